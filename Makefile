@@ -1,0 +1,34 @@
+PYTHON ?= python3
+TEST_JOBS ?= 2
+RUN_DIR ?= runs/highway-fast-ppo
+
+.DEFAULT_GOAL := help
+.PHONY: help .venv train test check clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[.a-z]+:.*## / { printf "make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+.venv: .venv/.installed ## install the package and its tools, at the versions of constraints.txt, into .venv
+
+.venv/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	.venv/bin/python -m pip install -c constraints.txt -e '.[all,dev]'
+	touch $@
+
+train: .venv/.installed ## train a policy on highway-fast-v0 into RUN_DIR
+	.venv/bin/python train_policy.py --run-dir $(RUN_DIR)
+
+# The shape checks break torch.compile, so its tests run without them; status 5 means that there are none.
+test: .venv/.installed ## run the tests, TEST_JOBS at a time
+	.venv/bin/python -m pytest -n $(TEST_JOBS) -m 'not compile'
+	JAXTYPING_DISABLE=1 .venv/bin/python -m pytest -m compile || test $$? -eq 5
+
+check: .venv/.installed ## lint, formatting, types, who may import whom
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy
+	.venv/bin/lint-imports
+
+clean: ## remove .venv, builds and caches; keep runs and data
+	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name .git -prune -o -type d -name __pycache__ -prune -exec rm -rf {} +

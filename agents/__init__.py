@@ -1,0 +1,1 @@
+"""Policies that learn from forecasts: features, training, evaluation, studies (Stable-Baselines3)."""

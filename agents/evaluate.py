@@ -1,0 +1,261 @@
+"""Closed-loop results of a policy on held-out seeds: `python -m agents.evaluate --run-dir runs/highway`.
+
+Every policy drives the same seeds; random and idle egos stand beside the trained one. Evaluation seeds are apart from
+those of training and of model selection (`agents.training`).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from agents.rows import EpisodeResult, Task, make_rows, run_episodes
+from agents.runs import POLICY_FILE, load_model, read_config, write_text
+from predictor.errors import UserError, run_entry_point
+from predictor.provenance import provenance, write_json
+
+EVALUATION_SEED = 2_000_000_000
+"""First seed of the final evaluation; training stays below 1e9, model selection between 1e9 and 2e9."""
+
+BASELINES = ("random", "idle")
+_WILSON_Z = 1.959963984540054  # two-sided 95 %
+PACKAGES = ("stable-baselines3", "gymnasium", "highway-env", "torch", "numpy")
+
+
+@dataclass(frozen=True)
+class PolicySummary:
+    """One row of the table: a policy over all episodes."""
+
+    policy: str
+    """Who drove."""
+    episodes: int
+    """Number of episodes."""
+    return_mean: float
+    """Mean undiscounted return."""
+    return_se: float
+    """Its standard error; NaN for a single episode."""
+    length_mean: float
+    """Mean length [policy steps]."""
+    length_se: float
+    """Its standard error."""
+    crash_rate: float
+    """Share of episodes with a crash."""
+    crash_low: float
+    """Lower end of its 95 % Wilson interval."""
+    crash_high: float
+    """Upper end."""
+    mean_speed_mps: float
+    """Mean over episodes of the mean speed [m/s]; NaN where the env reports none."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Results of several policies on the same seeds."""
+
+    env_id: str
+    """Gymnasium id."""
+    first_seed: int
+    """Episode i was reset with first_seed + i."""
+    results: dict[str, list[EpisodeResult]]
+    """Episodes by policy."""
+
+    @property
+    def rows(self) -> list[PolicySummary]:
+        """One summary per policy."""
+        return [summarize(policy, episodes) for policy, episodes in self.results.items()]
+
+    def write(self, folder: Path, **extra: Any) -> None:
+        """Write ``summary.json`` (with every episode and where it came from) and ``summary.md``."""
+        content = {
+            "env_id": self.env_id,
+            "first_seed": self.first_seed,
+            **extra,
+            "policies": [_finite(asdict(row)) for row in self.rows],
+            "episodes": {name: [_finite(asdict(e)) for e in found] for name, found in self.results.items()},
+            "provenance": provenance(PACKAGES),
+        }
+        write_json(folder / "summary.json", content)
+        write_text(folder / "summary.md", self.markdown())
+
+    def markdown(self) -> str:
+        """The table for a README."""
+        lines = ["| " + " | ".join(_HEADER) + " |", "|---" * len(_HEADER) + "|"]
+        lines += ["| " + " | ".join(_cells(row)) + " |" for row in self.rows]
+        return "\n".join(lines) + f"\n\n{self._caption()}\n"
+
+    def table(self) -> Table:
+        """The table for a terminal."""
+        table = Table(title=self.env_id, caption=self._caption())
+        for i, name in enumerate(_HEADER):
+            table.add_column(name, justify="right" if i else "left")
+        for row in self.rows:
+            table.add_row(*_cells(row))
+        return table
+
+    def _caption(self) -> str:
+        count = max(len(found) for found in self.results.values())
+        return (
+            f"{self.env_id}: {count} episodes each on seeds {self.first_seed}–{self.first_seed + count - 1}; "
+            "± is one standard error, crash rate with its 95 % Wilson interval."
+        )
+
+
+def wilson_interval(successes: int, trials: int, z: float = _WILSON_Z) -> tuple[float, float]:
+    """Wilson score interval of a rate; never outside [0, 1] and never of zero width.
+
+    Args:
+        successes: events seen.
+        trials: chances; at least 1.
+        z: normal quantile; the default gives 95 %.
+    """
+    if not 0 <= successes <= trials or trials < 1:
+        raise UserError(f"need 0 <= successes <= trials and trials >= 1, got {successes} of {trials}")
+    rate = successes / trials
+    centre = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
+    half = z / (1 + z**2 / trials) * math.sqrt(rate * (1 - rate) / trials + z**2 / (4 * trials**2))
+    low = 0.0 if successes == 0 else centre - half  # exact at the ends, where rounding would leave 1e-17
+    high = 1.0 if successes == trials else centre + half
+    return low, high
+
+
+def mean_and_standard_error(values: Sequence[float]) -> tuple[float, float]:
+    """Mean and its standard error (sample standard deviation / √n; NaN for a single value)."""
+    array = np.asarray(values, dtype=np.float64)
+    error = float(array.std(ddof=1) / math.sqrt(len(array))) if len(array) > 1 else math.nan
+    return float(array.mean()), error
+
+
+def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
+    """Summary of one policy's episodes."""
+    return_mean, return_se = mean_and_standard_error([e.episode_return for e in episodes])
+    length_mean, length_se = mean_and_standard_error([e.length for e in episodes])
+    crashes = sum(e.crashed for e in episodes)
+    return PolicySummary(
+        policy,
+        len(episodes),
+        return_mean,
+        return_se,
+        length_mean,
+        length_se,
+        crashes / len(episodes),
+        *wilson_interval(crashes, len(episodes)),
+        float(np.mean([e.mean_speed_mps for e in episodes])),
+    )
+
+
+def evaluate_policy_on_seeds(
+    task: Task,
+    model: BaseAlgorithm,
+    name: str,
+    num_episodes: int,
+    first_seed: int = EVALUATION_SEED,
+    num_rows: int = 2,
+    on_episode: Callable[[], None] = lambda: None,
+) -> Evaluation:
+    """Let the trained policy (most likely action) and the random and idle egos drive the same episodes.
+
+    Args:
+        task: what the model was trained on.
+        model: the trained policy.
+        name: what to call it in the table.
+        num_episodes: episodes per policy.
+        first_seed: episode i is reset with first_seed + i.
+        num_rows: parallel processes; the results do not depend on it.
+        on_episode: called after each episode.
+    """
+    seeds = range(first_seed, first_seed + num_episodes)
+    venv = make_rows(task, min(num_rows, num_episodes), seeded=True)
+    try:
+        results = {name: run_episodes(venv, lambda obs: model.predict(obs, deterministic=True)[0], seeds, on_episode)}
+        for baseline in BASELINES:
+            results[baseline] = run_episodes(venv, baseline, seeds, on_episode)
+    finally:
+        venv.close()
+    return Evaluation(task.env_id, first_seed, results)
+
+
+def evaluate_with_progress(
+    task: Task, model: BaseAlgorithm, name: str, num_episodes: int, first_seed: int = EVALUATION_SEED
+) -> Evaluation:
+    """`evaluate_policy_on_seeds` under a progress bar."""
+    columns = (TextColumn(f"evaluate {task.env_id}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns) as progress:
+        bar = progress.add_task("", total=num_episodes * (1 + len(BASELINES)))
+        return evaluate_policy_on_seeds(
+            task, model, name, num_episodes, first_seed, on_episode=lambda: progress.advance(bar)
+        )
+
+
+_HEADER = ("policy", "return", "length [steps]", "crash rate (95 %)", "mean speed [m/s]")
+
+
+def _cells(row: PolicySummary) -> tuple[str, ...]:
+    return (
+        row.policy,
+        f"{row.return_mean:.2f}{_plus_minus(row.return_se, 2)}",
+        f"{row.length_mean:.1f}{_plus_minus(row.length_se, 1)}",
+        f"{100 * row.crash_rate:.0f} % ({100 * row.crash_low:.0f}–{100 * row.crash_high:.0f} %)",
+        "–" if math.isnan(row.mean_speed_mps) else f"{row.mean_speed_mps:.1f}",
+    )
+
+
+def _plus_minus(error: float, digits: int) -> str:
+    return "" if math.isnan(error) else f" ± {error:.{digits}f}"
+
+
+def _finite(fields: dict[str, Any]) -> dict[str, Any]:
+    """JSON knows no NaN."""
+    return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in fields.items()}
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """Evaluate the policy of a training run on held-out seeds, beside random and idle."""
+
+    run_dir: Path
+    """Folder that train_policy.py made."""
+    episodes: int = 50
+    """Episodes per policy."""
+    seed: int = EVALUATION_SEED
+    """Episode i is reset with seed + i; the default is apart from all training seeds."""
+    out: Path | None = None
+    """Folder for summary.json and summary.md; None takes RUN_DIR/evaluation."""
+    device: str = "cpu"
+    """Where forecaster and policy run: cpu, cuda or auto."""
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        if self.episodes < 1:
+            raise UserError(f"episodes must be at least 1, got {self.episodes}")
+        if self.seed < 0:
+            raise UserError(f"seed must not be negative, got {self.seed}")
+
+
+def main() -> None:
+    """Entry point."""
+    config = tyro.cli(EvaluateConfig, description=__doc__)
+    run = read_config(config.run_dir)
+    task = Task(run["env_id"], run["observe"], run["checkpoint"])
+    task = replace(task, device=config.device)
+    task.check()
+    model = load_model(config.run_dir / POLICY_FILE, run["algorithm"])
+    evaluation = evaluate_with_progress(
+        task, model, f"{run['algorithm']} ({run['observe']})", config.episodes, config.seed
+    )
+    out = config.out or config.run_dir / "evaluation"
+    out.mkdir(parents=True, exist_ok=True)
+    evaluation.write(out, algorithm=run["algorithm"], observe=run["observe"])
+    Console().print(evaluation.table())
+    Console().print(f"written to {out / 'summary.json'} and {out / 'summary.md'}")
+
+
+if __name__ == "__main__":
+    run_entry_point(main)

@@ -1,0 +1,83 @@
+"""Hyperparameters per algorithm and scenario, as frozen dataclasses.
+
+They start from highway-env's own training scripts (``scripts/sb3_highway_ppo.py``, ``sb3_highway_dqn.py``,
+``sb3_racetracks_ppo.py``); where a value differs, the field says why.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+Algorithm = Literal["ppo", "dqn"]
+
+
+@dataclass(frozen=True)
+class PPOPreset:
+    """Proximal policy optimisation."""
+
+    n_steps: int = 128
+    """Steps per environment between updates."""
+    batch_size: int = 64
+    """Samples per gradient step."""
+    n_epochs: int = 10
+    """Passes over each rollout."""
+    learning_rate: float = 5e-4
+    """Adam's step size."""
+    gamma: float = 0.8
+    """Discount per policy step; a highway is decided within a few seconds."""
+    gae_lambda: float = 0.95
+    """Bias-variance trade-off of the advantages; SB3's default."""
+    ent_coef: float = 0.0
+    """Weight of the entropy bonus; SB3's default."""
+    net_arch: tuple[int, ...] = (256, 256)
+    """Hidden layers of actor and critic, each."""
+
+
+@dataclass(frozen=True)
+class DQNPreset:
+    """Deep Q-learning."""
+
+    learning_rate: float = 5e-4
+    """Adam's step size."""
+    buffer_size: int = 15_000
+    """Transitions kept."""
+    learning_starts: int = 200
+    """Random transitions before the first update."""
+    batch_size: int = 32
+    """Samples per gradient step."""
+    gamma: float = 0.8
+    """Discount per policy step."""
+    train_freq: int = 1
+    """Vector steps between updates."""
+    gradient_steps: int = -1
+    """Gradient steps per update; -1 makes one per collected transition, which equals the scripts' 1 for one env."""
+    target_update_interval: int = 50
+    """Transitions between copies to the target network."""
+    exploration_fraction: float = 0.7
+    """Part of the training over which exploration falls."""
+    exploration_final_eps: float = 0.05
+    """Exploration left at the end; SB3's default."""
+    net_arch: tuple[int, ...] = (256, 256)
+    """Hidden layers of the Q network."""
+
+
+Preset = PPOPreset | DQNPreset
+
+_PPO: dict[str, PPOPreset] = {
+    "highway-v0": PPOPreset(),
+    "highway-fast-v0": PPOPreset(),
+}
+_DQN: dict[str, DQNPreset] = {
+    "highway-v0": DQNPreset(),
+    "highway-fast-v0": DQNPreset(),
+}
+# Racetracks step five times as often, so the same foresight needs a longer discount (their script: 0.9).
+_FIVE_HZ_GAMMA = 0.9
+
+
+def preset_for(env_id: str, algorithm: Algorithm) -> Preset:
+    """The tuned preset of an env id, or the nearest published one."""
+    presets: dict[str, PPOPreset] | dict[str, DQNPreset] = _PPO if algorithm == "ppo" else _DQN
+    if env_id in presets:
+        return presets[env_id]
+    fallback: Preset = PPOPreset() if algorithm == "ppo" else DQNPreset()
+    return replace(fallback, gamma=_FIVE_HZ_GAMMA) if env_id.startswith("racetrack") else fallback

@@ -1,0 +1,112 @@
+"""Ways to drive the ego while data is collected or accuracy is measured."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from highway_env.vehicle.controller import ControlledVehicle
+
+from predictor.errors import UserError
+
+Ego = Callable[[Any], Any]
+"""From an observation to an action."""
+
+EGO_NAMES = ("random", "idle", "varied", "keep-lane")
+
+
+def make_ego(name: str, env: gym.Env, rng: np.random.Generator) -> Ego:
+    """An ego for one episode.
+
+    Args:
+        name: "random" (uniform actions), "idle" (no action), "varied" (each episode draws its own preferences and how
+            long it keeps to a choice), "keep-lane" (steers along its lane; continuous steering only), or the path of a
+            Stable-Baselines3 ``.zip``.
+        env: the environment that will be driven.
+        rng: source of all randomness of this episode.
+
+    Raises:
+        UserError: unknown name, or an ego that cannot drive this action space.
+    """
+    if name == "random":
+        return lambda obs: _uniform(env.action_space, rng)
+    if name == "idle":
+        action = idle_action(env)
+        return lambda obs: action
+    if name == "varied":
+        return _varied(env.action_space, rng)
+    if name == "keep-lane":
+        return _keep_lane(env, rng)
+    if name.endswith(".zip"):
+        return _trained(Path(name))
+    raise UserError(f"ego must be one of {', '.join(EGO_NAMES)} or the path of a policy .zip, got '{name}'")
+
+
+def idle_action(env: gym.Env) -> Any:
+    """The action that changes nothing: highway-env's IDLE, or zeros."""
+    space = env.action_space
+    if isinstance(space, gym.spaces.Discrete):
+        indexes = getattr(getattr(env.unwrapped, "action_type", None), "actions_indexes", {})
+        return int(indexes.get("IDLE", 0))
+    if isinstance(space, gym.spaces.Box):
+        return np.zeros(space.shape, dtype=space.dtype)
+    raise UserError(f"no idle action is known for {space}")
+
+
+def _uniform(space: gym.Space, rng: np.random.Generator) -> Any:
+    if isinstance(space, gym.spaces.Discrete):
+        return int(rng.integers(space.n))
+    if isinstance(space, gym.spaces.Box):
+        return rng.uniform(space.low, space.high).astype(space.dtype)
+    raise UserError(f"random egos need a Discrete or Box action space, got {space}")
+
+
+def _varied(space: gym.Space, rng: np.random.Generator) -> Ego:
+    persistence = rng.uniform(0.0, 0.9)
+    weights = rng.dirichlet(np.full(int(space.n), 0.7)) if isinstance(space, gym.spaces.Discrete) else None
+    last: list[Any] = []
+
+    def act(obs: Any) -> Any:
+        if not last or rng.random() > persistence:
+            last[:] = [_uniform(space, rng) if weights is None else int(rng.choice(len(weights), p=weights))]
+        return last[0]
+
+    return act
+
+
+def _keep_lane(env: gym.Env, rng: np.random.Generator) -> Ego:
+    """Follow the current lane with highway-env's own lane controller, with a little steering noise per episode."""
+    action_type: Any = getattr(env.unwrapped, "action_type", None)
+    if not isinstance(env.action_space, gym.spaces.Box) or not hasattr(action_type, "steering_range"):
+        raise UserError(f"keep-lane needs continuous steering, got {env.action_space}; use random, idle or varied")
+    noise = rng.uniform(0.0, 0.1)
+
+    def act(obs: Any) -> Any:
+        vehicle: Any = env.unwrapped.vehicle  # type: ignore[attr-defined]
+        driver = ControlledVehicle(vehicle.road, vehicle.position, vehicle.heading, vehicle.speed)
+        steering = driver.steering_control(vehicle.lane_index) / action_type.steering_range[1]
+        action = np.zeros(env.action_space.shape, dtype=np.float32)  # type: ignore[arg-type]
+        action[-1] = np.clip(steering + noise * rng.standard_normal(), -1, 1)
+        return action
+
+    return act
+
+
+def _trained(path: Path) -> Ego:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3 import DQN, PPO
+
+    if not path.exists():
+        raise UserError(f"no policy at {path}; train one with python train_policy.py")
+    model: BaseAlgorithm | None = None
+    for algorithm in (PPO, DQN):
+        try:
+            model = algorithm.load(path, device="cpu")
+            break
+        except (TypeError, KeyError, AttributeError, ValueError):
+            continue
+    if model is None:
+        raise UserError(f"{path} is neither a PPO nor a DQN policy")
+    policy = model
+    return lambda obs: policy.predict(obs, deterministic=True)[0]

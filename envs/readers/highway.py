@@ -1,0 +1,105 @@
+"""Reads scenes out of highway-env: positions, velocities and identities of the vehicles around the ego.
+
+A vehicle's identity is the simulator's own object, never its place in a list: highway-env sorts and filters its lists.
+Sees what a perception system could: vehicles within `perception_m`, the nearest `max_agents`; no routes, no driver
+parameters.
+"""
+
+import weakref
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+from highway_env.envs.common.abstract import AbstractEnv
+from highway_env.vehicle.kinematics import Vehicle
+
+from predictor.errors import ProtocolError, UserError
+from predictor.scene import KINEMATIC_FEATURES, PADDING_ID, AxisFrame, Scene, SceneSpec
+
+# Straight roads without end: x is relative to the ego, y (the lane) is the map. All other ids have a fixed map.
+_UNBOUNDED_X: tuple[AxisFrame, AxisFrame] = ("ego", "world")
+_FIXED_MAP: tuple[AxisFrame, AxisFrame] = ("world", "world")
+_FRAMES: dict[str, tuple[AxisFrame, AxisFrame]] = {
+    "highway-v0": _UNBOUNDED_X,
+    "highway-fast-v0": _UNBOUNDED_X,
+    "two-way-v0": _UNBOUNDED_X,
+}
+
+
+def is_highway_env(env: gym.Env) -> bool:
+    """Whether the environment comes from highway-env."""
+    return isinstance(env.unwrapped, AbstractEnv)
+
+
+class HighwayReader:
+    """Scene reader for single-ego highway-env environments (highway-env ≥ 1.12).
+
+    Args:
+        env: the environment; its `policy_frequency` gives `dt_s`, its id the frame.
+        perception_m: how far the ego sees [m]; None takes `SceneSpec`'s default.
+        max_agents: rows of a scene, the ego included; None takes `SceneSpec`'s default.
+    """
+
+    def __init__(self, env: gym.Env, perception_m: float | None = None, max_agents: int | None = None) -> None:
+        """Derive the spec from the environment."""
+        if not is_highway_env(env):
+            raise UserError(f"HighwayReader needs a highway-env environment, got {env.unwrapped.__class__.__name__}")
+        config = env.unwrapped.config  # type: ignore[attr-defined]
+        env_id = env.unwrapped.spec.id if env.unwrapped.spec is not None else ""
+        spec = SceneSpec(dt_s=1 / config["policy_frequency"], frame=_FRAMES.get(env_id, _FIXED_MAP))
+        if perception_m is not None:
+            spec = replace(spec, perception_m=float(perception_m))
+        if max_agents is not None:
+            spec = replace(spec, max_agents=int(max_agents))
+        self._spec = spec
+        self.reset()
+
+    @property
+    def spec(self) -> SceneSpec:
+        """What the scenes of this reader look like."""
+        return self._spec
+
+    def reset(self) -> None:
+        """Forget all identities; numbering starts anew, so equal seeds give equal ids."""
+        # Keyed by the living object: id() is reused after garbage collection and would join two vehicles.
+        self._ids: weakref.WeakKeyDictionary[Vehicle, int] = weakref.WeakKeyDictionary()
+        self._next_id = 0
+
+    def read(self, env: gym.Env) -> Scene:
+        """The ego and the nearest vehicles within perception, nearest first, padded to `max_agents` rows."""
+        spec = self._spec
+        everyone = self.read_all(env)
+        offsets = everyone.states[:, :2] - everyone.states[0, :2]
+        distance_m = np.hypot(offsets[:, 0], offsets[:, 1])
+        distance_m[0] = -1.0  # the ego stays in row 0, also when another vehicle lies on top of it
+        order = np.argsort(distance_m, kind="stable")[: spec.max_agents]
+        order = order[distance_m[order] <= spec.perception_m]
+        states = np.zeros((spec.max_agents, spec.num_features))
+        ids = np.full(spec.max_agents, PADDING_ID, dtype=np.int64)
+        valid = np.zeros(spec.max_agents, dtype=np.bool_)
+        states[: len(order)] = everyone.states[order]
+        ids[: len(order)] = everyone.ids[order]
+        valid[: len(order)] = True
+        return Scene(states, ids, valid, everyone.heading_rad)
+
+    def read_all(self, env: gym.Env) -> Scene:
+        """Every vehicle on the road, ego first, unpadded: ground truth for collection and evaluation."""
+        unwrapped = env.unwrapped
+        road, ego = unwrapped.road, unwrapped.vehicle  # type: ignore[attr-defined]
+        if road is None or ego is None:
+            raise ProtocolError("the environment has no vehicles yet; call reset() first")
+        vehicles = [ego] + [v for v in road.vehicles if v is not ego]
+        kinematics = np.array([(*v.position, v.speed, v.heading) for v in vehicles])
+        states = np.empty((len(vehicles), len(KINEMATIC_FEATURES)))
+        states[:, :2] = kinematics[:, :2]
+        states[:, 2] = kinematics[:, 2] * np.cos(kinematics[:, 3])
+        states[:, 3] = kinematics[:, 2] * np.sin(kinematics[:, 3])
+        ids = np.array([self._identify(v) for v in vehicles], dtype=np.int64)
+        return Scene(states, ids, np.ones(len(vehicles), dtype=np.bool_), float(ego.heading))
+
+    def _identify(self, vehicle: Vehicle) -> int:
+        number = self._ids.get(vehicle)
+        if number is None:
+            number = self._ids[vehicle] = self._next_id
+            self._next_id += 1
+        return number

@@ -1,0 +1,47 @@
+"""Which environments are known, how to make them, and which shipped checkpoint serves which id."""
+
+from typing import Any
+
+import gymnasium as gym
+import highway_env  # noqa: F401  (registers the ids)
+
+from predictor.errors import UserError
+
+CHECKPOINTS: dict[str, str] = {
+    "highway-v0": "highway",
+    "highway-fast-v0": "highway",
+    "two-way-v0": "two-way",
+    "merge-v1": "merge",
+    "merge-generic-v1": "merge-generic",
+    "roundabout-v1": "roundabout",
+    "roundabout-generic-v1": "roundabout-generic",
+    "intersection-v2": "intersection",
+    "exit-v1": "exit",
+    "racetrack-v1": "racetrack",
+    "racetrack-large-v1": "racetrack-large",
+    "racetrack-oval-v1": "racetrack-oval",
+    "u-turn-v1": "u-turn",
+}
+"""Env id → name of the checkpoint under predictor/pretrained."""
+
+
+def make_env(env_id: str, **kwargs: Any) -> gym.Env:
+    """`gym.make` with a one-line error for an unknown id."""
+    try:
+        return gym.make(env_id, **kwargs)
+    except (gym.error.UnregisteredEnv, gym.error.Error, ModuleNotFoundError) as error:
+        raise UserError(f"cannot make env '{env_id}': {error}; known here: {', '.join(CHECKPOINTS)}") from error
+
+
+def checkpoint_for(env_id: str) -> str:
+    """Name of the shipped checkpoint for an env id.
+
+    Raises:
+        UserError: none ships for the id.
+    """
+    if env_id not in CHECKPOINTS:
+        raise UserError(
+            f"no checkpoint ships for env '{env_id}'; pass one (a name or a path), or 'constant-velocity'. "
+            f"Shipped ids: {', '.join(CHECKPOINTS)}"
+        )
+    return CHECKPOINTS[env_id]

@@ -1,0 +1,1 @@
+"""Forecasters to compare with, behind the same interface as the dG-VAE."""

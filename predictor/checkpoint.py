@@ -1,0 +1,168 @@
+"""Predictor checkpoints: a folder with `config.json` and `model.safetensors`. Never pickle, so safe to load from others.
+
+A checkpoint carries everything needed to run it (spec, sizes, horizon, residual spread) and how it was made.
+"""
+
+import dataclasses
+import json
+import os
+import shutil
+import uuid
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import torch
+from safetensors.torch import load_file, save_file
+
+from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.dgvae import DGVAE, DGVAEConfig
+from predictor.errors import UserError
+from predictor.scene import SceneSpec
+
+FORMAT = "dgvae-rl predictor"
+VERSION = 1
+CONSTANT_VELOCITY = "constant-velocity"
+PRETRAINED = Path(__file__).resolve().parent / "pretrained"
+
+
+@dataclass(frozen=True)
+class CheckpointInfo:
+    """What stands beside the weights."""
+
+    spec: SceneSpec
+    """Scenes it takes."""
+    config: DGVAEConfig
+    """Sizes of the network."""
+    horizon_steps: int
+    """Steps it was trained to forecast."""
+    std_m: tuple[float, ...] = ()
+    """Standard deviation per axis of the validation error at each horizon step [m]; the spread that NLL uses."""
+    sources: tuple[str, ...] = ()
+    """What it was trained on (env ids or dataset names)."""
+    provenance: dict[str, Any] = field(default_factory=dict)
+    """Command, commit, versions, seeds, validation results."""
+
+
+def save_checkpoint(path: Path, model: DGVAE, info: CheckpointInfo) -> None:
+    """Write a checkpoint folder; an existing one is replaced only when the new one is complete."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.partial")
+    partial.mkdir()
+    try:
+        tensors = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
+        save_file(tensors, partial / "model.safetensors")
+        content = {"format": FORMAT, "version": VERSION, **asdict(info)}
+        (partial / "config.json").write_text(json.dumps(content, indent=2, default=str) + "\n")
+        replace_folder(partial, path)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def replace_folder(new: Path, target: Path) -> None:
+    """Put `new` in the place of `target`; a crash leaves one of them whole under the target's name or beside it."""
+    if not target.exists():
+        new.rename(target)
+        return
+    old = target.with_name(f".{target.name}.old")
+    shutil.rmtree(old, ignore_errors=True)
+    target.rename(old)
+    os.replace(new, target)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def resolve(name: str | Path) -> Path:
+    """The folder of a shipped name or of a path.
+
+    Raises:
+        UserError: neither exists.
+    """
+    path = Path(name)
+    if path.is_dir():
+        return path
+    if str(name) in shipped():
+        return PRETRAINED / str(name)
+    raise UserError(
+        f"no checkpoint '{name}': neither a folder nor a shipped name ({', '.join([*shipped(), CONSTANT_VELOCITY])})"
+    )
+
+
+def shipped() -> list[str]:
+    """Names of the checkpoints that ship with the package."""
+    return sorted(p.parent.name for p in PRETRAINED.glob("[!.]*/config.json"))
+
+
+def load_checkpoint(name: str | Path, device: str = "cpu") -> tuple[DGVAE, CheckpointInfo]:
+    """Load a model for inference from a shipped name or a folder.
+
+    Raises:
+        UserError: not there, not a predictor checkpoint, of another version, truncated, or not fitting its own config.
+    """
+    path = resolve(name)
+    info = read_info(path)
+    model = DGVAE(info.spec, info.config, info.horizon_steps)
+    try:
+        tensors = load_file(path / "model.safetensors")
+    except (safetensors.SafetensorError, OSError) as error:
+        raise UserError(f"{path / 'model.safetensors'} cannot be read ({error}); copy or train it again") from error
+    expected = {k: tuple(v.shape) for k, v in model.state_dict().items()}
+    found = {k: tuple(v.shape) for k, v in tensors.items()}
+    if expected != found:
+        name_ = next(k for k in sorted(expected.keys() | found.keys()) if expected.get(k) != found.get(k))
+        raise UserError(
+            f"{path}: tensor '{name_}' should be {expected.get(name_, 'absent')} by config.json but is "
+            f"{found.get(name_, 'absent')} in model.safetensors; the two files do not belong together"
+        )
+    if not all(bool(torch.isfinite(t).all()) for t in tensors.values()):
+        raise UserError(f"{path}: the weights are not finite; train it again")
+    model.load_state_dict(tensors)
+    return model.to(device).eval(), info
+
+
+def read_info(path: Path) -> CheckpointInfo:
+    """Read and check `config.json`."""
+    file = Path(path) / "config.json"
+    try:
+        content = json.loads(file.read_text())
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise UserError(f"{file} cannot be read ({error}); is {path} a predictor checkpoint?") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise UserError(f"{path} is not a predictor checkpoint (config.json has no format '{FORMAT}')")
+    if content.get("version") != VERSION:
+        raise UserError(f"{path} has checkpoint version {content.get('version')}, this release reads {VERSION}")
+    try:
+        return CheckpointInfo(
+            spec=_build(SceneSpec, content["spec"]),
+            config=_build(DGVAEConfig, content["config"]),
+            horizon_steps=int(content["horizon_steps"]),
+            std_m=tuple(content["std_m"]),
+            sources=tuple(content["sources"]),
+            provenance=dict(content["provenance"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{file} does not describe a predictor: {error}") from error
+
+
+def load_forecaster(
+    name: str | Path, scene_spec: SceneSpec, source: str, device: str = "cpu"
+) -> DGVAE | ConstantVelocity:
+    """A forecaster for scenes of `scene_spec`: a shipped name, a folder, or "constant-velocity".
+
+    Raises:
+        UserError: as `load_checkpoint`, or the checkpoint is of another spec (features, dt).
+    """
+    if str(name) == CONSTANT_VELOCITY:
+        return ConstantVelocity(scene_spec)
+    model, info = load_checkpoint(name, device)
+    info.spec.check_compatible(scene_spec, f"checkpoint '{name}'", source)
+    return model
+
+
+def _build(cls: type, values: dict[str, Any]) -> Any:
+    fields = {f.name for f in dataclasses.fields(cls)}
+    unknown = set(values) - fields
+    if unknown:
+        raise ValueError(f"unknown field '{sorted(unknown)[0]}' of {cls.__name__}")
+    return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})

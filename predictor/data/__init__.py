@@ -1,0 +1,1 @@
+"""Datasets: the episode store and what is read from it."""

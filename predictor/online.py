@@ -1,0 +1,120 @@
+"""Streaming: one forecaster, many parallel rows, memory that follows agents by id and is forgotten row by row.
+
+Between two observations rows may be re-sorted and agents may come and go: memory is moved to where an agent's id now
+stands, newcomers start from zero, and the memory of leavers is dropped with the old arrangement. The cost of a step does
+not depend on how much was seen before.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from predictor.errors import ProtocolError
+from predictor.forecaster import Belief, Forecaster, Memory
+from predictor.scene import PADDING_ID, Forecast, SceneBatch
+
+
+class OnlineForecaster:
+    """Keeps the memory of a forecaster for `rows` parallel scenes.
+
+    Args:
+        forecaster: any `Forecaster`.
+        rows: parallel scenes (environments).
+        agents: rows of each scene, padding included.
+        device: where the forecaster lives.
+    """
+
+    def __init__(self, forecaster: Forecaster, rows: int, agents: int, device: str = "cpu") -> None:
+        """Start with empty memory in every row."""
+        self.forecaster = forecaster
+        self.device = torch.device(device)
+        self._memory = forecaster.empty_memory(rows, agents)
+        self._fresh = forecaster.empty_memory(1, agents)
+        self._ids: Int[np.ndarray, "rows agents"] = np.full((rows, agents), PADDING_ID, dtype=np.int64)
+        self._ego_axes = np.array([f == "ego" for f in forecaster.spec.frame], dtype=np.float64)
+        self._belief: Belief | None = None
+        self._origin: np.ndarray | None = None
+
+    def reset(self, rows: Int[np.ndarray, " some"] | None = None) -> None:
+        """Forget the history of some rows (all, if None); the others keep theirs."""
+        chosen = np.arange(len(self._ids)) if rows is None else np.asarray(rows, dtype=np.int64)
+        if not len(chosen):
+            return
+        self._ids[chosen] = PADDING_ID
+        index = torch.from_numpy(chosen).to(self.device)
+        fresh = self._fresh.select(torch.zeros(len(chosen), dtype=torch.long, device=self.device))
+        self._memory = self._memory.replace_rows(index, fresh)
+
+    @torch.inference_mode()
+    def observe(self, scenes: SceneBatch) -> None:
+        """Take in one scene per row."""
+        self._take(scenes, self._ids, self._memory)
+
+    @torch.inference_mode()
+    def observe_boundary(
+        self, scenes: SceneBatch, ended: Int[np.ndarray, " ended"], successors: SceneBatch
+    ) -> None:
+        """Take in one scene per row, of which some are the last of their episode, together with their successors.
+
+        One batched step serves both: rows of `scenes` continue their histories; for each row in `ended`, the first
+        scene of its next episode enters with an empty history and is what stays in memory. A `forecast` that follows
+        has `len(scenes) + len(ended)` rows, the successors last.
+        """
+        ended = np.asarray(ended, dtype=np.int64)
+        rows = len(self._ids)
+        fresh = self._fresh.select(torch.zeros(len(ended), dtype=torch.long, device=self.device))
+        no_ids = np.full((len(ended), self._ids.shape[1]), PADDING_ID, dtype=np.int64)
+        self._take(
+            SceneBatch.concatenate(scenes, successors),
+            np.concatenate([self._ids, no_ids]),
+            Memory.concatenate(self._memory, fresh),
+        )
+        kept = np.arange(rows)
+        kept[ended] = rows + np.arange(len(ended))
+        self._memory = self._memory.select(torch.from_numpy(kept).to(self.device))
+        self._ids = self._ids[kept]
+
+    @torch.inference_mode()
+    def forecast(
+        self,
+        horizon_steps: int | None = None,
+        num_samples: int = 1,
+        generator: torch.Generator | None = None,
+    ) -> Forecast:
+        """Forecast from the latest observation; sample 0 is the most likely graph's.
+
+        Raises:
+            ProtocolError: nothing was observed yet.
+        """
+        if self._belief is None or self._origin is None:
+            raise ProtocolError("forecast() needs an observation; call observe() first")
+        belief = self._belief
+        steps = horizon_steps or self.forecaster.horizon_steps
+        states = self.forecaster.rollout(belief, steps, num_samples, generator)
+        # float32 relative to the ego: the origin that observe() removed is the ego's own position on "ego" axes
+        ego_now = belief.states[:, None, :1, None, :2]
+        xy = (states[..., :2] - ego_now) * belief.valid[:, None, :, None, None]
+        return Forecast(xy, belief.edge_probs, belief.edge_features, belief.valid)
+
+    def _take(self, scenes: SceneBatch, old_ids: Int[np.ndarray, "rows agents"], memory: Memory) -> None:
+        source, known = _match(old_ids, scenes.ids)
+        if not np.array_equal(old_ids, scenes.ids):
+            memory = memory.reorder(torch.from_numpy(source).to(self.device), torch.from_numpy(known).to(self.device))
+        # float64 until the ego's position is off: a scene 10 km down the road loses no precision
+        origin = scenes.states[:, :1, :2] * self._ego_axes
+        local = scenes.states.copy()
+        local[..., :2] -= origin
+        states: Tensor = torch.from_numpy((local * scenes.valid[..., None]).astype(np.float32)).to(self.device)
+        valid = torch.from_numpy(scenes.valid).to(self.device)
+        self._memory, self._belief = self.forecaster.observe(memory, states, valid)
+        self._origin = origin
+        self._ids = np.where(scenes.valid, scenes.ids, PADDING_ID)
+
+
+def _match(
+    old_ids: Int[np.ndarray, "rows agents"], new_ids: Int[np.ndarray, "rows agents"]
+) -> tuple[Int[np.ndarray, "rows agents"], Bool[np.ndarray, "rows agents"]]:
+    """For each new row of each scene, where its id stood before, and whether it did."""
+    same = (new_ids[:, :, None] == old_ids[:, None, :]) & (new_ids[:, :, None] != PADDING_ID)
+    return same.argmax(axis=2), same.any(axis=2)

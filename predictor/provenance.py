@@ -1,0 +1,59 @@
+"""How a result was made: command, commit, versions, time. Goes into every run folder, store and checkpoint."""
+
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+
+def provenance(packages: Sequence[str], command: str | None = None) -> dict[str, Any]:
+    """Command line, git commit (with "+changes" if the tree is dirty), package versions, machine, UTC time."""
+    if command is None:
+        command = " ".join(["python", *(_module_or_script()), *map(shlex.quote, sys.argv[1:])])
+    return {
+        "command": command,
+        "commit": _commit(),
+        "versions": {name: _version(name) for name in ("dgvae-rl", *packages)} | {"python": platform.python_version()},
+        "machine": f"{platform.machine()}, {os.cpu_count()} logical cores",
+        "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON so that a reader finds either the old file or the whole new one."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial.write_text(json.dumps(content, indent=2, default=str) + "\n")
+    os.replace(partial, path)
+
+
+def _module_or_script() -> list[str]:
+    spec = getattr(sys.modules.get("__main__"), "__spec__", None)
+    if spec is not None and spec.name != "__main__":
+        return ["-m", spec.name.removesuffix(".__main__")]
+    return [Path(sys.argv[0]).name]
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _commit() -> str:
+    here = Path(__file__).resolve().parent
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(["git", *arguments], cwd=here, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        return git("rev-parse", "--short=12", "HEAD") + ("+changes" if git("status", "--porcelain", "-uno") else "")
+    except (subprocess.CalledProcessError, FileNotFoundError):
+        return "unknown"

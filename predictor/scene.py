@@ -1,0 +1,167 @@
+"""What everything speaks in: the layout of a scene (`SceneSpec`), one instant (`Scene`), many (`SceneBatch`), `Forecast`.
+
+States are in the world frame and SI units. Where a scene has an ego, it is row 0, always. Padded rows are
+`valid=False`, hold zeros and id -1. The first four features are always position and velocity.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from predictor.errors import UserError
+
+KINEMATIC_FEATURES = ("x_m", "y_m", "vx_mps", "vy_mps")
+PADDING_ID = -1
+
+AxisFrame = Literal["ego", "world"]
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """The contract between whoever reads scenes and whoever forecasts them; travels inside every checkpoint."""
+
+    dt_s: float
+    """Time between two scenes [s]."""
+    frame: tuple[AxisFrame, AxisFrame] = ("world", "world")
+    """Per axis: "ego" subtracts the ego's position at each step (unbounded roads), "world" keeps it (fixed maps)."""
+    feature_names: tuple[str, ...] = KINEMATIC_FEATURES
+    """Columns of a state; position and velocity come first."""
+    feature_scales: tuple[float, ...] = (100.0, 100.0, 30.0, 30.0)
+    """Divisors that bring each feature to order one for the network."""
+    has_ego: bool = True
+    """Whether row 0 is the learner; tells the network which agent does not drive like the others."""
+    perception_m: float = 100.0
+    """How far the ego sees [m]; agents beyond are not in the scene."""
+    max_agents: int = 12
+    """Rows of a scene, the ego included; the nearest are kept."""
+
+    def __post_init__(self) -> None:
+        """Check that the fields fit together."""
+        if self.dt_s <= 0:
+            raise UserError(f"dt_s must be positive, got {self.dt_s}")
+        if self.feature_names[:4] != KINEMATIC_FEATURES:
+            raise UserError(f"the first features must be {KINEMATIC_FEATURES}, got {self.feature_names[:4]}")
+        if len(self.feature_scales) != len(self.feature_names) or min(self.feature_scales) <= 0:
+            raise UserError(
+                f"feature_scales needs one positive number per feature ({len(self.feature_names)}), "
+                f"got {self.feature_scales}"
+            )
+        if self.max_agents < 1 or self.perception_m <= 0:
+            raise UserError(
+                f"max_agents must be at least 1 and perception_m positive, got {self.max_agents}, {self.perception_m}"
+            )
+        if "ego" in self.frame and not self.has_ego:
+            raise UserError("an 'ego' frame needs has_ego=True; use frame ('world', 'world')")
+
+    @property
+    def num_features(self) -> int:
+        """Columns of a state."""
+        return len(self.feature_names)
+
+    def check_compatible(self, other: "SceneSpec", name: str, source: str) -> None:
+        """Raise unless scenes of `other` can be fed to a forecaster of this spec.
+
+        Args:
+            other: the spec of the scenes that arrive.
+            name: what this spec belongs to, for the message (``checkpoint 'highway'``).
+            source: what the scenes come from, for the message (``env 'racetrack-v1'``).
+
+        Raises:
+            UserError: features or time step differ.
+        """
+        if self.feature_names != other.feature_names:
+            raise UserError(
+                f"{name} was trained on features {self.feature_names} but {source} gives {other.feature_names}; "
+                "retrain on its data or use another reader"
+            )
+        if abs(self.dt_s - other.dt_s) > 1e-6:
+            raise UserError(
+                f"{name} was trained at dt_s={self.dt_s:g} but {source} steps at dt_s={other.dt_s:g}; "
+                "retrain on its data or change the env's policy_frequency"
+            )
+
+
+@dataclass(frozen=True)
+class Scene:
+    """All agents at one instant, padded to a fixed number of rows."""
+
+    states: Float[np.ndarray, "agents state"]
+    """World frame, SI units, float64; row 0 is the ego."""
+    ids: Int[np.ndarray, " agents"]
+    """Identity that stays with an agent from step to step; -1 in padded rows."""
+    valid: Bool[np.ndarray, " agents"]
+    """Which rows hold an agent."""
+    heading_rad: float = 0.0
+    """The ego's heading, which turns world axes into ego axes; 0 where agents have none."""
+
+    def check(self, source: str = "reader") -> None:
+        """Raise a `UserError` if the scene breaks the contract (no ego, duplicate ids, non-finite states)."""
+        if not self.valid[0]:
+            raise UserError(f"{source}: row 0 must hold the ego, but it is not valid")
+        live = self.ids[self.valid]
+        if len(np.unique(live)) != len(live):
+            raise UserError(f"{source}: ids must be unique within a scene, got {live.tolist()}")
+        if (live < 0).any():
+            raise UserError(f"{source}: ids of valid agents must be non-negative, got {live.tolist()}")
+        if not np.isfinite(self.states[self.valid]).all():
+            raise UserError(f"{source}: states must be finite, got {self.states[self.valid].tolist()}")
+
+
+@dataclass(frozen=True)
+class SceneBatch:
+    """Scenes of many rows (parallel environments) at one instant."""
+
+    states: Float[np.ndarray, "batch agents state"]
+    """World frame, SI units, float64."""
+    ids: Int[np.ndarray, "batch agents"]
+    """As in `Scene`."""
+    valid: Bool[np.ndarray, "batch agents"]
+    """As in `Scene`."""
+    heading_rad: Float[np.ndarray, " batch"]
+    """As in `Scene`."""
+
+    @staticmethod
+    def stack(scenes: Sequence[Scene]) -> "SceneBatch":
+        """Stack scenes of equal size."""
+        return SceneBatch(
+            np.stack([s.states for s in scenes]),
+            np.stack([s.ids for s in scenes]),
+            np.stack([s.valid for s in scenes]),
+            np.array([s.heading_rad for s in scenes], dtype=np.float64),
+        )
+
+    def __len__(self) -> int:
+        """Rows of the batch."""
+        return len(self.states)
+
+    def __getitem__(self, rows: Int[np.ndarray, " rows"]) -> "SceneBatch":
+        """The given rows, as a batch."""
+        return SceneBatch(self.states[rows], self.ids[rows], self.valid[rows], self.heading_rad[rows])
+
+    @staticmethod
+    def concatenate(first: "SceneBatch", second: "SceneBatch") -> "SceneBatch":
+        """The rows of `first`, then those of `second`."""
+        return SceneBatch(
+            np.concatenate([first.states, second.states]),
+            np.concatenate([first.ids, second.ids]),
+            np.concatenate([first.valid, second.valid]),
+            np.concatenate([first.heading_rad, second.heading_rad]),
+        )
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What a forecaster says at one instant about the steps that follow it."""
+
+    xy: Float[Tensor, "batch samples agents horizon 2"]
+    """Predicted positions [m], world axes, relative to the ego's position now; zeros where `valid` is not."""
+    edge_probs: Float[Tensor, "batch agents agents types"]
+    """Prior over edge types now, receiver first; type 0 is "no edge"."""
+    edge_features: Float[Tensor, "batch agents agents feature"]
+    """Edge features now, receiver first."""
+    valid: Bool[Tensor, "batch agents"]
+    """Which agents are forecast."""
