@@ -9,8 +9,8 @@ always present, so an empty scene works. Not recurrent: memory lives in the fore
 import math
 from dataclasses import dataclass
 
+import gymnasium as gym
 import torch
-from gymnasium import spaces
 from jaxtyping import Bool, Float
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -60,20 +60,21 @@ class ForecastAttention(BaseFeaturesExtractor):
         config: sizes and scales.
     """
 
-    def __init__(self, observation_space: spaces.Dict, config: AttentionConfig | None = None) -> None:
+    def __init__(self, observation_space: gym.Space, config: AttentionConfig | None = None) -> None:
         """Size the layers from the space."""
         config = config or AttentionConfig()
         super().__init__(observation_space, features_dim=2 * config.width)
-        if EGO_KEY not in observation_space.spaces:
-            raise UserError(f"ForecastAttention needs the key '{EGO_KEY}', got {sorted(observation_space.spaces)}")
+        if not isinstance(observation_space, gym.spaces.Dict) or EGO_KEY not in observation_space.spaces:
+            raise UserError(f"ForecastAttention needs a Dict with the key '{EGO_KEY}', got {observation_space}")
         self.config = config
-        self._keys = tuple(k for k in TOKEN_KEYS if k in observation_space.spaces)
+        shapes = {k: space.shape or () for k, space in observation_space.items()}
+        self._keys = tuple(k for k in TOKEN_KEYS if k in shapes)
         ego_dim = get_flattened_obs_dim(observation_space[EGO_KEY])
         self.ego = nn.Sequential(
             nn.Linear(ego_dim, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.width), nn.ReLU()
         )
         # A token is read in the light of the ego: its first layer also gets the ego's embedding.
-        token_dim = self._token_dim(observation_space)
+        token_dim = self._token_dim(shapes)
         self.token_in = nn.Linear(token_dim, config.hidden) if token_dim else None
         self.token_ego = nn.Linear(config.width, config.hidden, bias=False)
         self.token_out = nn.Sequential(nn.ReLU(), nn.Linear(config.hidden, config.width), nn.LayerNorm(config.width))
@@ -125,12 +126,11 @@ class ForecastAttention(BaseFeaturesExtractor):
     def _squash(self, metres: Float[Tensor, "*axes 2"]) -> Float[Tensor, "*axes 4"]:
         return torch.cat([torch.tanh(metres / self.config.near_m), metres / self.config.far_m], dim=-1)
 
-    def _token_dim(self, space: spaces.Dict) -> int:
+    def _token_dim(self, shapes: dict[str, tuple[int, ...]]) -> int:
         """Size of `_token_inputs`, by running it on zeros."""
         if not self._keys:
             return 0
-        shapes = {k: space[k].shape for k in self._keys}
-        return self._token_inputs({k: torch.zeros(1, *(s or ())) for k, s in shapes.items()}).shape[-1]
+        return self._token_inputs({k: torch.zeros(1, *shapes[k]) for k in self._keys}).shape[-1]
 
     def _attend(
         self,

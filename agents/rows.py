@@ -19,6 +19,7 @@ from envs.registry import make_env
 from envs.vector import VecForecast
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.errors import UserError
+from predictor.scene import SceneSpec
 
 Observe = Literal["forecast", "none", "constant-velocity"]
 
@@ -50,23 +51,38 @@ class Task:
         """What to pass as `checkpoint` to the wrappers."""
         return "constant-velocity" if self.observe == "constant-velocity" else self.checkpoint
 
-    def check(self) -> gym.Space:
-        """Make the environment once, with its forecaster, and return its action space.
+    @property
+    def scene_spec(self) -> SceneSpec | None:
+        """Scenes as the forecaster was trained on them; None if the policy sees none.
 
         Raises:
             UserError: unknown env, missing checkpoint, or a checkpoint that does not fit the env.
         """
+        if self.observe == "none":
+            return None
+        env = ForecastObservation(make_env(self.env_id), self.forecaster, device=resolve_device(self.device))
+        spec: SceneSpec = env.get_wrapper_attr("scene_spec")
+        env.close()
+        return spec
+
+    def check(self) -> gym.Space:
+        """Make the environment, with its forecaster, and return its action space.
+
+        Raises:
+            UserError: as `scene_spec`.
+        """
         env = make_env(self.env_id)
-        try:
-            if self.observe != "none":
-                env = ForecastObservation(env, self.forecaster, device=resolve_device(self.device))
-            return env.action_space
-        finally:
-            env.close()
+        env.close()
+        _ = self.scene_spec
+        return env.action_space
 
 
 def resolve_device(device: str) -> str:
-    """ "auto" becomes cuda where there is one, else cpu; an unusable device is a one-line error."""
+    """The torch device of a name; auto takes cuda where there is one.
+
+    Raises:
+        UserError: no such device here.
+    """
     if device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     try:
@@ -86,7 +102,7 @@ def make_rows(task: Task, num_rows: int, seeded: bool = False) -> VecEnv:
         num_rows: rows; one runs in this process, more in spawned ones.
         seeded: wrap each row in `SeededEpisodes`, for evaluation.
     """
-    row = _MakeRow(task.env_id, task.observe != "none", seeded)
+    row = _MakeRow(task.env_id, task.scene_spec, seeded)
     venv: VecEnv
     venv = DummyVecEnv([row]) if num_rows == 1 else SubprocVecEnv([row] * num_rows, start_method="spawn")
     if task.observe != "none":
@@ -99,15 +115,15 @@ class _MakeRow:
     """Picklable constructor of one row."""
 
     env_id: str
-    with_scene: bool
+    scene_spec: SceneSpec | None
     seeded: bool
 
     def __call__(self) -> gym.Env:
         if multiprocessing.parent_process() is not None:
             torch.set_num_threads(1)  # the rows already fill the cores
         env = make_env(self.env_id, disable_env_checker=True)
-        if self.with_scene:
-            env = SceneObservation(env)
+        if self.scene_spec is not None:
+            env = SceneObservation(env, self.scene_spec.perception_m, self.scene_spec.max_agents)
         return SeededEpisodes(env) if self.seeded else env
 
 

@@ -34,7 +34,6 @@ class OnlineForecaster:
         self._ids: Int[np.ndarray, "rows agents"] = np.full((rows, agents), PADDING_ID, dtype=np.int64)
         self._ego_axes = np.array([f == "ego" for f in forecaster.spec.frame], dtype=np.float64)
         self._belief: Belief | None = None
-        self._origin: np.ndarray | None = None
 
     def reset(self, rows: Int[np.ndarray, " some"] | None = None) -> None:
         """Forget the history of some rows (all, if None); the others keep theirs."""
@@ -47,9 +46,14 @@ class OnlineForecaster:
         self._memory = self._memory.replace_rows(index, fresh)
 
     @torch.inference_mode()
-    def observe(self, scenes: SceneBatch) -> None:
-        """Take in one scene per row."""
-        self._take(scenes, self._ids, self._memory)
+    def observe(self, scenes: SceneBatch, rows: Int[np.ndarray, " some"] | None = None) -> None:
+        """Take in one scene per row, or one for each of `rows`; a `forecast` that follows has the same rows."""
+        if rows is None:
+            self._memory, self._ids = self._take(scenes, self._ids, self._memory)
+            return
+        index = torch.from_numpy(np.asarray(rows, dtype=np.int64)).to(self.device)
+        memory, self._ids[rows] = self._take(scenes, self._ids[rows], self._memory.select(index))
+        self._memory = self._memory.replace_rows(index, memory)
 
     @torch.inference_mode()
     def observe_boundary(
@@ -65,15 +69,15 @@ class OnlineForecaster:
         rows = len(self._ids)
         fresh = self._fresh.select(torch.zeros(len(ended), dtype=torch.long, device=self.device))
         no_ids = np.full((len(ended), self._ids.shape[1]), PADDING_ID, dtype=np.int64)
-        self._take(
+        memory, ids = self._take(
             SceneBatch.concatenate(scenes, successors),
             np.concatenate([self._ids, no_ids]),
             Memory.concatenate(self._memory, fresh),
         )
         kept = np.arange(rows)
         kept[ended] = rows + np.arange(len(ended))
-        self._memory = self._memory.select(torch.from_numpy(kept).to(self.device))
-        self._ids = self._ids[kept]
+        self._memory = memory.select(torch.from_numpy(kept).to(self.device))
+        self._ids = ids[kept]
 
     @torch.inference_mode()
     def forecast(
@@ -87,7 +91,7 @@ class OnlineForecaster:
         Raises:
             ProtocolError: nothing was observed yet.
         """
-        if self._belief is None or self._origin is None:
+        if self._belief is None:
             raise ProtocolError("forecast() needs an observation; call observe() first")
         belief = self._belief
         steps = horizon_steps or self.forecaster.horizon_steps
@@ -97,7 +101,9 @@ class OnlineForecaster:
         xy = (states[..., :2] - ego_now) * belief.valid[:, None, :, None, None]
         return Forecast(xy, belief.edge_probs, belief.edge_features, belief.valid)
 
-    def _take(self, scenes: SceneBatch, old_ids: Int[np.ndarray, "rows agents"], memory: Memory) -> None:
+    def _take(
+        self, scenes: SceneBatch, old_ids: Int[np.ndarray, "rows agents"], memory: Memory
+    ) -> tuple[Memory, Int[np.ndarray, "rows agents"]]:
         source, known = _match(old_ids, scenes.ids)
         if not np.array_equal(old_ids, scenes.ids):
             memory = memory.reorder(torch.from_numpy(source).to(self.device), torch.from_numpy(known).to(self.device))
@@ -107,9 +113,8 @@ class OnlineForecaster:
         local[..., :2] -= origin
         states: Tensor = torch.from_numpy((local * scenes.valid[..., None]).astype(np.float32)).to(self.device)
         valid = torch.from_numpy(scenes.valid).to(self.device)
-        self._memory, self._belief = self.forecaster.observe(memory, states, valid)
-        self._origin = origin
-        self._ids = np.where(scenes.valid, scenes.ids, PADDING_ID)
+        memory, self._belief = self.forecaster.observe(memory, states, valid)
+        return memory, np.where(scenes.valid, scenes.ids, PADDING_ID)
 
 
 def _match(

@@ -1,0 +1,226 @@
+"""Train an SB3 policy: preset, parallel rows, model selection on seeds of its own, checkpoints that survive a kill.
+
+`policy.zip` is the model that did best on the selection seeds (the common practice, and what SB3's EvalCallback keeps);
+those seeds are disjoint from training and from the final evaluation, so the final numbers are not selected for.
+"""
+
+import zipfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from agents.features import AttentionConfig, ForecastAttention
+from agents.presets import Algorithm, PPOPreset, Preset, preset_for
+from agents.rows import Task, make_rows, resolve_device
+from agents.runs import BEST_FILE, CHECKPOINT_FILE, POLICY_FILE, copy_file, load_model, read_note, save_model
+from predictor.errors import UserError
+
+SELECTION_SEED = 1_000_000_000
+"""First seed of model selection; training seeds stay below it, those of the final evaluation start at 2e9."""
+
+
+@dataclass(frozen=True)
+class TrainingPlan:
+    """What to train and for how long."""
+
+    task: Task
+    """Environment and what the policy sees."""
+    algorithm: Algorithm
+    """ppo or dqn."""
+    steps: int
+    """Environment steps over all rows."""
+    num_rows: int
+    """Parallel environments."""
+    seed: int
+    """Drives torch, NumPy and the environments."""
+    device: str = "cpu"
+    """Where the policy's network runs: cpu, cuda or auto."""
+    selections: int = 8
+    """How often, evenly spread, the policy is measured on the selection seeds."""
+    selection_episodes: int = 20
+    """Episodes per measurement; always the same seeds."""
+    selection_rows: int = 2
+    """Parallel environments of the measurement."""
+    checkpoint_every: int = 2_000
+    """Environment steps between checkpoints."""
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        for name in ("steps", "num_rows", "selections", "selection_episodes", "selection_rows", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not 0 <= self.seed < SELECTION_SEED:
+            raise UserError(f"seed must lie in [0, {SELECTION_SEED}), got {self.seed}")
+
+    @property
+    def preset(self) -> Preset:
+        """Hyperparameters."""
+        return preset_for(self.task.env_id, self.algorithm)
+
+    def check_action_space(self, space: spaces.Space) -> None:
+        """Raise if the algorithm cannot drive this action space."""
+        if self.algorithm == "dqn" and not isinstance(space, spaces.Discrete):
+            raise UserError(f"dqn needs a discrete action space, {self.task.env_id} has {space}; use ppo")
+
+
+def train(plan: TrainingPlan, run_dir: Path, progress_bar: bool = True) -> Path:
+    """Train until `plan.steps`, from the checkpoint in `run_dir` if there is one.
+
+    Returns:
+        The final policy, `run_dir/policy.zip`.
+    """
+    venv = make_rows(plan.task, plan.num_rows)
+    selection = make_rows(plan.task, min(plan.selection_rows, plan.selection_episodes), seeded=True)
+    try:
+        model = _resume_or_make(plan, venv, run_dir)
+        remaining = plan.steps - model.num_timesteps
+        if remaining > 0:
+            keep_best = SelectBest(
+                selection, run_dir / BEST_FILE, plan.selection_episodes, max(plan.steps // plan.selections, 1)
+            )
+            keep_latest = SaveCheckpoint(run_dir / CHECKPOINT_FILE, plan.checkpoint_every)
+            model.learn(
+                remaining,
+                callback=CallbackList([keep_latest, keep_best]),
+                tb_log_name="run",
+                reset_num_timesteps=model.num_timesteps == 0,
+                progress_bar=progress_bar,
+                log_interval=1 if plan.algorithm == "ppo" else 20,
+            )
+            save_model(model, run_dir / CHECKPOINT_FILE, buffer=True)
+    finally:
+        venv.close()
+        selection.close()
+    copy_file(run_dir / BEST_FILE, run_dir / POLICY_FILE)
+    return run_dir / POLICY_FILE
+
+
+def make_model(plan: TrainingPlan, venv: VecEnv, tensorboard_log: str | None = None) -> BaseAlgorithm:
+    """A new model with the plan's preset; the ego attends over agents where the observation has any."""
+    preset = plan.preset
+    options = asdict(preset)
+    layers = list(options.pop("net_arch"))
+    policy_kwargs: dict[str, Any] = {
+        "net_arch": {"pi": layers, "vf": layers} if isinstance(preset, PPOPreset) else layers
+    }
+    policy = "MlpPolicy"
+    if isinstance(venv.observation_space, spaces.Dict):
+        policy = "MultiInputPolicy"
+        policy_kwargs |= {
+            "features_extractor_class": ForecastAttention,
+            "features_extractor_kwargs": {"config": AttentionConfig()},
+        }
+    algorithm: type[PPO] | type[DQN] = PPO if isinstance(preset, PPOPreset) else DQN
+    return algorithm(
+        policy,
+        venv,
+        policy_kwargs=policy_kwargs,
+        tensorboard_log=tensorboard_log,
+        seed=plan.seed,
+        device=resolve_device(plan.device),
+        **options,
+    )
+
+
+def _resume_or_make(plan: TrainingPlan, venv: VecEnv, run_dir: Path) -> BaseAlgorithm:
+    logs = str(run_dir / "tb")
+    checkpoint = run_dir / CHECKPOINT_FILE
+    if not checkpoint.exists():
+        return make_model(plan, venv, logs)
+    model = load_model(checkpoint, plan.algorithm, venv, resolve_device(plan.device))
+    model.tensorboard_log = logs  # the folder may have moved
+    # The episodes after a resume are new ones, still a function of the seed.
+    fresh = np.random.SeedSequence([plan.seed, model.num_timesteps]).generate_state(1)[0]
+    model.set_random_seed(int(fresh) % SELECTION_SEED)
+    return model
+
+
+class SaveCheckpoint(BaseCallback):
+    """Keeps the latest model on disk, taken between updates so that no collected step is lost or counted twice."""
+
+    def __init__(self, path: Path, every_steps: int) -> None:
+        """Save to `path` about every `every_steps` environment steps."""
+        super().__init__()
+        self._path, self._every = path, every_steps
+        self._saved_at = 0
+
+    def _on_training_start(self) -> None:
+        self._saved_at = self.model.num_timesteps
+
+    def _on_rollout_start(self) -> None:
+        if self.model.num_timesteps - self._saved_at >= self._every:
+            self._saved_at = self.model.num_timesteps
+            save_model(self.model, self._path, buffer=True)
+
+    def _on_step(self) -> bool:
+        return True
+
+
+class SelectBest(EvalCallback):
+    """SB3's EvalCallback on the same seeds each time; the best model is saved atomically with its result inside.
+
+    Args:
+        venv: from `make_rows(..., seeded=True)`.
+        path: where the best model goes.
+        num_episodes: episodes per measurement.
+        every_steps: environment steps between measurements; there is always one at the end.
+    """
+
+    def __init__(self, venv: VecEnv, path: Path, num_episodes: int, every_steps: int) -> None:
+        """Continue from the result inside an existing file."""
+        super().__init__(
+            venv,
+            callback_on_new_best=_SaveBest(path),
+            n_eval_episodes=num_episodes,
+            eval_freq=1,
+            verbose=0,
+        )
+        self._path, self._every = path, every_steps
+        self._measured_at = 0
+
+    def _on_training_start(self) -> None:
+        self._measured_at = self.model.num_timesteps
+        try:
+            self.best_mean_reward = float(read_note(self._path).get("selection_return", -np.inf))
+        except zipfile.BadZipFile as error:
+            raise UserError(f"{self._path} is damaged; remove it to go on without it") from error
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps - self._measured_at < self._every:
+            return True
+        return self._measure()
+
+    def _on_training_end(self) -> None:
+        if self._measured_at != self.num_timesteps:
+            self._measure()
+
+    def _measure(self) -> bool:
+        self._measured_at = self.num_timesteps
+        rows = self.eval_env.num_envs
+        first = SELECTION_SEED
+        for row in range(rows):
+            share = (self.n_eval_episodes + row) // rows  # as SB3's evaluate_policy divides them
+            self.eval_env.env_method("queue", list(range(first, first + share)), indices=[row])
+            first += share
+        return super()._on_step()
+
+
+class _SaveBest(BaseCallback):
+    """Saves the model that `SelectBest` found best so far."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self._path = path
+
+    def _on_step(self) -> bool:
+        assert isinstance(self.parent, EvalCallback)
+        note = {"selection_return": self.parent.best_mean_reward, "steps": self.model.num_timesteps}
+        save_model(self.model, self._path, note)
+        return True

@@ -1,0 +1,209 @@
+"""From scenes and a forecaster to what the policy sees; one implementation for one env, SB3 and gymnasium vector envs."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+
+from envs.registry import checkpoint_for
+from predictor.checkpoint import load_forecaster
+from predictor.errors import UserError
+from predictor.forecaster import Forecaster
+from predictor.online import OnlineForecaster
+from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
+
+SCENE_KEYS = ("scene_states", "scene_ids", "scene_valid", "scene_heading_rad")
+FORECAST_KEYS = ("agents", "forecast", "edge_probs", "edge_features", "valid")
+
+
+@dataclass(frozen=True)
+class ForecastConfig:
+    """How a forecast enters the observation."""
+
+    horizon_steps: int | None = None
+    """Steps to forecast; None takes what the checkpoint was trained for."""
+    num_samples: int = 1
+    """Sampled futures per agent; 1 gives the most likely one and drops the axis."""
+    device: str = "cpu"
+    """Where the forecaster runs."""
+    seed: int = 0
+    """Of the samples, until reset(seed=…) gives another."""
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        if self.num_samples < 1:
+            raise UserError(f"num_samples must be at least 1, got {self.num_samples}")
+        if self.horizon_steps is not None and self.horizon_steps < 1:
+            raise UserError(f"horizon_steps must be at least 1, got {self.horizon_steps}")
+
+
+def scene_spaces(spec: SceneSpec) -> dict[str, gym.Space]:
+    """Spaces of the entries that carry a scene; float64 because a highway's x has no bound."""
+    agents = spec.max_agents
+    return {
+        "scene_states": gym.spaces.Box(-np.inf, np.inf, (agents, spec.num_features), np.float64),
+        "scene_ids": gym.spaces.Box(-1, np.iinfo(np.int64).max, (agents,), np.int64),
+        "scene_valid": gym.spaces.MultiBinary(agents),
+        "scene_heading_rad": gym.spaces.Box(-np.inf, np.inf, (1,), np.float64),
+    }
+
+
+def scene_entries(scene: Scene) -> dict[str, NDArray[Any]]:
+    """A scene as observation entries."""
+    return {
+        "scene_states": scene.states,
+        "scene_ids": scene.ids,
+        "scene_valid": scene.valid.astype(np.int8),
+        "scene_heading_rad": np.array([scene.heading_rad], dtype=np.float64),
+    }
+
+
+def scenes_from(observations: Mapping[str, NDArray[Any]]) -> SceneBatch:
+    """The scenes of a batch of observations that carry them."""
+    return SceneBatch(
+        observations["scene_states"],
+        observations["scene_ids"],
+        observations["scene_valid"].astype(np.bool_),
+        observations["scene_heading_rad"][:, 0],
+    )
+
+
+def carries_scenes(space: gym.Space) -> bool:
+    """Whether observations of this space hold scenes."""
+    return isinstance(space, gym.spaces.Dict) and all(key in space.spaces for key in SCENE_KEYS)
+
+
+def require_scenes(space: gym.Space, wrapper: str) -> gym.spaces.Dict:
+    """The space as a Dict that carries scenes.
+
+    Raises:
+        UserError: it does not; the message says how to add them.
+    """
+    if not isinstance(space, gym.spaces.Dict) or not carries_scenes(space):
+        raise UserError(
+            f"{wrapper} needs environments that report scenes, got {type(space).__name__} observations; "
+            "make them with wrapper_class=SceneObservation (envs.wrappers)"
+        )
+    return space
+
+
+def open_forecaster(checkpoint: str | None, scene_spec: SceneSpec, source: str, device: str = "cpu") -> Forecaster:
+    """The forecaster of a shipped name, a folder, or "constant-velocity"; None takes the one that ships for `source`.
+
+    Raises:
+        UserError: there is none, or it is of another spec (features, dt).
+    """
+    name = checkpoint if checkpoint is not None else checkpoint_for(source)
+    return load_forecaster(name, scene_spec, f"env '{source}'", device)
+
+
+class ForecastStream:
+    """Forecasts for `rows` parallel environments, and the observations made of them.
+
+    Args:
+        forecaster: who forecasts; lives on `config.device`.
+        scene_spec: layout of the scenes that will arrive.
+        rows: parallel environments.
+        config: how the forecast enters the observation.
+
+    Attributes:
+        forecast: the latest forecast (all rows).
+    """
+
+    def __init__(self, forecaster: Forecaster, scene_spec: SceneSpec, rows: int, config: ForecastConfig) -> None:
+        """Start with empty memory."""
+        self.forecaster = forecaster
+        self.config = config
+        self.scene_spec = scene_spec
+        self.horizon_steps = config.horizon_steps or forecaster.horizon_steps
+        self.forecast: Forecast | None = None
+        self._online = OnlineForecaster(forecaster, rows, scene_spec.max_agents, config.device)
+        self._generator = torch.Generator(device=config.device).manual_seed(config.seed)
+
+    def seed(self, seed: int) -> None:
+        """Restart the samples' noise."""
+        self._generator.manual_seed(seed)
+
+    def spaces(self) -> dict[str, gym.Space]:
+        """Spaces of the forecast entries; metres and m/s have no honest bound, probabilities do."""
+        others = self.scene_spec.max_agents - 1
+        samples = (self.config.num_samples,) if self.config.num_samples > 1 else ()
+
+        def unbounded(*shape: int) -> gym.Space:
+            return gym.spaces.Box(-np.inf, np.inf, shape, np.float32)
+
+        return {
+            "agents": unbounded(others, self.scene_spec.num_features),
+            "forecast": unbounded(others, *samples, self.horizon_steps, 2),
+            "edge_probs": gym.spaces.Box(0, 1, (others, 2 * (self.forecaster.num_edge_types - 1)), np.float32),
+            "edge_features": unbounded(others, 2 * self.forecaster.edge_feature_dim),
+            "valid": gym.spaces.Box(0, 1, (others,), np.float32),
+        }
+
+    def reset(self, rows: Int[np.ndarray, " some"] | None = None) -> None:
+        """Forget the history of some rows (all, if None)."""
+        self._online.reset(rows)
+
+    def observe(
+        self, scenes: SceneBatch, rows: Int[np.ndarray, " some"] | None = None
+    ) -> dict[str, NDArray[np.float32]]:
+        """Take in one scene for each row (of `rows`, if given); the forecast entries for each."""
+        self._online.observe(scenes, rows)
+        return self._entries(scenes)
+
+    def observe_boundary(
+        self, scenes: SceneBatch, ended: Int[np.ndarray, " ended"], successors: SceneBatch
+    ) -> dict[str, NDArray[np.float32]]:
+        """As `observe`, with the last scenes of ended episodes and, as extra rows at the end, their successors' first."""
+        self._online.observe_boundary(scenes, ended, successors)
+        return self._entries(SceneBatch.concatenate(scenes, successors))
+
+    def _entries(self, scenes: SceneBatch) -> dict[str, NDArray[np.float32]]:
+        self.forecast = self._online.forecast(self.horizon_steps, self.config.num_samples, self._generator)
+        return ego_entries(scenes, self.forecast)
+
+
+def ego_entries(scenes: SceneBatch, forecast: Forecast) -> dict[str, NDArray[np.float32]]:
+    """The ego's view of scenes and forecasts: origin at the ego, x along its heading, others sorted by distance.
+
+    Returns:
+        agents: (B, A−1, F) relative states [m, m/s]; features beyond velocity are kept as they are.
+        forecast: (B, A−1, [K,] H, 2) future positions relative to the ego's position now [m].
+        edge_probs: (B, A−1, 2(E−1)) probability of each edge type but "no edge": agent → ego, then ego → agent.
+        edge_features: (B, A−1, 2D) in the same order.
+        valid: (B, A−1) 1 where there is an agent; everything else is zero in the other rows.
+    """
+    relative = scenes.states[:, 1:].copy()
+    relative[..., :4] -= scenes.states[:, :1, :4]
+    valid = scenes.valid[:, 1:]
+    distance_m = np.where(valid, np.hypot(relative[..., 0], relative[..., 1]), np.inf)
+    order = np.argsort(distance_m, axis=1, kind="stable")
+    rotation = _into_ego_axes(scenes.heading_rad)
+    relative[..., :2] = np.einsum("bxy,bay->bax", rotation, relative[..., :2])
+    relative[..., 2:4] = np.einsum("bxy,bay->bax", rotation, relative[..., 2:4])
+    xy = forecast.xy[:, :, 1:].cpu().numpy()
+    xy = np.einsum("bxy,bkahy->bakhx", rotation.astype(np.float32), xy)
+    probs, features = forecast.edge_probs.cpu().numpy(), forecast.edge_features.cpu().numpy()
+    entries = {
+        "agents": relative,
+        "forecast": xy[:, :, 0] if xy.shape[2] == 1 else xy,
+        "edge_probs": np.concatenate([probs[:, 0, 1:, 1:], probs[:, 1:, 0, 1:]], axis=-1),
+        "edge_features": np.concatenate([features[:, 0, 1:], features[:, 1:, 0]], axis=-1),
+        "valid": valid,
+    }
+    rows = np.arange(len(order))[:, None]
+    present = valid[rows, order]
+    return {
+        key: (value[rows, order] * present.reshape(*present.shape, *(1,) * (value.ndim - 2))).astype(np.float32)
+        for key, value in entries.items()
+    }
+
+
+def _into_ego_axes(heading_rad: Float[np.ndarray, " batch"]) -> Float[np.ndarray, "batch 2 2"]:
+    cos, sin = np.cos(heading_rad), np.sin(heading_rad)
+    return np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], -2)

@@ -1,0 +1,201 @@
+"""Gymnasium wrappers for one environment: `SceneObservation` adds the scene, `ForecastObservation` what comes next.
+
+    >>> import gymnasium as gym
+    >>> from envs.wrappers import ForecastObservation
+    >>> env = ForecastObservation(gym.make("highway-fast-v0"), "highway")
+    >>> obs, info = env.reset(seed=0)
+    >>> obs["forecast"].shape  # other agents, horizon steps, xy in the ego's frame [m]
+    (11, 5, 2)
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.utils import RecordConstructorArgs
+
+from envs.observation import (
+    ForecastConfig,
+    ForecastStream,
+    carries_scenes,
+    open_forecaster,
+    scene_entries,
+    scene_spaces,
+)
+from envs.readers import SceneReader, reader_for
+from predictor.errors import ProtocolError, UserError
+from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
+
+MakeReader = Callable[[gym.Env], SceneReader]
+
+
+def scene_source(env: gym.Env) -> str:
+    """What to call an env in messages, and where to look for its checkpoint: the id, else the class."""
+    spec = env.unwrapped.spec
+    return spec.id if spec is not None else type(env.unwrapped).__name__
+
+
+class SceneObservation(gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstructorArgs):
+    """Adds the scene around the ego to the observation.
+
+    Observation: Dict with `observation` (the env's own, untouched), `scene_states` (max_agents, F) in the world frame,
+    `scene_ids`, `scene_valid`, `scene_heading_rad` (the ego's). Row 0 is the ego. This is what `VecForecast` needs from
+    each environment; a policy wants `ForecastObservation`.
+
+    Args:
+        env: any environment that a scene reader knows.
+        perception_m: how far the ego sees [m]; None takes the reader's default.
+        max_agents: rows of a scene, the ego included; None takes the reader's default.
+        reader: makes a reader for the env; None picks one by env family.
+
+    Raises:
+        UserError: no reader knows the env, or its observation is a Dict or Tuple.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        perception_m: float | None = None,
+        max_agents: int | None = None,
+        reader: MakeReader | None = None,
+    ) -> None:
+        """Pick the reader and extend the observation space."""
+        RecordConstructorArgs.__init__(self, perception_m=perception_m, max_agents=max_agents, reader=reader)
+        gym.Wrapper.__init__(self, env)
+        own = env.observation_space
+        if isinstance(own, gym.spaces.Dict | gym.spaces.Tuple | gym.spaces.Graph | gym.spaces.Sequence):
+            raise UserError(
+                f"the env's own observation must be one array, got {type(own).__name__}; "
+                "apply gymnasium.wrappers.FlattenObservation first"
+            )
+        self.reader = reader(env) if reader is not None else reader_for(env, perception_m, max_agents)
+        self._scene: Scene | None = None
+        self.observation_space = gym.spaces.Dict({"observation": own, **scene_spaces(self.reader.spec)})
+
+    @property
+    def scene_spec(self) -> SceneSpec:
+        """Layout of the scenes."""
+        return self.reader.spec
+
+    @property
+    def scene_source(self) -> str:
+        """The env id, for messages and for picking a checkpoint."""
+        return scene_source(self.env)
+
+    @property
+    def scene(self) -> Scene:
+        """The latest scene."""
+        if self._scene is None:
+            raise ProtocolError("there is no scene yet; call reset() first")
+        return self._scene
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the env; identities start anew."""
+        obs, info = self.env.reset(seed=seed, options=options)
+        self.reader.reset()
+        return self._observe(obs), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the env and read the scene."""
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        return self._observe(obs), reward, terminated, truncated, info
+
+    def _observe(self, obs: Any) -> dict[str, Any]:
+        self._scene = self.reader.read(self.env)
+        self._scene.check(f"scene reader of '{self.scene_source}'")
+        return {"observation": obs, **scene_entries(self._scene)}
+
+
+class ForecastObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Shows the policy what the others are about to do.
+
+    Observation: Dict with `observation` (the env's own, untouched) and, for the other agents sorted by distance, `agents`
+    (relative current states), `forecast` (future positions in the ego's frame [m]; a samples axis when num_samples > 1),
+    `edge_probs` and `edge_features` (agent → ego, then ego → agent), `valid`. `envs.observation.ego_entries` gives the
+    shapes. With `flatten=True` it is one Box, in the Dict's key order.
+
+    The history is forgotten at reset. After each step, `scene` and `forecast` hold the same in the world frame.
+
+    Args:
+        env: any environment that a scene reader knows, or one that is already a `SceneObservation`.
+        checkpoint: shipped name, folder, or "constant-velocity"; None takes the one that ships for the env's id.
+        horizon_steps: steps to forecast; None takes the checkpoint's.
+        num_samples: sampled futures per agent.
+        flatten: one Box instead of a Dict, for MlpPolicy; combine with VecNormalize, the entries are in metres.
+        perception_m: how far the ego sees [m]; None takes what the checkpoint was trained with.
+        max_agents: rows of a scene, the ego included; None takes what the checkpoint was trained with.
+        device: where the forecaster runs.
+        reader: makes a reader for the env; None picks one by env family.
+
+    Raises:
+        UserError: no reader, no checkpoint, or a checkpoint of another spec (features, dt).
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        checkpoint: str | None = None,
+        *,
+        horizon_steps: int | None = None,
+        num_samples: int = 1,
+        flatten: bool = False,
+        perception_m: float | None = None,
+        max_agents: int | None = None,
+        device: str = "cpu",
+        reader: MakeReader | None = None,
+    ) -> None:
+        """Load the forecaster and extend the observation space."""
+        RecordConstructorArgs.__init__(
+            self, checkpoint=checkpoint, horizon_steps=horizon_steps, num_samples=num_samples, flatten=flatten,
+            perception_m=perception_m, max_agents=max_agents, device=device, reader=reader,
+        )  # fmt: skip
+        config = ForecastConfig(horizon_steps, num_samples, device)
+        ready = carries_scenes(env.observation_space)
+        source = scene_source(env)
+        if ready:
+            spec: SceneSpec = env.get_wrapper_attr("scene_spec")
+        else:
+            spec = (reader(env) if reader is not None else reader_for(env, perception_m, max_agents)).spec
+        forecaster = open_forecaster(checkpoint, spec, source, device)
+        if not ready:
+            trained = forecaster.spec
+            env = SceneObservation(env, perception_m or trained.perception_m, max_agents or trained.max_agents, reader)
+            spec = env.scene_spec
+        gym.Wrapper.__init__(self, env)
+        self._stream = ForecastStream(forecaster, spec, rows=1, config=config)
+        own = env.observation_space["observation"]  # type: ignore[index]
+        self._dict_space = gym.spaces.Dict({"observation": own, **self._stream.spaces()})
+        self._flatten = flatten
+        self.observation_space = gym.spaces.flatten_space(self._dict_space) if flatten else self._dict_space
+
+    @property
+    def scene(self) -> Scene:
+        """The latest scene, world frame, ego in row 0."""
+        scene: Scene = self.env.get_wrapper_attr("scene")
+        return scene
+
+    @property
+    def forecast(self) -> Forecast:
+        """The latest forecast, a batch of one, rows as in `scene`, world axes relative to the ego."""
+        if self._stream.forecast is None:
+            raise ProtocolError("there is no forecast yet; call reset() first")
+        return self._stream.forecast
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the env and forget the history; a seed also restarts the samples' noise."""
+        obs, info = self.env.reset(seed=seed, options=options)
+        self._stream.reset()
+        if seed is not None:
+            self._stream.seed(seed)
+        return self._observe(obs), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the env, take in the scene, forecast."""
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        return self._observe(obs), reward, terminated, truncated, info
+
+    def _observe(self, obs: dict[str, Any]) -> Any:
+        entries = self._stream.observe(SceneBatch.stack([self.scene]))
+        full = {"observation": obs["observation"], **{key: value[0] for key, value in entries.items()}}
+        return gym.spaces.flatten(self._dict_space, full) if self._flatten else full
+
