@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
 import tyro
 from rich.console import Console
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -121,6 +122,7 @@ def _act(config: TrainPolicyConfig, model: BaseAlgorithm) -> Callable[[Any], Any
 
 def main() -> None:
     """Entry point."""
+    torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
     run(tyro.cli(TrainPolicyConfig, description=__doc__), Console())
 
 

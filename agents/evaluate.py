@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -241,6 +242,7 @@ class EvaluateConfig:
 
 def main() -> None:
     """Entry point."""
+    torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
     config = tyro.cli(EvaluateConfig, description=__doc__)
     run = read_config(config.run_dir)
     task = Task(run["env_id"], run["observe"], run["checkpoint"])

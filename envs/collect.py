@@ -115,7 +115,9 @@ def main() -> None:
             progress.advance(task)
     write_store(config.out, info, episodes, config.overwrite)
     steps = sum(len(e.states) for e in episodes)
-    print(f"{config.out}: {len(episodes)} episodes, {steps} scenes, seeds {config.seed}–{config.seed + len(episodes) - 1}")
+    print(
+        f"{config.out}: {len(episodes)} episodes, {steps} scenes, seeds {config.seed}–{config.seed + len(episodes) - 1}"
+    )
 
 
 if __name__ == "__main__":

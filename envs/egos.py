@@ -86,7 +86,7 @@ def _keep_lane(env: gym.Env, rng: np.random.Generator) -> Ego:
         vehicle: Any = env.unwrapped.vehicle  # type: ignore[attr-defined]
         driver = ControlledVehicle(vehicle.road, vehicle.position, vehicle.heading, vehicle.speed)
         steering = driver.steering_control(vehicle.lane_index) / action_type.steering_range[1]
-        action = np.zeros(env.action_space.shape, dtype=np.float32)  # type: ignore[arg-type]
+        action = idle_action(env)
         action[-1] = np.clip(steering + noise * rng.standard_normal(), -1, 1)
         return action
 
@@ -94,8 +94,8 @@ def _keep_lane(env: gym.Env, rng: np.random.Generator) -> Ego:
 
 
 def _trained(path: Path) -> Ego:
-    from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3 import DQN, PPO
+    from stable_baselines3.common.base_class import BaseAlgorithm
 
     if not path.exists():
         raise UserError(f"no policy at {path}; train one with python train_policy.py")

@@ -1,4 +1,5 @@
-"""From scenes and a forecaster to what the policy sees; one implementation for one env, SB3 and gymnasium vector envs."""
+"""From scenes and a forecaster to what the policy sees; one implementation for one env, SB3 and gymnasium vector
+envs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -159,9 +160,9 @@ class ForecastStream:
     def observe_boundary(
         self, scenes: SceneBatch, ended: Int[np.ndarray, " ended"], successors: SceneBatch
     ) -> dict[str, NDArray[np.float32]]:
-        """As `observe`, with the last scenes of ended episodes and, as extra rows at the end, their successors' first."""
-        self._online.observe_boundary(scenes, ended, successors)
-        return self._entries(SceneBatch.concatenate(scenes, successors))
+        """As `observe`, with the last scenes of ended episodes and, as extra rows at the end, their successors'
+        first.""" self._online.observe_boundary(scenes, ended, successors) return
+        self._entries(SceneBatch.concatenate(scenes, successors))
 
     def _entries(self, scenes: SceneBatch) -> dict[str, NDArray[np.float32]]:
         self.forecast = self._online.forecast(self.horizon_steps, self.config.num_samples, self._generator)
@@ -181,9 +182,8 @@ def ego_entries(scenes: SceneBatch, forecast: Forecast) -> dict[str, NDArray[np.
     relative = scenes.states[:, 1:].copy()
     relative[..., :4] -= scenes.states[:, :1, :4]
     valid = scenes.valid[:, 1:]
-    distance_m = np.where(valid, np.hypot(relative[..., 0], relative[..., 1]), np.inf)
-    order = np.argsort(distance_m, axis=1, kind="stable")
-    rotation = _into_ego_axes(scenes.heading_rad)
+    order = others_by_distance(scenes)
+    rotation = into_ego_axes(scenes.heading_rad)
     relative[..., :2] = np.einsum("bxy,bay->bax", rotation, relative[..., :2])
     relative[..., 2:4] = np.einsum("bxy,bay->bax", rotation, relative[..., 2:4])
     xy = forecast.xy[:, :, 1:].cpu().numpy()
@@ -204,6 +204,14 @@ def ego_entries(scenes: SceneBatch, forecast: Forecast) -> dict[str, NDArray[np.
     }
 
 
-def _into_ego_axes(heading_rad: Float[np.ndarray, " batch"]) -> Float[np.ndarray, "batch 2 2"]:
+def others_by_distance(scenes: SceneBatch) -> Int[np.ndarray, "batch others"]:
+    """For each row of the forecast entries, the index of its agent among the scene's rows after the ego's."""
+    offsets = scenes.states[:, 1:, :2] - scenes.states[:, :1, :2]
+    distance_m = np.where(scenes.valid[:, 1:], np.hypot(offsets[..., 0], offsets[..., 1]), np.inf)
+    return np.argsort(distance_m, axis=1, kind="stable")
+
+
+def into_ego_axes(heading_rad: Float[np.ndarray, " batch"]) -> Float[np.ndarray, "batch 2 2"]:
+    """Rotations from world axes to axes along each ego's heading; the transpose goes back."""
     cos, sin = np.cos(heading_rad), np.sin(heading_rad)
     return np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], -2)

@@ -183,7 +183,7 @@ class _Recorder:
     def __init__(self, env: ForecastObservation, style: OverlayStyle) -> None:
         self._env = env
         self._base: Any = env.unwrapped
-        config = self._base.config
+        config: dict[str, Any] = self._base.config
         self.recording = Recording(
             env_id=env.spec.id if env.spec is not None else type(self._base).__name__,
             fps=0,

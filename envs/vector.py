@@ -1,4 +1,4 @@
-"""Forecasts for many environments with one batched forward per step: `VecForecast` for SB3, `VectorForecast` for gymnasium.
+"""Forecasts for many environments, one batched forward per step: `VecForecast` (SB3), `VectorForecast` (gymnasium).
 
 Each row keeps its own history and forgets it when, and only when, its own episode ends. The observation that closes an
 episode carries the forecast made from that episode's history; the one that opens the next starts from one step.
@@ -91,9 +91,9 @@ class VecForecast(VecEnvWrapper):
 class VectorForecast(gym.vector.VectorWrapper):
     """`ForecastObservation` for a gymnasium vector env whose environments are wrapped in `SceneObservation`.
 
-    Knows both autoreset modes and no autoreset: with NEXT_STEP the closing observation is the step's own and the next step
-    opens the new episode; with SAME_STEP the closing observation is `infos["final_obs"]`; with DISABLED, rows are forgotten
-    when `reset(options={"reset_mask": …})` names them.
+    Knows both autoreset modes and no autoreset: with NEXT_STEP the closing observation is the step's own and the next
+    step opens the new episode; with SAME_STEP the closing observation is `infos["final_obs"]`; with DISABLED, rows
+    are forgotten when `reset(options={"reset_mask": …})` names them.
 
     Args:
         env: gymnasium vector environment.
@@ -129,14 +129,14 @@ class VectorForecast(gym.vector.VectorWrapper):
         self._entries: Observations = {}
 
     def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Reset all environments, or those of `options["reset_mask"]`, and forget their histories."""
         mask = (options or {}).get("reset_mask")
         observations, infos = self.env.reset(seed=seed, options=options)
         rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
         self.stream.reset(rows)
-        if mask is None and isinstance(seed, int):
+        if mask is None and seed is not None:
             self.stream.seed(seed)
         self._ended[rows] = False
         # A partial reset repeats the other rows' observations, which were taken in already and must not count twice.

@@ -1,11 +1,11 @@
 """Gymnasium wrappers for one environment: `SceneObservation` adds the scene, `ForecastObservation` what comes next.
 
-    >>> import gymnasium as gym
-    >>> from envs.wrappers import ForecastObservation
-    >>> env = ForecastObservation(gym.make("highway-fast-v0"), "highway")
-    >>> obs, info = env.reset(seed=0)
-    >>> obs["forecast"].shape  # other agents, horizon steps, xy in the ego's frame [m]
-    (11, 5, 2)
+>>> import gymnasium as gym
+>>> from envs.wrappers import ForecastObservation
+>>> env = ForecastObservation(gym.make("highway-fast-v0"), "highway")
+>>> obs, info = env.reset(seed=0)
+>>> obs["forecast"].shape  # other agents, horizon steps, xy in the ego's frame [m]
+(11, 5, 2)
 """
 
 from collections.abc import Callable
@@ -109,10 +109,10 @@ class SceneObservation(gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstru
 class ForecastObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Shows the policy what the others are about to do.
 
-    Observation: Dict with `observation` (the env's own, untouched) and, for the other agents sorted by distance, `agents`
-    (relative current states), `forecast` (future positions in the ego's frame [m]; a samples axis when num_samples > 1),
-    `edge_probs` and `edge_features` (agent → ego, then ego → agent), `valid`. `envs.observation.ego_entries` gives the
-    shapes. With `flatten=True` it is one Box, in the Dict's key order.
+    Observation: Dict with `observation` (the env's own, untouched) and, for the other agents sorted by distance,
+    `agents` (relative current states), `forecast` (future positions in the ego's frame [m]; a samples axis when
+    num_samples > 1), `edge_probs` and `edge_features` (agent → ego, then ego → agent), `valid`.
+    `envs.observation.ego_entries` gives the shapes. With `flatten=True` it is one Box, in the Dict's key order.
 
     The history is forgotten at reset. After each step, `scene` and `forecast` hold the same in the world frame.
 
@@ -198,4 +198,3 @@ class ForecastObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         entries = self._stream.observe(SceneBatch.stack([self.scene]))
         full = {"observation": obs["observation"], **{key: value[0] for key, value in entries.items()}}
         return gym.spaces.flatten(self._dict_space, full) if self._flatten else full
-

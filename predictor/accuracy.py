@@ -55,12 +55,10 @@ def run_window_batch(
     num_samples: int = 1,
     generator: torch.Generator | None = None,
 ) -> Outcome:
-    """Stream the history of each window through the forecaster, forecast, and line up the truth; the ego is left out."""
-    rows = torch.arange(len(batch.states), device=batch.states.device)
-    longest = int(batch.last_observed.max())
-    memory = forecaster.empty_memory(batch.states.shape[0], batch.states.shape[2])
-    belief = None
-    for back in range(longest, -1, -1):
+    """Stream the history of each window through the forecaster, forecast, and line up the truth; the ego is left
+    out.""" rows = torch.arange(len(batch.states), device=batch.states.device) longest =
+    int(batch.last_observed.max()) memory = forecaster.empty_memory(batch.states.shape[0], batch.states.shape[2])
+    belief = None for back in range(longest, -1, -1):
         # Histories end together: rows that begin later see an empty scene until then.
         step = batch.last_observed - back
         started = step >= 0
@@ -114,7 +112,10 @@ def summarise(name: str, outcomes: Sequence[Outcome], std_m: Sequence[float] = (
         whole = valid.all(-1)
         complete.append(metrics.min_ade(forecast, future, valid)[0][whole])
         final.append(metrics.min_fde(forecast, future, valid)[0][whole])
-        values = [metrics.min_displacement(forecast, future, valid)[0], metrics.squared_error(forecast, future, valid)[0]]
+        values = [
+            metrics.min_displacement(forecast, future, valid)[0],
+            metrics.squared_error(forecast, future, valid)[0],
+        ]
         if spread is not None:
             values.append(metrics.gaussian_mixture_nll(forecast, future, valid, spread)[0])
         for i, value in enumerate(values):

@@ -1,4 +1,4 @@
-"""Predictor checkpoints: a folder with `config.json` and `model.safetensors`. Never pickle, so safe to load from others.
+"""Predictor checkpoints: a folder with `config.json` and `model.safetensors`. Never pickle: safe to load from others.
 
 A checkpoint carries everything needed to run it (spec, sizes, horizon, residual spread) and how it was made.
 """

@@ -6,8 +6,8 @@ change of state. `observe` and `rollout` make it a `Forecaster`; `window` is wha
 layers and differ only in how many steps enter at once.
 
 Two things the paper leaves open are settled here. An agent without edges would not see itself, so the decoder adds a
-linear term of the agent's own state to its messages. And while true states are fed, the graph is the prior's expectation,
-so that a history has one meaning; samples branch off at the first forecast step.
+linear term of the agent's own state to its messages. And while true states are fed, the graph is the prior's
+expectation, so that a history has one meaning; samples branch off at the first forecast step.
 """
 
 from dataclasses import dataclass, field
@@ -221,7 +221,7 @@ class Decoder(nn.Module):
         width = config.message_dim
         self.message_pair = PairLinear(inputs, self.types * width)
         self.message_feature = nn.Linear(config.edge_feature_dim, self.types * width, bias=False)
-        self.message_out = nn.ModuleList(nn.Linear(width, width) for _ in range(self.types))
+        self.message_out = nn.Linear(width, self.types * width)  # one block for each type that speaks
         self.own = nn.Linear(inputs, width)
         self.gru = nn.GRUCell(width, config.decoder_dim)
         self.readout = nn.Linear(config.decoder_dim, outputs)
@@ -235,12 +235,18 @@ class Decoder(nn.Module):
     ) -> Float[Tensor, "*batch agents message"]:
         """Σ_j z_ij · h(x_i ‖ x_j ‖ e_ij) plus the agent's own term; all steps at once."""
         hidden = functional.elu(self.message_pair(inputs) + self.message_feature(features))
-        total = self.own(inputs)
-        for k, hidden_k in enumerate(hidden.chunk(self.types, dim=-1)):
+        total: Tensor = self.own(inputs)
+        layers = zip(
+            hidden.chunk(self.types, dim=-1),
+            self.message_out.weight.chunk(self.types),
+            self.message_out.bias.chunk(self.types),
+            strict=True,
+        )
+        for k, (hidden_k, matrix, bias) in enumerate(layers):
             weight = graph[..., k + 1] * pairs
-            out = self.message_out[k]
-            summed = functional.linear(sum_over_senders(hidden_k, weight), out.weight)  # type: ignore[arg-type]
-            total = total + summed + weight.sum(-1, keepdim=True) * out.bias
+            # Σ_j z_ij (W h_ij + b) = W Σ_j z_ij h_ij + b Σ_j z_ij: the second layer costs agents, not pairs.
+            summed = functional.linear(sum_over_senders(hidden_k, weight), matrix)
+            total = total + summed + weight.sum(-1, keepdim=True) * bias
         return total
 
     def step(
@@ -334,7 +340,12 @@ class DGVAE(nn.Module):
         """One encoder step and one decoder step under the prior's expected graph."""
         inputs, pairs = self.network_inputs(states, valid), pair_mask(valid)
         edges = self.encoder(inputs[:, None], pairs[:, None], *memory.pairs)
-        hidden, cell, logits, features = (edges.hidden[:, 0], edges.cell[:, 0], edges.prior_logits[:, 0], edges.features[:, 0])
+        hidden, cell, logits, features = (
+            edges.hidden[:, 0],
+            edges.cell[:, 0],
+            edges.prior_logits[:, 0],
+            edges.features[:, 0],
+        )
         probs = torch.softmax(logits, dim=-1)
         (node_before,) = memory.nodes
         node_after = self.decoder.step(self.decoder.messages(inputs, pairs, probs, features), valid, node_before)
@@ -351,13 +362,17 @@ class DGVAE(nn.Module):
         futures = [self._continue(internal.next_states, belief.valid, memory, horizon_steps, None)]
         if num_samples > 1:
             draws = num_samples - 1
-            repeated = [t.repeat_interleave(draws, dim=0) for t in (belief.states, belief.valid, belief.edge_features)]
-            hidden, cell, node, logits = (
+            states, valid, features, hidden, cell, node, logits = (
                 t.repeat_interleave(draws, dim=0)
-                for t in (internal.pair_hidden, internal.pair_cell, internal.node_before, internal.logits)
-            )
+                for t in (
+                    belief.states, belief.valid, belief.edge_features,
+                    internal.pair_hidden, internal.pair_cell, internal.node_before, internal.logits,
+                )
+            )  # fmt: skip
             sampler = _Sampler(self.config.temperature, generator)
-            futures.append(self._free_run(*repeated, (hidden, cell, node), logits, horizon_steps, sampler))
+            futures.append(
+                self._free_run(states, valid, features, (hidden, cell, node), logits, horizon_steps, sampler)
+            )
         batch = len(belief.states)
         stacked = [f.unflatten(0, (batch, -1)) for f in futures]
         return torch.cat(stacked, dim=1) if num_samples > 1 else stacked[0]

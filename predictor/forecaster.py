@@ -23,9 +23,7 @@ class Memory:
     pairs: tuple[Float[Tensor, "batch agents agents _"], ...] = ()
     """One tensor per kind of pair memory, receiver first."""
 
-    def reorder(
-        self, source: Int[Tensor, "batch agents"], known: Bool[Tensor, "batch agents"]
-    ) -> "Memory":
+    def reorder(self, source: Int[Tensor, "batch agents"], known: Bool[Tensor, "batch agents"]) -> "Memory":
         """Move memory along with agents that changed rows.
 
         Args:

@@ -1,8 +1,8 @@
 """Streaming: one forecaster, many parallel rows, memory that follows agents by id and is forgotten row by row.
 
 Between two observations rows may be re-sorted and agents may come and go: memory is moved to where an agent's id now
-stands, newcomers start from zero, and the memory of leavers is dropped with the old arrangement. The cost of a step does
-not depend on how much was seen before.
+stands, newcomers start from zero, and the memory of leavers is dropped with the old arrangement. The cost of a step
+does not depend on how much was seen before.
 """
 
 import numpy as np
@@ -56,9 +56,7 @@ class OnlineForecaster:
         self._memory = self._memory.replace_rows(index, memory)
 
     @torch.inference_mode()
-    def observe_boundary(
-        self, scenes: SceneBatch, ended: Int[np.ndarray, " ended"], successors: SceneBatch
-    ) -> None:
+    def observe_boundary(self, scenes: SceneBatch, ended: Int[np.ndarray, " ended"], successors: SceneBatch) -> None:
         """Take in one scene per row, of which some are the last of their episode, together with their successors.
 
         One batched step serves both: rows of `scenes` continue their histories; for each row in `ended`, the first

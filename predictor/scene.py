@@ -1,4 +1,4 @@
-"""What everything speaks in: the layout of a scene (`SceneSpec`), one instant (`Scene`), many (`SceneBatch`), `Forecast`.
+"""What everything speaks in: a scene's layout (`SceneSpec`), one instant (`Scene`), many (`SceneBatch`), `Forecast`.
 
 States are in the world frame and SI units. Where a scene has an ego, it is row 0, always. Padded rows are
 `valid=False`, hold zeros and id -1. The first four features are always position and velocity.

@@ -4,6 +4,7 @@ Every random draw is a function of (seed, step), so a run that was killed and re
 that was not. The best checkpoint is chosen by free-running minADE on held-out episodes, not by one-step error.
 """
 
+import json
 import math
 import os
 import time
@@ -26,9 +27,8 @@ from predictor.data.windows import WindowBatch, Windows, concatenate, split_epis
 from predictor.dgvae import DGVAE, PRESETS, DGVAEConfig, WindowOutput
 from predictor.errors import UserError, run_entry_point
 from predictor.graph import pair_mask
-from predictor.losses import Likelihood, kl_categorical, nll
+from predictor.losses import Likelihood, kl_categorical, masked_mean, nll
 from predictor.metrics import edge_entropy
-from predictor.losses import masked_mean
 from predictor.provenance import provenance, write_json
 from predictor.scene import SceneSpec
 
@@ -128,9 +128,7 @@ def load_data(config: TrainConfig) -> TrainingData:
             )
         chosen = [store.episodes[i] for i in kept]
         train.append(Windows(chosen, spec, config.history_steps, config.horizon_steps))
-        val.append(
-            Windows([store.episodes[i] for i in held_out], spec, config.history_steps, config.horizon_steps)
-        )
+        val.append(Windows([store.episodes[i] for i in held_out], spec, config.history_steps, config.horizon_steps))
         episodes += chosen
     return TrainingData(spec, tuple(s.info.source for s in stores), train, val, episodes)
 
@@ -250,9 +248,7 @@ class Trainer:
 
     def _baseline(self) -> float:
         spec, steps = self.data.spec, self.config.horizon_steps
-        outcomes = [
-            o for w, i in self._val_indices() for o in run_windows(ConstantVelocity(spec, steps), w, i, steps)
-        ]
+        outcomes = [o for w, i in self._val_indices() for o in run_windows(ConstantVelocity(spec, steps), w, i, steps)]
         return summarise("constant velocity", outcomes).min_ade_m
 
     def _val_indices(self) -> list[tuple[Windows, np.ndarray]]:
@@ -263,9 +259,7 @@ class Trainer:
     def _draw(self, windows: Sequence[Windows], rng: np.random.Generator, size: int) -> WindowBatch:
         sizes = np.array([len(w) for w in windows])
         counts = rng.multinomial(size, sizes / sizes.sum())
-        return concatenate(
-            [w.batch(rng.integers(len(w), size=c)) for w, c in zip(windows, counts, strict=True) if c]
-        )
+        return concatenate([w.batch(rng.integers(len(w), size=c)) for w, c in zip(windows, counts, strict=True) if c])
 
 
 def _schedule(step: int, steps: int, warmup: int = 100) -> float:
@@ -288,7 +282,13 @@ def train(config: TrainConfig) -> Path:
         trainer.restore(state_file)
     made = provenance(("torch", "numpy", "zarr", "safetensors"))
     write_json(config_file, {"config": _comparable(config), "provenance": made})
-    columns = (TextColumn("train"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.fields[note]}"))
+    columns = (
+        TextColumn("train"),
+        BarColumn(20),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
     note = ""
     with SummaryWriter(str(config.out / "tb"), purge_step=trainer.step) as writer, Progress(*columns) as progress:
         task = progress.add_task("", total=config.steps, completed=trainer.step, note="")
@@ -331,7 +331,9 @@ def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, 
         save_checkpoint(trainer.config.out / "checkpoint", trainer.model, info)
     else:
         trainer.stale += 1
-    return f"| val minADE {accuracy.min_ade_m:.3f} m (best {trainer.best:.3f}, constant velocity {trainer.baseline_m:.3f})"
+    return (
+        f"| val minADE {accuracy.min_ade_m:.3f} m (best {trainer.best:.3f}, constant velocity {trainer.baseline_m:.3f})"
+    )
 
 
 def _comparable(config: TrainConfig) -> dict[str, Any]:
@@ -344,8 +346,6 @@ def _comparable(config: TrainConfig) -> dict[str, Any]:
 
 
 def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
-    import json
-
     if not config_file.exists():
         if config.out.exists() and any(config.out.iterdir()):
             raise UserError(f"{config.out} is not empty and not a training run; choose another --out")

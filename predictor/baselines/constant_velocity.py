@@ -37,7 +37,7 @@ class ConstantVelocity:
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
-        """x + v·t; all samples are the same."""
+        """X + v·t; all samples are the same."""
         states = belief.states
         time_s = self.spec.dt_s * torch.arange(1, horizon_steps + 1, dtype=states.dtype, device=states.device)
         future = states[:, :, None].repeat(1, 1, horizon_steps, 1)

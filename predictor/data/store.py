@@ -145,14 +145,16 @@ def read_store(path: Path) -> EpisodeStore:
         raise UserError(f"no episode store at {path}; make one with python -m envs.collect")
     try:
         group = zarr.open_group(path, mode="r")
-        attrs = dict(group.attrs)
+        attrs: dict[str, Any] = dict(group.attrs)
         if attrs.get("format") != FORMAT:
             raise UserError(f"{path} is not an episode store; make one with python -m envs.collect")
         if attrs["version"] != VERSION:
-            raise UserError(f"{path} has store version {attrs['version']}, this release reads {VERSION}; collect it anew")
-        arrays = {name: np.asarray(group[name][:]) for name in ("states", "valid", "ids", "starts", "seeds")}  # type: ignore[index]
-        info = StoreInfo(_spec_from_json(attrs["spec"]), str(attrs["source"]), dict(attrs["provenance"]))  # type: ignore[call-overload, arg-type]
-        labels = list(attrs["labels"])  # type: ignore[arg-type]
+            raise UserError(
+                f"{path} has store version {attrs['version']}, this release reads {VERSION}; collect it anew"
+            )
+        arrays = {name: np.asarray(group[name]) for name in ("states", "valid", "ids", "starts", "seeds")}
+        info = StoreInfo(_spec_from_json(attrs["spec"]), str(attrs["source"]), dict(attrs["provenance"]))
+        labels = list(attrs["labels"])
     except (KeyError, TypeError, OSError, json.JSONDecodeError, zarr.errors.BaseZarrError) as error:
         raise UserError(f"{path} is not a readable episode store ({error}); collect it anew") from error
     episodes = []
@@ -181,4 +183,5 @@ def _check_finite(episode: Episode, where: str) -> None:
 
 
 def _spec_from_json(values: dict[str, Any]) -> SceneSpec:
-    return SceneSpec(**{key: tuple(v) if isinstance(v, list) else v for key, v in values.items()})
+    arguments: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
+    return SceneSpec(**arguments)

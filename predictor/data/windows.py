@@ -1,7 +1,7 @@
 """Training windows cut from episodes: what the ego could see up to a step, and what then happened.
 
-History is masked to perception (range and nearest N at each step). After the last observed step, the agents visible then
-are followed for as long as they exist, seen or not: that is the truth a forecast is judged by.
+History is masked to perception (range and nearest N at each step). After the last observed step, the agents visible
+then are followed for as long as they exist, seen or not: that is the truth a forecast is judged by.
 """
 
 from collections.abc import Sequence
@@ -34,8 +34,8 @@ class WindowBatch:
 
 
 def visible(episode: Episode, spec: SceneSpec) -> Bool[np.ndarray, "time agents"]:
-    """Who the ego (column 0) perceives: within `perception_m`, the nearest `max_agents`; everyone if there is no ego."""
-    if not spec.has_ego:
+    """Who the ego (column 0) perceives: within `perception_m`, the nearest `max_agents`; everyone if there is no
+    ego.""" if not spec.has_ego:
         return episode.valid
     offsets = episode.states[..., :2] - episode.states[:, :1, :2]
     distance_m = np.where(episode.valid, np.hypot(offsets[..., 0], offsets[..., 1]), np.inf)

@@ -24,6 +24,7 @@ def make_space(shapes: dict[str, tuple[int, ...]]) -> spaces.Dict:
 def make_observations(shapes: dict[str, tuple[int, ...]], seed: int = 0) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     observations = {k: 20 * torch.randn(BATCH, *s, generator=generator) for k, s in shapes.items()}
+    observations["observation"] /= 20
     if "valid" in shapes:
         observations["valid"] = torch.ones(BATCH, *shapes["valid"])
     return observations
@@ -70,7 +71,7 @@ def test_padding_equals_a_smaller_scene():
 def test_a_valid_agent_does_change_something():
     extractor, observations = make_extractor(SHAPES), make_observations(SHAPES)
     before = extractor(observations)
-    observations["forecast"][:, 2] += 1.0
+    observations["forecast"][:, 2] += 5.0
     assert (extractor(observations) - before).abs().max() > 1e-3
 
 
