@@ -1,5 +1,4 @@
-"""From scenes and a forecaster to what the policy sees; one implementation for one env, SB3 and gymnasium vector
-envs."""
+"""From scenes and a forecaster to what the policy sees; the same for one env, SB3 and gymnasium vector envs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -160,9 +159,9 @@ class ForecastStream:
     def observe_boundary(
         self, scenes: SceneBatch, ended: Int[np.ndarray, " ended"], successors: SceneBatch
     ) -> dict[str, NDArray[np.float32]]:
-        """As `observe`, with the last scenes of ended episodes and, as extra rows at the end, their successors'
-        first.""" self._online.observe_boundary(scenes, ended, successors) return
-        self._entries(SceneBatch.concatenate(scenes, successors))
+        """As `observe`, with the last scenes of ended episodes; their successors' first scenes are extra rows."""
+        self._online.observe_boundary(scenes, ended, successors)
+        return self._entries(SceneBatch.concatenate(scenes, successors))
 
     def _entries(self, scenes: SceneBatch) -> dict[str, NDArray[np.float32]]:
         self.forecast = self._online.forecast(self.horizon_steps, self.config.num_samples, self._generator)

@@ -55,10 +55,12 @@ def run_window_batch(
     num_samples: int = 1,
     generator: torch.Generator | None = None,
 ) -> Outcome:
-    """Stream the history of each window through the forecaster, forecast, and line up the truth; the ego is left
-    out.""" rows = torch.arange(len(batch.states), device=batch.states.device) longest =
-    int(batch.last_observed.max()) memory = forecaster.empty_memory(batch.states.shape[0], batch.states.shape[2])
-    belief = None for back in range(longest, -1, -1):
+    """Stream the history of each window, forecast, and line up the truth; the ego is left out."""
+    rows = torch.arange(len(batch.states), device=batch.states.device)
+    longest = int(batch.last_observed.max())
+    memory = forecaster.empty_memory(batch.states.shape[0], batch.states.shape[2])
+    belief = None
+    for back in range(longest, -1, -1):
         # Histories end together: rows that begin later see an empty scene until then.
         step = batch.last_observed - back
         started = step >= 0

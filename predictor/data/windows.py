@@ -34,8 +34,8 @@ class WindowBatch:
 
 
 def visible(episode: Episode, spec: SceneSpec) -> Bool[np.ndarray, "time agents"]:
-    """Who the ego (column 0) perceives: within `perception_m`, the nearest `max_agents`; everyone if there is no
-    ego.""" if not spec.has_ego:
+    """Who the ego (column 0) perceives: the nearest `max_agents` within `perception_m`; everyone without an ego."""
+    if not spec.has_ego:
         return episode.valid
     offsets = episode.states[..., :2] - episode.states[:, :1, :2]
     distance_m = np.where(episode.valid, np.hypot(offsets[..., 0], offsets[..., 1]), np.inf)
