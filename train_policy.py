@@ -5,6 +5,7 @@ drawn in. The run folder holds config.json, tb/ (TensorBoard), checkpoint.zip (t
 selection seeds), policy.zip (the final policy: the best), summary.json, summary.md and video.mp4.
 """
 
+import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -52,6 +53,12 @@ class TrainPolicyConfig:
     """Run folder; None takes runs/ENV_ID-ALGORITHM-OBSERVE-SEED."""
     resume: bool = False
     """Continue the run in run_dir (or start it, if nothing is there yet)."""
+    selections: int = 8
+    """How often, evenly spread, the policy is measured to find the best one."""
+    selection_episodes: int = 20
+    """Episodes per such measurement, on seeds that neither training nor the final table uses."""
+    checkpoint_every: int = 2_000
+    """Environment steps between checkpoints."""
     eval_episodes: int = 50
     """Episodes per policy in the final table."""
     video: bool = True
@@ -61,7 +68,7 @@ class TrainPolicyConfig:
 
     def __post_init__(self) -> None:
         """Check ranges; what belongs together is checked by the parts."""
-        for name in ("steps", "envs", "eval_episodes"):
+        for name in ("steps", "envs", "selections", "selection_episodes", "checkpoint_every", "eval_episodes"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
 
@@ -74,7 +81,23 @@ class TrainPolicyConfig:
     def plan(self) -> TrainingPlan:
         """The training."""
         task = Task(self.env_id, self.observe, self.checkpoint, self.device)
-        return TrainingPlan(task, self.algorithm, self.steps, self.envs, self.seed, self.device)
+        return TrainingPlan(
+            task,
+            self.algorithm,
+            self.steps,
+            self.envs,
+            self.seed,
+            self.device,
+            self.selections,
+            self.selection_episodes,
+            self.measuring_rows,
+            self.checkpoint_every,
+        )
+
+    @property
+    def measuring_rows(self) -> int:
+        """Parallel environments that measure a policy; results do not depend on it."""
+        return min(self.envs, os.cpu_count() or 1)
 
 
 def run(config: TrainPolicyConfig, console: Console) -> None:
@@ -84,12 +107,12 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
     settings = asdict(config) | {"preset": asdict(plan.preset), "attention": asdict(AttentionConfig())}
     for name in ("run_dir", "resume"):
         settings.pop(name)
-    free = ("eval_episodes", "video", "device")
+    free = ("checkpoint_every", "eval_episodes", "video", "device")
     open_run(config.folder, settings, provenance(PACKAGES) | {"seed": config.seed}, config.resume, free)
     policy = train(plan, config.folder)
     model = load_model(policy, config.algorithm)
     evaluation = evaluate_with_progress(
-        plan.task, model, f"{config.algorithm} ({config.observe})", config.eval_episodes
+        plan.task, model, f"{config.algorithm} ({config.observe})", config.eval_episodes, config.measuring_rows
     )
     evaluation.write(config.folder, algorithm=config.algorithm, observe=config.observe)
     console.print(evaluation.table())

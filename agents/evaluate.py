@@ -5,8 +5,9 @@ those of training and of model selection (`agents.training`).
 """
 
 import math
+import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +91,7 @@ class Evaluation:
         """The table for a README."""
         lines = ["| " + " | ".join(_HEADER) + " |", "|---" * len(_HEADER) + "|"]
         lines += ["| " + " | ".join(_cells(row)) + " |" for row in self.rows]
-        return "\n".join(lines) + f"\n\n{self._caption()}\n"
+        return "\n".join(lines) + f"\n\n{self.env_id}: {self._caption()}\n"
 
     def table(self) -> Table:
         """The table for a terminal."""
@@ -104,8 +105,8 @@ class Evaluation:
     def _caption(self) -> str:
         count = max(len(found) for found in self.results.values())
         return (
-            f"{self.env_id}: {count} episodes each on seeds {self.first_seed}–{self.first_seed + count - 1}; "
-            "± is one standard error, crash rate with its 95 % Wilson interval."
+            f"{count} episodes each, the same seeds from {self.first_seed} on; mean ± standard error, length in policy "
+            "steps, crash rate with its 95 % Wilson interval."
         )
 
 
@@ -157,8 +158,8 @@ def evaluate_policy_on_seeds(
     model: BaseAlgorithm,
     name: str,
     num_episodes: int,
+    num_rows: int = 1,
     first_seed: int = EVALUATION_SEED,
-    num_rows: int = 2,
     on_episode: Callable[[], None] = lambda: None,
 ) -> Evaluation:
     """Let the trained policy (most likely action) and the random and idle egos drive the same episodes.
@@ -168,8 +169,8 @@ def evaluate_policy_on_seeds(
         model: the trained policy.
         name: what to call it in the table.
         num_episodes: episodes per policy.
+        num_rows: parallel environments; the results do not depend on it.
         first_seed: episode i is reset with first_seed + i.
-        num_rows: parallel processes; the results do not depend on it.
         on_episode: called after each episode.
     """
     seeds = range(first_seed, first_seed + num_episodes)
@@ -184,18 +185,23 @@ def evaluate_policy_on_seeds(
 
 
 def evaluate_with_progress(
-    task: Task, model: BaseAlgorithm, name: str, num_episodes: int, first_seed: int = EVALUATION_SEED
+    task: Task,
+    model: BaseAlgorithm,
+    name: str,
+    num_episodes: int,
+    num_rows: int,
+    first_seed: int = EVALUATION_SEED,
 ) -> Evaluation:
     """`evaluate_policy_on_seeds` under a progress bar."""
     columns = (TextColumn(f"evaluate {task.env_id}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns) as progress:
         bar = progress.add_task("", total=num_episodes * (1 + len(BASELINES)))
         return evaluate_policy_on_seeds(
-            task, model, name, num_episodes, first_seed, on_episode=lambda: progress.advance(bar)
+            task, model, name, num_episodes, num_rows, first_seed, lambda: progress.advance(bar)
         )
 
 
-_HEADER = ("policy", "return", "length [steps]", "crash rate (95 %)", "mean speed [m/s]")
+_HEADER = ("policy", "return", "length", "crash rate (95 %)", "speed [m/s]")
 
 
 def _cells(row: PolicySummary) -> tuple[str, ...]:
@@ -229,13 +235,16 @@ class EvaluateConfig:
     """Episode i is reset with seed + i; the default is apart from all training seeds."""
     out: Path | None = None
     """Folder for summary.json and summary.md; None takes RUN_DIR/evaluation."""
+    workers: int = os.cpu_count() or 1
+    """Parallel environments; the results do not depend on it."""
     device: str = "cpu"
     """Where forecaster and policy run: cpu, cuda or auto."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        if self.episodes < 1:
-            raise UserError(f"episodes must be at least 1, got {self.episodes}")
+        for name in ("episodes", "workers"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.seed < 0:
             raise UserError(f"seed must not be negative, got {self.seed}")
 
@@ -245,13 +254,11 @@ def main() -> None:
     torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
     config = tyro.cli(EvaluateConfig, description=__doc__)
     run = read_config(config.run_dir)
-    task = Task(run["env_id"], run["observe"], run["checkpoint"])
-    task = replace(task, device=config.device)
+    task = Task(run["env_id"], run["observe"], run["checkpoint"], config.device)
     task.check()
     model = load_model(config.run_dir / POLICY_FILE, run["algorithm"])
-    evaluation = evaluate_with_progress(
-        task, model, f"{run['algorithm']} ({run['observe']})", config.episodes, config.seed
-    )
+    name = f"{run['algorithm']} ({run['observe']})"
+    evaluation = evaluate_with_progress(task, model, name, config.episodes, config.workers, config.seed)
     out = config.out or config.run_dir / "evaluation"
     out.mkdir(parents=True, exist_ok=True)
     evaluation.write(out, algorithm=run["algorithm"], observe=run["observe"])

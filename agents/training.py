@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, ProgressBarCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.features import AttentionConfig, ForecastAttention
@@ -70,7 +70,7 @@ class TrainingPlan:
             raise UserError(f"dqn needs a discrete action space, {self.task.env_id} has {space}; use ppo")
 
 
-def train(plan: TrainingPlan, run_dir: Path, progress_bar: bool = True) -> Path:
+def train(plan: TrainingPlan, run_dir: Path) -> Path:
     """Train until `plan.steps`, from the checkpoint in `run_dir` if there is one.
 
     Returns:
@@ -80,26 +80,36 @@ def train(plan: TrainingPlan, run_dir: Path, progress_bar: bool = True) -> Path:
     selection = make_rows(plan.task, min(plan.selection_rows, plan.selection_episodes), seeded=True)
     try:
         model = _resume_or_make(plan, venv, run_dir)
-        remaining = plan.steps - model.num_timesteps
-        if remaining > 0:
-            keep_best = SelectBest(
-                selection, run_dir / BEST_FILE, plan.selection_episodes, max(plan.steps // plan.selections, 1)
-            )
-            keep_latest = SaveCheckpoint(run_dir / CHECKPOINT_FILE, plan.checkpoint_every)
-            model.learn(
-                remaining,
-                callback=CallbackList([keep_latest, keep_best]),
-                tb_log_name="run",
-                reset_num_timesteps=model.num_timesteps == 0,
-                progress_bar=progress_bar,
-                log_interval=1 if plan.algorithm == "ppo" else 20,
-            )
+        if model.num_timesteps < plan.steps:
+            _learn(plan, model, selection, run_dir)
             save_model(model, run_dir / CHECKPOINT_FILE, buffer=True)
     finally:
         venv.close()
         selection.close()
     copy_file(run_dir / BEST_FILE, run_dir / POLICY_FILE)
     return run_dir / POLICY_FILE
+
+
+def _learn(plan: TrainingPlan, model: BaseAlgorithm, selection: VecEnv, run_dir: Path) -> None:
+    """The remaining steps, under SB3's progress bar."""
+    every = max(plan.steps // plan.selections, 1)
+    progress = ProgressBarCallback()
+    callbacks = [
+        SaveCheckpoint(run_dir / CHECKPOINT_FILE, plan.checkpoint_every),
+        SelectBest(selection, run_dir / BEST_FILE, plan.selection_episodes, every),
+        progress,
+    ]
+    try:
+        model.learn(
+            plan.steps - model.num_timesteps,
+            callback=CallbackList(callbacks),
+            tb_log_name="run",
+            reset_num_timesteps=model.num_timesteps == 0,
+            log_interval=1 if plan.algorithm == "ppo" else 20,
+        )
+    finally:
+        if hasattr(progress, "pbar"):
+            progress.pbar.close()  # gives the terminal back after an interrupt
 
 
 def make_model(plan: TrainingPlan, venv: VecEnv, tensorboard_log: str | None = None) -> BaseAlgorithm:

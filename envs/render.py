@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import imageio_ffmpeg  # type: ignore[import-untyped]
 import numpy as np
@@ -182,7 +182,7 @@ class _Recorder:
 
     def __init__(self, env: ForecastObservation, style: OverlayStyle) -> None:
         self._env = env
-        self._base: Any = env.unwrapped
+        self._base = cast(Any, env.unwrapped)
         config: dict[str, Any] = self._base.config
         self.recording = Recording(
             env_id=env.spec.id if env.spec is not None else type(self._base).__name__,

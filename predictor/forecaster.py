@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn import functional
 
 from predictor.scene import SceneSpec
 
@@ -35,6 +36,15 @@ class Memory:
         nodes = tuple(m[rows[:, None], source] * known[..., None] for m in self.nodes)
         pairs = tuple(m[rows[:, None, None], source[:, :, None], source[:, None, :]] * both for m in self.pairs)
         return Memory(nodes, pairs)
+
+    def padded(self, agents: int) -> "Memory":
+        """The same with room for `agents` agents; the new ones have no memory."""
+
+        def pad(memory: Tensor, axes: int) -> Tensor:
+            missing = agents - memory.shape[1]
+            return functional.pad(memory, (0, 0) + (0, missing) * axes) if missing else memory
+
+        return Memory(tuple(pad(m, 1) for m in self.nodes), tuple(pad(m, 2) for m in self.pairs))
 
     def select(self, rows: Int[Tensor, " rows"]) -> "Memory":
         """The memory of some batch rows."""

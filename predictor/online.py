@@ -8,7 +8,7 @@ does not depend on how much was seen before.
 import numpy as np
 import torch
 from jaxtyping import Bool, Int
-from torch import Tensor
+from torch.nn import functional
 
 from predictor.errors import ProtocolError
 from predictor.forecaster import Belief, Forecaster, Memory
@@ -97,26 +97,36 @@ class OnlineForecaster:
         # float32 relative to the ego: the origin that observe() removed is the ego's own position on "ego" axes
         ego_now = belief.states[:, None, :1, None, :2]
         xy = (states[..., :2] - ego_now) * belief.valid[:, None, :, None, None]
-        return Forecast(xy, belief.edge_probs, belief.edge_features, belief.valid)
+        missing = self._ids.shape[1] - belief.valid.shape[1]
+        probs = functional.pad(belief.edge_probs, (0, 0, 0, missing, 0, missing))
+        probs[..., 0] = 1 - probs[..., 1:].sum(-1)  # padded pairs have no edge, as other absent ones
+        return Forecast(
+            functional.pad(xy, (0, 0, 0, 0, 0, missing)),
+            probs,
+            functional.pad(belief.edge_features, (0, 0, 0, missing, 0, missing)),
+            functional.pad(belief.valid, (0, missing)),
+        )
 
     def _take(
         self, scenes: SceneBatch, old_ids: Int[np.ndarray, "rows agents"], memory: Memory
     ) -> tuple[Memory, Int[np.ndarray, "rows agents"]]:
-        source, known = _match(old_ids, scenes.ids)
-        if not np.array_equal(old_ids, scenes.ids):
+        # Columns beyond the last agent of any row cost nothing: pairs grow with the square of the columns.
+        agents = 1 + int(np.flatnonzero(scenes.valid.any(axis=0)).max(initial=0))
+        valid = scenes.valid[:, :agents]
+        ids = np.where(scenes.valid, scenes.ids, PADDING_ID)
+        if agents < ids.shape[1] or not np.array_equal(old_ids, ids):
+            source, known = _match(old_ids, ids[:, :agents])
             memory = memory.reorder(torch.from_numpy(source).to(self.device), torch.from_numpy(known).to(self.device))
         # float64 until the ego's position is off: a scene 10 km down the road loses no precision
-        origin = scenes.states[:, :1, :2] * self._ego_axes
-        local = scenes.states.copy()
-        local[..., :2] -= origin
-        states: Tensor = torch.from_numpy((local * scenes.valid[..., None]).astype(np.float32)).to(self.device)
-        valid = torch.from_numpy(scenes.valid).to(self.device)
-        memory, self._belief = self.forecaster.observe(memory, states, valid)
-        return memory, np.where(scenes.valid, scenes.ids, PADDING_ID)
+        local = scenes.states[:, :agents].copy()
+        local[..., :2] -= local[:, :1, :2] * self._ego_axes
+        states = torch.from_numpy((local * valid[..., None]).astype(np.float32)).to(self.device)
+        memory, self._belief = self.forecaster.observe(memory, states, torch.from_numpy(valid).to(self.device))
+        return memory.padded(ids.shape[1]), ids
 
 
 def _match(
-    old_ids: Int[np.ndarray, "rows agents"], new_ids: Int[np.ndarray, "rows agents"]
+    old_ids: Int[np.ndarray, "rows before"], new_ids: Int[np.ndarray, "rows agents"]
 ) -> tuple[Int[np.ndarray, "rows agents"], Bool[np.ndarray, "rows agents"]]:
     """For each new row of each scene, where its id stood before, and whether it did."""
     same = (new_ids[:, :, None] == old_ids[:, None, :]) & (new_ids[:, :, None] != PADDING_ID)

@@ -1,0 +1,29 @@
+"""Fixtures of these tests; nothing of this project is imported at the top, so that the shape checks see it first."""
+
+import pytest
+from highway_env.vehicle.behavior import IDMVehicle
+
+AS_SHIPPED = {name: getattr(IDMVehicle, name) for name in ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN")}
+
+
+@pytest.fixture(autouse=True)
+def pristine_drivers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """highway-env's intersection changes every IDM driver of the process; no test may depend on who ran before it."""
+    for name, value in AS_SHIPPED.items():
+        monkeypatch.setattr(IDMVehicle, name, value)
+
+
+@pytest.fixture(scope="session")
+def highway_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A tiny dG-VAE with random weights for ids that step at 1 s; its scenes are smaller than the reader's default."""
+    from tests.envs.helpers import HIGHWAY_SPEC, save_tiny
+
+    return save_tiny(tmp_path_factory.mktemp("checkpoints") / "tiny-highway", HIGHWAY_SPEC)
+
+
+@pytest.fixture(scope="session")
+def map_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The same for a fixed map: world coordinates are kept."""
+    from tests.envs.helpers import MAP_SPEC, save_tiny
+
+    return save_tiny(tmp_path_factory.mktemp("checkpoints") / "tiny-map", MAP_SPEC)

@@ -1,0 +1,123 @@
+"""Tiny specs, models and scenes that the predictor's tests share."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from predictor.data.store import Episode, StoreInfo, write_store
+from predictor.dgvae import DGVAE, DGVAEConfig
+from predictor.scene import PADDING_ID, AxisFrame, Scene, SceneBatch, SceneSpec
+
+WORLD: tuple[AxisFrame, AxisFrame] = ("world", "world")
+ROAD: tuple[AxisFrame, AxisFrame] = ("ego", "world")
+
+# Every width differs from every other, so that an axis in the wrong place cannot fit by chance.
+FAST_LIKE = DGVAEConfig(
+    hidden_dim=9,
+    rnn_dim=5,
+    head_dim=8,
+    message_dim=11,
+    decoder_dim=13,
+    edge_feature_dim=6,
+    residual="constant_velocity",
+)
+PAPER_LIKE = replace(FAST_LIKE, hidden_dim=12, rnn_dim=7, head_dim=17, message_dim=10, decoder_dim=15, residual="state")
+SIZES = {"fast": FAST_LIKE, "paper": PAPER_LIKE}
+
+
+def spec(
+    frame: tuple[AxisFrame, AxisFrame] = WORLD,
+    has_ego: bool = True,
+    max_agents: int = 4,
+    perception_m: float = 100.0,
+    dt_s: float = 1.0,
+) -> SceneSpec:
+    """Scales that make states of a few metres matter to a small untrained network."""
+    scales = (10.0, 10.0, 5.0, 5.0)
+    return SceneSpec(
+        dt_s, frame, feature_scales=scales, has_ego=has_ego, max_agents=max_agents, perception_m=perception_m
+    )
+
+
+@cache
+def model(
+    size: Literal["fast", "paper"] = "fast",
+    num_edge_types: int = 2,
+    residual: Literal["state", "constant_velocity"] | None = None,
+    frame: tuple[AxisFrame, AxisFrame] = WORLD,
+    has_ego: bool = True,
+    horizon_steps: int = 3,
+) -> DGVAE:
+    """An untrained model in evaluation mode, with weights large enough for every path to leave a trace."""
+    config = replace(SIZES[size], num_edge_types=num_edge_types)
+    if residual is not None:
+        config = replace(config, residual=residual)
+    torch.manual_seed(7)
+    made = DGVAE(spec(frame, has_ego), config, horizon_steps)
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter.mul_(1.7)
+    return made.eval().requires_grad_(False)
+
+
+def random_states(seed: int, *shape: int) -> Tensor:
+    """States [SI] within ±20 m and ±10 m/s; the last axis of `shape` is the state's."""
+    drawn = np.random.default_rng(seed).uniform(-1, 1, size=shape) * np.array([20.0, 20.0, 10.0, 10.0])
+    return torch.from_numpy(drawn.astype(np.float32))
+
+
+def random_presence(seed: int, *shape: int, ego: bool = True, share: float = 0.7) -> Tensor:
+    """Who is present, at random; with `ego` agent 0 always is."""
+    drawn = np.random.default_rng([seed, 1]).random(shape) < share
+    if ego:
+        drawn[..., 0] = True
+    return torch.from_numpy(drawn)
+
+
+def scene(agents: Mapping[int, Sequence[float]], rows: int, order: Sequence[int] | None = None) -> Scene:
+    """A scene from id → state [SI].
+
+    Args:
+        agents: who is present.
+        rows: rows of the scene.
+        order: id of each row (-1 for none); left out, agents stand in the mapping's order and padding follows.
+    """
+    if order is None:
+        order = list(agents)
+    states, ids, valid = np.zeros((rows, 4)), np.full(rows, PADDING_ID), np.zeros(rows, dtype=np.bool_)
+    for row, agent in enumerate(order):
+        if agent != PADDING_ID:
+            states[row], ids[row], valid[row] = agents[agent], agent, True
+    return Scene(states, ids, valid)
+
+
+def batch(*scenes: Scene) -> SceneBatch:
+    """Short for `SceneBatch.stack`."""
+    return SceneBatch.stack(scenes)
+
+
+def circling_episode(seed: int, steps: int = 10, agents: int = 2, turn_rad: float = 0.5) -> Episode:
+    """Agents on circles: every velocity turns by `turn_rad` in each step of 1 s; constant velocity is wrong by a lot."""
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0, 2 * np.pi, size=agents) + turn_rad * np.arange(steps)[:, None]
+    speed_mps = rng.uniform(2, 5, size=agents)
+    centre = rng.uniform(-5, 5, size=(agents, 2))
+    radius_m = speed_mps / turn_rad
+    states = np.zeros((steps, agents, 4), dtype=np.float32)
+    states[..., 0] = centre[:, 0] + radius_m * np.sin(angle)
+    states[..., 1] = centre[:, 1] - radius_m * np.cos(angle)
+    states[..., 2] = speed_mps * np.cos(angle)
+    states[..., 3] = speed_mps * np.sin(angle)
+    return Episode(states, np.ones((steps, agents), dtype=np.bool_), np.arange(agents), "circle", seed)
+
+
+def write_circles(path: Path, episodes: int = 6, **kwargs: int) -> Path:
+    """A small store of circling agents."""
+    write_store(path, StoreInfo(spec(), "circles"), [circling_episode(i, **kwargs) for i in range(episodes)])
+    return path

@@ -1,0 +1,534 @@
+"""The dG-VAE against plain loops, and the semantics it must keep: streaming, no peeking, padding, symmetry, sampling."""
+
+from collections.abc import Iterator, Mapping
+from itertools import product
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor, nn
+from torch.nn import functional
+
+from predictor import dgvae
+from predictor.dgvae import DGVAE, PRESETS, DGVAEConfig, WindowOutput, concrete_sample
+from predictor.errors import UserError
+from predictor.forecaster import Belief, Memory
+from predictor.graph import pair_mask
+from tests.predictor.helpers import FAST_LIKE, ROAD, model, random_presence, random_states, spec
+
+BATCH, TIME, AGENTS = 2, 6, 4
+TOLERANCE = {"rtol": 0.0, "atol": 1e-5}
+EVERY_KIND = [
+    pytest.param(size, residual, types, id=f"{size}-{residual}-{types}types")
+    for size, residual, types in product(("fast", "paper"), ("state", "constant_velocity"), (2, 3))
+]
+every_kind = pytest.mark.parametrize(("size", "residual", "types"), EVERY_KIND)
+
+
+@st.composite
+def presence(draw: st.DrawFn, ego: bool = True) -> Tensor:
+    """Who is present at each step; every pattern of entering and leaving can occur."""
+    cells = BATCH * TIME * AGENTS
+    bits = draw(st.integers(0, 2**cells - 1))
+    valid = torch.tensor([bool(bits >> i & 1) for i in range(cells)]).view(BATCH, TIME, AGENTS)
+    if ego:
+        valid[..., 0] = True
+    return valid
+
+
+seeds = st.integers(0, 2**16)
+
+
+def stream(forecaster: DGVAE, states: Tensor, valid: Tensor) -> Iterator[tuple[Memory, Belief]]:
+    """Memory and belief after each step."""
+    memory = forecaster.empty_memory(states.shape[0], states.shape[2])
+    for now, present in zip(states.unbind(1), valid.unbind(1), strict=True):
+        memory, belief = forecaster.observe(memory, now, present)
+        yield memory, belief
+
+
+def last(forecaster: DGVAE, states: Tensor, valid: Tensor) -> Belief:
+    """Belief after the whole history."""
+    return list(stream(forecaster, states, valid))[-1][1]
+
+
+def window_without_noise(forecaster: DGVAE, states: Tensor, valid: Tensor, last_observed: Tensor) -> WindowOutput:
+    """The training pass with every sampled graph replaced by the expected one."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dgvae, "concrete_sample", lambda logits, temperature, generator: torch.softmax(logits, dim=-1))
+        return forecaster.window(states, valid, last_observed)
+
+
+# --- Streaming ≡ full window ------------------------------------------------------------------------------------------
+
+
+@every_kind
+@settings(max_examples=15)
+@given(valid=presence(), seed=seeds)
+def test_streaming_encodes_what_the_whole_history_at_once_does(
+    size: Any, residual: Any, types: int, valid: Tensor, seed: int
+):
+    forecaster = model(size, types, residual)
+    states = random_states(seed, BATCH, TIME, AGENTS, 4)
+    inputs, pairs = forecaster.network_inputs(states, valid), pair_mask(valid)
+    whole = forecaster.encoder(inputs, pairs, *forecaster.empty_memory(BATCH, AGENTS).pairs)
+    for t, (memory, belief) in enumerate(stream(forecaster, states, valid)):
+        torch.testing.assert_close(belief.internal.logits, whole.prior_logits[:, t], **TOLERANCE)
+        torch.testing.assert_close(belief.edge_probs, whole.prior_logits[:, t].softmax(-1), **TOLERANCE)
+        torch.testing.assert_close(belief.edge_features, whole.features[:, t], **TOLERANCE)
+        torch.testing.assert_close(memory.pairs, (whole.hidden[:, t], whole.cell[:, t]), **TOLERANCE)
+
+
+@every_kind
+@settings(max_examples=15)
+@given(valid=presence(), seed=seeds, last_observed=st.tuples(*[st.integers(0, TIME - 1)] * BATCH))
+def test_streaming_forecasts_what_the_window_does(
+    size: Any, residual: Any, types: int, valid: Tensor, seed: int, last_observed: tuple[int, ...]
+):
+    forecaster = model(size, types, residual)
+    states = random_states(seed, BATCH, TIME, AGENTS, 4)
+    window = window_without_noise(forecaster, states, valid, torch.tensor(last_observed))
+    beliefs = [belief for _, belief in stream(forecaster, states, valid)]
+    for row, t in enumerate(last_observed):
+        streamed = forecaster.rollout(beliefs[t], forecaster.horizon_steps)
+        torch.testing.assert_close(streamed[row, 0], window.rollout[row], rtol=1e-5, atol=1e-4)  # positions: tens of m
+
+
+def test_streaming_in_two_stretches_equals_one():
+    """The encoder takes a memory in: the second half of a history continues where the first one ended."""
+    forecaster = model()
+    states, valid = random_states(0, BATCH, TIME, AGENTS, 4), random_presence(0, BATCH, TIME, AGENTS)
+    inputs, pairs = forecaster.network_inputs(states, valid), pair_mask(valid)
+    empty = forecaster.empty_memory(BATCH, AGENTS).pairs
+    whole = forecaster.encoder(inputs, pairs, *empty)
+    first = forecaster.encoder(inputs[:, :2], pairs[:, :2], *empty)
+    second = forecaster.encoder(inputs[:, 2:], pairs[:, 2:], first.hidden[:, -1], first.cell[:, -1])
+    torch.testing.assert_close(second.prior_logits, whole.prior_logits[:, 2:], **TOLERANCE)
+    assert not torch.allclose(first.hidden[:, -1], torch.zeros(()))
+
+
+def test_history_matters():
+    """Without this, the equalities above would hold for a model that remembers nothing."""
+    forecaster = model()
+    states, valid = random_states(0, BATCH, TIME, AGENTS, 4), torch.ones(BATCH, TIME, AGENTS).bool()
+    long, short = last(forecaster, states, valid), last(forecaster, states[:, -1:], valid[:, -1:])
+    pairs = pair_mask(valid[:, -1])
+    assert (long.edge_probs - short.edge_probs)[pairs].abs().max() > 1e-2
+    assert (long.edge_features - short.edge_features)[pairs].abs().max() > 1e-2
+    assert (forecaster.rollout(long, 3) - forecaster.rollout(short, 3)).abs().max() > 1e-2
+
+
+def test_memory_does_not_grow():
+    forecaster = model()
+    states, valid = random_states(0, 1, 9, 3, 4), torch.ones(1, 9, 3).bool()
+    shapes = {tuple(t.shape for t in (*memory.nodes, *memory.pairs)) for memory, _ in stream(forecaster, states, valid)}
+    assert len(shapes) == 1
+
+
+# --- No peeking -------------------------------------------------------------------------------------------------------
+
+
+@every_kind
+@settings(max_examples=15)
+@given(valid=presence(), seed=seeds, now=st.integers(0, TIME - 2))
+def test_the_future_changes_the_posterior_and_nothing_else(
+    size: Any, residual: Any, types: int, valid: Tensor, seed: int, now: int
+):
+    forecaster = model(size, types, residual)
+    states = random_states(seed, BATCH, TIME, AGENTS, 4)
+    valid[0, : now + 1, 1] = valid[:, now + 1 :, :2] = True  # at least one pair lives on both sides of `now`
+    other_states, other_valid = states.clone(), valid.clone()
+    other_states[:, now + 1 :] = random_states(seed + 1, BATCH, TIME - now - 1, AGENTS, 4)
+    other_valid[:, now + 1 :, 2:] = ~valid[:, now + 1 :, 2:]
+    last_observed = torch.full((BATCH,), now)
+    one, other = (
+        forecaster.window(s, v, last_observed, torch.Generator().manual_seed(3))
+        for s, v in ((states, valid), (other_states, other_valid))
+    )
+    past = slice(None, now + 1)
+    assert torch.equal(one.prior_logits[:, past], other.prior_logits[:, past])
+    assert torch.equal(one.features[:, past], other.features[:, past])
+    torch.testing.assert_close(one.rollout, other.rollout, rtol=0, atol=1e-5)
+    assert (one.posterior_logits[0, now, 0, 1] - other.posterior_logits[0, now, 0, 1]).abs().max() > 1e-4
+    # … while the present does change all of them
+    assert not torch.allclose(one.prior_logits[:, now + 1], other.prior_logits[:, now + 1], atol=1e-4)
+
+
+# --- Padding and symmetry ---------------------------------------------------------------------------------------------
+
+
+def everything(forecaster: DGVAE, states: Tensor, valid: Tensor) -> dict[str, Tensor]:
+    """All outputs, time axis second; agents (and pairs of them) follow it."""
+    now = torch.full((len(states),), states.shape[1] - 2)
+    window = window_without_noise(forecaster, states, valid, now)
+    belief = last(forecaster, states, valid)
+    return {
+        "prior": window.prior_logits,
+        "posterior": window.posterior_logits,
+        "features": window.features,
+        "one_step": window.one_step,
+        "rollout": window.rollout[:, None],
+        "streamed_probs": belief.edge_probs[:, None],
+        "streamed_features": belief.edge_features[:, None],
+        "streamed": forecaster.rollout(belief, 3),
+    }
+
+
+PAIRWISE = {"prior", "posterior", "features", "streamed_probs", "streamed_features"}
+
+
+@pytest.mark.parametrize("frame", [("world", "world"), ROAD], ids=["world", "road"])
+@settings(max_examples=25)
+@given(valid=presence(), seed=seeds, padding=st.integers(1, 3))
+def test_padding_is_invisible(frame: Any, valid: Tensor, seed: int, padding: int):
+    forecaster = model(num_edge_types=3, frame=frame)
+    states = random_states(seed, BATCH, TIME, AGENTS, 4)
+    garbage = 100 * random_states(seed + 1, BATCH, TIME, AGENTS + padding, 4)
+    padded_valid = torch.cat([valid, torch.zeros(BATCH, TIME, padding).bool()], dim=2)
+    padded_states = torch.where(padded_valid[..., None], garbage.clone(), garbage)
+    padded_states[:, :, :AGENTS][valid] = states[valid]
+    plain, padded = everything(forecaster, states, valid), everything(forecaster, padded_states, padded_valid)
+    present = {"one_step": valid, "rollout": valid[:, [-2]], "streamed": valid[:, [-1]]}
+    for name, expected in plain.items():
+        ours = padded[name][:, :, :AGENTS, :AGENTS] if name in PAIRWISE else padded[name][:, :, :AGENTS]
+        if name in present:  # an absent agent has no state to speak of
+            ours, expected = ours[present[name]], expected[present[name]]
+        torch.testing.assert_close(ours, expected, rtol=1e-5, atol=2e-5, msg=lambda m, n=name: f"{n}: {m}")
+
+
+@settings(max_examples=25)
+@given(valid=presence(ego=False), seed=seeds, order=st.permutations(range(AGENTS)))
+def test_permuting_agents_permutes_outputs(valid: Tensor, seed: int, order: list[int]):
+    check_permutation(model(num_edge_types=3, has_ego=False), valid, seed, order)
+
+
+@settings(max_examples=25)
+@given(valid=presence(), seed=seeds, others=st.permutations(range(1, AGENTS)))
+def test_permuting_others_around_the_ego_permutes_outputs(valid: Tensor, seed: int, others: list[int]):
+    check_permutation(model(num_edge_types=3, frame=ROAD), valid, seed, [0, *others])
+
+
+def check_permutation(forecaster: DGVAE, valid: Tensor, seed: int, order: list[int]) -> None:
+    states = random_states(seed, BATCH, TIME, AGENTS, 4)
+    plain = everything(forecaster, states, valid)
+    permuted = everything(forecaster, states[:, :, order], valid[:, :, order])
+    for name, values in plain.items():
+        expected = values[:, :, order][:, :, :, order] if name in PAIRWISE else values[:, :, order]
+        torch.testing.assert_close(permuted[name], expected, rtol=1e-5, atol=2e-5, msg=lambda m, n=name: f"{n}: {m}")
+
+
+def test_the_ego_is_not_like_the_others():
+    forecaster = model()
+    states, valid = random_states(0, 1, TIME, 3, 4), torch.ones(1, TIME, 3).bool()
+    one, other = (last(forecaster, states[:, :, order], valid) for order in ([0, 1, 2], [1, 0, 2]))
+    assert not torch.allclose(one.edge_probs[:, 2, 0], other.edge_probs[:, 2, 1], atol=1e-3)
+
+
+@pytest.mark.parametrize("padding", [0, 3])
+def test_ego_alone_is_forecast(padding: int):
+    forecaster = model(frame=ROAD)
+    states, valid = random_states(0, BATCH, TIME, 1, 4), torch.ones(BATCH, TIME, 1).bool()
+    alone = everything(forecaster, states, valid)
+    wide = functional.pad(states, (0, 0, 0, padding)), functional.pad(valid, (0, padding))
+    for name, values in everything(forecaster, *wide).items():
+        assert torch.isfinite(values).all()
+        ours = values[:, :, :1, :1] if name in PAIRWISE else values[:, :, :1]
+        torch.testing.assert_close(ours, alone[name], rtol=1e-5, atol=1e-5)
+    belief = last(forecaster, *wide)
+    assert torch.equal(belief.edge_probs[..., 0], torch.ones(BATCH, 1 + padding, 1 + padding))
+    assert not belief.edge_features.any()
+
+
+def test_absent_pairs_have_no_edge_and_no_features():
+    states, valid = random_states(0, BATCH, TIME, AGENTS, 4), random_presence(0, BATCH, TIME, AGENTS)
+    belief = last(model(num_edge_types=3), states, valid)
+    absent = ~pair_mask(valid[:, -1])
+    assert torch.equal(belief.edge_probs[absent], torch.tensor([1.0, 0.0, 0.0]).expand(int(absent.sum()), 3))
+    assert not belief.edge_features[absent].any()
+    assert belief.edge_features[~absent].all()
+
+
+def test_agents_forget_what_was_before_they_left():
+    """An agent that is back after a step of absence stands where a newcomer would; so do its pairs."""
+    forecaster = model()
+    states, valid = random_states(0, 1, 4, 3, 4), torch.ones(1, 4, 3).bool()
+    valid[0, 1, 2] = False
+    returned = list(stream(forecaster, states, valid))[-1][0]
+    valid[0, 0, 2] = False
+    newcomer = list(stream(forecaster, states, valid))[-1][0]
+    for ours, expected in zip((*returned.pairs, *returned.nodes), (*newcomer.pairs, *newcomer.nodes), strict=True):
+        torch.testing.assert_close(ours[0, 2], expected[0, 2], **TOLERANCE)
+    assert not torch.allclose(returned.nodes[0][0, 0], newcomer.nodes[0][0, 0], atol=1e-3)  # the ego did meet it
+
+
+# --- Against plain loops ----------------------------------------------------------------------------------------------
+
+
+def lstm_cell(input_map: nn.Linear, hidden_map: nn.Linear) -> nn.LSTMCell:
+    """torch's own cell with our weights."""
+    cell = nn.LSTMCell(input_map.in_features, hidden_map.in_features)
+    cell.weight_ih.data, cell.bias_ih.data = input_map.weight.data, input_map.bias.data
+    cell.weight_hh.data, cell.bias_hh.data = hidden_map.weight.data, torch.zeros_like(input_map.bias.data)
+    return cell.requires_grad_(False)
+
+
+def loop_over_pairs(cell: nn.LSTMCell, embedding: Tensor, pairs: Tensor, reverse: bool) -> tuple[Tensor, Tensor]:
+    batch, time, agents = pairs.shape[:3]
+    hiddens = embedding.new_zeros(batch, time, agents, agents, cell.hidden_size)
+    cells = torch.zeros_like(hiddens)
+    for b, i, j in product(range(batch), range(agents), range(agents)):
+        state = None  # nothing is known of this pair
+        for t in reversed(range(time)) if reverse else range(time):
+            state = cell(embedding[b, t, i, j][None], state) if pairs[b, t, i, j] else None
+            if state is not None:
+                hiddens[b, t, i, j], cells[b, t, i, j] = state[0][0], state[1][0]
+    return hiddens, cells
+
+
+@settings(max_examples=5)
+@given(valid=presence(), seed=seeds)
+def test_recurrence_of_each_pair_is_a_plain_lstm(valid: Tensor, seed: int):
+    encoder = model("paper", 3).encoder
+    inputs, pairs = random_states(seed, BATCH, TIME, AGENTS, 4), pair_mask(valid)
+    inputs = functional.pad(inputs / 10, (0, 1))
+    zeros = torch.zeros(BATCH, AGENTS, AGENTS, 7)
+    edges = encoder(inputs, pairs, zeros, zeros)
+    forward = loop_over_pairs(lstm_cell(encoder.forward_input, encoder.forward_hidden), edges.embedding, pairs, False)
+    torch.testing.assert_close((edges.hidden, edges.cell), forward, **TOLERANCE)
+    backward, _ = loop_over_pairs(
+        lstm_cell(encoder.backward_input, encoder.backward_hidden), edges.embedding, pairs, True
+    )
+    expected = encoder.posterior_head(functional.elu(torch.cat([forward[0], backward], dim=-1)))
+    posterior = encoder.posterior_logits(edges, pairs)
+    torch.testing.assert_close(posterior[pairs], expected[pairs], **TOLERANCE)
+    assert torch.equal(posterior[~pairs].softmax(-1)[:, 0], torch.ones(int((~pairs).sum())))
+    prior, features = encoder.prior_head(functional.elu(forward[0])), encoder.feature_head(functional.elu(forward[0]))
+    torch.testing.assert_close(edges.prior_logits[pairs], prior[pairs], **TOLERANCE)
+    torch.testing.assert_close(edges.features[pairs], features[pairs], **TOLERANCE)
+
+
+def test_graph_block_against_a_loop():
+    """x_i ← Σ_j h(x_i ‖ x_j − x_i), then h(x_i ‖ x_j), with two-layer h."""
+    encoder = model("paper").encoder
+    generator = torch.Generator().manual_seed(0)
+    inputs, valid = torch.randn(AGENTS, 5, generator=generator), torch.tensor([True, True, False, True])
+    pairs = pair_mask(valid)
+    nodes = encoder.embed(inputs)
+    conv, edge = encoder.conv_pair, encoder.edge_pair
+    updated = []
+    for i in range(AGENTS):
+        total = torch.zeros(12)
+        for j in range(AGENTS):
+            if pairs[i, j]:
+                first = conv.receiver(nodes[i]) + conv.sender(nodes[j] - nodes[i])
+                total = total + encoder.conv_out(functional.elu(first))
+        updated.append(functional.elu(total))
+    embedding = encoder.embed_edges(inputs, pairs)
+    for i, j in product(range(AGENTS), range(AGENTS)):
+        first = edge.receiver(updated[i]) + edge.sender(updated[j])
+        torch.testing.assert_close(embedding[i, j], encoder.edge_out(functional.elu(first)), **TOLERANCE)
+
+
+@pytest.mark.parametrize("types", [2, 3])
+def test_messages_against_a_loop(types: int):
+    """x_i's own term plus Σ_j Σ_k z_ijk h_k(x_i ‖ x_j ‖ e_ij) over all types but "no edge"."""
+    decoder, width = model("fast", types).decoder, 11
+    generator = torch.Generator().manual_seed(0)
+    inputs, features = torch.randn(AGENTS, 5, generator=generator), torch.randn(AGENTS, AGENTS, 6, generator=generator)
+    graph = torch.rand(AGENTS, AGENTS, types, generator=generator)
+    pairs = pair_mask(torch.tensor([True, True, False, True]))
+    messages = decoder.messages(inputs, pairs, graph, features)
+    for i in range(AGENTS):
+        expected = decoder.own(inputs[i])
+        for j, k in product(range(AGENTS), range(1, types)):
+            if pairs[i, j]:
+                part = slice((k - 1) * width, k * width)
+                first = decoder.message_pair.receiver(inputs[i]) + decoder.message_pair.sender(inputs[j])
+                first = functional.elu(first + decoder.message_feature(features[i, j]))[part]
+                second = functional.linear(first, decoder.message_out.weight[part], decoder.message_out.bias[part])
+                expected = expected + graph[i, j, k] * second
+        torch.testing.assert_close(messages[i], expected, **TOLERANCE)
+
+
+def test_recurrence_of_each_agent_is_a_plain_gru():
+    decoder = model().decoder
+    valid = random_presence(0, BATCH, TIME, AGENTS, ego=False)
+    messages = torch.randn(BATCH, TIME, AGENTS, 11, generator=torch.Generator().manual_seed(0))
+    hidden = torch.zeros(BATCH, AGENTS, 13)
+    ours = []
+    for t in range(TIME):
+        hidden = decoder.step(messages[:, t], valid[:, t], hidden)
+        ours.append(hidden)
+    for b, i in product(range(BATCH), range(AGENTS)):
+        state = torch.zeros(13)
+        for t in range(TIME):
+            state = decoder.gru(messages[b, t, i][None], state[None])[0] if valid[b, t, i] else torch.zeros(13)
+            torch.testing.assert_close(ours[t][b, i], state, **TOLERANCE)
+
+
+def test_a_type_without_weight_is_silent():
+    decoder = model().decoder
+    inputs, pairs = torch.randn(3, 5, generator=torch.Generator().manual_seed(0)), pair_mask(torch.ones(3).bool())
+    no_edge = torch.tensor([1.0, 0.0]).expand(3, 3, 2)
+    messages = decoder.messages(inputs, pairs, no_edge, torch.zeros(3, 3, 6))
+    torch.testing.assert_close(messages, decoder.own(inputs))
+
+
+@pytest.mark.parametrize(
+    ("residual", "expected"),
+    [("state", [1.5, 4.0, 3.0, 4.5]), ("constant_velocity", [3.0, 6.0, 3.0, 4.5])],
+)
+def test_change_is_added_to_the_residual(residual: Any, expected: list[float]):
+    config = DGVAEConfig(8, 5, 6, 7, 9, residual=residual, delta_scales=(1.0, 2.0, 3.0, 4.0))
+    forecaster = DGVAE(spec(dt_s=0.5), config)
+    after = forecaster.advance(torch.tensor([1.0, 2.0, 3.0, 4.0]), torch.tensor([0.5, 1.0, 0.0, 0.125]))
+    assert after.tolist() == expected
+
+
+def test_network_inputs_closed_form():
+    states = torch.tensor([[[30.0, 5.0, 10.0, 0.0], [40.0, -5.0, 5.0, -5.0], [9.0, 9.0, 9.0, 9.0]]])
+    valid = torch.tensor([[True, True, False]])
+    assert model(frame=ROAD).network_inputs(states, valid).tolist() == [
+        [[0.0, 0.5, 2.0, 0.0, 1.0], [1.0, -0.5, 1.0, -1.0, 0.0], [0.0] * 5]
+    ]
+    assert model(has_ego=False).network_inputs(states, valid).tolist() == [
+        [[3.0, 0.5, 2.0, 0.0], [4.0, -0.5, 1.0, -1.0], [0.0] * 4]
+    ]
+
+
+# --- Samples ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def belief() -> Belief:
+    return last(model(num_edge_types=3), random_states(0, BATCH, TIME, AGENTS, 4), torch.ones(BATCH, TIME, AGENTS).bool())
+
+
+def test_sample_0_draws_nothing(belief: Belief):
+    forecaster = model(num_edge_types=3)
+    generator = torch.Generator().manual_seed(0)
+    before = generator.get_state()
+    first = forecaster.rollout(belief, 3, 1, generator)
+    assert torch.equal(generator.get_state(), before)
+    many = forecaster.rollout(belief, 3, 4, generator)
+    assert torch.equal(many[:, :1], first)
+    assert many.shape == (BATCH, 4, AGENTS, 3, 4)
+
+
+def test_samples_depend_on_the_generator_alone(belief: Belief):
+    forecaster = model(num_edge_types=3)
+
+    def draw(seed: int, everywhere: int) -> Tensor:
+        torch.manual_seed(everywhere)
+        return forecaster.rollout(belief, 3, 4, torch.Generator().manual_seed(seed))
+
+    assert torch.equal(draw(5, everywhere=1), draw(5, everywhere=2))
+    one, other = draw(5, everywhere=1), draw(6, everywhere=1)
+    assert torch.equal(one[:, 0], other[:, 0])
+    assert (one[:, 1:] - other[:, 1:]).abs().amax((2, 3, 4)).min() > 1e-4
+
+
+def test_samples_differ_from_each_other_and_between_rows(belief: Belief):
+    drawn = model(num_edge_types=3).rollout(belief, 3, 5, torch.Generator().manual_seed(0))
+    distance = (drawn[:, :, None] - drawn[:, None]).abs().amax((-1, -2, -3)) + torch.eye(5)
+    assert distance.min() > 1e-4
+
+
+def test_samples_belong_to_their_row(belief: Belief):
+    """Without noise every sample of a row is that row's own expected forecast, so rows and samples are not mixed up."""
+    forecaster = model(num_edge_types=3)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dgvae, "concrete_sample", lambda logits, temperature, generator: torch.softmax(logits, dim=-1))
+        drawn = forecaster.rollout(belief, 3, 4)
+    torch.testing.assert_close(drawn, drawn[:, :1].expand_as(drawn), rtol=1e-5, atol=1e-5)
+    assert not torch.allclose(drawn[0], drawn[1], atol=1.0)
+
+
+def test_longer_horizons_continue_shorter_ones(belief: Belief):
+    forecaster = model(num_edge_types=3)
+    torch.testing.assert_close(forecaster.rollout(belief, 5)[..., :3, :], forecaster.rollout(belief, 3), **TOLERANCE)
+
+
+def test_concrete_samples_follow_their_probabilities():
+    """At any temperature the largest entry is type k with probability softmax(logits)_k (the Gumbel-max identity)."""
+    probs = torch.tensor([0.2, 0.5, 0.3])
+    drawn = concrete_sample(probs.log().expand(20_000, 3), 0.5, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(drawn.sum(-1), torch.ones(20_000))
+    share = torch.bincount(drawn.argmax(-1), minlength=3) / 20_000
+    torch.testing.assert_close(share, probs, rtol=0, atol=0.015)  # four standard errors
+
+
+def test_cold_concrete_samples_are_one_hot_and_hot_ones_even():
+    logits = torch.zeros(1000, 3)
+    cold, hot = (concrete_sample(logits, t, torch.Generator().manual_seed(0)) for t in (1e-3, 1e3))
+    assert (cold.amax(-1) > 0.99).float().mean() > 0.98
+    assert (hot - 1 / 3).abs().max() < 0.01
+
+
+def test_concrete_samples_pass_gradients():
+    logits = torch.zeros(4, 3, requires_grad=True)
+    concrete_sample(logits, 0.5, torch.Generator().manual_seed(0))[:, 0].sum().backward()
+    assert logits.grad is not None and torch.isfinite(logits.grad).all() and logits.grad.abs().min() > 0
+
+
+# --- Training pass and config -----------------------------------------------------------------------------------------
+
+
+def test_every_weight_gets_a_finite_gradient():
+    torch.manual_seed(0)
+    forecaster = DGVAE(spec(), FAST_LIKE, horizon_steps=3)
+    states, valid = random_states(0, BATCH, TIME, AGENTS, 4), random_presence(0, BATCH, TIME, AGENTS)
+    output = forecaster.window(states, valid, torch.tensor([1, 3]), torch.Generator().manual_seed(0))
+    divergence = (output.posterior_logits.softmax(-1) * output.prior_logits.log_softmax(-1))[pair_mask(valid)].sum()
+    (output.one_step.square().mean() + output.rollout.square().mean() - divergence).backward()
+    for name, parameter in forecaster.named_parameters():
+        assert parameter.grad is not None and torch.isfinite(parameter.grad).all(), name
+        assert parameter.grad.abs().max() > 0, name
+
+
+def test_one_step_prediction_ignores_what_it_predicts():
+    """Teacher forcing shows the decoder the posterior's graph (which saw the future) but not the next state itself."""
+    forecaster = model()
+    states, valid = random_states(0, 1, TIME, 1, 4), torch.ones(1, TIME, 1).bool()  # no pairs: no graph to leak through
+    other = states.clone()
+    other[:, 3:] += 5.0
+    now = torch.tensor([1])
+    one, two = (window_without_noise(forecaster, s, valid, now).one_step for s in (states, other))
+    assert torch.equal(one[:, :3], two[:, :3])
+    assert not torch.equal(one[:, 3], two[:, 3])
+
+
+def test_dropout_acts_in_training_only():
+    torch.manual_seed(0)
+    forecaster = DGVAE(spec(), DGVAEConfig(8, 5, 6, 7, 9, dropout=0.5), 3)
+    states, valid = random_states(0, 1, 1, 3, 4), torch.ones(1, 1, 3).bool()
+    assert not torch.equal(last(forecaster, states, valid).edge_probs, last(forecaster, states, valid).edge_probs)
+    forecaster.eval()
+    assert torch.equal(last(forecaster, states, valid).edge_probs, last(forecaster, states, valid).edge_probs)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"rnn_dim": 0}, "rnn_dim must be at least 1, got 0"),
+        ({"num_edge_types": 1}, r"num_edge_types must be at least 2 \(the first is 'no edge'\), got 1"),
+        ({"temperature": 0.0}, "need temperature > 0 and 0 <= dropout < 1, got 0.0, 0.0"),
+        ({"dropout": 1.0}, "need temperature > 0 and 0 <= dropout < 1, got 0.5, 1.0"),
+    ],
+)
+def test_config_refuses(fields: Mapping[str, Any], message: str):
+    with pytest.raises(UserError, match=message):
+        DGVAEConfig(**fields)
+
+
+def test_delta_scales_must_fit_the_features():
+    with pytest.raises(UserError, match=r"delta_scales needs 4 numbers, got \(1.0, 2.0\)"):
+        DGVAE(spec(), DGVAEConfig(delta_scales=(1.0, 2.0)))
+
+
+def test_paper_preset_has_the_sizes_of_the_paper():
+    paper = PRESETS["paper"]
+    assert (paper.hidden_dim, paper.rnn_dim, paper.head_dim, paper.decoder_dim) == (128, 64, 256, 256)
+    assert (paper.num_edge_types, paper.temperature, paper.residual) == (2, 0.5, "state")

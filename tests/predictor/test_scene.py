@@ -1,0 +1,107 @@
+from collections.abc import Mapping
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from predictor.errors import UserError
+from predictor.scene import KINEMATIC_FEATURES, Scene, SceneBatch, SceneSpec
+from tests.predictor.helpers import batch, scene
+
+THREE = {0: (1.0, 2.0, 3.0, 4.0), 8: (5.0, 6.0, 7.0, 8.0), 3: (9.0, 10.0, 11.0, 12.0)}
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"dt_s": 0.0}, "dt_s must be positive, got 0.0"),
+        ({"feature_names": ("y_m", "x_m", "vx_mps", "vy_mps")}, "the first features must be"),
+        ({"feature_scales": (1.0, 1.0, 1.0)}, r"one positive number per feature \(4\), got \(1.0, 1.0, 1.0\)"),
+        ({"feature_scales": (1.0, 1.0, 0.0, 1.0)}, "one positive number per feature"),
+        ({"max_agents": 0}, "max_agents must be at least 1 and perception_m positive, got 0, 100.0"),
+        ({"perception_m": 0.0}, "max_agents must be at least 1 and perception_m positive, got 12, 0.0"),
+        ({"frame": ("ego", "world"), "has_ego": False}, "an 'ego' frame needs has_ego=True"),
+    ],
+    ids=["dt", "feature_order", "scales_short", "scales_zero", "no_agents", "blind", "ego_frame_without_ego"],
+)
+def test_spec_refuses(fields: Mapping[str, object], message: str):
+    with pytest.raises(UserError, match=message):
+        SceneSpec(**({"dt_s": 1.0} | fields))
+
+
+def test_smallest_spec_is_accepted():
+    smallest = SceneSpec(dt_s=1e-6, max_agents=1, perception_m=1e-6)
+    assert asdict(smallest)["max_agents"] == 1
+    assert smallest.num_features == 4
+
+
+def test_features_beyond_the_kinematic_ones_count():
+    names, scales = (*KINEMATIC_FEATURES, "heading_rad"), (1.0,) * 5
+    assert SceneSpec(dt_s=1.0, feature_names=names, feature_scales=scales).num_features == 5
+
+
+def test_another_time_step_is_named_with_both_numbers():
+    with pytest.raises(UserError) as error:
+        SceneSpec(dt_s=1.0).check_compatible(SceneSpec(dt_s=0.2), "checkpoint 'highway'", "env 'racetrack-v1'")
+    assert str(error.value) == (
+        "checkpoint 'highway' was trained at dt_s=1 but env 'racetrack-v1' steps at dt_s=0.2; "
+        "retrain on its data or change the env's policy_frequency"
+    )
+
+
+def test_other_features_are_named():
+    other = SceneSpec(dt_s=1.0, feature_names=(*KINEMATIC_FEATURES, "heading_rad"), feature_scales=(1.0,) * 5)
+    with pytest.raises(UserError, match=r"trained on features \(.*'vy_mps'\) but env 'b' gives \(.*'heading_rad'\)"):
+        SceneSpec(dt_s=1.0).check_compatible(other, "checkpoint 'a'", "env 'b'")
+
+
+def test_what_a_perception_system_sees_may_differ():
+    mine = SceneSpec(dt_s=1.0, perception_m=50.0, max_agents=3, frame=("ego", "world"))
+    mine.check_compatible(SceneSpec(dt_s=1.0 + 1e-7), "a", "b")
+
+
+def test_good_scene_passes_its_check():
+    scene(THREE, rows=5).check()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"valid": np.array([False, True, True])}, "my reader: row 0 must hold the ego"),
+        ({"ids": np.array([0, 8, 8])}, r"my reader: ids must be unique within a scene, got \[0, 8, 8\]"),
+        ({"ids": np.array([0, 8, -3])}, r"my reader: ids of valid agents must be non-negative, got \[0, 8, -3\]"),
+        ({"states": np.full((3, 4), np.inf)}, "my reader: states must be finite"),
+    ],
+    ids=["no_ego", "twice", "negative", "infinite"],
+)
+def test_broken_scene_is_refused(change: Mapping[str, np.ndarray], message: str):
+    good = {"states": np.zeros((3, 4)), "ids": np.array([0, 8, 3]), "valid": np.ones(3, dtype=np.bool_)}
+    with pytest.raises(UserError, match=message):
+        Scene(**(good | change)).check("my reader")
+
+
+def test_padding_may_repeat_ids_and_hold_anything():
+    Scene(
+        np.array([[0.0] * 4, [np.nan] * 4, [np.inf] * 4]), np.array([0, -1, -1]), np.array([True, False, False])
+    ).check()
+
+
+def test_stacking_keeps_the_order_of_rows():
+    first, second = scene(THREE, rows=4), scene({0: (0.5,) * 4}, rows=4)
+    both = batch(first, second)
+    assert len(both) == 2
+    for row, each in enumerate((first, second)):
+        np.testing.assert_array_equal(both.states[row], each.states)
+        np.testing.assert_array_equal(both.ids[row], each.ids)
+        np.testing.assert_array_equal(both.valid[row], each.valid)
+
+
+def test_rows_of_a_batch():
+    scenes = [Scene(np.full((2, 4), float(i)), np.array([i, -1]), np.array([True, False]), float(i)) for i in range(4)]
+    chosen = batch(*scenes)[np.array([3, 1])]
+    assert chosen.heading_rad.tolist() == [3.0, 1.0]
+    assert chosen.ids.tolist() == [[3, -1], [1, -1]]
+    joined = SceneBatch.concatenate(chosen, batch(scenes[0]))
+    assert joined.heading_rad.tolist() == [3.0, 1.0, 0.0]
+    assert joined.states[:, 0, 0].tolist() == [3.0, 1.0, 0.0]
+    assert joined.valid.tolist() == [[True, False]] * 3

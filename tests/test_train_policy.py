@@ -1,0 +1,201 @@
+"""The entry point, in-process and tiny; constant-velocity forecasts need no checkpoint."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import train_policy
+from agents import evaluate
+from agents.runs import load_model
+from agents.training import SaveCheckpoint
+from predictor.errors import run_entry_point
+
+# SB3 silences this warning at import, pytest makes it an error again.
+pytestmark = pytest.mark.filterwarnings("ignore:rich is experimental")
+
+TINY = (
+    "--observe", "constant-velocity", "--envs", "1", "--selections", "1", "--selection-episodes", "1",
+    "--eval-episodes", "1", "--checkpoint-every", "1",
+)  # fmt: skip
+PPO = (*TINY, "--steps", "256")  # two rollouts of 128
+DQN = (*TINY, "--algorithm", "dqn", "--steps", "230")  # learns from step 200 on
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch):
+    def run(*arguments: str) -> None:
+        monkeypatch.setattr(sys, "argv", ["train_policy.py", *arguments])
+        run_entry_point(train_policy.main)
+
+    return run
+
+
+def error_line(capsys: pytest.CaptureFixture[str]) -> str:
+    captured = capsys.readouterr()
+    lines = [line for line in captured.err.splitlines() if line.strip()]
+    assert len(lines) == 1, captured.err
+    assert lines[0].startswith("error: ")
+    return lines[0]
+
+
+def test_one_command_trains_evaluates_and_films(command, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    run = tmp_path / "run"
+    command(*PPO, "--run-dir", str(run))
+    names = {p.name for p in run.iterdir()}
+    assert names == {
+        "config.json", "tb", "checkpoint.zip", "best_model.zip", "policy.zip",
+        "summary.json", "summary.md", "video.mp4",
+    }  # fmt: skip
+    summary = json.loads((run / "summary.json").read_text())
+    assert [row["policy"] for row in summary["policies"]] == ["ppo (constant-velocity)", "random", "idle"]
+    assert {e["seed"] for found in summary["episodes"].values() for e in found} == {evaluate.EVALUATION_SEED}
+    config = json.loads((run / "config.json").read_text())
+    assert config["config"]["steps"] == 256
+    assert config["provenance"][0]["versions"]["stable-baselines3"]
+    assert list((run / "tb").rglob("events.out.tfevents.*"))
+    output = capsys.readouterr().out
+    for text in ("ppo", "random", "idle", "crash rate"):
+        assert text in output
+    assert "video.mp4" in output.replace("\n", "")
+
+
+def test_a_finished_policy_is_evaluated_again(command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    run = tmp_path / "run"
+    command(*PPO, "--run-dir", str(run), "--no-video")
+    arguments = ["evaluate.py", "--run-dir", str(run), "--episodes", "1", "--workers", "1"]
+    monkeypatch.setattr(sys, "argv", arguments)
+    run_entry_point(evaluate.main)
+    again = json.loads((run / "evaluation" / "summary.json").read_text())
+    assert again["episodes"] == json.loads((run / "summary.json").read_text())["episodes"]
+
+
+@pytest.mark.parametrize("arguments", [PPO, DQN], ids=["ppo", "dqn"])
+def test_interrupted_run_goes_on_where_it_was(
+    command, arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    run = tmp_path / "run"
+    algorithm = "dqn" if "dqn" in arguments else "ppo"
+    save = SaveCheckpoint._on_rollout_start
+
+    def save_then_die(self: SaveCheckpoint) -> None:
+        save(self)
+        if self._saved_at >= 128:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SaveCheckpoint, "_on_rollout_start", save_then_die)
+        with pytest.raises(SystemExit) as exit_:
+            command(*arguments, "--run-dir", str(run))
+    assert exit_.value.code == 130
+    interrupted = load_model(run / "checkpoint.zip", algorithm)
+    assert interrupted.num_timesteps == 128
+    assert not (run / "policy.zip").exists()
+
+    started_at: list[int] = []
+    start = SaveCheckpoint._on_training_start
+
+    def note_start(self: SaveCheckpoint) -> None:
+        started_at.append(self.model.num_timesteps)
+        start(self)
+
+    monkeypatch.setattr(SaveCheckpoint, "_on_training_start", note_start)
+    command(*arguments, "--run-dir", str(run), "--no-video", "--resume")
+    assert started_at == [128]
+    finished = load_model(run / "checkpoint.zip", algorithm)
+    assert finished.num_timesteps == int(arguments[-1])
+    if algorithm == "dqn":
+        assert finished.replay_buffer.size() == 230  # type: ignore[attr-defined]
+    assert (run / "policy.zip").exists()
+    assert (run / "summary.md").exists()
+
+
+@pytest.mark.slow
+def test_kill_nine_then_resume(command, tmp_path: Path):
+    run = tmp_path / "run"
+    arguments = [*DQN[:-1], "600", "--run-dir", str(run), "--no-video"]
+    root = Path(train_policy.__file__).parent
+    process = subprocess.Popen([sys.executable, "train_policy.py", *arguments], cwd=root, stderr=subprocess.DEVNULL)
+    while not (run / "checkpoint.zip").exists():
+        assert process.poll() is None
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    reached = load_model(run / "checkpoint.zip", "dqn").num_timesteps
+    assert 0 < reached < 600
+    command(*arguments, "--resume")
+    assert load_model(run / "checkpoint.zip", "dqn").num_timesteps == 600
+
+
+def test_resume_with_another_config_names_the_field(
+    command, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    run = tmp_path / "run"
+    monkeypatch.setattr(train_policy, "train", lambda *arguments: sys.exit(0))
+    with pytest.raises(SystemExit):
+        command(*PPO, "--run-dir", str(run))
+    before = (run / "config.json").read_bytes()
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as exit_:
+        command(*PPO, "--run-dir", str(run), "--resume", "--seed", "3")
+    assert exit_.value.code == 2
+    assert "seed was 0, now 3" in error_line(capsys)
+    with pytest.raises(SystemExit) as exit_:
+        command(*PPO, "--run-dir", str(run))
+    assert exit_.value.code == 2
+    assert "exists; choose another --run-dir" in error_line(capsys)
+    assert (run / "config.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--env-id", "highway-fats-v0"), "cannot make env 'highway-fats-v0'"),
+        (("--checkpoint", "nowhere"), "no checkpoint 'nowhere'"),
+        (("--checkpoint", "highway", "--observe", "none"), "has no effect with observe=none"),
+        (("--steps", "-5"), "steps must be at least 1, got -5"),
+        (("--steps", "0"), "steps must be at least 1, got 0"),
+        (("--envs", "0"), "envs must be at least 1, got 0"),
+        (("--eval-episodes", "0"), "eval_episodes must be at least 1, got 0"),
+        (("--seed", "-1"), "seed must lie in"),
+        (("--device", "tpu9"), "device must be cpu, cuda or auto, got 'tpu9'"),
+        (
+            ("--env-id", "racetrack-v1", "--algorithm", "dqn", "--observe", "none"),
+            "dqn needs a discrete action space",
+        ),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
+)
+def test_bad_input_is_one_clear_line_and_leaves_nothing(
+    command, arguments: tuple[str, ...], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    run = tmp_path / "run"
+    with pytest.raises(SystemExit) as exit_:
+        command(*arguments, "--run-dir", str(run))
+    assert exit_.value.code == 2
+    assert message in error_line(capsys)
+    assert not run.exists()
+
+
+def test_help_explains_every_field(command, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as exit_:
+        command("--help")
+    assert exit_.value.code == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for option in ("--env-id", "--observe", "--checkpoint", "--resume", "--eval-episodes", "--no-video"):
+        assert option in text
+
+
+def test_evaluating_no_run_is_one_clear_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--run-dir", str(tmp_path)])
+    with pytest.raises(SystemExit) as exit_:
+        run_entry_point(evaluate.main)
+    assert exit_.value.code == 2
+    assert "holds no training run" in error_line(capsys)
