@@ -66,8 +66,12 @@ class TrainPolicyConfig:
     device: str = "cpu"
     """Where forecaster and policy run: cpu, cuda or auto."""
 
-    def __post_init__(self) -> None:
-        """Check ranges; what belongs together is checked by the parts."""
+    def check(self) -> None:
+        """Check ranges; what belongs together is checked by the parts.
+
+        Raises:
+            UserError: a number that makes no sense. (In `__post_init__`, tyro would turn it into a box of lines.)
+        """
         for name in ("steps", "envs", "selections", "selection_episodes", "checkpoint_every", "eval_episodes"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -102,6 +106,7 @@ class TrainPolicyConfig:
 
 def run(config: TrainPolicyConfig, console: Console) -> None:
     """Train, evaluate, film. Nothing is written before the input has been checked."""
+    config.check()
     plan = config.plan
     plan.check_action_space(plan.task.check())
     settings = asdict(config) | {"preset": asdict(plan.preset), "attention": asdict(AttentionConfig())}

@@ -240,8 +240,12 @@ class EvaluateConfig:
     device: str = "cpu"
     """Where forecaster and policy run: cpu, cuda or auto."""
 
-    def __post_init__(self) -> None:
-        """Check ranges."""
+    def check(self) -> None:
+        """Check ranges.
+
+        Raises:
+            UserError: a number that makes no sense. (In `__post_init__`, tyro would turn it into a box of lines.)
+        """
         for name in ("episodes", "workers"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -253,6 +257,7 @@ def main() -> None:
     """Entry point."""
     torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
     config = tyro.cli(EvaluateConfig, description=__doc__)
+    config.check()
     run = read_config(config.run_dir)
     task = Task(run["env_id"], run["observe"], run["checkpoint"], config.device)
     task.check()

@@ -45,8 +45,12 @@ class OverheadConfig:
     out: Path | None = None
     """JSON file for the result."""
 
-    def __post_init__(self) -> None:
-        """Check ranges."""
+    def check(self) -> None:
+        """Check ranges.
+
+        Raises:
+            UserError: a value that makes no sense. (In `__post_init__`, tyro would turn it into a box of lines.)
+        """
         for name in ("envs", "steps", "blocks", "threads"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -67,6 +71,7 @@ def run_block(venv: VecEnv, config: OverheadConfig, seed: int) -> float:
 def main() -> None:
     """Entry point."""
     config = tyro.cli(OverheadConfig, description=__doc__)
+    config.check()
     torch.set_num_threads(config.threads)
     vec_class = DummyVecEnv if config.vec == "dummy" else SubprocVecEnv
     plain = make_vec_env(config.env_id, config.envs, vec_env_cls=vec_class)

@@ -44,8 +44,12 @@ class CollectConfig:
     overwrite: bool = False
     """Replace an existing store."""
 
-    def __post_init__(self) -> None:
-        """Check ranges."""
+    def check(self) -> None:
+        """Check ranges.
+
+        Raises:
+            UserError: a value that makes no sense. (In `__post_init__`, tyro would turn it into a box of lines.)
+        """
         for name in ("episodes", "max_steps", "workers"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -98,6 +102,7 @@ def _record(task: tuple[str, str, int, int]) -> Episode:
 def main() -> None:
     """Entry point."""
     config = tyro.cli(CollectConfig, description=__doc__)
+    config.check()
     if config.out.exists() and not config.overwrite:
         raise UserError(f"{config.out} exists; choose another path or pass --overwrite")
     env = make_env(config.env_id)

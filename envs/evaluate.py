@@ -60,8 +60,12 @@ class EvaluateConfig:
     out: Path | None = None
     """Folder for accuracy.json and accuracy.md."""
 
-    def __post_init__(self) -> None:
-        """Check ranges."""
+    def check(self) -> None:
+        """Check ranges.
+
+        Raises:
+            UserError: a value that makes no sense. (In `__post_init__`, tyro would turn it into a box of lines.)
+        """
         for name in ("episodes", "samples", "max_steps", "workers"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -251,6 +255,7 @@ def _overview_cells(row: EnvAccuracy) -> list[str]:
 def main() -> None:
     """Entry point."""
     config = tyro.cli(EvaluateConfig, description=__doc__)
+    config.check()
     console = Console(width=170)
     for env_id in config.env_ids:
         make_env(env_id).close()  # complain about any unknown id before hours of work

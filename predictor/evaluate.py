@@ -51,8 +51,12 @@ class EvaluateConfig:
     device: str = "cpu"
     """"cpu" or "cuda"."""
 
-    def __post_init__(self) -> None:
-        """Check ranges."""
+    def check(self) -> None:
+        """Check ranges.
+
+        Raises:
+            UserError: a value that makes no sense. (In `__post_init__`, tyro would turn it into a box of lines.)
+        """
         for name in ("samples", "history_steps", "max_windows"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -161,6 +165,7 @@ def _plot(
 def main() -> None:
     """Entry point."""
     config = tyro.cli(EvaluateConfig, description=__doc__)
+    config.check()
     rows = evaluate(config)
     dt_s = load_checkpoint(config.checkpoint)[1].spec.dt_s
     Console(width=160).print(accuracy_table(rows, dt_s, f"{config.checkpoint} on {config.data}"))

@@ -80,8 +80,12 @@ class TrainConfig:
     resume: bool = False
     """Continue a run that was stopped; finished runs stay as they are."""
 
-    def __post_init__(self) -> None:
-        """Check ranges."""
+    def check(self) -> None:
+        """Check ranges.
+
+        Raises:
+            UserError: a value that makes no sense. (In `__post_init__`, tyro would turn it into a box of lines.)
+        """
         for name in ("steps", "batch_size", "history_steps", "horizon_steps", "eval_every", "patience", "val_windows"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -361,6 +365,7 @@ def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
 def main() -> None:
     """Entry point."""
     config = tyro.cli(TrainConfig, description=__doc__)
+    config.check()
     checkpoint = train(config)
     print(f"best checkpoint: {checkpoint}")
 

@@ -1,18 +1,21 @@
 """The entry point, in-process and tiny; constant-velocity forecasts need no checkpoint."""
 
+import contextlib
+import io
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 import train_policy
 from agents import evaluate
-from agents.runs import load_model
+from agents.runs import load_model, read_note
 from agents.training import SaveCheckpoint
 from predictor.errors import run_entry_point
 
@@ -28,12 +31,23 @@ DQN = (*TINY, "--algorithm", "dqn", "--steps", "230")  # learns from step 200 on
 
 
 @pytest.fixture
-def command(monkeypatch: pytest.MonkeyPatch):
+def command(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     def run(*arguments: str) -> None:
         monkeypatch.setattr(sys, "argv", ["train_policy.py", *arguments])
         run_entry_point(train_policy.main)
 
     return run
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A run and what it printed."""
+    run = tmp_path_factory.mktemp("finished") / "run"
+    printed = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
+        patch.setattr(sys, "argv", ["train_policy.py", *PPO, "--run-dir", str(run)])
+        run_entry_point(train_policy.main)
+    return run, printed.getvalue()
 
 
 def error_line(capsys: pytest.CaptureFixture[str]) -> str:
@@ -44,9 +58,8 @@ def error_line(capsys: pytest.CaptureFixture[str]) -> str:
     return lines[0]
 
 
-def test_one_command_trains_evaluates_and_films(command, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    run = tmp_path / "run"
-    command(*PPO, "--run-dir", str(run))
+def test_one_command_trains_evaluates_and_films(finished: tuple[Path, str]):
+    run, printed = finished
     names = {p.name for p in run.iterdir()}
     assert names == {
         "config.json", "tb", "checkpoint.zip", "best_model.zip", "policy.zip",
@@ -59,15 +72,21 @@ def test_one_command_trains_evaluates_and_films(command, tmp_path: Path, capsys:
     assert config["config"]["steps"] == 256
     assert config["provenance"][0]["versions"]["stable-baselines3"]
     assert list((run / "tb").rglob("events.out.tfevents.*"))
-    output = capsys.readouterr().out
     for text in ("ppo", "random", "idle", "crash rate"):
-        assert text in output
-    assert "video.mp4" in output.replace("\n", "")
+        assert text in printed
+    assert "video.mp4" in printed.replace("\n", "")
 
 
-def test_a_finished_policy_is_evaluated_again(command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    run = tmp_path / "run"
-    command(*PPO, "--run-dir", str(run), "--no-video")
+def test_best_model_carries_its_result(finished: tuple[Path, str]):
+    run, _ = finished
+    note = read_note(run / "policy.zip")
+    assert note["steps"] == 256
+    assert 0 <= note["selection_return"] <= 30  # highway-env's rewards lie in [0, 1], 30 steps
+    assert (run / "policy.zip").read_bytes() == (run / "best_model.zip").read_bytes()
+
+
+def test_a_finished_policy_is_evaluated_again(finished: tuple[Path, str], monkeypatch: pytest.MonkeyPatch):
+    run, _ = finished
     arguments = ["evaluate.py", "--run-dir", str(run), "--episodes", "1", "--workers", "1"]
     monkeypatch.setattr(sys, "argv", arguments)
     run_entry_point(evaluate.main)
@@ -77,7 +96,7 @@ def test_a_finished_policy_is_evaluated_again(command, tmp_path: Path, monkeypat
 
 @pytest.mark.parametrize("arguments", [PPO, DQN], ids=["ppo", "dqn"])
 def test_interrupted_run_goes_on_where_it_was(
-    command, arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: Callable[..., None], arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     run = tmp_path / "run"
     algorithm = "dqn" if "dqn" in arguments else "ppo"
@@ -116,7 +135,7 @@ def test_interrupted_run_goes_on_where_it_was(
 
 
 @pytest.mark.slow
-def test_kill_nine_then_resume(command, tmp_path: Path):
+def test_kill_nine_then_resume(command: Callable[..., None], tmp_path: Path):
     run = tmp_path / "run"
     arguments = [*DQN[:-1], "600", "--run-dir", str(run), "--no-video"]
     root = Path(train_policy.__file__).parent
@@ -133,7 +152,7 @@ def test_kill_nine_then_resume(command, tmp_path: Path):
 
 
 def test_resume_with_another_config_names_the_field(
-    command, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    command: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     run = tmp_path / "run"
     monkeypatch.setattr(train_policy, "train", lambda *arguments: sys.exit(0))
@@ -172,7 +191,11 @@ def test_resume_with_another_config_names_the_field(
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )
 def test_bad_input_is_one_clear_line_and_leaves_nothing(
-    command, arguments: tuple[str, ...], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: Callable[..., None],
+    arguments: tuple[str, ...],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ):
     run = tmp_path / "run"
     with pytest.raises(SystemExit) as exit_:
@@ -182,7 +205,7 @@ def test_bad_input_is_one_clear_line_and_leaves_nothing(
     assert not run.exists()
 
 
-def test_help_explains_every_field(command, capsys: pytest.CaptureFixture[str]):
+def test_help_explains_every_field(command: Callable[..., None], capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as exit_:
         command("--help")
     assert exit_.value.code == 0

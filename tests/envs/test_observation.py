@@ -26,7 +26,8 @@ from envs.observation import (
 )
 from envs.registry import CHECKPOINTS
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.checkpoint import load_forecaster, shipped
+from predictor.checkpoint import CheckpointInfo, load_forecaster, save_checkpoint, shipped
+from predictor.dgvae import DGVAE, DGVAEConfig
 from predictor.errors import UserError
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 from tests.envs.helpers import (
@@ -245,7 +246,7 @@ def test_ego_alone_is_an_empty_observation():
 
 def test_memory_follows_ids_when_rows_are_sorted_anew():
     rng = np.random.default_rng(3)
-    scenes = drive(rng, batch=2, steps=4)
+    scenes = drive(rng, batch=2, steps=4, present=[6, 6])
     fixed, sorted_anew = stream(HIGHWAY_SPEC, 2), stream(HIGHWAY_SPEC, 2)
     by_row = stream(HIGHWAY_SPEC, 2)
     for scene in scenes:
@@ -253,8 +254,24 @@ def test_memory_follows_ids_when_rows_are_sorted_anew():
         moved = SceneBatch(scene.states[:, order], scene.ids[:, order], scene.valid[:, order], scene.heading_rad)
         expected, actual = fixed.observe(scene), sorted_anew.observe(moved)
         assert_same(actual, expected)
-        wrong = by_row.observe(replace(moved, ids=scene.ids, valid=scene.valid))
+        wrong = by_row.observe(replace(moved, ids=scene.ids))
     assert largest_difference(wrong, expected) > 100 * TOLERANCE  # rows for ids would have been noticed
+
+
+def test_a_newcomer_inherits_nothing_from_the_leaver_of_its_row():
+    """An edge's features come from the memory of its pair alone: a newcomer's are those of a first sight."""
+    scenes = drive(np.random.default_rng(9), batch=1, steps=3, present=[3])
+    ids = scenes[2].ids.copy()
+    ids[0, 2] = 77
+    last = replace(scenes[2], ids=ids)
+    seasoned, fresh = stream(HIGHWAY_SPEC), stream(HIGHWAY_SPEC)
+    for scene in scenes[:2]:
+        seasoned.observe(scene)
+    actual, first_sight = seasoned.observe(last)["edge_features"][0], fresh.observe(last)["edge_features"][0]
+    newcomer = int(np.flatnonzero(others_by_distance(last)[0] == 1)[0])
+    veteran = 1 - newcomer
+    np.testing.assert_allclose(actual[newcomer], first_sight[newcomer], rtol=TOLERANCE, atol=TOLERANCE)
+    assert np.abs(actual[veteran] - first_sight[veteran]).max() > 1e-3
 
 
 def test_a_row_of_a_batch_is_as_if_alone():
@@ -358,9 +375,6 @@ def test_features_that_differ_are_both_named(tmp_path: Path):
         feature_scales=(100.0, 100.0, 30.0, 30.0, 1.0),
     )
     path = tmp_path / "wide"
-    from predictor.checkpoint import CheckpointInfo, save_checkpoint
-    from predictor.dgvae import DGVAE, DGVAEConfig
-
     config = DGVAEConfig(hidden_dim=4, rnn_dim=4, head_dim=4, message_dim=4, decoder_dim=4, edge_feature_dim=2)
     save_checkpoint(path, DGVAE(wider, config, 2), CheckpointInfo(wider, config, 2))
     with pytest.raises(UserError, match=r"trained on features \(.*'heading_rad'\) but env 'merge-v1' gives \('x_m'"):
