@@ -15,8 +15,8 @@ help: ## list the targets
 	.venv/bin/python -m pip install -c constraints.txt -e '.[all,dev]'
 	touch $@
 
-train: .venv/.installed ## train a policy on highway-fast-v0 into RUN_DIR
-	.venv/bin/python train_policy.py --run-dir $(RUN_DIR)
+train: .venv/.installed ## train a policy on highway-fast-v0 into RUN_DIR (continues a run that was stopped), evaluate and film it
+	.venv/bin/python train_policy.py --resume --run-dir $(RUN_DIR)
 
 # The shape checks break torch.compile, so its tests run without them; status 5 means that there are none.
 test: .venv/.installed ## run the tests, TEST_JOBS at a time

@@ -1,7 +1,7 @@
 """What foresight costs: steps/s of plain environments against the same ones under `VecForecast`, in one run.
 
-`python benchmarks/wrapper_overhead.py` times both in turn, block by block, on the same seeds and actions, and prints the
-median ratio. Absolute numbers depend on the machine; the ratio is the result.
+`python benchmarks/wrapper_overhead.py` times both in turn, block by block, on the same seeds and actions, and prints
+the median ratio. Absolute numbers depend on the machine; the ratio is the result.
 """
 
 import json

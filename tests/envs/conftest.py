@@ -22,8 +22,16 @@ def highway_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture(scope="session")
-def map_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The same for a fixed map: world coordinates are kept."""
-    from tests.envs.helpers import MAP_SPEC, save_tiny
+def racetrack_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The same for ids that step at 0.2 s."""
+    from tests.envs.helpers import RACETRACK_SPEC, save_tiny
 
-    return save_tiny(tmp_path_factory.mktemp("checkpoints") / "tiny-map", MAP_SPEC)
+    return save_tiny(tmp_path_factory.mktemp("checkpoints") / "tiny-racetrack", RACETRACK_SPEC)
+
+
+@pytest.fixture(scope="session")
+def checkpoint_of(highway_checkpoint: str, racetrack_checkpoint: str) -> dict[str, str]:
+    """A tiny checkpoint that fits, for each registered id."""
+    from envs.registry import CHECKPOINTS
+
+    return {i: racetrack_checkpoint if i.startswith("racetrack") else highway_checkpoint for i in CHECKPOINTS}

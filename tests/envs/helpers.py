@@ -24,6 +24,7 @@ HORIZON = 3
 TOLERANCE = 1e-5
 HIGHWAY_SPEC = SceneSpec(dt_s=1.0, frame=("ego", "world"), perception_m=PERCEPTION_M, max_agents=MAX_AGENTS)
 MAP_SPEC = replace(HIGHWAY_SPEC, frame=("world", "world"))
+RACETRACK_SPEC = replace(MAP_SPEC, dt_s=0.2)
 
 SIZES = DGVAEConfig(
     hidden_dim=8,
