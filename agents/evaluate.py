@@ -138,7 +138,7 @@ def mean_and_standard_error(values: Sequence[float]) -> tuple[float, float]:
 def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
     """Summary of one policy's episodes."""
     return_mean, return_se = mean_and_standard_error([e.episode_return for e in episodes])
-    length_mean, length_se = mean_and_standard_error([e.length for e in episodes])
+    length_mean, length_se = mean_and_standard_error([float(e.length) for e in episodes])
     crashes = sum(e.crashed for e in episodes)
     return PolicySummary(
         policy,

@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from envs.egos import make_ego
+from envs.egos import env_for_ego, make_ego
 from envs.readers import reader_for
 from envs.registry import make_env
 from predictor.data.store import Episode, StoreInfo, write_store
@@ -72,7 +72,7 @@ def collect(config: CollectConfig) -> Iterator[Episode]:
         yield from pool.imap(_record, tasks, chunksize=4)
 
 
-_worker_envs: dict[str, gym.Env] = {}
+_worker_envs: dict[tuple[str, str], gym.Env] = {}
 
 
 def _limit_threads() -> None:
@@ -83,9 +83,10 @@ def _limit_threads() -> None:
 
 def _record(task: tuple[str, str, int, int]) -> Episode:
     env_id, ego_name, seed, max_steps = task
-    if env_id not in _worker_envs:
-        _worker_envs[env_id] = make_env(env_id, disable_env_checker=True)
-    env = _worker_envs[env_id]
+    view = ego_name if ego_name.endswith(".zip") else ""
+    if (env_id, view) not in _worker_envs:
+        _worker_envs[env_id, view] = env_for_ego(make_env(env_id, disable_env_checker=True), ego_name)
+    env = _worker_envs[env_id, view]
     reader = reader_for(env)
     obs: Any
     obs, _ = env.reset(seed=seed)
@@ -107,7 +108,7 @@ def main() -> None:
         raise UserError(f"{config.out} exists; choose another path or pass --overwrite")
     env = make_env(config.env_id)
     for name in config.ego:
-        make_ego(name, env, np.random.default_rng(0))
+        make_ego(name, env_for_ego(env, name), np.random.default_rng(0))
     info = StoreInfo(
         reader_for(env).spec, config.env_id, provenance(("highway-env", "gymnasium", "numpy")) | {"seed": config.seed}
     )

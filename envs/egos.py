@@ -1,14 +1,20 @@
 """Ways to drive the ego while data is collected or accuracy is measured."""
 
+import functools
+import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 from highway_env.vehicle.controller import ControlledVehicle
 
+from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.errors import UserError
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
 
 Ego = Callable[[Any], Any]
 """From an observation to an action."""
@@ -39,7 +45,7 @@ def make_ego(name: str, env: gym.Env, rng: np.random.Generator) -> Ego:
     if name == "keep-lane":
         return _keep_lane(env, rng)
     if name.endswith(".zip"):
-        return _trained(Path(name))
+        return _trained(name)
     raise UserError(f"ego must be one of {', '.join(EGO_NAMES)} or the path of a policy .zip, got '{name}'")
 
 
@@ -93,20 +99,57 @@ def _keep_lane(env: gym.Env, rng: np.random.Generator) -> Ego:
     return act
 
 
-def _trained(path: Path) -> Ego:
-    from stable_baselines3 import DQN, PPO
-    from stable_baselines3.common.base_class import BaseAlgorithm
+def env_for_ego(env: gym.Env, name: str) -> gym.Env:
+    """The env as the ego wants to see it: with forecasts for a policy that was trained on them, else as it is.
 
-    if not path.exists():
+    Raises:
+        UserError: no such policy, or one of other observations.
+    """
+    if not name.endswith(".zip"):
+        return env
+    wanted = load_policy(name).observation_space
+    if sees_forecasts(name):
+        from envs.wrappers import ForecastObservation  # the wrappers need no egos; most egos need no wrappers
+
+        env = ForecastObservation(env, _forecaster_of(Path(name)))
+    if env.observation_space != wanted:
+        raise UserError(f"policy {name} was trained on {wanted}, but the env gives {env.observation_space}")
+    return env
+
+
+def sees_forecasts(name: str) -> bool:
+    """Whether the ego is a policy that was trained on forecasts."""
+    return name.endswith(".zip") and isinstance(load_policy(name).observation_space, gym.spaces.Dict)
+
+
+@functools.cache
+def load_policy(path: str) -> "BaseAlgorithm":
+    """A PPO or DQN policy of Stable-Baselines3, loaded once per process. Its zip holds pickled data: trust its source.
+
+    Raises:
+        UserError: not there, or neither PPO nor DQN.
+    """
+    from stable_baselines3 import DQN, PPO
+
+    if not Path(path).exists():
         raise UserError(f"no policy at {path}; train one with python train_policy.py")
-    model: BaseAlgorithm | None = None
     for algorithm in (PPO, DQN):
         try:
-            model = algorithm.load(path, device="cpu")
-            break
+            return algorithm.load(path, device="cpu")
         except (TypeError, KeyError, AttributeError, ValueError):
             continue
-    if model is None:
-        raise UserError(f"{path} is neither a PPO nor a DQN policy")
-    policy = model
+    raise UserError(f"{path} is neither a PPO nor a DQN policy")
+
+
+def _trained(path: str) -> Ego:
+    policy = load_policy(path)
     return lambda obs: policy.predict(obs, deterministic=True)[0]
+
+
+def _forecaster_of(policy: Path) -> str | None:
+    """The checkpoint that the policy's run folder names; None (the one that ships) if there is no such folder."""
+    try:
+        config = json.loads((policy.parent / "config.json").read_text())["config"]
+    except (OSError, ValueError, KeyError):
+        return None
+    return CONSTANT_VELOCITY if config.get("observe") == CONSTANT_VELOCITY else config.get("checkpoint")

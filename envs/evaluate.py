@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from envs.egos import make_ego
+from envs.egos import env_for_ego, make_ego, sees_forecasts
 from envs.observation import into_ego_axes, others_by_distance
 from envs.readers import HighwayReader, reader_for
 from envs.registry import CHECKPOINTS, checkpoint_for, make_env
@@ -46,7 +46,7 @@ class EvaluateConfig:
     episodes: int = 50
     """Episodes per environment."""
     ego: str = "varied"
-    """Who drives: random, idle, varied, keep-lane, or the path of a policy .zip that sees the env's own observation."""
+    """Who drives: random, idle, varied, keep-lane, or the path of a policy .zip (which gets the measured forecasts)."""
     seed: int = 900_000
     """Episode i is seeded with seed + i; the shipped checkpoints were trained on seeds from 100,000 on."""
     samples: int = 20
@@ -120,7 +120,7 @@ def evaluate_env(config: EvaluateConfig, env_id: str) -> EnvAccuracy:
     env = make_env(env_id)
     spec = reader_for(env).spec
     forecaster = load_forecaster(checkpoint, spec, f"env '{env_id}'")
-    make_ego(config.ego, env, np.random.default_rng(0))
+    make_ego(config.ego, env_for_ego(env, config.ego), np.random.default_rng(0))
     horizon = config.horizon_steps or forecaster.horizon_steps
     tasks = [
         _Task(env_id, checkpoint, config.ego, config.seed + i, config.samples, horizon, config.max_steps)
@@ -168,7 +168,8 @@ def _episode(task: _Task) -> tuple[Outcome, Outcome]:
         straight.append(baseline.forecast().xy[0])
         if step == task.max_steps:
             break
-        obs, _, terminated, truncated, _ = env.step(ego(obs["observation"]))
+        seen = {**obs, "forecast": obs["forecast"][:, 0]} if sees_forecasts(task.ego) else obs["observation"]
+        obs, _, terminated, truncated, _ = env.step(ego(seen))
         if terminated or truncated:
             truths.append(reader.read_all(env))
             break

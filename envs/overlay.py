@@ -13,10 +13,10 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 Color = tuple[int, int, int]
-Polyline = Float[np.ndarray, "points 2"]
+Polyline = Float[np.ndarray, "_ 2"]
 
 _SMOOTHING = 2  # lines are drawn this much larger and scaled down
-_MARGIN_PX = 8
+_MARGIN_PX = 8.0
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 def _draw_captions(pen: _Pen, size: tuple[int, int], caption: str) -> None:
     """The caption in the upper left corner, the legend in the lower left one."""
-    height = pen.style.text_px + 8
+    height = pen.style.text_px + 8.0
     pen.box(_MARGIN_PX, _MARGIN_PX, 3 * _MARGIN_PX + pen.text_width(caption), _MARGIN_PX + height)
     pen.text(2 * _MARGIN_PX, _MARGIN_PX + height / 2, caption)
 

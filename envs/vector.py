@@ -128,9 +128,7 @@ class VectorForecast(gym.vector.VectorWrapper):
         self._ended = np.zeros(env.num_envs, dtype=np.bool_)
         self._entries: Observations = {}
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset all environments, or those of `options["reset_mask"]`, and forget their histories."""
         mask = (options or {}).get("reset_mask")
         observations, infos = self.env.reset(seed=seed, options=options)

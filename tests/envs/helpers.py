@@ -1,13 +1,16 @@
-"""What several test files of `envs` share: tiny checkpoints, short episodes, and a reference that cannot mix episodes."""
+"""What several test files of `envs` share: tiny checkpoints, short episodes, readers and references."""
 
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 import torch
+from highway_env.vehicle.behavior import IDMVehicle
 
 from envs.observation import ForecastConfig, ForecastStream
 from envs.readers import HighwayReader
@@ -15,6 +18,7 @@ from envs.registry import make_env
 from envs.wrappers import SceneObservation
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE, DGVAEConfig
+from predictor.errors import run_entry_point
 from predictor.forecaster import Forecaster
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 
@@ -53,6 +57,11 @@ def tiny_model(spec: SceneSpec, num_edge_types: int = 2) -> DGVAE:
 def save_tiny(path: Path, spec: SceneSpec) -> str:
     save_checkpoint(path, tiny_model(spec), CheckpointInfo(spec, SIZES, HORIZON))
     return str(path)
+
+
+def light_env(env_id: str) -> gym.Env:
+    """Any registered id; highway-v0 with a quarter of its 50 vehicles, which cost it 0.2 s per step."""
+    return make_env(env_id, config={"vehicles_count": 12} if env_id == "highway-v0" else None)
 
 
 def short_env(duration: int, vehicles: int = 8, **kwargs: Any) -> gym.Env:
@@ -138,6 +147,34 @@ def random_forecast(
     )
 
 
+def run_command(
+    main: Callable[[], None], arguments: Sequence[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> tuple[int, list[str], str]:
+    """Exit status, lines on stderr, and stdout of an entry point, run in this process."""
+    monkeypatch.setattr(sys, "argv", ["command", *arguments])
+    code = 0
+    try:
+        run_entry_point(main)
+    except SystemExit as stop:
+        assert isinstance(stop.code, int)
+        code = stop.code
+    captured = capsys.readouterr()
+    return code, captured.err.strip().splitlines(), captured.out
+
+
+class Cruiser(IDMVehicle):
+    """Keeps its speed and its course, whatever happens."""
+
+    def act(self, action: Any = None) -> None:
+        self.action = {"steering": 0.0, "acceleration": 0.0}
+
+
+def cruising_env(**kwargs: Any) -> gym.Env:
+    """highway-fast-v0 among cars for which constant velocity is the truth."""
+    others = "tests.envs.helpers.Cruiser"
+    return make_env("highway-fast-v0", config={"other_vehicles_type": others, "vehicles_count": 6}, **kwargs)
+
+
 class ShuffledReader(HighwayReader):
     """Sees what `HighwayReader` sees, with the others' rows in another order at each step."""
 
@@ -166,4 +203,3 @@ class NamedReader:
         valid = np.zeros(self.spec.max_agents, dtype=np.bool_)
         ids[0], valid[0] = 0, True
         return Scene(states, ids, valid)
-

@@ -99,7 +99,9 @@ def test_entries_equal_a_plain_loop(seed: int, batch: int, agents: int, samples:
     assert {value.dtype for value in entries.values()} == {np.dtype(np.float32)}
 
 
-def one_scene(*others: tuple[float, float, float, float], ego: Any = (0, 0, 0, 0), heading_rad: float = 0) -> SceneBatch:
+def one_scene(
+    *others: tuple[float, float, float, float], ego: Any = (0, 0, 0, 0), heading_rad: float = 0
+) -> SceneBatch:
     states = np.array([ego, *others], dtype=np.float64)
     valid = np.ones(len(states), dtype=np.bool_)
     return SceneBatch.stack([Scene(states, np.arange(len(states)), valid, float(heading_rad))])

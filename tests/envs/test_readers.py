@@ -12,7 +12,7 @@ from envs.registry import CHECKPOINTS, make_env
 from envs.wrappers import SceneObservation
 from predictor.errors import ProtocolError, UserError
 from predictor.scene import PADDING_ID, Scene
-from tests.envs.helpers import random_actions, short_env
+from tests.envs.helpers import light_env, random_actions, short_env
 
 FRAMES = {
     "highway-v0": ("ego", "world"),
@@ -34,7 +34,7 @@ STEPS = 4
 
 def place(env: gym.Env, *positions_m: tuple[float, float], speed_mps: float = 20.0, heading_rad: float = 0.0) -> None:
     """Put exactly these vehicles, and the ego at the origin, on the road."""
-    road, ego = env.unwrapped.road, env.unwrapped.vehicle  # type: ignore[attr-defined]
+    road, ego = env.unwrapped.road, env.unwrapped.vehicle
     ego.position, ego.heading, ego.speed = np.zeros(2), heading_rad, speed_mps
     road.vehicles = [ego] + [Vehicle(road, np.array(p), heading_rad, speed_mps) for p in positions_m]
 
@@ -44,7 +44,7 @@ def by_object(env: gym.Env, reader: HighwayReader) -> dict[int, Vehicle]:
     scene = reader.read(env)
     found = {}
     for state, number in zip(scene.states[scene.valid], scene.ids[scene.valid], strict=True):
-        (vehicle,) = [v for v in env.unwrapped.road.vehicles if np.array_equal(v.position, state[:2])]  # type: ignore[attr-defined]
+        (vehicle,) = [v for v in env.unwrapped.road.vehicles if np.array_equal(v.position, state[:2])]
         found[int(number)] = vehicle
     return found
 
@@ -62,7 +62,7 @@ def test_frames_cover_the_registry():
 
 @pytest.mark.parametrize("env_id", CHECKPOINTS)
 def test_every_registered_id_reads(env_id: str):
-    env = make_env(env_id)
+    env = light_env(env_id)
     reader = reader_for(env)
     assert isinstance(reader, HighwayReader)
     env.reset(seed=3)
@@ -76,12 +76,12 @@ def test_every_registered_id_reads(env_id: str):
         assert np.isfinite(scene.states).all()
         assert (scene.ids[~scene.valid] == PADDING_ID).all()
         assert (scene.states[~scene.valid] == 0).all()
-        np.testing.assert_array_equal(scene.states[0, :2], env.unwrapped.vehicle.position)  # type: ignore[attr-defined]
+        np.testing.assert_array_equal(scene.states[0, :2], env.unwrapped.vehicle.position)
         for number, vehicle in by_object(env, reader).items():
             assert seen.setdefault(number, vehicle) is vehicle
-        before = env.unwrapped.steps  # type: ignore[attr-defined]
+        before = env.unwrapped.steps
         _, _, terminated, truncated, _ = env.step(action)
-        simulated_s = (env.unwrapped.steps - before) / env.unwrapped.config["simulation_frequency"]  # type: ignore[attr-defined]
+        simulated_s = (env.unwrapped.steps - before) / env.unwrapped.config["simulation_frequency"]
         assert spec.dt_s == pytest.approx(simulated_s)
         if terminated or truncated:
             break
@@ -93,15 +93,15 @@ def test_time_step_is_what_the_simulator_simulates(policy_hz: int):
     """15 Hz is no multiple of 2 Hz: highway-env then simulates 7 of 7.5 frames."""
     env = make_env("merge-v1", config={"policy_frequency": policy_hz})
     env.reset(seed=0)
-    start_m = float(env.unwrapped.vehicle.position[0])  # type: ignore[attr-defined]
-    speed_mps = float(env.unwrapped.vehicle.speed)  # type: ignore[attr-defined]
+    start_m = float(env.unwrapped.vehicle.position[0])
+    speed_mps = float(env.unwrapped.vehicle.speed)
     env.step(idle_action(env))
-    travelled_m = float(env.unwrapped.vehicle.position[0]) - start_m  # type: ignore[attr-defined]
+    travelled_m = float(env.unwrapped.vehicle.position[0]) - start_m
     assert reader_for(env).spec.dt_s == pytest.approx(travelled_m / speed_mps, rel=1e-3)
 
 
 def test_states_are_position_and_velocity_of_each_vehicle(env: gym.Env):
-    road = env.unwrapped.road  # type: ignore[attr-defined]
+    road = env.unwrapped.road
     place(env, (10.0, 4.0), (-20.0, 0.0), heading_rad=0.3)
     road.vehicles[2].speed = 7.0
     scene = reader_for(env).read(env)
@@ -113,7 +113,7 @@ def test_states_are_position_and_velocity_of_each_vehicle(env: gym.Env):
 
 def test_nearest_come_first_and_the_ego_before_all(env: gym.Env):
     place(env, (30.0, 0.0), (0.0, 0.0), (-10.0, 0.0), (0.0, 12.0))
-    vehicles = env.unwrapped.road.vehicles  # type: ignore[attr-defined]
+    vehicles = env.unwrapped.road.vehicles
     vehicles.append(vehicles.pop(0))  # the ego is last in highway-env's own list, and shares its place with another
     found = by_object_order(env, reader_for(env).read(env))
     assert found == [vehicles[-1], vehicles[1], vehicles[2], vehicles[3], vehicles[0]]
@@ -121,8 +121,8 @@ def test_nearest_come_first_and_the_ego_before_all(env: gym.Env):
 
 def by_object_order(env: gym.Env, scene: Scene) -> list[Vehicle]:
     """The vehicles of the rows; the ego first among those that share its place."""
-    ego = env.unwrapped.vehicle  # type: ignore[attr-defined]
-    everyone = [ego] + [v for v in env.unwrapped.road.vehicles if v is not ego]  # type: ignore[attr-defined]
+    ego = env.unwrapped.vehicle
+    everyone = [ego] + [v for v in env.unwrapped.road.vehicles if v is not ego]
     found: list[Vehicle] = []
     for state in scene.states[scene.valid]:
         found.append(next(v for v in everyone if v not in found and np.array_equal(v.position, state[:2])))
@@ -147,7 +147,7 @@ def test_what_is_out_of_sight_changes_nothing(env: gym.Env):
     place(env, (10.0, 0.0), (200.0, 0.0))
     reader = reader_for(env, perception_m=100.0)
     before = reader.read(env)
-    hidden = env.unwrapped.road.vehicles[2]  # type: ignore[attr-defined]
+    hidden = env.unwrapped.road.vehicles[2]
     hidden.position, hidden.speed = np.array([-150.0, 4.0]), 3.0
     after = reader.read(env)
     for name in ("states", "ids", "valid"):
@@ -166,7 +166,7 @@ def test_truth_has_everyone(env: gym.Env):
 def test_an_id_stays_with_its_vehicle_when_lists_are_sorted_anew(env: gym.Env):
     reader = reader_for(env)
     rng = np.random.default_rng(0)
-    vehicles = env.unwrapped.road.vehicles  # type: ignore[attr-defined]
+    vehicles = env.unwrapped.road.vehicles
     number_of: dict[int, int] = {}
     orders = []
     for action in random_actions(env, 5):
@@ -184,7 +184,7 @@ def test_a_vehicle_that_returns_is_the_same(env: gym.Env):
     place(env, (10.0, 0.0), (20.0, 0.0))
     reader = reader_for(env, perception_m=100.0)
     first = reader.read(env).ids[:3].tolist()
-    wanderer = env.unwrapped.road.vehicles[1]  # type: ignore[attr-defined]
+    wanderer = env.unwrapped.road.vehicles[1]
     wanderer.position = np.array([500.0, 0.0])
     assert reader.read(env).ids[:3].tolist() == [first[0], first[2], PADDING_ID]
     wanderer.position = np.array([30.0, 0.0])
@@ -194,7 +194,7 @@ def test_a_vehicle_that_returns_is_the_same(env: gym.Env):
 def test_a_number_is_never_given_twice_although_python_reuses_addresses(env: gym.Env):
     place(env)
     reader = reader_for(env)
-    road = env.unwrapped.road  # type: ignore[attr-defined]
+    road = env.unwrapped.road
     numbers, addresses = [], []
     for _ in range(20):
         road.vehicles.append(IDMVehicle(road, np.array([10.0, 0.0])))
@@ -213,12 +213,12 @@ def test_numbering_restarts_at_reset():
     env.reset(seed=6)
     again, _ = env.reset(seed=5)
     np.testing.assert_array_equal(again["scene_ids"], first["scene_ids"])
-    assert first["scene_ids"].max() < len(env.unwrapped.road.vehicles)  # type: ignore[attr-defined]
+    assert first["scene_ids"].max() < len(env.unwrapped.road.vehicles)
 
 
 def test_without_vehicles_there_is_nothing_to_read(env: gym.Env):
     reader = reader_for(env)
-    env.unwrapped.road = None  # type: ignore[attr-defined]
+    env.unwrapped.road = None
     with pytest.raises(ProtocolError, match="no vehicles yet; call reset"):
         reader.read(env)
 

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from tests.envs.helpers import (
     assert_same,
     forecast_of_history,
     largest_difference,
+    light_env,
     play,
     random_actions,
     short_env,
@@ -61,21 +63,21 @@ def ignore_checker_warnings(test: Any) -> Any:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("env_id", CHECKPOINTS)
 def test_gymnasium_accepts(env_id: str, kind: str, checkpoint_of: dict[str, str]):
-    check_env(wrap(make_env(env_id), kind, checkpoint_of[env_id]), skip_render_check=True)
+    check_env(wrap(light_env(env_id), kind, checkpoint_of[env_id]), skip_render_check=True)
 
 
 @ignore_checker_warnings
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("env_id", CHECKPOINTS)
 def test_sb3_accepts(env_id: str, kind: str, checkpoint_of: dict[str, str]):
-    check_env_for_sb3(wrap(make_env(env_id), kind, checkpoint_of[env_id]))
+    check_env_for_sb3(wrap(light_env(env_id), kind, checkpoint_of[env_id]))
 
 
 @pytest.mark.parametrize("num_samples", [1, 3])
 @pytest.mark.parametrize("env_id", CHECKPOINTS)
 def test_same_seed_same_sequences(env_id: str, num_samples: int, checkpoint_of: dict[str, str]):
     def make() -> gym.Env:
-        return ForecastObservation(make_env(env_id), checkpoint_of[env_id], num_samples=num_samples)
+        return ForecastObservation(light_env(env_id), checkpoint_of[env_id], num_samples=num_samples)
 
     env = make()
     actions = random_actions(env, 3)
@@ -96,7 +98,7 @@ def test_own_observation_and_rewards_are_untouched(env_id: str, kind: str, check
     assert [step[1:] for step in actual] == [step[1:] for step in expected]
     for (obs, *_), (own, *_) in zip(actual, expected, strict=True):
         if kind == "flat":
-            obs = gym.spaces.unflatten(wrapped._dict_space, obs)  # type: ignore[attr-defined]
+            obs = gym.spaces.unflatten(wrapped._dict_space, obs)
         np.testing.assert_array_equal(obs["observation"], own)
 
 
@@ -109,7 +111,7 @@ def test_scene_entries(highway_checkpoint: str):
     assert set(obs) == {"observation", *SCENE_KEYS}
     np.testing.assert_array_equal(obs["scene_states"], env.scene.states)
     np.testing.assert_array_equal(obs["scene_ids"], env.scene.ids)
-    np.testing.assert_array_equal(obs["scene_states"][0, :2], env.unwrapped.vehicle.position)  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(obs["scene_states"][0, :2], env.unwrapped.vehicle.position)
     assert obs["scene_states"].dtype == np.float64
     assert env.scene_source == "highway-fast-v0"
     assert (env.scene_spec.perception_m, env.scene_spec.max_agents) == (PERCEPTION_M, MAX_AGENTS)
@@ -157,7 +159,7 @@ def test_constant_velocity_meets_the_simulator():
     """The first forecast step of an unperturbed car is where highway-env then puts it."""
     env = ForecastObservation(short_env(10), "constant-velocity")
     obs, _ = env.reset(seed=0)
-    ego, ahead = env.unwrapped.vehicle, env.unwrapped.road.vehicles[1]  # type: ignore[attr-defined]
+    ego, ahead = env.unwrapped.vehicle, env.unwrapped.road.vehicles[1]
     ahead.act = lambda action=None: ahead.action.update(acceleration=0.0, steering=0.0)
     row = int(np.argmin(np.abs(obs["agents"][:, :2] - (ahead.position - ego.position)).sum(-1)))
     before_m = ego.position.copy()
@@ -277,7 +279,7 @@ def test_scene_spec_round_trips():
 
 def test_make_takes_it_as_an_additional_wrapper(highway_checkpoint: str):
     wrapper = ForecastObservation.wrapper_spec(checkpoint=highway_checkpoint, num_samples=2)
-    made = gym.make("highway-fast-v0", additional_wrappers=(wrapper,))
+    made = gym.make(replace(gym.spec("highway-fast-v0"), additional_wrappers=(wrapper,)))
     by_hand = ForecastObservation(gym.make("highway-fast-v0"), highway_checkpoint, num_samples=2)
     assert isinstance(made, ForecastObservation)
     for (obs, *_), (want, *_) in zip(play(made, [1, 0], 9), play(by_hand, [1, 0], 9), strict=True):
@@ -289,7 +291,7 @@ def test_make_takes_it_as_an_additional_wrapper(highway_checkpoint: str):
 
 @pytest.mark.parametrize("env_id", CHECKPOINTS)
 def test_no_name_is_needed_where_a_checkpoint_ships(env_id: str):
-    env = ForecastObservation(make_env(env_id))
+    env = ForecastObservation(light_env(env_id))
     steps = play(env, random_actions(env, 2), seed=0)
     for obs, *_ in steps:
         assert obs in env.observation_space
@@ -306,7 +308,7 @@ def test_registry_names_the_ids_it_knows():
 
 
 def test_time_steps_that_differ_are_both_named(highway_checkpoint: str):
-    with pytest.raises(UserError, match=r"tiny-highway' was trained at dt_s=1 but env 'racetrack-v1' steps at dt_s=0.2"):
+    with pytest.raises(UserError, match="tiny-highway' was trained at dt_s=1 but env 'racetrack-v1' steps at dt_s=0.2"):
         ForecastObservation(make_env("racetrack-v1"), highway_checkpoint)
 
 

@@ -65,7 +65,7 @@ def window_without_noise(forecaster: DGVAE, states: Tensor, valid: Tensor, last_
 
 
 @every_kind
-@settings(max_examples=15)
+@settings(max_examples=10)
 @given(valid=presence(), seed=seeds)
 def test_streaming_encodes_what_the_whole_history_at_once_does(
     size: Any, residual: Any, types: int, valid: Tensor, seed: int
@@ -82,7 +82,7 @@ def test_streaming_encodes_what_the_whole_history_at_once_does(
 
 
 @every_kind
-@settings(max_examples=15)
+@settings(max_examples=10)
 @given(valid=presence(), seed=seeds, last_observed=st.tuples(*[st.integers(0, TIME - 1)] * BATCH))
 def test_streaming_forecasts_what_the_window_does(
     size: Any, residual: Any, types: int, valid: Tensor, seed: int, last_observed: tuple[int, ...]
@@ -131,7 +131,7 @@ def test_memory_does_not_grow():
 
 
 @every_kind
-@settings(max_examples=15)
+@settings(max_examples=10)
 @given(valid=presence(), seed=seeds, now=st.integers(0, TIME - 2))
 def test_the_future_changes_the_posterior_and_nothing_else(
     size: Any, residual: Any, types: int, valid: Tensor, seed: int, now: int
@@ -180,7 +180,7 @@ PAIRWISE = {"prior", "posterior", "features", "streamed_probs", "streamed_featur
 
 
 @pytest.mark.parametrize("frame", [("world", "world"), ROAD], ids=["world", "road"])
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(valid=presence(), seed=seeds, padding=st.integers(1, 3))
 def test_padding_is_invisible(frame: Any, valid: Tensor, seed: int, padding: int):
     forecaster = model(num_edge_types=3, frame=frame)
@@ -198,13 +198,13 @@ def test_padding_is_invisible(frame: Any, valid: Tensor, seed: int, padding: int
         torch.testing.assert_close(ours, expected, rtol=1e-5, atol=2e-5, msg=lambda m, n=name: f"{n}: {m}")
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(valid=presence(ego=False), seed=seeds, order=st.permutations(range(AGENTS)))
 def test_permuting_agents_permutes_outputs(valid: Tensor, seed: int, order: list[int]):
     check_permutation(model(num_edge_types=3, has_ego=False), valid, seed, order)
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(valid=presence(), seed=seeds, others=st.permutations(range(1, AGENTS)))
 def test_permuting_others_around_the_ego_permutes_outputs(valid: Tensor, seed: int, others: list[int]):
     check_permutation(model(num_edge_types=3, frame=ROAD), valid, seed, [0, *others])

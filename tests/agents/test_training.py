@@ -1,0 +1,142 @@
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
+
+from agents.evaluate import EVALUATION_SEED
+from agents.features import ForecastAttention
+from agents.presets import DQNPreset, PPOPreset, preset_for
+from agents.rows import SeededEpisodes, Task, make_rows
+from agents.runs import read_note, save_model
+from agents.training import SELECTION_SEED, SaveCheckpoint, SelectBest, TrainingPlan, make_model
+from predictor.errors import UserError
+
+CONSTANT_VELOCITY = Task("highway-fast-v0", "constant-velocity")
+
+
+class Coin(gym.Env[np.ndarray, np.int64]):
+    """Three steps; pays for action 1."""
+
+    observation_space = gym.spaces.Box(0, 1, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._steps = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._steps += 1
+        return np.zeros(1, np.float32), float(action), self._steps == 3, False, {}
+
+
+def make_selection(rows: int) -> VecEnv:
+    return VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Coin())] * rows))
+
+
+def make_ppo() -> PPO:
+    venv = VecMonitor(DummyVecEnv([Coin]))
+    return PPO("MlpPolicy", venv, n_steps=8, batch_size=8, n_epochs=1, seed=0, device="cpu")
+
+
+def plan(**changes: Any) -> TrainingPlan:
+    defaults = {"task": CONSTANT_VELOCITY, "algorithm": "ppo", "steps": 10, "num_rows": 1, "seed": 0}
+    return TrainingPlan(**(defaults | changes))
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_every_selection_plays_the_same_seeds(rows: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    played: list[int] = []
+    queue = SeededEpisodes.queue
+
+    def note(self: SeededEpisodes, seeds: Sequence[int], ego: str | None = None) -> None:
+        played.extend(seeds)
+        queue(self, seeds, ego)
+
+    monkeypatch.setattr(SeededEpisodes, "queue", note)
+    make_ppo().learn(32, callback=SelectBest(make_selection(rows), tmp_path / "best.zip", 5, every_steps=16))
+    assert played == [SELECTION_SEED + i for i in range(5)] * 2
+
+
+def test_there_is_always_a_selection_at_the_end(tmp_path: Path):
+    make_ppo().learn(24, callback=SelectBest(make_selection(1), tmp_path / "best.zip", 2, every_steps=1000))
+    assert read_note(tmp_path / "best.zip")["steps"] == 24
+
+
+@pytest.mark.parametrize(("stored", "replaced"), [(-1.0, True), (100.0, False)], ids=["worse", "better"])
+def test_best_model_of_an_earlier_start_counts(stored: float, replaced: bool, tmp_path: Path):
+    path = tmp_path / "best.zip"
+    save_model(make_ppo(), path, {"selection_return": stored, "steps": 0})
+    make_ppo().learn(8, callback=SelectBest(make_selection(1), path, 2, every_steps=8))
+    assert (read_note(path)["steps"] == 8) is replaced
+
+
+def test_damaged_best_model_is_one_clear_line(tmp_path: Path):
+    (tmp_path / "best.zip").write_bytes(b"not a zip")
+    with pytest.raises(UserError, match="is damaged; remove it"):
+        make_ppo().learn(8, callback=SelectBest(make_selection(1), tmp_path / "best.zip", 2, every_steps=8))
+
+
+def test_checkpoints_are_taken_between_updates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    saved: list[int] = []
+    monkeypatch.setattr("agents.training.save_model", lambda model, path, buffer: saved.append(model.num_timesteps))
+    make_ppo().learn(40, callback=SaveCheckpoint(tmp_path / "checkpoint.zip", every_steps=12))
+    assert saved == [16, 32]
+
+
+def test_seeds_of_training_selection_and_evaluation_are_apart():
+    assert plan(seed=SELECTION_SEED - 1).seed < SELECTION_SEED < EVALUATION_SEED
+    with pytest.raises(UserError, match="seed must lie in"):
+        plan(seed=SELECTION_SEED)
+
+
+@pytest.mark.parametrize("field", ["steps", "num_rows", "selections", "selection_episodes", "checkpoint_every"])
+def test_numbers_below_one_are_refused(field: str):
+    assert getattr(plan(**{field: 1}), field) == 1
+    with pytest.raises(UserError, match=f"{field} must be at least 1, got 0"):
+        plan(**{field: 0})
+
+
+def test_dqn_needs_discrete_actions():
+    space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    plan(algorithm="ppo").check_action_space(space)
+    with pytest.raises(UserError, match="dqn needs a discrete action space, highway-fast-v0 has Box"):
+        plan(algorithm="dqn").check_action_space(space)
+
+
+def test_models_follow_their_preset():
+    venv = make_rows(CONSTANT_VELOCITY, 1)
+    ppo = make_model(plan(), venv)
+    assert isinstance(ppo, PPO)
+    assert (ppo.n_steps, ppo.batch_size, ppo.gamma, ppo.learning_rate) == (128, 64, 0.8, 5e-4)
+    assert isinstance(ppo.policy.features_extractor, ForecastAttention)
+    dqn = make_model(plan(algorithm="dqn"), venv)
+    assert isinstance(dqn, DQN)
+    assert (dqn.buffer_size, dqn.learning_starts, dqn.target_update_interval) == (15_000, 200, 50)
+    venv.close()
+
+
+def test_presets():
+    assert preset_for("highway-fast-v0", "ppo") == PPOPreset()
+    assert preset_for("merge-v1", "dqn") == DQNPreset()
+    assert preset_for("racetrack-oval-v1", "ppo").gamma == 0.9
+
+
+def test_same_seed_same_policy():
+    def trained() -> dict[str, torch.Tensor]:
+        venv = make_rows(CONSTANT_VELOCITY, 1)
+        model = make_model(plan(seed=3), venv)
+        model.learn(128)
+        venv.close()
+        return model.policy.state_dict()
+
+    first, second = trained(), trained()
+    assert first.keys() == second.keys()
+    for name, value in first.items():
+        torch.testing.assert_close(second[name], value, rtol=0, atol=0)

@@ -1,0 +1,146 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+
+from envs import collect
+from envs.collect import CollectConfig
+from envs.egos import idle_action
+from envs.readers import HighwayReader
+from envs.registry import make_env
+from predictor.data.store import Episode, read_store
+from predictor.errors import UserError
+from tests.envs.helpers import run_command
+
+ENV_ID = "two-way-v0"
+STEPS = 3
+
+
+def config(**changes: Any) -> CollectConfig:
+    return CollectConfig(**{"env_id": ENV_ID, "out": Path("unused"), "workers": 1, "max_steps": STEPS, **changes})
+
+
+def assert_same_episodes(first: list[Episode], second: list[Episode]) -> None:
+    assert len(first) == len(second) > 0
+    for actual, expected in zip(first, second, strict=True):
+        assert (actual.label, actual.seed) == (expected.label, expected.seed)
+        for name in ("states", "valid", "ids"):
+            np.testing.assert_array_equal(getattr(actual, name), getattr(expected, name))
+
+
+def test_an_episode_is_what_the_simulator_did():
+    (episode,) = collect.collect(config(episodes=1, ego=("idle",), seed=11))
+    env = make_env(ENV_ID)
+    env.reset(seed=11)
+    reader = HighwayReader(env)
+    assert (episode.label, episode.seed, len(episode.states)) == ("idle", 11, STEPS + 1)
+    for t in range(STEPS + 1):
+        truth = reader.read_all(env)
+        present = episode.valid[t]
+        assert episode.ids[present].tolist() == truth.ids.tolist()
+        np.testing.assert_allclose(episode.states[t, present], truth.states, rtol=1e-6)
+        np.testing.assert_allclose(episode.states[t, 0, :2], env.unwrapped.vehicle.position, rtol=1e-6)
+        env.step(idle_action(env))
+
+
+def test_an_episode_ends_with_its_last_scene():
+    (episode,) = collect.collect(config(episodes=1, env_id="u-turn-v1", ego=("idle",), max_steps=200))
+    assert 2 < len(episode.states) <= 11  # highway-env stops u-turn-v1 after 10 s
+    assert episode.valid[:, 0].all()
+
+
+def test_an_episode_depends_on_its_seed_alone():
+    """Neither on its place in the order nor on what the process did before."""
+    many = list(collect.collect(config(episodes=3, seed=4, ego=("random",))))
+    again = list(collect.collect(config(episodes=3, seed=4, ego=("random",))))
+    assert_same_episodes(again, many)
+    single = list(collect.collect(config(episodes=1, seed=6, ego=("random",))))
+    assert_same_episodes(single, many[2:])
+    assert not np.array_equal(many[0].states, many[1].states)
+
+
+def test_the_store_is_the_same_for_any_number_of_workers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    for workers in (1, 2):
+        arguments = ["--env-id", ENV_ID, "--out", str(tmp_path / str(workers)), "--episodes", "5", "--seed", "30"]
+        arguments += ["--workers", str(workers), "--max-steps", str(STEPS)]
+        code, errors, output = run_command(collect.main, arguments, monkeypatch, capsys)
+        assert (code, errors) == (0, [])
+        assert "5 episodes" in output
+        assert "seeds 30–34" in output
+    alone, together = (read_store(tmp_path / name) for name in ("1", "2"))
+    assert_same_episodes(together.episodes, alone.episodes)
+    assert [e.label for e in alone.episodes] == ["varied", "random", "idle", "varied", "random"]
+    assert [e.seed for e in alone.episodes] == list(range(30, 35))
+    assert alone.info.source == ENV_ID
+    assert alone.info.spec == HighwayReader(make_env(ENV_ID)).spec
+    assert alone.info.provenance["seed"] == 30
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["1", "2"]
+
+
+def test_every_ego_drives(tmp_path: Path):
+    env = make_env(ENV_ID)
+    PPO("MlpPolicy", env, n_steps=4, batch_size=4, policy_kwargs={"net_arch": [4]}, device="cpu").save(tmp_path / "p")
+    egos = ("random", "idle", "varied", str(tmp_path / "p.zip"))
+    episodes = list(collect.collect(config(episodes=4, ego=egos)))
+    assert tuple(e.label for e in episodes) == egos
+    (kept,) = collect.collect(config(episodes=1, env_id="racetrack-v1", ego=("keep-lane",)))
+    assert kept.label == "keep-lane"
+    assert all(np.isfinite(e.states).all() and e.valid[:, 0].all() for e in [*episodes, kept])
+
+
+def test_overwrite_replaces_the_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
+    base = ["--env-id", ENV_ID, "--out", str(tmp_path / "s"), "--workers", "1", "--max-steps", "1", "--episodes", "1"]
+    for seed, extra in ((1, []), (2, ["--overwrite"])):
+        code, _, _ = run_command(collect.main, [*base, "--seed", str(seed), *extra], monkeypatch, capsys)
+        assert code == 0
+        assert read_store(tmp_path / "s").episodes[0].seed == seed
+
+
+ERRORS = {
+    "unknown-id": (["--env-id", "nope-v0"], "cannot make env 'nope-v0'"),
+    "unknown-version": (["--env-id", "merge-v9"], "cannot make env 'merge-v9'"),
+    "another-family": (["--env-id", "CartPole-v1"], "no scene reader knows CartPoleEnv"),
+    "zero-episodes": (["--episodes", "0"], "episodes must be at least 1, got 0"),
+    "negative-steps": (["--max-steps", "-1"], "max_steps must be at least 1, got -1"),
+    "zero-workers": (["--workers", "0"], "workers must be at least 1, got 0"),
+    "negative-seed": (["--seed", "-1"], "seed must not be negative, got -1"),
+    "unknown-ego": (["--ego", "random", "reckless"], "ego must be one of random, idle,"),
+    "unfit-ego": (["--ego", "keep-lane"], "keep-lane needs continuous steering"),
+    "missing-policy": (["--ego", "absent.zip"], "no policy at absent.zip"),
+}
+
+
+@pytest.mark.parametrize("case", ERRORS)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    arguments, message = ERRORS[case]
+    base = ["--env-id", ENV_ID, "--out", str(tmp_path / "store"), "--workers", "1", "--episodes", "1"]
+    code, errors, output = run_command(collect.main, [*base, *arguments], monkeypatch, capsys)
+    assert code == 2
+    assert len(errors) == 1
+    assert errors[0].startswith(f"error: {message}")
+    assert output == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_store_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
+    out = tmp_path / "store"
+    out.mkdir()
+    (out / "mine.txt").write_text("keep")
+    arguments = ["--env-id", ENV_ID, "--out", str(out), "--workers", "1", "--episodes", "1"]
+    code, errors, _ = run_command(collect.main, arguments, monkeypatch, capsys)
+    assert code == 2
+    assert errors == [f"error: {out} exists; choose another path or pass --overwrite"]
+    assert [p.name for p in tmp_path.rglob("*")] == ["store", "mine.txt"]
+    assert (out / "mine.txt").read_text() == "keep"
+
+
+def test_ranges_are_checked_before_anything_runs():
+    config(episodes=1, max_steps=1).check()
+    with pytest.raises(UserError, match="ego needs at least one name"):
+        config(ego=()).check()

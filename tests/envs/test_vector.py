@@ -1,0 +1,438 @@
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
+
+from envs.observation import FORECAST_KEYS
+from envs.registry import make_env
+from envs.vector import VecForecast, VectorForecast
+from envs.wrappers import ForecastObservation, SceneObservation
+from predictor.checkpoint import load_checkpoint
+from predictor.errors import UserError
+from predictor.scene import Scene
+from tests.envs.helpers import (
+    HIGHWAY_SPEC,
+    MAX_AGENTS,
+    PERCEPTION_M,
+    assert_same,
+    forecast_of_history,
+    largest_difference,
+    short_env,
+    short_scene_env,
+)
+
+DURATIONS = (2, 5, 3)
+"""Steps per episode of each row, so that rows end at different times."""
+STEPS = 7
+SEED = 20
+ACTIONS = np.random.default_rng(0).integers(5, size=(STEPS, len(DURATIONS)))
+MAKERS = [partial(short_scene_env, duration) for duration in DURATIONS]
+
+
+@dataclass
+class Row:
+    """What one row should see, played alone by `ForecastObservation`."""
+
+    opening: dict[str, Any]
+    """The first observation."""
+    steps: list[dict[str, Any]] = field(default_factory=list)
+    """The observation that each step leads to; the closing one where an episode ends."""
+    rewards: list[float] = field(default_factory=list)
+    ends: list[bool] = field(default_factory=list)
+    successors: dict[int, dict[str, Any]] = field(default_factory=dict)
+    """By step at which an episode ended: the first observation of the next."""
+
+
+def play_alone(row: int, checkpoint: str, idle_steps: bool = False) -> Row:
+    """One row for `STEPS` steps of its vector env; with `idle_steps`, the step after an end only resets."""
+    env = ForecastObservation(short_env(DURATIONS[row]), checkpoint)
+    played = Row(env.reset(seed=SEED + row)[0])
+    fresh_at = -1
+    for t in range(STEPS):
+        if t == fresh_at:
+            played.steps.append(played.successors[t - 1])
+            played.rewards.append(0.0)
+            played.ends.append(False)
+            continue
+        obs, reward, terminated, truncated, _ = env.step(int(ACTIONS[t, row]))
+        played.steps.append(obs)
+        played.rewards.append(float(reward))
+        played.ends.append(terminated or truncated)
+        if terminated or truncated:
+            played.successors[t] = env.reset()[0]
+            fresh_at = t + 1 if idle_steps else -1
+    return played
+
+
+@pytest.fixture(scope="module")
+def alone(highway_checkpoint: str) -> list[Row]:
+    return [play_alone(row, highway_checkpoint) for row in range(len(DURATIONS))]
+
+
+@pytest.fixture(scope="module")
+def alone_with_idle_steps(highway_checkpoint: str) -> list[Row]:
+    return [play_alone(row, highway_checkpoint, idle_steps=True) for row in range(len(DURATIONS))]
+
+
+def row_of(observations: dict[str, Any], row: int) -> dict[str, Any]:
+    return {key: value[row] for key, value in observations.items()}
+
+
+def test_rows_end_at_different_steps(alone: list[Row], alone_with_idle_steps: list[Row]):
+    """What the tests below rely on: every row ends, no two alike, and not all at once."""
+    for rows in (alone, alone_with_idle_steps):
+        ends = [tuple(row.ends) for row in rows]
+        assert all(any(e) for e in ends)
+        assert len(set(ends)) == len(DURATIONS)
+
+
+def test_mixed_histories_would_be_noticed(highway_checkpoint: str):
+    """The forecast that opens an episode would differ visibly if it still remembered the last one, and vice versa."""
+    env = short_scene_env(2)
+    env.reset(seed=SEED)
+    old: list[Scene] = [env.scene]
+    for action in ACTIONS[:2, 0]:
+        env.step(int(action))
+        old.append(env.scene)
+    env.reset()
+    new = [env.scene]
+    model, _ = load_checkpoint(highway_checkpoint)
+    entries = partial(forecast_of_history, model, HIGHWAY_SPEC)
+    assert largest_difference(entries(old + new), entries(new)) > 0.1
+    assert largest_difference(entries(old), entries(old[-1:])) > 0.1
+
+
+# --- Stable-Baselines3 ------------------------------------------------------------------------------------------------
+
+SB3_KINDS: dict[str, Callable[[], VecEnv]] = {
+    "dummy": lambda: DummyVecEnv(MAKERS),
+    "fork": lambda: SubprocVecEnv(MAKERS[:2], start_method="fork"),
+    "spawn": lambda: SubprocVecEnv(MAKERS[:2], start_method="spawn"),
+}
+
+
+# Python 3.12 warns of every fork of a process with threads; that it works is what is tested.
+@pytest.mark.filterwarnings("ignore:.*use of fork.. may lead to deadlocks:DeprecationWarning")
+@pytest.mark.parametrize("kind", SB3_KINDS)
+def test_sb3_rows_are_as_if_alone(kind: str, alone: list[Row], highway_checkpoint: str):
+    venv = VecForecast(SB3_KINDS[kind](), highway_checkpoint)
+    rows = alone[: venv.num_envs]
+    try:
+        venv.seed(SEED)
+        obs: Any = venv.reset()
+        for row, played in enumerate(rows):
+            assert_same(row_of(obs, row), played.opening)
+        for t in range(STEPS):
+            obs, rewards, dones, infos = venv.step(ACTIONS[t, : len(rows)])
+            assert dones.tolist() == [played.ends[t] for played in rows]
+            assert rewards.tolist() == pytest.approx([played.rewards[t] for played in rows], abs=1e-6)
+            for row, played in enumerate(rows):
+                if played.ends[t]:
+                    assert_same(infos[row]["terminal_observation"], played.steps[t])
+                    assert_same(row_of(obs, row), played.successors[t])
+                else:
+                    assert "terminal_observation" not in infos[row]
+                    assert_same(row_of(obs, row), played.steps[t])
+    finally:
+        venv.close()
+
+
+def test_sb3_reset_forgets_every_row(alone: list[Row], highway_checkpoint: str):
+    venv = VecForecast(DummyVecEnv(MAKERS), highway_checkpoint)
+    venv.reset()
+    venv.step(ACTIONS[0])
+    venv.seed(SEED)
+    obs: Any = venv.reset()
+    for row, played in enumerate(alone):
+        assert_same(row_of(obs, row), played.opening)
+
+
+def test_sb3_observations_lie_in_the_space(highway_checkpoint: str):
+    venv = VecForecast(VecMonitor(DummyVecEnv(MAKERS)), highway_checkpoint, num_samples=2, horizon_steps=4)
+    space = venv.observation_space
+    assert isinstance(space, gym.spaces.Dict)
+    assert set(space) == {"observation", *FORECAST_KEYS}
+    observations: list[Any] = [row_of(venv.reset(), row) for row in range(3)]
+    for t in range(3):
+        obs, _, dones, infos = venv.step(ACTIONS[t])
+        observations += [row_of(obs, row) for row in range(3)]
+        observations += [infos[row]["terminal_observation"] for row in np.flatnonzero(dones)]
+        for row in np.flatnonzero(dones):
+            assert {"TimeLimit.truncated", "episode"} <= set(infos[row])
+    assert len(observations) > 12
+    assert all(space.contains(obs) for obs in observations)
+    assert observations[0]["forecast"].shape == (MAX_AGENTS - 1, 2, 4, 2)
+
+
+# --- gymnasium --------------------------------------------------------------------------------------------------------
+
+
+def vector(mode: AutoresetMode, checkpoint: str, kind: Any = SyncVectorEnv, **kwargs: Any) -> VectorForecast:
+    return VectorForecast(kind(MAKERS, autoreset_mode=mode), checkpoint, **kwargs)
+
+
+@pytest.mark.filterwarnings("ignore:.*use of fork.. may lead to deadlocks:DeprecationWarning")
+@pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv], ids=["sync", "async"])
+def test_same_step_rows_are_as_if_alone(kind: Any, alone: list[Row], highway_checkpoint: str):
+    env = vector(AutoresetMode.SAME_STEP, highway_checkpoint, kind)
+    try:
+        obs, _ = env.reset(seed=SEED)
+        for row, played in enumerate(alone):
+            assert_same(row_of(obs, row), played.opening)
+        for t in range(STEPS):
+            obs, rewards, terminations, truncations, infos = env.step(ACTIONS[t])
+            assert (terminations | truncations).tolist() == [played.ends[t] for played in alone]
+            assert rewards.tolist() == pytest.approx([played.rewards[t] for played in alone])
+            for row, played in enumerate(alone):
+                if played.ends[t]:
+                    assert_same(infos["final_obs"][row], played.steps[t])
+                    assert_same(row_of(obs, row), played.successors[t])
+                else:
+                    assert_same(row_of(obs, row), played.steps[t])
+    finally:
+        env.close()
+
+
+def test_next_step_rows_are_as_if_alone(alone_with_idle_steps: list[Row], highway_checkpoint: str):
+    env = vector(AutoresetMode.NEXT_STEP, highway_checkpoint)
+    obs, _ = env.reset(seed=SEED)
+    for row, played in enumerate(alone_with_idle_steps):
+        assert_same(row_of(obs, row), played.opening)
+    for t in range(STEPS):
+        obs, rewards, terminations, truncations, _ = env.step(ACTIONS[t])
+        assert (terminations | truncations).tolist() == [played.ends[t] for played in alone_with_idle_steps]
+        assert rewards.tolist() == pytest.approx([played.rewards[t] for played in alone_with_idle_steps])
+        for row, played in enumerate(alone_with_idle_steps):
+            assert_same(row_of(obs, row), played.steps[t])
+
+
+def test_disabled_rows_are_as_if_alone(alone: list[Row], highway_checkpoint: str):
+    env = vector(AutoresetMode.DISABLED, highway_checkpoint)
+    obs, _ = env.reset(seed=SEED)
+    for t in range(STEPS):
+        obs, _, terminations, truncations, _ = env.step(ACTIONS[t])
+        ended = terminations | truncations
+        assert ended.tolist() == [played.ends[t] for played in alone]
+        for row, played in enumerate(alone):
+            assert_same(row_of(obs, row), played.steps[t])
+        if ended.any():
+            obs, _ = env.reset(options={"reset_mask": ended})
+            for row, played in enumerate(alone):
+                assert_same(row_of(obs, row), played.successors[t] if ended[row] else played.steps[t])
+
+
+def test_disabled_partial_reset_right_after_reset(alone: list[Row], highway_checkpoint: str):
+    """A row that is reset before its episode ends forgets; the others carry on, having seen nothing twice."""
+    env = vector(AutoresetMode.DISABLED, highway_checkpoint)
+    env.reset(seed=SEED)
+    env.step(ACTIONS[0])
+    obs, _ = env.reset(seed=SEED, options={"reset_mask": np.array([True, False, False])})
+    assert_same(row_of(obs, 0), alone[0].opening)
+    again, _, _, _, _ = env.step(np.array([ACTIONS[0, 0], ACTIONS[1, 1], ACTIONS[1, 2]]))
+    assert_same(row_of(again, 0), alone[0].steps[0])
+    for row in (1, 2):
+        assert_same(row_of(obs, row), alone[row].steps[0])
+        assert_same(row_of(again, row), alone[row].steps[1])
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.name)
+def test_gymnasium_observations_lie_in_the_space(mode: AutoresetMode, highway_checkpoint: str):
+    env = vector(mode, highway_checkpoint, num_samples=2)
+    assert env.metadata["autoreset_mode"] is mode
+    obs, _ = env.reset(seed=SEED)
+    assert obs in env.observation_space
+    obs, _, _, _, _ = env.step(ACTIONS[0])
+    assert obs in env.observation_space
+    assert row_of(obs, 0) in env.single_observation_space
+    assert obs["forecast"].shape == (3, MAX_AGENTS - 1, 2, 3, 2)
+
+
+def test_returned_observations_are_not_written_to_later(highway_checkpoint: str):
+    env = vector(AutoresetMode.DISABLED, highway_checkpoint)
+    obs, _ = env.reset(seed=SEED)
+    stepped = env.step(ACTIONS[0])[0]
+    copies = [{key: value.copy() for key, value in o.items()} for o in (obs, stepped)]
+    env.reset(options={"reset_mask": np.array([True, False, True])})
+    env.step(ACTIONS[1])
+    for kept, copy in zip((obs, stepped), copies, strict=True):
+        assert_same(kept, copy, tolerance=0.0)
+
+
+# --- One batched forward ----------------------------------------------------------------------------------------------
+
+
+class Spy:
+    """Notes the batch size of each call of a forecaster's `observe`."""
+
+    def __init__(self, forecaster: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.batches: list[int] = []
+        observe = forecaster.observe
+
+        def watched(memory: Any, states: Any, valid: Any) -> Any:
+            self.batches.append(len(states))
+            return observe(memory, states, valid)
+
+        monkeypatch.setattr(forecaster, "observe", watched)
+
+    def calls(self) -> list[int]:
+        batches, self.batches = self.batches, []
+        return batches
+
+
+def test_sb3_makes_one_forward_per_step(highway_checkpoint: str, monkeypatch: pytest.MonkeyPatch):
+    venv = VecForecast(DummyVecEnv(MAKERS), highway_checkpoint)
+    spy = Spy(venv.stream.forecaster, monkeypatch)
+    venv.reset()
+    assert spy.calls() == [3]
+    ended = 0
+    for t in range(STEPS):
+        _, _, dones, _ = venv.step(ACTIONS[t])
+        assert spy.calls() == [3 + int(dones.sum())]  # fresh episodes ride along with the closing ones
+        ended += int(dones.sum())
+    assert ended > 2
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP], ids=lambda mode: mode.name)
+def test_gymnasium_makes_one_forward_per_step(
+    mode: AutoresetMode, highway_checkpoint: str, monkeypatch: pytest.MonkeyPatch
+):
+    env = vector(mode, highway_checkpoint)
+    spy = Spy(env.stream.forecaster, monkeypatch)
+    env.reset(seed=SEED)
+    assert spy.calls() == [3]
+    for t in range(STEPS):
+        _, _, terminations, truncations, _ = env.step(ACTIONS[t])
+        extra = int((terminations | truncations).sum()) if mode is AutoresetMode.SAME_STEP else 0
+        assert spy.calls() == [3 + extra]
+
+
+def test_a_partial_reset_forwards_only_its_rows(highway_checkpoint: str, monkeypatch: pytest.MonkeyPatch):
+    env = vector(AutoresetMode.DISABLED, highway_checkpoint)
+    env.reset(seed=SEED)
+    spy = Spy(env.stream.forecaster, monkeypatch)
+    env.reset(options={"reset_mask": np.array([False, True, True])})
+    assert spy.calls() == [2]
+
+
+def test_a_forecaster_can_be_passed(highway_checkpoint: str):
+    model, _ = load_checkpoint(highway_checkpoint)
+    venvs = [
+        VecForecast(DummyVecEnv(MAKERS), forecaster=model),
+        VecForecast(DummyVecEnv(MAKERS), highway_checkpoint),
+    ]
+    assert venvs[0].stream.forecaster is model
+    observations: list[Any] = []
+    for venv in venvs:
+        venv.seed(SEED)
+        observations.append(venv.reset())
+    assert_same(*observations, tolerance=0.0)
+
+
+# --- Randomness -------------------------------------------------------------------------------------------------------
+
+
+def sb3_sequence(venv: VecEnv) -> list[Any]:
+    venv.seed(SEED)
+    sequence: list[Any] = [venv.reset()]
+    for t in range(4):
+        obs, rewards, _, infos = venv.step(ACTIONS[t])
+        sequence += [obs, {"rewards": rewards}, *(i["terminal_observation"] for i in infos if len(i) > 5)]
+    return sequence
+
+
+def assert_same_sequences(first: list[Any], second: list[Any]) -> None:
+    assert len(first) == len(second)
+    for actual, expected in zip(first, second, strict=True):
+        assert_same(actual, expected, tolerance=0.0)
+
+
+def test_sb3_same_seed_same_sequences(highway_checkpoint: str):
+    make = partial(VecForecast, checkpoint=highway_checkpoint, num_samples=3)
+    first, second = (sb3_sequence(make(DummyVecEnv(MAKERS))) for _ in range(2))
+    assert_same_sequences(first, second)
+
+
+def test_sb3_seeding_again_repeats_the_samples(highway_checkpoint: str):
+    venv = VecForecast(DummyVecEnv(MAKERS), highway_checkpoint, num_samples=3)
+    first, second = sb3_sequence(venv), sb3_sequence(venv)
+    assert_same_sequences(first, second)
+
+
+def test_sb3_noise_has_a_seed_of_its_own(highway_checkpoint: str):
+    first, second = (VecForecast(DummyVecEnv(MAKERS), highway_checkpoint, num_samples=3, seed=seed) for seed in (1, 2))
+    samples: list[Any] = []
+    for venv in (first, second):
+        venv.venv.seed(SEED)
+        samples.append(venv.reset())
+    assert (samples[0]["forecast"][:, :, 0] == samples[1]["forecast"][:, :, 0]).all()
+    assert (samples[0]["forecast"] != samples[1]["forecast"]).any()
+
+
+def gymnasium_sequence(env: VectorForecast) -> list[Any]:
+    sequence: list[Any] = [env.reset(seed=SEED)[0]]
+    for t in range(4):
+        obs, rewards, _, _, _ = env.step(ACTIONS[t])
+        sequence += [obs, {"rewards": rewards}]
+    return sequence
+
+
+def test_gymnasium_same_seed_same_sequences(highway_checkpoint: str):
+    env = vector(AutoresetMode.NEXT_STEP, highway_checkpoint, num_samples=3)
+    other = vector(AutoresetMode.NEXT_STEP, highway_checkpoint, num_samples=3)
+    first, again, second = gymnasium_sequence(env), gymnasium_sequence(env), gymnasium_sequence(other)
+    assert_same_sequences(again, first)
+    assert_same_sequences(second, first)
+
+
+# --- Errors -----------------------------------------------------------------------------------------------------------
+
+
+def test_rows_without_scenes_are_named():
+    bare = [partial(short_env, 2)]
+    with pytest.raises(UserError, match="VecForecast needs environments that report scenes, got Box .*SceneObserva"):
+        VecForecast(DummyVecEnv(bare), "constant-velocity")
+    with pytest.raises(UserError, match="VectorForecast needs environments that report scenes, got Box"):
+        VectorForecast(SyncVectorEnv(bare), "constant-velocity")
+
+
+def differing() -> list[Callable[[], gym.Env]]:
+    return [lambda range_m=range_m: SceneObservation(short_env(2), range_m, 4) for range_m in (50.0, 60.0)]
+
+
+def test_rows_with_differing_specs_are_named():
+    expected = r"all environments must have the same scene spec, got .*perception_m=50.0.*perception_m=60.0"
+    with pytest.raises(UserError, match=expected):
+        VecForecast(DummyVecEnv(differing()), "constant-velocity")
+    with pytest.raises(UserError, match=expected):
+        VectorForecast(SyncVectorEnv(differing()), "constant-velocity")
+
+
+def test_rows_of_differing_ids_are_named():
+    """Both stand on a 1 s step and have observations of the same shape; their checkpoints differ."""
+    ids = [lambda i=i: SceneObservation(make_env(i), PERCEPTION_M, 4) for i in ("merge-v1", "merge-generic-v1")]
+    with pytest.raises(UserError, match=r"the same env id, got \['merge-generic-v1', 'merge-v1'\]"):
+        VecForecast(DummyVecEnv(ids), "constant-velocity")
+    with pytest.raises(UserError, match=r"the same env id, got \['merge-generic-v1', 'merge-v1'\]"):
+        VectorForecast(SyncVectorEnv(ids), "constant-velocity")
+
+
+def test_time_steps_that_differ_are_both_named(racetrack_checkpoint: str):
+    expected = r"tiny-racetrack' was trained at dt_s=0.2 but env 'highway-fast-v0' steps at dt_s=1;"
+    with pytest.raises(UserError, match=expected):
+        VecForecast(DummyVecEnv(MAKERS), racetrack_checkpoint)
+    with pytest.raises(UserError, match=expected):
+        VectorForecast(SyncVectorEnv(MAKERS), racetrack_checkpoint)
+
+
+@pytest.mark.parametrize("name", ["num_samples", "horizon_steps"])
+def test_zero_is_named(name: str, highway_checkpoint: str):
+    with pytest.raises(UserError, match=f"{name} must be at least 1, got 0"):
+        VecForecast(DummyVecEnv(MAKERS), highway_checkpoint, **{name: 0})
+    with pytest.raises(UserError, match=f"{name} must be at least 1, got 0"):
+        VectorForecast(SyncVectorEnv(MAKERS), highway_checkpoint, **{name: 0})

@@ -1,0 +1,412 @@
+"""Streaming by id: rows in any order, agents that come and go, episodes that end row by row.
+
+The reference never streams: it lays out each row's whole episode as one window in which every stay of an agent has a
+column of its own, and encodes it in one call.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+from torch import Tensor
+
+from predictor import dgvae
+from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.dgvae import DGVAE
+from predictor.errors import ProtocolError
+from predictor.online import OnlineForecaster
+from predictor.scene import PADDING_ID, Forecast, Scene, SceneBatch
+from tests.predictor.helpers import ROAD, batch, model, random_states, scene, spec
+
+ROWS, AGENTS, EGO = 3, 4, 0
+OTHERS = (3, 7, 11, 20)  # more than fit in a scene beside the ego
+History = list[Scene]
+
+
+def assert_same(ours: Forecast, expected: Forecast, tolerance: float = 1e-5) -> None:
+    assert torch.equal(ours.valid, expected.valid)
+    torch.testing.assert_close(ours.edge_probs, expected.edge_probs, rtol=0, atol=tolerance)
+    torch.testing.assert_close(ours.edge_features, expected.edge_features, rtol=0, atol=tolerance)
+    torch.testing.assert_close(ours.xy, expected.xy, rtol=1e-5, atol=10 * tolerance)
+
+
+def rows_of(forecast: Forecast, rows: Sequence[int]) -> Forecast:
+    chosen = list(rows)
+    return Forecast(
+        forecast.xy[chosen], forecast.edge_probs[chosen], forecast.edge_features[chosen], forecast.valid[chosen]
+    )
+
+
+def reference(forecaster: DGVAE, history: History) -> Forecast:
+    """The forecast after an episode's scenes, from one pass over all of them."""
+    column: dict[tuple[int, int], int] = {}  # (id, step at which this stay began) → column; the ego's is the first
+    began: dict[int, int] = {}
+    places: list[list[int]] = []
+    for t, now in enumerate(history):
+        present = now.ids[now.valid].tolist()
+        began = {agent: began.get(agent, t) for agent in present}
+        places.append([column.setdefault((agent, began[agent]), len(column)) for agent in present])
+    states = np.zeros((1, len(history), len(column), 4))
+    valid = np.zeros((1, len(history), len(column)), dtype=np.bool_)
+    for t, (now, place) in enumerate(zip(history, places, strict=True)):
+        states[0, t, place] = now.states[now.valid]
+        valid[0, t, place] = True
+    states[..., 0] -= states[:, :, :1, 0] * valid  # the road's frame
+    tensor, present_ = torch.from_numpy(states.astype(np.float32)), torch.from_numpy(valid)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dgvae, "concrete_sample", lambda logits, temperature, generator: torch.softmax(logits, dim=-1))
+        window = forecaster.window(tensor, present_, torch.tensor([len(history) - 1]))
+    last, place = history[-1], places[-1]
+    xy = torch.zeros(1, 1, AGENTS, forecaster.horizon_steps, 2)
+    probs = torch.zeros(1, AGENTS, AGENTS, forecaster.num_edge_types)
+    probs[..., 0] = 1.0
+    features = torch.zeros(1, AGENTS, AGENTS, forecaster.edge_feature_dim)
+    rows = np.flatnonzero(last.valid)
+    xy[0, 0, rows] = window.rollout[0, place, :, :2] - tensor[0, -1, 0, :2]
+    probs[0, rows[:, None], rows] = window.prior_logits[0, -1][place][:, place].softmax(-1)
+    features[0, rows[:, None], rows] = window.features[0, -1][place][:, place]
+    return Forecast(xy, probs, features, torch.from_numpy(last.valid)[None])
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> Scene:
+    """The ego and some others, in any rows, with states that never repeat."""
+    rows: list[int] = draw(st.permutations([*OTHERS, PADDING_ID, PADDING_ID]))
+    order = [EGO, *rows[: AGENTS - 1]]
+    values = random_states(draw(st.integers(0, 2**16)), AGENTS, 4).double().numpy()
+    return scene({agent: values[row] for row, agent in enumerate(order) if agent != PADDING_ID}, AGENTS, order)
+
+
+some_rows = st.lists(st.sampled_from(range(ROWS)), unique=True, min_size=1).map(np.array)
+
+
+class Streams(RuleBasedStateMachine):
+    """Everything that can happen to the parallel rows of an environment, in any order."""
+
+    @initialize(first=st.tuples(*[scenes()] * ROWS))
+    def begin(self, first: tuple[Scene, ...]) -> None:
+        self.model = model(num_edge_types=3, frame=ROAD)
+        self.online = OnlineForecaster(self.model, ROWS, AGENTS)
+        self.histories: list[History] = [[] for _ in range(ROWS)]
+        self.judged: list[History] = []
+        self.step(first)
+
+    @rule(now=st.tuples(*[scenes()] * ROWS))
+    def step(self, now: tuple[Scene, ...]) -> None:
+        self.online.observe(batch(*now))
+        self.histories = [[*past, each] for past, each in zip(self.histories, now, strict=True)]
+        self.judged = self.histories
+
+    @rule(rows=some_rows, now=st.tuples(*[scenes()] * ROWS))
+    def step_some_rows(self, rows: np.ndarray, now: tuple[Scene, ...]) -> None:
+        self.online.observe(batch(*now[: len(rows)]), rows)
+        for row, each in zip(rows, now, strict=False):
+            self.histories[row] = [*self.histories[row], each]
+        self.judged = [self.histories[row] for row in rows]
+
+    @rule(rows=some_rows, now=st.tuples(*[scenes()] * ROWS))
+    def reset_some_rows(self, rows: np.ndarray, now: tuple[Scene, ...]) -> None:
+        self.online.reset(rows)
+        self.histories = [[] if row in rows else past for row, past in enumerate(self.histories)]
+        self.step(now)
+
+    @rule(ended=some_rows, now=st.tuples(*[scenes()] * ROWS), successors=st.tuples(*[scenes()] * ROWS))
+    def step_over_a_boundary(
+        self, ended: np.ndarray, now: tuple[Scene, ...], successors: tuple[Scene, ...]
+    ) -> None:
+        self.online.observe_boundary(batch(*now), ended, batch(*successors[: len(ended)]))
+        terminal = [[*past, each] for past, each in zip(self.histories, now, strict=True)]
+        fresh = [[each] for each in successors[: len(ended)]]
+        self.judged = terminal + fresh
+        self.histories = list(terminal)
+        for row, history in zip(ended, fresh, strict=True):
+            self.histories[row] = history
+
+    @invariant()
+    def forecast_is_that_of_the_whole_history(self) -> None:
+        if not hasattr(self, "judged"):
+            return
+        ours = self.online.forecast()
+        assert len(ours.xy) == len(self.judged)
+        for row, history in enumerate(self.judged):
+            assert_same(rows_of(ours, [row]), reference(self.model, history))
+
+
+TestStreams = Streams.TestCase
+TestStreams.settings = settings(max_examples=20, stateful_step_count=8)
+
+
+# --- The same, one fact at a time -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def forecaster() -> DGVAE:
+    return model(num_edge_types=3, frame=ROAD)
+
+
+def online(forecaster: DGVAE, rows: int = 1) -> OnlineForecaster:
+    return OnlineForecaster(forecaster, rows, AGENTS)
+
+
+def states_of(seed: int, *agents: int) -> dict[int, Sequence[float]]:
+    values = random_states(seed, len(agents), 4).double().tolist()
+    return dict(zip(agents, values, strict=True))
+
+
+def after(forecaster: DGVAE, *history: Scene) -> Forecast:
+    """A fresh stream's forecast after these scenes."""
+    stream = online(forecaster)
+    for now in history:
+        stream.observe(batch(now))
+    return stream.forecast()
+
+
+def differ(one: Forecast, other: Forecast, row: int = 0) -> float:
+    return (one.edge_features[row] - other.edge_features[row]).abs().max().item()
+
+
+def test_forecast_before_any_observation_is_refused(forecaster: DGVAE):
+    with pytest.raises(ProtocolError, match=r"forecast\(\) needs an observation; call observe\(\) first"):
+        online(forecaster).forecast()
+
+
+def test_history_follows_the_id_when_rows_are_sorted_anew(forecaster: DGVAE):
+    first, second = states_of(0, 0, 3, 7), states_of(1, 0, 3, 7)
+    kept = after(forecaster, scene(first, AGENTS), scene(second, AGENTS))
+    moved = after(forecaster, scene(first, AGENTS), scene(second, AGENTS, [0, PADDING_ID, 7, 3]))
+    rows = torch.tensor([0, 3, 2])
+    torch.testing.assert_close(moved.xy[:, :, rows], kept.xy[:, :, :3])
+    torch.testing.assert_close(moved.edge_features[:, rows][:, :, rows], kept.edge_features[:, :3, :3])
+    torch.testing.assert_close(moved.edge_probs[:, rows][:, :, rows], kept.edge_probs[:, :3, :3])
+
+
+def test_leaver_leaks_nothing_into_a_newcomer_in_its_row(forecaster: DGVAE):
+    first, second = states_of(0, 0, 3), states_of(1, 0, 7)
+    heir = after(forecaster, scene(first, AGENTS), scene(second, AGENTS))
+    newcomer = after(forecaster, scene({0: first[0]}, AGENTS), scene(second, AGENTS))
+    torch.testing.assert_close(heir.edge_features[:, 1], newcomer.edge_features[:, 1])
+    torch.testing.assert_close(heir.edge_probs[:, :2, :2], newcomer.edge_probs[:, :2, :2])
+    same_id = after(forecaster, scene(first, AGENTS), scene({0: second[0], 3: second[7]}, AGENTS))
+    assert differ(same_id, heir) > 1e-2  # an id that stayed would have been another matter
+
+
+@pytest.mark.parametrize("away", [1, 3])
+def test_agent_that_comes_back_starts_fresh(forecaster: DGVAE, away: int):
+    first, last = states_of(0, 0, 3), states_of(9, 0, 3)
+    gone = [scene(states_of(t, 0), AGENTS) for t in range(1, 1 + away)]
+    returned = after(forecaster, scene(first, AGENTS), *gone, scene(last, AGENTS))
+    newcomer = after(forecaster, scene({0: first[0]}, AGENTS), *gone, scene(last, AGENTS))
+    torch.testing.assert_close(returned.edge_features, newcomer.edge_features)
+    torch.testing.assert_close(returned.edge_probs, newcomer.edge_probs)
+
+
+def test_agent_that_is_not_valid_is_forgotten_even_if_its_id_stays(forecaster: DGVAE):
+    first, last = states_of(0, 0, 3), states_of(9, 0, 3)
+    hidden = scene(states_of(1, 0, 3), AGENTS)
+    hidden.valid[1] = False
+    returned = after(forecaster, scene(first, AGENTS), hidden, scene(last, AGENTS))
+    alone = scene({0: tuple(hidden.states[0])}, AGENTS)
+    torch.testing.assert_close(
+        returned.edge_features, after(forecaster, scene({0: first[0]}, AGENTS), alone, scene(last, AGENTS)).edge_features
+    )
+
+
+def test_reset_of_one_row_is_felt_in_that_row_only(forecaster: DGVAE):
+    now, then = [scene(states_of(row, 0, 3, 7), AGENTS) for row in range(3)], scene(states_of(9, 0, 3, 7), AGENTS)
+    stream, untouched = online(forecaster, 3), online(forecaster, 3)
+    for each in (stream, untouched):
+        each.observe(batch(*now))
+    stream.reset(np.array([1]))
+    for each in (stream, untouched):
+        each.observe(batch(then, then, then))
+    ours, expected = stream.forecast(), untouched.forecast()
+    assert_same(rows_of(ours, [0, 2]), rows_of(expected, [0, 2]), tolerance=1e-6)
+    assert_same(rows_of(ours, [1]), after(forecaster, then))
+    assert differ(ours, expected, row=1) > 1e-2
+
+
+def test_reset_of_all_rows(forecaster: DGVAE):
+    now, then = scene(states_of(0, 0, 3), AGENTS), scene(states_of(9, 0, 3), AGENTS)
+    stream = online(forecaster, 2)
+    stream.observe(batch(now, now))
+    stream.reset()
+    stream.observe(batch(then, then))
+    assert_same(stream.forecast(), rows_of(after(forecaster, then), [0, 0]))
+
+
+def test_reset_of_no_row_changes_nothing(forecaster: DGVAE):
+    now, then = scene(states_of(0, 0, 3), AGENTS), scene(states_of(9, 0, 3), AGENTS)
+    stream = online(forecaster)
+    stream.observe(batch(now))
+    stream.reset(np.array([], dtype=np.int64))
+    stream.observe(batch(then))
+    assert_same(stream.forecast(), after(forecaster, now, then))
+
+
+def test_boundary_is_the_last_scene_then_reset_then_the_first_scene(forecaster: DGVAE):
+    past, last, following = ([scene(states_of(9 * k + r, 0, 3, 7), AGENTS) for r in range(3)] for k in range(3))
+    first = scene(states_of(77, 0, 3), AGENTS)
+    at_once, step_by_step = online(forecaster, 3), online(forecaster, 3)
+    for each in (at_once, step_by_step):
+        each.observe(batch(*past))
+    at_once.observe_boundary(batch(*last), np.array([2]), batch(first))
+    ours = at_once.forecast()
+    assert ours.valid.tolist()[3] == [True, True, False, False]
+    step_by_step.observe(batch(*last))
+    assert_same(rows_of(ours, [0, 1, 2]), step_by_step.forecast())
+    step_by_step.reset(np.array([2]))
+    step_by_step.observe(batch(first), np.array([2]))
+    assert_same(rows_of(ours, [3]), step_by_step.forecast())
+    assert_same(rows_of(ours, [3]), after(forecaster, first))
+    for each in (at_once, step_by_step):
+        each.observe(batch(*following))
+    assert_same(at_once.forecast(), step_by_step.forecast())
+
+
+def test_batch_is_one_by_one(forecaster: DGVAE):
+    histories = [[scene(states_of(10 * row + t, 0, 3, *OTHERS[1 : 1 + row]), AGENTS) for t in range(4)] for row in range(3)]
+    stream = online(forecaster, 3)
+    for now in zip(*histories, strict=True):
+        stream.observe(batch(*now))
+    together = stream.forecast(horizon_steps=5)
+    assert together.xy.shape == (3, 1, AGENTS, 5, 2)
+    for row, history in enumerate(histories):
+        alone = online(forecaster)
+        for each in history:
+            alone.observe(batch(each))
+        assert_same(rows_of(together, [row]), alone.forecast(horizon_steps=5))
+
+
+def test_observing_some_rows_leaves_the_others_alone(forecaster: DGVAE):
+    past, last = ([scene(states_of(9 * k + r, 0, 3, 7), AGENTS) for r in range(3)] for k in range(2))
+    extra = scene(states_of(50, 0, 7, 3), AGENTS)
+    stream = online(forecaster, 3)
+    stream.observe(batch(*past))
+    stream.observe(batch(extra), np.array([1]))
+    assert_same(stream.forecast(), after(forecaster, past[1], extra))
+    stream.observe(batch(*last))
+    assert_same(rows_of(stream.forecast(), [0]), after(forecaster, past[0], last[0]))
+    assert_same(rows_of(stream.forecast(), [1]), after(forecaster, past[1], extra, last[1]))
+    assert_same(rows_of(stream.forecast(), [2]), after(forecaster, past[2], last[2]))
+
+
+def test_scenes_are_not_changed(forecaster: DGVAE):
+    now = batch(scene(states_of(0, 0, 3), AGENTS))
+    before = SceneBatch(now.states.copy(), now.ids.copy(), now.valid.copy(), now.heading_rad.copy())
+    stream = online(forecaster)
+    stream.observe(now)
+    stream.forecast()
+    np.testing.assert_array_equal(now.states, before.states)
+    np.testing.assert_array_equal(now.ids, before.ids)
+
+
+# --- Frame ------------------------------------------------------------------------------------------------------------
+
+
+def shifted(now: Scene, *, x_m: float = 0.0, y_m: float = 0.0) -> Scene:
+    states = now.states.copy()
+    states[now.valid, :2] += [x_m, y_m]
+    return Scene(states, now.ids, now.valid)
+
+
+def drive(steps: int = 4) -> list[Scene]:
+    """A few scenes in which the ego moves on by 20 m in each step."""
+    return [shifted(scene(states_of(t, 0, 3, 7), AGENTS), x_m=20.0 * t) for t in range(steps)]
+
+
+def test_ten_kilometres_down_the_road_nothing_changes(forecaster: DGVAE):
+    here, there = after(forecaster, *drive()), after(forecaster, *(shifted(s, x_m=10_000.0) for s in drive()))
+    assert_same(there, here, tolerance=1e-6)
+
+
+def test_across_the_road_it_matters(forecaster: DGVAE):
+    here, aside = after(forecaster, *drive()), after(forecaster, *(shifted(s, y_m=10.0) for s in drive()))
+    assert differ(here, aside) > 1e-2
+
+
+def test_on_a_fixed_map_it_matters_where_the_scene_is():
+    on_map = model(num_edge_types=3)
+    here, there = after(on_map, *drive()), after(on_map, *(shifted(s, x_m=10.0) for s in drive()))
+    assert differ(here, there) > 1e-2
+
+
+def test_frame_follows_the_ego_at_each_step(forecaster: DGVAE):
+    """Moving a past scene as a whole along the road changes nothing: each step is seen from where the ego then was."""
+    history = drive()
+    jumped = [shifted(history[0], x_m=-500.0), *history[1:]]
+    assert_same(after(forecaster, *jumped), after(forecaster, *history))
+
+
+@pytest.mark.parametrize("frame", [("world", "world"), ROAD], ids=["world", "road"])
+def test_positions_are_relative_to_the_ego_in_world_axes(frame: tuple[str, str]):
+    standing = {0: (1000.0, 50.0, 1.0, 0.0), 5: (1010.0, 40.0, 0.0, 2.0)}
+    stream = OnlineForecaster(ConstantVelocity(spec(frame, dt_s=0.5)), 1, AGENTS)
+    stream.observe(batch(scene(standing, AGENTS)))
+    xy = stream.forecast(horizon_steps=2).xy
+    assert xy[0, 0, 0].tolist() == [[0.5, 0.0], [1.0, 0.0]]
+    assert xy[0, 0, 1].tolist() == [[10.0, -9.0], [10.0, -8.0]]
+    assert not xy[0, 0, 2:].any()
+
+
+def test_forecast_of_the_model_is_relative_to_the_ego_too():
+    on_map, history = model(num_edge_types=3), drive()
+    tensor = torch.from_numpy(np.stack([s.states for s in history])).float()[None]
+    valid = torch.from_numpy(np.stack([s.valid for s in history]))[None]
+    memory = on_map.empty_memory(1, AGENTS)
+    for now, present in zip(tensor.unbind(1), valid.unbind(1), strict=True):
+        memory, belief = on_map.observe(memory, now, present)
+    expected = (on_map.rollout(belief, 3)[..., :2] - tensor[0, -1, 0, :2]) * valid[0, -1, :, None, None]
+    torch.testing.assert_close(after(on_map, *history).xy, expected, rtol=1e-5, atol=1e-4)
+
+
+# --- Padding and samples ----------------------------------------------------------------------------------------------
+
+
+def test_padded_rows_are_invisible_whatever_they_hold(forecaster: DGVAE):
+    history = drive()
+    littered = []
+    for t, now in enumerate(history):
+        states, ids = now.states.copy(), now.ids.copy()
+        states[~now.valid], ids[~now.valid] = 1e3 * (t + 1), 3 + t  # even the id of someone who is present
+        littered.append(Scene(states, ids, now.valid))
+    ours = after(forecaster, *littered)
+    assert_same(ours, after(forecaster, *history))
+    assert not ours.xy[:, :, 3:].any()
+    assert ours.valid.tolist() == [[True, True, True, False]]
+
+
+def test_more_rows_change_nothing(forecaster: DGVAE):
+    narrow, wide = OnlineForecaster(forecaster, 1, 3), OnlineForecaster(forecaster, 1, 6)
+    for t in range(3):
+        agents = states_of(t, 0, 3, 7)
+        narrow.observe(batch(scene(agents, 3)))
+        wide.observe(batch(scene(agents, 6, [0, PADDING_ID, 7, PADDING_ID, PADDING_ID, 3])))
+    ours, expected, rows = wide.forecast(), narrow.forecast(), torch.tensor([0, 5, 2])
+    torch.testing.assert_close(ours.xy[:, :, rows], expected.xy)
+    torch.testing.assert_close(ours.edge_features[:, rows][:, :, rows], expected.edge_features)
+
+
+def test_ego_alone(forecaster: DGVAE):
+    stream = OnlineForecaster(forecaster, 2, 1)
+    for t in range(3):
+        stream.observe(batch(*(scene(states_of(t, 0), 1) for _ in range(2))))
+    forecast = stream.forecast(num_samples=3, generator=torch.Generator().manual_seed(0))
+    assert forecast.xy.shape == (2, 3, 1, 3, 2) and torch.isfinite(forecast.xy).all()
+    assert torch.equal(forecast.edge_probs, torch.tensor([1.0, 0.0, 0.0]).expand(2, 1, 1, 3))
+
+
+def test_samples_come_from_the_generator_and_leave_the_memory_alone(forecaster: DGVAE):
+    stream = online(forecaster)
+    for now in drive():
+        stream.observe(batch(now))
+
+    def draw(seed: int) -> Tensor:
+        return stream.forecast(num_samples=3, generator=torch.Generator().manual_seed(seed)).xy
+
+    assert torch.equal(draw(0), draw(0))
+    assert not torch.allclose(draw(0)[:, 1:], draw(1)[:, 1:], atol=1e-4)
+    assert_same(stream.forecast(), after(forecaster, *drive()), tolerance=0)
