@@ -1,5 +1,6 @@
 """What several test files of `envs` share: tiny checkpoints, short episodes, readers and references."""
 
+import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -11,11 +12,12 @@ import numpy as np
 import pytest
 import torch
 from highway_env.vehicle.behavior import IDMVehicle
+from stable_baselines3 import PPO
 
 from envs.observation import ForecastConfig, ForecastStream
 from envs.readers import HighwayReader
 from envs.registry import make_env
-from envs.wrappers import SceneObservation
+from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE, DGVAEConfig
 from predictor.errors import run_entry_point
@@ -57,6 +59,15 @@ def tiny_model(spec: SceneSpec, num_edge_types: int = 2) -> DGVAE:
 def save_tiny(path: Path, spec: SceneSpec) -> str:
     save_checkpoint(path, tiny_model(spec), CheckpointInfo(spec, SIZES, HORIZON))
     return str(path)
+
+
+def save_forecast_policy(run_dir: Path, env_id: str, checkpoint: str) -> Path:
+    """A run folder as train_policy leaves it: a policy (untrained) and the checkpoint whose forecasts it sees."""
+    env = ForecastObservation(make_env(env_id), checkpoint)
+    model = PPO("MultiInputPolicy", env, n_steps=4, batch_size=4, policy_kwargs={"net_arch": [4]}, device="cpu", seed=0)
+    model.save(run_dir / "policy.zip")
+    (run_dir / "config.json").write_text(json.dumps({"config": {"observe": "forecast", "checkpoint": checkpoint}}))
+    return run_dir / "policy.zip"
 
 
 def light_env(env_id: str) -> gym.Env:

@@ -12,7 +12,7 @@ from envs.readers import HighwayReader
 from envs.registry import make_env
 from predictor.data.store import Episode, read_store
 from predictor.errors import UserError
-from tests.envs.helpers import run_command
+from tests.envs.helpers import run_command, save_forecast_policy
 
 ENV_ID = "two-way-v0"
 STEPS = 3
@@ -92,6 +92,14 @@ def test_every_ego_drives(tmp_path: Path):
     assert all(np.isfinite(e.states).all() and e.valid[:, 0].all() for e in [*episodes, kept])
 
 
+def test_a_policy_trained_on_forecasts_drives_the_same_each_time(tmp_path: Path, highway_checkpoint: str):
+    ego = (str(save_forecast_policy(tmp_path, ENV_ID, highway_checkpoint)),)
+    first = list(collect.collect(config(episodes=2, seed=8, ego=ego)))
+    (alone,) = collect.collect(config(episodes=1, seed=9, ego=ego))
+    assert_same_episodes([alone], first[1:])
+    assert first[0].valid[:, 0].all()
+
+
 def test_overwrite_replaces_the_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
     base = ["--env-id", ENV_ID, "--out", str(tmp_path / "s"), "--workers", "1", "--max-steps", "1", "--episodes", "1"]
     for seed, extra in ((1, []), (2, ["--overwrite"])):
@@ -126,6 +134,18 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert errors[0].startswith(f"error: {message}")
     assert output == ""
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_policy_of_another_env_is_one_line(
+    tmp_path: Path, highway_checkpoint: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    policy = save_forecast_policy(tmp_path, ENV_ID, highway_checkpoint)
+    arguments = ["--env-id", "intersection-v2", "--out", str(tmp_path / "store"), "--ego", str(policy)]
+    code, errors, _ = run_command(collect.main, arguments, monkeypatch, capsys)
+    assert code == 2
+    assert len(errors) == 1
+    assert errors[0].startswith(f"error: policy {policy} was trained on Dict(")
+    assert not (tmp_path / "store").exists()
 
 
 def test_an_existing_store_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):

@@ -1,3 +1,5 @@
+import json
+import shutil
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -7,9 +9,11 @@ import numpy as np
 import pytest
 from stable_baselines3 import DQN, PPO
 
-from envs.egos import EGO_NAMES, idle_action, make_ego
+from envs.egos import EGO_NAMES, env_for_ego, idle_action, make_ego, sees_forecasts
 from envs.registry import CHECKPOINTS, make_env
+from envs.wrappers import ForecastObservation
 from predictor.errors import UserError
+from tests.envs.helpers import assert_same, save_forecast_policy
 
 TRACK_STEPS = 40
 
@@ -36,6 +40,11 @@ def policies(tmp_path_factory: pytest.TempPathFactory, discrete: gym.Env) -> Pat
     PPO("MlpPolicy", discrete, n_steps=4, batch_size=4, **tiny).save(folder / "ppo.zip")
     DQN("MlpPolicy", discrete, buffer_size=10, **tiny).save(folder / "dqn.zip")
     return folder
+
+
+@pytest.fixture(scope="module")
+def forecast_policy(tmp_path_factory: pytest.TempPathFactory, highway_checkpoint: str) -> Path:
+    return save_forecast_policy(tmp_path_factory.mktemp("run"), "two-way-v0", highway_checkpoint)
 
 
 @pytest.mark.parametrize("name", ["random", "varied", "idle"])
@@ -113,6 +122,31 @@ def test_trained_policies_drive(algorithm: str, policies: Path, discrete: gym.En
     assert actions == [int(model.predict(obs, deterministic=True)[0]) for obs in observations]
 
 
+@pytest.mark.parametrize("name", EGO_NAMES)
+def test_only_policies_change_the_view(name: str, discrete: gym.Env, policies: Path):
+    assert env_for_ego(discrete, name) is discrete
+    assert not sees_forecasts(name)
+    assert env_for_ego(discrete, str(policies / "dqn.zip")) is discrete
+    assert not sees_forecasts(str(policies / "dqn.zip"))
+
+
+def test_policies_trained_on_forecasts_get_those_of_their_run(
+    forecast_policy: Path, discrete: gym.Env, highway_checkpoint: str
+):
+    name = str(forecast_policy)
+    assert sees_forecasts(name)
+    env, expected = env_for_ego(discrete, name), ForecastObservation(make_env("two-way-v0"), highway_checkpoint)
+    ego = make_ego(name, env, np.random.default_rng(0))
+    model = PPO.load(forecast_policy, device="cpu")
+    obs, _ = env.reset(seed=0)
+    own, _ = expected.reset(seed=0)
+    for _ in range(3):
+        assert_same(obs, own, tolerance=0.0)
+        action = int(ego(obs))
+        assert action == int(model.predict(own, deterministic=True)[0])
+        obs, own = env.step(action)[0], expected.step(action)[0]
+
+
 # --- Errors -----------------------------------------------------------------------------------------------------------
 
 
@@ -156,7 +190,15 @@ def test_file_that_is_no_policy_is_named(kind: str, tmp_path: Path, policies: Pa
 
 
 def test_policy_of_another_env_is_named(policies: Path):
-    env = make_env("highway-fast-v0")
-    obs, _ = env.reset(seed=0)
-    with pytest.raises(UserError, match="ppo.zip"):
-        make_ego(str(policies / "ppo.zip"), env, np.random.default_rng(0))(obs)
+    expected = r"policy .*ppo.zip was trained on Box\(.*\(3, 3, 5\).*, but the env gives Box\(.*\(5, 5\)"
+    with pytest.raises(UserError, match=expected):
+        env_for_ego(make_env("highway-fast-v0"), str(policies / "ppo.zip"))
+
+
+def test_policy_of_other_forecasts_is_named(forecast_policy: Path, tmp_path: Path):
+    """Without its run folder, the forecasts it saw are unknown: those of constant velocity have other edges."""
+    stray = tmp_path / "policy.zip"
+    shutil.copy(forecast_policy, stray)
+    (tmp_path / "config.json").write_text(json.dumps({"config": {"observe": "constant-velocity"}}))
+    with pytest.raises(UserError, match="policy .*policy.zip was trained on Dict.*, but the env gives Dict"):
+        env_for_ego(make_env("two-way-v0"), str(stray))

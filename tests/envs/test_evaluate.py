@@ -21,7 +21,16 @@ from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.errors import UserError
 from predictor.forecaster import Belief
 from predictor.scene import Scene, SceneSpec
-from tests.envs.helpers import HIGHWAY_SPEC, HORIZON, SIZES, cruising_env, play, run_command, tiny_model
+from tests.envs.helpers import (
+    HIGHWAY_SPEC,
+    HORIZON,
+    SIZES,
+    cruising_env,
+    play,
+    run_command,
+    save_forecast_policy,
+    tiny_model,
+)
 
 OFFSET_M = torch.tensor([3.0, 4.0])
 """A displacement of exactly 5 m."""
@@ -229,6 +238,27 @@ def test_a_learned_checkpoint_is_measured(in_process: None, tmp_path: Path):
     low, high = result.reduction_interval
     assert low <= result.reduction <= high
     assert all(np.isfinite(row.nll).all() and len(row.nll) == HORIZON for row in (result.model, result.model_samples))
+
+
+def test_a_policy_trained_on_forecasts_drives(in_process: None, tmp_path: Path, highway_checkpoint: str):
+    policy = str(save_forecast_policy(tmp_path, "two-way-v0", highway_checkpoint))
+    settings = {"checkpoint": highway_checkpoint, "horizon_steps": None}
+    driven = evaluate_env(run_config(**settings, ego=policy), "two-way-v0")
+    assert driven.model.agents > 0
+    assert driven != evaluate_env(run_config(**settings), "two-way-v0")
+
+
+@pytest.mark.parametrize(
+    "changes", [{"checkpoint": "constant-velocity"}, {"horizon_steps": 2}], ids=["edges", "horizon"]
+)
+def test_a_policy_trained_on_other_forecasts_is_named(
+    changes: dict[str, Any], in_process: None, tmp_path: Path, highway_checkpoint: str
+):
+    """It gets the forecasts that are measured; these have other edges, or fewer steps, than it was trained on."""
+    policy = str(save_forecast_policy(tmp_path, "two-way-v0", highway_checkpoint))
+    config = run_config(**{"checkpoint": highway_checkpoint, "horizon_steps": HORIZON, "ego": policy, **changes})
+    with pytest.raises(UserError, match="policy .*policy.zip was trained on"):
+        evaluate_env(config, "two-way-v0")
 
 
 def test_the_command_writes_json_and_markdown(

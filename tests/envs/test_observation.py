@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jaxtyping import TypeCheckError
 
 from envs.observation import (
     FORECAST_KEYS,
@@ -166,6 +167,16 @@ def test_ego_axes_closed_form():
     np.testing.assert_allclose(north @ [0, 1], [1, 0], atol=1e-12)
     np.testing.assert_allclose(west @ [0, 1], [0, -1], atol=1e-12)
     np.testing.assert_allclose(north.T @ north, np.eye(2), atol=1e-12)
+
+
+def test_shapes_execute():
+    rng = np.random.default_rng(0)
+    scenes = random_scenes(rng, 2, 4)
+    forecast = random_forecast(rng, scenes, 3, 5, 2, 4)
+    with pytest.raises(TypeCheckError, match="xy"):
+        replace(forecast, xy=forecast.xy.transpose(1, 2))
+    with pytest.raises(TypeCheckError, match="into_ego_axes"):
+        into_ego_axes(scenes.heading_rad[:, None])
 
 
 def test_order_skips_padding_that_lies_nearer():

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
 from envs.observation import FORECAST_KEYS
@@ -262,6 +263,17 @@ def test_returned_observations_are_not_written_to_later(highway_checkpoint: str)
     env.step(ACTIONS[1])
     for kept, copy in zip((obs, stepped), copies, strict=True):
         assert_same(kept, copy, tolerance=0.0)
+
+
+def test_the_usual_makers_work(highway_checkpoint: str):
+    """What SB3 and gymnasium offer to make many rows at once, with the reader's own perception."""
+    sb3 = VecForecast(make_vec_env("highway-fast-v0", 2, seed=SEED, wrapper_class=SceneObservation), highway_checkpoint)
+    made = gym.make_vec("highway-fast-v0", 2, vectorization_mode="sync", wrappers=(SceneObservation,))
+    gymnasium = VectorForecast(made, highway_checkpoint)
+    first: Any = sb3.reset()
+    second, _ = gymnasium.reset(seed=SEED)
+    assert first["agents"].shape == (2, 11, 4)
+    assert_same(first, second)
 
 
 # --- One batched forward ----------------------------------------------------------------------------------------------

@@ -117,6 +117,18 @@ def circling_episode(seed: int, steps: int = 10, agents: int = 2, turn_rad: floa
     return Episode(states, np.ones((steps, agents), dtype=np.bool_), np.arange(agents), "circle", seed)
 
 
+def following_episode(seed: int) -> Episode:
+    """Agent 1 takes over the ego's velocity after the first of three steps: unknowable without looking at the ego."""
+    rng = np.random.default_rng(seed)
+    velocity_mps, position_m = rng.uniform(-5, 5, size=(2, 2)), rng.uniform(-5, 5, size=(2, 2))
+    states = np.zeros((3, 2, 4), dtype=np.float32)
+    for t in range(3):
+        states[t] = np.concatenate([position_m, velocity_mps], axis=-1)
+        velocity_mps = np.stack([velocity_mps[0], velocity_mps[0]])
+        position_m = position_m + velocity_mps
+    return Episode(states, np.ones((3, 2), dtype=np.bool_), np.arange(2), "follow", seed)
+
+
 def write_circles(path: Path, episodes: int = 6, **kwargs: int) -> Path:
     """A small store of circling agents."""
     write_store(path, StoreInfo(spec(), "circles"), [circling_episode(i, **kwargs) for i in range(episodes)])

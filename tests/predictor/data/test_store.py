@@ -1,0 +1,204 @@
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from predictor.data.store import Episode, StoreInfo, read_store, write_store
+from predictor.errors import UserError
+from predictor.scene import SceneSpec
+from tests.predictor.helpers import ROAD, random_presence, random_states, scene, spec
+
+INFO = StoreInfo(spec(ROAD), "toy-v0", {"command": "python -m envs.collect", "seeds": [3, 4]})
+
+
+def episode(seed: int, steps: int = 4, agents: int = 3) -> Episode:
+    return Episode(
+        random_states(seed, steps, agents, 4).numpy(),
+        random_presence(seed, steps, agents).numpy(),
+        10 * np.arange(agents) + seed,
+        f"driven by {seed}",
+        seed,
+    )
+
+
+def assert_equal(ours: Episode, expected: Episode) -> None:
+    np.testing.assert_array_equal(ours.states, expected.states)
+    np.testing.assert_array_equal(ours.valid, expected.valid)
+    np.testing.assert_array_equal(ours.ids, expected.ids)
+    assert (ours.label, ours.seed) == (expected.label, expected.seed)
+
+
+@st.composite
+def episodes(draw: st.DrawFn) -> Episode:
+    steps, agents = draw(st.integers(1, 5)), draw(st.integers(1, 4))
+    finite = st.floats(-1e6, 1e6, width=32)
+    return Episode(
+        draw(hnp.arrays(np.float32, (steps, agents, 4), elements=finite)),
+        draw(hnp.arrays(np.bool_, (steps, agents))),
+        np.array(draw(st.lists(st.integers(0, 2**40), min_size=agents, max_size=agents, unique=True))),
+        draw(st.text(st.characters(codec="utf-8"), max_size=8)),
+        draw(st.integers(0, 2**60)),
+    )
+
+
+@settings(max_examples=20)
+@given(written=st.lists(episodes(), min_size=1, max_size=4))
+def test_round_trip(tmp_path_factory: pytest.TempPathFactory, written: list[Episode]):
+    path = tmp_path_factory.mktemp("stores") / "store"
+    write_store(path, INFO, written)
+    store = read_store(path)
+    assert store.info == INFO
+    assert store.num_steps == sum(len(e.states) for e in written)
+    for ours, expected in zip(store.episodes, written, strict=True):
+        assert_equal(ours, expected)
+
+
+def test_every_field_of_the_spec_comes_back(tmp_path: Path):
+    names, scales = (*spec().feature_names, "heading_rad"), (1.0, 2.0, 3.0, 4.0, 5.0)
+    unusual = SceneSpec(0.2, ROAD, names, scales, perception_m=33.0, max_agents=7)
+    states, valid = np.zeros((2, 1, 5), dtype=np.float32), np.ones((2, 1), dtype=np.bool_)
+    write_store(tmp_path / "store", StoreInfo(unusual, "toy"), [Episode(states, valid, np.array([0]))])
+    assert read_store(tmp_path / "store").info.spec == unusual
+
+
+def test_episode_from_scenes_gives_each_id_a_column():
+    first = scene({0: (1.0,) * 4, 7: (2.0,) * 4}, rows=4)
+    second = scene({0: (3.0,) * 4, 9: (4.0,) * 4}, rows=4, order=[0, -1, -1, 9])
+    third = scene({0: (5.0,) * 4, 9: (6.0,) * 4, 7: (7.0,) * 4}, rows=4)
+    joined = Episode.from_scenes([first, second, third], "idle", 5)
+    assert joined.ids.tolist() == [0, 7, 9]
+    assert joined.valid.tolist() == [[True, True, False], [True, False, True], [True, True, True]]
+    assert joined.states[..., 0].tolist() == [[1.0, 2.0, 0.0], [3.0, 0.0, 4.0], [5.0, 7.0, 6.0]]
+    assert (joined.label, joined.seed) == ("idle", 5)
+
+
+# --- Refusals ---------------------------------------------------------------------------------------------------------
+
+
+def broken(value: float, visible: bool) -> Episode:
+    bad = episode(3)
+    states, valid = bad.states.copy(), bad.valid.copy()
+    states[2, 1, 3], valid[2, 1] = value, visible
+    return replace(bad, states=states, valid=valid)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("visible", [True, False], ids=["visible", "hidden"])
+def test_non_finite_states_are_refused_with_their_place(tmp_path: Path, value: float, visible: bool):
+    with pytest.raises(UserError, match=rf"states must be finite, got \[.*{value}\] \(episode seed 3, step 2, agent 13\)"):
+        write_store(tmp_path / "store", INFO, [episode(1), broken(value, visible)])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_non_finite_states_in_a_store_are_refused_with_their_place(tmp_path: Path):
+    write_store(tmp_path / "store", INFO, [episode(1), episode(3)])
+    states: Any = zarr.open_group(tmp_path / "store", mode="r+")["states"]
+    states[4 + 2, 1, 0] = np.nan
+    with pytest.raises(UserError, match=r"store: states must be finite, got \[nan.*\(episode seed 3, step 2, agent 13\)"):
+        read_store(tmp_path / "store")
+
+
+def test_zero_episodes_are_refused(tmp_path: Path):
+    with pytest.raises(UserError, match="a store needs at least one episode, got none"):
+        write_store(tmp_path / "store", INFO, iter([]))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_store_is_not_overwritten_unasked(tmp_path: Path):
+    path = tmp_path / "store"
+    write_store(path, INFO, [episode(1)])
+    with pytest.raises(UserError, match=r"store exists; choose another path or pass --overwrite"):
+        write_store(path, INFO, [episode(2)])
+    assert_equal(read_store(path).episodes[0], episode(1))
+    write_store(path, INFO, [episode(2)], overwrite=True)
+    assert_equal(read_store(path).episodes[0], episode(2))
+    assert [p.name for p in tmp_path.iterdir()] == ["store"]
+
+
+def test_missing_store(tmp_path: Path):
+    with pytest.raises(UserError, match=r"no episode store at .*/nowhere; make one with python -m envs.collect"):
+        read_store(tmp_path / "nowhere")
+
+
+def foreign_folder(path: Path) -> None:
+    path.mkdir()
+    (path / "notes.txt").write_text("mine")
+
+
+def foreign_file(path: Path) -> None:
+    path.write_text("mine")
+
+
+def foreign_group(path: Path) -> None:
+    zarr.open_group(path, mode="w").attrs["format"] = "something else"
+
+
+def newer_version(path: Path) -> None:
+    write_store(path, INFO, [episode(1)])
+    zarr.open_group(path, mode="r+").attrs["version"] = 99
+
+
+def without_an_array(path: Path) -> None:
+    write_store(path, INFO, [episode(1)])
+    shutil.rmtree(path / "ids")
+
+
+def with_broken_metadata(path: Path) -> None:
+    write_store(path, INFO, [episode(1)])
+    (path / "zarr.json").write_text((path / "zarr.json").read_text()[:50])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (foreign_folder, "store is not a readable episode store"),
+        (foreign_file, "store is not a readable episode store"),
+        (foreign_group, "store is not an episode store; make one with python -m envs.collect"),
+        (newer_version, "store has store version 99, this release reads 1; collect it anew"),
+        (without_an_array, "store is not a readable episode store .*ids.*; collect it anew"),
+        (with_broken_metadata, "store is not a readable episode store"),
+    ],
+)
+def test_what_is_no_store_is_refused(tmp_path: Path, make: Any, message: str):
+    make(tmp_path / "store")
+    with pytest.raises(UserError, match=message):
+        read_store(tmp_path / "store")
+
+
+# --- Crashes ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stage", [0, 1, 4, 5])
+@pytest.mark.parametrize("existing", [False, True], ids=["new", "overwriting"])
+def test_crash_while_writing_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: int, existing: bool
+):
+    path = tmp_path / "store"
+    if existing:
+        write_store(path, INFO, [episode(1)])
+    calls = 0
+    create = zarr.Group.create_array
+
+    def crash(group: zarr.Group, *args: Any, **kwargs: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls > stage:
+            raise KeyboardInterrupt
+        return create(group, *args, **kwargs)
+
+    monkeypatch.setattr(zarr.Group, "create_array", crash)
+    if stage == 5:  # all arrays are there, the attributes that make them a store are not
+        monkeypatch.setattr("predictor.data.store.asdict", lambda _: crash(None))  # type: ignore[arg-type]
+    with pytest.raises(KeyboardInterrupt):
+        write_store(path, INFO, [episode(2)], overwrite=True)
+    monkeypatch.undo()
+    assert [p.name for p in tmp_path.iterdir()] == ["store"] * existing
+    if existing:
+        assert_equal(read_store(path).episodes[0], episode(1))

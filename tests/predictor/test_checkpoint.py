@@ -1,0 +1,288 @@
+import json
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from predictor import checkpoint
+from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.checkpoint import CheckpointInfo, load_checkpoint, load_forecaster, resolve, save_checkpoint
+from predictor.dgvae import DGVAE
+from predictor.errors import UserError
+from predictor.scene import SceneSpec
+from tests.predictor.helpers import ROAD, model, random_states, spec
+
+INFO = CheckpointInfo(
+    spec(ROAD),
+    replace(model().config, delta_scales=(0.1, 0.2, 0.3, 1 / 3)),
+    horizon_steps=4,
+    std_m=(0.1, 0.25, 1 / 3, 0.7),
+    sources=("toy-v0", "toy-v1"),
+    provenance={"command": "python -m predictor.train", "result": {"step": 3}},
+)
+
+
+def made(seed: int = 0) -> DGVAE:
+    torch.manual_seed(seed)
+    return DGVAE(INFO.spec, INFO.config, INFO.horizon_steps)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A good checkpoint."""
+    save_checkpoint(tmp_path / "toy", made(), INFO)
+    return tmp_path / "toy"
+
+
+def assert_holds(path: Path, expected: DGVAE) -> None:
+    weights = load_checkpoint(path)[0].state_dict()
+    assert weights.keys() == expected.state_dict().keys()
+    for name, value in expected.state_dict().items():
+        assert torch.equal(weights[name], value), name
+
+
+def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    content = json.loads((path / "config.json").read_text())
+    change(content)
+    (path / "config.json").write_text(json.dumps(content))
+
+
+# --- Round trip -------------------------------------------------------------------------------------------------------
+
+
+def test_round_trip_is_exact(path: Path):
+    assert_holds(path, made())
+    loaded, info = load_checkpoint(path)
+    assert info == INFO
+    assert (loaded.spec, loaded.config, loaded.horizon_steps) == (INFO.spec, INFO.config, INFO.horizon_steps)
+    assert sorted(p.name for p in path.iterdir()) == ["config.json", "model.safetensors"]
+    assert [p.name for p in path.parent.iterdir()] == ["toy"]
+
+
+def test_loaded_model_forecasts_what_the_saved_one_did(path: Path):
+    states, valid = random_states(0, 2, 3, 4), torch.ones(2, 3).bool()
+    forecasts = []
+    for forecaster in (made().eval(), load_checkpoint(path)[0]):
+        belief = forecaster.observe(forecaster.empty_memory(2, 3), states, valid)[1]
+        forecasts.append(forecaster.rollout(belief, 4))
+    assert torch.equal(*forecasts)
+
+
+def test_loaded_model_is_in_evaluation_mode(path: Path):
+    assert not load_checkpoint(path)[0].training
+
+
+def test_saving_again_replaces(path: Path):
+    save_checkpoint(path, made(1), INFO)
+    assert_holds(path, made(1))
+    assert [p.name for p in path.parent.iterdir()] == ["toy"]
+
+
+# --- Failed saves -----------------------------------------------------------------------------------------------------
+
+
+def crash(*args: object, **kwargs: object) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("point", ["weights", "config", "replace"])
+@pytest.mark.parametrize("existing", [True, False], ids=["overwriting", "new"])
+def test_failed_save_leaves_the_old_checkpoint_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, point: str, existing: bool
+):
+    path = tmp_path / "toy"
+    if existing:
+        save_checkpoint(path, made(), INFO)
+    before = {p.name: p.read_bytes() for p in path.iterdir()} if existing else {}
+    match point:
+        case "weights":
+            monkeypatch.setattr(checkpoint, "save_file", crash)
+        case "config":
+            monkeypatch.setattr(checkpoint, "asdict", crash)
+        case "replace":
+            monkeypatch.setattr(checkpoint, "replace_folder", crash)
+    with pytest.raises(KeyboardInterrupt):
+        save_checkpoint(path, made(1), INFO)
+    monkeypatch.undo()
+    assert [p.name for p in tmp_path.iterdir()] == ["toy"] * existing
+    if existing:
+        assert {p.name: p.read_bytes() for p in path.iterdir()} == before
+
+
+def test_crash_in_the_moment_of_replacement_leaves_a_whole_checkpoint_beside(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(os, "replace", crash)
+    with pytest.raises(KeyboardInterrupt):
+        save_checkpoint(path, made(1), INFO)
+    monkeypatch.undo()
+    (left,) = path.parent.iterdir()
+    assert_holds(left, made())
+    save_checkpoint(path, made(2), INFO)  # and the next save is not hindered
+    assert_holds(path, made(2))
+
+
+# --- Files that are no good -------------------------------------------------------------------------------------------
+
+
+def truncated_weights(path: Path) -> None:
+    file = path / "model.safetensors"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def no_weights(path: Path) -> None:
+    (path / "model.safetensors").unlink()
+
+
+def weights_are_text(path: Path) -> None:
+    (path / "model.safetensors").write_text("PK, this is not it")
+
+
+def foreign_weights(path: Path) -> None:
+    save_file({"linear.weight": torch.zeros(3, 3)}, path / "model.safetensors")
+
+
+def weights_of_another_size(path: Path) -> None:
+    wider = DGVAE(INFO.spec, replace(INFO.config, rnn_dim=6), INFO.horizon_steps)
+    save_file(wider.state_dict(), path / "model.safetensors")
+
+
+def one_weight_missing(path: Path) -> None:
+    tensors = load_file(path / "model.safetensors")
+    del tensors["decoder.readout.bias"]
+    save_file(tensors, path / "model.safetensors")
+
+
+def weights_not_finite(path: Path) -> None:
+    tensors = load_file(path / "model.safetensors")
+    tensors["decoder.readout.bias"][1] = float("nan")
+    save_file(tensors, path / "model.safetensors")
+
+
+def truncated_config(path: Path) -> None:
+    (path / "config.json").write_text((path / "config.json").read_text()[:100])
+
+
+def no_config(path: Path) -> None:
+    (path / "config.json").unlink()
+
+
+def config_is_binary(path: Path) -> None:
+    (path / "config.json").write_bytes(b"\x80\x04\x95\xff\xfe")
+
+
+def foreign_json(path: Path) -> None:
+    (path / "config.json").write_text('{"model_type": "bert", "hidden_size": 768}')
+
+
+def json_list(path: Path) -> None:
+    (path / "config.json").write_text("[1, 2]")
+
+
+def newer_version(path: Path) -> None:
+    edit(path, lambda c: c.update(version=2))
+
+
+def unknown_size(path: Path) -> None:
+    edit(path, lambda c: c["config"].update(attention_heads=4))
+
+
+def unknown_spec_field(path: Path) -> None:
+    edit(path, lambda c: c["spec"].update(lidar=True))
+
+
+def no_spec(path: Path) -> None:
+    edit(path, lambda c: c.pop("spec"))
+
+
+def impossible_size(path: Path) -> None:
+    edit(path, lambda c: c["config"].update(rnn_dim=0))
+
+
+def impossible_dt(path: Path) -> None:
+    edit(path, lambda c: c["spec"].update(dt_s=-1.0))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (truncated_weights, r"toy/model\.safetensors cannot be read \(.*\); copy or train it again"),
+        (no_weights, r"toy/model\.safetensors cannot be read"),
+        (weights_are_text, r"toy/model\.safetensors cannot be read"),
+        (foreign_weights, r"toy: tensor '\S+' should be \(.*\) by config\.json but is absent in model\.safetensors"),
+        (
+            weights_of_another_size,
+            r"tensor 'encoder\.\S+' should be \((5|20).*\) by config\.json but is \((6|24).*do not belong together",
+        ),
+        (one_weight_missing, r"tensor 'decoder\.readout\.bias' should be \(4,\) by config\.json but is absent"),
+        (weights_not_finite, "toy: the weights are not finite; train it again"),
+        (truncated_config, r"toy/config\.json cannot be read \(.*\); is .*toy a predictor checkpoint\?"),
+        (no_config, r"toy/config\.json cannot be read"),
+        (config_is_binary, r"toy/config\.json cannot be read"),
+        (foreign_json, r"toy is not a predictor checkpoint \(config\.json has no format 'dgvae-rl predictor'\)"),
+        (json_list, "toy is not a predictor checkpoint"),
+        (newer_version, "toy has checkpoint version 2, this release reads 1"),
+        (unknown_size, r"config\.json does not describe a predictor: unknown field 'attention_heads' of DGVAEConfig"),
+        (unknown_spec_field, "unknown field 'lidar' of SceneSpec"),
+        (no_spec, r"does not describe a predictor: 'spec'"),
+        (impossible_size, "does not describe a predictor: rnn_dim must be at least 1, got 0"),
+        (impossible_dt, "does not describe a predictor: dt_s must be positive, got -1.0"),
+    ],
+)
+def test_bad_files_are_refused(path: Path, damage: Callable[[Path], None], message: str):
+    damage(path)
+    before = {p.name: p.read_bytes() for p in path.iterdir()}
+    with pytest.raises(UserError, match=message) as error:
+        load_checkpoint(path)
+    assert "\n" not in str(error.value)
+    assert {p.name: p.read_bytes() for p in path.iterdir()} == before
+
+
+# --- Names and specs --------------------------------------------------------------------------------------------------
+
+
+def test_unknown_name_lists_the_known_ones(monkeypatch: pytest.MonkeyPatch, path: Path):
+    monkeypatch.setattr(checkpoint, "PRETRAINED", path.parent)
+    with pytest.raises(UserError) as error:
+        resolve("highwy")
+    assert str(error.value) == (
+        "no checkpoint 'highwy': neither a folder nor a shipped name (toy, constant-velocity)"
+    )
+
+
+def test_shipped_names_are_found(monkeypatch: pytest.MonkeyPatch, path: Path):
+    monkeypatch.setattr(checkpoint, "PRETRAINED", path.parent)
+    assert resolve("toy") == path
+    assert load_checkpoint("toy")[1] == INFO
+
+
+def test_half_written_folders_are_no_shipped_names(monkeypatch: pytest.MonkeyPatch, path: Path):
+    path.rename(path.with_name(".toy.1234.partial"))
+    monkeypatch.setattr(checkpoint, "PRETRAINED", path.parent)
+    assert checkpoint.shipped() == []
+
+
+def test_another_time_step_names_both_numbers(path: Path):
+    with pytest.raises(UserError, match=r"was trained at dt_s=1 but env 'racetrack-v1' steps at dt_s=0.2; retrain"):
+        load_forecaster(path, replace(INFO.spec, dt_s=0.2), "env 'racetrack-v1'")
+
+
+def test_other_features_name_both_lists(path: Path):
+    names, scales = (*INFO.spec.feature_names, "heading_rad"), (1.0,) * 5
+    other = SceneSpec(1.0, feature_names=names, feature_scales=scales)
+    with pytest.raises(UserError, match=r"features \('x_m', 'y_m', 'vx_mps', 'vy_mps'\) but env 'b' gives .*'heading_rad'"):
+        load_forecaster(path, other, "env 'b'")
+
+
+def test_scenes_of_its_own_spec_are_taken(path: Path):
+    assert load_forecaster(path, INFO.spec, "env 'a'").horizon_steps == 4
+
+
+def test_constant_velocity_takes_every_spec():
+    forecaster = load_forecaster("constant-velocity", spec(dt_s=0.2), "env 'a'")
+    assert isinstance(forecaster, ConstantVelocity) and forecaster.spec.dt_s == 0.2

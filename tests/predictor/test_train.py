@@ -1,0 +1,516 @@
+"""Training: it learns what can be learned, it is a function of its seed, and nothing it writes can be lost by a kill."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import zarr
+
+from predictor import train as training
+from predictor.accuracy import run_windows, summarise
+from predictor.checkpoint import load_checkpoint
+from predictor.data.store import Episode, StoreInfo, read_store, write_store
+from predictor.data.windows import WindowBatch
+from predictor.dgvae import PRESETS, WindowOutput
+from predictor.errors import UserError, run_entry_point
+from predictor.train import TrainConfig, Trainer, load_data, train, typical_change, window_loss
+from tests.predictor.helpers import FAST_LIKE, circling_episode, following_episode, model, spec, write_circles
+
+ROOT = Path(__file__).parents[2]
+State = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def circles(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_circles(tmp_path_factory.mktemp("data") / "circles")
+
+
+@pytest.fixture
+def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The "fast" preset at a size that trains in milliseconds; dropout, so that its noise is part of what is tested."""
+    monkeypatch.setitem(PRESETS, "fast", replace(FAST_LIKE, dropout=0.1))
+
+
+def config(data: Path, out: Path, **changes: Any) -> TrainConfig:
+    small = {"steps": 7, "batch_size": 5, "history_steps": 3, "horizon_steps": 2, "val_fraction": 0.34, "eval_every": 2}
+    return TrainConfig(data=(data,), out=out, **(small | changes))
+
+
+def weights(trainer: Trainer) -> list[torch.Tensor]:
+    return [p.detach().clone() for p in trainer.model.parameters()]
+
+
+def run(trainer: Trainer, steps: int) -> Trainer:
+    for _ in range(steps):
+        trainer.train_step()
+    return trainer
+
+
+def assert_same_state(ours: State, expected: State) -> None:
+    """Bit for bit, optimiser included."""
+    for name in ("step", "best", "stale"):
+        assert ours[name] == expected[name], name
+    for name, value in expected["model"].items():
+        assert torch.equal(ours["model"][name], value), name
+    for index, moments in expected["optimizer"]["state"].items():
+        for name, value in moments.items():
+            assert torch.equal(ours["optimizer"]["state"][index][name], value), (index, name)
+
+
+def state(out: Path) -> State:
+    loaded: State = torch.load(out / "train_state.pt", weights_only=True)
+    return loaded
+
+
+# --- Learning ---------------------------------------------------------------------------------------------------------
+
+
+def learned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, episodes: list[Episode], **changes: Any) -> Trainer:
+    monkeypatch.setitem(PRESETS, "fast", FAST_LIKE)
+    write_store(tmp_path / "store", StoreInfo(spec(), "toy"), episodes)
+    settings = config(tmp_path / "store", tmp_path / "run", lr=1e-2, **changes)
+    trainer = Trainer(settings, load_data(settings))
+    return run(trainer, settings.steps)
+
+
+def test_circles_are_learned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Agents that turn at a constant rate: the optimum is exact, and constant velocity is off by metres."""
+    episodes = [circling_episode(seed) for seed in range(4)]
+    trainer = learned(monkeypatch, tmp_path, episodes, steps=200, batch_size=16, horizon_steps=3, val_fraction=0.25)
+    trainer.model.eval()
+    seen = trainer.data.train[0]
+    row = summarise("model", list(run_windows(trainer.model, seen, np.arange(len(seen)), 3)))
+    assert trainer.baseline_m > 3.0
+    assert row.min_ade_m < trainer.baseline_m / 5
+    assert trainer.validate()[0].min_ade_m < trainer.baseline_m / 2
+
+
+def test_following_is_learned_through_the_edge(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """On held-out episodes: the follower's future is in the ego's velocity, so only messages can bring the error down."""
+    episodes = [following_episode(seed) for seed in range(60)]
+    trainer = learned(monkeypatch, tmp_path, episodes, steps=300, batch_size=32, history_steps=2, val_fraction=0.2)
+    assert trainer.baseline_m > 4.0
+    assert trainer.validate()[0].min_ade_m < trainer.baseline_m / 4
+    first = torch.from_numpy(np.stack([e.states[0] for e in episodes]))
+    memory = trainer.model.empty_memory(len(first), 2)
+    belief = trainer.model.observe(memory, first, torch.ones(len(first), 2).bool())[1]
+    assert belief.edge_probs[:, 1, 0, 1].mean() > 0.9  # the follower listens to the ego
+
+
+# --- A function of its seed -------------------------------------------------------------------------------------------
+
+
+def test_equal_seeds_give_equal_weights(tiny: None, circles: Path, tmp_path: Path):
+    settings = config(circles, tmp_path)
+    one = run(Trainer(settings, load_data(settings)), 5)
+    torch.manual_seed(123)
+    other = Trainer(settings, load_data(settings))
+    for _ in range(5):
+        torch.rand(3), np.random.default_rng().random()  # what happens elsewhere does not matter
+        other.train_step()
+    assert all(torch.equal(a, b) for a, b in zip(weights(one), weights(other), strict=True))
+
+
+def test_other_seeds_give_other_weights(tiny: None, circles: Path, tmp_path: Path):
+    one, other = (
+        run(Trainer(settings, load_data(settings)), 2) for settings in (config(circles, tmp_path, seed=s) for s in (0, 1))
+    )
+    assert not any(torch.equal(a, b) for a, b in zip(weights(one), weights(other), strict=True))
+
+
+def test_steps_differ_in_batch_and_noise(tiny: None, circles: Path, tmp_path: Path):
+    settings = config(circles, tmp_path, lr=1e-12)
+    trainer = Trainer(settings, load_data(settings))
+    losses = [trainer.train_step()["loss"] for _ in range(4)]
+    assert len(set(losses)) == 4
+
+
+def test_validation_does_not_disturb_training(tiny: None, circles: Path, tmp_path: Path):
+    settings = config(circles, tmp_path)
+    one, other = (Trainer(settings, load_data(settings)) for _ in range(2))
+    run(one, 4)
+    for _ in range(4):
+        other.validate()
+        other.train_step()
+    assert all(torch.equal(a, b) for a, b in zip(weights(one), weights(other), strict=True))
+
+
+# --- Stopped and resumed ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stop", [1, 3])
+def test_restored_trainer_continues_exactly(tiny: None, circles: Path, tmp_path: Path, stop: int):
+    settings = config(circles, tmp_path)
+    whole = run(Trainer(settings, load_data(settings)), 5)
+    run(Trainer(settings, load_data(settings)), stop).save(tmp_path / "state")
+    torch.manual_seed(99)
+    resumed = Trainer(settings, load_data(settings))
+    resumed.restore(tmp_path / "state")
+    assert resumed.step == stop
+    run(resumed, 5 - stop)
+    for name, trainer in (("whole", whole), ("resumed", resumed)):
+        trainer.save(tmp_path / name)
+    states = [torch.load(tmp_path / name, weights_only=True) for name in ("resumed", "whole")]
+    assert_same_state(*states)
+
+
+def stop_at(step: int) -> Callable[[pytest.MonkeyPatch], None]:
+    def patch(monkeypatch: pytest.MonkeyPatch) -> None:
+        original = Trainer.train_step
+
+        def train_step(trainer: Trainer) -> dict[str, float]:
+            if trainer.step == step:
+                raise KeyboardInterrupt
+            return original(trainer)
+
+        monkeypatch.setattr(Trainer, "train_step", train_step)
+
+    return patch
+
+
+def stop_before_the_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "save_checkpoint", interrupt)
+
+
+def stop_between_checkpoint_and_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Trainer, "save", interrupt)
+
+
+def interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    "stop",
+    [stop_at(0), stop_at(1), stop_at(5), stop_before_the_checkpoint, stop_between_checkpoint_and_state],
+    ids=["at_once", "before_the_first_save", "between_saves", "before_the_checkpoint", "before_the_state"],
+)
+def test_interrupted_run_ends_like_one_that_was_not(
+    tiny: None, circles: Path, tmp_path: Path, stop: Callable[[pytest.MonkeyPatch], None]
+):
+    train(config(circles, tmp_path / "whole"))
+    settings = config(circles, tmp_path / "run")
+    with pytest.MonkeyPatch.context() as patch:
+        stop(patch)
+        with pytest.raises(KeyboardInterrupt):
+            train(settings)
+    train(replace(settings, resume=True))
+    assert_same_state(state(tmp_path / "run"), state(tmp_path / "whole"))
+    for ours, expected in zip(*(sorted(checkpoint_of(tmp_path / n).items()) for n in ("run", "whole")), strict=True):
+        assert ours[0] == expected[0] and torch.equal(ours[1], expected[1])
+
+
+def checkpoint_of(out: Path) -> dict[str, torch.Tensor]:
+    return load_checkpoint(out / "checkpoint")[0].state_dict()
+
+
+def test_run_folder_says_how_it_was_made(tiny: None, circles: Path, tmp_path: Path):
+    out = tmp_path / "run"
+    assert train(config(circles, out)) == out / "checkpoint"
+    _, info = load_checkpoint(out / "checkpoint")
+    assert (info.spec, info.sources, info.horizon_steps, len(info.std_m)) == (spec(), ("circles",), 2, 2)
+    assert info.provenance["result"]["val_constant_velocity_ade_m"] > 1.0
+    assert info.provenance["train_config"]["steps"] == 7
+    recorded = json.loads((out / "config.json").read_text())
+    assert recorded["config"]["data"] == [str(circles)]
+    assert recorded["provenance"]["versions"]["torch"] == torch.__version__
+    assert list((out / "tb").glob("events*"))
+    assert state(out)["step"] == 7  # the last step is saved although eval_every does not divide it
+    assert sorted(p.name for p in out.iterdir()) == ["checkpoint", "config.json", "tb", "train_state.pt"]
+
+
+def test_finished_run_is_left_as_it_is(tiny: None, circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    settings = config(circles, tmp_path / "run")
+    train(settings)
+    files = [*(tmp_path / "run" / "checkpoint").iterdir(), tmp_path / "run" / "train_state.pt"]
+    before = {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in files}
+    monkeypatch.setattr(Trainer, "train_step", interrupt)
+    train(replace(settings, resume=True))
+    assert {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in files} == before
+
+
+def test_more_steps_may_be_asked_for_on_resuming(tiny: None, circles: Path, tmp_path: Path):
+    train(config(circles, tmp_path / "run", steps=2))
+    train(config(circles, tmp_path / "run", steps=5, resume=True))
+    assert state(tmp_path / "run")["step"] == 5
+
+
+def test_best_checkpoint_is_kept_and_a_stale_run_stops(
+    tiny: None, circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    validate, errors, kept = Trainer.validate, iter([3.0, 1.0, 1.0, 2.0, 0.5]), []
+
+    def scripted(trainer: Trainer) -> Any:
+        kept.append(weights(trainer))
+        accuracy, std_m = validate(trainer)
+        return replace(accuracy, min_ade_m=next(errors)), std_m
+
+    monkeypatch.setattr(Trainer, "validate", scripted)
+    out = train(config(circles, tmp_path / "run", steps=100, eval_every=1, patience=2))
+    assert state(tmp_path / "run")["step"] == 4  # two validations without a better one: as good is not better
+    best = load_checkpoint(out)[0]
+    assert all(torch.equal(a, b) for a, b in zip(best.parameters(), kept[1], strict=True))
+    assert load_checkpoint(out)[1].provenance["result"]["val_min_ade_m"] == 1.0
+
+
+# --- kill -9 ----------------------------------------------------------------------------------------------------------
+
+KILLED = """
+import os, signal, sys
+from predictor import train
+replace, step = os.replace, train.Trainer.train_step
+seen = {}
+
+def kill():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+def killing_step(trainer):
+    kill() if WHERE == "step" and trainer.step == WHEN else None
+    return step(trainer)
+
+def killing_replace(source, target):
+    name = os.path.basename(target)
+    seen[name] = seen.get(name, 0) + 1
+    kill() if (name, seen[name]) == (WHERE, WHEN) else None
+    return replace(source, target)
+
+os.replace, train.Trainer.train_step = killing_replace, killing_step
+sys.argv = ["train", *sys.argv[1:]]
+train.main()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("where", "when"),
+    # checkpoint: the old one is already moved away, the new one not yet in its place
+    [("step", 1), ("step", 5), ("train_state.pt", 1), ("train_state.pt", 2), ("checkpoint", 1)],
+    ids=["before_the_first_save", "between_saves", "in_the_first_save", "in_the_second_save", "replacing_the_checkpoint"],
+)
+def test_killed_process_is_resumed_to_the_same_weights(
+    circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str, when: int
+):
+    settings = config(circles, tmp_path / "run", threads=1)
+    code = KILLED.replace("WHERE", repr(where)).replace("WHEN", repr(when))
+    command = [sys.executable, "-c", code, *arguments(settings)]
+    killed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    monkeypatch.setattr(sys, "argv", ["train", *arguments(settings), "--resume"])
+    training.main()
+    train(config(circles, tmp_path / "whole", threads=1))
+    assert_same_state(state(tmp_path / "run"), state(tmp_path / "whole"))
+    assert checkpoint_of(tmp_path / "run").keys() == checkpoint_of(tmp_path / "whole").keys()
+    assert all(
+        torch.equal(value, checkpoint_of(tmp_path / "whole")[name])
+        for name, value in checkpoint_of(tmp_path / "run").items()
+    )
+
+
+def arguments(settings: TrainConfig) -> list[str]:
+    """The command line of a config."""
+    names = ("out", "steps", "batch_size", "history_steps", "horizon_steps", "val_fraction", "eval_every", "threads")
+    pairs = [(f"--{name.replace('_', '-')}", str(getattr(settings, name))) for name in names]
+    return ["--data", *map(str, settings.data), *(word for pair in pairs for word in pair)]
+
+
+# --- Bad input --------------------------------------------------------------------------------------------------------
+
+
+def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    """The one line that the entry point prints; its exit status is checked here."""
+    monkeypatch.setattr(sys, "argv", ["train", *words])
+    with pytest.raises(SystemExit) as stop:
+        run_entry_point(training.main)
+    assert stop.value.code == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.startswith("error: ") and captured.err.count("\n") == 1
+    return captured.err
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_bad_input_ends_a_real_process_with_one_line(tmp_path: Path):
+    words = ["--data", str(tmp_path / "nowhere"), "--out", str(tmp_path / "run")]
+    command = [sys.executable, "-m", "predictor.train", *words]
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    assert ended.stdout == ""
+    assert ended.stderr == f"error: no episode store at {tmp_path}/nowhere; make one with python -m envs.collect\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--steps", "-3"], "steps must be at least 1, got -3"),
+        (["--steps", "0"], "steps must be at least 1, got 0"),
+        (["--batch-size", "0"], "batch_size must be at least 1, got 0"),
+        (["--history-steps", "0"], "history_steps must be at least 1, got 0"),
+        (["--horizon-steps", "-1"], "horizon_steps must be at least 1, got -1"),
+        (["--val-fraction", "1.0"], "val_fraction must lie between 0 and 1, got 1.0"),
+        (["--val-fraction", "0.01"], "6 episodes split into 6 for training and 0 for validation; both need at least one"),
+        (["--lr", "0"], "lr and variance must be positive, got 0.0 and 5e-05"),
+        (["--device", "cuda"], "device 'cuda' asked for but torch sees no CUDA device; use --device cpu"),
+    ],
+)
+def test_bad_arguments_are_named(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    circles: Path,
+    tmp_path: Path,
+    words: list[str],
+    message: str,
+):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    given = refused(monkeypatch, capsys, "--data", str(circles), "--out", str(tmp_path / "run"), *words)
+    assert message in given
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_existing_run_is_not_overwritten(
+    tiny: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], circles: Path, tmp_path: Path
+):
+    train(config(circles, tmp_path / "run"))
+    capsys.readouterr()
+    before = contents(tmp_path)
+    given = refused(monkeypatch, capsys, *arguments(config(circles, tmp_path / "run")))
+    assert given == f"error: {tmp_path}/run holds a run already; pass --resume to continue it or choose another --out\n"
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"batch_size": 6}, "cannot resume: batch_size was 5 and is now 6; use the same arguments"),
+        ({"horizon_steps": 3}, "cannot resume: horizon_steps was 2 and is now 3; use the same arguments"),
+    ],
+)
+def test_resuming_with_other_arguments_names_them(
+    tiny: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    circles: Path,
+    tmp_path: Path,
+    change: Mapping[str, int],
+    message: str,
+):
+    train(config(circles, tmp_path / "run"))
+    capsys.readouterr()
+    before = contents(tmp_path)
+    changed = arguments(config(circles, tmp_path / "run", **change))
+    assert message in refused(monkeypatch, capsys, *changed, "--resume")
+    assert contents(tmp_path) == before
+
+
+def test_foreign_folder_is_not_written_into(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], circles: Path, tmp_path: Path
+):
+    (tmp_path / "notes.txt").write_text("mine")
+    for resume in ([], ["--resume"]):
+        given = refused(monkeypatch, capsys, *arguments(config(circles, tmp_path)), *resume)
+        assert given == f"error: {tmp_path} is not empty and not a training run; choose another --out\n"
+    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_non_finite_states_in_the_store(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    write_circles(tmp_path / "data")
+    states: Any = zarr.open_group(tmp_path / "data", mode="r+")["states"]
+    states[13, 1, 2] = np.inf
+    given = refused(monkeypatch, capsys, *arguments(config(tmp_path / "data", tmp_path / "run")))
+    assert "data: states must be finite, got [" in given and "(episode seed 1, step 3, agent 1)" in given
+    assert not (tmp_path / "run").exists()
+
+
+def test_stores_of_different_time_steps_do_not_mix(circles: Path, tmp_path: Path):
+    write_store(tmp_path / "quick", StoreInfo(spec(dt_s=0.2), "quick"), read_store(circles).episodes)
+    settings = replace(config(circles, tmp_path / "run"), data=(circles, tmp_path / "quick"))
+    with pytest.raises(UserError, match=r"store .*circles was trained at dt_s=1 but store .*quick steps at dt_s=0\.2"):
+        load_data(settings)
+
+
+# --- Parts ------------------------------------------------------------------------------------------------------------
+
+
+def test_stores_are_mixed_by_their_windows(tiny: None, circles: Path, tmp_path: Path):
+    write_store(tmp_path / "short", StoreInfo(spec(), "short"), [circling_episode(s, steps=2) for s in range(6)])
+    settings = replace(config(circles, tmp_path / "run", batch_size=400), data=(circles, tmp_path / "short"))
+    data = load_data(settings)
+    assert data.sources == ("circles", "short")
+    assert [len(w) for w in data.train] == [4 * 9, 4 * 1]
+    trainer = Trainer(settings, data)
+    batch = trainer._draw(data.train, np.random.default_rng(0), 400)
+    longest = batch.valid[..., 0].sum(dim=1)
+    assert len(batch.states) == 400
+    assert 20 < int((longest == 2).sum()) < 130  # 1 in 10 from the short store, and the last windows of the other
+
+
+@pytest.mark.parametrize(
+    ("residual", "expected"),
+    [("state", [np.sqrt((9 + 16) / 2), 1e-3, 1.0, 1e-3]), ("constant_velocity", [1.0, 1e-3, 1.0, 1e-3])],
+)
+def test_typical_change_closed_form(residual: str, expected: list[float]):
+    states = np.zeros((3, 2, 4), dtype=np.float32)
+    states[:, 0, 0], states[:, 0, 2] = (0.0, 3.0, 7.0), (2.0, 3.0, 4.0)  # moves by 3 and 4 m at 2 and 3 m/s
+    states[:, 1, 0] = (0.0, 100.0, 0.0)
+    valid = np.array([[True, True], [True, False], [True, True]])  # the jumps of the second agent are not seen
+    assert typical_change([Episode(states, valid, np.arange(2))], spec(), residual) == pytest.approx(expected)
+
+
+def test_loss_closed_form(tmp_path: Path):
+    """One row, two agents; the last one is absent at the last step. Scales 10, 10, 5, 5."""
+    states = torch.zeros(1, 3, 2, 4)
+    valid = torch.tensor([[[True, True], [True, True], [True, False]]])
+    even = torch.zeros(1, 3, 2, 2, 2)
+    one_step, rollout = torch.zeros(1, 3, 2, 4), torch.zeros(1, 2, 2, 4)
+    one_step[0, 0, 0, 0] = 10.0  # wrong about step 1
+    one_step[0, 1, 1, 0] = one_step[0, 2] = 1e6  # of what does not exist
+    rollout[0, 1, 0, 2] = 10.0
+    rollout[0, 1, 1, 0] = 1e6
+    posterior = even.clone()
+    posterior[0, 0, 0, 1] = torch.tensor([0.8, 0.2]).log()
+    posterior[0, :, 0, 0] = posterior[0, 2] = 100.0 * torch.tensor([1.0, -1.0])  # no pairs there
+    output = WindowOutput(one_step, rollout, even, posterior, torch.zeros(1, 3, 2, 2, 1))
+    settings = TrainConfig((), tmp_path, variance=0.5, likelihood="gaussian", one_step_weight=10.0, kl_weight=100.0)
+    forecaster = model(horizon_steps=2)
+    loss, terms = window_loss(forecaster, WindowBatch(states, valid, torch.tensor([0])), output, settings)
+    divergence = 0.8 * np.log(1.6) + 0.2 * np.log(0.4)
+    assert terms["nll_one_step"].item() == pytest.approx(1 / 3)  # of 3 transitions
+    assert terms["nll_rollout"].item() == pytest.approx(4 / 3)  # of 3 future states
+    assert terms["kl"].item() == pytest.approx(divergence / 4, rel=1e-5)  # of 4 pairs
+    assert terms["prior_entropy"].item() == pytest.approx(np.log(2))
+    assert terms["prior_edge_share"].item() == pytest.approx(0.5)
+    assert loss.item() == pytest.approx(10 / 3 + 4 / 3 + 100 * divergence / 4, rel=1e-5)
+
+
+def test_diverged_training_says_so(tiny: None, circles: Path, tmp_path: Path):
+    settings = config(circles, tmp_path)
+    trainer = Trainer(settings, load_data(settings))
+    with torch.no_grad():
+        trainer.model.decoder.readout.bias.fill_(float("nan"))
+    with pytest.raises(UserError, match="the loss is nan at step 0; lower --lr or check the data"):
+        trainer.train_step()
+
+
+def test_state_is_written_at_once(tiny: None, circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    settings = config(circles, tmp_path)
+    trainer = Trainer(settings, load_data(settings))
+    trainer.save(tmp_path / "state")
+    before = (tmp_path / "state").read_bytes()
+    trainer.train_step()
+    monkeypatch.setattr(os, "replace", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        trainer.save(tmp_path / "state")
+    assert (tmp_path / "state").read_bytes() == before
