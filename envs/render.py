@@ -20,7 +20,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from envs.overlay import AgentOverlay, OverlayStyle, View, decode_png, draw_overlay, encode_png
-from envs.readers.highway import is_highway_env
+from envs.readers.highway import HighwayReader, is_highway_env
 from envs.wrappers import ForecastObservation
 from predictor.errors import UserError
 
@@ -28,8 +28,6 @@ ENLARGE = 2.0
 """Size of the picture relative to highway-env's."""
 WIDEN = 1.25
 """How much more road is shown than by highway-env: forecasts reach far ahead."""
-
-_SAME_PLACE_M = 1e-3
 
 
 @dataclass(frozen=True)
@@ -191,7 +189,7 @@ class _Recorder:
             dt_s=1 / config["policy_frequency"],
             style=style,
         )
-        self._seen: dict[int, Any] = {}  # keeps vehicles alive, so that id() stays unique
+        self._reader: HighwayReader = env.get_wrapper_attr("reader")
 
     def begin(self) -> None:
         """The first picture, just after the reset."""
@@ -203,7 +201,7 @@ class _Recorder:
         base.viewer = _make_viewer(base, config)
         base.set_record_video_wrapper(self)
         self.recording.fps = int(self.frames_per_sec)
-        self.recording._ego = id(base.vehicle)
+        self.recording._ego = int(self._env.scene.ids[0])
         self._note_forecast()
         self._capture_frame()
 
@@ -225,10 +223,9 @@ class _Recorder:
         """Called by highway-env for every picture within a step, and by us for the one at its end."""
         pixels = np.ascontiguousarray(self._base.render())
         surface = self._base.viewer.sim_surface
-        positions: dict[int, tuple[float, float]] = {}
-        for vehicle in self._base.road.vehicles:
-            self._seen[id(vehicle)] = vehicle
-            positions[id(vehicle)] = (float(vehicle.position[0]), float(vehicle.position[1]))
+        everyone = self._reader.read_all(self._env)
+        places = zip(everyone.ids.tolist(), everyone.states[:, :2].tolist(), strict=True)
+        positions = {key: (x, y) for key, (x, y) in places}
         view = View((float(surface.origin[0]), float(surface.origin[1])), float(surface.scaling))
         step = len(self.recording._steps) - 1
         frame = _Frame(encode_png(pixels), view, positions, float(self._base.vehicle.speed), step)
@@ -236,19 +233,12 @@ class _Recorder:
 
     def _note_forecast(self) -> None:
         scene, forecast = self._env.scene, self._env.forecast
-        vehicles = self._base.road.vehicles
-        places_m = np.array([v.position for v in vehicles], dtype=np.float64)
-        rows, keys = [], []
-        for row in np.flatnonzero(scene.valid)[1:]:  # the ego needs no forecast of itself
-            apart_m = np.hypot(*(places_m - scene.states[row, :2]).T)
-            nearest = int(apart_m.argmin())
-            if apart_m[nearest] < _SAME_PLACE_M:
-                rows.append(int(row))
-                keys.append(id(vehicles[nearest]))
+        rows = np.flatnonzero(scene.valid)[1:]  # the ego needs no forecast of itself
+        keys = tuple(scene.ids[rows].tolist())
         xy_m = forecast.xy[0].double().cpu().numpy() + scene.states[0, :2]
         interaction = 1 - forecast.edge_probs[0, :, :, 0].double().cpu().numpy()
         probs = np.maximum(interaction[0], interaction[:, 0])
-        step = _Step(len(self.recording._frames), tuple(keys), xy_m[:, rows].swapaxes(0, 1), probs[rows])
+        step = _Step(len(self.recording._frames), keys, xy_m[:, rows].swapaxes(0, 1), probs[rows])
         self.recording._steps.append(step)
 
 

@@ -5,7 +5,7 @@ forgotten one by one, and agents may be re-sorted. `predictor.online` keeps the 
 """
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -82,6 +82,7 @@ class Belief:
     """What the forecaster itself needs to roll out."""
 
 
+@runtime_checkable
 class Forecaster(Protocol):
     """Anything that forecasts scenes step by step."""
 

@@ -1,6 +1,6 @@
 """Scene readers: how to see the agents of an environment family. One module per family."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import gymnasium as gym
 
@@ -11,6 +11,7 @@ from predictor.scene import Scene, SceneSpec
 __all__ = ["HighwayReader", "SceneReader", "reader_for"]
 
 
+@runtime_checkable
 class SceneReader(Protocol):
     """Sees the agents of one environment; keeps their identities from step to step."""
 

@@ -25,9 +25,10 @@ from envs.observation import (
     scene_spaces,
     scenes_from,
 )
-from envs.registry import CHECKPOINTS
+from envs.readers import reader_for
+from envs.registry import CHECKPOINTS, make_env
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.checkpoint import CheckpointInfo, load_forecaster, save_checkpoint, shipped
+from predictor.checkpoint import CheckpointInfo, load_forecaster, resolve, save_checkpoint, shipped
 from predictor.dgvae import DGVAE, DGVAEConfig
 from predictor.errors import UserError
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
@@ -414,6 +415,10 @@ def test_constant_velocity_fits_any_spec():
 def test_a_checkpoint_ships_for_every_registered_id(env_id: str):
     name = CHECKPOINTS[env_id]
     assert name in shipped()
-    dt_s = 0.2 if env_id.startswith("racetrack") else 1.0
-    model = load_forecaster(name, SceneSpec(dt_s=dt_s), f"env '{env_id}'")
+    scenes = reader_for(make_env(env_id)).spec
+    model = load_forecaster(name, scenes, f"env '{env_id}'")
+    assert model.spec.frame == scenes.frame
     assert model.horizon_steps >= 5
+    folder = resolve(name)
+    assert sum(file.stat().st_size for file in folder.iterdir()) < 5_000_000
+    assert env_id in (folder / "README.md").read_text()  # the model card

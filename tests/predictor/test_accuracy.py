@@ -85,7 +85,9 @@ def test_perfect_forecasts_have_a_finite_spread():
 def windows(frame_seed: int = 0, **kwargs: int) -> Windows:
     present = random_presence(frame_seed, 9, 4, share=0.8).numpy()
     states = random_states(frame_seed, 9, 4, 4).numpy() * present[..., None]
-    return Windows([Episode(states, present, np.arange(4))], spec(ROAD), **({"history_steps": 4, "horizon_steps": 3} | kwargs))
+    return Windows(
+        [Episode(states, present, np.arange(4))], spec(ROAD), **({"history_steps": 4, "horizon_steps": 3} | kwargs)
+    )
 
 
 def test_streamed_windows_against_a_loop():

@@ -246,13 +246,23 @@ def test_bad_files_are_refused(path: Path, damage: Callable[[Path], None], messa
 # --- Names and specs --------------------------------------------------------------------------------------------------
 
 
+def test_everything_that_ships_is_small_and_forecasts():
+    assert checkpoint.shipped()
+    for name in checkpoint.shipped():
+        forecaster, info = load_checkpoint(name)
+        agents = info.spec.max_agents
+        states = random_states(0, 1, agents, info.spec.num_features)
+        belief = forecaster.observe(forecaster.empty_memory(1, agents), states, torch.ones(1, agents).bool())[1]
+        assert torch.isfinite(forecaster.rollout(belief, info.horizon_steps)).all(), name
+        assert len(info.std_m) == info.horizon_steps and info.provenance["command"], name
+        assert sum(p.stat().st_size for p in resolve(name).iterdir()) < 5_000_000, name
+
+
 def test_unknown_name_lists_the_known_ones(monkeypatch: pytest.MonkeyPatch, path: Path):
     monkeypatch.setattr(checkpoint, "PRETRAINED", path.parent)
     with pytest.raises(UserError) as error:
         resolve("highwy")
-    assert str(error.value) == (
-        "no checkpoint 'highwy': neither a folder nor a shipped name (toy, constant-velocity)"
-    )
+    assert str(error.value) == ("no checkpoint 'highwy': neither a folder nor a shipped name (toy, constant-velocity)")
 
 
 def test_shipped_names_are_found(monkeypatch: pytest.MonkeyPatch, path: Path):
@@ -275,7 +285,9 @@ def test_another_time_step_names_both_numbers(path: Path):
 def test_other_features_name_both_lists(path: Path):
     names, scales = (*INFO.spec.feature_names, "heading_rad"), (1.0,) * 5
     other = SceneSpec(1.0, feature_names=names, feature_scales=scales)
-    with pytest.raises(UserError, match=r"features \('x_m', 'y_m', 'vx_mps', 'vy_mps'\) but env 'b' gives .*'heading_rad'"):
+    with pytest.raises(
+        UserError, match=r"features \('x_m', 'y_m', 'vx_mps', 'vy_mps'\) but env 'b' gives .*'heading_rad'"
+    ):
         load_forecaster(path, other, "env 'b'")
 
 

@@ -1,4 +1,4 @@
-"""The dG-VAE against plain loops, and the semantics it must keep: streaming, no peeking, padding, symmetry, sampling."""
+"""The dG-VAE against plain loops, and what it must keep: streaming, no peeking, padding, symmetry, sampling."""
 
 from collections.abc import Iterator, Mapping
 from itertools import product
@@ -403,7 +403,9 @@ def test_network_inputs_closed_form():
 
 @pytest.fixture
 def belief() -> Belief:
-    return last(model(num_edge_types=3), random_states(0, BATCH, TIME, AGENTS, 4), torch.ones(BATCH, TIME, AGENTS).bool())
+    return last(
+        model(num_edge_types=3), random_states(0, BATCH, TIME, AGENTS, 4), torch.ones(BATCH, TIME, AGENTS).bool()
+    )
 
 
 def test_sample_0_draws_nothing(belief: Belief):

@@ -38,6 +38,17 @@ def test_reordering_twice_is_reordering_once():
     assert all(torch.equal(a, b) for a, b in zip(there_and_back.pairs, before.pairs, strict=True))
 
 
+def test_padding_adds_agents_without_memory():
+    before = memory(0)
+    after = before.padded(AGENTS + 2)
+    assert torch.equal(after.nodes[0][:, :AGENTS], before.nodes[0]) and not after.nodes[0][:, AGENTS:].any()
+    for ours, expected in zip(after.pairs, before.pairs, strict=True):
+        assert ours.shape == (BATCH, AGENTS + 2, AGENTS + 2, expected.shape[-1])
+        assert torch.equal(ours[:, :AGENTS, :AGENTS], expected)
+        assert not ours[:, AGENTS:].any() and not ours[:, :, AGENTS:].any()
+    assert all(torch.equal(a, b) for a, b in zip(before.padded(AGENTS).pairs, before.pairs, strict=True))
+
+
 def test_select_and_replace_rows():
     before, other = memory(0), memory(1, batch=2)
     rows = torch.tensor([2, 0])

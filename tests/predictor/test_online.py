@@ -115,9 +115,7 @@ class Streams(RuleBasedStateMachine):
         self.step(now)
 
     @rule(ended=some_rows, now=st.tuples(*[scenes()] * ROWS), successors=st.tuples(*[scenes()] * ROWS))
-    def step_over_a_boundary(
-        self, ended: np.ndarray, now: tuple[Scene, ...], successors: tuple[Scene, ...]
-    ) -> None:
+    def step_over_a_boundary(self, ended: np.ndarray, now: tuple[Scene, ...], successors: tuple[Scene, ...]) -> None:
         self.online.observe_boundary(batch(*now), ended, batch(*successors[: len(ended)]))
         terminal = [[*past, each] for past, each in zip(self.histories, now, strict=True)]
         fresh = [[each] for each in successors[: len(ended)]]
@@ -211,7 +209,8 @@ def test_agent_that_is_not_valid_is_forgotten_even_if_its_id_stays(forecaster: D
     returned = after(forecaster, scene(first, AGENTS), hidden, scene(last, AGENTS))
     alone = scene({0: tuple(hidden.states[0])}, AGENTS)
     torch.testing.assert_close(
-        returned.edge_features, after(forecaster, scene({0: first[0]}, AGENTS), alone, scene(last, AGENTS)).edge_features
+        returned.edge_features,
+        after(forecaster, scene({0: first[0]}, AGENTS), alone, scene(last, AGENTS)).edge_features,
     )
 
 
@@ -268,7 +267,9 @@ def test_boundary_is_the_last_scene_then_reset_then_the_first_scene(forecaster: 
 
 
 def test_batch_is_one_by_one(forecaster: DGVAE):
-    histories = [[scene(states_of(10 * row + t, 0, 3, *OTHERS[1 : 1 + row]), AGENTS) for t in range(4)] for row in range(3)]
+    histories = [
+        [scene(states_of(10 * row + t, 0, 3, *OTHERS[1 : 1 + row]), AGENTS) for t in range(4)] for row in range(3)
+    ]
     stream = online(forecaster, 3)
     for now in zip(*histories, strict=True):
         stream.observe(batch(*now))

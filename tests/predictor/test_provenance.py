@@ -19,7 +19,10 @@ def test_provenance_says_how_a_result_was_made(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_given_command_is_kept():
-    assert provenance((), command="python -m predictor.train --steps 3")["command"] == "python -m predictor.train --steps 3"
+    assert (
+        provenance((), command="python -m predictor.train --steps 3")["command"]
+        == "python -m predictor.train --steps 3"
+    )
 
 
 def test_written_json_is_whole(tmp_path: Path):

@@ -92,7 +92,9 @@ def broken(value: float, visible: bool) -> Episode:
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("visible", [True, False], ids=["visible", "hidden"])
 def test_non_finite_states_are_refused_with_their_place(tmp_path: Path, value: float, visible: bool):
-    with pytest.raises(UserError, match=rf"states must be finite, got \[.*{value}\] \(episode seed 3, step 2, agent 13\)"):
+    with pytest.raises(
+        UserError, match=rf"states must be finite, got \[.*{value}\] \(episode seed 3, step 2, agent 13\)"
+    ):
         write_store(tmp_path / "store", INFO, [episode(1), broken(value, visible)])
     assert list(tmp_path.iterdir()) == []
 
@@ -101,7 +103,9 @@ def test_non_finite_states_in_a_store_are_refused_with_their_place(tmp_path: Pat
     write_store(tmp_path / "store", INFO, [episode(1), episode(3)])
     states: Any = zarr.open_group(tmp_path / "store", mode="r+")["states"]
     states[4 + 2, 1, 0] = np.nan
-    with pytest.raises(UserError, match=r"store: states must be finite, got \[nan.*\(episode seed 3, step 2, agent 13\)"):
+    with pytest.raises(
+        UserError, match=r"store: states must be finite, got \[nan.*\(episode seed 3, step 2, agent 13\)"
+    ):
         read_store(tmp_path / "store")
 
 

@@ -128,7 +128,9 @@ def test_episodes_are_not_mixed():
     perception_m=st.sampled_from([8.0, 15.0, 100.0]),
     max_agents=st.integers(3, 5),
 )
-def test_windows_against_a_loop(seed: int, history_steps: int, horizon_steps: int, perception_m: float, max_agents: int):
+def test_windows_against_a_loop(
+    seed: int, history_steps: int, horizon_steps: int, perception_m: float, max_agents: int
+):
     """Every agent that was seen in the history is there (they fit: five agents, `max_agents` + 2 columns), no other."""
     layout = spec(perception_m=perception_m, max_agents=max_agents)
     episodes = [random_episode(seed + i, steps, 5) for i, steps in enumerate((6, 3))]
@@ -147,7 +149,9 @@ def test_windows_against_a_loop(seed: int, history_steps: int, horizon_steps: in
             if np.isfinite(track[: now - begin + 1]).any():
                 expected[track.tobytes()] = agent
         tracks = np.where(batch.valid[row, :, :, None].numpy(), batch.states[row].numpy(), np.nan).astype(np.float64)
-        ours = [tracks[:, column].tobytes() for column in range(tracks.shape[1]) if np.isfinite(tracks[:, column]).any()]
+        ours = [
+            tracks[:, column].tobytes() for column in range(tracks.shape[1]) if np.isfinite(tracks[:, column]).any()
+        ]
         assert sorted(ours) == sorted(expected)
         assert expected[ours[0]] == 0  # the ego is column 0
         assert not batch.states[row][~batch.valid[row]].any()
