@@ -181,7 +181,7 @@ def _draw_captions(pen: _Pen, size: tuple[int, int], caption: str) -> None:
     legend: tuple[tuple[str, Callable[[Polyline], None]], ...] = (
         ("forecast", pen.forecast),
         ("what happened", pen.truth),
-        ("edge probability", lambda line: pen.edge(line, 0.7)),
+        ("edge to the ego (probability)", lambda line: pen.edge(line, 0.7)),
     )
     sample_px = 34.0
     entry_px = [sample_px + _MARGIN_PX + pen.text_width(name) + 2 * _MARGIN_PX for name, _ in legend]

@@ -236,8 +236,7 @@ class _Recorder:
         rows = np.flatnonzero(scene.valid)[1:]  # the ego needs no forecast of itself
         keys = tuple(scene.ids[rows].tolist())
         xy_m = forecast.xy[0].double().cpu().numpy() + scene.states[0, :2]
-        interaction = 1 - forecast.edge_probs[0, :, :, 0].double().cpu().numpy()
-        probs = np.maximum(interaction[0], interaction[:, 0])
+        probs = 1 - forecast.edge_probs[0, 0, :, 0].double().cpu().numpy()  # receiver ego: who acts on it
         step = _Step(len(self.recording._frames), keys, xy_m[:, rows].swapaxes(0, 1), probs[rows])
         self.recording._steps.append(step)
 
