@@ -11,80 +11,19 @@ expectation, so that a history has one meaning; samples branch off at the first 
 """
 
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
-from torch.nn import functional
 
 from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory
-from predictor.graph import PairLinear, pair_mask, sum_over_senders
+from predictor.graph import pair_mask
+from predictor.networks import PRESETS, Decoder, DGVAEConfig, Edges, Encoder, concrete_sample
 from predictor.scene import SceneSpec
 
-
-@dataclass(frozen=True)
-class DGVAEConfig:
-    """Sizes of the network; the defaults are the paper's (Sec. V, Implementation)."""
-
-    hidden_dim: int = 128
-    """Width of the encoder's graph layers."""
-    rnn_dim: int = 64
-    """Width of the LSTM of each pair."""
-    head_dim: int = 256
-    """Hidden width of the prior, posterior and feature heads."""
-    message_dim: int = 128
-    """Width of the decoder's messages."""
-    decoder_dim: int = 256
-    """Width of the GRU of each agent."""
-    num_edge_types: int = 2
-    """Edge types; the first one is "no edge" and sends no message."""
-    edge_feature_dim: int = 32
-    """Size of an edge's continuous features (paper: 16 to 64, by dataset)."""
-    temperature: float = 0.5
-    """Of the concrete distribution."""
-    dropout: float = 0.0
-    """After the LSTM."""
-    residual: Literal["state", "constant_velocity"] = "state"
-    """What the predicted change is added to: the state (paper) or the state moved on at its own velocity."""
-    delta_scales: tuple[float, ...] = ()
-    """Typical one-step change of each feature [SI]; empty takes the spec's feature scales."""
-
-    def __post_init__(self) -> None:
-        """Check ranges."""
-        for name in ("hidden_dim", "rnn_dim", "head_dim", "message_dim", "decoder_dim", "edge_feature_dim"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.num_edge_types < 2:
-            raise UserError(f"num_edge_types must be at least 2 (the first is 'no edge'), got {self.num_edge_types}")
-        if self.temperature <= 0 or not 0 <= self.dropout < 1:
-            raise UserError(f"need temperature > 0 and 0 <= dropout < 1, got {self.temperature}, {self.dropout}")
-
-
-PRESETS: dict[str, DGVAEConfig] = {
-    "paper": DGVAEConfig(),
-    "fast": DGVAEConfig(
-        hidden_dim=48,
-        rnn_dim=24,
-        head_dim=48,
-        message_dim=64,
-        decoder_dim=96,
-        edge_feature_dim=8,
-        residual="constant_velocity",
-    ),
-}
-"""Named sizes: "paper" for accuracy studies, "fast" for policies on a CPU."""
-
-
-class Edges(NamedTuple):
-    """Encoder outputs for a stretch of time; time axis second."""
-
-    hidden: Float[Tensor, "batch time agents agents rnn"]
-    cell: Float[Tensor, "batch time agents agents rnn"]
-    prior_logits: Float[Tensor, "batch time agents agents types"]
-    features: Float[Tensor, "batch time agents agents feature"]
-    embedding: Float[Tensor, "batch time agents agents hidden"]
+__all__ = ["DGVAE", "PRESETS", "DGVAEConfig", "Decoder", "Edges", "Encoder", "WindowOutput", "concrete_sample"]
 
 
 class WindowOutput(NamedTuple):
@@ -106,164 +45,6 @@ class _Internal(NamedTuple):
     logits: Tensor
     node_after: Tensor  # … and after, under the prior's expectation
     next_states: Tensor
-
-
-def concrete_sample(
-    logits: Float[Tensor, "*batch types"], temperature: float, generator: torch.Generator | None = None
-) -> Float[Tensor, "*batch types"]:
-    """Reparameterised sample of the concrete distribution (paper Sec. IV, Sampling)."""
-    uniform = torch.rand(logits.shape, generator=generator, device=logits.device, dtype=logits.dtype)
-    tiny = torch.finfo(logits.dtype).tiny
-    gumbel = -torch.log(-torch.log(uniform.clamp(tiny, 1 - torch.finfo(logits.dtype).eps)))
-    return torch.softmax((logits + gumbel) / temperature, dim=-1)
-
-
-def _head(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(inputs, hidden), nn.ELU(), nn.Linear(hidden, outputs))
-
-
-class Encoder(nn.Module):
-    """Edge logits and features from states, step by step or for many steps at once."""
-
-    def __init__(self, config: DGVAEConfig, inputs: int) -> None:
-        """Layers in the order in which data passes."""
-        super().__init__()
-        width, rnn = config.hidden_dim, config.rnn_dim
-        self.embed = nn.Linear(inputs, width)
-        self.conv_pair = PairLinear(width, width, relative=True)
-        self.conv_out = nn.Linear(width, width)
-        self.edge_pair = PairLinear(width, width)
-        self.edge_out = nn.Linear(width, width)
-        self.forward_input = nn.Linear(width, 4 * rnn)
-        self.forward_hidden = nn.Linear(rnn, 4 * rnn, bias=False)
-        self.backward_input = nn.Linear(width, 4 * rnn)
-        self.backward_hidden = nn.Linear(rnn, 4 * rnn, bias=False)
-        self.dropout = nn.Dropout(config.dropout)
-        self.prior_head = _head(rnn, config.head_dim, config.num_edge_types)
-        self.feature_head = _head(rnn, config.head_dim, config.edge_feature_dim)
-        self.posterior_head = _head(2 * rnn, config.head_dim, config.num_edge_types)
-
-    def embed_edges(
-        self, inputs: Float[Tensor, "*batch agents inputs"], pairs: Bool[Tensor, "*batch agents agents"]
-    ) -> Float[Tensor, "*batch agents agents hidden"]:
-        """The graph block; all steps at once."""
-        nodes = self.embed(inputs)
-        weight = pairs.to(nodes.dtype)
-        summed = sum_over_senders(functional.elu(self.conv_pair(nodes)), weight)
-        # Σ_j (W h_ij + b) = W Σ_j h_ij + n b: the second layer of EdgeConv costs agents, not pairs.
-        count = weight.sum(-1, keepdim=True)
-        nodes = functional.elu(functional.linear(summed, self.conv_out.weight) + count * self.conv_out.bias)
-        edges: Tensor = self.edge_out(functional.elu(self.edge_pair(nodes)))
-        return edges
-
-    def forward(
-        self,
-        inputs: Float[Tensor, "batch time agents inputs"],
-        pairs: Bool[Tensor, "batch time agents agents"],
-        hidden: Float[Tensor, "batch agents agents rnn"],
-        cell: Float[Tensor, "batch agents agents rnn"],
-    ) -> Edges:
-        """Run the forward LSTM from a given memory; a pair that is not present has its memory set to zero."""
-        embedding = self.embed_edges(inputs, pairs)
-        hiddens, cells = _masked_lstm(self.forward_input(embedding), self.forward_hidden, pairs, hidden, cell)
-        past = self.dropout(functional.elu(hiddens))
-        present = pairs[..., None]
-        features = self.feature_head(past) * present
-        return Edges(hiddens, cells, _no_edge_where_absent(self.prior_head(past), present), features, embedding)
-
-    def posterior_logits(
-        self, edges: Edges, pairs: Bool[Tensor, "batch time agents agents"]
-    ) -> Float[Tensor, "batch time agents agents types"]:
-        """Logits that have seen the future; training only."""
-        zeros = torch.zeros_like(edges.hidden[:, 0])
-        gates = self.backward_input(edges.embedding)
-        backward, _ = _masked_lstm(gates, self.backward_hidden, pairs, zeros, zeros, reverse=True)
-        both = self.dropout(functional.elu(torch.cat([edges.hidden, backward], dim=-1)))
-        return _no_edge_where_absent(self.posterior_head(both), pairs[..., None])
-
-
-def _no_edge_where_absent(logits: Tensor, present: Tensor) -> Tensor:
-    absent = torch.full_like(logits, -1e4)
-    absent[..., 0] = 0.0
-    return torch.where(present, logits, absent)
-
-
-def _masked_lstm(
-    gates: Float[Tensor, "batch time agents agents gates"],
-    recurrent: nn.Linear,
-    pairs: Bool[Tensor, "batch time agents agents"],
-    hidden: Float[Tensor, "batch agents agents rnn"],
-    cell: Float[Tensor, "batch agents agents rnn"],
-    reverse: bool = False,
-) -> tuple[Float[Tensor, "batch time agents agents rnn"], Float[Tensor, "batch time agents agents rnn"]]:
-    hiddens, cells = [], []
-    # unbind, not [:, t]: the gradient of an index is a full-size tensor of zeros for every step
-    steps = list(zip(gates.unbind(1), pairs[..., None].unbind(1), strict=True))
-    for gate, present in reversed(steps) if reverse else steps:
-        i, f, g, o = (gate + recurrent(hidden)).chunk(4, dim=-1)
-        cell = (torch.sigmoid(f) * cell + torch.sigmoid(i) * torch.tanh(g)) * present
-        hidden = torch.sigmoid(o) * torch.tanh(cell) * present
-        hiddens.append(hidden)
-        cells.append(cell)
-    if reverse:
-        hiddens.reverse()
-        cells.reverse()
-    return torch.stack(hiddens, dim=1), torch.stack(cells, dim=1)
-
-
-class Decoder(nn.Module):
-    """Change of state from messages along edges."""
-
-    def __init__(self, config: DGVAEConfig, inputs: int, outputs: int) -> None:
-        """Layers in the order in which data passes."""
-        super().__init__()
-        self.types = config.num_edge_types - 1  # type 0 is silent
-        width = config.message_dim
-        self.message_pair = PairLinear(inputs, self.types * width)
-        self.message_feature = nn.Linear(config.edge_feature_dim, self.types * width, bias=False)
-        self.message_out = nn.Linear(width, self.types * width)  # one block for each type that speaks
-        self.own = nn.Linear(inputs, width)
-        self.gru = nn.GRUCell(width, config.decoder_dim)
-        self.readout = nn.Linear(config.decoder_dim, outputs)
-
-    def messages(
-        self,
-        inputs: Float[Tensor, "*batch agents inputs"],
-        pairs: Bool[Tensor, "*batch agents agents"],
-        graph: Float[Tensor, "*batch agents agents types"],
-        features: Float[Tensor, "*batch agents agents feature"],
-    ) -> Float[Tensor, "*batch agents message"]:
-        """Σ_j z_ij · h(x_i ‖ x_j ‖ e_ij) plus the agent's own term; all steps at once."""
-        hidden = functional.elu(self.message_pair(inputs) + self.message_feature(features))
-        total: Tensor = self.own(inputs)
-        layers = zip(
-            hidden.chunk(self.types, dim=-1),
-            self.message_out.weight.chunk(self.types),
-            self.message_out.bias.chunk(self.types),
-            strict=True,
-        )
-        for k, (hidden_k, matrix, bias) in enumerate(layers):
-            weight = graph[..., k + 1] * pairs
-            # Σ_j z_ij (W h_ij + b) = W Σ_j z_ij h_ij + b Σ_j z_ij: the second layer costs agents, not pairs.
-            summed = functional.linear(sum_over_senders(hidden_k, weight), matrix)
-            total = total + summed + weight.sum(-1, keepdim=True) * bias
-        return total
-
-    def step(
-        self,
-        messages: Float[Tensor, "batch agents message"],
-        valid: Bool[Tensor, "batch agents"],
-        hidden: Float[Tensor, "batch agents decoder"],
-    ) -> Float[Tensor, "batch agents decoder"]:
-        """One GRU step for every agent; absent agents keep no memory."""
-        batch, agents, width = hidden.shape
-        after = self.gru(messages.reshape(batch * agents, -1), hidden.reshape(batch * agents, width))
-        return after.view(batch, agents, width) * valid[..., None]
-
-    def change(self, hidden: Float[Tensor, "*batch decoder"]) -> Float[Tensor, "*batch state"]:
-        """Change of state, in units of `delta_scales`."""
-        change: Tensor = self.readout(functional.elu(hidden))
-        return change
 
 
 class DGVAE(nn.Module):
