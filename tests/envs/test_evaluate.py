@@ -2,6 +2,7 @@ import json
 import multiprocessing
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,22 +12,25 @@ import pytest
 import torch
 
 from envs import evaluate
-from envs.egos import idle_action
-from envs.evaluate import EvaluateConfig, _episode, _futures, _reduction, _Task, evaluate_env
-from envs.readers import reader_for
+from envs.egos import idle_action, make_ego
+from envs.evaluate import EvaluateConfig, _episode, _futures, _reduction, _Task, _world_forecast, evaluate_env
+from envs.observation import ego_entries
 from envs.registry import make_env
+from envs.wrappers import SceneObservation
 from predictor.accuracy import Outcome, summarise
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.errors import UserError
 from predictor.forecaster import Belief
-from predictor.scene import Scene, SceneSpec
+from predictor.scene import PADDING_ID, Scene, SceneSpec
 from tests.envs.helpers import (
     HIGHWAY_SPEC,
     HORIZON,
     SIZES,
     cruising_env,
     play,
+    random_forecast,
+    random_scenes,
     run_command,
     save_forecast_policy,
     tiny_model,
@@ -142,15 +146,35 @@ def test_an_episode_that_is_cut_keeps_its_last_scene():
 
 
 def test_out_of_sight_is_not_out_of_truth():
-    """With everyone in sight at first, agents that later leave perception still have a whole future."""
-    model, _ = _episode(task("highway-fast-v0", seed=8, max_steps=10))
-    env = make_env("highway-fast-v0")
-    perception_m = reader_for(env).spec.perception_m
-    distance_m = model.future.norm(dim=-1)
-    assert (distance_m[model.valid] > perception_m).any()
+    """Nobody leaves this road, so whoever is seen has a future up to the episode's end, seen again or not."""
+    steps, seed = 8, 2
+    env = SceneObservation(make_env("highway-fast-v0"))
+    ego = make_ego("random", env, np.random.default_rng(seed))
+    played = play(env, [ego(None) for _ in range(steps)], seed)
+    seen = [set(obs["scene_ids"].tolist()) for obs, *_ in played]
+    assert any(before - after - {PADDING_ID} for before, after in pairwise(seen))  # some are lost from sight
+    model, _ = _episode(task(seed=seed, ego="random", max_steps=steps))
+    assert len(model.valid) == len(seen) == steps + 1
+    for t in range(steps):
+        known = model.valid[t, :, 0]
+        assert int(known.sum()) == len(seen[t] - {0, PADDING_ID})
+        assert (model.valid[t, known].sum(-1) == min(HORIZON, steps - t)).all()
 
 
 # --- Forecasts, read out of the observation ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_way_back_undoes_the_ego_view(seed: int):
+    """For rows in any order, with gaps, and any heading."""
+    rng = np.random.default_rng(seed)
+    scenes = random_scenes(rng, 1, 6)
+    forecast = random_forecast(rng, scenes, 3, HORIZON, 2, 4)
+    obs = {key: value[0] for key, value in ego_entries(scenes, forecast).items()}
+    back = _world_forecast(obs, Scene(scenes.states[0], scenes.ids[0], scenes.valid[0], float(scenes.heading_rad[0])))
+    expected = forecast.xy[0] * forecast.valid[0][None, :, None, None]
+    expected[:, 0] = 0  # the ego has no entry
+    torch.testing.assert_close(back, expected, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("env_id", ["highway-fast-v0", "intersection-v2", "racetrack-v1"])

@@ -103,7 +103,7 @@ def batch(*scenes: Scene) -> SceneBatch:
 
 
 def circling_episode(seed: int, steps: int = 10, agents: int = 2, turn_rad: float = 0.5) -> Episode:
-    """Agents on circles: every velocity turns by `turn_rad` in each step of 1 s; constant velocity is wrong by a lot."""
+    """Agents on circles: every velocity turns by `turn_rad` in each step of 1 s, so constant velocity is far off."""
     rng = np.random.default_rng(seed)
     angle = rng.uniform(0, 2 * np.pi, size=agents) + turn_rad * np.arange(steps)[:, None]
     speed_mps = rng.uniform(2, 5, size=agents)

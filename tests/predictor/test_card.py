@@ -1,0 +1,76 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from predictor.card import CardConfig, write_card
+from predictor.checkpoint import CheckpointInfo, save_checkpoint
+from predictor.errors import UserError
+from tests.predictor.helpers import model, write_circles
+
+ROW = {
+    "checkpoint": "toy",
+    "env_id": "toy-v0",
+    "model": {"min_ade_m": 1.254, "min_fde_m": 2.5},
+    "model_samples": {"min_ade_m": 0.75},
+    "constant_velocity": {"min_ade_m": 5.0, "min_fde_m": 9.0},
+    "reduction": 0.75,
+    "reduction_interval": [0.5, 0.875],
+}
+RESULTS = {
+    "config": {"seed": 10000, "episodes": 40, "ego": "idle", "samples": 20},
+    "provenance": {"command": "python -m envs.evaluate --all"},
+}
+MADE = {
+    "command": "python -m predictor.train --data a",
+    "commit": "abc",
+    "versions": {"torch": "2.13.0"},
+    "train_config": {"seed": 3},
+    "result": {"step": 500, "val_min_ade_m": 0.5, "val_constant_velocity_ade_m": 1.5},
+}
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> CardConfig:
+    forecaster = model()
+    info = CheckpointInfo(forecaster.spec, forecaster.config, 3, (1.0,) * 3, ("toy-v0",), MADE)
+    save_checkpoint(tmp_path / "toy", forecaster, info)
+    (tmp_path / "accuracy.json").write_text(json.dumps(RESULTS | {"results": [ROW | {"checkpoint": "other"}, ROW]}))
+    return CardConfig(tmp_path / "toy", (write_circles(tmp_path / "data"),), tmp_path / "accuracy.json")
+
+
+def test_card_says_what_the_files_say(config: CardConfig):
+    path = write_card(config)
+    text = path.read_text()
+    assert path == config.checkpoint / "README.md"
+    assert text.startswith("# Predictor checkpoint `toy`\n")
+    assert [line for line in text.splitlines() if line.startswith("| toy-v0")] == [
+        "| toy-v0 | 1.25 | 2.50 | 0.75 | 5.00 / 9.00 | 75 % | 50 to 88 % |"
+    ]
+    for fact in (
+        "forecasts 3 steps of 1 s",
+        "Held-out seeds from 10,000, 40 episodes each, ego driven `idle`",
+        "* circles: 6 episodes, 60 scenes.",
+        "`python -m envs.evaluate --all`",
+        "`python -m predictor.train --data a`",
+        "Seed 3, commit abc, torch 2.13.0.",
+        "step 500: minADE 0.500 m against 1.500 m of constant velocity",
+    ):
+        assert fact in text
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "is not an accuracy.json of envs.evaluate"),
+        ('{"rows": []}', r"is not an accuracy.json of envs.evaluate \('results'\)"),
+        (json.dumps(RESULTS | {"results": [ROW | {"checkpoint": "other"}]}), "has no row for checkpoint 'toy'"),
+    ],
+    ids=["broken", "foreign", "another_checkpoint"],
+)
+def test_card_without_its_accuracy_is_refused(config: CardConfig, content: Any, message: str):
+    config.accuracy.write_text(content)
+    with pytest.raises(UserError, match=message):
+        write_card(config)
+    assert not (config.checkpoint / "README.md").exists()
