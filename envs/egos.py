@@ -39,7 +39,7 @@ def make_ego(name: str, env: gym.Env, rng: np.random.Generator) -> Ego:
         return lambda obs: _uniform(env.action_space, rng)
     if name == "idle":
         action = idle_action(env)
-        return lambda obs: action
+        return lambda obs: np.copy(action) if isinstance(action, np.ndarray) else action
     if name == "varied":
         return _varied(env.action_space, rng)
     if name == "keep-lane":
@@ -107,14 +107,21 @@ def env_for_ego(env: gym.Env, name: str) -> gym.Env:
     """
     if not name.endswith(".zip"):
         return env
-    wanted = load_policy(name).observation_space
     if sees_forecasts(name):
         from envs.wrappers import ForecastObservation  # the wrappers need no egos; most egos need no wrappers
 
         env = ForecastObservation(env, _forecaster_of(Path(name)))
+    require_view(env, name)
+    return env
+
+
+def require_view(env: gym.Env, name: str) -> None:
+    """Raise a `UserError` if the ego is a policy that was trained on other observations than the env gives."""
+    if not name.endswith(".zip"):
+        return
+    wanted = load_policy(name).observation_space
     if env.observation_space != wanted:
         raise UserError(f"policy {name} was trained on {wanted}, but the env gives {env.observation_space}")
-    return env
 
 
 def sees_forecasts(name: str) -> bool:
@@ -136,7 +143,7 @@ def load_policy(path: str) -> "BaseAlgorithm":
     for algorithm in (PPO, DQN):
         try:
             return algorithm.load(path, device="cpu")
-        except (TypeError, KeyError, AttributeError, ValueError):
+        except (TypeError, KeyError, AttributeError, ValueError, AssertionError):
             continue
     raise UserError(f"{path} is neither a PPO nor a DQN policy")
 

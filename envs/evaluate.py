@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from envs.egos import env_for_ego, make_ego, sees_forecasts
+from envs.egos import make_ego, require_view, sees_forecasts
 from envs.observation import into_ego_axes, others_by_distance
 from envs.readers import HighwayReader, reader_for
 from envs.registry import CHECKPOINTS, checkpoint_for, make_env
@@ -120,8 +121,10 @@ def evaluate_env(config: EvaluateConfig, env_id: str) -> EnvAccuracy:
     env = make_env(env_id)
     spec = reader_for(env).spec
     forecaster = load_forecaster(checkpoint, spec, f"env '{env_id}'")
-    make_ego(config.ego, env_for_ego(env, config.ego), np.random.default_rng(0))
     horizon = config.horizon_steps or forecaster.horizon_steps
+    measured = ForecastObservation(env, checkpoint, horizon_steps=horizon)
+    require_view(measured if sees_forecasts(config.ego) else env, config.ego)
+    make_ego(config.ego, env, np.random.default_rng(0))
     tasks = [
         _Task(env_id, checkpoint, config.ego, config.seed + i, config.samples, horizon, config.max_steps)
         for i in range(config.episodes)
@@ -217,9 +220,14 @@ def _reduction(model: Sequence[Outcome], baseline: Sequence[Outcome]) -> tuple[f
             sums[i, j] = float(error[outcome.valid.all(-1)].sum())
     draws = np.random.default_rng(0).integers(len(sums), size=(2000, len(sums)))
     totals = sums[draws].sum(axis=1)
-    ratios = 1 - totals[:, 0] / np.maximum(totals[:, 1], 1e-12)
-    low, high = np.percentile(ratios, [2.5, 97.5])
-    return float(1 - sums[:, 0].sum() / max(sums[:, 1].sum(), 1e-12)), (float(low), float(high))
+    low, high = np.percentile(_relative(totals), [2.5, 97.5])
+    return float(_relative(sums.sum(axis=0))), (float(low), float(high))
+
+
+def _relative(totals: Float[np.ndarray, "*draws 2"]) -> Float[np.ndarray, "*draws"]:
+    """1 − first / second; nothing to improve on is no improvement."""
+    first, second = totals[..., 0], totals[..., 1]
+    return np.where(second > 0, 1 - first / np.where(second > 0, second, 1.0), 0.0)
 
 
 def overview(rows: Sequence[EnvAccuracy]) -> Table:

@@ -4,6 +4,7 @@ Each row keeps its own history and forgets it when, and only when, its own episo
 episode carries the forecast made from that episode's history; the one that opens the next starts from one step.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -79,13 +80,20 @@ class VecForecast(VecEnvWrapper):
     def step_wait(self) -> VecEnvStepReturn:
         """Step; one batched forward serves running rows, terminal observations and fresh episodes."""
         observations: Any
-        observations, rewards, dones, infos = self.venv.step_wait()
+        observations, rewards, dones, step_infos = self.venv.step_wait()
+        infos = list(step_infos)  # a tuple, with SubprocVecEnv
         ended = np.flatnonzero(dones)
         closing = [infos[i]["terminal_observation"] for i in ended]
         entries, closing_entries = _observe_ended(self.stream, observations, ended, closing)
         for i, own, extra in zip(ended, closing, closing_entries, strict=True):
             infos[i]["terminal_observation"] = _join(own, extra)
         return _join(observations, entries), rewards, dones, infos
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seed the environments and the samples' noise."""
+        if seed is not None:
+            self.stream.seed(seed)
+        return self.venv.seed(seed)
 
 
 class VectorForecast(gym.vector.VectorWrapper):
@@ -128,14 +136,17 @@ class VectorForecast(gym.vector.VectorWrapper):
         self._ended = np.zeros(env.num_envs, dtype=np.bool_)
         self._entries: Observations = {}
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Reset all environments, or those of `options["reset_mask"]`, and forget their histories."""
         mask = (options or {}).get("reset_mask")
-        observations, infos = self.env.reset(seed=seed, options=options)
+        observations, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
         self.stream.reset(rows)
-        if mask is None and seed is not None:
-            self.stream.seed(seed)
+        seeds = [s for s in (seed if isinstance(seed, list) else [seed]) if s is not None]
+        if mask is None and seeds:
+            self.stream.seed(seeds[0])
         self._ended[rows] = False
         # A partial reset repeats the other rows' observations, which were taken in already and must not count twice.
         entries = self.stream.observe(scenes_from(observations)[rows], rows)
@@ -157,7 +168,8 @@ class VectorForecast(gym.vector.VectorWrapper):
             if self._mode is AutoresetMode.NEXT_STEP:
                 self.stream.reset(np.flatnonzero(self._ended))
             entries = self.stream.observe(scenes_from(observations))
-        self._ended, self._entries = ended, entries
+        # copies: a later reset writes into the rows that it opens
+        self._ended, self._entries = ended, {key: value.copy() for key, value in entries.items()}
         return _join(observations, entries), rewards, terminations, truncations, infos
 
 

@@ -98,7 +98,8 @@ class SceneObservation(gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstru
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the env and read the scene."""
         obs, reward, terminated, truncated, info = self.env.step(action)
-        return self._observe(obs), reward, terminated, truncated, info
+        # some highway-env ids return NumPy's bool, which SB3 refuses
+        return self._observe(obs), reward, bool(terminated), bool(truncated), info
 
     def _observe(self, obs: Any) -> dict[str, Any]:
         self._scene = self.reader.read(self.env)
@@ -154,6 +155,11 @@ class ForecastObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         source = scene_source(env)
         if ready:
             spec: SceneSpec = env.get_wrapper_attr("scene_spec")
+            if perception_m not in (None, spec.perception_m) or max_agents not in (None, spec.max_agents):
+                raise UserError(
+                    f"perception_m={perception_m} and max_agents={max_agents} do not fit the SceneObservation below "
+                    f"({spec.perception_m:g}, {spec.max_agents}); give them to that wrapper"
+                )
         else:
             spec = (reader(env) if reader is not None else reader_for(env, perception_m, max_agents)).spec
         forecaster = open_forecaster(checkpoint, spec, source, device)

@@ -7,6 +7,7 @@ parameters.
 
 import weakref
 from dataclasses import replace
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -31,6 +32,12 @@ def is_highway_env(env: gym.Env) -> bool:
     return isinstance(env.unwrapped, AbstractEnv)
 
 
+def _dt_s(config: dict[str, Any]) -> float:
+    """What a policy step really simulates: whole simulation frames, rounded down."""
+    frames = config["simulation_frequency"] // config["policy_frequency"]
+    return float(frames / config["simulation_frequency"])
+
+
 class HighwayReader:
     """Scene reader for single-ego highway-env environments (highway-env ≥ 1.12).
 
@@ -46,7 +53,7 @@ class HighwayReader:
             raise UserError(f"HighwayReader needs a highway-env environment, got {env.unwrapped.__class__.__name__}")
         config = env.unwrapped.config  # type: ignore[attr-defined]
         env_id = env.unwrapped.spec.id if env.unwrapped.spec is not None else ""
-        spec = SceneSpec(dt_s=1 / config["policy_frequency"], frame=_FRAMES.get(env_id, _FIXED_MAP))
+        spec = SceneSpec(dt_s=_dt_s(config), frame=_FRAMES.get(env_id, _FIXED_MAP))
         if perception_m is not None:
             spec = replace(spec, perception_m=float(perception_m))
         if max_agents is not None:
@@ -86,6 +93,12 @@ class HighwayReader:
         """Every vehicle on the road, ego first, unpadded: ground truth for collection and evaluation."""
         unwrapped = env.unwrapped
         road, ego = unwrapped.road, unwrapped.vehicle  # type: ignore[attr-defined]
+        dt_s = _dt_s(unwrapped.config)  # type: ignore[attr-defined]
+        if dt_s != self._spec.dt_s:
+            raise UserError(
+                f"the env was wrapped at dt_s={self._spec.dt_s:g} but now steps at dt_s={dt_s:g}; "
+                "pass its config to gym.make, not to reset"
+            )
         if road is None or ego is None:
             raise ProtocolError("the environment has no vehicles yet; call reset() first")
         vehicles = [ego] + [v for v in road.vehicles if v is not ego]

@@ -186,6 +186,7 @@ def test_leaver_leaks_nothing_into_a_newcomer_in_its_row(forecaster: DGVAE):
     newcomer = after(forecaster, scene({0: first[0]}, AGENTS), scene(second, AGENTS))
     torch.testing.assert_close(heir.edge_features[:, 1], newcomer.edge_features[:, 1])
     torch.testing.assert_close(heir.edge_probs[:, :2, :2], newcomer.edge_probs[:, :2, :2])
+    torch.testing.assert_close(heir.xy[:, :, 1, 0], newcomer.xy[:, :, 1, 0])  # later steps depend on where the ego goes
     same_id = after(forecaster, scene(first, AGENTS), scene({0: second[0], 3: second[7]}, AGENTS))
     assert differ(same_id, heir) > 1e-2  # an id that stayed would have been another matter
 
@@ -198,6 +199,7 @@ def test_agent_that_comes_back_starts_fresh(forecaster: DGVAE, away: int):
     newcomer = after(forecaster, scene({0: first[0]}, AGENTS), *gone, scene(last, AGENTS))
     torch.testing.assert_close(returned.edge_features, newcomer.edge_features)
     torch.testing.assert_close(returned.edge_probs, newcomer.edge_probs)
+    torch.testing.assert_close(returned.xy[:, :, 1, 0], newcomer.xy[:, :, 1, 0])
 
 
 def test_agent_that_is_not_valid_is_forgotten_even_if_its_id_stays(forecaster: DGVAE):
