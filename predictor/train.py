@@ -213,7 +213,7 @@ class Trainer:
         output = self.model.window(batch.states, batch.valid, batch.last_observed, generator)
         loss, terms = window_loss(self.model, batch, output, config)
         if not torch.isfinite(loss):
-            raise UserError(f"the loss is {float(loss)} at step {self.step}; lower --lr or check the data")
+            raise UserError(f"the loss is {float(loss.detach())} at step {self.step}; lower --lr or check the data")
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), config.clip_norm)

@@ -86,7 +86,7 @@ class Windows:
 
     def batch(self, indices: Int[np.ndarray, " batch"]) -> WindowBatch:
         """Cut and pad the given windows; agents beyond the widest window cost nothing."""
-        cuts = [self._cut(*self.index[i]) for i in indices]
+        cuts = [self._cut(episode, now) for episode, now in self.index[indices].tolist()]
         agents = max(states.shape[1] for states, _, _ in cuts)
         time = max(last for _, _, last in cuts) + 1 + self.horizon_steps
         states = np.zeros((len(cuts), time, agents, self.spec.num_features), dtype=np.float32)
