@@ -15,6 +15,7 @@ import numpy as np
 import torch
 import tyro
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -97,7 +98,7 @@ class Evaluation:
         """The table for a terminal."""
         table = Table(title=self.env_id, caption=self._caption())
         for i, name in enumerate(_HEADER):
-            table.add_column(name, justify="right" if i else "left")
+            table.add_column(escape(name), justify="right" if i else "left")
         for row in self.rows:
             table.add_row(*_cells(row))
         return table

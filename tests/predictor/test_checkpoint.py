@@ -255,6 +255,7 @@ def test_everything_that_ships_is_small_and_forecasts():
         belief = forecaster.observe(forecaster.empty_memory(1, agents), states, torch.ones(1, agents).bool())[1]
         assert torch.isfinite(forecaster.rollout(belief, info.horizon_steps)).all(), name
         assert len(info.std_m) == info.horizon_steps and info.provenance["command"], name
+        assert (resolve(name) / "README.md").is_file(), name  # the model card
         assert sum(p.stat().st_size for p in resolve(name).iterdir()) < 5_000_000, name
 
 

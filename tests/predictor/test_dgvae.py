@@ -288,6 +288,25 @@ def test_network_inputs_closed_form():
     ]
 
 
+@settings(max_examples=8)
+@given(valid=presence(), seed=seeds, offsets=st.tuples(*[st.integers(-400, 400)] * TIME))
+def test_each_step_is_seen_from_where_the_ego_is(valid: Tensor, seed: int, offsets: tuple[int, ...]):
+    """Moving the scenes of a window along the road, each by its own distance, moves its predictions and nothing else."""
+    forecaster = model(frame=ROAD)
+    states = random_states(seed, BATCH, TIME, AGENTS, 4)
+    moved = states.clone()
+    moved[..., 0] += torch.tensor(offsets)[:, None]
+    now = TIME - 2
+    here, there = (window_without_noise(forecaster, s, valid, torch.full((BATCH,), now)) for s in (states, moved))
+    torch.testing.assert_close(there.prior_logits, here.prior_logits, rtol=0, atol=1e-3)  # float32 at 400 m: 3e-5 m
+    torch.testing.assert_close(there.posterior_logits, here.posterior_logits, rtol=0, atol=1e-3)
+    torch.testing.assert_close(there.features, here.features, rtol=0, atol=1e-3)
+    there.rollout[..., 0] -= offsets[now]
+    there.one_step[..., 0] -= torch.tensor(offsets)[:, None]
+    torch.testing.assert_close(there.rollout, here.rollout, rtol=0, atol=1e-2)
+    torch.testing.assert_close(there.one_step, here.one_step, rtol=0, atol=1e-2)
+
+
 # --- Samples ----------------------------------------------------------------------------------------------------------
 
 

@@ -263,6 +263,24 @@ def test_best_checkpoint_is_kept_and_a_stale_run_stops(
     assert load_checkpoint(out)[1].provenance["result"]["val_min_ade_m"] == 1.0
 
 
+def test_resumed_run_remembers_its_best(tiny: None, circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    validate, errors = Trainer.validate, iter([1.0, 3.0, 2.0, 2.5])
+
+    def scripted(trainer: Trainer) -> Any:
+        accuracy, std_m = validate(trainer)
+        return replace(accuracy, min_ade_m=next(errors)), std_m
+
+    monkeypatch.setattr(Trainer, "validate", scripted)
+    settings = config(circles, tmp_path / "run", steps=100, eval_every=1, patience=3)
+    with pytest.MonkeyPatch.context() as patch:
+        stop_at(2)(patch)
+        with pytest.raises(KeyboardInterrupt):
+            train(settings)
+    out = train(replace(settings, resume=True))
+    assert (state(tmp_path / "run")["step"], state(tmp_path / "run")["best"]) == (4, 1.0)
+    assert load_checkpoint(out)[1].provenance["result"]["step"] == 1
+
+
 # --- kill -9 ----------------------------------------------------------------------------------------------------------
 
 KILLED = """
