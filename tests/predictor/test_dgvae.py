@@ -291,7 +291,7 @@ def test_network_inputs_closed_form():
 @settings(max_examples=8)
 @given(valid=presence(), seed=seeds, offsets=st.tuples(*[st.integers(-400, 400)] * TIME))
 def test_each_step_is_seen_from_where_the_ego_is(valid: Tensor, seed: int, offsets: tuple[int, ...]):
-    """Moving the scenes of a window along the road, each by its own distance, moves its predictions and nothing else."""
+    """Moving the scenes of a window along the road, each by its own distance, moves predictions and nothing else."""
     forecaster = model(frame=ROAD)
     states = random_states(seed, BATCH, TIME, AGENTS, 4)
     moved = states.clone()
