@@ -1,5 +1,6 @@
 """From scenes and a forecaster to what the policy sees; the same for one env, SB3 and gymnasium vector envs."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,10 @@ from predictor.errors import UserError
 from predictor.forecaster import Forecaster
 from predictor.online import OnlineForecaster
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
+
+# A forked worker (SubprocVecEnv, start_method="fork") inherits OpenMP's state without its threads and would wait for
+# them forever; with one thread it never asks for them. torch's own DataLoader workers do the same.
+os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 SCENE_KEYS = ("scene_states", "scene_ids", "scene_valid", "scene_heading_rad")
 FORECAST_KEYS = ("agents", "forecast", "edge_probs", "edge_features", "valid")

@@ -5,7 +5,6 @@ A checkpoint carries everything needed to run it (spec, sizes, horizon, residual
 
 import dataclasses
 import json
-import os
 import shutil
 import uuid
 from dataclasses import asdict, dataclass, field
@@ -19,6 +18,7 @@ from safetensors.torch import load_file, save_file
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.dgvae import DGVAE, DGVAEConfig
 from predictor.errors import UserError
+from predictor.provenance import replace_folder
 from predictor.scene import SceneSpec
 
 FORMAT = "dgvae-rl predictor"
@@ -59,18 +59,6 @@ def save_checkpoint(path: Path, model: DGVAE, info: CheckpointInfo) -> None:
         replace_folder(partial, path)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-
-
-def replace_folder(new: Path, target: Path) -> None:
-    """Put `new` in the place of `target`; a crash leaves one of them whole under the target's name or beside it."""
-    if not target.exists():
-        new.rename(target)
-        return
-    old = target.with_name(f".{target.name}.old")
-    shutil.rmtree(old, ignore_errors=True)
-    target.rename(old)
-    os.replace(new, target)
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def resolve(name: str | Path) -> Path:
@@ -133,6 +121,8 @@ def read_info(path: Path) -> CheckpointInfo:
     if content.get("version") != VERSION:
         raise UserError(f"{path} has checkpoint version {content.get('version')}, this release reads {VERSION}")
     try:
+        if int(content["horizon_steps"]) < 1:
+            raise ValueError(f"horizon_steps must be at least 1, got {content['horizon_steps']}")
         return CheckpointInfo(
             spec=_build(SceneSpec, content["spec"]),
             config=_build(DGVAEConfig, content["config"]),
@@ -141,7 +131,7 @@ def read_info(path: Path) -> CheckpointInfo:
             sources=tuple(content["sources"]),
             provenance=dict(content["provenance"]),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise UserError(f"{file} does not describe a predictor: {error}") from error
 
 

@@ -28,7 +28,8 @@ def nll(
         variance: σ of the paper (which uses it as a variance), 5e-5 there.
         likelihood: "gaussian" (paper) or "laplace" with the same variance, whose gradient does not grow with the error.
     """
-    error = (predicted - target) / scales
+    # masked before it is squared: the gradient of an infinite error is NaN, also times zero
+    error = torch.where(valid[..., None], (predicted - target) / scales, 0.0)
     if likelihood == "gaussian":
         per_entry = error.square().sum(-1) / (2 * variance)
     else:

@@ -49,6 +49,8 @@ class DGVAEConfig:
         for name in ("hidden_dim", "rnn_dim", "head_dim", "message_dim", "decoder_dim", "edge_feature_dim"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.residual not in ("state", "constant_velocity"):
+            raise UserError(f"residual must be 'state' or 'constant_velocity', got '{self.residual}'")
         if self.num_edge_types < 2:
             raise UserError(f"num_edge_types must be at least 2 (the first is 'no edge'), got {self.num_edge_types}")
         if self.temperature <= 0 or not 0 <= self.dropout < 1:

@@ -40,6 +40,7 @@ class OnlineForecaster:
         chosen = np.arange(len(self._ids)) if rows is None else np.asarray(rows, dtype=np.int64)
         if not len(chosen):
             return
+        self._belief = None  # a forecast of what is forgotten would have no meaning
         self._ids[chosen] = PADDING_ID
         index = torch.from_numpy(chosen).to(self.device)
         fresh = self._fresh.select(torch.zeros(len(chosen), dtype=torch.long, device=self.device))

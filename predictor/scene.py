@@ -41,8 +41,10 @@ class SceneSpec:
 
     def __post_init__(self) -> None:
         """Check that the fields fit together."""
-        if self.dt_s <= 0:
+        if not 0 < self.dt_s < float("inf"):
             raise UserError(f"dt_s must be positive, got {self.dt_s}")
+        if len(self.frame) != 2 or not set(self.frame) <= {"ego", "world"}:
+            raise UserError(f"frame must be 'ego' or 'world' for each of two axes, got {self.frame}")
         if self.feature_names[:4] != KINEMATIC_FEATURES:
             raise UserError(f"the first features must be {KINEMATIC_FEATURES}, got {self.feature_names[:4]}")
         if len(self.feature_scales) != len(self.feature_names) or min(self.feature_scales) <= 0:

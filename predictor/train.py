@@ -308,6 +308,11 @@ def train(config: TrainConfig) -> Path:
                     writer.add_scalar(f"train/{name}", value, trainer.step)
             shown = " ".join(f"{k} {terms[k]:.3g}" for k in ("nll_rollout", "nll_one_step", "kl"))
             progress.update(task, completed=trainer.step, note=f"{shown} {note}")
+    if not (config.out / "checkpoint").exists():
+        raise UserError(
+            f"no validation episode has {config.horizon_steps} steps of future, so no checkpoint was chosen; "
+            "lower --horizon-steps or collect longer episodes"
+        )
     return config.out / "checkpoint"
 
 

@@ -18,6 +18,7 @@ import zarr
 from jaxtyping import Bool, Float, Int
 
 from predictor.errors import UserError
+from predictor.provenance import replace_folder
 from predictor.scene import PADDING_ID, Scene, SceneSpec
 
 FORMAT = "dgvae-rl episodes"
@@ -91,6 +92,8 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
     path = Path(path)
     if path.exists() and not overwrite:
         raise UserError(f"{path} exists; choose another path or pass --overwrite")
+    if path.exists() and not (path / "zarr.json").exists():
+        raise UserError(f"{path} is not an episode store and will not be replaced; choose another path")
     episodes = list(episodes)
     if not episodes:
         raise UserError("a store needs at least one episode, got none")
@@ -127,9 +130,7 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
                 "labels": [e.label for e in episodes],
             }
         )
-        if path.exists():
-            shutil.rmtree(path)
-        partial.rename(path)
+        replace_folder(partial, path)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 

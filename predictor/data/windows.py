@@ -103,10 +103,10 @@ class Windows:
         last = now - begin
         seen = self._visible[episode][begin:end].copy()
         seen[last + 1 :] = self._present[episode][begin:end][last + 1 :] & seen[last]
-        # Columns: the ego, then who is visible now, then who was visible for longest; the rest never matters.
+        # Columns: the ego, who is visible now, who was visible before (it sent messages then); nobody else matters.
         weight = seen[: last + 1].sum(axis=0) + 1000 * seen[last]
         weight[0] += 1_000_000 * self.spec.has_ego
-        columns = np.argsort(-weight, kind="stable")[: self.spec.max_agents + 2]
+        columns = np.argsort(-weight, kind="stable")
         columns = columns[weight[columns] > 0]
         seen = seen[:, columns]
         states = self._states[episode][begin:end][:, columns] * seen[..., None]
