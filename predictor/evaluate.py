@@ -57,6 +57,8 @@ class EvaluateConfig:
         Raises:
             UserError: a value that makes no sense. (In `__post_init__`, tyro would turn it into a box of lines.)
         """
+        if self.device.startswith("cuda") and not torch.cuda.is_available():
+            raise UserError(f"device '{self.device}' asked for but torch sees no CUDA device; use --device cpu")
         for name in ("samples", "history_steps", "max_windows"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")

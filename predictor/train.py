@@ -7,6 +7,7 @@ that was not. The best checkpoint is chosen by free-running minADE on held-out e
 import json
 import math
 import os
+import pickle
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -91,8 +92,16 @@ class TrainConfig:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
         if not 0 < self.val_fraction < 1:
             raise UserError(f"val_fraction must lie between 0 and 1, got {self.val_fraction}")
-        if self.lr <= 0 or self.variance <= 0:
-            raise UserError(f"lr and variance must be positive, got {self.lr} and {self.variance}")
+        if not self.data:
+            raise UserError("data needs at least one episode store; make one with python -m envs.collect")
+        for name in ("lr", "variance", "clip_norm"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise UserError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("one_step_weight", "kl_weight", "seed", "threads"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
+        if self.device != "cpu" and not self.device.startswith("cuda"):
+            raise UserError(f"device must be 'cpu' or 'cuda', got '{self.device}'")
         if self.device.startswith("cuda") and not torch.cuda.is_available():
             raise UserError(f"device '{self.device}' asked for but torch sees no CUDA device; use --device cpu")
 
@@ -245,10 +254,14 @@ class Trainer:
 
     def restore(self, path: Path) -> None:
         """Continue from a saved training state."""
-        state = torch.load(path, weights_only=True, map_location=self.device)
-        self.model.load_state_dict(state["model"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.step, self.best, self.stale = int(state["step"]), float(state["best"]), int(state["stale"])
+        try:
+            state = torch.load(path, weights_only=True, map_location=self.device)
+            self.model.load_state_dict(state["model"])
+            self.optimizer.load_state_dict(state["optimizer"])
+            self.step, self.best, self.stale = int(state["step"]), float(state["best"]), int(state["stale"])
+        except (RuntimeError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
+            reason = " ".join(str(error).split())[:200]
+            raise UserError(f"{path} cannot be read ({reason}); train anew into another --out") from error
 
     def _baseline(self) -> float:
         spec, steps = self.data.spec, self.config.horizon_steps
@@ -356,12 +369,15 @@ def _comparable(config: TrainConfig) -> dict[str, Any]:
 
 def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
     if not config_file.exists():
-        if config.out.exists() and any(config.out.iterdir()):
+        if config.out.exists() and any(not p.name.startswith(".") for p in config.out.iterdir()):
             raise UserError(f"{config.out} is not empty and not a training run; choose another --out")
         return
     if not config.resume:
         raise UserError(f"{config.out} holds a run already; pass --resume to continue it or choose another --out")
-    before, now = json.loads(config_file.read_text())["config"], _comparable(config)
+    try:
+        before, now = json.loads(config_file.read_text())["config"], _comparable(config)
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{config_file} cannot be read ({error}); train anew into another --out") from error
     for name, value in now.items():
         if name != "steps" and before.get(name) != value:
             raise UserError(f"cannot resume: {name} was {before.get(name)} and is now {value}; use the same arguments")

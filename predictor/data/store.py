@@ -115,8 +115,9 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
     try:
         group = zarr.open_group(partial, mode="w")
         chunk = max(1, min(len(states), 4096))
-        group.create_array("states", data=states, chunks=(chunk, columns, states.shape[-1]))
-        group.create_array("valid", data=valid, chunks=(chunk, columns))
+        every_chunk: Any = {"write_empty_chunks": True}  # so that a missing chunk is damage, not zeros
+        group.create_array("states", data=states, chunks=(chunk, columns, states.shape[-1]), config=every_chunk)
+        group.create_array("valid", data=valid, chunks=(chunk, columns), config=every_chunk)
         group.create_array("ids", data=ids)
         group.create_array("starts", data=starts)
         group.create_array("seeds", data=np.array([e.seed for e in episodes], dtype=np.int64))
@@ -154,9 +155,13 @@ def read_store(path: Path) -> EpisodeStore:
                 f"{path} has store version {attrs['version']}, this release reads {VERSION}; collect it anew"
             )
         arrays = {name: np.asarray(group[name]) for name in ("states", "valid", "ids", "starts", "seeds")}
+        for name in ("states", "valid"):
+            stored: Any = group[name]
+            if stored.nchunks_initialized != stored.nchunks:  # Zarr reads what is missing as zeros
+                raise UserError(f"{path}: chunks of '{name}' are missing; copy or collect it anew")
         info = StoreInfo(_spec_from_json(attrs["spec"]), str(attrs["source"]), dict(attrs["provenance"]))
         labels = list(attrs["labels"])
-    except (KeyError, TypeError, OSError, json.JSONDecodeError, zarr.errors.BaseZarrError) as error:
+    except (KeyError, TypeError, OSError, RuntimeError, json.JSONDecodeError, zarr.errors.BaseZarrError) as error:
         raise UserError(f"{path} is not a readable episode store ({error}); collect it anew") from error
     episodes = []
     for i, (start, stop) in enumerate(zip(arrays["starts"][:-1], arrays["starts"][1:], strict=True)):

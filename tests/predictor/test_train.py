@@ -382,7 +382,7 @@ def test_bad_input_ends_a_real_process_with_one_line(tmp_path: Path):
             ["--val-fraction", "0.01"],
             "6 episodes split into 6 for training and 0 for validation; both need at least one",
         ),
-        (["--lr", "0"], "lr and variance must be positive, got 0.0 and 5e-05"),
+        (["--lr", "0"], "lr must be positive, got 0.0"),
         (["--device", "cuda"], "device 'cuda' asked for but torch sees no CUDA device; use --device cpu"),
     ],
 )
