@@ -14,10 +14,12 @@ from typing import Any
 import safetensors
 import torch
 from safetensors.torch import load_file, save_file
+from torch import nn
 
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.dgvae import DGVAE, DGVAEConfig
 from predictor.errors import UserError
+from predictor.forecaster import TrainableForecaster
+from predictor.models import build, config_from_json, name_of
 from predictor.provenance import replace_folder
 from predictor.scene import SceneSpec
 
@@ -33,8 +35,8 @@ class CheckpointInfo:
 
     spec: SceneSpec
     """Scenes it takes."""
-    config: DGVAEConfig
-    """Sizes of the network."""
+    config: Any
+    """Sizes of the network: the model's config dataclass."""
     horizon_steps: int
     """Steps it was trained to forecast."""
     std_m: tuple[float, ...] = ()
@@ -43,10 +45,14 @@ class CheckpointInfo:
     """What it was trained on (env ids or dataset names)."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Command, commit, versions, seeds, validation results."""
+    model: str = "dgvae"
+    """Which network, by its name in `predictor.models`."""
 
 
-def save_checkpoint(path: Path, model: DGVAE, info: CheckpointInfo) -> None:
+def save_checkpoint(path: Path, model: nn.Module, info: CheckpointInfo) -> None:
     """Write a checkpoint folder; an existing one is replaced only when the new one is complete."""
+    if name_of(model) != info.model:
+        raise UserError(f"the checkpoint says model '{info.model}' but the network is '{name_of(model)}'")
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.partial")
@@ -82,7 +88,7 @@ def shipped() -> list[str]:
     return sorted(p.parent.name for p in PRETRAINED.glob("[!.]*/config.json"))
 
 
-def load_checkpoint(name: str | Path, device: str = "cpu") -> tuple[DGVAE, CheckpointInfo]:
+def load_checkpoint(name: str | Path, device: str = "cpu") -> tuple[Any, CheckpointInfo]:
     """Load a model for inference from a shipped name or a folder.
 
     Raises:
@@ -90,7 +96,7 @@ def load_checkpoint(name: str | Path, device: str = "cpu") -> tuple[DGVAE, Check
     """
     path = resolve(name)
     info = read_info(path)
-    model = DGVAE(info.spec, info.config, info.horizon_steps)
+    model = build(info.model, info.spec, info.config, info.horizon_steps)
     try:
         tensors = load_file(path / "model.safetensors")
     except (safetensors.SafetensorError, OSError) as error:
@@ -123,13 +129,15 @@ def read_info(path: Path) -> CheckpointInfo:
     try:
         if int(content["horizon_steps"]) < 1:
             raise ValueError(f"horizon_steps must be at least 1, got {content['horizon_steps']}")
+        model = str(content.get("model", "dgvae"))  # checkpoints before version 0.2 knew one model only
         return CheckpointInfo(
             spec=_build(SceneSpec, content["spec"]),
-            config=_build(DGVAEConfig, content["config"]),
+            config=config_from_json(model, content["config"]),
             horizon_steps=int(content["horizon_steps"]),
             std_m=tuple(content["std_m"]),
             sources=tuple(content["sources"]),
             provenance=dict(content["provenance"]),
+            model=model,
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise UserError(f"{file} does not describe a predictor: {error}") from error
@@ -137,7 +145,7 @@ def read_info(path: Path) -> CheckpointInfo:
 
 def load_forecaster(
     name: str | Path, scene_spec: SceneSpec, source: str, device: str = "cpu"
-) -> DGVAE | ConstantVelocity:
+) -> TrainableForecaster | ConstantVelocity:
     """A forecaster for scenes of `scene_spec`: a shipped name, a folder, or "constant-velocity".
 
     Raises:
@@ -145,6 +153,7 @@ def load_forecaster(
     """
     if str(name) == CONSTANT_VELOCITY:
         return ConstantVelocity(scene_spec)
+    model: TrainableForecaster
     model, info = load_checkpoint(name, device)
     info.spec.check_compatible(scene_spec, f"checkpoint '{name}'", source)
     return model

@@ -17,8 +17,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from predictor.codec import StateCodec
+from predictor.disentangle import running_mean, window_mean
 from predictor.errors import UserError
-from predictor.forecaster import Belief, Memory
+from predictor.forecaster import Belief, Memory, WindowOutput
 from predictor.graph import pair_mask
 from predictor.networks import PRESETS, Decoder, DGVAEConfig, Edges, Encoder, concrete_sample
 from predictor.scene import SceneSpec
@@ -26,23 +28,25 @@ from predictor.scene import SceneSpec
 __all__ = ["DGVAE", "PRESETS", "DGVAEConfig", "Decoder", "Edges", "Encoder", "WindowOutput", "concrete_sample"]
 
 
-class WindowOutput(NamedTuple):
-    """What the losses need from one training window."""
+class _Past(NamedTuple):
+    """What the encoder remembers; tensors with a time axis, or without one."""
 
-    one_step: Float[Tensor, "batch time agents state"]
-    """Teacher-forced prediction of the next state under the posterior graph, for each step [SI]."""
-    rollout: Float[Tensor, "batch agents horizon state"]
-    """Free-running states after `last_observed`, under the prior graph [SI]."""
-    prior_logits: Float[Tensor, "batch time agents agents types"]
-    posterior_logits: Float[Tensor, "batch time agents agents types"]
-    features: Float[Tensor, "batch time agents agents feature"]
+    hidden: Tensor
+    cell: Tensor
+    static: Tensor  # pair matching: mean and count (no column if off)
+    seen: Tensor  # the latest inputs and a 1 (no column if changes are not looked at)
+
+
+class _Encoding(NamedTuple):
+    edges: Edges
+    features: Tensor  # with the static dimensions averaged over the past of each step
+    past: _Past  # after each step
 
 
 class _Internal(NamedTuple):
-    pair_hidden: Tensor
-    pair_cell: Tensor
-    node_before: Tensor  # GRU state before the latest observation was decoded
+    past: _Past
     logits: Tensor
+    node_before: Tensor  # GRU state before the latest observation was decoded
     node_after: Tensor  # … and after, under the prior's expectation
     next_states: Tensor
 
@@ -52,7 +56,7 @@ class DGVAE(nn.Module):
 
     Args:
         spec: layout of the scenes.
-        config: sizes.
+        config: sizes and variants.
         horizon_steps: steps it is trained to forecast.
     """
 
@@ -62,18 +66,16 @@ class DGVAE(nn.Module):
         self.spec = spec
         self.config = config
         self.horizon_steps = horizon_steps
-        inputs = spec.num_features + int(spec.has_ego)
-        self.encoder = Encoder(config, inputs)
+        self.codec = StateCodec(spec, config.delta_scales, config.residual)
+        self.sees_changes = bool(config.change_scales)
+        if self.sees_changes and len(config.change_scales) != spec.num_features:
+            raise UserError(f"change_scales needs {spec.num_features} numbers, got {config.change_scales}")
+        inputs = self.codec.num_inputs
+        self.encoder = Encoder(config, inputs + spec.num_features * self.sees_changes)
         self.decoder = Decoder(config, inputs, spec.num_features)
-        deltas = config.delta_scales or spec.feature_scales
-        if len(deltas) != spec.num_features:
-            raise UserError(f"delta_scales needs {spec.num_features} numbers, got {deltas}")
-        self._scales: Tensor
-        self._deltas: Tensor
-        self._ego_axes: Tensor
-        self.register_buffer("_scales", torch.tensor(spec.feature_scales), persistent=False)
-        self.register_buffer("_deltas", torch.tensor(deltas), persistent=False)
-        self.register_buffer("_ego_axes", torch.tensor([float(f == "ego") for f in spec.frame]), persistent=False)
+        self._per_change: Tensor
+        per_change = self.codec.scales / torch.tensor(config.change_scales) if self.sees_changes else torch.ones(0)
+        self.register_buffer("_per_change", per_change, persistent=False)
 
     @property
     def num_edge_types(self) -> int:
@@ -85,75 +87,44 @@ class DGVAE(nn.Module):
         """Size of an edge's features."""
         return self.config.edge_feature_dim
 
-    def network_inputs(
-        self, states: Float[Tensor, "*batch agents state"], valid: Bool[Tensor, "*batch agents"]
-    ) -> Float[Tensor, "*batch agents inputs"]:
-        """Scaled features in the spec's frame (re-centred on the ego at this very step), plus the ego's mark."""
-        centre = states[..., :1, :2] * self._ego_axes
-        inputs = torch.cat([states[..., :2] - centre, states[..., 2:]], dim=-1) / self._scales
-        if self.spec.has_ego:
-            mark = torch.zeros_like(inputs[..., :1])
-            mark[..., 0, 0] = 1.0
-            inputs = torch.cat([inputs, mark], dim=-1)
-        return inputs * valid[..., None]
-
-    def advance(
-        self, states: Float[Tensor, "*batch state"], change: Float[Tensor, "*batch state"]
-    ) -> Float[Tensor, "*batch state"]:
-        """Next states [SI] from states and the decoder's change."""
-        after = states + change * self._deltas
-        if self.config.residual == "constant_velocity":
-            drift = torch.cat([states[..., 2:4] * self.spec.dt_s, torch.zeros_like(states[..., 2:])], dim=-1)
-            after = after + drift
-        return after
-
     # --- Forecaster ---------------------------------------------------------------------------------------------
 
     def empty_memory(self, batch: int, agents: int) -> Memory:
         """Zeros on the model's device."""
-        zeros = self._scales.new_zeros
+        zeros = self.codec.scales.new_zeros
         pair = zeros(batch, agents, agents, self.config.rnn_dim)
-        return Memory(nodes=(zeros(batch, agents, self.config.decoder_dim),), pairs=(pair, pair.clone()))
+        static = zeros(batch, agents, agents, self.config.static_dim + 1 if self.config.static_dim else 0)
+        seen = zeros(batch, agents, self.codec.num_inputs + 1 if self.sees_changes else 0)
+        return Memory(nodes=(zeros(batch, agents, self.config.decoder_dim), seen), pairs=(pair, pair.clone(), static))
 
     def observe(
         self, memory: Memory, states: Float[Tensor, "batch agents state"], valid: Bool[Tensor, "batch agents"]
     ) -> tuple[Memory, Belief]:
         """One encoder step and one decoder step under the prior's expected graph."""
-        inputs, pairs = self.network_inputs(states, valid), pair_mask(valid)
-        edges = self.encoder(inputs[:, None], pairs[:, None], *memory.pairs)
-        hidden, cell, logits, features = (
-            edges.hidden[:, 0],
-            edges.cell[:, 0],
-            edges.prior_logits[:, 0],
-            edges.features[:, 0],
-        )
+        node_before, seen = memory.nodes
+        past, logits, features = self._encode_step(states, valid, _Past(*memory.pairs, seen))
         probs = torch.softmax(logits, dim=-1)
-        (node_before,) = memory.nodes
-        node_after = self.decoder.step(self.decoder.messages(inputs, pairs, probs, features), valid, node_before)
-        next_states = self.advance(states, self.decoder.change(node_after))
-        internal = _Internal(hidden, cell, node_before, logits, node_after, next_states)
-        return Memory((node_after,), (hidden, cell)), Belief(states, valid, probs, features, internal)
+        node_after, next_states = self._move(states, valid, probs, features, node_before)
+        internal = _Internal(past, logits, node_before, node_after, next_states)
+        after = Memory((node_after, past.seen), (past.hidden, past.cell, past.static))
+        return after, Belief(states, valid, probs, features, internal)
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
         """Feed predictions back through the encoder, so that the graph evolves; sample 0 takes expected graphs."""
-        internal: _Internal = belief.internal
-        memory = (internal.pair_hidden, internal.pair_cell, internal.node_after)
-        futures = [self._continue(internal.next_states, belief.valid, memory, horizon_steps, None)]
+        known: _Internal = belief.internal
+        futures = [self._continue(known.next_states, belief.valid, known.past, known.node_after, horizon_steps, None)]
         if num_samples > 1:
             draws = num_samples - 1
-            states, valid, features, hidden, cell, node, logits = (
+            states, valid, features, node, logits, *past = (
                 t.repeat_interleave(draws, dim=0)
                 for t in (
-                    belief.states, belief.valid, belief.edge_features,
-                    internal.pair_hidden, internal.pair_cell, internal.node_before, internal.logits,
+                    belief.states, belief.valid, belief.edge_features, known.node_before, known.logits, *known.past
                 )
             )  # fmt: skip
-            sampler = _Sampler(self.config.temperature, generator)
-            futures.append(
-                self._free_run(states, valid, features, (hidden, cell, node), logits, horizon_steps, sampler)
-            )
+            sampler = self._sampler(generator)
+            futures.append(self._free_run(states, valid, features, _Past(*past), node, logits, horizon_steps, sampler))
         batch = len(belief.states)
         stacked = [f.unflatten(0, (batch, -1)) for f in futures]
         return torch.cat(stacked, dim=1) if num_samples > 1 else stacked[0]
@@ -165,87 +136,138 @@ class DGVAE(nn.Module):
         states: Float[Tensor, "batch time agents state"],
         valid: Bool[Tensor, "batch time agents"],
         last_observed: Int[Tensor, " batch"],
+        rollout_steps: int,
         generator: torch.Generator | None = None,
     ) -> WindowOutput:
-        """Teacher-forced pass under the posterior and free-running roll-out under the prior, from the same encoding.
-
-        Args:
-            states: true states [SI]; the horizon's steps included.
-            valid: who is present.
-            last_observed: index of the last step that the roll-out has seen; needs history before and
-                `horizon_steps` after it.
-            generator: source of the concrete noise.
-        """
-        inputs, pairs = self.network_inputs(states, valid), pair_mask(valid)
+        """Teacher-forced pass under the posterior and free-running roll-out under the prior, from the same encoding."""
+        inputs, pairs = self.codec.inputs(states, valid), pair_mask(valid)
         memory = self.empty_memory(states.shape[0], states.shape[2])
-        edges = self.encoder(inputs, pairs, *memory.pairs)
+        node, seen = memory.nodes
+        edges, features, past = self._encode(inputs, valid, _Past(*memory.pairs, seen))
         posterior = self.encoder.posterior_logits(edges, pairs)
-        sampled = concrete_sample(posterior, self.config.temperature, generator)
-        nodes = self._decode(inputs, valid, pairs, sampled, edges.features, memory.nodes[0])
-        one_step = self.advance(states, self.decoder.change(nodes))
+        sampled = self._sampler(generator)(posterior)
+        shown = self._match_window(edges.features, features, pairs)
+        messages = self.decoder.messages(inputs, pairs, sampled, shown)
+        nodes = self._remember(messages, valid, node)
+        one_step = self._integrate(states, valid, pairs, sampled, shown, nodes, messages)
+        if not rollout_steps:
+            nothing = states.new_zeros(len(states), states.shape[2], 0, states.shape[3])
+            return WindowOutput(one_step, nothing, edges.prior_logits, posterior, shown)
 
         steps = int(last_observed.max())
         expected = torch.softmax(edges.prior_logits[:, :steps], dim=-1)
-        past = (inputs[:, :steps], valid[:, :steps], pairs[:, :steps], expected, edges.features[:, :steps])
-        burned_in = torch.cat([memory.nodes[0][:, None], self._decode(*past, memory.nodes[0])], dim=1)
-        rows = torch.arange(len(states), device=states.device)
-        now = (rows, last_observed)
-        start = (edges.hidden[now], edges.cell[now], burned_in[now])
+        messages = self.decoder.messages(inputs[:, :steps], pairs[:, :steps], expected, features[:, :steps])
+        burned_in = torch.cat([node[:, None], self._remember(messages, valid[:, :steps], node)], dim=1)
+        now = (torch.arange(len(states), device=states.device), last_observed)
         future = self._free_run(
-            states[now], valid[now], edges.features[now], start, edges.prior_logits[now], self.horizon_steps,
-            _Sampler(self.config.temperature, generator),
+            states[now], valid[now], features[now], _Past(*(t[now] for t in past)), burned_in[now],
+            edges.prior_logits[now], rollout_steps, self._sampler(generator),
         )  # fmt: skip
-        return WindowOutput(one_step, future, edges.prior_logits, posterior, edges.features)
+        return WindowOutput(one_step, future, edges.prior_logits, posterior, shown)
 
     # --- Shared -------------------------------------------------------------------------------------------------
 
-    def _decode(
-        self, inputs: Tensor, valid: Tensor, pairs: Tensor, graph: Tensor, features: Tensor, hidden: Tensor
-    ) -> Float[Tensor, "batch time agents decoder"]:
-        messages = self.decoder.messages(inputs, pairs, graph, features)
+    def _sampler(self, generator: torch.Generator | None) -> "_Sampler":
+        return _Sampler(self.config.temperature, self.config.hard_samples, generator)
+
+    def _encode(self, inputs: Tensor, valid: Tensor, past: _Past) -> _Encoding:
+        """Encode a stretch of steps after `past`."""
+        pairs, seen = pair_mask(valid), inputs.new_zeros(*inputs.shape[:-1], 0)
+        if self.sees_changes:
+            seen = torch.cat([inputs, torch.ones_like(inputs[..., :1])], dim=-1) * valid[..., None]
+            before = torch.cat([past.seen[:, None], seen[:, :-1]], dim=1)
+            known = before[..., -1:] * valid[..., None]
+            features = self.spec.num_features
+            changes = (inputs[..., :features] - before[..., :features]) * self._per_change * known
+            inputs = torch.cat([inputs, changes], dim=-1)
+        edges = self.encoder(inputs, pairs, past.hidden, past.cell)
+        matched, static = edges.features, inputs.new_zeros(*pairs.shape, 0)
+        if self.config.static_dim:
+            static = running_mean(edges.features[..., : self.config.static_dim], pairs, past.static)
+            matched = torch.cat([static[..., :-1], edges.features[..., self.config.static_dim :]], dim=-1)
+        return _Encoding(edges, matched, _Past(edges.hidden, edges.cell, static, seen))
+
+    def _encode_step(self, states: Tensor, valid: Tensor, past: _Past) -> tuple[_Past, Tensor, Tensor]:
+        """The same for one step: memory, prior logits and features after it."""
+        inputs = self.codec.inputs(states, valid)[:, None]
+        edges, features, after = self._encode(inputs, valid[:, None], past)
+        return _Past(*(t[:, 0] for t in after)), edges.prior_logits[:, 0], features[:, 0]
+
+    def _match_window(self, features: Tensor, causal: Tensor, pairs: Tensor) -> Tensor:
+        """Features for the teacher-forced pass: the static ones from the whole window, if the config asks for that."""
+        static = self.config.static_dim
+        if not static or self.config.pair_matching == "causal":
+            return causal
+        return torch.cat([window_mean(features[..., :static], pairs), features[..., static:]], dim=-1)
+
+    def _remember(self, messages: Tensor, valid: Tensor, hidden: Tensor) -> Float[Tensor, "batch time agents decoder"]:
+        """GRU states of all agents after each step."""
         nodes = []
         for message, present in zip(messages.unbind(1), valid.unbind(1), strict=True):
             hidden = self.decoder.step(message, present, hidden)
             nodes.append(hidden)
         return torch.stack(nodes, dim=1) if nodes else messages.new_zeros(len(hidden), 0, *hidden.shape[1:])
 
+    def _move(
+        self, states: Tensor, valid: Tensor, graph: Tensor, features: Tensor, node: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """One decoder step: GRU states after it, and the next states."""
+        pairs = pair_mask(valid)
+        messages = self.decoder.messages(self.codec.inputs(states, valid), pairs, graph, features)
+        node = self.decoder.step(messages, valid, node)
+        return node, self._integrate(states, valid, pairs, graph, features, node, messages)
+
+    def _integrate(
+        self,
+        states: Tensor,
+        valid: Tensor,
+        pairs: Tensor,
+        graph: Tensor,
+        features: Tensor,
+        node: Tensor,
+        messages: Tensor,
+    ) -> Float[Tensor, "*batch agents state"]:
+        """States one step later; with substeps, messages are evaluated anew as the agents move."""
+        change = self.decoder.change(node)
+        substeps = self.config.substeps
+        if not substeps:
+            return self.codec.advance(states, change)
+        for substep in range(substeps):
+            if substep:
+                messages = self.decoder.messages(self.codec.inputs(states, valid), pairs, graph, features)
+            states = self.codec.advance(states, change + self.decoder.direct(messages), 1 / substeps)
+        return states
+
     def _free_run(
         self,
         states: Tensor,
         valid: Tensor,
         features: Tensor,
-        memory: tuple[Tensor, Tensor, Tensor],
+        past: _Past,
+        node: Tensor,
         logits: Tensor,
         horizon_steps: int,
         sampler: "_Sampler",
     ) -> Float[Tensor, "batch agents horizon state"]:
         """Roll out from an observation whose decoder step is still to be taken."""
-        hidden, cell, node = memory
-        inputs, pairs = self.network_inputs(states, valid), pair_mask(valid)
-        node = self.decoder.step(self.decoder.messages(inputs, pairs, sampler(logits), features), valid, node)
-        states = self.advance(states, self.decoder.change(node))
-        return self._continue(states, valid, (hidden, cell, node), horizon_steps, sampler)
+        node, states = self._move(states, valid, sampler(logits), features, node)
+        return self._continue(states, valid, past, node, horizon_steps, sampler)
 
     def _continue(
         self,
         states: Tensor,
         valid: Tensor,
-        memory: tuple[Tensor, Tensor, Tensor],
+        past: _Past,
+        node: Tensor,
         horizon_steps: int,
         sampler: "_Sampler | None",
     ) -> Float[Tensor, "batch agents horizon state"]:
         """Roll out from predicted states; without a sampler along expected graphs."""
-        hidden, cell, node = memory
-        pairs = pair_mask(valid)
         future = [states]
         for _ in range(horizon_steps - 1):
-            inputs = self.network_inputs(states, valid)
-            edges = self.encoder(inputs[:, None], pairs[:, None], hidden, cell)
-            hidden, cell, logits = edges.hidden[:, 0], edges.cell[:, 0], edges.prior_logits[:, 0]
+            past, logits, features = self._encode_step(states, valid, past)
             graph = torch.softmax(logits, dim=-1) if sampler is None else sampler(logits)
-            messages = self.decoder.messages(inputs, pairs, graph, edges.features[:, 0])
-            node = self.decoder.step(messages, valid, node)
-            states = self.advance(states, self.decoder.change(node))
+            node, states = self._move(states, valid, graph, features, node)
             future.append(states)
         return torch.stack(future, dim=2)
 
@@ -253,7 +275,8 @@ class DGVAE(nn.Module):
 @dataclass(frozen=True)
 class _Sampler:
     temperature: float
+    hard: bool = False
     generator: torch.Generator | None = field(default=None)
 
     def __call__(self, logits: Tensor) -> Tensor:
-        return concrete_sample(logits, self.temperature, self.generator)
+        return concrete_sample(logits, self.temperature, self.generator, self.hard)

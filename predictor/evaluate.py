@@ -1,9 +1,11 @@
 """Measure a checkpoint on recorded data: `python -m predictor.evaluate --checkpoint NAME --data STORE`.
 
-Prints minADE, minFDE, RMSE and NLL by horizon for K = 1 and K samples beside constant velocity; writes JSON,
-Markdown and plots. Accuracy in the loop that a policy drives is `python -m envs.evaluate`'s.
+Prints minADE and minFDE (per agent and joint, with standard errors over subsets of the windows), miss rate, coverage,
+and RMSE and NLL by horizon, for K = 1 and K samples beside constant velocity; writes JSON, Markdown and plots. Accuracy
+in the loop that a policy drives is `python -m envs.evaluate`'s.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,13 +21,30 @@ from rich.table import Table
 
 from predictor.accuracy import Accuracy, Outcome, fitted_std_m, run_window_batch, run_windows, summarise
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.checkpoint import load_checkpoint
-from predictor.data.store import read_store
+from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint
+from predictor.data.store import EpisodeStore, read_store
 from predictor.data.windows import Windows
 from predictor.errors import UserError, run_entry_point
 from predictor.forecaster import Forecaster
+from predictor.metrics import COVERAGE_SHARE, MISS_THRESHOLD_M
 from predictor.plots import plot_error_by_horizon, plot_scene
 from predictor.provenance import provenance, write_json
+from predictor.scene import SceneSpec
+
+SCALARS = (
+    "minADE [m]",
+    "minFDE [m]",
+    "joint ADE [m]",
+    "joint FDE [m]",
+    "RMSE [m]",
+    "missed",
+    "cover",
+)
+"""Columns of both tables between K and the steps."""
+ROW_NAMES = {"dgvae": "dG-VAE", "dnri": "dNRI", "imma": "IMMA", "lstm": "LSTM", "mlp": "MLP"}
+"""What a table calls a model; others go by their own name."""
+MAX_STEPS_SHOWN = 6
+"""Steps of the horizon that fit on a screen, the first and the last among them; accuracy.json has all."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +52,7 @@ class EvaluateConfig:
     """Measure a predictor's accuracy on recorded episodes, beside constant velocity."""
 
     checkpoint: str
-    """Shipped name or folder."""
+    """Shipped name, folder, or "constant-velocity"."""
     data: Path
     """Episode store that was not trained on."""
     out: Path | None = None
@@ -43,7 +62,7 @@ class EvaluateConfig:
     history_steps: int = 10
     """Steps streamed before each forecast (fewer where the episode has just begun)."""
     horizon_steps: int | None = None
-    """Steps to forecast; None takes the checkpoint's."""
+    """Steps to forecast; None takes the checkpoint's (5 for constant velocity)."""
     max_windows: int = 4000
     """Forecasts to make, drawn evenly from the store."""
     seed: int = 0
@@ -66,58 +85,128 @@ class EvaluateConfig:
             raise UserError(f"horizon_steps must be at least 1, got {self.horizon_steps}")
 
 
+@dataclass(frozen=True)
+class _Subject:
+    store: EpisodeStore
+    spec: SceneSpec
+    horizon: int
+    model: Forecaster | None = None  # None: constant velocity alone
+    std_m: tuple[float, ...] = ()
+    name: str = ""
+
+
 def evaluate(config: EvaluateConfig) -> list[Accuracy]:
-    """Rows for the model at K = 1 and K = `samples`, and for constant velocity."""
+    """Rows for the model at K = 1 and K = `samples`, and for constant velocity.
+
+    Raises:
+        UserError: checkpoint or store unreadable or of different specs, or no episode as long as the horizon.
+    """
+    return _evaluate(config, _load(config))
+
+
+def _load(config: EvaluateConfig) -> _Subject:
+    if config.checkpoint == CONSTANT_VELOCITY:
+        store = read_store(config.data)
+        spec = store.info.spec
+        return _Subject(store, spec, config.horizon_steps or ConstantVelocity(spec).horizon_steps)
     model, info = load_checkpoint(config.checkpoint, config.device)
     store = read_store(config.data)
     info.spec.check_compatible(store.info.spec, f"checkpoint '{config.checkpoint}'", f"store {config.data}")
-    horizon = config.horizon_steps or info.horizon_steps
-    windows = Windows(store.episodes, info.spec, config.history_steps, horizon)
+    name = ROW_NAMES.get(info.model, info.model)
+    return _Subject(store, info.spec, config.horizon_steps or info.horizon_steps, model, info.std_m, name)
+
+
+def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:
+    horizon, baseline = subject.horizon, ConstantVelocity(subject.spec, subject.horizon)
+    longest = max(len(e.states) for e in subject.store.episodes)
+    if 1 < longest <= horizon:
+        raise UserError(
+            f"store {config.data}: episodes have at most {longest} steps, a horizon of {horizon} needs {horizon + 1}; "
+            "lower --horizon-steps or record longer episodes"
+        )
+    windows = Windows(subject.store.episodes, subject.spec, config.history_steps, horizon)
     chosen = np.random.default_rng(config.seed).permutation(len(windows))[: config.max_windows]
-    baseline = ConstantVelocity(info.spec, horizon)
-    entries: list[tuple[str, Forecaster, int]] = [("dG-VAE", model, k) for k in sorted({1, config.samples})]
-    entries.append(("constant velocity", baseline, 1))
+    # Constant velocity has no training data of its own; its spread is fitted on these very errors, in its favour.
+    std_m = fitted_std_m(run_windows(baseline, windows, chosen, horizon))
+    straight = summarise("constant velocity", run_windows(baseline, windows, chosen, horizon), std_m)
+    if not straight.agents:
+        raise UserError(
+            f"store {config.data}: in {len(chosen)} windows no agent{' but the ego' * subject.spec.has_ego} is there "
+            f"for all {horizon} steps of the horizon; lower --horizon-steps, raise --max-windows or record longer "
+            "episodes"
+        )
     rows = []
-    for name, forecaster, samples in track(entries, description="evaluate"):
-        device = config.device if forecaster is model else "cpu"
-        outcomes = list(run_windows(forecaster, windows, chosen, horizon, samples, config.seed, device=device))
-        # Constant velocity has no training data of its own; its spread is fitted on these very errors, in its favour.
-        std_m = info.std_m if forecaster is model else fitted_std_m(outcomes)
-        rows.append(summarise(name, outcomes, std_m))
+    if subject.model is not None:
+        for samples in track(sorted({1, config.samples}), description="evaluate"):
+            made = run_windows(subject.model, windows, chosen, horizon, samples, config.seed, device=config.device)
+            rows.append(summarise(subject.name, made, subject.std_m))
+    rows.append(straight)
     if config.out is not None:
-        _write(config, rows, store.info.source, info.spec.dt_s)
-        _plot(config, rows, windows, chosen, model, horizon)
+        _write(config, rows, subject.store.info.source, subject.spec.dt_s)
+        _plot(config, rows, windows, chosen, subject.model or baseline, horizon)
     return rows
 
 
 def accuracy_table(rows: Sequence[Accuracy], dt_s: float, title: str) -> Table:
-    """One line per row; the columns by horizon are displacement / RMSE / NLL."""
-    table = Table(title=title)
+    """One line per row; the columns by horizon hold displacement, RMSE and NLL, for `MAX_STEPS_SHOWN` of its steps."""
+    table = Table(title=title, show_lines=True)
     table.add_column("forecaster")
-    for heading in ("K", r"minADE \[m]", r"minFDE \[m]", "forecasts"):
-        table.add_column(heading, justify="right")
-    for step in range(len(rows[0].by_step_m)):
+    for heading in ("K", *SCALARS, "forecasts"):
+        table.add_column("\n".join(heading.split()).replace("[", r"\["), justify="right")
+    shown = _steps_shown(rows)
+    for step in shown:
         table.add_column(f"{dt_s * (step + 1):g} s", justify="right")
     for row in rows:
-        cells = [
-            "/".join([f"{d:.2f}", f"{r:.2f}", *([f"{row.nll[i]:.2f}"] if row.nll else [])])
-            for i, (d, r) in enumerate(zip(row.by_step_m, row.rmse_m, strict=True))
-        ]
-        head = [f"{row.min_ade_m:.3f}", f"{row.min_fde_m:.3f}", str(row.agents)]
-        table.add_row(row.name, str(row.num_samples), *head, *cells)
-    table.caption = r"by time ahead: displacement of the best sample \[m] / RMSE of the mean \[m] / NLL \[nats]"
+        stacks = [(row.by_step_m[i], row.rmse_m[i], *([row.nll[i]] if row.nll else [])) for i in shown]
+        cells = ["\n".join(_number(value, 2) for value in stack) for stack in stacks]
+        scalars = [cell.replace(" ± ", "\n±") for cell in _scalar_cells(row)]
+        table.add_row(row.name, str(row.num_samples), *scalars, str(row.agents), *cells)
+    table.caption = (
+        r"by time ahead: displacement of the best sample \[m] / RMSE of the mean \[m] / NLL \[nats], top to bottom; "
+        f"± standard error over subsets of the windows; missed: ends more than {MISS_THRESHOLD_M:g} m off; "
+        f"cover: truths within the central {100 * COVERAGE_SHARE:g} % of the samples"
+    )
     return table
 
 
 def markdown_table(rows: Sequence[Accuracy], dt_s: float) -> str:
-    """The same as Markdown."""
-    steps = [f"{dt_s * (i + 1):g} s" for i in range(len(rows[0].by_step_m))]
-    lines = ["| " + " | ".join(["forecaster", "K", "minADE [m]", "minFDE [m]", *steps]) + " |"]
-    lines.append("|" + "---|" * (4 + len(steps)))
+    """The same as Markdown; by time ahead the displacement alone."""
+    shown = _steps_shown(rows)
+    steps = [f"{dt_s * (i + 1):g} s" for i in shown]
+    lines = ["| " + " | ".join(["forecaster", "K", *SCALARS, *steps]) + " |"]
+    lines.append("|" + "---|" * (2 + len(SCALARS) + len(steps)))
     for row in rows:
-        cells = [row.name, str(row.num_samples), f"{row.min_ade_m:.3f}", f"{row.min_fde_m:.3f}"]
-        lines.append("| " + " | ".join([*cells, *(f"{d:.2f}" for d in row.by_step_m)]) + " |")
+        cells = [row.name, str(row.num_samples), *_scalar_cells(row)]
+        lines.append("| " + " | ".join([*cells, *(_number(row.by_step_m[i], 2) for i in shown)]) + " |")
     return "\n".join(lines) + "\n"
+
+
+def _steps_shown(rows: Sequence[Accuracy]) -> list[int]:
+    horizon = len(rows[0].by_step_m)
+    return np.linspace(0, horizon - 1, min(horizon, MAX_STEPS_SHOWN)).round().astype(int).tolist()
+
+
+def _number(value: float, places: int) -> str:
+    """Fixed places, or two digits where those would show fewer; springs err by millimetres, traffic by metres."""
+    if math.isnan(value):
+        return "–"
+    return f"{value:.{places}f}" if value == 0 or abs(value) >= 10 ** (1 - places) else f"{value:.2g}"
+
+
+def _scalar_cells(row: Accuracy) -> list[str]:
+    """Cells under `SCALARS`; what was not measured is a dash."""
+
+    def metres(name: str) -> str:
+        value: float = getattr(row, name)
+        error = row.statistics[name].standard_error if name in row.statistics else None
+        return _number(value, 3) + ("" if error is None else f" ± {_number(error, 3)}")
+
+    lengths = [
+        metres(name) for name in ("min_ade_m", "min_fde_m", "min_joint_ade_m", "min_joint_fde_m", "overall_rmse_m")
+    ]
+    miss = "–" if math.isnan(row.miss_rate) else f"{100 * row.miss_rate:.1f} %"
+    covered = f"{100 * row.statistics['coverage'].mean:.0f} %" if "coverage" in row.statistics else "–"
+    return [*lengths, miss, covered]
 
 
 def _write(config: EvaluateConfig, rows: Sequence[Accuracy], source: str, dt_s: float) -> None:
@@ -144,8 +233,9 @@ def _plot(
     figure.savefig(config.out / "error_by_horizon.png", dpi=130)
     plt.close(figure)
     batch = windows.batch(chosen[:200])
+    device = torch.device("cpu" if isinstance(model, ConstantVelocity) else config.device)
     outcome: Outcome = run_window_batch(
-        model, batch.to(torch.device(config.device)), horizon, min(config.samples, 10), torch.Generator(config.device)
+        model, batch.to(device), horizon, min(config.samples, 10), torch.Generator(device)
     )
     busiest = torch.argsort(outcome.valid.cpu().all(-1).sum(-1), descending=True)[:4].tolist()
     figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
@@ -155,8 +245,8 @@ def _plot(
             ax,
             batch.states[row, past, :, :2].numpy(),
             batch.valid[row, past].numpy(),
-            outcome.forecast[row].cpu().numpy(),
-            outcome.future[row].cpu().numpy(),
+            outcome.forecast[row, ..., :2].cpu().numpy(),
+            outcome.future[row, ..., :2].cpu().numpy(),
             outcome.valid[row].cpu().numpy(),
         )
     figure.suptitle("history solid, forecast dashed, truth thin black")
@@ -168,9 +258,10 @@ def main() -> None:
     """Entry point."""
     config = tyro.cli(EvaluateConfig, description=__doc__)
     config.check()
-    rows = evaluate(config)
-    dt_s = load_checkpoint(config.checkpoint)[1].spec.dt_s
-    Console(width=160).print(accuracy_table(rows, dt_s, f"{config.checkpoint} on {config.data}"))
+    subject = _load(config)
+    rows = _evaluate(config, subject)
+    title = f"{config.checkpoint} on {config.data}"
+    Console(width=160).print(accuracy_table(rows, subject.spec.dt_s, title))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ forgotten one by one, and agents may be re-sorted. `predictor.online` keeps the 
 """
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -117,3 +117,45 @@ class Forecaster(Protocol):
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
         """Future states [SI units]: sample 0 follows the most likely graph, the others draw theirs."""
+
+
+class WindowOutput(NamedTuple):
+    """What the losses need from one batch of training windows; graph entries are None for models without a graph."""
+
+    one_step: Float[Tensor, "batch time agents state"]
+    """Teacher-forced prediction of the next state, for each step [SI]; under the posterior graph where there is one."""
+    rollout: Float[Tensor, "batch agents horizon state"]
+    """Free-running states after `last_observed` [SI]; under the prior graph where there is one."""
+    prior_logits: Float[Tensor, "batch time agents agents types"] | None = None
+    """Edge types from the past."""
+    posterior_logits: Float[Tensor, "batch time agents agents types"] | None = None
+    """Edge types from past and future."""
+    features: Float[Tensor, "batch time agents agents feature"] | None = None
+    """Edge features from the past."""
+
+
+@runtime_checkable
+class TrainableForecaster(Forecaster, Protocol):
+    """A forecaster that `predictor.train` can fit; an `nn.Module` besides."""
+
+    @property
+    def config(self) -> Any:
+        """Its sizes: a frozen dataclass of JSON values."""
+
+    def window(
+        self,
+        states: Float[Tensor, "batch time agents state"],
+        valid: Bool[Tensor, "batch time agents"],
+        last_observed: Int[Tensor, " batch"],
+        rollout_steps: int,
+        generator: torch.Generator | None = None,
+    ) -> WindowOutput:
+        """Teacher-forced pass over all steps, and a free roll-out of `rollout_steps` after each `last_observed`.
+
+        Args:
+            states: true states [SI], zeros where not valid.
+            valid: who is present.
+            last_observed: index of the last step that the roll-out of a row has seen.
+            rollout_steps: steps to roll out; 0 skips it (`rollout` then has no steps).
+            generator: source of all noise.
+        """

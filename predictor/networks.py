@@ -5,6 +5,7 @@ agents are computed per agent and added on the pair, and the last layer of an ed
 senders; both are identities.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -13,13 +14,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from predictor.codec import Residual
 from predictor.errors import UserError
 from predictor.graph import PairLinear, sum_over_senders
+from predictor.innovation import Innovation
 
 
 @dataclass(frozen=True)
 class DGVAEConfig:
-    """Sizes of the network; the defaults are the paper's (Sec. V, Implementation)."""
+    """Sizes and variants of the network; the defaults are the paper's (Sec. V, Implementation)."""
 
     hidden_dim: int = 128
     """Width of the encoder's graph layers."""
@@ -34,26 +37,55 @@ class DGVAEConfig:
     num_edge_types: int = 2
     """Edge types; the first one is "no edge" and sends no message."""
     edge_feature_dim: int = 32
-    """Size of an edge's continuous features (paper: 16 to 64, by dataset)."""
+    """Size of an edge's continuous features (paper: 16 to 64, by dataset); 0 is the ablation without them (dVAE)."""
     temperature: float = 0.5
     """Of the concrete distribution."""
     dropout: float = 0.0
     """After the LSTM."""
-    residual: Literal["state", "constant_velocity"] = "state"
-    """What the predicted change is added to: the state (paper) or the state moved on at its own velocity."""
+    residual: Residual = "state"
+    """What the predicted change of position is added to: the state (paper), the state moved on at its own velocity, or
+    at the mean of its own and the predicted velocity (velocity-consistent)."""
     delta_scales: tuple[float, ...] = ()
-    """Typical one-step change of each feature [SI]; empty takes the spec's feature scales."""
+    """Typical one-step change of each feature [SI] beyond the residual; empty takes the spec's feature scales."""
+    change_scales: tuple[float, ...] = ()
+    """Typical one-step change of each input [SI]; given, the encoder also sees what changed since the last step."""
+    forget_bias: float = 0.0
+    """Added to the initial bias of the LSTMs' forget gates; 2 starts them with a memory of about eight steps."""
+    innovation_rounds: int = 0
+    """Rounds of predict-compare-correct in the encoder at each step (`predictor.innovation`); 0 is the paper's."""
+    innovation_dim: int = 32
+    """Width of such a round."""
+    static_dim: int = 0
+    """Pair matching: so many of the first feature dimensions are averaged over time (paper: 16); 0 is off."""
+    pair_matching: Literal["window", "causal"] = "causal"
+    """Average in training over the whole window (paper), or over the past of each step, as deployed."""
+    substeps: int = 0
+    """Evaluations of the messages within a step, each moving the agents on; 0 is the paper's decoder, in which messages
+    act through the GRU alone."""
+    gated_messages: bool = False
+    """Edge features scale the messages instead of being one more input of theirs."""
+    hard_samples: bool = False
+    """Sample one-hot graphs, with the gradient of the soft ones (straight-through)."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        for name in ("hidden_dim", "rnn_dim", "head_dim", "message_dim", "decoder_dim", "edge_feature_dim"):
+        for name in ("hidden_dim", "rnn_dim", "head_dim", "message_dim", "decoder_dim", "innovation_dim"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.residual not in ("state", "constant_velocity"):
-            raise UserError(f"residual must be 'state' or 'constant_velocity', got '{self.residual}'")
+        for name in ("edge_feature_dim", "innovation_rounds", "static_dim", "substeps"):
+            if getattr(self, name) < 0:
+                raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
+        if self.residual not in ("state", "constant_velocity", "trapezoid"):
+            raise UserError(f"residual must be 'state', 'constant_velocity' or 'trapezoid', got '{self.residual}'")
+        if self.pair_matching not in ("window", "causal"):
+            raise UserError(f"pair_matching must be 'window' or 'causal', got '{self.pair_matching}'")
+        if self.static_dim > self.edge_feature_dim:
+            raise UserError(
+                f"static_dim must be at most edge_feature_dim ({self.edge_feature_dim}), got {self.static_dim}"
+            )
         if self.num_edge_types < 2:
             raise UserError(f"num_edge_types must be at least 2 (the first is 'no edge'), got {self.num_edge_types}")
-        if self.temperature <= 0 or not 0 <= self.dropout < 1:
+        if not 0 < self.temperature or not 0 <= self.dropout < 1:
             raise UserError(f"need temperature > 0 and 0 <= dropout < 1, got {self.temperature}, {self.dropout}")
 
 
@@ -83,13 +115,27 @@ class Edges(NamedTuple):
 
 
 def concrete_sample(
-    logits: Float[Tensor, "*batch types"], temperature: float, generator: torch.Generator | None = None
+    logits: Float[Tensor, "*batch types"],
+    temperature: float,
+    generator: torch.Generator | None = None,
+    hard: bool = False,
 ) -> Float[Tensor, "*batch types"]:
-    """Reparameterised sample of the concrete distribution (paper Sec. IV, Sampling)."""
+    """Reparameterised sample of the concrete distribution (paper Sec. IV, Sampling).
+
+    Args:
+        logits: unnormalised log-probabilities.
+        temperature: towards 0 samples become one-hot.
+        generator: source of the Gumbel noise.
+        hard: one-hot samples whose gradient is that of the soft ones (straight-through).
+    """
     uniform = torch.rand(logits.shape, generator=generator, device=logits.device, dtype=logits.dtype)
     tiny = torch.finfo(logits.dtype).tiny
     gumbel = -torch.log(-torch.log(uniform.clamp(tiny, 1 - torch.finfo(logits.dtype).eps)))
-    return torch.softmax((logits + gumbel) / temperature, dim=-1)
+    soft = torch.softmax((logits + gumbel) / temperature, dim=-1)
+    if not hard:
+        return soft
+    one_hot = torch.zeros_like(soft).scatter_(-1, soft.argmax(-1, keepdim=True), 1.0)
+    return one_hot + soft - soft.detach()
 
 
 def _head(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
@@ -102,6 +148,7 @@ class Encoder(nn.Module):
     def __init__(self, config: DGVAEConfig, inputs: int) -> None:
         """Layers in the order in which data passes."""
         super().__init__()
+        self.config = config
         width, rnn = config.hidden_dim, config.rnn_dim
         self.embed = nn.Linear(inputs, width)
         self.conv_pair = PairLinear(width, width, relative=True)
@@ -112,9 +159,15 @@ class Encoder(nn.Module):
         self.forward_hidden = nn.Linear(rnn, 4 * rnn, bias=False)
         self.backward_input = nn.Linear(width, 4 * rnn)
         self.backward_hidden = nn.Linear(rnn, 4 * rnn, bias=False)
+        for gates in (self.forward_input, self.backward_input):
+            gates.bias.data[rnn : 2 * rnn] += config.forget_bias
+        if config.innovation_rounds:
+            self.innovation = Innovation(inputs, rnn, config.innovation_dim, config.innovation_rounds)
+            self.innovation_gates = nn.Linear(rnn, 4 * rnn, bias=False)
         self.dropout = nn.Dropout(config.dropout)
         self.prior_head = _head(rnn, config.head_dim, config.num_edge_types)
-        self.feature_head = _head(rnn, config.head_dim, config.edge_feature_dim)
+        if config.edge_feature_dim:
+            self.feature_head = _head(rnn, config.head_dim, config.edge_feature_dim)
         self.posterior_head = _head(2 * rnn, config.head_dim, config.num_edge_types)
 
     def embed_edges(
@@ -139,11 +192,26 @@ class Encoder(nn.Module):
     ) -> Edges:
         """Run the forward LSTM from a given memory; a pair that is not present has its memory set to zero."""
         embedding = self.embed_edges(inputs, pairs)
-        hiddens, cells = _masked_lstm(self.forward_input(embedding), self.forward_hidden, pairs, hidden, cell)
+        correct = self._correction(inputs, pairs) if self.config.innovation_rounds else None
+        gates = self.forward_input(embedding)
+        hiddens, cells = _masked_lstm(gates, self.forward_hidden, pairs, hidden, cell, correct=correct)
         past = self.dropout(functional.elu(hiddens))
         present = pairs[..., None]
-        features = self.feature_head(past) * present
+        if self.config.edge_feature_dim:
+            features = self.feature_head(past) * present
+        else:
+            features = past.new_zeros(*pairs.shape, 0)
         return Edges(hiddens, cells, _no_edge_where_absent(self.prior_head(past), present), features, embedding)
+
+    def _correction(self, inputs: Tensor, pairs: Tensor) -> Callable[[int, Tensor], Tensor]:
+        regressors, targets = self.innovation.prepare(inputs, pairs)
+        steps = list(zip(regressors.unbind(1), targets.unbind(1), strict=True))
+
+        def gates(t: int, hidden: Tensor) -> Tensor:
+            added: Tensor = self.innovation_gates(self.innovation(hidden, *steps[t]))
+            return added
+
+        return gates
 
     def posterior_logits(
         self, edges: Edges, pairs: Bool[Tensor, "batch time agents agents"]
@@ -169,12 +237,16 @@ def _masked_lstm(
     hidden: Float[Tensor, "batch agents agents rnn"],
     cell: Float[Tensor, "batch agents agents rnn"],
     reverse: bool = False,
+    correct: Callable[[int, Tensor], Tensor] | None = None,
 ) -> tuple[Float[Tensor, "batch time agents agents rnn"], Float[Tensor, "batch time agents agents rnn"]]:
     hiddens, cells = [], []
     # unbind, not [:, t]: the gradient of an index is a full-size tensor of zeros for every step
     steps = list(zip(gates.unbind(1), pairs[..., None].unbind(1), strict=True))
-    for gate, present in reversed(steps) if reverse else steps:
-        i, f, g, o = (gate + recurrent(hidden)).chunk(4, dim=-1)
+    for t, (gate, present) in enumerate(reversed(steps) if reverse else steps):
+        gate = gate + recurrent(hidden)
+        if correct is not None:
+            gate = gate + correct(t, hidden)
+        i, f, g, o = gate.chunk(4, dim=-1)
         cell = (torch.sigmoid(f) * cell + torch.sigmoid(i) * torch.tanh(g)) * present
         hidden = torch.sigmoid(o) * torch.tanh(cell) * present
         hiddens.append(hidden)
@@ -192,13 +264,18 @@ class Decoder(nn.Module):
         """Layers in the order in which data passes."""
         super().__init__()
         self.types = config.num_edge_types - 1  # type 0 is silent
+        self.gated = config.gated_messages
         width = config.message_dim
         self.message_pair = PairLinear(inputs, self.types * width)
-        self.message_feature = nn.Linear(config.edge_feature_dim, self.types * width, bias=False)
+        if config.edge_feature_dim:
+            self.message_feature = nn.Linear(config.edge_feature_dim, self.types * width, bias=False)
         self.message_out = nn.Linear(width, self.types * width)  # one block for each type that speaks
         self.own = nn.Linear(inputs, width)
         self.gru = nn.GRUCell(width, config.decoder_dim)
         self.readout = nn.Linear(config.decoder_dim, outputs)
+        if config.substeps:
+            self.direct = nn.Linear(width, outputs, bias=False)
+        self.has_features = config.edge_feature_dim > 0
 
     def messages(
         self,
@@ -208,7 +285,7 @@ class Decoder(nn.Module):
         features: Float[Tensor, "*batch agents agents feature"],
     ) -> Float[Tensor, "*batch agents message"]:
         """Σ_j z_ij · h(x_i ‖ x_j ‖ e_ij) plus the agent's own term; all steps at once."""
-        hidden = functional.elu(self.message_pair(inputs) + self.message_feature(features))
+        hidden = self._hidden(inputs, features)
         total: Tensor = self.own(inputs)
         layers = zip(
             hidden.chunk(self.types, dim=-1),
@@ -222,6 +299,13 @@ class Decoder(nn.Module):
             summed = functional.linear(sum_over_senders(hidden_k, weight), matrix)
             total = total + summed + weight.sum(-1, keepdim=True) * bias
         return total
+
+    def _hidden(self, inputs: Tensor, features: Tensor) -> Tensor:
+        pair: Tensor = self.message_pair(inputs)
+        if not self.has_features:
+            return functional.elu(pair)
+        feature = self.message_feature(features)
+        return functional.elu(pair) * (1 + feature) if self.gated else functional.elu(pair + feature)
 
     def step(
         self,

@@ -1,7 +1,7 @@
 """What everything speaks in: a scene's layout (`SceneSpec`), one instant (`Scene`), many (`SceneBatch`), `Forecast`.
 
 States are in the world frame and SI units. Where a scene has an ego, it is row 0, always. Padded rows are
-`valid=False`, hold zeros and id -1. The first four features are always position and velocity.
+`valid=False`, hold zeros and id -1. The first features are always position and velocity, on two axes or three.
 """
 
 from collections.abc import Sequence
@@ -15,9 +15,10 @@ from torch import Tensor
 from predictor.errors import UserError
 
 KINEMATIC_FEATURES = ("x_m", "y_m", "vx_mps", "vy_mps")
+KINEMATIC_FEATURES_3D = ("x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps")
 PADDING_ID = -1
 
-AxisFrame = Literal["ego", "world"]
+AxisFrame = Literal["ego", "world", "centroid"]
 
 
 @dataclass(frozen=True)
@@ -26,10 +27,11 @@ class SceneSpec:
 
     dt_s: float
     """Time between two scenes [s]."""
-    frame: tuple[AxisFrame, AxisFrame] = ("world", "world")
-    """Per axis: "ego" subtracts the ego's position at each step (unbounded roads), "world" keeps it (fixed maps)."""
+    frame: tuple[AxisFrame, ...] = ("world", "world")
+    """Per axis, what is subtracted from positions at each step: "ego" the ego's (unbounded roads), "centroid" the mean
+    of everyone present (nobody is special, the place does not matter), "world" nothing (fixed maps)."""
     feature_names: tuple[str, ...] = KINEMATIC_FEATURES
-    """Columns of a state; position and velocity come first."""
+    """Columns of a state; position and velocity come first, on two or three axes."""
     feature_scales: tuple[float, ...] = (100.0, 100.0, 30.0, 30.0)
     """Divisors that bring each feature to order one for the network."""
     has_ego: bool = True
@@ -43,10 +45,14 @@ class SceneSpec:
         """Check that the fields fit together."""
         if not 0 < self.dt_s < float("inf"):
             raise UserError(f"dt_s must be positive, got {self.dt_s}")
-        if len(self.frame) != 2 or not set(self.frame) <= {"ego", "world"}:
-            raise UserError(f"frame must be 'ego' or 'world' for each of two axes, got {self.frame}")
-        if self.feature_names[:4] != KINEMATIC_FEATURES:
-            raise UserError(f"the first features must be {KINEMATIC_FEATURES}, got {self.feature_names[:4]}")
+        if self.feature_names[:4] != KINEMATIC_FEATURES and self.feature_names[:6] != KINEMATIC_FEATURES_3D:
+            raise UserError(
+                f"the first features must be {KINEMATIC_FEATURES} or {KINEMATIC_FEATURES_3D}, "
+                f"got {self.feature_names[:6]}"
+            )
+        if len(self.frame) != self.position_dim or not set(self.frame) <= {"ego", "world", "centroid"}:
+            axes = {2: "two", 3: "three"}[self.position_dim]
+            raise UserError(f"frame must be 'ego', 'world' or 'centroid' for each of {axes} axes, got {self.frame}")
         if len(self.feature_scales) != len(self.feature_names) or min(self.feature_scales) <= 0:
             raise UserError(
                 f"feature_scales needs one positive number per feature ({len(self.feature_names)}), "
@@ -57,7 +63,12 @@ class SceneSpec:
                 f"max_agents must be at least 1 and perception_m positive, got {self.max_agents}, {self.perception_m}"
             )
         if "ego" in self.frame and not self.has_ego:
-            raise UserError("an 'ego' frame needs has_ego=True; use frame ('world', 'world')")
+            raise UserError("an 'ego' frame needs has_ego=True; use 'world' or 'centroid'")
+
+    @property
+    def position_dim(self) -> int:
+        """Axes of a position, which is the first columns of a state; as many columns of velocity follow."""
+        return 3 if self.feature_names[:6] == KINEMATIC_FEATURES_3D else 2
 
     @property
     def num_features(self) -> int:
@@ -161,7 +172,7 @@ class SceneBatch:
 class Forecast:
     """What a forecaster says at one instant about the steps that follow it."""
 
-    xy: Float[Tensor, "batch samples agents horizon 2"]
+    xy: Float[Tensor, "batch samples agents horizon axes"]
     """Predicted positions [m], world axes, relative to the ego's position now; zeros where `valid` is not."""
     edge_probs: Float[Tensor, "batch agents agents types"]
     """Prior over edge types now, receiver first; type 0 is "no edge"."""

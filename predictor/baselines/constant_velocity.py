@@ -41,5 +41,6 @@ class ConstantVelocity:
         states = belief.states
         time_s = self.spec.dt_s * torch.arange(1, horizon_steps + 1, dtype=states.dtype, device=states.device)
         future = states[:, :, None].repeat(1, 1, horizon_steps, 1)
-        future[..., :2] += states[:, :, None, 2:4] * time_s[:, None]
+        axes = self.spec.position_dim
+        future[..., :axes] += states[:, :, None, axes : 2 * axes] * time_s[:, None]
         return future[:, None].expand(-1, num_samples, -1, -1, -1)

@@ -23,6 +23,7 @@ from predictor.scene import PADDING_ID, Scene, SceneSpec
 
 FORMAT = "dgvae-rl episodes"
 VERSION = 1
+EDGE_LABELS = ("edge_types", "edge_attributes")
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,10 @@ class Episode:
     """How the ego was driven, or any other tag."""
     seed: int = 0
     """The seed that reproduces the episode."""
+    edge_types: Int[np.ndarray, "label_time agents agents"] | None = None
+    """True type of each edge, receiver first, where known; -1 where not. One step if it never changes."""
+    edge_attributes: Float[np.ndarray, "label_time agents agents attributes"] | None = None
+    """Known properties of each edge (a spring's constant), named in `StoreInfo`; one step if they never change."""
 
     @staticmethod
     def from_scenes(scenes: Sequence[Scene], label: str = "", seed: int = 0) -> "Episode":
@@ -66,6 +71,10 @@ class StoreInfo:
     """What was recorded: an env id or a dataset's name."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Command, versions, commit, seeds."""
+    edge_attribute_names: tuple[str, ...] = ()
+    """Columns of the episodes' `edge_attributes`."""
+    num_steps: int = 0
+    """Scenes over all episodes; filled in when a store is read."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +130,8 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
         group.create_array("ids", data=ids)
         group.create_array("starts", data=starts)
         group.create_array("seeds", data=np.array([e.seed for e in episodes], dtype=np.int64))
+        for name, labels in _padded_labels(episodes, columns, str(path)).items():
+            group.create_array(name, data=labels)
         group.attrs.update(
             {
                 "format": FORMAT,
@@ -129,6 +140,7 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
                 "source": info.source,
                 "provenance": json.loads(json.dumps(info.provenance, default=str)),
                 "labels": [e.label for e in episodes],
+                "edge_attribute_names": list(info.edge_attribute_names),
             }
         )
         replace_folder(partial, path)
@@ -159,8 +171,10 @@ def read_store(path: Path) -> EpisodeStore:
             stored: Any = group[name]
             if stored.nchunks_initialized != stored.nchunks:  # Zarr reads what is missing as zeros
                 raise UserError(f"{path}: chunks of '{name}' are missing; copy or collect it anew")
-        info = StoreInfo(_spec_from_json(attrs["spec"]), str(attrs["source"]), dict(attrs["provenance"]))
+        info = _info(attrs, len(arrays["states"]))
         labels = list(attrs["labels"])
+        edge_labels = {name: np.asarray(group[name]) for name in EDGE_LABELS if name in group}
+        label_starts = np.asarray(group["label_starts"]) if edge_labels else None
     except (KeyError, TypeError, OSError, RuntimeError, json.JSONDecodeError, zarr.errors.BaseZarrError) as error:
         raise UserError(f"{path} is not a readable episode store ({error}); collect it anew") from error
     episodes = []
@@ -172,10 +186,65 @@ def read_store(path: Path) -> EpisodeStore:
             arrays["ids"][i][present],
             str(labels[i]),
             int(arrays["seeds"][i]),
+            **_labels_of(edge_labels, label_starts, i, present),
         )
         _check_finite(episode, str(path))
         episodes.append(episode)
     return EpisodeStore(info, episodes)
+
+
+def read_info_of(path: Path) -> StoreInfo:
+    """What a store holds and how it was made, without reading its arrays.
+
+    Raises:
+        UserError: the path holds no store.
+    """
+    try:
+        group = zarr.open_group(path, mode="r")
+        states: Any = group["states"]
+        return _info(dict(group.attrs), int(states.shape[0]))
+    except (KeyError, TypeError, OSError, RuntimeError, json.JSONDecodeError, zarr.errors.BaseZarrError) as error:
+        raise UserError(f"{path} is not a readable episode store ({error}); make it anew") from error
+
+
+def _info(attrs: dict[str, Any], num_steps: int) -> StoreInfo:
+    names = tuple(str(name) for name in attrs.get("edge_attribute_names", ()))
+    spec = _spec_from_json(attrs["spec"])
+    return StoreInfo(spec, str(attrs["source"]), dict(attrs["provenance"]), names, num_steps)
+
+
+def _padded_labels(episodes: Sequence[Episode], columns: int, where: str) -> dict[str, np.ndarray]:
+    """The episodes' edge labels end to end, with where each begins; nothing if they have none."""
+    given = {name: [getattr(e, name) for e in episodes] for name in EDGE_LABELS}
+    given = {name: labels for name, labels in given.items() if any(x is not None for x in labels)}
+    if not given:
+        return {}
+    padded: dict[str, np.ndarray] = {}
+    for name, labels in given.items():
+        if any(x is None for x in labels):
+            raise UserError(f"{where}: either all episodes have {name} or none, got both")
+        lengths = np.array([len(x) for x in labels])
+        bad = [i for i, (e, n) in enumerate(zip(episodes, lengths, strict=True)) if n not in (1, len(e.states))]
+        if bad:
+            raise UserError(f"{where}: {name} of episode {bad[0]} need one step or every step, got {lengths[bad[0]]}")
+        starts = np.concatenate([[0], np.cumsum(lengths)])
+        if not np.array_equal(padded.setdefault("label_starts", starts), starts):
+            raise UserError(f"{where}: edge_types and edge_attributes need equal numbers of steps in each episode")
+        fill = -1 if name == "edge_types" else 0
+        joined = np.full((starts[-1], columns, columns, *labels[0].shape[3:]), fill, dtype=labels[0].dtype)
+        for label, begin in zip(labels, starts[:-1], strict=True):
+            joined[begin : begin + len(label), : label.shape[1], : label.shape[2]] = label
+        padded[name] = joined
+    return padded
+
+
+def _labels_of(
+    edge_labels: dict[str, np.ndarray], starts: np.ndarray | None, episode: int, present: np.ndarray
+) -> dict[str, np.ndarray]:
+    if starts is None:
+        return {}
+    rows = slice(starts[episode], starts[episode + 1])
+    return {name: labels[rows][:, present][:, :, present] for name, labels in edge_labels.items()}
 
 
 def _check_finite(episode: Episode, where: str) -> None:

@@ -28,7 +28,19 @@ FAST_LIKE = DGVAEConfig(
     residual="constant_velocity",
 )
 PAPER_LIKE = replace(FAST_LIKE, hidden_dim=12, rnn_dim=7, head_dim=17, message_dim=10, decoder_dim=15, residual="state")
-SIZES = {"fast": FAST_LIKE, "paper": PAPER_LIKE}
+# Everything that the paper does not have, at once.
+RICH = replace(
+    FAST_LIKE,
+    residual="trapezoid",
+    change_scales=(3.0, 3.0, 2.0, 2.0),
+    forget_bias=1.0,
+    innovation_rounds=2,
+    innovation_dim=4,
+    static_dim=3,
+    substeps=2,
+    gated_messages=True,
+)
+SIZES = {"fast": FAST_LIKE, "paper": PAPER_LIKE, "rich": RICH}
 
 
 def spec(
@@ -47,9 +59,9 @@ def spec(
 
 @cache
 def model(
-    size: Literal["fast", "paper"] = "fast",
+    size: Literal["fast", "paper", "rich"] = "fast",
     num_edge_types: int = 2,
-    residual: Literal["state", "constant_velocity"] | None = None,
+    residual: Literal["state", "constant_velocity", "trapezoid"] | None = None,
     frame: tuple[AxisFrame, AxisFrame] = WORLD,
     has_ego: bool = True,
     horizon_steps: int = 3,

@@ -1,10 +1,15 @@
+import json
 import math
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
-from predictor.accuracy import Outcome, fitted_std_m, run_window_batch, run_windows, summarise
+from predictor import metrics
+from predictor.accuracy import Outcome, Statistic, Tally, fitted_std_m, run_window_batch, run_windows, summarise
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.data.store import Episode
 from predictor.data.windows import WindowBatch, Windows
@@ -44,6 +49,167 @@ def test_summary_closed_form():
     )
 
 
+def test_joint_and_overall_numbers_closed_form():
+    row = summarise("model", OUTCOMES)
+    # the agents known throughout are one per scene here: the first of the first scene, that of the third
+    assert (row.scenes, row.axes) == (2, 2)
+    assert row.min_joint_ade_m == pytest.approx((2.0 + 1.0) / 2)
+    assert row.min_joint_fde_m == pytest.approx((3.0 + 0.0) / 2)
+    assert row.miss_rate == pytest.approx(0.5)  # 3 m misses, 0 m does not
+    assert row.overall_rmse_m == pytest.approx(math.sqrt((1.5**2 + 9 + 9 + 4.5**2 + 0) / 5))
+    assert row.rmse_per_axis_m == pytest.approx(row.overall_rmse_m / math.sqrt(2))
+    assert summarise("model", OUTCOMES, miss_threshold_m=3.0).miss_rate == 0.0
+
+
+def test_one_sample_serves_all_agents_of_a_scene():
+    both = outcome([[[1.0, 1.0], [5.0, 5.0]], [[4.0, 4.0], [3.0, 3.0]]], [[True, True], [True, True]])
+    row = summarise("model", [both])
+    assert row.min_ade_m == pytest.approx((1 + 3) / 2)
+    assert row.min_joint_ade_m == row.min_joint_fde_m == pytest.approx((1 + 5) / 2)
+
+
+def test_agents_known_in_part_count_where_asked_for():
+    tally = Tally(partial_agents=True)
+    for o in OUTCOMES:
+        tally.add(o)
+    row = tally.accuracy("model")
+    assert row.agents == 3
+    assert row.min_ade_m == pytest.approx((2.0 + 1.0 + 1.0) / 3)  # the second agent: 1 m at its only step
+    assert row.min_fde_m == pytest.approx((3.0 + 0.0) / 2)
+    assert row.by_step_m == summarise("model", OUTCOMES).by_step_m
+
+
+def gaussian(seed: int, samples: int = 20, windows: int = 400, spread: float = 1.0, axes: int = 2) -> Outcome:
+    """Samples and truths from one distribution (but for `spread`)."""
+    generator = torch.Generator().manual_seed(seed)
+    forecast = spread * torch.randn(windows, samples, 3, 2, axes, generator=generator)
+    truth = torch.randn(windows, 3, 2, axes, generator=generator)
+    return Outcome(forecast, truth, torch.rand(windows, 3, 2, generator=generator) < 0.9)
+
+
+def test_coverage_says_whether_the_samples_are_spread_like_the_truth():
+    calibrated, sure = summarise("a", [gaussian(0)]), summarise("a", [gaussian(0, spread=0.3)])
+    assert calibrated.coverage == pytest.approx([0.9, 0.9], abs=0.03)
+    assert max(sure.coverage) < 0.5
+    known = calibrated.statistics["coverage"]
+    assert known.mean == pytest.approx(np.mean(calibrated.coverage), abs=0.01)
+    assert len(calibrated.step_errors["coverage"]) == 2
+
+
+@pytest.mark.parametrize("samples", [1, 8])
+def test_too_few_samples_have_no_coverage(samples: int):
+    row = summarise("a", [gaussian(0, samples)])
+    assert row.coverage == [] and "coverage" not in row.statistics and "coverage" not in row.step_errors
+
+
+def test_statistics_are_those_of_the_subsets():
+    """Against plain loops over the same subsets."""
+    whole = gaussian(0, samples=4, windows=90)
+    row = summarise("a", [whole])
+    parts = np.array_split(np.random.default_rng(0).permutation(90), 20)
+    rows = [summarise("a", [Outcome(whole.forecast[p], whole.future[p], whole.valid[p])]) for p in parts]
+    names = ("min_ade_m", "min_fde_m", "min_joint_ade_m", "min_joint_fde_m", "miss_rate", "overall_rmse_m")
+    assert set(row.statistics) == set(names)
+    for name in names:
+        values = [getattr(r, name) for r in rows]
+        found = row.statistics[name]
+        assert found.mean == pytest.approx(np.mean(values), rel=1e-5)
+        assert found.standard_error == pytest.approx(np.std(values, ddof=1) / math.sqrt(20), rel=1e-4)
+        assert found.subsets == 20
+    for name in ("by_step_m", "rmse_m"):
+        for step in range(2):
+            values = [getattr(r, name)[step] for r in rows]
+            assert row.step_errors[name][step] == pytest.approx(np.std(values, ddof=1) / math.sqrt(20), rel=1e-4)
+
+
+def test_rows_on_the_same_windows_have_the_same_subsets():
+    first = gaussian(0, windows=60)
+    shifted = replace(first, forecast=first.future[:, None] + torch.tensor([2.0, 0.0]))
+    doubled = replace(first, forecast=first.future[:, None] + torch.tensor([4.0, 0.0]))
+    a, b = (summarise("a", [o]).statistics["min_ade_m"] for o in (shifted, doubled))
+    assert (a.mean, b.mean) == pytest.approx((2.0, 4.0))
+    assert a.standard_error == pytest.approx(0.0, abs=1e-6)
+
+
+def test_one_window_has_no_standard_error():
+    row = summarise("a", [OUTCOMES[0]])
+    assert row.statistics["min_ade_m"] == Statistic(2.0, None, 1)
+    assert row.step_errors["by_step_m"] == [None, None]
+
+
+def test_a_row_is_json():
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    content = json.loads(json.dumps(asdict(summarise("a", [gaussian(0)], (1.0, 1.0)))), parse_constant=refuse)
+    assert content["statistics"]["min_ade_m"]["subsets"] == 20
+    assert set(content["step_errors"]) == {"by_step_m", "rmse_m", "nll", "coverage"}
+
+
+@given(st.integers(0, 10**6), st.integers(1, 11), st.permutations(range(3)))
+def test_batches_agents_and_padding_do_not_matter(seed: int, cut: int, order: list[int]):
+    whole = gaussian(seed, samples=3, windows=12)
+    expected = summarise("a", [whole], (1.0, 2.0))
+    padded = Outcome(
+        torch.cat([whole.forecast[:, :, order], 50 * torch.ones_like(whole.forecast)], dim=2),
+        torch.cat([whole.future[:, order], torch.zeros_like(whole.future)], dim=1),
+        torch.cat([whole.valid[:, order], torch.zeros_like(whole.valid)], dim=1),
+    )
+    pieces = [Outcome(o.forecast, o.future, o.valid) for o in (slices(padded, 0, cut), slices(padded, cut, 12))]
+    found = summarise("a", pieces, (1.0, 2.0))
+    for name in ("min_ade_m", "min_fde_m", "min_joint_ade_m", "min_joint_fde_m", "miss_rate", "overall_rmse_m"):
+        assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-5, nan_ok=True)
+    assert found.by_step_m == pytest.approx(expected.by_step_m, rel=1e-5)
+    assert found.nll == pytest.approx(expected.nll, rel=1e-5)
+    for name, statistic in expected.statistics.items():
+        assert found.statistics[name].mean == pytest.approx(statistic.mean, rel=1e-5)
+
+
+def slices(outcome_: Outcome, begin: int, end: int) -> Outcome:
+    return Outcome(outcome_.forecast[begin:end], outcome_.future[begin:end], outcome_.valid[begin:end])
+
+
+def test_an_iterator_is_enough_and_forecasts_are_not_kept():
+    assert summarise("a", iter(OUTCOMES)).by_step_m == summarise("a", OUTCOMES).by_step_m
+    assert fitted_std_m(iter(OUTCOMES)) == fitted_std_m(OUTCOMES)
+    tally = Tally()
+    for _ in range(3):
+        tally.add(gaussian(0, windows=50))
+    kept = [a for parts in (*tally._sums.values(), *tally._counts.values()) for a in parts]
+    assert sum(a.size for a in kept) < 3 * 50 * 2 * 20  # far fewer numbers than the 240 per window of a forecast
+
+
+def test_outcomes_of_different_shape_are_no_row():
+    tally = Tally()
+    tally.add(gaussian(0, samples=3))
+    with pytest.raises(ValueError, match=r"same samples, horizon and axes \(3, 2, 2\), got \(4, 2, 2\)"):
+        tally.add(gaussian(0, samples=4))
+
+
+def test_no_outcome_is_no_row():
+    with pytest.raises(ValueError, match="an accuracy needs at least one outcome, got none"):
+        summarise("a", [])
+    with pytest.raises(ValueError, match="a spread needs at least one outcome, got none"):
+        fitted_std_m([])
+
+
+def test_three_axes():
+    row = summarise("a", [gaussian(0, axes=3)], (1.0, 1.0))
+    assert row.axes == 3
+    assert row.rmse_per_axis_m == pytest.approx(row.overall_rmse_m / math.sqrt(3))
+    assert row.overall_rmse_m == pytest.approx(math.sqrt(3 * (1 + 1 / 20)), rel=0.03)
+    first = gaussian(0, samples=1, axes=3)
+    assert fitted_std_m([first]) == pytest.approx([math.sqrt(2)] * 2, rel=0.05)
+
+
+def test_numbers_are_those_of_the_metrics():
+    o = gaussian(0, samples=5)
+    row, whole = summarise("a", [o]), o.valid & o.valid.all(-1, keepdim=True)
+    for name, metric in (("min_joint_ade_m", metrics.min_joint_ade), ("miss_rate", metrics.miss_rate)):
+        value, known = metric(o.forecast, o.future, whole)
+        assert getattr(row, name) == pytest.approx(value[known].mean().item(), rel=1e-5)
+
+
 def test_order_of_batches_does_not_matter():
     forwards, backwards = summarise("a", OUTCOMES, (1.0, 2.0)), summarise("a", OUTCOMES[::-1], (1.0, 2.0))
     assert forwards.by_step_m == pytest.approx(backwards.by_step_m)
@@ -52,8 +218,10 @@ def test_order_of_batches_does_not_matter():
 
 def test_nothing_known_is_not_a_perfect_score():
     row = summarise("model", [OUTCOMES[1]])
-    assert row.agents == 0
-    assert math.isnan(row.min_ade_m) and math.isnan(row.min_fde_m)
+    assert row.agents == row.scenes == 0
+    numbers = (row.min_ade_m, row.min_fde_m, row.min_joint_ade_m, row.min_joint_fde_m, row.miss_rate)
+    assert all(math.isnan(x) for x in (*numbers, row.overall_rmse_m, *row.by_step_m, *row.rmse_m))
+    assert row.statistics == {} and row.coverage == []
 
 
 @pytest.mark.parametrize("std_m", [(), (1.0,)], ids=["none", "too_short"])

@@ -8,7 +8,7 @@ from predictor.data.store import read_store
 from predictor.errors import ProtocolError, UserError
 from predictor.losses import nll
 from predictor.online import OnlineForecaster
-from predictor.train import TrainConfig
+from predictor.train_config import TrainConfig
 from tests.predictor.helpers import batch, model, scene, write_circles
 
 

@@ -16,13 +16,16 @@ from predictor.dgvae import DGVAE, DGVAEConfig, WindowOutput
 from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory
 from predictor.graph import pair_mask
-from tests.predictor.helpers import FAST_LIKE, ROAD, model, random_presence, random_states, spec
+from tests.predictor.helpers import FAST_LIKE, RICH, ROAD, model, random_presence, random_states, spec
 
 BATCH, TIME, AGENTS = 2, 6, 4
 TOLERANCE = {"rtol": 0.0, "atol": 1e-5}
 EVERY_KIND = [
     pytest.param(size, residual, types, id=f"{size}-{residual}-{types}types")
-    for size, residual, types in product(("fast", "paper"), ("state", "constant_velocity"), (2, 3))
+    for size, residual, types in (
+        *product(("fast", "paper"), ("state", "constant_velocity"), (2, 3)),
+        *product(("rich",), ("trapezoid",), (2, 3)),
+    )
 ]
 every_kind = pytest.mark.parametrize(("size", "residual", "types"), EVERY_KIND)
 
@@ -57,8 +60,8 @@ def last(forecaster: DGVAE, states: Tensor, valid: Tensor) -> Belief:
 def window_without_noise(forecaster: DGVAE, states: Tensor, valid: Tensor, last_observed: Tensor) -> WindowOutput:
     """The training pass with every sampled graph replaced by the expected one."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dgvae, "concrete_sample", lambda logits, temperature, generator: torch.softmax(logits, dim=-1))
-        return forecaster.window(states, valid, last_observed)
+        patch.setattr(dgvae, "concrete_sample", lambda logits, temperature, generator, hard: torch.softmax(logits, dim=-1))
+        return forecaster.window(states, valid, last_observed, forecaster.horizon_steps)
 
 
 # --- Streaming ≡ full window ------------------------------------------------------------------------------------------
@@ -72,13 +75,11 @@ def test_streaming_encodes_what_the_whole_history_at_once_does(
 ):
     forecaster = model(size, types, residual)
     states = random_states(seed, BATCH, TIME, AGENTS, 4)
-    inputs, pairs = forecaster.network_inputs(states, valid), pair_mask(valid)
-    whole = forecaster.encoder(inputs, pairs, *forecaster.empty_memory(BATCH, AGENTS).pairs)
-    for t, (memory, belief) in enumerate(stream(forecaster, states, valid)):
+    whole = window_without_noise(forecaster, states, valid, torch.zeros(BATCH, dtype=torch.long))
+    for t, (_, belief) in enumerate(stream(forecaster, states, valid)):
         torch.testing.assert_close(belief.internal.logits, whole.prior_logits[:, t], **TOLERANCE)
         torch.testing.assert_close(belief.edge_probs, whole.prior_logits[:, t].softmax(-1), **TOLERANCE)
         torch.testing.assert_close(belief.edge_features, whole.features[:, t], **TOLERANCE)
-        torch.testing.assert_close(memory.pairs, (whole.hidden[:, t], whole.cell[:, t]), **TOLERANCE)
 
 
 @every_kind
@@ -100,8 +101,8 @@ def test_streaming_in_two_stretches_equals_one():
     """The encoder takes a memory in: the second half of a history continues where the first one ended."""
     forecaster = model()
     states, valid = random_states(0, BATCH, TIME, AGENTS, 4), random_presence(0, BATCH, TIME, AGENTS)
-    inputs, pairs = forecaster.network_inputs(states, valid), pair_mask(valid)
-    empty = forecaster.empty_memory(BATCH, AGENTS).pairs
+    inputs, pairs = forecaster.codec.inputs(states, valid), pair_mask(valid)
+    empty = forecaster.empty_memory(BATCH, AGENTS).pairs[:2]
     whole = forecaster.encoder(inputs, pairs, *empty)
     first = forecaster.encoder(inputs[:, :2], pairs[:, :2], *empty)
     second = forecaster.encoder(inputs[:, 2:], pairs[:, 2:], first.hidden[:, -1], first.cell[:, -1])
@@ -144,7 +145,7 @@ def test_the_future_changes_the_posterior_and_nothing_else(
     other_valid[:, now + 1 :, 2:] = ~valid[:, now + 1 :, 2:]
     last_observed = torch.full((BATCH,), now)
     one, other = (
-        forecaster.window(s, v, last_observed, torch.Generator().manual_seed(3))
+        forecaster.window(s, v, last_observed, 3, torch.Generator().manual_seed(3))
         for s, v in ((states, valid), (other_states, other_valid))
     )
     past = slice(None, now + 1)
@@ -179,11 +180,14 @@ def everything(forecaster: DGVAE, states: Tensor, valid: Tensor) -> dict[str, Te
 PAIRWISE = {"prior", "posterior", "features", "streamed_probs", "streamed_features"}
 
 
-@pytest.mark.parametrize("frame", [("world", "world"), ROAD], ids=["world", "road"])
+@pytest.mark.parametrize("size", ["fast", "rich"])
+@pytest.mark.parametrize(
+    "frame", [("world", "world"), ROAD, ("centroid", "centroid")], ids=["world", "road", "centroid"]
+)
 @settings(max_examples=12)
 @given(valid=presence(), seed=seeds, padding=st.integers(1, 3))
-def test_padding_is_invisible(frame: Any, valid: Tensor, seed: int, padding: int):
-    forecaster = model(num_edge_types=3, frame=frame)
+def test_padding_is_invisible(size: Any, frame: Any, valid: Tensor, seed: int, padding: int):
+    forecaster = model(size, num_edge_types=3, frame=frame)
     states = random_states(seed, BATCH, TIME, AGENTS, 4)
     garbage = 100 * random_states(seed + 1, BATCH, TIME, AGENTS + padding, 4)
     padded_valid = torch.cat([valid, torch.zeros(BATCH, TIME, padding).bool()], dim=2)
@@ -198,10 +202,11 @@ def test_padding_is_invisible(frame: Any, valid: Tensor, seed: int, padding: int
         torch.testing.assert_close(ours, expected, rtol=1e-5, atol=2e-5, msg=lambda m, n=name: f"{n}: {m}")
 
 
+@pytest.mark.parametrize("size", ["fast", "rich"])
 @settings(max_examples=12)
 @given(valid=presence(ego=False), seed=seeds, order=st.permutations(range(AGENTS)))
-def test_permuting_agents_permutes_outputs(valid: Tensor, seed: int, order: list[int]):
-    check_permutation(model(num_edge_types=3, has_ego=False), valid, seed, order)
+def test_permuting_agents_permutes_outputs(size: Any, valid: Tensor, seed: int, order: list[int]):
+    check_permutation(model(size, num_edge_types=3, has_ego=False), valid, seed, order)
 
 
 @settings(max_examples=12)
@@ -273,17 +278,17 @@ def test_agents_forget_what_was_before_they_left():
 def test_change_is_added_to_the_residual(residual: Any, expected: list[float]):
     config = DGVAEConfig(8, 5, 6, 7, 9, residual=residual, delta_scales=(1.0, 2.0, 3.0, 4.0))
     forecaster = DGVAE(spec(dt_s=0.5), config)
-    after = forecaster.advance(torch.tensor([1.0, 2.0, 3.0, 4.0]), torch.tensor([0.5, 1.0, 0.0, 0.125]))
+    after = forecaster.codec.advance(torch.tensor([1.0, 2.0, 3.0, 4.0]), torch.tensor([0.5, 1.0, 0.0, 0.125]))
     assert after.tolist() == expected
 
 
 def test_network_inputs_closed_form():
     states = torch.tensor([[[30.0, 5.0, 10.0, 0.0], [40.0, -5.0, 5.0, -5.0], [9.0, 9.0, 9.0, 9.0]]])
     valid = torch.tensor([[True, True, False]])
-    assert model(frame=ROAD).network_inputs(states, valid).tolist() == [
+    assert model(frame=ROAD).codec.inputs(states, valid).tolist() == [
         [[0.0, 0.5, 2.0, 0.0, 1.0], [1.0, -0.5, 1.0, -1.0, 0.0], [0.0] * 5]
     ]
-    assert model(has_ego=False).network_inputs(states, valid).tolist() == [
+    assert model(has_ego=False).codec.inputs(states, valid).tolist() == [
         [[3.0, 0.5, 2.0, 0.0], [4.0, -0.5, 1.0, -1.0], [0.0] * 4]
     ]
 
@@ -351,7 +356,7 @@ def test_samples_belong_to_their_row(belief: Belief):
     """Without noise every sample of a row is that row's own expected forecast, so rows and samples are not mixed up."""
     forecaster = model(num_edge_types=3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dgvae, "concrete_sample", lambda logits, temperature, generator: torch.softmax(logits, dim=-1))
+        patch.setattr(dgvae, "concrete_sample", lambda logits, temperature, generator, hard: torch.softmax(logits, dim=-1))
         drawn = forecaster.rollout(belief, 3, 4)
     torch.testing.assert_close(drawn, drawn[:, :1].expand_as(drawn), rtol=1e-5, atol=1e-5)
     assert not torch.allclose(drawn[0], drawn[1], atol=1.0)
@@ -365,11 +370,12 @@ def test_longer_horizons_continue_shorter_ones(belief: Belief):
 # --- Training pass and config -----------------------------------------------------------------------------------------
 
 
-def test_every_weight_gets_a_finite_gradient():
+@pytest.mark.parametrize("sizes", [FAST_LIKE, RICH], ids=["fast", "rich"])
+def test_every_weight_gets_a_finite_gradient(sizes: DGVAEConfig):
     torch.manual_seed(0)
-    forecaster = DGVAE(spec(), FAST_LIKE, horizon_steps=3)
+    forecaster = DGVAE(spec(), sizes, horizon_steps=3)
     states, valid = random_states(0, BATCH, TIME, AGENTS, 4), random_presence(0, BATCH, TIME, AGENTS)
-    output = forecaster.window(states, valid, torch.tensor([1, 3]), torch.Generator().manual_seed(0))
+    output = forecaster.window(states, valid, torch.tensor([1, 3]), 3, torch.Generator().manual_seed(0))
     divergence = (output.posterior_logits.softmax(-1) * output.prior_logits.log_softmax(-1))[pair_mask(valid)].sum()
     (output.one_step.square().mean() + output.rollout.square().mean() - divergence).backward()
     for name, parameter in forecaster.named_parameters():

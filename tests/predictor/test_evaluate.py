@@ -1,3 +1,4 @@
+import io
 import json
 import math
 import sys
@@ -5,18 +6,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
 from predictor import evaluate as evaluation
-from predictor.accuracy import Accuracy
+from predictor.accuracy import Accuracy, Statistic
+from predictor.baselines.mlp import MLP, MLPConfig
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
-from predictor.data.store import StoreInfo, read_store, write_store
+from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.dgvae import DGVAE
 from predictor.errors import UserError, run_entry_point
-from predictor.evaluate import EvaluateConfig, evaluate, markdown_table
-from predictor.scene import SceneSpec
+from predictor.evaluate import EvaluateConfig, accuracy_table, evaluate, markdown_table
+from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from tests.predictor.helpers import FAST_LIKE, spec, write_circles
+
+HEADING = "| forecaster | K | minADE [m] | minFDE [m] | joint ADE [m] | joint FDE [m] | RMSE [m] | missed | cover |"
 
 
 @pytest.fixture
@@ -50,8 +56,9 @@ def test_smoke(
     out = tmp_path / "out"
     run(monkeypatch, "--checkpoint", checkpoint, "--data", data, "--samples", 3, "--out", out)
     printed = capsys.readouterr().out
-    assert "minADE [m]" in printed and "constant velocity" in printed
+    assert "minADE" in printed and "constant velocity" in printed
     assert "displacement of the best sample [m] / RMSE of the mean [m] / NLL [nats]" in " ".join(printed.split())
+    assert max(map(len, printed.splitlines())) <= 160 and "…" not in printed
     assert sorted(p.name for p in out.iterdir()) == [
         "accuracy.json",
         "accuracy.md",
@@ -70,7 +77,7 @@ def test_smoke(
     ]
     assert all(len(r["by_step_m"]) == len(r["rmse_m"]) == len(r["nll"]) == 2 for r in content["rows"])
     lines = (out / "accuracy.md").read_text().splitlines()
-    assert lines[0] == "| forecaster | K | minADE [m] | minFDE [m] | 1 s | 2 s |"
+    assert lines[0] == f"{HEADING} 1 s | 2 s |"
     assert [line.split("|")[1].strip() for line in lines[2:]] == ["dG-VAE", "dG-VAE", "constant velocity"]
 
 
@@ -104,18 +111,82 @@ def test_one_sample_gives_one_row(data: Path, checkpoint: Path):
     ]
 
 
+def test_rows_bear_the_name_of_the_model(data: Path, tmp_path: Path):
+    torch.manual_seed(0)
+    save_checkpoint(tmp_path / "mlp", MLP(spec(), MLPConfig(), 2), CheckpointInfo(spec(), MLPConfig(), 2, model="mlp"))
+    rows = evaluate(EvaluateConfig(str(tmp_path / "mlp"), data, samples=2))
+    assert [r.name for r in rows] == ["MLP", "MLP", "constant velocity"]
+
+
 def test_equal_seeds_give_equal_rows(data: Path, checkpoint: Path):
     settings = EvaluateConfig(str(checkpoint), data, samples=3, max_windows=6)
     assert evaluate(settings) == evaluate(settings)
 
 
 def test_markdown_closed_form():
-    rows = [Accuracy("dG-VAE", 20, 0.1234, 0.5, [0.1, 0.25], [0.2, 0.3], [], 7)]
-    assert markdown_table(rows, 0.2) == (
-        "| forecaster | K | minADE [m] | minFDE [m] | 0.2 s | 0.4 s |\n"
-        "|---|---|---|---|---|---|\n"
-        "| dG-VAE | 20 | 0.123 | 0.500 | 0.10 | 0.25 |\n"
+    bare = Accuracy("dG-VAE", 1, 0.1234, 0.5, [0.1, 0.25], [0.2, 0.3], [], 7)
+    full = replace(
+        bare,
+        num_samples=20,
+        min_joint_ade_m=0.2,
+        min_joint_fde_m=0.7,
+        miss_rate=0.125,
+        overall_rmse_m=0.25,
+        statistics={"min_ade_m": Statistic(0.12, 0.004, 20), "coverage": Statistic(0.87, 0.01, 20)},
     )
+    assert markdown_table([bare, full], 0.2) == (
+        f"{HEADING} 0.2 s | 0.4 s |\n"
+        "|---|---|---|---|---|---|---|---|---|---|---|\n"
+        "| dG-VAE | 1 | 0.123 | 0.500 | – | – | – | – | – | 0.10 | 0.25 |\n"
+        "| dG-VAE | 20 | 0.123 ± 0.004 | 0.500 | 0.200 | 0.700 | 0.250 | 12.5 % | 87 % | 0.10 | 0.25 |\n"
+    )
+
+
+def test_small_errors_keep_two_digits():
+    errors = [0.00123, 0.0]
+    row = Accuracy("dG-VAE", 1, 0.01, 0.00987, errors, errors, [], 7)
+    row = replace(row, statistics={"min_fde_m": Statistic(0.00987, 0.0000123, 20)})
+    cells = [c.strip() for c in markdown_table([row], 1.0).splitlines()[-1].split("|")[1:-1]]
+    assert cells[2:4] == ["0.010", "0.0099 ± 1.2e-05"] and cells[-2:] == ["0.0012", "0.00"]
+
+
+def test_long_horizons_show_some_steps_and_the_last():
+    errors = [float(i) for i in range(50)]
+    rows = [Accuracy("constant velocity", 1, 1.0, 1.0, errors, errors, errors, 7)]
+    assert markdown_table(rows, 0.1).splitlines()[0] == f"{HEADING} 0.1 s | 1.1 s | 2.1 s | 3 s | 4 s | 5 s |"
+    console = Console(width=160, record=True, file=io.StringIO())
+    console.print(accuracy_table(rows, 0.1, "title"))
+    assert "49.00" in console.export_text() and "48.00" not in console.export_text()
+
+
+def test_constant_velocity_is_a_checkpoint_of_every_store(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], data: Path, checkpoint: Path, tmp_path: Path
+):
+    settings = EvaluateConfig("constant-velocity", data, horizon_steps=2)
+    (row,) = evaluate(settings)
+    assert row == evaluate(EvaluateConfig(str(checkpoint), data, samples=1))[-1]
+    assert len(evaluate(EvaluateConfig("constant-velocity", data))[0].by_step_m) == 5
+    out = tmp_path / "out"
+    run(monkeypatch, "--checkpoint", "constant-velocity", "--data", data, "--horizon-steps", 2, "--out", out)
+    assert "constant velocity" in capsys.readouterr().out
+    content = json.loads((out / "accuracy.json").read_text(), parse_constant=refuse)
+    assert [r["name"] for r in content["rows"]] == ["constant velocity"]
+    assert (out / "scenes.png").exists()
+
+
+def test_three_axes(tmp_path: Path):
+    layout = SceneSpec(
+        1.0, ("world",) * 3, feature_names=KINEMATIC_FEATURES_3D, feature_scales=(1.0,) * 6, has_ego=False, max_agents=9
+    )
+    states = np.zeros((8, 2, 6), dtype=np.float32)
+    states[:, :, 2] = np.arange(8.0)[:, None] ** 2  # climbs ever faster
+    states[:, :, 5] = 2 * np.arange(8.0)[:, None]
+    episode = Episode(states, np.ones((8, 2), dtype=np.bool_), np.arange(2))
+    write_store(tmp_path / "solid", StoreInfo(layout, "solid"), [episode])
+    (row,) = evaluate(EvaluateConfig("constant-velocity", tmp_path / "solid", horizon_steps=2, out=tmp_path / "out"))
+    assert row.axes == 3
+    assert row.by_step_m == pytest.approx([1.0, 4.0])  # what v·t leaves out of (t + h)²
+    assert (tmp_path / "out" / "scenes.png").exists()
 
 
 def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: object) -> str:
@@ -163,6 +234,19 @@ def no_horizon(data: Path, checkpoint: Path) -> list[Any]:
     return ["--checkpoint", checkpoint, "--data", data, "--horizon-steps", 0]
 
 
+def horizon_beyond_every_episode(data: Path, checkpoint: Path) -> list[Any]:
+    return ["--checkpoint", checkpoint, "--data", data, "--horizon-steps", 6]
+
+
+def nobody_stays(data: Path, checkpoint: Path) -> list[Any]:
+    other, episodes = data.with_name("other"), read_store(data).episodes
+    for episode in episodes:
+        episode.valid[1::2, 1] = False
+        episode.states[1::2, 1] = 0
+    write_store(other, StoreInfo(spec(), "restless"), episodes)
+    return ["--checkpoint", checkpoint, "--data", other]
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -174,6 +258,8 @@ def no_horizon(data: Path, checkpoint: Path) -> list[Any]:
         (truncated_checkpoint, "model.safetensors cannot be read"),
         (negative_samples, "samples must be at least 1, got -1"),
         (no_horizon, "horizon_steps must be at least 1, got 0"),
+        (horizon_beyond_every_episode, "episodes have at most 6 steps, a horizon of 6 needs 7; lower --horizon-steps"),
+        (nobody_stays, "in 15 windows no agent but the ego is there for all 2 steps of the horizon; lower --horizon"),
     ],
 )
 def test_bad_input_is_one_line(
@@ -195,3 +281,8 @@ def test_windows_without_a_future_are_refused(data: Path, checkpoint: Path, tmp_
     write_store(tmp_path / "short", StoreInfo(spec(), "short"), short)
     with pytest.raises(UserError, match="no window fits: episodes have at most 1 steps"):
         evaluate(EvaluateConfig(str(checkpoint), tmp_path / "short"))
+
+
+def test_longest_horizon_that_fits_is_measured(data: Path, checkpoint: Path):
+    rows = evaluate(EvaluateConfig(str(checkpoint), data, horizon_steps=5, samples=2))
+    assert all(len(r.by_step_m) == 5 and r.agents == 3 and math.isfinite(r.min_ade_m) for r in rows)

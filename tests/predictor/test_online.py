@@ -59,7 +59,7 @@ def reference(forecaster: DGVAE, history: History) -> Forecast:
     tensor, present_ = torch.from_numpy(states.astype(np.float32)), torch.from_numpy(valid)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dgvae, "concrete_sample", lambda logits, temperature, generator: torch.softmax(logits, dim=-1))
-        window = forecaster.window(tensor, present_, torch.tensor([len(history) - 1]))
+        window = forecaster.window(tensor, present_, torch.tensor([len(history) - 1]), forecaster.horizon_steps)
     last, place = history[-1], places[-1]
     xy = torch.zeros(1, 1, AGENTS, forecaster.horizon_steps, 2)
     probs = torch.zeros(1, AGENTS, AGENTS, forecaster.num_edge_types)

@@ -22,7 +22,10 @@ from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.data.windows import WindowBatch
 from predictor.dgvae import PRESETS, WindowOutput
 from predictor.errors import UserError, run_entry_point
-from predictor.train import TrainConfig, Trainer, load_data, train, typical_change, window_loss
+from predictor.objective import window_loss
+from predictor.train import train
+from predictor.train_config import TrainConfig
+from predictor.trainer import Trainer, load_data, typical_change
 from tests.predictor.helpers import FAST_LIKE, circling_episode, following_episode, model, spec, write_circles
 
 ROOT = Path(__file__).parents[2]

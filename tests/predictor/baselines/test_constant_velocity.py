@@ -2,7 +2,7 @@ import torch
 
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.forecaster import Belief, Memory
-from predictor.scene import SceneSpec
+from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from tests.predictor.helpers import random_presence, random_states, spec
 
 
@@ -24,6 +24,14 @@ def test_other_features_stay_as_they_are():
     forecaster = ConstantVelocity(SceneSpec(1.0, feature_names=names, feature_scales=scales))
     future = forecaster.rollout(observe(forecaster, torch.tensor([[[0.0, 0.0, 1.0, 2.0, 0.7]]])), 2)
     torch.testing.assert_close(future[0, 0, 0], torch.tensor([[1.0, 2.0, 1.0, 2.0, 0.7], [2.0, 4.0, 1.0, 2.0, 0.7]]))
+
+
+def test_three_dimensions():
+    layout = SceneSpec(0.5, ("world",) * 3, KINEMATIC_FEATURES_3D, (1.0,) * 6)
+    future = ConstantVelocity(layout).rollout(
+        observe(ConstantVelocity(layout), torch.tensor([[[1.0, 2.0, 3.0, 4.0, 0.0, -2.0]]])), 2
+    )
+    assert future[0, 0, 0].tolist() == [[3.0, 2.0, 2.0, 4.0, 0.0, -2.0], [5.0, 2.0, 1.0, 4.0, 0.0, -2.0]]
 
 
 def test_all_samples_are_the_same():

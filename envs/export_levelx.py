@@ -1,0 +1,224 @@
+"""Write rollouts in levelXData's CSV layout: `python -m envs.export_levelx --env-id roundabout-v1 --out exported`.
+
+One episode becomes one recording XX of inD's layout (`XX_tracks.csv`, `XX_tracksMeta.csv`, `XX_recordingMeta.csv`), at
+25 frames per second: the simulation runs at that rate and every simulated frame is written, however long a policy step
+is. `python -m predictor.data.levelx` reads it like the licensed datasets. Coordinates, headings and axes are the
+simulator's own. Accelerations are backward differences of the velocity, zero in a vehicle's first frame.
+"""
+
+import csv
+import shutil
+import uuid
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import tyro
+from jaxtyping import Float
+from rich.progress import track
+
+from envs.egos import make_ego
+from envs.readers.highway import HighwayReader, is_highway_env
+from envs.registry import make_env
+from predictor.data.store import Episode
+from predictor.errors import UserError, run_entry_point
+from predictor.provenance import provenance, replace_folder, write_json
+
+FRAMES_PER_S = 25
+"""As the datasets."""
+TRACKS = (
+    "recordingId,trackId,frame,trackLifetime,xCenter,yCenter,heading,width,length,xVelocity,yVelocity,"
+    "xAcceleration,yAcceleration,lonVelocity,latVelocity,lonAcceleration,latAcceleration"
+).split(",")
+TRACKS_META = "recordingId,trackId,initialFrame,finalFrame,numFrames,width,length,class".split(",")
+RECORDING_META = (
+    "recordingId,locationId,frameRate,speedLimit,weekday,startTime,duration,numTracks,numVehicles,numVRUs,"
+    "latLocation,lonLocation,xUtmOrigin,yUtmOrigin,orthoPxToMeter"
+).split(",")
+
+
+@dataclass(frozen=True)
+class ExportConfig:
+    """Write highway-env rollouts in levelXData's CSV layout."""
+
+    env_id: str
+    """Gymnasium id of a highway-env environment, for example roundabout-v1."""
+    out: Path
+    """Folder of the new recordings."""
+    episodes: int = 10
+    """Episodes, one recording each."""
+    ego: str = "varied"
+    """Who drives the ego: random, idle, varied, keep-lane."""
+    seed: int = 0
+    """Episode i is seeded with seed + i."""
+    max_steps: int = 200
+    """Cut longer episodes here [policy steps]."""
+    overwrite: bool = False
+    """Replace an existing export."""
+
+    def check(self) -> None:
+        """Check ranges, and that nothing is in the way.
+
+        Raises:
+            UserError: a value that makes no sense.
+        """
+        for name in ("episodes", "max_steps"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.seed < 0:
+            raise UserError(f"seed must not be negative, got {self.seed}")
+        if self.out.exists() and not self.overwrite:
+            raise UserError(f"{self.out} exists; choose another path or pass --overwrite")
+        if self.out.exists() and not (self.out / "export.json").exists():
+            raise UserError(f"{self.out} is not an export and will not be replaced; choose another path")
+
+
+def export_env(env_id: str) -> gym.Env:
+    """The environment, simulated at the datasets' frame rate; policy steps stay as long as they are.
+
+    Raises:
+        UserError: not a highway-env environment, or policy steps that are not whole frames.
+    """
+    env = make_env(env_id, disable_env_checker=True)
+    if not is_highway_env(env):
+        raise UserError(f"exports need a highway-env environment, got {env.unwrapped.__class__.__name__}")
+    policy_hz = env.unwrapped.config["policy_frequency"]  # type: ignore[attr-defined]
+    if FRAMES_PER_S % policy_hz:
+        raise UserError(
+            f"policy steps must be whole frames of 1/{FRAMES_PER_S} s, but '{env_id}' has {policy_hz} per s"
+        )
+    return make_env(env_id, disable_env_checker=True, config={"simulation_frequency": FRAMES_PER_S})
+
+
+def roll_out(
+    env: gym.Env, ego_name: str, seed: int, max_steps: int
+) -> tuple[Episode, Float[np.ndarray, "time agents"]]:
+    """One episode, every simulated frame of it, and all headings [rad]; zeros where absent."""
+    reader = HighwayReader(env)
+    obs: Any
+    obs, _ = env.reset(seed=seed)
+    ego = make_ego(ego_name, env, np.random.default_rng(seed))
+    road: Any = env.unwrapped.road  # type: ignore[attr-defined]
+    scenes, headings = [reader.read_all(env)], [_headings_rad(env)]
+    advance = road.step
+
+    def advance_and_record(dt: float) -> None:
+        advance(dt)
+        scenes.append(reader.read_all(env))
+        headings.append(_headings_rad(env))
+
+    road.step = advance_and_record
+    for _ in range(max_steps):
+        obs, _, terminated, truncated, _ = env.step(ego(obs))
+        if terminated or truncated:
+            break
+    episode = Episode.from_scenes(scenes, label=ego_name, seed=seed)
+    heading_rad = np.zeros(episode.valid.shape)
+    column = {int(agent): i for i, agent in enumerate(episode.ids)}
+    for t, (scene, values) in enumerate(zip(scenes, headings, strict=True)):
+        heading_rad[t, [column[int(agent)] for agent in scene.ids]] = values
+    return episode, heading_rad
+
+
+def _headings_rad(env: gym.Env) -> list[float]:
+    """In the order of `HighwayReader.read_all`: the ego, then the road's list."""
+    unwrapped: Any = env.unwrapped
+    ego = unwrapped.vehicle
+    return [float(vehicle.heading) for vehicle in [ego, *(v for v in unwrapped.road.vehicles if v is not ego)]]
+
+
+def write_recording(
+    folder: Path,
+    number: int,
+    episode: Episode,
+    heading_rad: Float[np.ndarray, "time agents"],
+    size_m: tuple[float, float],
+) -> None:
+    """Write the three files of one recording.
+
+    Args:
+        folder: where.
+        number: recording id.
+        episode: every frame.
+        heading_rad: zeros where absent.
+        size_m: length and width of every vehicle.
+    """
+    length_m, width_m = (f"{size:.3f}" for size in size_m)
+    tracks, meta = [], []
+    for column, agent in enumerate(episode.ids.tolist()):
+        frames = np.flatnonzero(episode.valid[:, column])
+        states = episode.states[frames, column].astype(np.float64)
+        motion = _motion(states, heading_rad[frames, column], frames)
+        for frame, state, values in zip(frames.tolist(), states, motion, strict=True):
+            numbers = [f"{v:z.5f}" for v in (*state[:2], values[0])]
+            rest = [f"{v:z.5f}" for v in (*state[2:], *values[1:])]
+            tracks.append([number, agent, frame, frame - int(frames[0]), *numbers, width_m, length_m, *rest])
+        meta.append([number, agent, frames[0], frames[-1], len(frames), width_m, length_m, "car"])
+    seconds = f"{len(episode.states) / FRAMES_PER_S:.2f}"
+    recording = [number, 0, FRAMES_PER_S, -1, "monday", 0, seconds, len(meta), len(meta), 0, 0, 0, 0, 0, 1]
+    _write_csv(folder / f"{number:02d}_tracks.csv", TRACKS, tracks)
+    _write_csv(folder / f"{number:02d}_tracksMeta.csv", TRACKS_META, meta)
+    _write_csv(folder / f"{number:02d}_recordingMeta.csv", RECORDING_META, [recording])
+
+
+def _motion(
+    states: Float[np.ndarray, "frames 4"], heading_rad: Float[np.ndarray, " frames"], frames: np.ndarray
+) -> Float[np.ndarray, "frames 7"]:
+    """Heading [deg], acceleration on both axes, velocity along and across the heading, acceleration likewise."""
+    velocity = states[:, 2:]
+    acceleration = np.zeros_like(velocity)
+    acceleration[1:] = np.diff(velocity, axis=0) / (np.diff(frames) / FRAMES_PER_S)[:, None]
+    along = np.stack([np.cos(heading_rad), np.sin(heading_rad)], axis=-1)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
+    projected = [(vector * axis).sum(axis=-1) for vector in (velocity, acceleration) for axis in (along, across)]
+    return np.stack([np.degrees(heading_rad) % 360, *acceleration.T, *projected], axis=-1)
+
+
+def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows(rows)
+
+
+def export(config: ExportConfig) -> int:
+    """Write all recordings; nothing appears under `out` until they are complete.
+
+    Returns:
+        Number of frames.
+
+    Raises:
+        UserError: the environment or the ego does not fit.
+    """
+    env = export_env(config.env_id)
+    make_ego(config.ego, env, np.random.default_rng(0))
+    partial = config.out.with_name(f".{config.out.name}.{uuid.uuid4().hex[:8]}.partial")
+    frames = 0
+    try:
+        partial.mkdir(parents=True)
+        for i in track(range(config.episodes), f"export {config.env_id}"):
+            episode, heading_rad = roll_out(env, config.ego, config.seed + i, config.max_steps)
+            ego: Any = env.unwrapped.vehicle  # type: ignore[attr-defined]
+            write_recording(partial, i, episode, heading_rad, (ego.LENGTH, ego.WIDTH))
+            frames += len(episode.states)
+        made = provenance(("highway-env", "gymnasium", "numpy"))
+        write_json(partial / "export.json", {"env_id": config.env_id, "seed": config.seed, "provenance": made})
+        replace_folder(partial, config.out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return frames
+
+
+def main() -> None:
+    """Entry point."""
+    config = tyro.cli(ExportConfig, description=__doc__)
+    config.check()
+    frames = export(config)
+    print(f"{config.out}: {config.episodes} recordings, {frames} frames at {FRAMES_PER_S} Hz")
+
+
+if __name__ == "__main__":
+    run_entry_point(main)

@@ -1,0 +1,251 @@
+"""dNRI (Graber & Schwing, "Dynamic Neural Relational Inference", CVPR 2020) for scenes whose agents come and go.
+
+Encoder per frame: agent → pair → agent → pair; then a forward LSTM per pair for the learned prior and a reverse one
+that the posterior sees besides (training only). Decoder: messages from its own hidden states along sampled edges, type
+0 silent; gated update; change of state. The loss is `predictor.losses`.
+
+Unlike the public code for a varying number of agents: the forward memory of a pair is carried on and the reverse LSTM
+does run, in training as in prediction; nobody's future presence is known when forecasting; a frame without agents is a
+frame. Batch normalisation is left out (see `predictor.baselines.nri`). While true states are fed, the graph is the
+prior's expectation rather than a draw, as in `predictor.dgvae`, and samples branch off at the first forecast step.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from predictor.baselines.nri import FrameEncoder, HiddenDecoder, PairLSTM, elu_head
+from predictor.baselines.unroll import (
+    Encoded,
+    GraphRule,
+    Internal,
+    Tensors,
+    UnrolledForecaster,
+    check_sizes,
+    mean_weight,
+)
+from predictor.codec import Residual
+from predictor.errors import UserError
+from predictor.forecaster import Belief, WindowOutput
+from predictor.graph import pair_mask
+from predictor.networks import _no_edge_where_absent as no_edge_where_absent
+from predictor.networks import concrete_sample
+from predictor.scene import SceneSpec
+
+
+@dataclass(frozen=True)
+class DNRIConfig:
+    """Sizes; the defaults are those of the public run scripts."""
+
+    hidden_dim: int = 256
+    """Width of the encoder's frame embedding."""
+    rnn_dim: int = 64
+    """Width of the LSTMs of each pair."""
+    head_dim: int = 128
+    """Hidden width of the prior and posterior heads."""
+    decoder_dim: int = 256
+    """Width of the memory of each agent."""
+    message_dim: int = 256
+    """Width of the decoder's messages."""
+    num_edge_types: int = 2
+    """Edge types; the first one is "no edge" and sends no message."""
+    temperature: float = 0.5
+    """Of the concrete distribution."""
+    hard_samples: bool = False
+    """Draw one type per pair instead of a mixture, with the gradient of the mixture (straight-through)."""
+    residual: Residual = "state"
+    """What the predicted change of position is added to; see `predictor.codec`."""
+    delta_scales: tuple[float, ...] = ()
+    """Typical one-step change of each feature [SI]; empty takes the spec's feature scales."""
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        check_sizes(self, "hidden_dim", "rnn_dim", "head_dim", "decoder_dim", "message_dim")
+        if self.num_edge_types < 2:
+            raise UserError(f"num_edge_types must be at least 2 (the first is 'no edge'), got {self.num_edge_types}")
+        if not self.temperature > 0:
+            raise UserError(f"temperature must be positive, got {self.temperature}")
+
+
+class Edges(NamedTuple):
+    """Encoder outputs for a stretch of time; time axis second."""
+
+    hidden: Float[Tensor, "batch time agents agents rnn"]
+    cell: Float[Tensor, "batch time agents agents rnn"]
+    prior_logits: Float[Tensor, "batch time agents agents types"]
+    embedding: Float[Tensor, "batch time agents agents hidden"]
+
+
+class DNRIEncoder(nn.Module):
+    """Edge-type logits from states."""
+
+    def __init__(self, config: DNRIConfig, inputs: int) -> None:
+        """Layers in the order in which data passes."""
+        super().__init__()
+        self.frames = FrameEncoder(inputs, config.hidden_dim)
+        self.forward_rnn = PairLSTM(config.hidden_dim, config.rnn_dim)
+        self.reverse_rnn = PairLSTM(config.hidden_dim, config.rnn_dim)
+        self.prior_head = elu_head(config.rnn_dim, config.head_dim, config.num_edge_types)
+        self.posterior_head = elu_head(2 * config.rnn_dim, config.head_dim, config.num_edge_types)
+
+    def forward(
+        self,
+        inputs: Float[Tensor, "batch time agents inputs"],
+        valid: Bool[Tensor, "batch time agents"],
+        hidden: Float[Tensor, "batch agents agents rnn"],
+        cell: Float[Tensor, "batch agents agents rnn"],
+    ) -> Edges:
+        """Run the forward LSTM from a given memory."""
+        embedding = self.frames(inputs, valid)
+        hiddens, cells = self.forward_rnn(embedding, valid, hidden, cell)
+        logits = no_edge_where_absent(self.prior_head(hiddens), pair_mask(valid)[..., None])
+        return Edges(hiddens, cells, logits, embedding)
+
+    def posterior_logits(
+        self, edges: Edges, valid: Bool[Tensor, "batch time agents"]
+    ) -> Float[Tensor, "batch time agents agents types"]:
+        """Logits that have seen the future; training only."""
+        zeros = torch.zeros_like(edges.hidden[:, 0])
+        reverse, _ = self.reverse_rnn(edges.embedding, valid, zeros, zeros, reverse=True)
+        logits = self.posterior_head(torch.cat([edges.hidden, reverse], dim=-1))
+        return no_edge_where_absent(logits, pair_mask(valid)[..., None])
+
+
+class DNRI(UnrolledForecaster):
+    """The model, as a `TrainableForecaster`.
+
+    Args:
+        spec: layout of the scenes.
+        config: sizes.
+        horizon_steps: steps it is trained to forecast.
+    """
+
+    def __init__(self, spec: SceneSpec, config: DNRIConfig | None = None, horizon_steps: int = 5) -> None:
+        """Build the network; weights come from torch's generator, so seed it first."""
+        config = config or DNRIConfig()
+        super().__init__(spec, config.residual, config.delta_scales, horizon_steps)
+        self.config = config
+        self.num_edge_types = config.num_edge_types
+        self.node_sizes = (config.decoder_dim,)
+        self.pair_sizes = (config.rnn_dim, config.rnn_dim)
+        inputs = self.codec.num_inputs
+        self.encoder = DNRIEncoder(config, inputs)
+        speaking = config.num_edge_types - 1
+        self.decoder = HiddenDecoder(inputs, config.decoder_dim, config.message_dim, speaking, spec.num_features)
+
+    # --- Pieces -------------------------------------------------------------------------------------------------
+
+    def encode(
+        self,
+        inputs: Float[Tensor, "batch time agents inputs"],
+        valid: Bool[Tensor, "batch time agents"],
+        pairs: Tensors,
+    ) -> Encoded:
+        """Prior logits and the forward LSTM's memory."""
+        edges = self.encoder(inputs, valid, *pairs)
+        return Encoded((edges.hidden, edges.cell), edges.prior_logits)
+
+    def expected(self, scores: Float[Tensor, "*batch types"]) -> Float[Tensor, "*batch types"]:
+        """The prior's probabilities."""
+        return torch.softmax(scores, dim=-1)
+
+    def drawn(self, generator: torch.Generator | None) -> GraphRule:
+        """A rule that draws graphs."""
+
+        def draw(logits: Tensor) -> Tensor:
+            return concrete_sample(logits, self.config.temperature, generator, self.config.hard_samples)
+
+        return draw
+
+    def edge_probs(
+        self, graph: Float[Tensor, "batch agents agents types"], valid: Bool[Tensor, "batch agents"]
+    ) -> Float[Tensor, "batch agents agents types"]:
+        """The expected graph is the distribution."""
+        return graph
+
+    def recur(
+        self,
+        inputs: Float[Tensor, "batch agents inputs"],
+        valid: Bool[Tensor, "batch agents"],
+        graph: Float[Tensor, "batch agents agents types"],
+        nodes: Tensors,
+    ) -> Tensors:
+        """Messages are averaged over the other agents and over the types that speak."""
+        weights = graph[..., 1:] * mean_weight(valid, inputs.dtype)[..., None] / (self.num_edge_types - 1)
+        return (self.decoder.step(inputs, valid, weights, nodes[0]),)
+
+    def change(
+        self, inputs: Float[Tensor, "*batch agents inputs"], valid: Bool[Tensor, "*batch agents"], nodes: Tensors
+    ) -> Float[Tensor, "*batch agents state"]:
+        """Read off the decoder's memory."""
+        change: Tensor = self.decoder.readout(nodes[0])
+        return change
+
+    # --- Forecaster ---------------------------------------------------------------------------------------------
+
+    def rollout(
+        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
+    ) -> Float[Tensor, "batch samples agents horizon state"]:
+        """Feed predictions back through the encoder; sample 0 takes expected graphs, the others draw theirs."""
+        expected = super().rollout(belief, horizon_steps)
+        if num_samples == 1:
+            return expected
+        now: Internal = belief.internal
+        draws = num_samples - 1
+
+        def repeat(*tensors: Tensor) -> Tensors:
+            return tuple(t.repeat_interleave(draws, dim=0) for t in tensors)
+
+        states, valid, scores = repeat(belief.states, belief.valid, now.scores)
+        memory, before, draw = repeat(*now.pairs), repeat(*now.before), self.drawn(generator)
+        futures = self._branch(states, valid, memory, scores, before, horizon_steps, draw)
+        return torch.cat([expected, futures.unflatten(0, (len(belief.states), draws))], dim=1)
+
+    # --- Training -----------------------------------------------------------------------------------------------
+
+    def window(
+        self,
+        states: Float[Tensor, "batch time agents state"],
+        valid: Bool[Tensor, "batch time agents"],
+        last_observed: Int[Tensor, " batch"],
+        rollout_steps: int,
+        generator: torch.Generator | None = None,
+    ) -> WindowOutput:
+        """Teacher-forced pass along posterior draws, and a free roll-out along prior draws, from the same encoding."""
+        inputs = self.codec.inputs(states, valid)
+        empty = self.empty_memory(states.shape[0], states.shape[2])
+        edges = self.encoder(inputs, valid, *empty.pairs)
+        posterior = self.encoder.posterior_logits(edges, valid)
+        draw = self.drawn(generator)
+        (nodes,) = self.remember(inputs, valid, draw(posterior), empty.nodes)
+        one_step = self.codec.advance(states, self.change(inputs, valid, (nodes[:, 1:],)))
+        rollout = one_step.new_zeros(*states[:, 0].shape[:2], 0, states.shape[-1])
+        if rollout_steps:
+            past = slice(int(last_observed.max()))
+            expected = self.expected(edges.prior_logits[:, past])
+            (before,) = self.remember(inputs[:, past], valid[:, past], expected, empty.nodes)
+            now = (torch.arange(len(states), device=states.device), last_observed)
+            memory = (edges.hidden[now], edges.cell[now])
+            rollout = self._branch(
+                states[now], valid[now], memory, edges.prior_logits[now], (before[now],), rollout_steps, draw
+            )
+        return WindowOutput(one_step, rollout, edges.prior_logits, posterior)
+
+    def _branch(
+        self,
+        states: Tensor,
+        valid: Tensor,
+        pairs: Tensors,
+        scores: Tensor,
+        before: Tensors,
+        horizon_steps: int,
+        rule: GraphRule,
+    ) -> Float[Tensor, "batch agents horizon state"]:
+        """Roll out from an observation that the decoder has yet to take in, along graphs of its own."""
+        inputs = self.codec.inputs(states, valid)
+        nodes = self.recur(inputs, valid, rule(scores), before)
+        states = self.codec.advance(states, self.change(inputs, valid, nodes))
+        return self.continue_from(states, valid, pairs, scores, nodes, horizon_steps, rule)

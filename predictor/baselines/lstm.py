@@ -1,0 +1,120 @@
+"""An LSTM between two linear layers (64–128–64), as in the paper's comparison (Sec. V): one per scene, or per agent.
+
+The paper's processes all agents at once (`joint=True`): its input is the states of a fixed number of agents side by
+side, so it knows agents by their column, permuting them changes its forecast, and it fits fixed casts only (a team, a
+skeleton). `joint=False` runs the same network on every agent by itself and takes any number of them.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from predictor.baselines.unroll import Tensors, UnrolledForecaster, check_sizes
+from predictor.codec import Residual
+from predictor.errors import UserError
+from predictor.scene import SceneSpec
+
+
+@dataclass(frozen=True)
+class LSTMConfig:
+    """Sizes; the defaults are the paper's (Sec. V)."""
+
+    joint: bool = False
+    """One LSTM for the whole scene, as in the paper, rather than one per agent."""
+    num_agents: int = 0
+    """Columns of the joint variant; 0 takes the spec's `max_agents`. Not used otherwise."""
+    embed_dim: int = 64
+    """Width of the linear layers before and after the LSTM."""
+    rnn_dim: int = 128
+    """Width of the LSTM."""
+    residual: Residual = "state"
+    """What the predicted change of position is added to; see `predictor.codec`."""
+    delta_scales: tuple[float, ...] = ()
+    """Typical one-step change of each feature [SI]; empty takes the spec's feature scales."""
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        check_sizes(self, "embed_dim", "rnn_dim")
+        if self.num_agents < 0:
+            raise UserError(f"num_agents must be positive, or 0 for the spec's max_agents; got {self.num_agents}")
+
+
+class LSTM(UnrolledForecaster):
+    """Linear → ReLU → LSTM → linear → ReLU → linear.
+
+    The joint variant has one memory for the scene. It lies on the row of every present agent, with a mark beside it, so
+    that it moves through `Memory` like any agent's; it is read back from an agent who was there and still is. A scene
+    is thus remembered for as long as somebody stays, and forgotten when everyone was replaced.
+
+    Args:
+        spec: layout of the scenes.
+        config: sizes.
+        horizon_steps: steps it is trained to forecast.
+    """
+
+    def __init__(self, spec: SceneSpec, config: LSTMConfig | None = None, horizon_steps: int = 5) -> None:
+        """Build the network; weights come from torch's generator, so seed it first."""
+        config = config or LSTMConfig()
+        super().__init__(spec, config.residual, config.delta_scales, horizon_steps)
+        self.config = config
+        self.columns = (config.num_agents or spec.max_agents) if config.joint else 1
+        self.node_sizes = (config.rnn_dim, config.rnn_dim) + ((1,) if config.joint else ())
+        self.embed = nn.Linear(self.columns * self.codec.num_inputs, config.embed_dim)
+        self.cell = nn.LSTMCell(config.embed_dim, config.rnn_dim)
+        self.hidden = nn.Linear(config.rnn_dim, config.embed_dim)
+        self.readout = nn.Linear(config.embed_dim, self.columns * spec.num_features)
+
+    def recur(
+        self,
+        inputs: Float[Tensor, "batch agents inputs"],
+        valid: Bool[Tensor, "batch agents"],
+        graph: Float[Tensor, "batch agents agents graph"],
+        nodes: Tensors,
+    ) -> Tensors:
+        """One LSTM step per agent, or one per scene."""
+        present = valid[..., None]
+        if not self.config.joint:
+            flat = [t.flatten(0, 1) for t in (inputs, *nodes)]
+            hidden, cell = self.cell(torch.relu(self.embed(flat[0])), (flat[1], flat[2]))
+            return hidden.view_as(nodes[0]) * present, cell.view_as(nodes[1]) * present
+        *memory, mark = nodes
+        hidden, cell = (_of_first(m, valid & (mark[..., 0] > 0)) for m in memory)
+        hidden, cell = self.cell(torch.relu(self.embed(self._side_by_side(inputs, valid))), (hidden, cell))
+        return hidden[:, None] * present, cell[:, None] * present, present.to(inputs.dtype)
+
+    def change(
+        self,
+        inputs: Float[Tensor, "*batch agents inputs"],
+        valid: Bool[Tensor, "*batch agents"],
+        nodes: Tensors,
+    ) -> Float[Tensor, "*batch agents state"]:
+        """Read off the hidden state; in the joint variant each column has its own."""
+        hidden = _of_first(nodes[0], valid) if self.config.joint else nodes[0]
+        change: Tensor = self.readout(torch.relu(self.hidden(hidden)))
+        if self.config.joint:
+            change = change.unflatten(-1, (self.columns, -1))
+            change = functional.pad(change, (0, 0, 0, valid.shape[-1] - self.columns))
+        return change
+
+    def _side_by_side(
+        self, inputs: Float[Tensor, "batch agents inputs"], valid: Bool[Tensor, "batch agents"]
+    ) -> Float[Tensor, "batch columns"]:
+        extra = valid.shape[1] - self.columns
+        if extra > 0 and valid[:, self.columns :].any():
+            needed = 1 + int(valid.any(0).nonzero().max())
+            raise UserError(
+                f"this joint LSTM takes {self.columns} agents in fixed rows, but row {needed - 1} holds one too; "
+                f"train with num_agents={needed} or joint=False"
+            )
+        return functional.pad(inputs, (0, 0, 0, -extra)).flatten(1)
+
+
+def _of_first(
+    memory: Float[Tensor, "*batch agents hidden"], chosen: Bool[Tensor, "*batch agents"]
+) -> Float[Tensor, "*batch hidden"]:
+    """The row of the first chosen agent; zeros if there is none."""
+    first = chosen.to(torch.uint8).argmax(-1)[..., None, None].expand(*chosen.shape[:-1], 1, memory.shape[-1])
+    return memory.gather(-2, first).squeeze(-2) * chosen.any(-1, keepdim=True)

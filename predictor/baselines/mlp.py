@@ -1,0 +1,58 @@
+"""Two layers from an agent's state to its change of state, without memory and without others: the paper's "Linear" row.
+
+What it cannot know is the point of it: the past, and everybody else.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from predictor.baselines.unroll import Tensors, UnrolledForecaster, check_sizes
+from predictor.codec import Residual
+from predictor.scene import SceneSpec
+
+
+@dataclass(frozen=True)
+class MLPConfig:
+    """Sizes; the default is the paper's (Sec. V)."""
+
+    hidden_dim: int = 256
+    """Width of the hidden layer."""
+    residual: Residual = "state"
+    """What the predicted change of position is added to; see `predictor.codec`."""
+    delta_scales: tuple[float, ...] = ()
+    """Typical one-step change of each feature [SI]; empty takes the spec's feature scales."""
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        check_sizes(self, "hidden_dim")
+
+
+class MLP(UnrolledForecaster):
+    """The same two layers for every agent and every step.
+
+    Args:
+        spec: layout of the scenes.
+        config: sizes.
+        horizon_steps: steps it is trained to forecast.
+    """
+
+    def __init__(self, spec: SceneSpec, config: MLPConfig | None = None, horizon_steps: int = 5) -> None:
+        """Build the network; weights come from torch's generator, so seed it first."""
+        config = config or MLPConfig()
+        super().__init__(spec, config.residual, config.delta_scales, horizon_steps)
+        self.config = config
+        self.hidden = nn.Linear(self.codec.num_inputs, config.hidden_dim)
+        self.readout = nn.Linear(config.hidden_dim, spec.num_features)
+
+    def change(
+        self,
+        inputs: Float[Tensor, "*batch agents inputs"],
+        valid: Bool[Tensor, "*batch agents"],
+        nodes: Tensors,
+    ) -> Float[Tensor, "*batch agents state"]:
+        """W₂ relu(W₁ x)."""
+        change: Tensor = self.readout(torch.relu(self.hidden(inputs)))
+        return change

@@ -1,0 +1,109 @@
+"""From states to network inputs and back: scaling, frames, and what a predicted change is added to.
+
+Every forecaster shares it, so that a comparison of models is not a comparison of normalisations.
+"""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from predictor.errors import UserError
+from predictor.scene import SceneSpec
+
+Residual = Literal["state", "constant_velocity", "trapezoid"]
+
+
+def drift(
+    spec: SceneSpec,
+    residual: Residual,
+    states: Float[Tensor, "*batch state"],
+    after: Float[Tensor, "*batch state"],
+    fraction: float = 1.0,
+) -> Float[Tensor, "*batch axes"]:
+    """Change of position in one step that follows from velocities alone [m].
+
+    Args:
+        spec: layout.
+        residual: "state" has none; "constant_velocity" is v·dt; "trapezoid" is (v + v')/2·dt.
+        states: now.
+        after: one step later; only "trapezoid" looks at its velocities.
+        fraction: of a step.
+    """
+    axes = spec.position_dim
+    velocity = states[..., axes : 2 * axes]
+    if residual == "state":
+        return torch.zeros_like(velocity)
+    if residual == "trapezoid":
+        velocity = 0.5 * (velocity + after[..., axes : 2 * axes])
+    return velocity * (spec.dt_s * fraction)
+
+
+class StateCodec(nn.Module):
+    """Scaled features in the spec's frame, and next states from a network's output.
+
+    Args:
+        spec: layout, frame and scales.
+        delta_scales: typical one-step change of each feature [SI]; empty takes the spec's feature scales.
+        residual: what the predicted change of position is added to.
+    """
+
+    def __init__(self, spec: SceneSpec, delta_scales: tuple[float, ...] = (), residual: Residual = "state") -> None:
+        """Buffers only; nothing is learned and nothing is saved."""
+        super().__init__()
+        deltas = delta_scales or spec.feature_scales
+        if len(deltas) != spec.num_features:
+            raise UserError(f"delta_scales needs {spec.num_features} numbers, got {deltas}")
+        if residual not in ("state", "constant_velocity", "trapezoid"):
+            raise UserError(f"residual must be 'state', 'constant_velocity' or 'trapezoid', got '{residual}'")
+        self.spec = spec
+        self.residual: Residual = residual
+        self.scales: Tensor
+        self.deltas: Tensor
+        self._ego_axes: Tensor
+        self._centroid_axes: Tensor
+        for name, values in (
+            ("scales", spec.feature_scales),
+            ("deltas", deltas),
+            ("_ego_axes", [float(f == "ego") for f in spec.frame]),
+            ("_centroid_axes", [float(f == "centroid") for f in spec.frame]),
+        ):
+            self.register_buffer(name, torch.tensor(values), persistent=False)
+
+    @property
+    def num_inputs(self) -> int:
+        """Columns of `inputs`: the features, and the ego's mark where there is an ego."""
+        return self.spec.num_features + int(self.spec.has_ego)
+
+    def inputs(
+        self, states: Float[Tensor, "*batch agents state"], valid: Bool[Tensor, "*batch agents"]
+    ) -> Float[Tensor, "*batch agents inputs"]:
+        """Scaled features, re-centred at this very step, plus the ego's mark; zeros where absent."""
+        axes = self.spec.position_dim
+        positions, present = states[..., :axes], valid[..., None]
+        centre = positions[..., :1, :] * self._ego_axes
+        if "centroid" in self.spec.frame:
+            total = torch.where(present, positions, 0.0).sum(-2, keepdim=True)
+            centre = centre + total / present.sum(-2, keepdim=True).clamp(min=1) * self._centroid_axes
+        inputs = torch.cat([positions - centre, states[..., axes:]], dim=-1) / self.scales
+        if self.spec.has_ego:
+            mark = torch.zeros_like(inputs[..., :1])
+            mark[..., 0, 0] = 1.0
+            inputs = torch.cat([inputs, mark], dim=-1)
+        return inputs * present
+
+    def advance(
+        self, states: Float[Tensor, "*batch state"], change: Float[Tensor, "*batch state"], fraction: float = 1.0
+    ) -> Float[Tensor, "*batch state"]:
+        """States [SI] a step, or a fraction of one, later.
+
+        Args:
+            states: now [SI].
+            change: predicted rate of change, in units of `delta_scales` per step.
+            fraction: of a step.
+        """
+        axes = self.spec.position_dim
+        after = states + change * (self.deltas * fraction)
+        moved = after[..., :axes] + drift(self.spec, self.residual, states, after, fraction)
+        return torch.cat([moved, after[..., axes:]], dim=-1)

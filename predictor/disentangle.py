@@ -1,0 +1,56 @@
+"""Disentangled edge features (paper Sec. IV): restricted labelling and pair matching.
+
+Restricted labelling is supervised: the first feature dimensions are regressed on known edge attributes. Pair matching
+is not: the first dimensions are averaged over time, so they can only carry what stays the same.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from predictor.losses import masked_mean
+
+
+def running_mean(
+    values: Float[Tensor, "batch time agents agents static"],
+    pairs: Bool[Tensor, "batch time agents agents"],
+    memory: Float[Tensor, "batch agents agents static_and_count"],
+) -> Float[Tensor, "batch time agents agents static_and_count"]:
+    """Mean over the steps at which a pair was there without a break, and their number; what streaming can know.
+
+    Args:
+        values: the feature dimensions to average.
+        pairs: which pairs are there.
+        memory: mean and count before the first step; zeros for "nothing yet".
+    """
+    after = []
+    for value, present in zip(values.unbind(1), pairs[..., None].unbind(1), strict=True):
+        mean, count = memory[..., :-1], memory[..., -1:] + 1
+        memory = torch.cat([mean + (value - mean) / count, count], dim=-1) * present
+        after.append(memory)
+    return torch.stack(after, dim=1)
+
+
+def window_mean(
+    values: Float[Tensor, "batch time agents agents static"], pairs: Bool[Tensor, "batch time agents agents"]
+) -> Float[Tensor, "batch time agents agents static"]:
+    """Mean over all steps of the window at which a pair is there (the paper's pair matching); training only."""
+    present = pairs[..., None]
+    mean = (values * present).sum(1, keepdim=True) / present.sum(1, keepdim=True).clamp(min=1)
+    return mean * present
+
+
+def restricted_labelling(
+    features: Float[Tensor, "batch time agents agents feature"],
+    attributes: Float[Tensor, "batch time agents agents attributes"],
+    labelled: Bool[Tensor, "batch time agents agents"],
+) -> Float[Tensor, ""]:
+    """Mean squared error of the first feature dimensions against known edge attributes.
+
+    Args:
+        features: edge features from the past; as many of the first dimensions are used as there are attributes.
+        attributes: true values; anything where not labelled.
+        labelled: pairs with an edge whose attributes are known.
+    """
+    error = features[..., : attributes.shape[-1]] - attributes
+    return masked_mean(error.square().mean(-1), labelled)

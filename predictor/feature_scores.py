@@ -1,0 +1,219 @@
+"""Do edge features say what they should: R² of known attributes, and disentanglement (DCI, MIG), on NumPy arrays.
+
+For edges: rows are pairs (mask out pairs without an edge, whose spring constant means nothing), columns of `features`
+are the edge-feature dimensions, columns of `factors` the known attributes. R² that is negative is worse than knowing
+the mean alone. Where a number cannot be had (nothing valid, a constant target) it is None.
+
+Sources: DCI, Eastwood & Williams, "A Framework for the Quantitative Evaluation of Disentangled Representations", ICLR
+2018; MIG, Chen et al., "Isolating Sources of Disentanglement in VAEs", NeurIPS 2018 (histograms as in Locatello et al.,
+ICML 2019). `dci` needs scikit-learn (the `scores` extra).
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from predictor.errors import UserError
+
+MIN_R2 = 0.01
+"""Held-out R² from which on `dci` believes that a factor can be read."""
+
+
+def direct_r2(
+    prediction: Float[np.ndarray, "*entries"],
+    target: Float[np.ndarray, "*entries"],
+    valid: Bool[np.ndarray, "*entries"],
+) -> float | None:
+    """1 − SSE/SST of predictions as they are, nothing refitted: what restricted labelling is judged by.
+
+    Args:
+        prediction: in the target's unit.
+        target: truth.
+        valid: which entries count.
+
+    Returns:
+        None where fewer than two targets count or all are equal.
+    """
+    given, truth = prediction[valid].astype(np.float64), target[valid].astype(np.float64)
+    total = float(np.square(truth - truth.mean()).sum()) if len(truth) > 1 else 0.0
+    return 1.0 - float(np.square(truth - given).sum()) / total if total > 0 else None
+
+
+def linear_r2(
+    features: Float[np.ndarray, "*entries dims"],
+    target: Float[np.ndarray, "*entries"],
+    valid: Bool[np.ndarray, "*entries"],
+    ridge: float = 1e-3,
+    seed: int = 0,
+) -> float | None:
+    """R² of a linear read-out of all dimensions, fitted on one half and scored on the other.
+
+    The halves are drawn over the first axis, so that with (windows, receivers, senders) both directions of a spring
+    fall into the same half.
+
+    Args:
+        features: edge features.
+        target: attribute to read out.
+        valid: which entries count.
+        ridge: penalty per row on the weights of standardised features; small, for dimensions that are copies.
+        seed: of the halves.
+
+    Returns:
+        None where a half has fewer than two valid entries, or the scored half's targets are all equal.
+    """
+    order = np.random.default_rng(seed).permutation(len(valid))
+    fit, score = order[: len(order) // 2], order[len(order) // 2 :]
+    known, answers = features[fit][valid[fit]].astype(np.float64), target[fit][valid[fit]].astype(np.float64)
+    if len(answers) < 2:
+        return None
+    mean, std = known.mean(0), known.std(0)
+    scale = np.where(std > 0, std, 1.0)
+    known = (known - mean) / scale
+    weights = np.linalg.solve(
+        known.T @ known + ridge * len(known) * np.eye(known.shape[1]), known.T @ (answers - answers.mean())
+    )
+    asked = (features[score][valid[score]] - mean) / scale
+    prediction, truth = asked @ weights + answers.mean(), target[score][valid[score]]
+    return direct_r2(prediction, truth, np.ones(len(truth), dtype=np.bool_))
+
+
+@dataclass(frozen=True)
+class DCI:
+    """Disentanglement, completeness, informativeness; the first two lie between 0 and 1."""
+
+    disentanglement: float | None
+    """1 where every dimension serves one factor at most; None with one factor (it would be 1 by definition)."""
+    completeness: float | None
+    """1 where every factor is held by one dimension; None with one dimension."""
+    informativeness: float | None
+    """Mean over factors of the held-out R² of the regressor (the paper gives its error; 1 is perfect in either)."""
+    importance: list[list[float]]
+    """Of each dimension (rows) for each factor (columns); all zero where no factor can be read at all."""
+
+
+def dci(
+    features: Float[np.ndarray, "rows dims"],
+    factors: Float[np.ndarray, "rows factors"],
+    regressor: Literal["lasso", "forest"] = "lasso",
+    seed: int = 0,
+    alpha: float = 0.05,
+) -> DCI:
+    """DCI of features, with factors and features standardised; fitted on half of the rows, scored on the other.
+
+    Importance is a Lasso's absolute weight (linear relations) or a random forest's impurity decrease (any). A factor
+    that the regressor cannot read (held-out R² below `MIN_R2`) has no importances: they would be noise, and noise in
+    one place looks perfectly disentangled. Where informativeness is low, the other two mean little.
+
+    Args:
+        features: one row per pair (or whatever carries features).
+        factors: the same rows' known attributes.
+        regressor: "lasso" or "forest"; the forest takes seconds where rows are ten thousands.
+        seed: of the halves and the forest.
+        alpha: the Lasso's penalty; correlations below it count as none.
+
+    Raises:
+        UserError: scikit-learn is not installed.
+        ValueError: fewer than four rows.
+    """
+    if len(features) < 4:
+        raise ValueError(f"dci needs at least 4 rows, got {len(features)}")
+    order = np.random.default_rng(seed).permutation(len(features))
+    fit, score = order[: len(order) // 2], order[len(order) // 2 :]
+    inputs, outputs = _standardised(features, fit), _standardised(factors, fit)
+    importance = np.zeros((features.shape[1], factors.shape[1]))
+    everything = np.ones(len(score), dtype=np.bool_)
+    scores = []
+    for factor in range(factors.shape[1]):
+        model = _regressor(regressor, alpha, seed).fit(inputs[fit], outputs[fit, factor])
+        r2 = direct_r2(model.predict(inputs[score]), outputs[score, factor], everything)
+        scores.append(r2)
+        if r2 is not None and r2 >= MIN_R2:
+            importance[:, factor] = np.abs(model.coef_ if regressor == "lasso" else model.feature_importances_)
+    known = [s for s in scores if s is not None]
+    return DCI(
+        _decided(importance) if factors.shape[1] > 1 else None,
+        _decided(importance.T) if features.shape[1] > 1 else None,
+        float(np.mean(known)) if known else None,
+        importance.tolist(),
+    )
+
+
+def mig(
+    features: Float[np.ndarray, "rows dims"], factors: Float[np.ndarray, "rows factors"], bins: int = 20
+) -> float | None:
+    """Mutual information gap: how much more the best dimension says of a factor than the second, over its entropy.
+
+    Mean over factors that vary; about 1 where each is held by one dimension, 0 where two dimensions say the same or
+    none says anything; 0 to 1. One dimension alone is compared with knowing nothing. None if no factor varies.
+    """
+    information = np.sort(mutual_information(features, factors, bins), axis=0)[::-1]
+    second = information[1] if len(information) > 1 else np.zeros_like(information[0])
+    entropy = np.array([_information(label, label) for label in _labels(factors, bins).T])
+    vary = entropy > 0
+    gaps = np.clip((information[0] - second)[vary] / entropy[vary], 0.0, 1.0)
+    return float(gaps.mean()) if len(gaps) else None
+
+
+def mutual_information(
+    features: Float[np.ndarray, "rows dims"], factors: Float[np.ndarray, "rows factors"], bins: int = 20
+) -> Float[np.ndarray, "dims factors"]:
+    """Mutual information of each dimension and factor [nats], from histograms; never negative.
+
+    Bins hold equally many rows each, so that no monotone rescaling matters; values of few kinds (edge types) are their
+    own bins. Miller & Madow's correction takes off what finite samples add, (cells − rows − columns + 1) / 2n.
+    """
+    if bins < 2:
+        raise ValueError(f"bins must be at least 2, got {bins}")
+    rows, columns = _labels(features, bins).T, _labels(factors, bins).T
+    return np.array([[_information(row, column) for column in columns] for row in rows])
+
+
+def _regressor(kind: Literal["lasso", "forest"], alpha: float, seed: int) -> Any:
+    try:
+        from sklearn.ensemble import RandomForestRegressor
+        from sklearn.linear_model import Lasso
+    except ImportError as error:
+        raise UserError("dci needs scikit-learn: pip install 'dgvae-rl[scores]'") from error
+    if kind == "lasso":
+        return Lasso(alpha=alpha)
+    return RandomForestRegressor(n_estimators=50, min_samples_leaf=5, random_state=seed)
+
+
+def _standardised(values: np.ndarray, fit: np.ndarray) -> np.ndarray:
+    std = values[fit].std(0)
+    return (values - values[fit].mean(0)) / np.where(std > 0, std, 1.0)
+
+
+def _decided(importance: Float[np.ndarray, "rows columns"]) -> float:
+    """1 − entropy of each row's shares (base: number of columns), rows weighted by their importance; 0 if all is 0."""
+    total = importance.sum(1)
+    if not total.any():
+        return 0.0
+    shares = importance / np.where(total > 0, total, 1.0)[:, None]
+    entropy = -(shares * np.log(np.where(shares > 0, shares, 1.0))).sum(1) / np.log(importance.shape[1])
+    return float(((1 - entropy) * total).sum() / total.sum())
+
+
+def _labels(values: Float[np.ndarray, "rows columns"], bins: int) -> Int[np.ndarray, "rows columns"]:
+    """Bin of each value, column by column."""
+    labels = np.empty(values.shape, dtype=np.int64)
+    for column in range(values.shape[1]):
+        kinds, labels[:, column] = np.unique(values[:, column], return_inverse=True)
+        if len(kinds) > bins:
+            edges = np.quantile(values[:, column], np.linspace(0, 1, bins + 1)[1:-1])
+            labels[:, column] = np.searchsorted(edges, values[:, column], side="right")
+    return labels
+
+
+def _information(first: Int[np.ndarray, " rows"], second: Int[np.ndarray, " rows"]) -> float:
+    """Mutual information of two labels [nats]; of a label with itself its entropy."""
+    joint = np.zeros((first.max() + 1, second.max() + 1))
+    np.add.at(joint, (first, second), 1.0)
+    row, column = joint.sum(1), joint.sum(0)
+    filled = joint > 0
+    expected = np.outer(row, column)[filled] / len(first)
+    plain = float((joint[filled] * np.log(joint[filled] / expected)).sum()) / len(first)
+    excess = filled.sum() - (row > 0).sum() - (column > 0).sum() + 1
+    return max(0.0, plain - float(excess) / (2 * len(first)))

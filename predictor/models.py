@@ -1,0 +1,126 @@
+"""Every trainable forecaster by name: its config class, its network, and how a config is put together.
+
+Checkpoints, training and the suite of tables go through here, so that a new model is one line.
+"""
+
+import dataclasses
+import types
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from torch import nn
+
+from predictor.baselines.dnri import DNRI, DNRIConfig
+from predictor.baselines.imma import IMMA, IMMAConfig
+from predictor.baselines.lstm import LSTM, LSTMConfig
+from predictor.baselines.mlp import MLP, MLPConfig
+from predictor.dgvae import DGVAE, PRESETS, DGVAEConfig
+from predictor.errors import UserError
+from predictor.scene import SceneSpec
+
+ModelName = Literal["dgvae", "dnri", "imma", "lstm", "mlp"]
+
+
+@dataclass(frozen=True)
+class _Kind:
+    config: type
+    network: type
+
+
+KINDS: dict[str, _Kind] = {
+    "dgvae": _Kind(DGVAEConfig, DGVAE),
+    "dnri": _Kind(DNRIConfig, DNRI),
+    "imma": _Kind(IMMAConfig, IMMA),
+    "lstm": _Kind(LSTMConfig, LSTM),
+    "mlp": _Kind(MLPConfig, MLP),
+}
+
+
+def name_of(model: nn.Module) -> str:
+    """The name under which a model can be built again."""
+    return next(name for name, kind in KINDS.items() if type(model) is kind.network)
+
+
+def build(name: str, spec: SceneSpec, config: Any, horizon_steps: int) -> nn.Module:
+    """A network with fresh weights from torch's generator.
+
+    Raises:
+        UserError: no model of this name.
+    """
+    network: nn.Module = _kind(name).network(spec, config, horizon_steps)
+    return network
+
+
+def config_from_json(name: str, values: Mapping[str, Any]) -> Any:
+    """The config of a checkpoint.
+
+    Raises:
+        UserError: no model of this name, or a value out of range.
+        ValueError: an unknown field.
+    """
+    cls = _kind(name).config
+    unknown = set(values) - {f.name for f in dataclasses.fields(cls)}
+    if unknown:
+        raise ValueError(f"unknown field '{sorted(unknown)[0]}' of {cls.__name__}")
+    return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+
+
+def configure(name: str, preset: str, overrides: Sequence[str] = (), **fitted: Any) -> Any:
+    """A config from a preset, `field=value` overrides, and values fitted to the data.
+
+    Args:
+        name: of the model.
+        preset: "paper" or "fast"; models other than the dG-VAE have their published sizes, halved for "fast".
+        overrides: such as "hidden_dim=64".
+        fitted: fields such as `delta_scales`; an override wins.
+
+    Raises:
+        UserError: an unknown field, or a value that does not fit it.
+    """
+    cls = _kind(name).config
+    base = PRESETS[preset] if name == "dgvae" else cls()
+    if name != "dgvae" and preset == "fast":
+        widths = {f.name: getattr(base, f.name) for f in dataclasses.fields(cls) if f.name.endswith("_dim")}
+        base = dataclasses.replace(base, **{k: max(1, v // 2) for k, v in widths.items()})
+    return dataclasses.replace(base, **{**fitted, **dict(_parse(cls, text) for text in overrides)})
+
+
+def _parse(cls: type, text: str) -> tuple[str, Any]:
+    name, _, value = text.partition("=")
+    hints = get_type_hints(cls)
+    if name not in hints or not value:
+        raise UserError(f"--set takes field=value with a field of {cls.__name__} ({', '.join(hints)}), got '{text}'")
+    kind = hints[name]
+    try:
+        return name, _convert(kind, value)
+    except ValueError as error:
+        raise UserError(f"{name} of {cls.__name__} must be {_described(kind)}, got '{value}'") from error
+
+
+def _convert(kind: Any, value: str) -> Any:
+    if kind is bool:
+        if value.lower() not in ("true", "false"):
+            raise ValueError(value)
+        return value.lower() == "true"
+    if get_origin(kind) is Literal:
+        if value not in get_args(kind):
+            raise ValueError(value)
+        return value
+    if get_origin(kind) is tuple:
+        return tuple(float(v) for v in value.split(","))
+    return kind(value)
+
+
+def _described(kind: Any) -> str:
+    if get_origin(kind) is Literal:
+        return "one of " + ", ".join(get_args(kind))
+    if kind is bool:
+        return "true or false"
+    return "comma-separated numbers" if isinstance(kind, types.GenericAlias) else f"of type {kind.__name__}"
+
+
+def _kind(name: str) -> _Kind:
+    if name not in KINDS:
+        raise UserError(f"no model '{name}'; there are {', '.join(KINDS)}")
+    return KINDS[name]

@@ -1,0 +1,265 @@
+"""The paper's tables as data: which stores, which rows with which recipe, which budget, and the paper's own figures.
+
+A row is a model and what its training changes from the table's; everything else (data, steps, batch, history, horizon,
+selection) is the same for every row of a table. `predictor.suite` runs them.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from predictor.models import ModelName
+
+Budget = Literal["smoke", "cpu", "paper"]
+BURN_IN_STEPS = 40
+HORIZON_STEPS = 10
+NUM_SAMPLES = 20
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table."""
+
+    key: str
+    """Short name, for folders."""
+    name: str
+    """Name in the table."""
+    model: ModelName | Literal["constant-velocity", "least-squares"]
+    """What forecasts."""
+    set: tuple[str, ...] = ()
+    """Fields of the model's config, beyond the budget's sizes."""
+    train: dict[str, Any] = field(default_factory=dict)
+    """Fields of the training config that differ from the table's."""
+    paper: dict[str, float] = field(default_factory=dict)
+    """The paper's figures, by column: "rmse", "ade", "fde", "ood_ade", "ood_fde", "graph" [m]."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What a budget allows for one table; the same for every row."""
+
+    steps: int
+    """Optimiser steps."""
+    batch_size: int
+    """Windows per step."""
+    max_episodes: int
+    """Training episodes used; 0 is all."""
+    val_windows: int
+    """Windows for model selection."""
+    test_windows: int
+    """Windows measured, of each test store; 0 is all."""
+    eval_every: int
+    """Steps between validations."""
+    widths: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """Config fields by model; none means the sizes of the papers."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table of the paper."""
+
+    title: str
+    """Heading."""
+    train: str
+    """Training store, below the data folder."""
+    tests: dict[str, str]
+    """Test stores by what they are: "test" and, where there is one, "ood"."""
+    rows: tuple[Row, ...]
+    """In the order of the table."""
+    budgets: dict[str, Sizes]
+    """By name."""
+    val: str | None = None
+    """Validation store; None holds out training episodes."""
+    test_stride: int = 1
+    """Steps between two test windows of one episode."""
+    unit: str = "m"
+    """Of errors."""
+    commands: tuple[str, ...] = ()
+    """How the stores are made."""
+
+
+_SMALL = {
+    "dgvae": ("hidden_dim=32", "rnn_dim=32", "head_dim=48", "message_dim=48", "decoder_dim=48"),
+    "dnri": ("hidden_dim=64", "rnn_dim=32", "head_dim=64", "message_dim=64", "decoder_dim=64"),
+    "imma": ("hidden_dim=64", "rnn_dim=32", "message_dim=64", "decoder_dim=64"),
+}
+"""Quarter to half of the published widths, so that a step of either graph model takes about as long on a CPU."""
+
+_TINY = {
+    "dgvae": ("hidden_dim=12", "rnn_dim=8", "head_dim=12", "message_dim=12", "decoder_dim=12"),
+    "dnri": ("hidden_dim=12", "rnn_dim=8", "head_dim=12", "message_dim=12", "decoder_dim=12"),
+    "imma": ("hidden_dim=12", "rnn_dim=8", "message_dim=12", "decoder_dim=12"),
+}
+
+_OURS = ("innovation_rounds=1", "forget_bias=2", "residual=trapezoid", "substeps=2", "gated_messages=true")
+"""What docs/training.md found to work, beyond the paper's network."""
+_TEACHER_FORCED = {"rollout_weight": 0.0, "one_step_weight": 1.0, "likelihood": "gaussian"}
+"""How the NRI family trains: one-step likelihood under the posterior, no free run."""
+
+
+def _dgvae(key: str, name: str, features: int, *more: str, paper: dict[str, float] | None = None, **train: Any) -> Row:
+    changes = {"input_changes": True} | train
+    return Row(key, name, "dgvae", (*_OURS, f"edge_feature_dim={features}", *more), changes, paper or {})
+
+
+def _figures(rmse: float, ade: float, fde: float, ood_ade: float = 0.0, ood_fde: float = 0.0) -> dict[str, float]:
+    figures = {"rmse": rmse, "ade": ade, "fde": fde}
+    return figures | ({"ood_ade": ood_ade, "ood_fde": ood_fde} if ood_ade else {})
+
+
+_LSTM_JOINT = ("joint=true",)
+
+SPRINGS = Table(
+    title="5-Spring",
+    train="springs/train",
+    val="springs/val",
+    tests={"test": "springs/test", "ood": "springs/ood"},
+    commands=("python -m predictor.data.springs --out {data}/springs",),
+    rows=(
+        Row("constant-velocity", "constant velocity", "constant-velocity"),
+        Row("mlp", "Linear (MLP)", "mlp", paper=_figures(0.196, 0.202, 0.446, 2.158, 3.541)),
+        Row("lstm-joint", "LSTM (all agents)", "lstm", _LSTM_JOINT, paper=_figures(0.037, 0.024, 0.159, 0.406, 1.485)),
+        Row("lstm", "LSTM (per agent)", "lstm"),
+        Row("imma", "IMMA", "imma", paper=_figures(0.162, 0.176, 0.350, 1.389, 1.934)),
+        Row(
+            "dnri", "dNRI", "dnri", train=_TEACHER_FORCED,
+            paper=_figures(0.114, 0.058, 0.469, 0.379, 1.372) | {"graph": 0.877},
+        ),
+        Row("dnri-free", "dNRI, trained in free run", "dnri", ("residual=trapezoid",), {"edge_cost": 1.0}),
+        _dgvae("dvae", "dVAE (no edge features)", 0, edge_cost=5.0),
+        _dgvae("dgvae", "dG-VAE", 16, edge_cost=5.0, paper=_figures(0.019, 0.011, 0.048, 0.302, 1.063)),
+        _dgvae("dgvae-pm", "dG-VAE + pair matching", 24, "static_dim=16", edge_cost=5.0),
+        _dgvae(
+            "dgvae-rl", "dG-VAE + restricted labelling", 16, label_weight=200.0, type_label_weight=40.0,
+            paper=_figures(0.016, 0.010, 0.063, 0.309, 1.032) | {"graph": 0.984},
+        ),
+        Row("least-squares", "least squares (limit)", "least-squares"),
+    ),
+    budgets={
+        "smoke": Sizes(60, 16, 500, 100, 200, 30, _TINY),
+        "cpu": Sizes(1500, 32, 10_000, 500, 2000, 250, _SMALL),
+        "paper": Sizes(150 * 50_000 // 128, 128, 0, 2000, 0, 1000),
+    },
+)  # fmt: skip
+
+_REAL_BUDGETS = {
+    "smoke": Sizes(40, 4, 40, 20, 40, 20, _TINY),
+    "cpu": Sizes(800, 8, 0, 200, 400, 100, _SMALL),
+}
+
+
+def _real_rows(features: int, static: int, paper: dict[str, dict[str, float]]) -> tuple[Row, ...]:
+    free = ("residual=trapezoid",)
+    return (
+        Row("constant-velocity", "constant velocity", "constant-velocity"),
+        Row("mlp", "Linear (MLP)", "mlp", paper=paper.get("mlp", {})),
+        Row("lstm-joint", "LSTM (all agents)", "lstm", _LSTM_JOINT, paper=paper.get("lstm", {})),
+        Row("lstm", "LSTM (per agent)", "lstm"),
+        Row("imma", "IMMA", "imma", paper=paper.get("imma", {})),
+        Row("dnri", "dNRI", "dnri", train=_TEACHER_FORCED, paper=paper.get("dnri", {})),
+        Row("dnri-free", "dNRI, trained in free run", "dnri", free),
+        _dgvae("dgvae", "dG-VAE", features, "substeps=1", paper=paper.get("dgvae", {})),
+        _dgvae(
+            "dgvae-pm", "dG-VAE + pair matching", features, "substeps=1", f"static_dim={static}",
+            paper=paper.get("dgvae-pm", {}),
+        ),
+    )  # fmt: skip
+
+
+MOCAP = Table(
+    title="Motion capture, subjects 35 and 39",
+    train="mocap35_train",
+    val="mocap35_val",
+    tests={"test": "mocap35_test", "ood": "mocap39"},
+    test_stride=5,
+    commands=(
+        "python -m predictor.data.mocap --source CMU/35 --split train --all-phases --out {data}/mocap35_train",
+        "python -m predictor.data.mocap --source CMU/35 --split val --out {data}/mocap35_val",
+        "python -m predictor.data.mocap --source CMU/35 --split test --out {data}/mocap35_test",
+        "python -m predictor.data.mocap --source CMU/39 --split all --out {data}/mocap39",
+    ),
+    rows=_real_rows(
+        32, 16,
+        {
+            "mlp": _figures(2.726, 3.989, 4.493, 5.466, 5.750),
+            "lstm": _figures(0.208, 0.167, 0.829, 0.291, 1.398),
+            "imma": _figures(0.418, 0.583, 1.081, 1.274, 2.328),
+            "dnri": _figures(0.161, 0.145, 0.699, 0.228, 1.124),
+            "dgvae": _figures(0.068, 0.075, 0.294, 0.168, 0.790),
+            "dgvae-pm": _figures(0.088, 0.083, 0.344, 0.167, 0.786),
+        },
+    ),
+    budgets=_REAL_BUDGETS | {
+        "cpu": Sizes(500, 2, 0, 60, 300, 100, _SMALL),
+        "paper": Sizes(150 * 64, 64, 0, 200, 0, 500),
+    },
+)  # fmt: skip
+
+NBA = Table(
+    title="NBA",
+    train="nba_train",
+    tests={"test": "nba_test"},
+    commands=(
+        "python -m predictor.data.nba --source score/train --out {data}/nba_train",
+        "python -m predictor.data.nba --source score/test --out {data}/nba_test",
+    ),
+    rows=_real_rows(
+        32, 16,
+        {
+            "mlp": _figures(1.027, 1.038, 4.118),
+            "lstm": _figures(0.884, 0.830, 2.895),
+            "imma": _figures(1.036, 0.965, 2.922),
+            "dnri": _figures(1.140, 0.802, 4.080),
+            "dgvae": _figures(0.876, 0.547, 3.199),
+            "dgvae-pm": _figures(0.579, 0.381, 2.166),
+        },
+    ),
+    budgets=_REAL_BUDGETS | {"paper": Sizes(150 * 4000 // 128, 128, 0, 1000, 0, 500)},
+)  # fmt: skip
+
+
+def _crowd_rows(paper: dict[str, dict[str, float]]) -> tuple[Row, ...]:
+    """Variable N(t): without the rows that need a fixed cast."""
+    return tuple(
+        row
+        for row in _real_rows(64, 16, paper)
+        if row.key in ("constant-velocity", "lstm", "dnri", "dnri-free", "dgvae", "dgvae-pm")
+    )
+
+
+SDD = Table(
+    title="Stanford Drone Dataset",
+    train="sdd_train",
+    val="sdd_val",
+    tests={"test": "sdd_test"},
+    test_stride=5,
+    commands=tuple(
+        f"python -m predictor.data.sdd --source SDD --split {split} --out {{data}}/sdd_{split}"
+        for split in ("train", "val", "test")
+    ),
+    rows=_crowd_rows({}),
+    budgets=_REAL_BUDGETS | {"cpu": Sizes(600, 2, 0, 60, 200, 100, _SMALL), "paper": Sizes(40_000, 1, 0, 300, 0, 1000)},
+)
+
+IND = Table(
+    title="inD, out of distribution rounD",
+    train="ind_train",
+    val="ind_val",
+    tests={"test": "ind_test", "ood": "round"},
+    test_stride=5,
+    commands=(
+        "python -m predictor.data.levelx --source inD --split train --out {data}/ind_train",
+        "python -m predictor.data.levelx --source inD --split val --out {data}/ind_val",
+        "python -m predictor.data.levelx --source inD --split test --out {data}/ind_test",
+        "python -m predictor.data.levelx --source rounD --split all --out {data}/round",
+    ),
+    rows=_crowd_rows(
+        {
+            "dnri": _figures(1.080, 0.561, 4.290, 4.831, 37.077),
+            "dgvae": _figures(1.056, 0.486, 4.285, 4.958, 38.985),
+            "dgvae-pm": _figures(1.104, 0.558, 4.441, 4.384, 34.848),
+        }
+    ),
+    budgets=_REAL_BUDGETS | {"cpu": Sizes(600, 1, 0, 60, 200, 100, _SMALL), "paper": Sizes(40_000, 1, 0, 300, 0, 1000)},
+)
+
+TABLES: dict[str, Table] = {"springs": SPRINGS, "mocap": MOCAP, "nba": NBA, "sdd": SDD, "ind": IND}
