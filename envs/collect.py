@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -17,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from envs.egos import env_for_ego, make_ego
 from envs.readers import reader_for
+from envs.readers.highway_labels import ATTRIBUTE_NAMES, read_labels, with_labels
 from envs.registry import make_env
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.errors import UserError, run_entry_point
@@ -39,6 +40,9 @@ class CollectConfig:
     """Episode i is seeded with seed + i; keep test seeds apart from training seeds."""
     max_steps: int = 200
     """Cut longer episodes here [policy steps]."""
+    labels: bool = True
+    """Record who follows whom at each step, and with what gap: for training on known edges and for scores, never seen
+    by a policy. The recorded states are the same without; docs/datasets/env.md has the price in time and bytes."""
     workers: int = os.cpu_count() or 1
     """Parallel processes."""
     overwrite: bool = False
@@ -62,7 +66,7 @@ class CollectConfig:
 def collect(config: CollectConfig) -> Iterator[Episode]:
     """Record the episodes of a config, in the order of their seeds."""
     tasks = [
-        (config.env_id, config.ego[i % len(config.ego)], config.seed + i, config.max_steps)
+        _Task(config.env_id, config.ego[i % len(config.ego)], config.seed + i, config.max_steps, config.labels)
         for i in range(config.episodes)
     ]
     if config.workers == 1:
@@ -70,6 +74,14 @@ def collect(config: CollectConfig) -> Iterator[Episode]:
         return
     with multiprocessing.get_context("spawn").Pool(config.workers, initializer=_limit_threads) as pool:
         yield from pool.imap(_record, tasks, chunksize=4)
+
+
+class _Task(NamedTuple):
+    env_id: str
+    ego: str
+    seed: int
+    max_steps: int
+    labels: bool
 
 
 _worker_envs: dict[tuple[str, str], gym.Env] = {}
@@ -81,23 +93,26 @@ def _limit_threads() -> None:
     torch.set_num_threads(1)  # workers already fill the cores
 
 
-def _record(task: tuple[str, str, int, int]) -> Episode:
-    env_id, ego_name, seed, max_steps = task
-    view = ego_name if ego_name.endswith(".zip") else ""
-    if (env_id, view) not in _worker_envs:
-        _worker_envs[env_id, view] = env_for_ego(make_env(env_id, disable_env_checker=True), ego_name)
-    env = _worker_envs[env_id, view]
+def _record(task: _Task) -> Episode:
+    view = task.ego if task.ego.endswith(".zip") else ""
+    if (task.env_id, view) not in _worker_envs:
+        _worker_envs[task.env_id, view] = env_for_ego(make_env(task.env_id, disable_env_checker=True), task.ego)
+    env = _worker_envs[task.env_id, view]
     reader = reader_for(env)
     obs: Any
-    obs, _ = env.reset(seed=seed)
-    ego = make_ego(ego_name, env, np.random.default_rng(seed))
+    obs, _ = env.reset(seed=task.seed)
+    ego = make_ego(task.ego, env, np.random.default_rng(task.seed))
     scenes = [reader.read_all(env)]
-    for _ in range(max_steps):
+    labels = [read_labels(env)] if task.labels else []
+    for _ in range(task.max_steps):
         obs, _, terminated, truncated, _ = env.step(ego(obs))
         scenes.append(reader.read_all(env))
+        if task.labels:
+            labels.append(read_labels(env))
         if terminated or truncated:
             break
-    return Episode.from_scenes(scenes, label=ego_name, seed=seed)
+    episode = Episode.from_scenes(scenes, label=task.ego, seed=task.seed)
+    return with_labels(episode, scenes, labels) if task.labels else episode
 
 
 def main() -> None:
@@ -110,7 +125,10 @@ def main() -> None:
     for name in config.ego:
         make_ego(name, env_for_ego(env, name), np.random.default_rng(0))
     info = StoreInfo(
-        reader_for(env).spec, config.env_id, provenance(("highway-env", "gymnasium", "numpy")) | {"seed": config.seed}
+        reader_for(env).spec,
+        config.env_id,
+        provenance(("highway-env", "gymnasium", "numpy")) | {"seed": config.seed},
+        ATTRIBUTE_NAMES if config.labels else (),
     )
     episodes = []
     columns = (TextColumn(f"collect {config.env_id}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

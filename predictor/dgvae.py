@@ -101,8 +101,8 @@ class DGVAE(nn.Module):
         self, memory: Memory, states: Float[Tensor, "batch agents state"], valid: Bool[Tensor, "batch agents"]
     ) -> tuple[Memory, Belief]:
         """One encoder step and one decoder step under the prior's expected graph."""
-        node_before, seen = memory.nodes
-        past, logits, features = self._encode_step(states, valid, _Past(*memory.pairs, seen))
+        node_before, _ = memory.nodes
+        past, logits, features = self._encode_step(states, valid, self._past(memory))
         probs = torch.softmax(logits, dim=-1)
         node_after, next_states = self._move(states, valid, probs, features, node_before)
         internal = _Internal(past, logits, node_before, node_after, next_states)
@@ -142,8 +142,8 @@ class DGVAE(nn.Module):
         """Teacher-forced pass under the posterior and free-running roll-out under the prior, from the same encoding."""
         inputs, pairs = self.codec.inputs(states, valid), pair_mask(valid)
         memory = self.empty_memory(states.shape[0], states.shape[2])
-        node, seen = memory.nodes
-        edges, features, past = self._encode(inputs, valid, _Past(*memory.pairs, seen))
+        node, _ = memory.nodes
+        edges, features, past = self._encode(inputs, valid, self._past(memory))
         posterior = self.encoder.posterior_logits(edges, pairs)
         sampled = self._sampler(generator)(posterior)
         shown = self._match_window(edges.features, features, pairs)
@@ -166,6 +166,10 @@ class DGVAE(nn.Module):
         return WindowOutput(one_step, future, edges.prior_logits, posterior, shown)
 
     # --- Shared -------------------------------------------------------------------------------------------------
+
+    def _past(self, memory: Memory) -> _Past:
+        hidden, cell, static = memory.pairs
+        return _Past(hidden, cell, static, memory.nodes[1])
 
     def _sampler(self, generator: torch.Generator | None) -> "_Sampler":
         return _Sampler(self.config.temperature, self.config.hard_samples, generator)

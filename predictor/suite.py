@@ -28,7 +28,7 @@ from predictor.tables import BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, TABLES, 
 from predictor.train import train
 from predictor.train_config import TrainConfig
 
-TableName = Literal["springs", "mocap", "nba", "sdd", "ind"]
+TableName = Literal["springs", "recipe", "mocap", "nba", "sdd", "ind"]
 
 
 @dataclass(frozen=True)

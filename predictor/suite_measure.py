@@ -1,5 +1,6 @@
 """Measure one row of a table: accuracy in both views on every test store, the inferred graph, the edge features."""
 
+import resource
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -18,6 +19,7 @@ from predictor.errors import UserError
 from predictor.feature_scores import direct_r2, linear_r2
 from predictor.graph import pair_mask
 from predictor.graph_metrics import GraphTally
+from predictor.metrics import edge_entropy
 from predictor.outcomes import Outcome, run_windows
 from predictor.tables import BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, Row, Sizes, Table
 
@@ -32,10 +34,12 @@ def measure_row(
     stores = {kind: read_store(data / name) for kind, name in table.tests.items()}
     spec = next(iter(stores.values())).info.spec
     forecaster: Any
+    std_m: tuple[float, ...] = ()
+    parameters = 0
     if row.model == "constant-velocity":
-        forecaster, std_m, parameters = ConstantVelocity(spec, HORIZON_STEPS), (), 0
+        forecaster = ConstantVelocity(spec, HORIZON_STEPS)
     elif row.model == "least-squares":
-        forecaster, std_m, parameters = SpringLeastSquares(spec, HORIZON_STEPS), (), 0
+        forecaster = SpringLeastSquares(spec, HORIZON_STEPS)
     else:
         assert checkpoint is not None
         forecaster, info = load_checkpoint(checkpoint, device)
@@ -74,10 +78,12 @@ def _measure_store(
     chosen = test_indices(windows, table.test_stride, sizes.test_windows, seed)
     samples = NUM_SAMPLES if row.model in ("dgvae", "dnri") else 1  # the others are deterministic
     horizon_only, whole = Tally(std_m), Tally(partial_agents=True)
-    graph, features = GraphTally(forecaster.num_edge_types), _Features()
+    graph, features, entropies = GraphTally(forecaster.num_edge_types), _Features(), []
     agents = [int(store.episodes[e].valid[t].sum()) for e, t in windows.index[chosen].tolist()]
     batch = max(1, min(256, PAIR_BUDGET // (max(agents, default=1) ** 2 * samples)))
     began = time.perf_counter()
+    if device.startswith("cuda"):
+        torch.cuda.reset_peak_memory_stats()
     for outcome in run_windows(
         forecaster, windows, chosen, HORIZON_STEPS, samples, seed, batch, device,
         whole_sequence=True, keep_beliefs=True,
@@ -85,7 +91,9 @@ def _measure_store(
         whole.add(outcome)
         horizon_only.add(outcome.tail(HORIZON_STEPS))
         assert outcome.edge_probs is not None and outcome.present is not None
-        graph.add(outcome.edge_probs, _binary(outcome, forecaster.num_edge_types), pair_mask(outcome.present))
+        pairs = pair_mask(outcome.present)
+        graph.add(outcome.edge_probs, _binary(outcome, forecaster.num_edge_types), pairs)
+        entropies.append(edge_entropy(outcome.edge_probs, pairs)[0][pairs].cpu())
         if row.model in ("dgvae", "least-squares"):  # the others' features are placeholders
             features.add(outcome)
     result: dict[str, Any] = {
@@ -94,10 +102,19 @@ def _measure_store(
         "horizon_only": asdict(horizon_only.accuracy(row.name)),
         "whole_sequence": asdict(whole.accuracy(row.name)),
         "graph": asdict(graph.results()) if row.model in ("dgvae", "dnri", "least-squares") else None,
+        "prior_entropy": float(torch.cat(entropies).mean()) if row.model in ("dgvae", "dnri") else None,
         "features": features.scores(),
         "seconds": time.perf_counter() - began,
+        "peak_memory_mb": _peak_memory_mb(device),
     }
     return result
+
+
+def _peak_memory_mb(device: str) -> float:
+    """Of the accelerator since measuring began, or of this process since it started."""
+    if device.startswith("cuda"):
+        return torch.cuda.max_memory_allocated() / 2**20
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def _binary(outcome: Outcome, num_types: int) -> torch.Tensor | None:

@@ -4,8 +4,8 @@ from typing import Any
 
 VIEWS = {"horizon_only": "Horizon-only", "whole_sequence": "Whole sequence"}
 EXPLAINED = {
-    "horizon_only": "errors on the 10 future steps after a burn-in of 40, best of K = 20 samples",
-    "whole_sequence": "errors over all predicted steps of the sequence, one-step errors of the burn-in included",
+    "horizon_only": "Errors on the 10 future steps after a burn-in of 40, best of K = 20 samples",
+    "whole_sequence": "Errors over all predicted steps of the sequence, one-step errors of the burn-in included",
 }
 METRICS = {"overall_rmse_m": ("RMSE", "rmse"), "min_ade_m": ("minADE", "ade"), "min_fde_m": ("minFDE", "fde")}
 
@@ -21,7 +21,7 @@ def markdown_report(content: dict[str, Any]) -> str:
         "Mean ± standard error over 20 random subsets of the test windows. Metres. One seed per row.",
     ]
     for view, heading in VIEWS.items():
-        parts += [f"## {heading}", EXPLAINED[view].capitalize() + ".", _accuracy_table(content, view)]
+        parts += [f"## {heading}", EXPLAINED[view] + ".", _accuracy_table(content, view)]
     graph = _graph_table(content)
     if graph:
         parts += ["## Graph and edge features", graph]
@@ -93,14 +93,22 @@ def _graph_table(content: dict[str, Any]) -> str:
             test = row["tests"][kind]
             graph, scores = test["graph"] or {}, test["features"] or {}
             coverage = test["horizon_only"]["statistics"].get("coverage")
-            numbers = [graph.get("accuracy"), graph.get("f1"), graph.get("connectivity")]
+            numbers = [graph.get("accuracy"), graph.get("f1"), graph.get("connectivity"), test.get("prior_entropy")]
             numbers += [scores.get("direct_r2"), scores.get("linear_r2"), coverage and coverage["mean"]]
             cells += [_number(x) for x in numbers]
         if any(c != "–" for c in cells):
             lines.append("| " + " | ".join([row["name"], *cells]) + " |")
     if not lines:
         return ""
-    names = ["graph accuracy", "F1", "connectivity", "R² (first dimension)", "R² (linear)", "coverage of 90 %"]
+    names = [
+        "graph accuracy",
+        "F1",
+        "connectivity",
+        "prior entropy [nats]",
+        "R² (first dimension)",
+        "R² (linear)",
+        "coverage of 90 %",
+    ]
     headings = ["model", *(n if kind == "test" else f"{kind} {n}" for kind in kinds for n in names)]
     return "\n".join(["| " + " | ".join(headings) + " |", "|---|" + "---:|" * (len(headings) - 1), *lines])
 
@@ -116,4 +124,8 @@ def _size_line(content: dict[str, Any]) -> str:
         f"{kind}: {t['windows']:,} windows of {t['agents']['min']} to {t['agents']['max']} agents"
         for kind, t in (content["rows"][0]["tests"].items() if content["rows"] else ())
     ]
-    return f"Measured on {'; '.join(tests)}. Parameters (training time): {', '.join(sizes)}."
+    memory = max((t.get("peak_memory_mb", 0.0) for r in content["rows"] for t in r["tests"].values()), default=0.0)
+    return (
+        f"Measured on {'; '.join(tests)}. Parameters (training time): {', '.join(sizes)}. "
+        f"Largest memory of any row's process, training included: {memory:,.0f} MB."
+    )

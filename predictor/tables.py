@@ -143,7 +143,7 @@ SPRINGS = Table(
 
 _REAL_BUDGETS = {
     "smoke": Sizes(40, 4, 40, 20, 40, 20, _TINY),
-    "cpu": Sizes(800, 8, 0, 200, 400, 100, _SMALL),
+    "cpu": Sizes(800, 8, 0, 200, 400, 200, _SMALL),
 }
 
 
@@ -189,7 +189,7 @@ MOCAP = Table(
         },
     ),
     budgets=_REAL_BUDGETS | {
-        "cpu": Sizes(500, 2, 0, 60, 300, 100, _SMALL),
+        "cpu": Sizes(500, 2, 0, 40, 60, 125, _SMALL),
         "paper": Sizes(150 * 64, 64, 0, 200, 0, 500),
     },
 )  # fmt: skip
@@ -230,14 +230,17 @@ SDD = Table(
     title="Stanford Drone Dataset",
     train="sdd_train",
     val="sdd_val",
-    tests={"test": "sdd_test"},
+    tests={"test": "sdd_test", "crowd": "sdd_crowd"},
     test_stride=5,
-    commands=tuple(
-        f"python -m predictor.data.sdd --source SDD --split {split} --out {{data}}/sdd_{split}"
-        for split in ("train", "val", "test")
+    commands=(
+        *(
+            f"python -m predictor.data.sdd --source SDD --split {split} --dt-s 0.2 --out {{data}}/sdd_{split}"
+            for split in ("train", "val", "test")
+        ),
+        "python -m predictor.data.crowd --source {data}/sdd_test --episodes 3 --out {data}/sdd_crowd",
     ),
     rows=_crowd_rows({}),
-    budgets=_REAL_BUDGETS | {"cpu": Sizes(600, 2, 0, 60, 200, 100, _SMALL), "paper": Sizes(40_000, 1, 0, 300, 0, 1000)},
+    budgets=_REAL_BUDGETS | {"cpu": Sizes(600, 4, 0, 60, 200, 150, _SMALL), "paper": Sizes(40_000, 1, 0, 300, 0, 1000)},
 )
 
 IND = Table(
@@ -262,4 +265,50 @@ IND = Table(
     budgets=_REAL_BUDGETS | {"cpu": Sizes(600, 1, 0, 60, 200, 100, _SMALL), "paper": Sizes(40_000, 1, 0, 300, 0, 1000)},
 )
 
-TABLES: dict[str, Table] = {"springs": SPRINGS, "mocap": MOCAP, "nba": NBA, "sdd": SDD, "ind": IND}
+_PLAIN = {"edge_cost": 0.0, "input_changes": False}
+_SEES = ("forget_bias=2",)
+_INFERS = (*_SEES, "innovation_rounds=1")
+_MOVES = (*_INFERS, "residual=trapezoid", "substeps=2")
+_WHOLE = (*_MOVES, "gated_messages=true")
+
+
+def _recipe(key: str, name: str, sets: tuple[str, ...], **train: Any) -> Row:
+    return Row(key, name, "dgvae", ("edge_feature_dim=16", *sets), {"edge_cost": 5.0, "input_changes": True} | train)
+
+
+RECIPE = Table(
+    title="5-Spring: what each part of the recipe is worth",
+    train="springs/train",
+    val="springs/val",
+    tests={"test": "springs/test", "ood": "springs/ood"},
+    commands=SPRINGS.commands,
+    rows=(
+        _recipe("paper", "paper's network, teacher-forced, Gaussian", (), **_PLAIN, **_TEACHER_FORCED),
+        _recipe("free", "paper's network, free run", (), **_PLAIN),
+        _recipe("sees", "+ input changes, forget bias", _SEES, edge_cost=0.0),
+        _recipe("infers", "+ innovation", _INFERS, edge_cost=0.0),
+        _recipe("moves", "+ velocity-consistent decoding, 2 substeps", _MOVES, edge_cost=0.0),
+        _recipe("gated", "+ gated messages", _WHOLE, edge_cost=0.0),
+        _recipe("priced", "+ price of edges (5 nats)", _WHOLE),
+        _recipe("hard", "… hard samples", (*_WHOLE, "hard_samples=true")),
+        _recipe("warm-up", "… KL warm-up over half of the steps", _WHOLE, kl_warmup_steps=300),
+        _recipe("curriculum", "… free run grows over half of the steps", _WHOLE, curriculum_steps=300),
+        _recipe("sigma", "… σ = 5e-3 instead of 5e-5", _WHOLE, variance=5e-3),
+        _recipe("gaussian", "… Gaussian instead of Laplace", _WHOLE, likelihood="gaussian"),
+        _recipe("labels", "… restricted labelling", _WHOLE, label_weight=200.0, type_label_weight=40.0),
+    ),
+    budgets={
+        "smoke": Sizes(20, 8, 200, 50, 50, 20, _TINY),
+        "cpu": Sizes(600, 32, 10_000, 500, 1000, 150, _SMALL),
+        "paper": Sizes(20_000, 128, 0, 2000, 0, 1000),
+    },
+)
+
+TABLES: dict[str, Table] = {
+    "springs": SPRINGS,
+    "recipe": RECIPE,
+    "mocap": MOCAP,
+    "nba": NBA,
+    "sdd": SDD,
+    "ind": IND,
+}

@@ -77,8 +77,17 @@ def load_data(config: TrainConfig) -> TrainingData:
 
 
 def _windows(config: TrainConfig, episodes: Sequence[Episode], spec: SceneSpec, validation: bool) -> Windows:
-    least = config.val_history_steps if validation else 1
-    return Windows(episodes, spec, config.history_steps, config.horizon_steps, min_history_steps=least)
+    if not validation or config.val_history_steps == 1:
+        return Windows(episodes, spec, config.history_steps, config.horizon_steps)
+    # as in the tables: whole burn-in, whole horizon
+    return Windows(
+        episodes,
+        spec,
+        config.history_steps,
+        config.horizon_steps,
+        min_future_steps=config.horizon_steps,
+        min_history_steps=config.val_history_steps,
+    )
 
 
 def typical_change(episodes: Sequence[Episode], spec: SceneSpec, residual: Residual) -> tuple[float, ...]:

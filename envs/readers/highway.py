@@ -32,6 +32,18 @@ def is_highway_env(env: gym.Env) -> bool:
     return isinstance(env.unwrapped, AbstractEnv)
 
 
+def vehicles_of(env: gym.Env) -> list[Vehicle]:
+    """Every vehicle on the road, ego first: the rows of `HighwayReader.read_all`.
+
+    Raises:
+        ProtocolError: before the first reset.
+    """
+    road, ego = env.unwrapped.road, env.unwrapped.vehicle  # type: ignore[attr-defined]
+    if road is None or ego is None:
+        raise ProtocolError("the environment has no vehicles yet; call reset() first")
+    return [ego] + [v for v in road.vehicles if v is not ego]
+
+
 def _dt_s(config: dict[str, Any]) -> float:
     """What a policy step really simulates: whole simulation frames, rounded down."""
     frames = config["simulation_frequency"] // config["policy_frequency"]
@@ -91,24 +103,20 @@ class HighwayReader:
 
     def read_all(self, env: gym.Env) -> Scene:
         """Every vehicle on the road, ego first, unpadded: ground truth for collection and evaluation."""
-        unwrapped = env.unwrapped
-        road, ego = unwrapped.road, unwrapped.vehicle  # type: ignore[attr-defined]
-        dt_s = _dt_s(unwrapped.config)  # type: ignore[attr-defined]
+        dt_s = _dt_s(env.unwrapped.config)  # type: ignore[attr-defined]
         if dt_s != self._spec.dt_s:
             raise UserError(
                 f"the env was wrapped at dt_s={self._spec.dt_s:g} but now steps at dt_s={dt_s:g}; "
                 "pass its config to gym.make, not to reset"
             )
-        if road is None or ego is None:
-            raise ProtocolError("the environment has no vehicles yet; call reset() first")
-        vehicles = [ego] + [v for v in road.vehicles if v is not ego]
+        vehicles = vehicles_of(env)
         kinematics = np.array([(*v.position, v.speed, v.heading) for v in vehicles])
         states = np.empty((len(vehicles), len(KINEMATIC_FEATURES)))
         states[:, :2] = kinematics[:, :2]
         states[:, 2] = kinematics[:, 2] * np.cos(kinematics[:, 3])
         states[:, 3] = kinematics[:, 2] * np.sin(kinematics[:, 3])
         ids = np.array([self._identify(v) for v in vehicles], dtype=np.int64)
-        return Scene(states, ids, np.ones(len(vehicles), dtype=np.bool_), float(ego.heading))
+        return Scene(states, ids, np.ones(len(vehicles), dtype=np.bool_), float(vehicles[0].heading))
 
     def _identify(self, vehicle: Vehicle) -> int:
         number = self._ids.get(vehicle)

@@ -1,17 +1,23 @@
 """Tiny specs, models and scenes that the predictor's tests share."""
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from predictor.baselines.dnri import DNRIConfig
+from predictor.baselines.imma import IMMAConfig
+from predictor.baselines.lstm import LSTMConfig
+from predictor.baselines.mlp import MLPConfig
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.dgvae import DGVAE, DGVAEConfig
+from predictor.models import build
 from predictor.scene import PADDING_ID, AxisFrame, Scene, SceneBatch, SceneSpec
 
 WORLD: tuple[AxisFrame, AxisFrame] = ("world", "world")
@@ -41,6 +47,21 @@ RICH = replace(
     gated_messages=True,
 )
 SIZES = {"fast": FAST_LIKE, "paper": PAPER_LIKE, "rich": RICH}
+# Every kind of trainable forecaster: its name in `predictor.models`, and a small config.
+EVERY_MODEL: dict[str, tuple[str, Any]] = {
+    "dgvae": ("dgvae", FAST_LIKE),
+    "dgvae-rich": ("dgvae", RICH),
+    "dgvae-window": ("dgvae", replace(RICH, pair_matching="window", hard_samples=True, num_edge_types=3)),
+    "dnri": ("dnri", DNRIConfig(hidden_dim=9, rnn_dim=5, head_dim=8, decoder_dim=13, message_dim=11)),
+    "imma": ("imma", IMMAConfig(hidden_dim=9, rnn_dim=5, decoder_dim=13, message_dim=11)),
+    "imma-dynamic": (
+        "imma",
+        IMMAConfig(hidden_dim=9, rnn_dim=5, decoder_dim=13, message_dim=11, num_layers=3, dynamic_graph=True),
+    ),
+    "lstm": ("lstm", LSTMConfig(embed_dim=9, rnn_dim=5, residual="constant_velocity")),
+    "lstm-joint": ("lstm", LSTMConfig(joint=True, embed_dim=9, rnn_dim=5)),
+    "mlp": ("mlp", MLPConfig(hidden_dim=9, delta_scales=(0.1, 0.2, 0.3, 1 / 3))),
+}
 
 
 def spec(
@@ -72,6 +93,24 @@ def model(
         config = replace(config, residual=residual)
     torch.manual_seed(7)
     made = DGVAE(spec(frame, has_ego), config, horizon_steps)
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter.mul_(1.7)
+    return made.eval().requires_grad_(False)
+
+
+@cache
+def precise(*args: Any, **kwargs: Any) -> DGVAE:
+    """`model` in float64: a sum in another order then shows as 1e-13, and a leak as what it is."""
+    return deepcopy(model(*args, **kwargs)).double()
+
+
+@cache
+def any_model(kind: str) -> Any:
+    """One of `EVERY_MODEL`, untrained and in evaluation mode, with weights large enough to leave a trace."""
+    name, config = EVERY_MODEL[kind]
+    torch.manual_seed(7)
+    made = build(name, spec(), config, horizon_steps=3)
     with torch.no_grad():
         for parameter in made.parameters():
             parameter.mul_(1.7)

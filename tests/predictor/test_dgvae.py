@@ -16,10 +16,11 @@ from predictor.dgvae import DGVAE, DGVAEConfig, WindowOutput
 from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory
 from predictor.graph import pair_mask
-from tests.predictor.helpers import FAST_LIKE, RICH, ROAD, model, random_presence, random_states, spec
+from tests.predictor.helpers import FAST_LIKE, RICH, ROAD, model, precise, random_presence, random_states, spec
 
 BATCH, TIME, AGENTS = 2, 6, 4
 TOLERANCE = {"rtol": 0.0, "atol": 1e-5}
+EXACT = {"rtol": 0.0, "atol": 1e-9}  # in float64
 EVERY_KIND = [
     pytest.param(size, residual, types, id=f"{size}-{residual}-{types}types")
     for size, residual, types in (
@@ -60,7 +61,7 @@ def last(forecaster: DGVAE, states: Tensor, valid: Tensor) -> Belief:
 def window_without_noise(forecaster: DGVAE, states: Tensor, valid: Tensor, last_observed: Tensor) -> WindowOutput:
     """The training pass with every sampled graph replaced by the expected one."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dgvae, "concrete_sample", lambda logits, temperature, generator, hard: torch.softmax(logits, dim=-1))
+        patch.setattr(dgvae, "concrete_sample", lambda logits, *_: torch.softmax(logits, dim=-1))
         return forecaster.window(states, valid, last_observed, forecaster.horizon_steps)
 
 
@@ -187,9 +188,9 @@ PAIRWISE = {"prior", "posterior", "features", "streamed_probs", "streamed_featur
 @settings(max_examples=12)
 @given(valid=presence(), seed=seeds, padding=st.integers(1, 3))
 def test_padding_is_invisible(size: Any, frame: Any, valid: Tensor, seed: int, padding: int):
-    forecaster = model(size, num_edge_types=3, frame=frame)
-    states = random_states(seed, BATCH, TIME, AGENTS, 4)
-    garbage = 100 * random_states(seed + 1, BATCH, TIME, AGENTS + padding, 4)
+    forecaster = precise(size, num_edge_types=3, frame=frame)
+    states = random_states(seed, BATCH, TIME, AGENTS, 4).double()
+    garbage = 100 * random_states(seed + 1, BATCH, TIME, AGENTS + padding, 4).double()
     padded_valid = torch.cat([valid, torch.zeros(BATCH, TIME, padding).bool()], dim=2)
     padded_states = torch.where(padded_valid[..., None], garbage.clone(), garbage)
     padded_states[:, :, :AGENTS][valid] = states[valid]
@@ -199,29 +200,29 @@ def test_padding_is_invisible(size: Any, frame: Any, valid: Tensor, seed: int, p
         ours = padded[name][:, :, :AGENTS, :AGENTS] if name in PAIRWISE else padded[name][:, :, :AGENTS]
         if name in present:  # an absent agent has no state to speak of
             ours, expected = ours[present[name]], expected[present[name]]
-        torch.testing.assert_close(ours, expected, rtol=1e-5, atol=2e-5, msg=lambda m, n=name: f"{n}: {m}")
+        torch.testing.assert_close(ours, expected, **EXACT, msg=lambda m, n=name: f"{n}: {m}")
 
 
 @pytest.mark.parametrize("size", ["fast", "rich"])
 @settings(max_examples=12)
 @given(valid=presence(ego=False), seed=seeds, order=st.permutations(range(AGENTS)))
 def test_permuting_agents_permutes_outputs(size: Any, valid: Tensor, seed: int, order: list[int]):
-    check_permutation(model(size, num_edge_types=3, has_ego=False), valid, seed, order)
+    check_permutation(precise(size, num_edge_types=3, has_ego=False), valid, seed, order)
 
 
 @settings(max_examples=12)
 @given(valid=presence(), seed=seeds, others=st.permutations(range(1, AGENTS)))
 def test_permuting_others_around_the_ego_permutes_outputs(valid: Tensor, seed: int, others: list[int]):
-    check_permutation(model(num_edge_types=3, frame=ROAD), valid, seed, [0, *others])
+    check_permutation(precise(num_edge_types=3, frame=ROAD), valid, seed, [0, *others])
 
 
 def check_permutation(forecaster: DGVAE, valid: Tensor, seed: int, order: list[int]) -> None:
-    states = random_states(seed, BATCH, TIME, AGENTS, 4)
+    states = random_states(seed, BATCH, TIME, AGENTS, 4).double()
     plain = everything(forecaster, states, valid)
     permuted = everything(forecaster, states[:, :, order], valid[:, :, order])
     for name, values in plain.items():
         expected = values[:, :, order][:, :, :, order] if name in PAIRWISE else values[:, :, order]
-        torch.testing.assert_close(permuted[name], expected, rtol=1e-5, atol=2e-5, msg=lambda m, n=name: f"{n}: {m}")
+        torch.testing.assert_close(permuted[name], expected, **EXACT, msg=lambda m, n=name: f"{n}: {m}")
 
 
 def test_the_ego_is_not_like_the_others():
@@ -233,16 +234,16 @@ def test_the_ego_is_not_like_the_others():
 
 @pytest.mark.parametrize("padding", [0, 3])
 def test_ego_alone_is_forecast(padding: int):
-    forecaster = model(frame=ROAD)
-    states, valid = random_states(0, BATCH, TIME, 1, 4), torch.ones(BATCH, TIME, 1).bool()
+    forecaster = precise(frame=ROAD)
+    states, valid = random_states(0, BATCH, TIME, 1, 4).double(), torch.ones(BATCH, TIME, 1).bool()
     alone = everything(forecaster, states, valid)
     wide = functional.pad(states, (0, 0, 0, padding)), functional.pad(valid, (0, padding))
     for name, values in everything(forecaster, *wide).items():
         assert torch.isfinite(values).all()
         ours = values[:, :, :1, :1] if name in PAIRWISE else values[:, :, :1]
-        torch.testing.assert_close(ours, alone[name], rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(ours, alone[name], **EXACT)
     belief = last(forecaster, *wide)
-    assert torch.equal(belief.edge_probs[..., 0], torch.ones(BATCH, 1 + padding, 1 + padding))
+    assert torch.equal(belief.edge_probs[..., 0], torch.ones(BATCH, 1 + padding, 1 + padding).double())
     assert not belief.edge_features.any()
 
 
@@ -356,7 +357,7 @@ def test_samples_belong_to_their_row(belief: Belief):
     """Without noise every sample of a row is that row's own expected forecast, so rows and samples are not mixed up."""
     forecaster = model(num_edge_types=3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dgvae, "concrete_sample", lambda logits, temperature, generator, hard: torch.softmax(logits, dim=-1))
+        patch.setattr(dgvae, "concrete_sample", lambda logits, *_: torch.softmax(logits, dim=-1))
         drawn = forecaster.rollout(belief, 3, 4)
     torch.testing.assert_close(drawn, drawn[:, :1].expand_as(drawn), rtol=1e-5, atol=1e-5)
     assert not torch.allclose(drawn[0], drawn[1], atol=1.0)

@@ -1,13 +1,19 @@
 from collections.abc import Mapping
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 import pytest
 
 from predictor.errors import UserError
-from predictor.scene import KINEMATIC_FEATURES, Scene, SceneBatch, SceneSpec
+from predictor.scene import KINEMATIC_FEATURES, KINEMATIC_FEATURES_3D, Scene, SceneBatch, SceneSpec
 from tests.predictor.helpers import batch, scene
 
+IN_SPACE: dict[str, Any] = {
+    "frame": ("world", "centroid", "world"),
+    "feature_names": KINEMATIC_FEATURES_3D,
+    "feature_scales": (1.0,) * 6,
+}
 THREE = {0: (1.0, 2.0, 3.0, 4.0), 8: (5.0, 6.0, 7.0, 8.0), 3: (9.0, 10.0, 11.0, 12.0)}
 
 
@@ -20,13 +26,43 @@ THREE = {0: (1.0, 2.0, 3.0, 4.0), 8: (5.0, 6.0, 7.0, 8.0), 3: (9.0, 10.0, 11.0, 
         ({"feature_scales": (1.0, 1.0, 0.0, 1.0)}, "one positive number per feature"),
         ({"max_agents": 0}, "max_agents must be at least 1 and perception_m positive, got 0, 100.0"),
         ({"perception_m": 0.0}, "max_agents must be at least 1 and perception_m positive, got 12, 0.0"),
-        ({"frame": ("ego", "world"), "has_ego": False}, "an 'ego' frame needs has_ego=True"),
+        ({"frame": ("ego", "world"), "has_ego": False}, "an 'ego' frame needs has_ego=True; use 'world' or 'centroid'"),
+        (
+            {"frame": ("world", "world", "world")},
+            r"'ego', 'world' or 'centroid' for each of two axes, got \('world', 'world', 'world'\)",
+        ),
+        (IN_SPACE | {"frame": ("world", "world")}, r"for each of three axes, got \('world', 'world'\)"),
+        (IN_SPACE | {"feature_scales": (1.0,) * 4}, r"one positive number per feature \(6\)"),
+        (
+            {"feature_names": (*KINEMATIC_FEATURES_3D[:5], "heading_rad"), "feature_scales": (1.0,) * 6},
+            r"the first features must be \('x_m', 'y_m', 'vx_mps', 'vy_mps'\) or \('x_m', 'y_m', 'z_m', .*'heading_rad'",
+        ),
     ],
-    ids=["dt", "feature_order", "scales_short", "scales_zero", "no_agents", "blind", "ego_frame_without_ego"],
+    ids=[
+        "dt", "feature_order", "scales_short", "scales_zero", "no_agents", "blind", "ego_frame_without_ego",
+        "third_axis_in_the_plane", "two_axes_in_space", "scales_short_in_space", "half_of_space",
+    ],  # fmt: skip
 )
 def test_spec_refuses(fields: Mapping[str, object], message: str):
     with pytest.raises(UserError, match=message):
         SceneSpec(**({"dt_s": 1.0} | fields))
+
+
+def test_axes_follow_from_the_feature_names():
+    assert SceneSpec(dt_s=1.0).position_dim == 2
+    space = SceneSpec(dt_s=1.0, **IN_SPACE)
+    assert (space.position_dim, space.num_features) == (3, 6)
+    more = IN_SPACE | {"feature_names": (*KINEMATIC_FEATURES_3D, "heading_rad"), "feature_scales": (1.0,) * 7}
+    assert SceneSpec(dt_s=1.0, **more).position_dim == 3
+
+
+def test_centroid_frame_needs_no_ego():
+    assert SceneSpec(dt_s=1.0, frame=("centroid", "world"), has_ego=False).frame == ("centroid", "world")
+
+
+def test_plane_and_space_do_not_mix():
+    with pytest.raises(UserError, match=r"trained on features \('x_m', 'y_m', 'vx_mps', 'vy_mps'\) but env 'b' gives .*'z_m'"):
+        SceneSpec(dt_s=1.0).check_compatible(SceneSpec(dt_s=1.0, **IN_SPACE), "checkpoint 'a'", "env 'b'")
 
 
 def test_smallest_spec_is_accepted():

@@ -1,0 +1,124 @@
+"""Who follows whom in highway-env, read from the drivers themselves: labels for training and for scores.
+
+A vehicle driven by the intelligent driver model (IDM) brakes for the vehicle in front of it on its lane, and while it
+changes lane for the one on the lane it changes to as well. Those are its leaders. A perception system could not know
+this (nor the driver's parameters), so labels never enter an observation; scenes are read in `envs.readers.highway`.
+
+Only the longitudinal driving is labelled. A lane change also weighs the gaps on the other lane, for one frame.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import gymnasium as gym
+import numpy as np
+from highway_env.road.lane import AbstractLane
+from highway_env.road.road import LaneIndex, Road
+from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.kinematics import Vehicle
+from highway_env.vehicle.objects import RoadObject
+from jaxtyping import Float, Int
+
+from envs.readers.highway import vehicles_of
+from predictor.data.store import Episode
+from predictor.scene import Scene
+
+UNKNOWN, NO_EDGE, LEADER = -1, 0, 1
+"""Edge types: not known, the sender does not lead the receiver, the sender leads the receiver."""
+ATTRIBUTE_NAMES = ("time_gap_s", "desired_time_gap_s", "headway_m")
+"""Attributes of a leader edge: headway over the receiver's speed; the driver's own TIME_WANTED; from centre to centre
+along the lane on which the leader was found."""
+MAX_TIME_GAP_S = 10.0
+"""Longer time gaps are given as this; a receiver at rest has no other."""
+
+
+@dataclass(frozen=True)
+class SceneLabels:
+    """The edges of one instant, in the order of the rows of `HighwayReader.read_all`."""
+
+    edge_types: Int[np.ndarray, "agents agents"]
+    """int8, receiver first: LEADER, NO_EDGE or UNKNOWN. Unknown is who receives without an IDM driver (the ego), the
+    pair of an agent with itself, and all but the leaders of one that yields to an unnamed other by a crossing's rules.
+    """
+    edge_attributes: Float[np.ndarray, "agents agents attributes"]
+    """float32, named in `ATTRIBUTE_NAMES`; zeros without a leader edge."""
+
+
+def read_labels(env: gym.Env) -> SceneLabels:
+    """The edges between the vehicles that are on the road now; changes nothing in the simulation.
+
+    Obstacles are no agents: who follows one has no leader, since a driver does not react to what is beyond.
+    """
+    vehicles = vehicles_of(env)
+    row = {vehicle: i for i, vehicle in enumerate(vehicles)}
+    controlled = env.unwrapped.controlled_vehicles  # type: ignore[attr-defined]
+    types = np.full((len(vehicles), len(vehicles)), UNKNOWN, dtype=np.int8)
+    attributes = np.zeros((*types.shape, len(ATTRIBUTE_NAMES)), dtype=np.float32)
+    for receiver, vehicle in enumerate(vehicles):
+        if not isinstance(vehicle, IDMVehicle) or vehicle in controlled:
+            continue
+        if not getattr(vehicle, "is_yielding", False):
+            types[receiver] = NO_EDGE
+        for leader, headway_m in leaders_of(vehicle):
+            if leader in row:
+                time_gap_s = min(headway_m / max(vehicle.speed, 1e-6), MAX_TIME_GAP_S)
+                types[receiver, row[leader]] = LEADER
+                attributes[receiver, row[leader]] = time_gap_s, vehicle.TIME_WANTED, headway_m
+    np.fill_diagonal(types, UNKNOWN)
+    return SceneLabels(types, attributes)
+
+
+def leaders_of(vehicle: IDMVehicle) -> list[tuple[RoadObject, float]]:
+    """Whom the driver brakes for in `IDMVehicle.act`, with the headway [m]: on its lane, and on the one it changes to.
+
+    A driver that has crashed reacts to nobody.
+    """
+    if vehicle.crashed:
+        return []
+    found: list[tuple[RoadObject, float]] = []
+    for lane_index in dict.fromkeys((vehicle.lane_index, vehicle.target_lane_index)):
+        leader, _ = vehicle.road.neighbour_vehicles(vehicle, lane_index)
+        if leader is not None and all(leader is not other for other, _ in found):
+            found.append((leader, _headway_m(vehicle, leader, lane_index)))
+    return found
+
+
+def with_labels(episode: Episode, scenes: Sequence[Scene], labels: Sequence[SceneLabels]) -> Episode:
+    """The episode with the labels of its scenes, moved from the scenes' rows to the episode's columns."""
+    column = {int(agent): i for i, agent in enumerate(episode.ids)}
+    types = np.full((*episode.valid.shape, len(column)), UNKNOWN, dtype=np.int8)
+    attributes = np.zeros((*types.shape, len(ATTRIBUTE_NAMES)), dtype=np.float32)
+    for t, (scene, label) in enumerate(zip(scenes, labels, strict=True)):
+        columns = np.array([column[int(agent)] for agent in scene.ids])
+        types[t, columns[:, None], columns] = label.edge_types
+        attributes[t, columns[:, None], columns] = label.edge_attributes
+    return replace(episode, edge_types=types, edge_attributes=attributes)
+
+
+def _headway_m(vehicle: Vehicle, leader: RoadObject, lane_index: LaneIndex) -> float:
+    """Along the lane, and past its end along the one where `Road.neighbour_vehicles` found the leader.
+
+    `lane_distance_to`, which the driver takes, extends the vehicle's own lane instead: on u-turn-v1 half of it is
+    negative, since the lane is a circle and the leader beyond its end.
+    """
+    lane = vehicle.road.network.get_lane(lane_index)
+    own_m = lane.local_coordinates(vehicle.position)[0]
+    for stretch, offset_m in _stretches(vehicle.road, lane, lane_index):
+        if stretch.on_lane(leader.position, margin=1):
+            return float(stretch.local_coordinates(leader.position)[0] + offset_m - own_m)
+    raise AssertionError("neighbour_vehicles found a leader that is on none of the lanes it searches")
+
+
+def _stretches(road: Road, lane: AbstractLane, lane_index: LaneIndex) -> Iterator[tuple[AbstractLane, float]]:
+    """The lane, those after and those before it, each with where it begins, in the simulator's order of search."""
+    yield lane, 0.0
+    if not road.neighbour_vehicles_connected_lanes:
+        return
+    start, end, number = lane_index
+    for lanes in road.network.graph.get(end, {}).values():
+        if lanes:
+            yield lanes[number if number < len(lanes) else 0], lane.length
+    for roads in road.network.graph.values():
+        if roads.get(start):
+            before = roads[start][number if number < len(roads[start]) else 0]
+            yield before, -before.length

@@ -1,0 +1,103 @@
+"""Overlay recorded scenes until they hold a given number of agents: `python -m predictor.data.crowd --source STORE`.
+
+Public recordings of crowds are small or short. An overlay has as many agents as wanted, each of which really moved so;
+agents of different recordings ignore each other, so it tests what a forecaster does with many who do not matter to one
+another (and its time and memory), not how crowds behave.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from predictor.data.store import Episode, StoreInfo, read_store, write_store
+from predictor.errors import UserError, run_entry_point
+from predictor.provenance import provenance
+
+
+@dataclass(frozen=True)
+class CrowdConfig:
+    """Overlay the scenes of a store."""
+
+    source: Path
+    """Episode store without an ego."""
+    out: Path
+    """New store."""
+    agents: tuple[int, ...] = (2, 5, 10, 20, 50, 100, 150)
+    """Agents wanted at the last observed step; each number gives `episodes` episodes."""
+    episodes: int = 8
+    """Episodes for each number."""
+    steps: int = 50
+    """Of an episode; shorter ones of the source are left out."""
+    at_step: int = 39
+    """Where agents are counted: the last step of the burn-in."""
+    seed: int = 0
+    """Of the choice of scenes."""
+    overwrite: bool = False
+    """Replace an existing store."""
+
+    def check(self) -> None:
+        """Check ranges.
+
+        Raises:
+            UserError: a value that makes no sense.
+        """
+        if not self.agents or min(self.agents) < 1 or self.episodes < 1:
+            raise UserError(f"agents and episodes must be at least 1, got {self.agents}, {self.episodes}")
+        if not 0 <= self.at_step < self.steps:
+            raise UserError(f"at_step must lie between 0 and {self.steps - 1}, got {self.at_step}")
+
+
+def overlay(episodes: list[Episode], axes: int, seed: int) -> Episode:
+    """One episode with everybody of several, each recording centred on its own mean position."""
+    steps = min(len(e.states) for e in episodes)
+    parts, presence = [], []
+    for episode in episodes:
+        states, valid = episode.states[:steps].copy(), episode.valid[:steps]
+        if valid.any():
+            states[..., :axes] -= states[valid][:, :axes].mean(axis=0)
+        parts.append(states * valid[..., None])
+        presence.append(valid)
+    valid = np.concatenate(presence, axis=1)
+    label = f"{len(episodes)} scenes overlaid"
+    return Episode(np.concatenate(parts, axis=1), valid, np.arange(valid.shape[1]), label, seed)
+
+
+def make_crowds(config: CrowdConfig) -> list[Episode]:
+    """Draw scenes until each crowd is large enough.
+
+    Raises:
+        UserError: no scene of the source is long enough, or all are empty at the step that counts.
+    """
+    store = read_store(config.source)
+    if store.info.spec.has_ego:
+        raise UserError(f"{config.source} has an ego, and there can be only one; overlay stores without")
+    usable = [e for e in store.episodes if len(e.states) >= config.steps and e.valid[config.at_step].any()]
+    if not usable:
+        raise UserError(f"{config.source}: no episode has {config.steps} steps and an agent at step {config.at_step}")
+    rng = np.random.default_rng(config.seed)
+    crowds: list[Episode] = []
+    for wanted in config.agents:
+        for _ in range(config.episodes):
+            chosen: list[Episode] = []
+            while sum(int(e.valid[config.at_step].sum()) for e in chosen) < wanted:
+                chosen.append(usable[int(rng.integers(len(usable)))])
+            crowds.append(overlay(chosen, store.info.spec.position_dim, len(crowds)))
+    return crowds
+
+
+def main() -> None:
+    """Entry point."""
+    config = tyro.cli(CrowdConfig, description=__doc__)
+    config.check()
+    crowds = make_crowds(config)
+    source = read_store(config.source).info
+    made = provenance(("numpy", "zarr")) | {"overlaid": source.provenance}
+    write_store(config.out, StoreInfo(source.spec, f"{source.source}, overlaid", made), crowds, config.overwrite)
+    counts = [int(e.valid[config.at_step].sum()) for e in crowds]
+    print(f"{config.out}: {len(crowds)} episodes of {min(counts)} to {max(counts)} agents at step {config.at_step}")
+
+
+if __name__ == "__main__":
+    run_entry_point(main)
