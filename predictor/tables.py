@@ -189,7 +189,7 @@ MOCAP = Table(
         },
     ),
     budgets=_REAL_BUDGETS | {
-        "cpu": Sizes(500, 2, 0, 40, 60, 125, _SMALL),
+        "cpu": Sizes(400, 2, 0, 40, 40, 100, _SMALL),
         "paper": Sizes(150 * 64, 64, 0, 200, 0, 500),
     },
 )  # fmt: skip
