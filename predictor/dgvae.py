@@ -273,7 +273,7 @@ class DGVAE(nn.Module):
             graph = torch.softmax(logits, dim=-1) if sampler is None else sampler(logits)
             node, states = self._move(states, valid, graph, features, node)
             future.append(states)
-        return torch.stack(future, dim=2)
+        return torch.stack(future, dim=2)[:, :, :horizon_steps]
 
 
 @dataclass(frozen=True)

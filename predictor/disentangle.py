@@ -52,5 +52,6 @@ def restricted_labelling(
         attributes: true values; anything where not labelled.
         labelled: pairs with an edge whose attributes are known.
     """
-    error = features[..., : attributes.shape[-1]] - attributes
+    # masked before it is squared: the gradient of an infinite error is NaN, also times zero
+    error = torch.where(labelled[..., None], features[..., : attributes.shape[-1]] - attributes, 0.0)
     return masked_mean(error.square().mean(-1), labelled)

@@ -34,6 +34,7 @@ from predictor.feature_scores import DCI, dci, direct_r2, linear_r2, mig
 from predictor.forecaster import Belief, Forecaster
 from predictor.graph import pair_mask
 from predictor.graph_metrics import GraphAccuracy, GraphTally, graph_accuracy
+from predictor.interpret_plots import Reading
 from predictor.outcomes import run_window_batch
 from predictor.provenance import provenance, write_json
 from predictor.scene import SceneSpec
@@ -165,10 +166,11 @@ def correlations(features: Float[np.ndarray, "rows dims"], factor: Float[np.ndar
 def dealt_out(
     factor: Float[np.ndarray, " rows"], groups: Int[np.ndarray, " rows"], rng: np.random.Generator
 ) -> Float[np.ndarray, " rows"]:
-    """The factor, shuffled between groups: each group gets the values of another one, in their order.
+    """The factor, shuffled between groups: each gets another's values, read round from anywhere, in either direction.
 
     Rows of a group (an episode) are alike, and shuffling them one by one would make chance look smaller than it is.
-    Longer groups repeat the values that they get; a group that gets its own has them rotated.
+    Longer groups repeat the values that they get. Reading begins at an even row, so that both directions of a pair,
+    which stand together, stay together.
 
     Args:
         factor: what to shuffle.
@@ -177,9 +179,11 @@ def dealt_out(
     """
     _, first, group, count = np.unique(groups, return_index=True, return_inverse=True, return_counts=True)
     donor = rng.permutation(len(count))
-    turn = np.where(donor == np.arange(len(count)), rng.integers(0, count[donor]), 0)
-    place = np.arange(len(factor)) - first[group] + turn[group]
-    return factor[first[donor][group] + place % count[donor][group]]
+    begin = (2 * rng.integers(0, (count[donor] + 1) // 2))[group]
+    backwards = (rng.random(len(count)) < 0.5)[group]
+    place = np.arange(len(factor)) - first[group]
+    read = np.where(backwards, begin - 1 - place, begin + place) % count[donor][group]
+    return factor[first[donor][group] + read]
 
 
 def chance_correlation(
@@ -269,9 +273,12 @@ def separation(
 def disentanglement(
     features: Float[np.ndarray, "rows dims"], factors: Float[np.ndarray, "rows factors"], seed: int = 0
 ) -> Disentanglement:
-    """DCI (where scikit-learn is installed) and MIG."""
+    """DCI (where scikit-learn is installed) and MIG of the factors that vary."""
     if len(features) < 4:
         return Disentanglement(len(features), None, None, f"needs at least 4 edges, got {len(features)}")
+    factors = factors[:, _standardised(factors).any(axis=0)]
+    if not factors.shape[1]:
+        return Disentanglement(len(features), None, None, "no attribute varies")
     found, note = None, ""
     try:
         found = dci(features, factors, seed=seed)
@@ -388,18 +395,6 @@ class PairRows:
 
 
 @dataclass(frozen=True)
-class Reading:
-    """How a drawn graph gets the value of an attribute from the features: offset + slope × dimension."""
-
-    dimension: int
-    """Which feature."""
-    slope: float = 1.0
-    """1 where restricted labelling made the feature the attribute itself."""
-    offset: float = 0.0
-    """0 likewise."""
-
-
-@dataclass(frozen=True)
 class Findings:
     """All numbers; parts are None (or empty) where the data has no labels for them."""
 
@@ -471,7 +466,7 @@ def labelled_rows(
 def measure(
     forecaster: Forecaster,
     windows: Windows,
-    parts: Iterable[Int[np.ndarray, " some"]],
+    parts: Iterable[Int[np.ndarray, " _"]],
     names: Sequence[str] = (),
     seed: int = 0,
     device: str = "cpu",
@@ -586,7 +581,8 @@ def interpret(config: InterpretConfig) -> Findings:
         model, windows, track(parts, description="watch"), store.info.edge_attribute_names, config.seed, config.device
     )
     content = _content(config, info, store.info, findings)
-    partial = config.out.with_name(f".{config.out.name}.{uuid.uuid4().hex[:8]}.partial")
+    out = config.out.resolve()
+    partial = out.with_name(f".{out.name}.{uuid.uuid4().hex[:8]}.partial")
     partial.mkdir(parents=True)
     try:
         shown = _shown(config, model, windows, first, store.info)
@@ -594,11 +590,12 @@ def interpret(config: InterpretConfig) -> Findings:
         _draw(partial, config, content, findings, shown, graphs, info.spec)
         write_json(partial / "scores.json", content)
         (partial / "scores.md").write_text(pictures.scores_markdown(content), encoding="utf-8")
-        config.out.mkdir(exist_ok=True)
-        for name in FILES:  # a file of an earlier run that this one does not write would mislead
-            (config.out / name).unlink(missing_ok=True)
+        out.mkdir(exist_ok=True)
+        for name in FILES:
             if (partial / name).exists():
-                os.replace(partial / name, config.out / name)
+                os.replace(partial / name, out / name)
+            else:  # of an earlier run; it would mislead beside the new ones
+                (out / name).unlink(missing_ok=True)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return findings

@@ -4,21 +4,23 @@ Functions take arrays (or what scores.json holds) and return an axis, a figure o
 where things go on the page.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from predictor.graph_metrics import GraphAccuracy
 from predictor.plots import plot_scene
 
-GRAPH_QUANTILES = (0.1, 0.5, 0.9)
-"""Of graph accuracy over windows: the ones that graph.png shows."""
+GRAPH_QUANTILES = (0.0, 0.1, 0.5)
+"""Of graph accuracy over windows: the ones that graph.png shows, the least accurate first."""
 NUM_TRAJECTORIES = 4
 """Windows in trajectories.png."""
 DIMENSIONS_SHOWN = 4
@@ -26,24 +28,26 @@ DIMENSIONS_SHOWN = 4
 RIGHT, MISSED, INVENTED, TRUE = "#1f5fa8", "#c0392b", "#e08e0b", "#404040"
 WIDTHS = (1.0, 5.0)
 """Of a drawn edge [points], from the smallest true value to the largest."""
+ROAD_RATIO = 6.0
+"""Length over width from which a scene is drawn stretched: to scale, a road is a line."""
 MAX_NUMBERED = 9
 """Agents up to which drawn edges bear numbers."""
+MAX_NAMED = 40
+"""Agents up to which matrices bear names."""
+CROWD, SAMPLES_IN_CROWD = 12, 5
+"""From how many agents on fewer samples are drawn, and how many."""
 
 
-class Reads(Protocol):
-    """How a value is read off the features: offset + slope × dimension (`predictor.interpret.Reading`)."""
+@dataclass(frozen=True)
+class Reading:
+    """How a drawn graph gets the value of an attribute from the features: offset + slope × dimension."""
 
-    @property
-    def dimension(self) -> int:
-        """Which feature."""
-
-    @property
-    def slope(self) -> float:
-        """1 for the feature as it is."""
-
-    @property
-    def offset(self) -> float:
-        """0 likewise."""
+    dimension: int
+    """Which feature."""
+    slope: float = 1.0
+    """1 where restricted labelling made the feature the attribute itself."""
+    offset: float = 0.0
+    """0 likewise."""
 
 
 @dataclass(frozen=True)
@@ -101,42 +105,34 @@ def plot_graph(
         places: of the agents.
         edges: receiver first.
         names: of the agents.
-        values: numbers on the edges.
+        values: numbers on the edges; among arrows, of which there may be many, on those alone that are true.
         truth: right, missed (dotted) and invented edges get their own colour; None draws all in one.
         value_range: values that get the thinnest and the thickest line.
     """
     both = edges if truth is None else edges | truth
     directed = not np.array_equal(both, both.T) or not np.array_equal(edges, edges.T)
-    numbered = values is not None and len(places) <= MAX_NUMBERED
     for receiver, sender in np.argwhere(both):
         if not directed and receiver > sender:
             continue
-        color, missed = TRUE, False
-        if truth is not None:
-            missed = not edges[receiver, sender]
-            color = MISSED if missed else RIGHT if truth[receiver, sender] else INVENTED
+        missed = not edges[receiver, sender]
+        real = truth is None or bool(truth[receiver, sender])
+        color = TRUE if truth is None else MISSED if missed else RIGHT if real else INVENTED
         width = 1.5
-        if values is not None and not missed:
+        if values is not None and not missed and (real or not directed):
             share = (values[receiver, sender] - value_range[0]) / max(value_range[1] - value_range[0], 1e-12)
             width = WIDTHS[0] + (WIDTHS[1] - WIDTHS[0]) * float(np.clip(share, 0, 1))
-        style = ":" if missed else "-"
-        start, end = places[sender], places[receiver]
+            if len(places) <= MAX_NUMBERED:
+                x, y = places[sender] + (places[receiver] - places[sender]) * (0.5 if len(places) % 2 else 0.4)
+                box = {"boxstyle": "round,pad=0.12", "fc": "white", "ec": "none"}
+                number = f"{values[receiver, sender]:.2f}"
+                ax.text(x, y, number, fontsize=8.5, color=color, ha="center", va="center", bbox=box, zorder=2)
+        style: dict[str, Any] = {"color": color, "lw": width, "ls": ":" if missed else "-"}
         if directed:
-            ax.annotate(
-                "", end, start, zorder=1,
-                arrowprops={"arrowstyle": "-|>", "color": color, "lw": width, "ls": style, "shrinkA": 9, "shrinkB": 9,
-                            "connectionstyle": "arc3,rad=0.12"},
-            )  # fmt: skip
+            style |= {"arrowstyle": "-|>", "shrinkA": 10, "shrinkB": 10, "connectionstyle": "arc3,rad=0.12"}
+            ax.annotate("", places[receiver], places[sender], arrowprops=style, zorder=1.5 if real else 1)
         else:
-            ax.plot(*np.stack([start, end]).T, color=color, lw=width, ls=style, zorder=1)
-        if numbered and not missed:
-            assert values is not None
-            middle = start + (end - start) * (0.5 if len(places) % 2 else 0.4)
-            box = {"boxstyle": "round,pad=0.12", "fc": "white", "ec": "none", "alpha": 0.85}
-            number = f"{values[receiver, sender]:.2f}"
-            x, y = middle.tolist()
-            ax.text(x, y, number, fontsize=7.5, color=color, ha="center", va="center", bbox=box, zorder=2)
-    ax.scatter(places[:, 0], places[:, 1], s=210, color="white", edgecolors="black", zorder=3)
+            ax.plot(*places[[sender, receiver]].T, zorder=1, **style)
+    ax.scatter(places[:, 0], places[:, 1], s=290, color="white", edgecolors="black", zorder=3)
     for (x, y), name in zip(places.tolist(), names, strict=True):
         ax.text(x, y, name, fontsize=8, ha="center", va="center", zorder=4)
     return ax
@@ -144,15 +140,17 @@ def plot_graph(
 
 def graphs_figure(
     windows: Sequence[WindowShown],
-    reading: Reads | None,
+    reading: Reading | None,
     attribute_names: Sequence[str],
     graph: GraphAccuracy,
     where: str,
     on_circle: bool = True,
 ) -> Figure:
     """True graphs above, inferred ones below; one column per window."""
-    figure = Figure(figsize=(4.3 * len(windows), 8.6), layout="constrained")
+    figure = Figure(figsize=(4.3 * len(windows), 8.4), layout="constrained")
     axes = figure.subplots(2, len(windows), squeeze=False)
+    every = [w.types > 0 for w in windows if w.types is not None]
+    symmetric = any(edges.any() for edges in every) and all(np.array_equal(edges, edges.T) for edges in every)
     for column, window in enumerate(windows):
         assert window.types is not None
         there = window.history_valid[-1]
@@ -163,7 +161,6 @@ def graphs_figure(
         if reading is not None and window.attributes is not None:
             true_values = window.attributes[..., 0][among]
             inferred = reading.offset + reading.slope * window.features[-1, ..., reading.dimension][among]
-        symmetric = np.array_equal(truth, truth.T)
         if symmetric:  # one line per pair: the mean of both directions
             prob = (prob + prob.T) / 2
             inferred = None if inferred is None else (inferred + inferred.T) / 2
@@ -185,10 +182,12 @@ def graphs_figure(
         )
         for ax in axes[:, column]:
             _frame(ax, on_circle)
+    commoner = None if graph.true_connectivity is None else max(graph.true_connectivity, 1 - graph.true_connectivity)
     figure.legend(handles=_edge_legend(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     figure.suptitle(
-        f"{where}: accuracy {graph.accuracy:.3f} over all ordered pairs (saying 'edge' everywhere: "
-        f"{graph.true_connectivity:.3f})\nnumbers and widths: {_value_name(reading, attribute_names)}",
+        f"{where}: accuracy {_plain(graph.accuracy)} over all ordered pairs (always giving the commoner answer: "
+        f"{_plain(commoner)})\nnumbers and widths: {_value_name(reading, attribute_names)}"
+        + ("" if on_circle else "; arrows go from sender to receiver"),
         fontsize=10,
     )
     return figure
@@ -196,10 +195,10 @@ def graphs_figure(
 
 def _percentile(column: int) -> str:
     quantile = GRAPH_QUANTILES[column]
-    return "median" if quantile == 0.5 else f"{100 * quantile:.0f}th percentile"
+    return {0.0: "least accurate", 0.5: "median"}.get(quantile, f"{100 * quantile:.0f}th percentile")
 
 
-def _value_name(reading: Reads | None, names: Sequence[str]) -> str:
+def _value_name(reading: Reading | None, names: Sequence[str]) -> str:
     if reading is None or not names:
         return "the model's probability of an edge (truth: none)"
     if (reading.slope, reading.offset) == (1.0, 0.0):
@@ -210,7 +209,7 @@ def _value_name(reading: Reads | None, names: Sequence[str]) -> str:
 def _frame(ax: Axes, on_circle: bool) -> None:
     if on_circle:
         ax.set_aspect("equal")
-        ax.set(xlim=(-1.25, 1.25), ylim=(-1.25, 1.25))
+        ax.set(xlim=(-1.15, 1.15), ylim=(-1.1, 1.15))
         ax.set_axis_off()
         return
     ax.margins(0.12, 0.25)
@@ -232,15 +231,26 @@ def _edge_legend() -> list[Line2D]:
 
 
 def plot_matrix(
-    ax: Axes, matrix: Float[np.ndarray, "agents agents"], limits: tuple[float, float], names: Sequence[str]
+    ax: Axes,
+    matrix: Float[np.ndarray, "agents agents"],
+    limits: tuple[float, float],
+    names: Sequence[str],
+    crossed: Bool[np.ndarray, "agents agents"] | None = None,
 ) -> Axes:
-    """Receivers × senders as a heat map; NaN (no pair, no edge) is grey."""
+    """Receivers × senders as a heat map; NaN (no pair, no edge) is grey; `crossed` pairs bear a small cross."""
     ax.set_facecolor("0.85")
     low, high = limits
-    ax.imshow(np.ma.masked_invalid(matrix), vmin=low, vmax=high if high > low else low + 1e-6, cmap="viridis")
-    size = 8 if len(names) <= 12 else 4.5
-    ax.set_xticks(range(len(names)), names, fontsize=size, rotation=90 if max(map(len, names)) > 2 else 0)
-    ax.set_yticks(range(len(names)), names, fontsize=size)
+    if high - low <= 1e-6 * max(1.0, abs(low), abs(high)):  # flat: no contrast out of float noise
+        low, high = low - 0.5, high + 0.5
+    ax.imshow(np.ma.masked_invalid(matrix), vmin=low, vmax=high, cmap="viridis")
+    few = len(names) <= 12
+    if crossed is not None:
+        receivers, senders = np.nonzero(crossed)
+        ax.plot(senders, receivers, ls="", marker="x", color="white", ms=5 if few else 1.5, mew=1.0 if few else 0.4)
+    if len(names) <= MAX_NAMED:
+        size = 8 if few else 5.5
+        ax.set_xticks(range(len(names)), names, fontsize=size, rotation=90 if max(map(len, names)) > 3 else 0)
+        ax.set_yticks(range(len(names)), names, fontsize=size)
     return ax
 
 
@@ -251,30 +261,37 @@ def features_figure(
     there = window.history_valid[-1]
     among = np.ix_(there, there)
     names = [name for name, present in zip(window.names, there, strict=True) if present]
-    steps = {0: "first step", len(window.features) - 1: f"last step ({(len(window.features) - 1) * dt_s:.3g} s later)"}
+    last, dims = len(window.features) - 1, window.features.shape[-1]
+    steps = {0: "first step", last: f"last step, {last * dt_s:.3g} s later"}
     matrices = {step: np.where(window.pairs[step, ..., None], window.features[step], np.nan)[among] for step in steps}
-    dims = window.features.shape[-1]
     blocks: list[tuple[str, range]] = []
     if static_dim:
-        blocks.append((f"static: dimensions 0–{static_dim - 1} are averaged over the past", range(static_dim)))
+        title = f"static (pair matching): features 0 to {static_dim - 1}, averaged over the past"
+        blocks.append((title, range(static_dim)))
     if static_dim < dims:
-        held = "free to change at every step"
-        blocks.append((f"dynamic: dimensions {static_dim}–{dims - 1} are {held}", range(static_dim, dims)))
+        title = f"dynamic: features {static_dim} to {dims - 1}, free to change at every step"
+        blocks.append((title, range(static_dim, dims)))
     truths = _true_matrices(window, attribute_names)
-    side = float(np.clip(0.14 * len(names), 2.0, 4.4))
-    columns = DIMENSIONS_SHOWN + len(truths)
+    side = float(np.clip(0.14 * len(names), 2.2, 4.4))
+    columns = min(DIMENSIONS_SHOWN, max(len(block) for _, block in blocks)) + len(truths)
     figure = Figure(
-        figsize=(1.0 + 1.18 * side * columns, len(blocks) * (2.15 * side + 0.9) + 0.7), layout="constrained"
+        figsize=(0.6 + 1.15 * side * columns, len(blocks) * (2.35 * side + 1.1) + 0.8), layout="constrained"
     )
     figure.suptitle(
-        f"Edge features, {where}, {window.place}\nrow: receiver (who is influenced); column: sender; grey: no pair"
-        + (", or no edge in the true matrices" if truths else ""),
-        fontsize=11,
+        f"Edge features: {where}, {window.place}\nrow: receiver (who is influenced), column: sender; grey: no pair"
+        + (", or in the truth no edge" if truths else "")
+        + "; cross: no edge inferred, so the feature is hardly used",
+        fontsize=10,
     )
+    silent = (window.edge_prob <= 0.5)[among] & window.pairs[-1][among]
     parts = figure.subfigures(len(blocks), 1, squeeze=False)[:, 0]
     for (title, block), part in zip(blocks, parts, strict=True):
         part.suptitle(title, fontsize=11, fontweight="bold")
-        _feature_block(part, block[:DIMENSIONS_SHOWN], matrices, steps, names, truths)
+        axes = part.subplots(len(steps), columns, squeeze=False)
+        _feature_block(part, axes, block[:DIMENSIONS_SHOWN], matrices, steps, names, silent)
+        _truth_columns(part, axes[:, columns - len(truths) :], truths, names)
+        for ax in axes.flat:
+            ax.set_axis_off() if not ax.images else None
     return figure
 
 
@@ -296,33 +313,41 @@ def _true_matrices(window: WindowShown, names: Sequence[str]) -> dict[str, np.nd
 
 
 def _feature_block(
-    part: SubFigure | Figure,
+    part: Any,
+    axes: Any,
     dimensions: range,
     matrices: dict[int, np.ndarray],
     steps: dict[int, str],
     names: Sequence[str],
-    truths: dict[str, np.ndarray],
+    silent: Bool[np.ndarray, "agents agents"],
 ) -> None:
-    axes = part.subplots(2, DIMENSIONS_SHOWN + len(truths), squeeze=False)
-    for row, (step, label) in enumerate(steps.items() if len(steps) == 2 else [*steps.items()] * 2):
-        for column, dimension in enumerate(dimensions):
+    """One column per dimension, one row per step, one scale per column."""
+    for column, dimension in enumerate(dimensions):
+        both = np.stack([matrix[..., dimension] for matrix in matrices.values()])
+        limits = (float(np.nanmin(both)), float(np.nanmax(both)))
+        for row, (step, label) in enumerate(steps.items()):
             ax = axes[row, column]
-            both = np.stack([m[..., dimension] for m in matrices.values()])
-            limits = (float(np.nanmin(both)), float(np.nanmax(both)))
-            plot_matrix(ax, matrices[step][..., dimension], limits, names)
-            ax.set_title(f"feature {dimension}, {label}", fontsize=9)
-            if row:
-                part.colorbar(ax.images[0], ax=axes[:, column], shrink=0.6, pad=0.02).ax.tick_params(labelsize=7)
-    for column, (name, matrix) in enumerate(truths.items(), DIMENSIONS_SHOWN):
-        ax = axes[1, column]
+            plot_matrix(ax, matrices[step][..., dimension], limits, names, silent if row == len(steps) - 1 else None)
+            ax.set_title(f"feature {dimension}" if not row else "", fontsize=10)
+            ax.set_ylabel(label if not column else "", fontsize=10)
+        _scale(part, axes[:, column])
+
+
+def _truth_columns(part: Any, axes: Any, truths: dict[str, np.ndarray], names: Sequence[str]) -> None:
+    """The truth at the last step, beside the features there."""
+    for column, (name, matrix) in zip(axes.T, truths.items(), strict=True):
         finite = matrix[np.isfinite(matrix)]
         limits = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
-        plot_matrix(ax, matrix, limits, names)
-        ax.set_title(f"truth: {name}", fontsize=9, color="darkgreen")
-        part.colorbar(ax.images[0], ax=axes[:, column], shrink=0.6, pad=0.02).ax.tick_params(labelsize=7)
-    for ax in axes.flat:
-        if not ax.images:
-            ax.set_axis_off()
+        plot_matrix(column[-1], matrix, limits, names)
+        column[-1].set_title(f"truth: {name}", fontsize=10, color="darkgreen")
+        _scale(part, column)
+
+
+def _scale(part: Any, column: Any) -> None:
+    bar = part.colorbar(column[-1].images[0], ax=column, location="bottom", shrink=0.8, pad=0.02, aspect=25)
+    bar.ax.tick_params(labelsize=7)
+    bar.locator = MaxNLocator(4)
+    bar.update_ticks()
 
 
 # --- Forecasts --------------------------------------------------------------------------------------------------------
@@ -331,36 +356,45 @@ def _feature_block(
 def trajectories_figure(windows: Sequence[WindowShown], feature_names: Sequence[str], where: str) -> Figure:
     """Samples beside the truth; three axes are seen along the one with the least variance."""
     axes_shown = shown_axes(np.concatenate([w.history[w.history_valid] for w in windows]))
+    past = 1 + windows[0].future.shape[1]  # as long as the forecast; more hides it
+    extents = [np.ptp(w.history[-past:][w.history_valid[-past:]][:, axes_shown], axis=0) for w in windows]
+    longest = np.max(extents, axis=0)
+    on_road = longest[0] > ROAD_RATIO * longest[1]
     figure = Figure(figsize=(11, 9), layout="constrained")
-    for ax, window in zip(
-        figure.subplots(2, 2).flat, [*windows, *[None] * (NUM_TRAJECTORIES - len(windows))], strict=True
-    ):
+    panels = figure.subplots(len(windows), 1, squeeze=False) if on_road else figure.subplots(2, 2)
+    names = [feature_names[axis].removesuffix("_m") for axis in axes_shown]
+    drawn = min(len(windows[0].forecast), SAMPLES_IN_CROWD if windows[0].future.shape[0] > CROWD else 1_000)
+    for ax, window in itertools.zip_longest(panels.flat, windows):
         if window is None:
             ax.set_axis_off()
             continue
         plot_scene(
             ax,
-            window.history[..., axes_shown],
-            window.history_valid,
-            window.forecast[..., axes_shown],
+            window.history[-past:, :, axes_shown],
+            window.history_valid[-past:],
+            window.forecast[:drawn][..., axes_shown],
             window.future[..., axes_shown],
             window.future_valid,
         )
-        names = [feature_names[axis].removesuffix("_m") for axis in axes_shown]
         ax.set_xlabel(f"{names[0]} [m]")
-        ax.set_ylabel(f"{names[1]} [m]")
+        ax.set_ylabel(f"{names[1]} [m]" + (f", not to {names[0]}'s scale" if on_road else ""))
+        if on_road:
+            ax.set_aspect("auto")
+            ax.margins(0.02, 0.2)
         ax.set_title(f"{window.place}{_error(window)}", fontsize=10)
     view = "" if windows[0].history.shape[-1] == 2 else "; seen along the axis that varies least"
-    samples = len(windows[0].forecast)
     figure.suptitle(
-        f"{where}\nhistory solid (square: now), {samples} forecasts dashed, truth thin black{view}", fontsize=11
+        f"{where}\nlast {min(past, len(windows[0].history))} observed steps solid (square: now), "
+        f"{drawn} forecast{'s' * (drawn > 1)} dashed, truth thin black{view}",
+        fontsize=11,
     )
     return figure
 
 
 def shown_axes(positions: Float[np.ndarray, "points axes"]) -> list[int]:
-    """The two axes with the largest variance, in their own order."""
-    return sorted(np.argsort(-positions.var(axis=0), kind="stable")[:2].tolist())
+    """The plane that is drawn: x and y, or of three axes the two with the largest variance, the larger one flat."""
+    axes: list[int] = np.argsort(-positions.var(axis=0), kind="stable")[:2].tolist()
+    return axes if positions.shape[1] > 2 else [0, 1]
 
 
 def _error(window: WindowShown) -> str:
@@ -369,7 +403,7 @@ def _error(window: WindowShown) -> str:
     if not whole.any():
         return ""
     distance = np.linalg.norm(window.forecast - window.future, axis=-1).mean(axis=-1)[:, whole]
-    return f"; minADE {distance.min(axis=0).mean():.3g} m, first sample {distance[0].mean():.3g} m"
+    return f"; error: best of {len(distance)} {distance.min(axis=0).mean():.3g} m, first {distance[0].mean():.3g} m"
 
 
 # --- Table ------------------------------------------------------------------------------------------------------------
@@ -456,8 +490,8 @@ def _graph_lines(content: dict[str, Any]) -> str:
 def _disentanglement_lines(content: dict[str, Any]) -> str:
     found = content["disentanglement"]
     lines = [
-        f"* MIG {_plain(found['mig'])} over {found['rows']} true edges (1: each attribute is held by one dimension alone, "
-        "0: by none, or by two alike)"
+        f"* MIG {_plain(found['mig'])} over {found['rows']} true edges (1: each attribute is held by one dimension "
+        "alone, 0: by none, or by two alike)"
     ]
     if found["dci"] is not None:
         dci = found["dci"]

@@ -135,7 +135,7 @@ def concrete_sample(
     if not hard:
         return soft
     one_hot = torch.zeros_like(soft).scatter_(-1, soft.argmax(-1, keepdim=True), 1.0)
-    return one_hot + soft - soft.detach()
+    return one_hot + (soft - soft.detach())
 
 
 def _head(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
@@ -194,14 +194,14 @@ class Encoder(nn.Module):
         embedding = self.embed_edges(inputs, pairs)
         correct = self._correction(inputs, pairs) if self.config.innovation_rounds else None
         gates = self.forward_input(embedding)
-        hiddens, cells = _masked_lstm(gates, self.forward_hidden, pairs, hidden, cell, correct=correct)
+        hiddens, cells = masked_lstm(gates, self.forward_hidden, pairs, hidden, cell, correct=correct)
         past = self.dropout(functional.elu(hiddens))
         present = pairs[..., None]
         if self.config.edge_feature_dim:
             features = self.feature_head(past) * present
         else:
             features = past.new_zeros(*pairs.shape, 0)
-        return Edges(hiddens, cells, _no_edge_where_absent(self.prior_head(past), present), features, embedding)
+        return Edges(hiddens, cells, no_edge_where_absent(self.prior_head(past), present), features, embedding)
 
     def _correction(self, inputs: Tensor, pairs: Tensor) -> Callable[[int, Tensor], Tensor]:
         regressors, targets = self.innovation.prepare(inputs, pairs)
@@ -219,18 +219,21 @@ class Encoder(nn.Module):
         """Logits that have seen the future; training only."""
         zeros = torch.zeros_like(edges.hidden[:, 0])
         gates = self.backward_input(edges.embedding)
-        backward, _ = _masked_lstm(gates, self.backward_hidden, pairs, zeros, zeros, reverse=True)
+        backward, _ = masked_lstm(gates, self.backward_hidden, pairs, zeros, zeros, reverse=True)
         both = self.dropout(functional.elu(torch.cat([edges.hidden, backward], dim=-1)))
-        return _no_edge_where_absent(self.posterior_head(both), pairs[..., None])
+        return no_edge_where_absent(self.posterior_head(both), pairs[..., None])
 
 
-def _no_edge_where_absent(logits: Tensor, present: Tensor) -> Tensor:
+def no_edge_where_absent(
+    logits: Float[Tensor, "*batch types"], present: Bool[Tensor, "*batch 1"]
+) -> Float[Tensor, "*batch types"]:
+    """The same, with certainty of "no edge" for pairs that are not there."""
     absent = torch.full_like(logits, -1e4)
     absent[..., 0] = 0.0
     return torch.where(present, logits, absent)
 
 
-def _masked_lstm(
+def masked_lstm(
     gates: Float[Tensor, "batch time agents agents gates"],
     recurrent: nn.Linear,
     pairs: Bool[Tensor, "batch time agents agents"],
@@ -239,9 +242,21 @@ def _masked_lstm(
     reverse: bool = False,
     correct: Callable[[int, Tensor], Tensor] | None = None,
 ) -> tuple[Float[Tensor, "batch time agents agents rnn"], Float[Tensor, "batch time agents agents rnn"]]:
+    """An LSTM for each pair, from gate inputs of all steps; a pair that is not there has its memory set to zero.
+
+    Args:
+        gates: input share of the gates (input, forget, cell, output).
+        recurrent: hidden state to gates.
+        pairs: which pairs are there.
+        hidden: before the first step (after the last one, if reversed).
+        cell: likewise.
+        reverse: run from the last step to the first.
+        correct: what else to add to the gates, given the step and the hidden state before it.
+    """
     hiddens, cells = [], []
     # unbind, not [:, t]: the gradient of an index is a full-size tensor of zeros for every step
     steps = list(zip(gates.unbind(1), pairs[..., None].unbind(1), strict=True))
+    assert correct is None or not reverse  # corrections know the steps in their order only
     for t, (gate, present) in enumerate(reversed(steps) if reverse else steps):
         gate = gate + recurrent(hidden)
         if correct is not None:

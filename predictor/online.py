@@ -96,8 +96,9 @@ class OnlineForecaster:
         steps = horizon_steps or self.forecaster.horizon_steps
         states = self.forecaster.rollout(belief, steps, num_samples, generator)
         # float32 relative to the ego: the origin that observe() removed is the ego's own position on "ego" axes
-        ego_now = belief.states[:, None, :1, None, :2]
-        xy = (states[..., :2] - ego_now) * belief.valid[:, None, :, None, None]
+        axes = self.forecaster.spec.position_dim
+        ego_now = belief.states[:, None, :1, None, :axes]
+        xy = (states[..., :axes] - ego_now) * belief.valid[:, None, :, None, None]
         missing = self._ids.shape[1] - belief.valid.shape[1]
         probs = functional.pad(belief.edge_probs, (0, 0, 0, missing, 0, missing))
         probs[..., 0] = 1 - probs[..., 1:].sum(-1)  # padded pairs have no edge, as other absent ones
@@ -120,7 +121,8 @@ class OnlineForecaster:
             memory = memory.reorder(torch.from_numpy(source).to(self.device), torch.from_numpy(known).to(self.device))
         # float64 until the ego's position is off: a scene 10 km down the road loses no precision
         local = scenes.states[:, :agents].copy()
-        local[..., :2] -= local[:, :1, :2] * self._ego_axes
+        axes = len(self._ego_axes)
+        local[..., :axes] -= local[:, :1, :axes] * self._ego_axes
         states = torch.from_numpy((local * valid[..., None]).astype(np.float32)).to(self.device)
         memory, self._belief = self.forecaster.observe(memory, states, torch.from_numpy(valid).to(self.device))
         return memory.padded(ids.shape[1]), ids

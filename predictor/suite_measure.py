@@ -53,7 +53,7 @@ def measure_row(
     return {"parameters": parameters, "tests": results}
 
 
-def test_indices(windows: Windows, stride: int, limit: int, seed: int) -> np.ndarray:
+def protocol_indices(windows: Windows, stride: int, limit: int, seed: int) -> np.ndarray:
     """Windows that end their burn-in at every `stride`-th step of an episode; `limit` of them, drawn evenly."""
     chosen = np.flatnonzero((windows.index[:, 1] - (BURN_IN_STEPS - 1)) % stride == 0)
     if limit and len(chosen) > limit:
@@ -75,7 +75,7 @@ def _measure_store(
         windows = Windows(store.episodes, store.info.spec, BURN_IN_STEPS, HORIZON_STEPS, HORIZON_STEPS, BURN_IN_STEPS)
     except UserError as error:
         raise UserError(f"test store of '{store.info.source}' fits no window of the protocol: {error}") from error
-    chosen = test_indices(windows, table.test_stride, sizes.test_windows, seed)
+    chosen = protocol_indices(windows, table.test_stride, sizes.test_windows, seed)
     samples = NUM_SAMPLES if row.model in ("dgvae", "dnri") else 1  # the others are deterministic
     horizon_only, whole = Tally(std_m), Tally(partial_agents=True)
     graph, features, entropies = GraphTally(forecaster.num_edge_types), _Features(), []

@@ -53,6 +53,7 @@ def load_data(config: TrainConfig) -> TrainingData:
     spec = stores[0].info.spec
     for path, store in zip((*config.data, *config.val_data), stores, strict=True):
         spec.check_compatible(store.info.spec, f"store {config.data[0]}", f"store {path}")
+    _check_labels(config, stores)
     sources = tuple(s.info.source for s in stores[: len(config.data)])
     if config.val_data:
         cut = len(config.data)
@@ -74,6 +75,14 @@ def load_data(config: TrainConfig) -> TrainingData:
         val.append(_windows(config, [store.episodes[i] for i in held_out], spec, validation=True))
         episodes += mine
     return TrainingData(spec, sources, train, val, episodes)
+
+
+def _check_labels(config: TrainConfig, stores: Sequence[EpisodeStore]) -> None:
+    """Weights of labels need labels in every training store; without this they would silently do nothing."""
+    for option, name in (("label_weight", "edge_attributes"), ("type_label_weight", "edge_types")):
+        for path, store in zip(config.data, stores, strict=False):
+            if getattr(config, option) and any(getattr(e, name) is None for e in store.episodes[:1]):
+                raise UserError(f"{option} needs {name}, and store {path} has none; set it to 0 or use labelled data")
 
 
 def _windows(config: TrainConfig, episodes: Sequence[Episode], spec: SceneSpec, validation: bool) -> Windows:

@@ -7,15 +7,12 @@ this (nor the driver's parameters), so labels never enter an observation; scenes
 Only the longitudinal driving is labelled. A lane change also weighs the gaps on the other lane, for one frame.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gymnasium as gym
 import numpy as np
-from highway_env.road.lane import AbstractLane
-from highway_env.road.road import LaneIndex, Road
 from highway_env.vehicle.behavior import IDMVehicle
-from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import RoadObject
 from jaxtyping import Float, Int
 
@@ -27,7 +24,7 @@ UNKNOWN, NO_EDGE, LEADER = -1, 0, 1
 """Edge types: not known, the sender does not lead the receiver, the sender leads the receiver."""
 ATTRIBUTE_NAMES = ("time_gap_s", "desired_time_gap_s", "headway_m")
 """Attributes of a leader edge: headway over the receiver's speed; the driver's own TIME_WANTED; from centre to centre
-along the lane on which the leader was found."""
+along the receiver's lane, as its driver measures it (see `leaders_of`)."""
 MAX_TIME_GAP_S = 10.0
 """Longer time gaps are given as this; a receiver at rest has no other."""
 
@@ -59,7 +56,7 @@ def read_labels(env: gym.Env) -> SceneLabels:
             continue
         if not getattr(vehicle, "is_yielding", False):
             types[receiver] = NO_EDGE
-        for leader, headway_m in leaders_of(vehicle):
+        for leader, headway_m in leaders_of(vehicle).items():
             if leader in row:
                 time_gap_s = min(headway_m / max(vehicle.speed, 1e-6), MAX_TIME_GAP_S)
                 types[receiver, row[leader]] = LEADER
@@ -68,18 +65,20 @@ def read_labels(env: gym.Env) -> SceneLabels:
     return SceneLabels(types, attributes)
 
 
-def leaders_of(vehicle: IDMVehicle) -> list[tuple[RoadObject, float]]:
+def leaders_of(vehicle: IDMVehicle) -> dict[RoadObject, float]:
     """Whom the driver brakes for in `IDMVehicle.act`, with the headway [m]: on its lane, and on the one it changes to.
 
-    A driver that has crashed reacts to nobody.
+    A driver that has crashed reacts to nobody. The headway is the driver's own: its lane is extended past its end, and
+    the sign is lost in a square. So it is short of the road between two vehicles where the lane bends, and drivers who
+    leave intersection-v2 brake for oncoming ones, as near as they are: highway-env takes the lanes for connected.
     """
     if vehicle.crashed:
-        return []
-    found: list[tuple[RoadObject, float]] = []
+        return {}
+    found: dict[RoadObject, float] = {}
     for lane_index in dict.fromkeys((vehicle.lane_index, vehicle.target_lane_index)):
         leader, _ = vehicle.road.neighbour_vehicles(vehicle, lane_index)
-        if leader is not None and all(leader is not other for other, _ in found):
-            found.append((leader, _headway_m(vehicle, leader, lane_index)))
+        if leader is not None:
+            found[leader] = abs(float(vehicle.lane_distance_to(leader)))
     return found
 
 
@@ -93,32 +92,3 @@ def with_labels(episode: Episode, scenes: Sequence[Scene], labels: Sequence[Scen
         types[t, columns[:, None], columns] = label.edge_types
         attributes[t, columns[:, None], columns] = label.edge_attributes
     return replace(episode, edge_types=types, edge_attributes=attributes)
-
-
-def _headway_m(vehicle: Vehicle, leader: RoadObject, lane_index: LaneIndex) -> float:
-    """Along the lane, and past its end along the one where `Road.neighbour_vehicles` found the leader.
-
-    `lane_distance_to`, which the driver takes, extends the vehicle's own lane instead: on u-turn-v1 half of it is
-    negative, since the lane is a circle and the leader beyond its end.
-    """
-    lane = vehicle.road.network.get_lane(lane_index)
-    own_m = lane.local_coordinates(vehicle.position)[0]
-    for stretch, offset_m in _stretches(vehicle.road, lane, lane_index):
-        if stretch.on_lane(leader.position, margin=1):
-            return float(stretch.local_coordinates(leader.position)[0] + offset_m - own_m)
-    raise AssertionError("neighbour_vehicles found a leader that is on none of the lanes it searches")
-
-
-def _stretches(road: Road, lane: AbstractLane, lane_index: LaneIndex) -> Iterator[tuple[AbstractLane, float]]:
-    """The lane, those after and those before it, each with where it begins, in the simulator's order of search."""
-    yield lane, 0.0
-    if not road.neighbour_vehicles_connected_lanes:
-        return
-    start, end, number = lane_index
-    for lanes in road.network.graph.get(end, {}).values():
-        if lanes:
-            yield lanes[number if number < len(lanes) else 0], lane.length
-    for roads in road.network.graph.values():
-        if roads.get(start):
-            before = roads[start][number if number < len(roads[start]) else 0]
-            yield before, -before.length

@@ -31,8 +31,7 @@ from predictor.codec import Residual
 from predictor.errors import UserError
 from predictor.forecaster import Belief, WindowOutput
 from predictor.graph import pair_mask
-from predictor.networks import _no_edge_where_absent as no_edge_where_absent
-from predictor.networks import concrete_sample
+from predictor.networks import concrete_sample, no_edge_where_absent
 from predictor.scene import SceneSpec
 
 

@@ -131,7 +131,7 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
         group.create_array("starts", data=starts)
         group.create_array("seeds", data=np.array([e.seed for e in episodes], dtype=np.int64))
         for name, labels in _padded_labels(episodes, columns, str(path)).items():
-            group.create_array(name, data=labels)
+            group.create_array(name, data=labels, config=every_chunk)
         group.attrs.update(
             {
                 "format": FORMAT,
@@ -167,13 +167,14 @@ def read_store(path: Path) -> EpisodeStore:
                 f"{path} has store version {attrs['version']}, this release reads {VERSION}; collect it anew"
             )
         arrays = {name: np.asarray(group[name]) for name in ("states", "valid", "ids", "starts", "seeds")}
-        for name in ("states", "valid"):
+        labelled = [name for name in EDGE_LABELS if name in group]
+        for name in ("states", "valid", *labelled):
             stored: Any = group[name]
             if stored.nchunks_initialized != stored.nchunks:  # Zarr reads what is missing as zeros
                 raise UserError(f"{path}: chunks of '{name}' are missing; copy or collect it anew")
         info = _info(attrs, len(arrays["states"]))
         labels = list(attrs["labels"])
-        edge_labels = {name: np.asarray(group[name]) for name in EDGE_LABELS if name in group}
+        edge_labels = {name: np.asarray(group[name]) for name in labelled}
         label_starts = np.asarray(group["label_starts"]) if edge_labels else None
     except (KeyError, TypeError, OSError, RuntimeError, json.JSONDecodeError, zarr.errors.BaseZarrError) as error:
         raise UserError(f"{path} is not a readable episode store ({error}); collect it anew") from error

@@ -9,8 +9,10 @@ from envs import collect
 from envs.collect import CollectConfig
 from envs.egos import idle_action
 from envs.readers import HighwayReader
+from envs.readers.highway_labels import LEADER
 from envs.registry import make_env
 from predictor.data.store import Episode, read_store
+from predictor.data.windows import Windows
 from predictor.errors import UserError
 from tests.envs.helpers import run_command, save_forecast_policy
 
@@ -26,7 +28,7 @@ def assert_same_episodes(first: list[Episode], second: list[Episode]) -> None:
     assert len(first) == len(second) > 0
     for actual, expected in zip(first, second, strict=True):
         assert (actual.label, actual.seed) == (expected.label, expected.seed)
-        for name in ("states", "valid", "ids"):
+        for name in ("states", "valid", "ids", "edge_types", "edge_attributes"):
             np.testing.assert_array_equal(getattr(actual, name), getattr(expected, name))
 
 
@@ -75,6 +77,8 @@ def test_the_store_is_the_same_for_any_number_of_workers(
     assert_same_episodes(together.episodes, alone.episodes)
     assert [e.label for e in alone.episodes] == ["varied", "random", "idle", "varied", "random"]
     assert [e.seed for e in alone.episodes] == list(range(30, 35))
+    assert all(e.edge_types is not None and (e.edge_types == LEADER).any() for e in alone.episodes)
+    assert alone.info.edge_attribute_names == ("time_gap_s", "desired_time_gap_s", "headway_m")
     assert alone.info.source == ENV_ID
     assert alone.info.spec == HighwayReader(make_env(ENV_ID)).spec
     assert alone.info.provenance["seed"] == 30
@@ -106,6 +110,17 @@ def test_overwrite_replaces_the_store(tmp_path: Path, monkeypatch: pytest.Monkey
         code, _, _ = run_command(collect.main, [*base, "--seed", str(seed), *extra], monkeypatch, capsys)
         assert code == 0
         assert read_store(tmp_path / "s").episodes[0].seed == seed
+
+
+def test_labels_can_be_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
+    arguments = ["--env-id", ENV_ID, "--out", str(tmp_path / "s"), "--workers", "1", "--max-steps", "1"]
+    code, _, _ = run_command(collect.main, [*arguments, "--episodes", "1", "--no-labels"], monkeypatch, capsys)
+    assert code == 0
+    store = read_store(tmp_path / "s")
+    assert store.info.edge_attribute_names == ()
+    assert (store.episodes[0].edge_types, store.episodes[0].edge_attributes) == (None, None)
+    batch = Windows(store.episodes, store.info.spec, 1, 1).batch(np.array([0]))
+    assert (batch.edge_types, batch.edge_attributes) == (None, None)
 
 
 ERRORS = {

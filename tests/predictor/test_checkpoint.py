@@ -15,7 +15,7 @@ from predictor.checkpoint import CheckpointInfo, load_checkpoint, load_forecaste
 from predictor.dgvae import DGVAE
 from predictor.errors import UserError
 from predictor.scene import SceneSpec
-from tests.predictor.helpers import ROAD, model, random_states, spec
+from tests.predictor.helpers import EVERY_MODEL, ROAD, any_model, model, random_presence, random_states, spec
 
 INFO = CheckpointInfo(
     spec(ROAD),
@@ -25,6 +25,11 @@ INFO = CheckpointInfo(
     sources=("toy-v0", "toy-v1"),
     provenance={"command": "python -m predictor.train", "result": {"step": 3}},
 )
+# What the config of a checkpoint did not say before version 0.2; all of it was off.
+NEWER_FIELDS = (
+    "change_scales", "forget_bias", "innovation_rounds", "innovation_dim", "static_dim", "pair_matching", "substeps",
+    "gated_messages", "hard_samples",
+)  # fmt: skip
 
 
 def made(seed: int = 0) -> DGVAE:
@@ -299,3 +304,80 @@ def test_scenes_of_its_own_spec_are_taken(path: Path):
 def test_constant_velocity_takes_every_spec():
     forecaster = load_forecaster("constant-velocity", spec(dt_s=0.2), "env 'a'")
     assert isinstance(forecaster, ConstantVelocity) and forecaster.spec.dt_s == 0.2
+
+
+# --- Every kind of model ----------------------------------------------------------------------------------------------
+
+
+def save_any(path: Path, kind: str) -> CheckpointInfo:
+    forecaster = any_model(kind)
+    info = replace(INFO, spec=forecaster.spec, config=forecaster.config, horizon_steps=3, model=EVERY_MODEL[kind][0])
+    save_checkpoint(path, forecaster, info)
+    return info
+
+
+@pytest.mark.parametrize("kind", EVERY_MODEL)
+def test_every_model_comes_back_and_forecasts_the_same(tmp_path: Path, kind: str):
+    info = save_any(tmp_path / "toy", kind)
+    loaded, read = load_checkpoint(tmp_path / "toy")
+    assert read == info
+    assert type(loaded) is type(any_model(kind)) and not loaded.training
+    states, valid = random_states(0, 4, 2, 4, 4), random_presence(0, 4, 2, 4)
+    beliefs, forecasts = [], []
+    for forecaster in (any_model(kind), loaded):
+        memory = forecaster.empty_memory(2, 4)
+        for now, present in zip(states, valid, strict=True):
+            memory, belief = forecaster.observe(memory, now, present)
+        beliefs.append(belief)
+        forecasts.append(forecaster.rollout(belief, 3, 2, torch.Generator().manual_seed(0)))
+    assert torch.equal(*forecasts)
+    assert torch.equal(beliefs[0].edge_probs, beliefs[1].edge_probs)
+    assert torch.equal(beliefs[0].edge_features, beliefs[1].edge_features)
+
+
+def test_checkpoints_from_before_there_were_other_models_are_dgvaes(path: Path):
+    edit(path, lambda c: c.pop("model"))
+    edit(path, lambda c: [c["config"].pop(name) for name in NEWER_FIELDS])
+    loaded, info = load_checkpoint(path)
+    assert info == INFO
+    assert isinstance(loaded, DGVAE)
+    assert_holds(path, made())
+
+
+def test_shipped_checkpoints_that_name_no_model_are_dgvaes():
+    for name in checkpoint.shipped():
+        if "model" not in json.loads((resolve(name) / "config.json").read_text()):
+            loaded, info = load_checkpoint(name)
+            assert type(loaded) is DGVAE and info.model == "dgvae", name
+
+
+def test_a_model_is_not_saved_under_another_ones_name(tmp_path: Path):
+    with pytest.raises(UserError, match="the checkpoint says model 'mlp' but the network is 'dgvae'"):
+        save_checkpoint(tmp_path / "toy", made(), replace(INFO, model="mlp"))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"model": "transformer"},
+            "does not describe a predictor: no model 'transformer'; there are dgvae, dnri, imma",
+        ),
+        ({"model": "mlp"}, "does not describe a predictor: unknown field 'change_scales' of MLPConfig"),
+        ({"horizon_steps": 0}, "does not describe a predictor: horizon_steps must be at least 1, got 0"),
+    ],
+)
+def test_impossible_models_are_refused(path: Path, change: dict[str, Any], message: str):
+    edit(path, lambda c: c.update(change))
+    with pytest.raises(UserError, match=message):
+        load_checkpoint(path)
+
+
+def test_weights_of_another_model_are_refused(path: Path, tmp_path: Path):
+    save_any(tmp_path / "lstm", "lstm")
+    (tmp_path / "lstm" / "model.safetensors").replace(path / "model.safetensors")
+    with pytest.raises(
+        UserError, match=r"tensor '\S+' should be \S+.* by config\.json but is .*do not belong together"
+    ):
+        load_checkpoint(path)

@@ -72,7 +72,9 @@ def test_inputs_in_space(frame: Any, expected: list[list[float]]):
 
 
 def test_features_beyond_the_kinematic_ones_are_scaled_only():
-    layout = SceneSpec(1.0, ("centroid", "world"), (*KINEMATIC_FEATURES, "heading_rad"), (10.0, 10.0, 5.0, 5.0, 2.0), False)
+    layout = SceneSpec(
+        1.0, ("centroid", "world"), (*KINEMATIC_FEATURES, "heading_rad"), (10.0, 10.0, 5.0, 5.0, 2.0), False
+    )
     states = torch.tensor([[30.0, 5.0, 10.0, 0.0, 1.0], [40.0, -5.0, 5.0, -5.0, -1.0]])
     assert StateCodec(layout).inputs(states, torch.ones(2).bool()).tolist() == [
         [-0.5, 0.5, 2.0, 0.0, 0.5],

@@ -1,6 +1,7 @@
 """The dG-VAE against plain loops, and what it must keep: streaming, no peeking, padding, symmetry, sampling."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -292,6 +293,72 @@ def test_network_inputs_closed_form():
     assert model(has_ego=False).codec.inputs(states, valid).tolist() == [
         [[3.0, 0.5, 2.0, 0.0], [4.0, -0.5, 1.0, -1.0], [0.0] * 4]
     ]
+
+
+def test_encoder_sees_what_changed_since_the_last_step():
+    """In units of `change_scales`, in the frame of each step; nothing for who was not there a step ago."""
+    torch.manual_seed(0)
+    forecaster = DGVAE(spec(ROAD), replace(FAST_LIKE, change_scales=(2.0, 4.0, 1.0, 5.0)), 3)
+    shown = []
+    forecaster.encoder.register_forward_pre_hook(lambda _, arguments: shown.append(arguments[0]))
+    states, valid = torch.zeros(1, 4, 3, 4), torch.ones(1, 4, 3).bool()
+    states[0, :, 0, 0] = torch.tensor([0.0, 10.0, 20.0, 30.0])  # the ego drives on; agent 1 keeps its distance …
+    states[0, :, 1, 0] = torch.tensor([5.0, 15.0, 25.0, 39.0])  # … until it is 4 m further
+    states[0, :, 1, 3] = torch.tensor([0.0, 5.0, 5.0, 0.0])
+    states[0, :, 2, 1] = torch.tensor([0.0, 8.0, 8.0, 16.0])
+    valid[0, 1, 2] = False
+    forecaster.window(states, valid, torch.tensor([3]), 0)
+    inputs = torch.cat([forecaster.codec.inputs(states, valid), torch.zeros(1, 4, 3, 4)], dim=-1)
+    inputs[0, 1, 1, 8] = 1.0
+    inputs[0, 3, 1, 5:] = torch.tensor([2.0, 0.0, 0.0, -1.0])
+    inputs[0, 3, 2, 5:] = torch.tensor([-5.0, 2.0, 0.0, 0.0])  # the ego moved away by 10 m
+    torch.testing.assert_close(shown.pop(), inputs)
+    memory = forecaster.empty_memory(1, 3)
+    for t in range(4):
+        memory, _ = forecaster.observe(memory, states[:, t], valid[:, t])
+        torch.testing.assert_close(shown.pop(), inputs[:, [t]])
+
+
+def test_change_scales_must_fit_the_features():
+    with pytest.raises(UserError, match=r"change_scales needs 4 numbers, got \(1.0, 2.0\)"):
+        DGVAE(spec(), replace(FAST_LIKE, change_scales=(1.0, 2.0)))
+
+
+def test_substeps_against_a_loop():
+    """Messages act on the motion directly, and anew as the agents move; the memory of each agent stands still."""
+    forecaster = precise("rich", num_edge_types=3)
+    states, valid = random_states(0, BATCH, TIME, AGENTS, 4).double(), random_presence(0, BATCH, TIME, AGENTS)
+    belief = last(forecaster, states, valid)
+    moved, pairs = belief.states, pair_mask(belief.valid)
+    change = forecaster.decoder.change(belief.internal.node_after)
+    for _ in range(2):
+        inputs = forecaster.codec.inputs(moved, belief.valid)
+        messages = forecaster.decoder.messages(inputs, pairs, belief.edge_probs, belief.edge_features)
+        pushed = forecaster.decoder.direct(messages)
+        assert pushed.abs().max() > 1e-2
+        moved = forecaster.codec.advance(moved, change + pushed, 0.5)
+    torch.testing.assert_close(forecaster.rollout(belief, 1)[:, 0, :, 0], moved, **EXACT)
+    window = forecaster.window(states, valid, torch.full((BATCH,), TIME - 1), 1)
+    assert window.one_step.shape == states.shape and window.rollout.shape == (BATCH, AGENTS, 1, 4)
+
+
+@pytest.mark.parametrize("hard", [False, True])
+def test_graphs_are_drawn_as_the_config_says(hard: bool, monkeypatch: pytest.MonkeyPatch):
+    """Once for the whole teacher-forced pass, then once for each step of the free run."""
+    drawn = []
+
+    def sample(logits: Tensor, temperature: float, generator: Any, hard: bool) -> Tensor:
+        drawn.append((tuple(logits.shape), temperature, hard))
+        return torch.softmax(logits, dim=-1)
+
+    monkeypatch.setattr(dgvae, "concrete_sample", sample)
+    forecaster = DGVAE(spec(), replace(FAST_LIKE, temperature=0.75, hard_samples=hard), 3)
+    states, valid = random_states(0, BATCH, TIME, AGENTS, 4), random_presence(0, BATCH, TIME, AGENTS)
+    forecaster.window(states, valid, torch.tensor([1, 3]), 2)
+    pair = (AGENTS, AGENTS, 2)
+    assert drawn == [((BATCH, TIME, *pair), 0.75, hard)] + 2 * [((BATCH, *pair), 0.75, hard)]
+    forecaster.window(states, valid, torch.tensor([1, 3]), 0)
+    assert len(drawn) == 4
 
 
 @settings(max_examples=8)

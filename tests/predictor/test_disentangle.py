@@ -130,7 +130,9 @@ def test_labelling_pulls_at_the_labelled_dimensions_of_labelled_pairs_only():
     features = torch.zeros(1, 1, 2, 2, 3, requires_grad=True)
     labelled = torch.zeros(1, 1, 2, 2).bool()
     labelled[0, 0, 0, 1] = True
-    restricted_labelling(features, torch.ones(1, 1, 2, 2, 2), labelled).backward()
+    attributes = torch.full((1, 1, 2, 2, 2), math.nan)  # unknown
+    attributes[0, 0, 0, 1] = 1.0
+    restricted_labelling(features, attributes, labelled).backward()
     assert features.grad is not None
     assert features.grad[0, 0, 0, 1].tolist() == [-1.0, -1.0, 0.0]
     features.grad[0, 0, 0, 1] = 0.0

@@ -1,4 +1,4 @@
-"""The encoder's corrections against a plain loop over pairs, and gradients of all pairwise blocks against differences."""
+"""The encoder's corrections against a loop over pairs, and gradients of all pairwise blocks against differences."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -236,5 +236,3 @@ def test_gated_messages_against_a_loop():
     plain.load_state_dict(decoder.state_dict())
     silent = torch.zeros_like(features)
     assert torch.equal(decoder.messages(inputs, THREE, graph, silent), plain.messages(inputs, THREE, graph, silent))
-
-

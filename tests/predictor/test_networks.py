@@ -1,6 +1,7 @@
 """The layers of the dG-VAE against plain loops, and the concrete distribution."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -13,8 +14,8 @@ from torch.nn import functional
 
 from predictor.errors import UserError
 from predictor.graph import pair_mask
-from predictor.networks import PRESETS, DGVAEConfig, concrete_sample
-from tests.predictor.helpers import model, random_presence, random_states
+from predictor.networks import PRESETS, Decoder, DGVAEConfig, Encoder, concrete_sample
+from tests.predictor.helpers import FAST_LIKE, model, random_presence, random_states
 
 BATCH, TIME, AGENTS = 2, 6, 4
 TOLERANCE = {"rtol": 0.0, "atol": 1e-5}
@@ -157,6 +158,22 @@ def test_concrete_samples_pass_gradients():
     assert logits.grad is not None and torch.isfinite(logits.grad).all() and logits.grad.abs().min() > 0
 
 
+def test_hard_samples_are_one_hot_and_pass_the_soft_gradient():
+    logits = torch.randn(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weight = torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)
+    samples, gradients = [], []
+    for hard in (False, True):
+        leaf = logits.clone().requires_grad_()
+        sample = concrete_sample(leaf, 0.5, torch.Generator().manual_seed(1), hard)
+        (sample * weight).sum().backward()
+        samples.append(sample.detach())
+        gradients.append(leaf.grad)
+    soft, one_hot = samples
+    torch.testing.assert_close(one_hot, functional.one_hot(soft.argmax(-1), 3).double(), rtol=0, atol=1e-12)
+    torch.testing.assert_close(gradients[1], gradients[0])
+    assert gradients[0] is not None and gradients[0].abs().max() > 1e-3
+
+
 # --- Config ---------------------------------------------------------------------------------------------------------
 
 
@@ -167,11 +184,63 @@ def test_concrete_samples_pass_gradients():
         ({"num_edge_types": 1}, r"num_edge_types must be at least 2 \(the first is 'no edge'\), got 1"),
         ({"temperature": 0.0}, "need temperature > 0 and 0 <= dropout < 1, got 0.0, 0.0"),
         ({"dropout": 1.0}, "need temperature > 0 and 0 <= dropout < 1, got 0.5, 1.0"),
+        ({"innovation_dim": 0}, "innovation_dim must be at least 1, got 0"),
+        ({"innovation_rounds": -1}, "innovation_rounds must not be negative, got -1"),
+        ({"substeps": -1}, "substeps must not be negative, got -1"),
+        ({"edge_feature_dim": -1}, "edge_feature_dim must not be negative, got -1"),
+        ({"static_dim": 33}, r"static_dim must be at most edge_feature_dim \(32\), got 33"),
     ],
 )
 def test_config_refuses(fields: Mapping[str, Any], message: str):
     with pytest.raises(UserError, match=message):
         DGVAEConfig(**fields)
+
+
+def test_forget_bias_lengthens_the_first_memory():
+    """It is added to the forget gates' initial bias and to nothing else."""
+    made = []
+    for forget_bias in (0.0, 2.0):
+        torch.manual_seed(0)
+        made.append(Encoder(replace(FAST_LIKE, forget_bias=forget_bias), 4))
+    plain, biased = (dict(encoder.named_parameters()) for encoder in made)
+    for name, weight in plain.items():
+        added = torch.zeros_like(weight)
+        if name in ("forward_input.bias", "backward_input.bias"):
+            added[5:10] = 2.0  # gates are input, forget, cell, output; the LSTM is 5 wide
+        assert torch.equal(biased[name], weight + added), name
+
+
+def test_without_edge_features_there_are_no_layers_for_them():
+    """The ablation dVAE: messages are those of features that are all zero."""
+    torch.manual_seed(0)
+    encoder, decoder = (
+        Encoder(replace(FAST_LIKE, edge_feature_dim=0), 5),
+        Decoder(replace(FAST_LIKE, edge_feature_dim=0), 5, 4),
+    )
+    assert not any("feature" in name for part in (encoder, decoder) for name, _ in part.named_parameters())
+    inputs, pairs = torch.randn(1, 1, 3, 5), pair_mask(torch.ones(1, 1, 3).bool())
+    zeros = torch.zeros(1, 3, 3, 5)
+    assert encoder(inputs, pairs, zeros, zeros).features.shape == (1, 1, 3, 3, 0)
+    full = Decoder(FAST_LIKE, 5, 4)
+    full.load_state_dict(decoder.state_dict(), strict=False)
+    graph = torch.full((3, 3, 2), 0.5)
+    ours = decoder.messages(inputs[0, 0], pairs[0, 0], graph, torch.zeros(3, 3, 0))
+    assert torch.equal(ours, full.messages(inputs[0, 0], pairs[0, 0], graph, torch.zeros(3, 3, 6)))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("residual", "midpoint", "residual must be 'state', 'constant_velocity' or 'trapezoid', got 'midpoint'"),
+        ("pair_matching", "future", "pair_matching must be 'window' or 'causal', got 'future'"),
+    ],
+)
+def test_config_refuses_unknown_choices(field: str, value: str, message: str):
+    """As when a checkpoint is read where types are not checked; here they would be refused earlier."""
+    config = DGVAEConfig()
+    object.__setattr__(config, field, value)
+    with pytest.raises(UserError, match=message):
+        config.__post_init__()
 
 
 def test_paper_preset_has_the_sizes_of_the_paper():

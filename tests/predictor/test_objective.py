@@ -163,7 +163,9 @@ def test_type_labels_count_where_they_are_known():
     prior, posterior = logits([0.2, 0.9], [0.3, 0.4]), logits([0.6, 0.9], [0.3, 0.4])
     config = replace(SILENT, type_label_weight=2.0)
     ours = terms(config, batch(TYPES), output(prior, posterior))
-    expected = -(math.log(0.2) + math.log(0.7) + math.log(0.4)) / 3 - (math.log(0.6) + math.log(0.7) + math.log(0.4)) / 3
+    expected = (
+        -(math.log(0.2) + math.log(0.7) + math.log(0.4)) / 3 - (math.log(0.6) + math.log(0.7) + math.log(0.4)) / 3
+    )
     assert ours["type_label"] == pytest.approx(expected, rel=1e-5)
     assert ours["total"] == pytest.approx(2.0 * expected, rel=1e-5)
     assert ours["graph_accuracy"] == pytest.approx(1 / 3)

@@ -151,9 +151,25 @@ def test_validation_does_not_disturb_training(tiny: None, circles: Path, tmp_pat
 # --- Stopped and resumed ----------------------------------------------------------------------------------------------
 
 
+# Everything that changes from step to step.
+SCHEDULES = {
+    "model": "dgvae",
+    "min_history_steps": 1,
+    "history_steps": 4,
+    "horizon_steps": 3,
+    "curriculum_steps": 4,
+    "kl_warmup_steps": 4,
+    "input_changes": True,
+    "set": ("static_dim=2", "innovation_rounds=1", "substeps=2", "pair_matching=window", "hard_samples=true"),
+}
+
+
 @pytest.mark.parametrize("stop", [1, 3])
-def test_restored_trainer_continues_exactly(tiny: None, circles: Path, tmp_path: Path, stop: int):
-    settings = config(circles, tmp_path)
+@pytest.mark.parametrize("changes", [{}, SCHEDULES, {"model": "dnri"}], ids=["plain", "schedules", "dnri"])
+def test_restored_trainer_continues_exactly(
+    tiny: None, circles: Path, tmp_path: Path, stop: int, changes: dict[str, Any]
+):
+    settings = config(circles, tmp_path, **changes)
     whole = run(Trainer(settings, load_data(settings)), 5)
     run(Trainer(settings, load_data(settings)), stop).save(tmp_path / "state")
     torch.manual_seed(99)
@@ -201,8 +217,8 @@ def interrupt(*_: object) -> None:
 def test_interrupted_run_ends_like_one_that_was_not(
     tiny: None, circles: Path, tmp_path: Path, stop: Callable[[pytest.MonkeyPatch], None]
 ):
-    train(config(circles, tmp_path / "whole"))
-    settings = config(circles, tmp_path / "run")
+    train(config(circles, tmp_path / "whole", **SCHEDULES))
+    settings = config(circles, tmp_path / "run", **SCHEDULES)
     with pytest.MonkeyPatch.context() as patch:
         stop(patch)
         with pytest.raises(KeyboardInterrupt):
@@ -339,9 +355,13 @@ def test_killed_process_is_resumed_to_the_same_weights(
 
 def arguments(settings: TrainConfig) -> list[str]:
     """The command line of a config."""
-    names = ("out", "steps", "batch_size", "history_steps", "horizon_steps", "val_fraction", "eval_every", "threads")
+    names = (
+        "out", "model", "steps", "batch_size", "history_steps", "horizon_steps", "val_fraction", "eval_every",
+        "threads",
+    )  # fmt: skip
     pairs = [(f"--{name.replace('_', '-')}", str(getattr(settings, name))) for name in names]
-    return ["--data", *map(str, settings.data), *(word for pair in pairs for word in pair)]
+    overrides = ["--set", *settings.set] if settings.set else []
+    return ["--data", *map(str, settings.data), *(word for pair in pairs for word in pair), *overrides]
 
 
 # --- Bad input --------------------------------------------------------------------------------------------------------
@@ -386,6 +406,22 @@ def test_bad_input_ends_a_real_process_with_one_line(tmp_path: Path):
             "6 episodes split into 6 for training and 0 for validation; both need at least one",
         ),
         (["--lr", "0"], "lr must be positive, got 0.0"),
+        (["--min-history-steps", "11"], "min_history_steps must be at most 10, got 11"),
+        (["--min-history-steps", "-1"], "min_history_steps must not be negative, got -1"),
+        (["--val-history-steps", "0"], "val_history_steps must lie between 1 and 10, got 0"),
+        (["--val-history-steps", "11"], "val_history_steps must lie between 1 and 10, got 11"),
+        (["--one-step-weight", "0", "--rollout-weight", "0"], "both 0; nothing would be learned"),
+        (["--edge-cost", "-0.1"], "edge_cost must not be negative, got -0.1"),
+        (["--label-weight", "nan"], "label_weight must not be negative, got nan"),
+        (["--curriculum-steps", "-1"], "curriculum_steps must not be negative, got -1"),
+        (["--set", "width=3"], "--set takes field=value with a field of DGVAEConfig (hidden_dim, "),
+        (["--set", "rnn_dim=wide"], "rnn_dim of DGVAEConfig must be of type int, got 'wide'"),
+        (["--set", "rnn_dim=0"], "rnn_dim must be at least 1, got 0"),
+        (["--set", "delta_scales=1,2"], "delta_scales needs 4 numbers, got (1.0, 2.0)"),
+        (
+            ["--model", "mlp", "--input-changes"],
+            "--input-changes belongs to the dG-VAE; leave it out for --model mlp",
+        ),
         (["--device", "cuda"], "device 'cuda' asked for but torch sees no CUDA device; use --device cpu"),
     ],
 )
@@ -419,6 +455,8 @@ def test_existing_run_is_not_overwritten(
     [
         ({"batch_size": 6}, "cannot resume: batch_size was 5 and is now 6; use the same arguments"),
         ({"horizon_steps": 3}, "cannot resume: horizon_steps was 2 and is now 3; use the same arguments"),
+        ({"model": "mlp"}, "cannot resume: model was dgvae and is now mlp; use the same arguments"),
+        ({"set": ("rnn_dim=4",)}, "cannot resume: set was [] and is now ['rnn_dim=4']; use the same arguments"),
     ],
 )
 def test_resuming_with_other_arguments_names_them(
@@ -427,7 +465,7 @@ def test_resuming_with_other_arguments_names_them(
     capsys: pytest.CaptureFixture[str],
     circles: Path,
     tmp_path: Path,
-    change: Mapping[str, int],
+    change: Mapping[str, Any],
     message: str,
 ):
     train(config(circles, tmp_path / "run"))

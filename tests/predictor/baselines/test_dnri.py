@@ -202,6 +202,15 @@ def test_training_and_forecasting_draw_from_the_right_logits(monkeypatch: pytest
     assert torch.equal(seen[1], window.prior_logits[torch.arange(2), torch.tensor([1, 3])])
 
 
+def test_the_burn_in_ends_at_the_last_observation(monkeypatch: pytest.MonkeyPatch):
+    forecaster, calls = tiny("dnri"), []
+    inner = DNRI.recur
+    monkeypatch.setattr(DNRI, "recur", lambda self, *args: calls.append(1) or inner(self, *args))
+    states, valid = random_states(0, BATCH, TIME, AGENTS, 4), torch.ones(BATCH, TIME, AGENTS).bool()
+    forecaster.window(states, valid, torch.tensor([1, 3]), HORIZON)
+    assert len(calls) == TIME + 3 + HORIZON  # teacher forcing, steps 0 to 2, the rest is the free run's
+
+
 def test_hard_draws_are_one_type_each_and_pass_the_soft_gradient():
     config = DNRIConfig(**DNRI_SIZES, num_edge_types=3)
     logits = torch.randn(50, 3, generator=torch.Generator().manual_seed(0), requires_grad=True)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from predictor.data.store import Episode, StoreInfo, read_store, write_store
+from predictor.data.store import EDGE_LABELS, Episode, StoreInfo, read_info_of, read_store, write_store
 from predictor.errors import UserError
 from predictor.scene import SceneSpec
 from tests.predictor.helpers import ROAD, random_presence, random_states, scene, spec
@@ -54,8 +54,9 @@ def test_round_trip(tmp_path_factory: pytest.TempPathFactory, written: list[Epis
     path = tmp_path_factory.mktemp("stores") / "store"
     write_store(path, INFO, written)
     store = read_store(path)
-    assert store.info == INFO
-    assert store.num_steps == sum(len(e.states) for e in written)
+    steps = sum(len(e.states) for e in written)
+    assert store.info == read_info_of(path) == replace(INFO, num_steps=steps)
+    assert store.num_steps == steps
     for ours, expected in zip(store.episodes, written, strict=True):
         assert_equal(ours, expected)
 
@@ -77,6 +78,119 @@ def test_episode_from_scenes_gives_each_id_a_column():
     assert joined.valid.tolist() == [[True, True, False], [True, False, True], [True, True, True]]
     assert joined.states[..., 0].tolist() == [[1.0, 2.0, 0.0], [3.0, 0.0, 4.0], [5.0, 7.0, 6.0]]
     assert (joined.label, joined.seed) == ("idle", 5)
+
+
+# --- Edge labels ------------------------------------------------------------------------------------------------------
+
+
+def labelled(seed: int, steps: int = 4, agents: int = 3, label_steps: int = 1, width: int = 2) -> Episode:
+    """Random types in -1 … 2 and attributes of random size."""
+    rng = np.random.default_rng([seed, 5])
+    types = rng.integers(-1, 3, size=(label_steps, agents, agents)).astype(np.int8)
+    attributes = rng.normal(size=(label_steps, agents, agents, width)).astype(np.float32)
+    return replace(episode(seed, steps, agents), edge_types=types, edge_attributes=attributes)
+
+
+def assert_same_labels(ours: Episode, expected: Episode) -> None:
+    for name in EDGE_LABELS:
+        given, wanted = getattr(ours, name), getattr(expected, name)
+        assert (given is None) == (wanted is None)
+        if wanted is not None:
+            np.testing.assert_array_equal(given, wanted)
+            assert given.dtype == wanted.dtype
+
+
+@pytest.mark.parametrize("only", [None, "edge_types", "edge_attributes"])
+def test_edge_labels_come_back(tmp_path: Path, only: str | None):
+    """Episodes of different lengths and casts; labels of one step and of every step, side by side."""
+    written = [labelled(1), labelled(2, steps=6, agents=5, label_steps=6), labelled(3, steps=1, agents=2)]
+    if only:
+        written = [replace(e, **{name: None for name in EDGE_LABELS if name != only}) for e in written]
+    info = replace(INFO, edge_attribute_names=("gap_m", "time_s"))
+    write_store(tmp_path / "store", info, written)
+    store = read_store(tmp_path / "store")
+    assert store.info.edge_attribute_names == ("gap_m", "time_s")
+    for ours, expected in zip(store.episodes, written, strict=True):
+        assert_equal(ours, expected)
+        assert_same_labels(ours, expected)
+
+
+def test_stores_without_labels_have_none(tmp_path: Path):
+    write_store(tmp_path / "store", INFO, [episode(1)])
+    store = read_store(tmp_path / "store")
+    assert (store.episodes[0].edge_types, store.episodes[0].edge_attributes) == (None, None)
+    assert store.info.edge_attribute_names == ()
+    group = zarr.open_group(tmp_path / "store", mode="r")
+    assert sorted(group) == ["ids", "seeds", "starts", "states", "valid"]
+
+
+def test_what_is_not_labelled_is_unknown(tmp_path: Path):
+    """Columns that an episode does not have are stored as type -1 and attribute 0."""
+    write_store(tmp_path / "store", INFO, [labelled(1, agents=2), labelled(2, agents=3)])
+    group = zarr.open_group(tmp_path / "store", mode="r")
+    types, attributes = (np.asarray(group[name])[0] for name in EDGE_LABELS)
+    assert (types[2] == -1).all() and (types[:, 2] == -1).all()
+    assert not attributes[2].any() and not attributes[:, 2].any()
+    np.testing.assert_array_equal(types[:2, :2], labelled(1, agents=2).edge_types[0])
+
+
+def of_different_steps() -> Episode:
+    mixed = labelled(1, label_steps=4)
+    object.__setattr__(mixed, "edge_attributes", labelled(1).edge_attributes)  # shape checks would refuse it earlier
+    return mixed
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (
+            lambda: [labelled(1), episode(2)],
+            "store: either all episodes have edge_types or none, got both",
+        ),
+        (
+            lambda: [labelled(1), replace(labelled(2), edge_attributes=None)],
+            "store: either all episodes have edge_attributes or none, got both",
+        ),
+        (
+            lambda: [labelled(1), labelled(2, steps=4, label_steps=3)],
+            "store: edge_types of episode 1 need one step or every step, got 3",
+        ),
+        (
+            lambda: [labelled(1, steps=4, label_steps=5)],
+            "store: edge_types of episode 0 need one step or every step, got 5",
+        ),
+        (
+            lambda: [of_different_steps()],
+            "store: edge_types and edge_attributes need equal numbers of steps in each episode",
+        ),
+    ],
+    ids=["some_without", "some_without_attributes", "too_few_steps", "too_many_steps", "different_steps"],
+)
+def test_labels_that_do_not_fit_are_refused(tmp_path: Path, broken: Any, message: str):
+    with pytest.raises(UserError) as error:
+        write_store(tmp_path / "store", INFO, broken())
+    assert str(error.value).endswith(message)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", EDGE_LABELS)
+def test_missing_labels_are_not_read_as_no_edge(tmp_path: Path, name: str):
+    """Zarr reads a missing chunk as zeros, which as a type means "no edge"; labels that are all zero are no damage."""
+    nothing = replace(labelled(1), edge_types=np.zeros((1, 3, 3), np.int8), edge_attributes=np.zeros((1, 3, 3, 2)))
+    write_store(tmp_path / "store", INFO, [nothing])
+    assert not read_store(tmp_path / "store").episodes[0].edge_types.any()
+    next(f for f in (tmp_path / "store" / name).rglob("*") if f.is_file() and f.name != "zarr.json").unlink()
+    with pytest.raises(UserError, match=f"store: chunks of '{name}' are missing; copy or collect it anew"):
+        read_store(tmp_path / "store")
+
+
+def test_info_is_read_without_the_arrays(tmp_path: Path):
+    write_store(tmp_path / "store", INFO, [episode(1, steps=4), episode(2, steps=3)])
+    for name in ("states", "valid"):
+        shutil.rmtree(tmp_path / "store" / name / "c")
+    assert read_info_of(tmp_path / "store") == replace(INFO, num_steps=7)
+    with pytest.raises(UserError, match=r"nowhere is not a readable episode store \(.*\); make it anew"):
+        read_info_of(tmp_path / "nowhere")
 
 
 # --- Refusals ---------------------------------------------------------------------------------------------------------

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -193,6 +194,96 @@ def test_episodes_without_a_window_are_refused(episodes: list[Episode], message:
         Windows(episodes, spec(), 3, 2)
 
 
+# --- Length of the history --------------------------------------------------------------------------------------------
+
+
+def test_a_batch_may_have_a_shorter_history():
+    """As if the windows had been made with it: what was before is not there, and nobody who was seen then only."""
+    episode = along_x([float(t) for t in range(6)], [3.0, 50.0, 50.0, 50.0, 50.0, 50.0])
+    windows = Windows([episode], spec(perception_m=10.0), history_steps=4, horizon_steps=1)
+    long, short = windows.batch(np.array([0, 3])), windows.batch(np.array([0, 3]), history_steps=2)
+    assert long.last_observed.tolist() == [0, 3] and long.states.shape == (2, 5, 2, 4)
+    assert short.last_observed.tolist() == [0, 1] and short.states.shape == (2, 3, 2, 4)
+    assert short.states[1, :, 0, 0].tolist() == [2.0, 3.0, 4.0]
+    assert long.valid[1, :, 1].any() and not short.valid[1, :, 1].any()
+    expected = Windows([episode], spec(perception_m=10.0), history_steps=2, horizon_steps=1).batch(np.array([0, 3]))
+    assert torch.equal(short.states, expected.states) and torch.equal(short.valid, expected.valid)
+    assert windows.batch(np.array([3])).last_observed.tolist() == [3]  # nothing was changed for good
+
+
+@pytest.mark.parametrize(
+    ("min_history_steps", "min_future_steps", "steps"),
+    [(1, 1, [0, 1, 2, 3]), (3, 1, [2, 3]), (3, 2, [2]), (4, 1, [3])],
+)
+def test_windows_with_too_little_history_are_left_out(min_history_steps: int, min_future_steps: int, steps: list[int]):
+    windows = Windows([along_x([0.0] * 5), along_x([0.0] * 2)], spec(), 3, 4, min_future_steps, min_history_steps)
+    assert windows.index[windows.index[:, 0] == 0, 1].tolist() == steps
+    assert windows.index[windows.index[:, 0] == 1, 1].tolist() == ([0] if min_history_steps == 1 else [])
+
+
+def test_history_that_no_episode_has_is_named():
+    with pytest.raises(UserError, match="no window fits: episodes have at most 5 steps, a window needs 7"):
+        Windows([along_x([0.0] * 5)], spec(), 3, 4, min_future_steps=3, min_history_steps=4)
+
+
+# --- Edge labels ------------------------------------------------------------------------------------------------------
+
+
+def with_labels(episode: Episode, label_steps: int) -> Episode:
+    """The type of a pair tells who it is (receiver · 10 + sender, plus 100 a step); so does the attribute."""
+    agents = episode.states.shape[1]
+    codes = 10 * np.arange(agents)[:, None] + np.arange(agents) + 100 * np.arange(label_steps)[:, None, None]
+    return replace(
+        episode, edge_types=codes.astype(np.int16), edge_attributes=np.stack([codes / 2, -codes], -1).astype(np.float32)
+    )
+
+
+@settings(max_examples=10)
+@given(
+    seed=st.integers(0, 2**16),
+    per_step=st.booleans(),
+    history_steps=st.integers(1, 4),
+    shorter=st.sampled_from([None, 1, 2]),
+    has_ego=st.booleans(),
+)
+def test_labels_follow_their_agents(seed: int, per_step: bool, history_steps: int, shorter: int | None, has_ego: bool):
+    """Whatever column an agent is moved to; unknown for who is not there, for oneself, and after the end."""
+    layout = spec(perception_m=15.0, max_agents=3, has_ego=has_ego)
+    episodes = [
+        with_labels(random_episode(seed + i, steps, 5), steps if per_step else 1) for i, steps in enumerate((6, 3))
+    ]
+    windows = Windows(episodes, layout, history_steps, horizon_steps=2)
+    batch = windows.batch(np.arange(len(windows)), shorter)
+    assert batch.edge_types is not None and batch.edge_attributes is not None
+    for row, (number, now) in enumerate(windows.index.tolist()):
+        episode, begin = episodes[number], max(0, now - (shorter or history_steps) + 1)
+        who = {}  # agents by their column, recognised by their states
+        for column, agent in product(range(batch.valid.shape[2]), range(5)):
+            steps = batch.valid[row, :, column].nonzero()[:, 0]
+            if len(steps) and all(
+                np.array_equal(batch.states[row, t, column].numpy(), episode.states[begin + t, agent])
+                for t in steps.tolist()
+            ):
+                who[column] = agent
+        for t, i, j in product(range(batch.valid.shape[1]), *(range(batch.valid.shape[2]),) * 2):
+            known = bool(batch.valid[row, t, i] and batch.valid[row, t, j]) and i != j
+            code = 10 * who[i] + who[j] + 100 * (begin + t) * per_step if known else -1
+            assert batch.edge_types[row, t, i, j] == code
+            expected = [code / 2, -code] if known else [0.0, 0.0]
+            assert batch.edge_attributes[row, t, i, j].tolist() == expected
+
+
+def test_windows_without_labels_have_none():
+    batch = only(Windows([along_x([0.0] * 3)], spec(), 2, 1), 0, 1)
+    assert (batch.edge_types, batch.edge_attributes) == (None, None)
+
+
+def test_labels_move_with_the_batch():
+    batch = only(Windows([with_labels(along_x([0.0] * 3, [1.0] * 3), 1)], spec(), 2, 1), 1).to(torch.device("cpu"))
+    assert batch.edge_types is not None and batch.edge_types.shape == (1, 3, 2, 2)
+    assert batch.edge_attributes is not None and batch.edge_attributes.shape == (1, 3, 2, 2, 2)
+
+
 # --- Joining and splitting --------------------------------------------------------------------------------------------
 
 
@@ -205,6 +296,29 @@ def test_concatenation_pads_and_keeps_every_row():
     assert torch.equal(joined.states[2:], wide.states) and torch.equal(joined.valid[2:], wide.valid)
     assert not joined.valid[:2, 2:].any() and not joined.valid[:2, :, 1:].any()
     assert joined.last_observed.tolist() == [0, 0, 2]
+
+
+def test_concatenation_pads_labels_with_unknown():
+    small = only(Windows([with_labels(along_x([0.0] * 3, [1.0] * 3), 1)], spec(), 1, 1), 0)
+    wide = only(Windows([with_labels(along_x([5.0] * 6, [6.0] * 6, [7.0] * 6), 6)], spec(), 3, 2), 2)
+    joined = concatenate([small, wide])
+    types, attributes = joined.edge_types, joined.edge_attributes
+    assert types is not None and attributes is not None
+    assert types.shape == (2, 5, 3, 3) and attributes.shape == (2, 5, 3, 3, 2)
+    assert torch.equal(types[0, :2, :2, :2], small.edge_types[0]) and torch.equal(types[1:], wide.edge_types)
+    assert torch.equal(attributes[0, :2, :2, :2], small.edge_attributes[0])
+    assert torch.equal(attributes[1:], wide.edge_attributes)
+    assert (types[0, 2:] == -1).all() and (types[0, :, 2] == -1).all() and (types[0, :, :, 2] == -1).all()
+    assert not attributes[0, 2:].any() and not attributes[0, :, 2].any() and not attributes[0, :, :, 2].any()
+
+
+@pytest.mark.parametrize("labelled_first", [True, False])
+def test_labels_of_some_stores_only_are_dropped(labelled_first: bool):
+    plain = along_x([0.0] * 3, [1.0] * 3)
+    batches = [only(Windows([e], spec(), 1, 1), 0) for e in (with_labels(plain, 1), plain)]
+    joined = concatenate(batches if labelled_first else batches[::-1])
+    assert (joined.edge_types, joined.edge_attributes) == (None, None)
+    assert len(joined.states) == 2
 
 
 @pytest.mark.parametrize(("count", "fraction"), list(product((2, 7, 20), (0.1, 0.5))))

@@ -1,0 +1,176 @@
+"""The suite: rows are trained and measured once, failures say why, and the table says what was run."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from predictor import suite, tables
+from predictor.data.springs import SpringsConfig, make
+from predictor.data.store import Episode, StoreInfo, write_store
+from predictor.data.windows import Windows
+from predictor.errors import UserError
+from predictor.models import configure
+from predictor.suite import SuiteConfig, row_config, row_folder, run_row, run_suite
+from predictor.suite_measure import protocol_indices
+from predictor.suite_report import latex_table, markdown_report
+from predictor.tables import TABLES, Row
+from tests.predictor.helpers import spec
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    make(SpringsConfig(folder / "springs", train=30, val=12, test=24, ood=24))
+    return folder
+
+
+def config(data: Path, out: Path, **changes: Any) -> SuiteConfig:
+    return SuiteConfig("springs", data, out, "smoke", **({"steps": 2, "jobs": 1} | changes))
+
+
+def row(key: str) -> Row:
+    return next(r for r in TABLES["springs"].rows if r.key == key)
+
+
+# --- Rows ---------------------------------------------------------------------------------------------------------
+
+
+def test_least_squares_is_the_limit(data: Path, tmp_path: Path):
+    """Known law, unknown constants: everything is recovered, in and out of distribution."""
+    result = run_row(config(data, tmp_path), row("least-squares"))
+    for kind in ("test", "ood"):
+        measured = result["tests"][kind]
+        assert measured["horizon_only"]["min_ade_m"] < 1e-3
+        assert measured["graph"]["accuracy"] == 1.0
+        assert measured["features"]["direct_r2"] > 0.999
+
+
+@pytest.mark.parametrize("key", ["dgvae-rl", "dvae", "dnri", "lstm-joint"])
+def test_every_kind_of_row_is_trained_and_measured(data: Path, tmp_path: Path, key: str):
+    result = run_row(config(data, tmp_path), row(key))
+    measured = result["tests"]["test"]
+    assert result["parameters"] > 0
+    assert measured["windows"] == 24
+    horizon, whole = measured["horizon_only"], measured["whole_sequence"]
+    assert len(horizon["by_step_m"]) == 10 and len(whole["by_step_m"]) == 49
+    assert whole["by_step_m"][-1] == pytest.approx(horizon["by_step_m"][-1], rel=0.3)  # best by another mean
+    assert set(horizon["statistics"]) >= {"min_ade_m", "min_fde_m", "overall_rmse_m"}
+    assert (measured["features"] is None) == (key != "dgvae-rl")
+    saved = json.loads((row_folder(config(data, tmp_path), row(key)) / "result.json").read_text())
+    assert saved["tests"]["test"]["horizon_only"]["min_ade_m"] == horizon["min_ade_m"]
+
+
+def test_all_rows_of_a_table_share_data_steps_and_protocol(data: Path, tmp_path: Path):
+    trained = [r for r in TABLES["springs"].rows if r.model not in ("constant-velocity", "least-squares")]
+    configs = [row_config(config(data, tmp_path), r, tmp_path / r.key) for r in trained]
+    shared = ("data", "val_data", "steps", "batch_size", "max_episodes", "history_steps", "horizon_steps", "lr", "seed")
+    for name in shared:
+        assert len({getattr(c, name) for c in configs}) == 1, name
+
+
+# --- Caching ------------------------------------------------------------------------------------------------------
+
+
+def test_a_row_has_a_folder_of_its_own_for_each_config_and_data(data: Path, tmp_path: Path):
+    base = config(data, tmp_path)
+    folders = {
+        row_folder(base, row("dgvae")),
+        row_folder(base, row("dnri")),
+        row_folder(replace(base, steps=3), row("dgvae")),
+        row_folder(replace(base, seed=1), row("dgvae")),
+        row_folder(base, replace(row("dgvae"), set=("edge_feature_dim=4",))),
+    }
+    assert len(folders) == 5
+    assert row_folder(replace(base, jobs=2), row("dgvae")) in folders  # nothing that changes no number
+
+
+def test_suite_runs_what_is_missing_and_nothing_else(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    settings = config(data, tmp_path, rows=("constant-velocity", "mlp"), jobs=2)
+    content = run_suite(settings)
+    assert [r["key"] for r in content["rows"]] == ["constant-velocity", "mlp"]
+    assert not content["failed"]
+    for name in ("table.md", "table.tex", "table.json"):
+        assert (settings.folder / name).exists()
+    monkeypatch.setattr(suite, "_start", lambda *_: pytest.fail("a finished row was started again"))
+    again = run_suite(settings)
+    assert again["rows"] == content["rows"]
+
+
+def test_a_row_that_fails_says_why_and_leaves_the_others(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    broken = config(data, tmp_path, rows=("constant-velocity", "mlp"), jobs=2)
+    folder = row_folder(broken, row("mlp")) / "run"
+    folder.mkdir(parents=True)
+    (folder / "somebody.txt").write_text("not a run")
+    content = run_suite(broken)
+    assert [r["key"] for r in content["rows"]] == ["constant-velocity"]
+    assert "not empty and not a training run" in content["failed"]["mlp"]
+    assert "Failed rows: mlp" in (broken.folder / "table.md").read_text()
+
+
+# --- Tables -------------------------------------------------------------------------------------------------------
+
+
+def test_reports_have_a_line_for_each_row_and_the_papers_figures(data: Path, tmp_path: Path):
+    settings = config(data, tmp_path, rows=("constant-velocity", "least-squares"), jobs=2)
+    content = run_suite(settings)
+    content["paper"] = {"least-squares": {"rmse": 0.125, "ade": 0.25, "fde": 0.5}}
+    text, latex = markdown_report(content), latex_table(content)
+    assert text.count("| least squares (limit) |") == 3  # two views and the graph
+    assert "0.125 / 0.250 / 0.500" in text
+    assert latex.count(r"\\") == 3 and latex.count("&") == 3 * 12
+
+
+@pytest.mark.parametrize("name", list(TABLES))
+@pytest.mark.parametrize("budget", ["smoke", "cpu", "paper"])
+def test_every_row_of_every_table_is_a_valid_config(name: Any, budget: Any, tmp_path: Path):
+    settings = SuiteConfig(name, tmp_path, tmp_path, budget)
+    keys = [r.key for r in TABLES[name].rows]
+    assert len(set(keys)) == len(keys)
+    for each in TABLES[name].rows:
+        if each.model not in ("constant-velocity", "least-squares"):
+            made = row_config(settings, each, tmp_path)
+            made.check()
+            configure(made.model, made.preset, made.set)
+
+
+def test_windows_end_their_burn_in_at_every_stride():
+    episodes = [Episode(np.zeros((n, 1, 4), np.float32), np.ones((n, 1), np.bool_), np.arange(1)) for n in (70, 55)]
+    windows = Windows(episodes, spec(has_ego=False), 40, 10, min_future_steps=10, min_history_steps=40)
+    ends = windows.index[protocol_indices(windows, 5, 0, 0)].tolist()
+    assert ends == [[0, 39], [0, 44], [0, 49], [0, 54], [0, 59], [1, 39], [1, 44]]
+    limited = protocol_indices(windows, 5, 3, 0)
+    assert len(limited) == 3 and sorted(limited.tolist()) == limited.tolist()
+
+
+# --- Bad input ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rows": ("dgvea",)}, "table 'springs' has no row 'dgvea'; there are constant-velocity, mlp"),
+        ({"steps": -1}, "steps must not be negative, got -1"),
+        ({"device": "cuda:7"}, "device 'cuda:7' asked for but torch sees no CUDA device"),
+    ],
+)
+def test_suite_refuses(data: Path, tmp_path: Path, changes: Mapping[str, Any], message: str):
+    with pytest.raises(UserError, match=message):
+        config(data, tmp_path, **changes).check()
+
+
+def test_a_missing_store_is_named_with_the_command_that_makes_it(tmp_path: Path):
+    with pytest.raises(UserError, match=r"no store at .*springs/train; make the stores .* predictor\.data\.springs"):
+        SuiteConfig("springs", tmp_path).check()
+
+
+def test_test_stores_too_short_for_the_protocol_are_refused(data: Path, tmp_path: Path):
+    short = Episode(np.zeros((12, 2, 4), np.float32), np.ones((12, 2), np.bool_), np.arange(2))
+    write_store(tmp_path / "short", StoreInfo(spec(has_ego=False), "short"), [short])
+    table = replace(tables.SPRINGS, tests={"test": "short"})
+    with pytest.raises(UserError, match="test store of 'short' fits no window of the protocol"):
+        suite.measure_row(table, row("constant-velocity"), tmp_path, table.budgets["smoke"], None, 0, "cpu")
