@@ -150,6 +150,9 @@ def graphs_figure(
     figure = Figure(figsize=(4.3 * len(windows), 8.4), layout="constrained")
     axes = figure.subplots(2, len(windows), squeeze=False)
     every = [w.types > 0 for w in windows if w.types is not None]
+    drawn = [w.attributes[..., 0][w.types > 0] for w in windows if w.attributes is not None and w.types is not None]
+    known_values = np.concatenate([*drawn, np.zeros(0)])
+    spread = (float(known_values.min()), float(known_values.max())) if reading and len(known_values) else (0.0, 1.0)
     symmetric = any(edges.any() for edges in every) and all(np.array_equal(edges, edges.T) for edges in every)
     for column, window in enumerate(windows):
         assert window.types is not None
@@ -166,9 +169,6 @@ def graphs_figure(
             inferred = None if inferred is None else (inferred + inferred.T) / 2
         said = (prob > 0.5) & known
         numbers = prob if inferred is None else inferred
-        spread = (0.0, 1.0)
-        if true_values is not None and truth.any():
-            spread = (float(true_values[truth].min()), float(true_values[truth].max()))
         places = circle(int(there.sum())) if on_circle else window.history[-1, there, :2]
         names = [name for name, present in zip(window.names, there, strict=True) if present]
         plot_graph(axes[0, column], places, truth, names, true_values, value_range=spread)

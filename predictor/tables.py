@@ -291,15 +291,15 @@ RECIPE = Table(
         _recipe("gated", "+ gated messages", _WHOLE, edge_cost=0.0),
         _recipe("priced", "+ price of edges (5 nats)", _WHOLE),
         _recipe("hard", "… hard samples", (*_WHOLE, "hard_samples=true")),
-        _recipe("warm-up", "… KL warm-up over half of the steps", _WHOLE, kl_warmup_steps=300),
-        _recipe("curriculum", "… free run grows over half of the steps", _WHOLE, curriculum_steps=300),
+        _recipe("warm-up", "… KL warm-up over half of the steps", _WHOLE, kl_warmup_steps=150),
+        _recipe("curriculum", "… free run grows over half of the steps", _WHOLE, curriculum_steps=150),
         _recipe("sigma", "… σ = 5e-3 instead of 5e-5", _WHOLE, variance=5e-3),
         _recipe("gaussian", "… Gaussian instead of Laplace", _WHOLE, likelihood="gaussian"),
         _recipe("labels", "… restricted labelling", _WHOLE, label_weight=200.0, type_label_weight=40.0),
     ),
     budgets={
         "smoke": Sizes(20, 8, 200, 50, 50, 20, _TINY),
-        "cpu": Sizes(600, 32, 10_000, 500, 1000, 150, _SMALL),
+        "cpu": Sizes(300, 32, 10_000, 500, 500, 100, _SMALL),
         "paper": Sizes(20_000, 128, 0, 2000, 0, 1000),
     },
 )
