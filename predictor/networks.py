@@ -64,6 +64,9 @@ class DGVAEConfig:
     act through the GRU alone."""
     gated_messages: bool = False
     """Edge features scale the messages instead of being one more input of theirs."""
+    zero_start: bool = False
+    """Fresh weights predict no change beyond the residual: with many senders, sums are large, and a free run through
+    random weights explodes."""
     hard_samples: bool = False
     """Sample one-hot graphs, with the gradient of the soft ones (straight-through)."""
 
@@ -291,6 +294,9 @@ class Decoder(nn.Module):
         if config.substeps:
             self.direct = nn.Linear(width, outputs, bias=False)
         self.has_features = config.edge_feature_dim > 0
+        if config.zero_start:
+            for parameter in (*self.readout.parameters(), *(self.direct.parameters() if config.substeps else ())):
+                nn.init.zeros_(parameter)
 
     def messages(
         self,

@@ -147,7 +147,9 @@ _REAL_BUDGETS = {
 }
 
 
-def _real_rows(features: int, static: int, paper: dict[str, dict[str, float]]) -> tuple[Row, ...]:
+def _real_rows(
+    features: int, static: int, paper: dict[str, dict[str, float]], more: tuple[str, ...] = ()
+) -> tuple[Row, ...]:
     free = ("residual=trapezoid",)
     return (
         Row("constant-velocity", "constant velocity", "constant-velocity"),
@@ -157,9 +159,9 @@ def _real_rows(features: int, static: int, paper: dict[str, dict[str, float]]) -
         Row("imma", "IMMA", "imma", paper=paper.get("imma", {})),
         Row("dnri", "dNRI", "dnri", train=_TEACHER_FORCED, paper=paper.get("dnri", {})),
         Row("dnri-free", "dNRI, trained in free run", "dnri", free),
-        _dgvae("dgvae", "dG-VAE", features, "substeps=1", paper=paper.get("dgvae", {})),
+        _dgvae("dgvae", "dG-VAE", features, "substeps=1", *more, paper=paper.get("dgvae", {})),
         _dgvae(
-            "dgvae-pm", "dG-VAE + pair matching", features, "substeps=1", f"static_dim={static}",
+            "dgvae-pm", "dG-VAE + pair matching", features, "substeps=1", *more, f"static_dim={static}",
             paper=paper.get("dgvae-pm", {}),
         ),
     )  # fmt: skip
@@ -187,6 +189,7 @@ MOCAP = Table(
             "dgvae": _figures(0.068, 0.075, 0.294, 0.168, 0.790),
             "dgvae-pm": _figures(0.088, 0.083, 0.344, 0.167, 0.786),
         },
+        ("zero_start=true",),
     ),
     budgets=_REAL_BUDGETS | {
         "cpu": Sizes(400, 2, 0, 40, 40, 100, _SMALL),
