@@ -28,7 +28,7 @@ INFO = CheckpointInfo(
 # What the config of a checkpoint did not say before version 0.2; all of it was off.
 NEWER_FIELDS = (
     "change_scales", "forget_bias", "innovation_rounds", "innovation_dim", "static_dim", "pair_matching", "substeps",
-    "gated_messages", "hard_samples",
+    "gated_messages", "hard_samples", "zero_start",
 )  # fmt: skip
 
 

@@ -342,6 +342,23 @@ def test_substeps_against_a_loop():
     assert window.one_step.shape == states.shape and window.rollout.shape == (BATCH, AGENTS, 1, 4)
 
 
+@pytest.mark.parametrize("substeps", [0, 2])
+def test_zero_start_begins_at_the_residual_and_learns(substeps: int):
+    """Fresh weights forecast constant velocity; the readout, which is zero, has a gradient that is not."""
+    torch.manual_seed(0)
+    forecaster = DGVAE(spec(), replace(FAST_LIKE, zero_start=True, substeps=substeps), 3)
+    states, valid = random_states(0, BATCH, TIME, AGENTS, 4), torch.ones(BATCH, TIME, AGENTS).bool()
+    output = forecaster.window(states, valid, torch.tensor([1, 3]), 3, torch.Generator().manual_seed(0))
+    now = states[torch.arange(BATCH), torch.tensor([1, 3])]
+    steps = torch.arange(1.0, 4.0)[:, None]
+    expected = now[:, :, None, :2] + steps * now[:, :, None, 2:]
+    torch.testing.assert_close(output.rollout[..., :2], expected)
+    torch.testing.assert_close(output.rollout[..., 2:], now[:, :, None, 2:].expand(-1, -1, 3, -1))
+    output.rollout.sum().backward()
+    assert forecaster.decoder.readout.weight.grad is not None
+    assert forecaster.decoder.readout.weight.grad.abs().max() > 0
+
+
 @pytest.mark.parametrize("hard", [False, True])
 def test_graphs_are_drawn_as_the_config_says(hard: bool, monkeypatch: pytest.MonkeyPatch):
     """Once for the whole teacher-forced pass, then once for each step of the free run."""

@@ -23,23 +23,20 @@ from predictor.data.springs import Physics, SpringsConfig, make_episodes, spring
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.data.windows import Windows
 from predictor.dgvae import DGVAE
-from predictor.errors import UserError, run_entry_point
-from predictor.forecaster import Belief, Memory
-from predictor.interpret import (
-    InterpretConfig,
+from predictor.edge_findings import labelled_rows, measure, watch
+from predictor.edge_scores import (
     StillnessTally,
     chance_correlation,
     correlations,
     dealt_out,
     disentanglement,
-    interpret,
-    labelled_rows,
-    measure,
     rank_statistic,
     score_factor,
     separation,
-    watch,
 )
+from predictor.errors import UserError, run_entry_point
+from predictor.forecaster import Belief, Memory
+from predictor.interpret import InterpretConfig, interpret
 from predictor.outcomes import run_window_batch
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from tests.predictor.helpers import RICH, circling_episode, model, spec, write_circles

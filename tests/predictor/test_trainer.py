@@ -199,6 +199,23 @@ def test_validation_may_ask_for_whole_histories_and_horizons(circles: Path, tmp_
     assert (batch.last_observed == 2).all() and batch.valid[..., 0].all()
 
 
+@pytest.mark.parametrize(
+    ("option", "needed"), [("label_weight", "edge_attributes"), ("type_label_weight", "edge_types")]
+)
+def test_weights_of_labels_need_labels(circles: Path, tmp_path: Path, option: str, needed: str):
+    """In every training store; validation does without."""
+    labels = {
+        "edge_types": np.zeros((1, 2, 2), dtype=np.int8),
+        "edge_attributes": np.zeros((1, 2, 2, 1), dtype=np.float32),
+    }
+    episodes = [replace(circling_episode(i), **{needed: labels[needed]}) for i in range(3)]
+    write_store(tmp_path / "labelled", StoreInfo(spec(), "labelled"), episodes)
+    fine = config(tmp_path / "labelled", tmp_path / "run", val_data=(circles,), **{option: 1.0})
+    assert len(load_data(fine).train_episodes) == 3
+    with pytest.raises(UserError, match=f"{option} needs {needed}, and store .*circles has none; set it to 0 or use"):
+        load_data(replace(fine, data=(tmp_path / "labelled", circles)))
+
+
 # --- Schedules --------------------------------------------------------------------------------------------------------
 
 

@@ -304,6 +304,15 @@ def test_labels_are_the_graph_that_made_the_motion(tmp_path: Path, split: str, k
             assert set(strength[strength > 0].tolist()) <= ({1.0, 2.0, 3.0} if kind == "springs" else {2.0})
 
 
+def test_share_of_springs_in_each_split(tmp_path: Path):
+    """3,000 pairs, so four standard errors are 0.04; out of distribution it is a half, whatever the option says."""
+    settings = config(tmp_path, edge_probability=0.9, physics=replace(SHORT, frames=2, substeps=1))
+    off_diagonal = ~np.eye(5, dtype=np.bool_)
+    for split, share in (("train", 0.9), ("val", 0.9), ("test", 0.9), ("ood", 0.5)):
+        types = np.stack([e.edge_types[0] for e in make_episodes(settings, split, 300) if e.edge_types is not None])
+        assert types[:, off_diagonal].mean() == pytest.approx(share, abs=0.04), split
+
+
 def test_written_stores(tmp_path: Path):
     took = make(config(tmp_path / "data"))
     assert sorted(p.name for p in (tmp_path / "data").iterdir()) == sorted(took) == ["ood", "test", "train", "val"]
