@@ -1,6 +1,7 @@
 """Plots of forecasts and their accuracy; functions take arrays and an axis and return the axis."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,6 +22,32 @@ def plot_error_by_horizon(ax: Axes, rows: Sequence[Accuracy], dt_s: float) -> Ax
     ax.set_ylim(bottom=0)
     ax.grid(alpha=0.3)
     ax.legend(frameon=False)
+    return ax
+
+
+def plot_rows_by_step(ax: Axes, results: Sequence[dict[str, Any]], kind: str, dt_s: float) -> Axes:
+    """A suite's rows: displacement of the best sample at each step of the free run, with standard errors; log scale.
+
+    Args:
+        ax: where to draw.
+        results: rows of a suite's table.json.
+        kind: test store, "test" or "ood".
+        dt_s: length of a step.
+    """
+    for i, row in enumerate(results):
+        view = row["tests"][kind]["horizon_only"]
+        if row["key"] == "least-squares":  # the limit, orders of magnitude below
+            continue
+        ours = row["key"].startswith(("dgvae", "dvae"))
+        baseline = row["key"] == "constant-velocity"
+        time_s = dt_s * np.arange(1, len(view["by_step_m"]) + 1)
+        errors = [error or 0.0 for error in view["step_errors"]["by_step_m"]]
+        style: dict[str, Any] = {"ls": "-" if ours else "--", "lw": 2.0 if ours else 1.2, "marker": "o", "ms": 3}
+        color = "black" if baseline else f"C{i % 10}"
+        ax.errorbar(time_s, view["by_step_m"], yerr=errors, color=color, label=row["name"], **style)
+    ax.set_yscale("log")
+    ax.set_xlabel("time ahead [s]")
+    ax.grid(alpha=0.3, which="both")
     return ax
 
 

@@ -15,12 +15,15 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import matplotlib
 import torch
 import tyro
+from matplotlib import pyplot as plt
 from rich.progress import Progress
 
 from predictor.data.store import read_info_of
 from predictor.errors import UserError, run_entry_point
+from predictor.plots import plot_rows_by_step
 from predictor.provenance import provenance, write_json
 from predictor.suite_measure import measure_row
 from predictor.suite_report import latex_table, markdown_report
@@ -191,7 +194,27 @@ def run_suite(config: SuiteConfig) -> dict[str, Any]:
         partial = config.folder / f".{name}.partial"
         partial.write_text(text)
         os.replace(partial, config.folder / name)
+    if content["rows"]:
+        _plot(config, content["rows"], content["title"])
     return content
+
+
+def _plot(config: SuiteConfig, rows: Sequence[dict[str, Any]], title: str) -> None:
+    matplotlib.use("Agg")
+    kinds = list(rows[0]["tests"])
+    dt_s = read_info_of(config.data / TABLES[config.table].tests[kinds[0]]).spec.dt_s
+    figure, axes = plt.subplots(
+        1, len(kinds), figsize=(1 + 5 * len(kinds), 4.4), sharey=True, squeeze=False, layout="constrained"
+    )
+    for ax, kind in zip(axes[0], kinds, strict=True):
+        plot_rows_by_step(ax, rows, kind, dt_s).set_title(kind)
+    axes[0, 0].set_ylabel("displacement of the best sample [m]")
+    axes[0, -1].legend(fontsize=7.5, frameon=False)
+    figure.suptitle(
+        f"{title}, budget {config.budget}, one seed per row; bars: standard error over 20 subsets", fontsize=9
+    )
+    figure.savefig(config.folder / "by_step.png", dpi=110)
+    plt.close(figure)
 
 
 def _run_in_processes(config: SuiteConfig, pending: Sequence[Row]) -> dict[str, str]:
@@ -250,7 +273,7 @@ def main() -> None:
         return
     content = run_suite(config)
     print((config.folder / "table.md").read_text())
-    print(f"written to {config.folder}: table.md, table.json, table.tex")
+    print(f"written to {config.folder}: table.md, table.json, table.tex, by_step.png")
     if content["failed"]:
         raise UserError(
             "; ".join(f"row '{key}' failed: {reason}" for key, reason in content["failed"].items())

@@ -94,7 +94,7 @@ def test_suite_runs_what_is_missing_and_nothing_else(data: Path, tmp_path: Path,
     content = run_suite(settings)
     assert [r["key"] for r in content["rows"]] == ["constant-velocity", "mlp"]
     assert not content["failed"]
-    for name in ("table.md", "table.tex", "table.json"):
+    for name in ("table.md", "table.tex", "table.json", "by_step.png"):
         assert (settings.folder / name).exists()
     monkeypatch.setattr(suite, "_start", lambda *_: pytest.fail("a finished row was started again"))
     again = run_suite(settings)
