@@ -38,8 +38,15 @@ KINDS: dict[str, _Kind] = {
 
 
 def name_of(model: nn.Module) -> str:
-    """The name under which a model can be built again."""
-    return next(name for name, kind in KINDS.items() if type(model) is kind.network)
+    """The name under which a model can be built again.
+
+    Raises:
+        UserError: not a model that can be trained.
+    """
+    for name, kind in KINDS.items():
+        if type(model) is kind.network:
+            return name
+    raise UserError(f"{type(model).__name__} is not a trainable model; there are {', '.join(KINDS)}")
 
 
 def build(name: str, spec: SceneSpec, config: Any, horizon_steps: int) -> nn.Module:

@@ -7,6 +7,7 @@ from torch.nn import functional
 
 from predictor.data.windows import WindowBatch
 from predictor.disentangle import restricted_labelling
+from predictor.errors import UserError
 from predictor.forecaster import TrainableForecaster, WindowOutput
 from predictor.graph import pair_mask
 from predictor.losses import kl_categorical, masked_mean, nll
@@ -75,6 +76,12 @@ def _graph_loss(batch: WindowBatch, output: WindowOutput, config: TrainConfig, k
             total = total + config.type_label_weight * labelled
             terms["type_label"] = labelled
     if config.label_weight and batch.edge_attributes is not None and output.features is not None:
+        missing = batch.edge_attributes.shape[-1] - output.features.shape[-1]
+        if missing > 0:
+            raise UserError(
+                f"restricted labelling of {batch.edge_attributes.shape[-1]} attributes needs as many edge features, "
+                f"got {output.features.shape[-1]}; raise edge_feature_dim or set label_weight to 0"
+            )
         with_edge = pairs if batch.edge_types is None else pairs & (batch.edge_types > 0)
         label = restricted_labelling(output.features, batch.edge_attributes, with_edge)
         total = total + config.label_weight * label

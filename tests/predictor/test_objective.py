@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from predictor.data.windows import WindowBatch
+from predictor.errors import UserError
 from predictor.forecaster import WindowOutput
 from predictor.objective import window_loss
 from predictor.train_config import TrainConfig
@@ -229,3 +230,9 @@ def test_terms_are_for_reading_only():
     config = replace(CONFIG, edge_cost=1.0, type_label_weight=1.0)
     total, parts = window_loss(model(), batch(TYPES), output(prior, EVEN), config)
     assert total.requires_grad and not any(part.requires_grad for part in parts.values())
+
+
+def test_more_attributes_than_features_are_refused():
+    attributes = torch.zeros(1, 3, 2, 2, 3)
+    with pytest.raises(UserError, match="restricted labelling of 3 attributes needs as many edge features, got 1"):
+        terms(replace(SILENT, label_weight=1.0), batch(None, attributes), output(features=torch.zeros(1, 3, 2, 2, 1)))
