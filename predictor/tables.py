@@ -129,6 +129,10 @@ SPRINGS = Table(
         _dgvae("dgvae", "dG-VAE", 16, edge_cost=5.0, paper=_figures(0.019, 0.011, 0.048, 0.302, 1.063)),
         _dgvae("dgvae-pm", "dG-VAE + pair matching", 24, "static_dim=16", edge_cost=5.0),
         _dgvae(
+            "dgvae-pm-window", "dG-VAE + pair matching, whole window in training", 24,
+            "static_dim=16", "pair_matching=window", edge_cost=5.0,
+        ),
+        _dgvae(
             "dgvae-rl", "dG-VAE + restricted labelling", 16, label_weight=200.0, type_label_weight=40.0,
             paper=_figures(0.016, 0.010, 0.063, 0.309, 1.032) | {"graph": 0.984},
         ),
