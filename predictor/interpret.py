@@ -35,6 +35,7 @@ from predictor.edge_findings import (
     watch,
 )
 from predictor.errors import UserError, run_entry_point
+from predictor.interpret_report import scores_markdown
 from predictor.outcomes import run_window_batch
 from predictor.provenance import provenance, write_json
 from predictor.scene import SceneSpec
@@ -119,7 +120,7 @@ def interpret(config: InterpretConfig) -> Findings:
         graphs = _shown(config, model, windows, _by_accuracy(np.sort(drawn), accuracies), store.info)
         _draw(partial, config, content, findings, shown, graphs, info.spec)
         write_json(partial / "scores.json", content)
-        (partial / "scores.md").write_text(pictures.scores_markdown(content), encoding="utf-8")
+        (partial / "scores.md").write_text(scores_markdown(content), encoding="utf-8")
         out.mkdir(exist_ok=True)
         for name in FILES:
             if (partial / name).exists():

@@ -1,7 +1,6 @@
-"""Pictures and tables of what edges mean (`predictor.interpret`): graphs, edge-feature matrices, forecasts, scores.
+"""Pictures of what edges mean (`predictor.interpret`): graphs, edge-feature matrices, forecasts.
 
-Functions take arrays (or what scores.json holds) and return an axis, a figure or text; nothing is computed here but
-where things go on the page.
+Functions take arrays and return an axis or a figure; nothing is computed here but where things go on the page.
 """
 
 import itertools
@@ -17,6 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from predictor.graph_metrics import GraphAccuracy
+from predictor.interpret_report import plain
 from predictor.plots import plot_scene
 
 GRAPH_QUANTILES = (0.0, 0.1, 0.5)
@@ -185,8 +185,8 @@ def graphs_figure(
     commoner = None if graph.true_connectivity is None else max(graph.true_connectivity, 1 - graph.true_connectivity)
     figure.legend(handles=_edge_legend(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     figure.suptitle(
-        f"{where}: accuracy {_plain(graph.accuracy)} over all ordered pairs (always giving the commoner answer: "
-        f"{_plain(commoner)})\nnumbers and widths: {_value_name(reading, attribute_names)}"
+        f"{where}: accuracy {plain(graph.accuracy)} over all ordered pairs (always giving the commoner answer: "
+        f"{plain(commoner)})\nnumbers and widths: {_value_name(reading, attribute_names)}"
         + ("" if on_circle else "; arrows go from sender to receiver"),
         fontsize=10,
     )
@@ -404,137 +404,3 @@ def _error(window: WindowShown) -> str:
         return ""
     distance = np.linalg.norm(window.forecast - window.future, axis=-1).mean(axis=-1)[:, whole]
     return f"; error: best of {len(distance)} {distance.min(axis=0).mean():.3g} m, first {distance[0].mean():.3g} m"
-
-
-# --- Table ------------------------------------------------------------------------------------------------------------
-
-
-def scores_markdown(content: dict[str, Any]) -> str:
-    """What scores.json holds, as tables and sentences."""
-    parts = [
-        f"# What the edges of `{content['config']['checkpoint']}` say about {content['source']}",
-        f"{content['windows']} windows of {content['episodes']} episodes; features are read at the last of "
-        f"{content['config']['history_steps']} observed steps.",
-    ]
-    relation = content["edges"]
-    if content["has_ego"] and relation is not None:
-        parts.append("An edge exists where the sender is the receiver's leader.")
-    scores = [score for score in [relation, *content["attributes"]] if score is not None]
-    if scores:
-        parts += ["## In words", "\n".join(f"* {_sentence(score)}" for score in scores)]
-        parts += ["## What features know", _factor_table(scores), FACTOR_NOTE]
-    if content["graph"] is not None:
-        parts += ["## Graph", _graph_lines(content)]
-    if content["disentanglement"] is not None:
-        parts += ["## Disentanglement", _disentanglement_lines(content)]
-    parts += ["## Dimension by dimension", _dimension_table(content, scores), _stillness_note(content)]
-    made = content["provenance"]
-    parts.append(f"Made by `{made['command']}`, commit {made['commit']}, {made['time']}.")
-    return "\n\n".join(parts) + "\n"
-
-
-FACTOR_NOTE = (
-    "best: dimension with the largest |r|. chance: the largest |r| among all dimensions that 95 of 100 shuffled "
-    "properties stay below. distance: r of the property with the distance between the two agents, for comparison. "
-    "linear R²: all dimensions, fitted on half of the episodes, scored on the other half. direct R²: dimension i as it "
-    "is against attribute i; only restricted labelling aims at it (negative: worse than the mean)."
-)
-
-
-def _sentence(score: dict[str, Any]) -> str:
-    name, r, chance = f"**{score['name']}**", score["correlation"], score["chance"]
-    if r is None:
-        return f"{name}: nothing to say; {score['rows']} pairs, or all of them are alike."
-    if abs(r) <= chance:
-        return f"{name}: no feature goes with it beyond chance (best |r| {abs(r):.2f}, chance {chance:.2f})."
-    by_hand = abs(score["distance_correlation"]) >= abs(r)
-    ruler = f"; the distance alone does no worse (r = {score['distance_correlation']:+.2f})" if by_hand else ""
-    return f"{name}: feature {score['dimension']} goes with it, r = {r:+.2f} (chance {chance:.2f}){ruler}."
-
-
-def _factor_table(scores: Sequence[dict[str, Any]]) -> str:
-    rows = [
-        [
-            s["name"],
-            str(s["rows"]),
-            "–" if s["dimension"] is None else str(s["dimension"]),
-            _signed(s["correlation"]),
-            _plain(s["r2"]),
-            _plain(s["chance"]),
-            _signed(s["distance_correlation"]),
-            _plain(s["linear_r2"]),
-            _plain(s["direct_r2"]),
-        ]
-        for s in scores
-    ]
-    header = ["property", "pairs", "best", "r", "r²", "chance", "distance", "linear R²", "direct R²"]
-    return _table(header, rows)
-
-
-def _graph_lines(content: dict[str, Any]) -> str:
-    graph, apart = content["graph"], content["separation"]
-    lines = [
-        f"* accuracy {_plain(graph['accuracy'])}, F1 {_plain(graph['f1'])} over {graph['pairs']} ordered pairs; "
-        f"always saying 'edge' has accuracy {_plain(graph['true_connectivity'])}, always 'no edge' "
-        f"{_plain(None if graph['true_connectivity'] is None else 1 - graph['true_connectivity'])}"
-    ]
-    if apart is not None:
-        lines.append(
-            f"* chance that an edge has the larger value than a non-edge (AUC; 0.5 knows nothing, near 0 is as good as "
-            f"near 1): feature {apart['dimension']} {_plain(apart['auc'])}, the model's own probability "
-            f"{_plain(apart['edge_prob_auc'])}"
-        )
-    return "\n".join(lines)
-
-
-def _disentanglement_lines(content: dict[str, Any]) -> str:
-    found = content["disentanglement"]
-    lines = [
-        f"* MIG {_plain(found['mig'])} over {found['rows']} true edges (1: each attribute is held by one dimension "
-        "alone, 0: by none, or by two alike)"
-    ]
-    if found["dci"] is not None:
-        dci = found["dci"]
-        one = "" if dci["disentanglement"] is not None else " (not defined for one attribute)"
-        lines.append(
-            f"* DCI: disentanglement {_plain(dci['disentanglement'])}{one}, completeness "
-            f"{_plain(dci['completeness'])}, informativeness {_plain(dci['informativeness'])}"
-        )
-    if found["note"]:
-        lines.append(f"* DCI not available: {found['note']}")
-    return "\n".join(lines)
-
-
-def _dimension_table(content: dict[str, Any], scores: Sequence[dict[str, Any]]) -> str:
-    scored = [s for s in scores if s["correlations"]]
-    whole, late = content["stillness"], content["stillness_late"]
-    rows = []
-    for d, spread in enumerate(late["spread"]):
-        kind = "static" if d < content["static_dim"] else "dynamic"
-        row = [str(d), kind, f"{spread:.3g}", _plain(whole["within"][d], 2), _plain(late["within"][d], 2)]
-        rows.append(row + [_signed(s["correlations"][d]) for s in scored])
-    header = ["feature", "kind", "spread", "changing", "changing, 2nd half", *(f"r: {s['name']}" for s in scored)]
-    return _table(header, rows)
-
-
-def _stillness_note(content: dict[str, Any]) -> str:
-    whole, late = content["stillness"], content["stillness_late"]
-    which = "true edges" if content["edges"] is not None else "pairs"
-    return (
-        f"changing: variance within a pair over time / variance over pairs and time; 0 stands still, 1 is all change. "
-        f"Over all {whole['steps']} observed steps ({whole['edges']} {which} that are there throughout), and over the "
-        f"second half ({late['edges']}). static: averaged over the past (pair matching), so stiller by construction. "
-        f"spread: standard deviation in the second half; a dash beside it is a dimension that never changes at all."
-    )
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in [header, ["---"] * len(header), *rows])
-
-
-def _plain(value: float | None, places: int = 3) -> str:
-    return "–" if value is None else f"{value:.{places}f}"
-
-
-def _signed(value: float | None) -> str:
-    return "–" if value is None else f"{value:+.2f}"

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
@@ -43,7 +44,7 @@ def plot_rows_by_step(ax: Axes, results: Sequence[dict[str, Any]], kind: str, dt
         time_s = dt_s * np.arange(1, len(view["by_step_m"]) + 1)
         errors = [error or 0.0 for error in view["step_errors"]["by_step_m"]]
         style: dict[str, Any] = {"ls": "-" if ours else "--", "lw": 2.0 if ours else 1.2, "marker": "o", "ms": 3}
-        color = "black" if baseline else f"C{i % 10}"
+        color = "black" if baseline else colormaps["tab20"](i % 20)
         ax.errorbar(time_s, view["by_step_m"], yerr=errors, color=color, label=row["name"], **style)
     ax.set_yscale("log")
     ax.set_xlabel("time ahead [s]")

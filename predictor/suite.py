@@ -204,12 +204,13 @@ def _plot(config: SuiteConfig, rows: Sequence[dict[str, Any]], title: str) -> No
     kinds = list(rows[0]["tests"])
     dt_s = read_info_of(config.data / TABLES[config.table].tests[kinds[0]]).spec.dt_s
     figure, axes = plt.subplots(
-        1, len(kinds), figsize=(1 + 5 * len(kinds), 4.4), sharey=True, squeeze=False, layout="constrained"
+        1, len(kinds), figsize=(1 + 5 * len(kinds), 5.2), sharey=True, squeeze=False, layout="constrained"
     )
     for ax, kind in zip(axes[0], kinds, strict=True):
         plot_rows_by_step(ax, rows, kind, dt_s).set_title(kind)
     axes[0, 0].set_ylabel("displacement of the best sample [m]")
-    axes[0, -1].legend(fontsize=7.5, frameon=False)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2 * len(kinds), fontsize=7.5, frameon=False)
     figure.suptitle(
         f"{title}, budget {config.budget}, one seed per row; bars: standard error over 20 subsets", fontsize=9
     )

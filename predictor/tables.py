@@ -233,6 +233,11 @@ def _crowd_rows(paper: dict[str, dict[str, float]]) -> tuple[Row, ...]:
     )
 
 
+_CROWD_BUDGETS = _REAL_BUDGETS | {
+    "cpu": Sizes(600, 4, 0, 60, 200, 150, _SMALL),
+    "paper": Sizes(40_000, 1, 0, 300, 0, 1000),
+}
+
 SDD = Table(
     title="Stanford Drone Dataset",
     train="sdd_train",
@@ -247,7 +252,7 @@ SDD = Table(
         "python -m predictor.data.crowd --source {data}/sdd_test --episodes 3 --out {data}/sdd_crowd",
     ),
     rows=_crowd_rows({}),
-    budgets=_REAL_BUDGETS | {"cpu": Sizes(600, 4, 0, 60, 200, 150, _SMALL), "paper": Sizes(40_000, 1, 0, 300, 0, 1000)},
+    budgets=_CROWD_BUDGETS,
 )
 
 IND = Table(
@@ -269,7 +274,7 @@ IND = Table(
             "dgvae-pm": _figures(1.104, 0.558, 4.441, 4.384, 34.848),
         }
     ),
-    budgets=_REAL_BUDGETS | {"cpu": Sizes(600, 1, 0, 60, 200, 100, _SMALL), "paper": Sizes(40_000, 1, 0, 300, 0, 1000)},
+    budgets=_CROWD_BUDGETS | {"cpu": Sizes(600, 1, 0, 60, 200, 100, _SMALL)},
 )
 
 _PLAIN = {"edge_cost": 0.0, "input_changes": False}

@@ -164,3 +164,8 @@ def test_unknown_fields_of_a_checkpoint_are_named():
 def test_values_of_a_checkpoint_are_checked():
     with pytest.raises(UserError, match="num_edge_types must be at least 2"):
         config_from_json("dgvae", dataclasses.asdict(DGVAEConfig()) | {"num_edge_types": 1})
+
+
+def test_a_network_that_cannot_be_trained_has_no_name():
+    with pytest.raises(UserError, match="Linear is not a trainable model; there are dgvae, dnri, imma, lstm, mlp"):
+        name_of(torch.nn.Linear(1, 1))
