@@ -8,7 +8,6 @@
 (11, 5, 2)
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -22,11 +21,9 @@ from envs.observation import (
     scene_entries,
     scene_spaces,
 )
-from envs.readers import SceneReader, reader_for
+from envs.readers import MakeReader, reader_for
 from predictor.errors import ProtocolError, UserError
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
-
-MakeReader = Callable[[gym.Env], SceneReader]
 
 
 def scene_source(env: gym.Env) -> str:
@@ -103,7 +100,8 @@ class SceneObservation(gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstru
 
     def _observe(self, obs: Any) -> dict[str, Any]:
         self._scene = self.reader.read(self.env)
-        self._scene.check(f"scene reader of '{self.scene_source}'")
+        spec = self.reader.spec
+        self._scene.check(f"scene reader of '{self.scene_source}'", spec, rows=spec.max_agents)
         return {"observation": obs, **scene_entries(self._scene)}
 
 

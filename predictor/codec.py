@@ -63,11 +63,13 @@ class StateCodec(nn.Module):
         self.deltas: Tensor
         self._ego_axes: Tensor
         self._centroid_axes: Tensor
+        self._predicted: Tensor
         for name, values in (
             ("scales", spec.feature_scales),
             ("deltas", deltas),
             ("_ego_axes", [float(f == "ego") for f in spec.frame]),
             ("_centroid_axes", [float(f == "centroid") for f in spec.frame]),
+            ("_predicted", [float(f not in spec.constant_features) for f in spec.feature_names]),
         ):
             self.register_buffer(name, torch.tensor(values), persistent=False)
 
@@ -104,6 +106,6 @@ class StateCodec(nn.Module):
             fraction: of a step.
         """
         axes = self.spec.position_dim
-        after = states + change * (self.deltas * fraction)
+        after = states + change * (self.deltas * self._predicted * fraction)
         moved = after[..., :axes] + drift(self.spec, self.residual, states, after, fraction)
         return torch.cat([moved, after[..., axes:]], dim=-1)

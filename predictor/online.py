@@ -97,7 +97,7 @@ class OnlineForecaster:
         states = self.forecaster.rollout(belief, steps, num_samples, generator)
         # float32 relative to the ego: the origin that observe() removed is the ego's own position on "ego" axes
         axes = self.forecaster.spec.position_dim
-        ego_now = belief.states[:, None, :1, None, :axes]
+        ego_now = belief.states[:, None, :1, None, :axes] * float(self.forecaster.spec.has_ego)
         xy = (states[..., :axes] - ego_now) * belief.valid[:, None, :, None, None]
         missing = self._ids.shape[1] - belief.valid.shape[1]
         probs = functional.pad(belief.edge_probs, (0, 0, 0, missing, 0, missing))

@@ -40,6 +40,8 @@ class SceneSpec:
     """How far the ego sees [m]; agents beyond are not in the scene."""
     max_agents: int = 12
     """Rows of a scene, the ego included; the nearest are kept."""
+    constant_features: tuple[str, ...] = ()
+    """Features that never change while an agent is there (a role, a size): given to the network, never predicted."""
 
     def __post_init__(self) -> None:
         """Check that the fields fit together."""
@@ -57,6 +59,12 @@ class SceneSpec:
             raise UserError(
                 f"feature_scales needs one positive number per feature ({len(self.feature_names)}), "
                 f"got {self.feature_scales}"
+            )
+        predicted = self.feature_names[: 2 * self.position_dim]
+        if not set(self.constant_features) <= set(self.feature_names) - set(predicted):
+            raise UserError(
+                f"constant_features must be among the features beyond velocity, got {self.constant_features} of "
+                f"{self.feature_names}"
             )
         if self.max_agents < 1 or self.perception_m <= 0:
             raise UserError(
@@ -111,9 +119,19 @@ class Scene:
     heading_rad: float = 0.0
     """The ego's heading, which turns world axes into ego axes; 0 where agents have none."""
 
-    def check(self, source: str = "reader") -> None:
-        """Raise a `UserError` if the scene breaks the contract (no ego, duplicate ids, non-finite states)."""
-        if not self.valid[0]:
+    def check(self, source: str = "reader", spec: SceneSpec | None = None, rows: int | None = None) -> None:
+        """Raise unless the scene keeps the contract.
+
+        Args:
+            source: who read it, for messages.
+            spec: features and ego are checked against it; None expects an ego and any features.
+            rows: required number of rows, padding included; None takes any.
+
+        Raises:
+            UserError: wrong types or shapes, no ego, duplicate or negative ids, non-finite values.
+        """
+        self._check_arrays(source, spec, rows)
+        if (spec is None or spec.has_ego) and not (len(self.valid) and self.valid[0]):
             raise UserError(f"{source}: row 0 must hold the ego, but it is not valid")
         live = self.ids[self.valid]
         if len(np.unique(live)) != len(live):
@@ -124,6 +142,27 @@ class Scene:
             raise UserError(f"{source}: heading_rad must be finite, got {self.heading_rad}")
         if not np.isfinite(self.states[self.valid]).all():
             raise UserError(f"{source}: states must be finite, got {self.states[self.valid].tolist()}")
+
+    def _check_arrays(self, source: str, spec: SceneSpec | None, rows: int | None) -> None:
+        for name, array, kind, wanted, axes in (
+            ("states", self.states, "f", "floating point", 2),
+            ("ids", self.ids, "iu", "integers", 1),
+            ("valid", self.valid, "b", "bool", 1),
+        ):
+            if not isinstance(array, np.ndarray) or array.dtype.kind not in kind or array.ndim != axes:
+                got = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+                raise UserError(f"{source}: {name} must be a NumPy array of {wanted} with {axes} axes, got {got}")
+        if not len(self.states) == len(self.ids) == len(self.valid):
+            raise UserError(
+                f"{source}: states, ids and valid need one row per agent, got {len(self.states)}, {len(self.ids)} and "
+                f"{len(self.valid)}"
+            )
+        if spec is not None and self.states.shape[1] != spec.num_features:
+            raise UserError(
+                f"{source}: states need {spec.num_features} features {spec.feature_names}, got {self.states.shape[1]}"
+            )
+        if rows is not None and len(self.ids) != rows:
+            raise UserError(f"{source}: a scene needs {rows} rows (max_agents), padding included, got {len(self.ids)}")
 
 
 @dataclass(frozen=True)
@@ -173,7 +212,8 @@ class Forecast:
     """What a forecaster says at one instant about the steps that follow it."""
 
     xy: Float[Tensor, "batch samples agents horizon axes"]
-    """Predicted positions [m], world axes, relative to the ego's position now; zeros where `valid` is not."""
+    """Predicted positions [m], world axes; relative to the ego's position now, or to the world's origin where there is
+    no ego (a spec without one, or an absent row 0). Zeros where `valid` is not."""
     edge_probs: Float[Tensor, "batch agents agents types"]
     """Prior over edge types now, receiver first; type 0 is "no edge"."""
     edge_features: Float[Tensor, "batch agents agents feature"]

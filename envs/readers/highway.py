@@ -14,8 +14,9 @@ import numpy as np
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.vehicle.kinematics import Vehicle
 
+from envs.readers.base import Reader
 from predictor.errors import ProtocolError, UserError
-from predictor.scene import KINEMATIC_FEATURES, PADDING_ID, AxisFrame, Scene, SceneSpec
+from predictor.scene import KINEMATIC_FEATURES, AxisFrame, Scene, SceneSpec
 
 # Straight roads without end: x is relative to the ego, y (the lane) is the map. All other ids have a fixed map.
 _UNBOUNDED_X: tuple[AxisFrame, AxisFrame] = ("ego", "world")
@@ -50,7 +51,7 @@ def _dt_s(config: dict[str, Any]) -> float:
     return float(frames / config["simulation_frequency"])
 
 
-class HighwayReader:
+class HighwayReader(Reader):
     """Scene reader for single-ego highway-env environments (highway-env ≥ 1.12).
 
     Args:
@@ -70,36 +71,14 @@ class HighwayReader:
             spec = replace(spec, perception_m=float(perception_m))
         if max_agents is not None:
             spec = replace(spec, max_agents=int(max_agents))
-        self._spec = spec
+        super().__init__(spec)
         self.reset()
-
-    @property
-    def spec(self) -> SceneSpec:
-        """What the scenes of this reader look like."""
-        return self._spec
 
     def reset(self) -> None:
         """Forget all identities; numbering starts anew, so equal seeds give equal ids."""
         # Keyed by the living object: id() is reused after garbage collection and would join two vehicles.
         self._ids: weakref.WeakKeyDictionary[Vehicle, int] = weakref.WeakKeyDictionary()
         self._next_id = 0
-
-    def read(self, env: gym.Env) -> Scene:
-        """The ego and the nearest vehicles within perception, nearest first, padded to `max_agents` rows."""
-        spec = self._spec
-        everyone = self.read_all(env)
-        offsets = everyone.states[:, :2] - everyone.states[0, :2]
-        distance_m = np.hypot(offsets[:, 0], offsets[:, 1])
-        distance_m[0] = -1.0  # the ego stays in row 0, also when another vehicle lies on top of it
-        order = np.argsort(distance_m, kind="stable")[: spec.max_agents]
-        order = order[distance_m[order] <= spec.perception_m]
-        states = np.zeros((spec.max_agents, spec.num_features))
-        ids = np.full(spec.max_agents, PADDING_ID, dtype=np.int64)
-        valid = np.zeros(spec.max_agents, dtype=np.bool_)
-        states[: len(order)] = everyone.states[order]
-        ids[: len(order)] = everyone.ids[order]
-        valid[: len(order)] = True
-        return Scene(states, ids, valid, everyone.heading_rad)
 
     def read_all(self, env: gym.Env) -> Scene:
         """Every vehicle on the road, ego first, unpadded: ground truth for collection and evaluation."""

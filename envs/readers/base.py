@@ -1,0 +1,147 @@
+"""What every scene reader is: who is there, where, and who they are; the same rules of perception for all families.
+
+A reader reports everyone (`read_all`); what the ego perceives of it (`read`) is decided here, once: agents within
+`perception_m`, the nearest `max_agents`, the ego in row 0, padded rows of zeros. A PettingZoo environment has many
+learners and no single ego: its reader gives a `SharedScene`, from which every agent's own view is cut.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from predictor.errors import UserError
+from predictor.scene import PADDING_ID, Scene, SceneSpec
+
+
+@runtime_checkable
+class SceneReader(Protocol):
+    """Sees the agents of one environment; keeps their identities from step to step."""
+
+    @property
+    def spec(self) -> SceneSpec:
+        """What the scenes of this reader look like."""
+
+    def reset(self) -> None:
+        """Forget all identities: a new episode has begun."""
+
+    def read(self, env: Any) -> Scene:
+        """The scene as a perception system would have it: within `perception_m`, at most `max_agents`."""
+
+    def read_all(self, env: Any) -> Scene:
+        """Everyone, ego first, unpadded: ground truth for collection and evaluation."""
+
+
+class Reader(ABC):
+    """A `SceneReader` that only has to say who is there; derive from it for a new family.
+
+    Args:
+        spec: what the scenes look like.
+    """
+
+    def __init__(self, spec: SceneSpec) -> None:
+        """Keep the spec."""
+        self._spec = spec
+
+    @property
+    def spec(self) -> SceneSpec:
+        """What the scenes of this reader look like."""
+        return self._spec
+
+    def reset(self) -> None:  # noqa: B027 (a default, not a duty)
+        """Forget all identities; a reader whose environment names its agents has none to forget."""
+
+    @abstractmethod
+    def read_all(self, env: Any) -> Scene:
+        """Everyone, ego first, unpadded."""
+
+    def read(self, env: Any) -> Scene:
+        """What the ego perceives of everyone, padded to `max_agents` rows."""
+        return perceive(self.read_all(env), self._spec, type(self).__name__)
+
+
+def perceive(everyone: Scene, spec: SceneSpec, source: str = "reader") -> Scene:
+    """The ego and the nearest agents within perception, nearest first, padded to `max_agents` rows.
+
+    Agents beyond the nearest `max_agents` are out of perception, not an error. Rows that are not valid are dropped.
+
+    Args:
+        everyone: ego first, any number of rows.
+        spec: its `perception_m` and `max_agents` decide.
+        source: who read the scene, for messages.
+
+    Raises:
+        UserError: `everyone` breaks the contract of a scene.
+    """
+    everyone.check(source, spec)
+    offsets = everyone.states[:, : spec.position_dim] - everyone.states[0, : spec.position_dim]
+    distance_m = np.where(everyone.valid, np.linalg.norm(offsets, axis=1), np.inf)
+    distance_m[0] = -1.0  # the ego stays in row 0, also when another agent lies on top of it
+    order = np.argsort(distance_m, kind="stable")[: spec.max_agents]
+    order = order[distance_m[order] <= spec.perception_m]
+    return padded(everyone, order, spec.max_agents)
+
+
+def padded(scene: Scene, rows: np.ndarray, agents: int) -> Scene:
+    """The given rows of a scene, in this order, and rows of padding up to `agents`."""
+    states = np.zeros((agents, scene.states.shape[1]))
+    ids = np.full(agents, PADDING_ID, dtype=np.int64)
+    valid = np.zeros(agents, dtype=np.bool_)
+    states[: len(rows)] = scene.states[rows]
+    ids[: len(rows)] = scene.ids[rows]
+    valid[: len(rows)] = True
+    return Scene(states, ids, valid, scene.heading_rad)
+
+
+@dataclass(frozen=True)
+class SharedScene:
+    """Everyone in an environment with many learners; nobody is the ego."""
+
+    scene: Scene
+    """Everyone, padded to `max_agents` rows; a row need not stay an agent's, its id does."""
+    rows: Mapping[str, int]
+    """Row of each living agent, by the name the environment gives it."""
+    heading_rad: Float[np.ndarray, " agents"]
+    """Heading of each row, which turns world axes into the agent's; 0 where agents have none."""
+
+
+@runtime_checkable
+class SharedSceneReader(Protocol):
+    """Sees everyone in one PettingZoo parallel environment."""
+
+    @property
+    def spec(self) -> SceneSpec:
+        """What the scenes look like: `has_ego` is False; `max_agents` holds everyone."""
+
+    def reset(self) -> None:
+        """Forget all identities: a new episode has begun."""
+
+    def read(self, env: Any) -> SharedScene:
+        """Everyone who is there now."""
+
+
+def share(
+    everyone: Scene, rows: Mapping[str, int], heading_rad: np.ndarray, spec: SceneSpec, source: str = "reader"
+) -> SharedScene:
+    """A `SharedScene` of an unpadded scene.
+
+    Args:
+        everyone: all rows valid, any order.
+        rows: row of each living agent.
+        heading_rad: of each row.
+        spec: `max_agents` is the number of rows to pad to.
+        source: who read the scene, for messages.
+
+    Raises:
+        UserError: more agents than `max_agents`, or `everyone` breaks the contract of a scene.
+    """
+    everyone.check(source, spec)
+    count = len(everyone.ids)
+    if count > spec.max_agents:
+        raise UserError(f"{source}: {count} agents do not fit max_agents={spec.max_agents}; raise max_agents")
+    headings = np.zeros(spec.max_agents)
+    headings[:count] = heading_rad
+    return SharedScene(padded(everyone, np.arange(count), spec.max_agents), dict(rows), headings)
