@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 import tyro
@@ -18,8 +18,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.evaluate import EVALUATION_SEED, PACKAGES, evaluate_with_progress
 from agents.features import EGO_KEY, AttentionConfig
-from agents.rows import Task
 from agents.runs import load_model, open_run
+from agents.task import Task
 from agents.training import TrainingPlan, train
 from envs.registry import CHECKPOINTS, make_env
 from envs.render import record_episode
@@ -29,14 +29,18 @@ from predictor.provenance import provenance
 
 MAX_VIDEO_STEPS = 200
 """Longest video [policy steps]; racetracks go on for 1500."""
+ENVS = {"gymnasium": 6, "envpool": 64}
+"""Parallel environments by default."""
+LEARNERS: dict[str, tuple[str, ...]] = {"simple_tag_v3": ("adversary",), "simple_world_comm_v3": ("adversary",)}
+"""Who learns by default where the sides are opponents: pursuers, against a prey that flees by rule."""
 
 
 @dataclass(frozen=True)
 class TrainPolicyConfig:
     """Train a policy on forecasts, evaluate it and film it."""
 
-    env_id: str = "highway-fast-v0"
-    """Gymnasium id."""
+    env_id: Annotated[str, tyro.conf.arg(aliases=["--env"])] = "highway-fast-v0"
+    """Gymnasium id (highway-fast-v0) or PettingZoo parallel id (simple_tag_v3)."""
     algorithm: Literal["ppo", "dqn"] = "ppo"
     """Learning algorithm; its hyperparameters are in agents/presets.py."""
     observe: Literal["forecast", "none", "constant-velocity"] = "forecast"
@@ -45,8 +49,15 @@ class TrainPolicyConfig:
     """Forecaster: name of a shipped checkpoint or a path; None takes the one that ships for the env id."""
     steps: int = 20_000
     """Environment steps to train for, over all environments."""
-    envs: int = 6
-    """Parallel environments, each in its own process."""
+    envs: int | None = None
+    """Parallel environments: processes, native ones with EnvPool, copies of a PettingZoo environment. None takes 6, with
+    EnvPool 64."""
+    backend: Literal["gymnasium", "envpool"] = "gymnasium"
+    """Who simulates in training; measured and filmed on the gymnasium environment in any case."""
+    learners: tuple[str, ...] | None = None
+    """PettingZoo: agents or roles that learn, for example adversary; None takes all, in simple_tag the adversaries."""
+    partner: str = "heuristic"
+    """PettingZoo: who drives the agents that do not learn: random, idle, varied, heuristic or mixed."""
     seed: int = 0
     """Drives torch, NumPy and the environments; evaluation seeds do not depend on it."""
     run_dir: Path | None = None
@@ -72,7 +83,7 @@ class TrainPolicyConfig:
         Raises:
             UserError: a number that makes no sense. (In `__post_init__`, tyro would turn it into a box of lines.)
         """
-        for name in ("steps", "envs", "selections", "selection_episodes", "checkpoint_every", "eval_episodes"):
+        for name in ("steps", "num_envs", "selections", "selection_episodes", "checkpoint_every", "eval_episodes"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
 
@@ -84,12 +95,15 @@ class TrainPolicyConfig:
     @property
     def plan(self) -> TrainingPlan:
         """The training."""
-        task = Task(self.env_id, self.observe, self.checkpoint, self.device)
+        learners = LEARNERS.get(self.env_id, ()) if self.learners is None else self.learners
+        task = Task(
+            self.env_id, self.observe, self.checkpoint, self.device, self.backend, tuple(learners), self.partner
+        )
         return TrainingPlan(
             task,
             self.algorithm,
             self.steps,
-            self.envs,
+            self.num_envs,
             self.seed,
             self.device,
             self.selections,
@@ -99,9 +113,14 @@ class TrainPolicyConfig:
         )
 
     @property
+    def num_envs(self) -> int:
+        """Parallel environments."""
+        return self.envs if self.envs is not None else ENVS[self.backend]
+
+    @property
     def measuring_rows(self) -> int:
         """Parallel environments that measure a policy; results do not depend on it."""
-        return min(self.envs, os.cpu_count() or 1)
+        return min(self.num_envs, os.cpu_count() or 1)
 
 
 def run(config: TrainPolicyConfig, console: Console) -> None:
@@ -128,11 +147,15 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
 
 def film(config: TrainPolicyConfig, model: BaseAlgorithm) -> Path:
     """Film the first evaluation episode with the forecasts drawn in, also for a policy that sees none."""
-    checkpoint = config.plan.task.forecaster
+    path = config.folder / "video.mp4"
+    task = config.plan.task
+    if task.is_parallel:
+        record_task(task, model, EVALUATION_SEED, MAX_VIDEO_STEPS).write_video(path)
+        return path
+    checkpoint = task.forecaster
     if config.observe == "none" and config.env_id not in CHECKPOINTS:
         checkpoint = "constant-velocity"
     env = ForecastObservation(make_env(config.env_id, render_mode="rgb_array"), checkpoint)
-    path = config.folder / "video.mp4"
     try:
         record_episode(env, _act(config, model), seed=EVALUATION_SEED, max_steps=MAX_VIDEO_STEPS).write_video(path)
     finally:

@@ -7,7 +7,7 @@ those of training and of model selection (`agents.training`).
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +20,20 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from agents.rows import EpisodeResult, Task, make_rows, run_episodes
+from agents.arena import open_arena
+from agents.episodes import EpisodeResult
 from agents.runs import POLICY_FILE, load_model, read_config, write_text
+from agents.task import Task
 from predictor.errors import UserError, run_entry_point
 from predictor.provenance import provenance, write_json
 
 EVALUATION_SEED = 2_000_000_000
 """First seed of the final evaluation; training stays below 1e9, model selection between 1e9 and 2e9."""
 
-BASELINES = ("random", "idle")
+NUM_POLICIES = 3
+"""The trained one and an arena's two baselines."""
 _WILSON_Z = 1.959963984540054  # two-sided 95 %
-PACKAGES = ("stable-baselines3", "gymnasium", "highway-env", "torch", "numpy")
+PACKAGES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2", "envpool", "torch", "numpy")
 
 
 @dataclass(frozen=True)
@@ -49,14 +52,16 @@ class PolicySummary:
     """Mean length [policy steps]."""
     length_se: float
     """Its standard error."""
-    crash_rate: float
-    """Share of episodes with a crash."""
-    crash_low: float
+    crash_rate: float | None
+    """Share of episodes with a crash; None where there is no ego."""
+    crash_low: float | None
     """Lower end of its 95 % Wilson interval."""
-    crash_high: float
+    crash_high: float | None
     """Upper end."""
     mean_speed_mps: float
     """Mean over episodes of the mean speed [m/s]; NaN where the env reports none."""
+    role_returns: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Mean return and its standard error of the learners of each role, where there are several."""
 
 
 @dataclass(frozen=True)
@@ -90,25 +95,39 @@ class Evaluation:
 
     def markdown(self) -> str:
         """The table for a README."""
-        lines = ["| " + " | ".join(_HEADER) + " |", "|---" * len(_HEADER) + "|"]
-        lines += ["| " + " | ".join(_cells(row)) + " |" for row in self.rows]
+        header, rows = self._cells()
+        lines = ["| " + " | ".join(header) + " |", "|---" * len(header) + "|"]
+        lines += ["| " + " | ".join(row) + " |" for row in rows]
         return "\n".join(lines) + f"\n\n{self.env_id}: {self._caption()}\n"
 
     def table(self) -> Table:
         """The table for a terminal."""
+        header, rows = self._cells()
         table = Table(title=self.env_id, caption=self._caption())
-        for i, name in enumerate(_HEADER):
+        for i, name in enumerate(header):
             table.add_column(escape(name), justify="right" if i else "left")
-        for row in self.rows:
-            table.add_row(*_cells(row))
+        for row in rows:
+            table.add_row(*row)
         return table
+
+    def _cells(self) -> tuple[list[str], list[list[str]]]:
+        """Header and rows; what no row has is left out."""
+        summaries = self.rows
+        roles = list(dict.fromkeys(role for row in summaries for role in row.role_returns))
+        with_crashes = any(row.crash_rate is not None for row in summaries)
+        header = ["policy", "return", *(f"return of {role}" for role in roles), "length"]
+        header += ["crash rate (95 %)", "speed [m/s]"] if with_crashes else []
+        return header, [_row_cells(row, roles, with_crashes) for row in summaries]
 
     def _caption(self) -> str:
         count = max(len(found) for found in self.results.values())
-        return (
+        caption = (
             f"{count} episodes each, the same seeds from {self.first_seed} on; mean ± standard error, length in policy "
-            "steps, crash rate with its 95 % Wilson interval."
+            "steps"
         )
+        if all(row.crash_rate is None for row in self.rows):
+            return f"{caption}; return: mean over the learners."
+        return f"{caption}, crash rate with its 95 % Wilson interval."
 
 
 def wilson_interval(successes: int, trials: int, z: float = _WILSON_Z) -> tuple[float, float]:
@@ -140,7 +159,9 @@ def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
     """Summary of one policy's episodes."""
     return_mean, return_se = mean_and_standard_error([e.episode_return for e in episodes])
     length_mean, length_se = mean_and_standard_error([float(e.length) for e in episodes])
-    crashes = sum(e.crashed for e in episodes)
+    crashes = [e.crashed for e in episodes if e.crashed is not None]
+    interval = wilson_interval(sum(crashes), len(crashes)) if crashes else (None, None)
+    roles = list(dict.fromkeys(role for e in episodes for role in e.returns_by_role))
     return PolicySummary(
         policy,
         len(episodes),
@@ -148,9 +169,10 @@ def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
         return_se,
         length_mean,
         length_se,
-        crashes / len(episodes),
-        *wilson_interval(crashes, len(episodes)),
+        sum(crashes) / len(crashes) if crashes else None,
+        *interval,
         float(np.mean([e.mean_speed_mps for e in episodes])),
+        {role: mean_and_standard_error([e.returns_by_role[role] for e in episodes]) for role in roles},
     )
 
 
@@ -163,7 +185,7 @@ def evaluate_policy_on_seeds(
     first_seed: int = EVALUATION_SEED,
     on_episode: Callable[[], None] = lambda: None,
 ) -> Evaluation:
-    """Let the trained policy (most likely action) and the random and idle egos drive the same episodes.
+    """Let the trained policy (most likely action) and the arena's baselines drive the same episodes.
 
     Args:
         task: what the model was trained on.
@@ -175,13 +197,13 @@ def evaluate_policy_on_seeds(
         on_episode: called after each episode.
     """
     seeds = range(first_seed, first_seed + num_episodes)
-    venv = make_rows(task, min(num_rows, num_episodes), seeded=True)
+    arena = open_arena(task, min(num_rows, num_episodes))
     try:
-        results = {name: run_episodes(venv, lambda obs: model.predict(obs, deterministic=True)[0], seeds, on_episode)}
-        for baseline in BASELINES:
-            results[baseline] = run_episodes(venv, baseline, seeds, on_episode)
+        results = {name: arena.play(model, seeds, on_episode)}
+        for baseline in arena.baselines:
+            results[baseline] = arena.play(baseline, seeds, on_episode)
     finally:
-        venv.close()
+        arena.close()
     return Evaluation(task.env_id, first_seed, results)
 
 
@@ -196,23 +218,22 @@ def evaluate_with_progress(
     """`evaluate_policy_on_seeds` under a progress bar."""
     columns = (TextColumn(f"evaluate {task.env_id}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns) as progress:
-        bar = progress.add_task("", total=num_episodes * (1 + len(BASELINES)))
+        bar = progress.add_task("", total=num_episodes * NUM_POLICIES)
         return evaluate_policy_on_seeds(
             task, model, name, num_episodes, num_rows, first_seed, lambda: progress.advance(bar)
         )
 
 
-_HEADER = ("policy", "return", "length", "crash rate (95 %)", "speed [m/s]")
-
-
-def _cells(row: PolicySummary) -> tuple[str, ...]:
-    return (
-        row.policy,
-        f"{row.return_mean:.2f}{_plus_minus(row.return_se, 2)}",
-        f"{row.length_mean:.1f}{_plus_minus(row.length_se, 1)}",
-        f"{100 * row.crash_rate:.0f} % ({100 * row.crash_low:.0f}–{100 * row.crash_high:.0f} %)",
-        "–" if math.isnan(row.mean_speed_mps) else f"{row.mean_speed_mps:.1f}",
-    )
+def _row_cells(row: PolicySummary, roles: Sequence[str], with_crashes: bool) -> list[str]:
+    cells = [row.policy, f"{row.return_mean:.2f}{_plus_minus(row.return_se, 2)}"]
+    for role in roles:
+        mean, error = row.role_returns.get(role, (math.nan, math.nan))
+        cells.append(f"{mean:.2f}{_plus_minus(error, 2)}")
+    cells.append(f"{row.length_mean:.1f}{_plus_minus(row.length_se, 1)}")
+    if with_crashes and row.crash_rate is not None and row.crash_low is not None and row.crash_high is not None:
+        cells.append(f"{100 * row.crash_rate:.0f} % ({100 * row.crash_low:.0f}–{100 * row.crash_high:.0f} %)")
+        cells.append("–" if math.isnan(row.mean_speed_mps) else f"{row.mean_speed_mps:.1f}")
+    return cells
 
 
 def _plus_minus(error: float, digits: int) -> str:
@@ -260,7 +281,14 @@ def main() -> None:
     config = tyro.cli(EvaluateConfig, description=__doc__)
     config.check()
     run = read_config(config.run_dir)
-    task = Task(run["env_id"], run["observe"], run["checkpoint"], config.device)
+    task = Task(
+        run["env_id"],
+        run["observe"],
+        run["checkpoint"],
+        config.device,
+        learners=tuple(run.get("learners", ())),
+        partner=run.get("partner", "heuristic"),
+    )
     task.check()
     model = load_model(config.run_dir / POLICY_FILE, run["algorithm"])
     name = f"{run['algorithm']} ({run['observe']})"

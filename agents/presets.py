@@ -7,6 +7,9 @@ They start from highway-env's own training scripts (``scripts/sb3_highway_ppo.py
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from agents.task import Backend
+from envs.parallel_registry import is_parallel_id
+
 Algorithm = Literal["ppo", "dqn"]
 
 
@@ -74,8 +77,19 @@ _DQN: dict[str, DQNPreset] = {
 _FIVE_HZ_GAMMA = 0.9
 
 
-def preset_for(env_id: str, algorithm: Algorithm) -> Preset:
+# Many native rows give large rollouts: larger batches keep the gradient steps per sample near a tenth of a row's.
+_ENVPOOL_PPO = PPOPreset(n_steps=32, batch_size=512, n_epochs=8)
+# Agents of the particle world live for 25 steps of 0.1 s; rewards are dense.
+_PARTICLES = PPOPreset(n_steps=100, batch_size=300, n_epochs=8, learning_rate=7e-4, gamma=0.95, ent_coef=0.01)
+
+
+def preset_for(env_id: str, algorithm: Algorithm, backend: Backend = "gymnasium") -> Preset:
     """The tuned preset of an env id, or the nearest published one."""
+    if algorithm == "ppo" and is_parallel_id(env_id):
+        return _PARTICLES
+    if algorithm == "ppo" and backend == "envpool":
+        gamma = _FIVE_HZ_GAMMA if env_id.startswith("racetrack") else _ENVPOOL_PPO.gamma
+        return replace(_ENVPOOL_PPO, gamma=gamma)
     presets: dict[str, PPOPreset] | dict[str, DQNPreset] = _PPO if algorithm == "ppo" else _DQN
     if env_id in presets:
         return presets[env_id]

@@ -13,13 +13,15 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, ProgressBarCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from agents.arena import Arena, open_arena
 from agents.features import AttentionConfig, ForecastAttention
 from agents.presets import Algorithm, PPOPreset, Preset, preset_for
-from agents.rows import Task, make_rows, resolve_device
+from agents.rows import make_rows
 from agents.runs import BEST_FILE, CHECKPOINT_FILE, POLICY_FILE, copy_file, load_model, read_note, save_model
+from agents.task import Task, resolve_device
 from predictor.errors import UserError
 
 SELECTION_SEED = 1_000_000_000
@@ -62,7 +64,7 @@ class TrainingPlan:
     @property
     def preset(self) -> Preset:
         """Hyperparameters."""
-        return preset_for(self.task.env_id, self.algorithm)
+        return preset_for(self.task.env_id, self.algorithm, self.task.backend)
 
     def check_action_space(self, space: spaces.Space) -> None:
         """Raise if the algorithm cannot drive this action space."""
@@ -77,7 +79,7 @@ def train(plan: TrainingPlan, run_dir: Path) -> Path:
         The final policy, `run_dir/policy.zip`.
     """
     venv = make_rows(plan.task, plan.num_rows)
-    selection = make_rows(plan.task, min(plan.selection_rows, plan.selection_episodes), seeded=True)
+    selection = open_arena(plan.task, min(plan.selection_rows, plan.selection_episodes))
     try:
         model = _resume_or_make(plan, venv, run_dir)
         if model.num_timesteps < plan.steps:
@@ -90,7 +92,7 @@ def train(plan: TrainingPlan, run_dir: Path) -> Path:
     return run_dir / POLICY_FILE
 
 
-def _learn(plan: TrainingPlan, model: BaseAlgorithm, selection: VecEnv, run_dir: Path) -> None:
+def _learn(plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: Path) -> None:
     """The remaining steps, under SB3's progress bar."""
     every = max(plan.steps // plan.selections, 1)
     progress = ProgressBarCallback()
@@ -173,64 +175,49 @@ class SaveCheckpoint(BaseCallback):
         return True
 
 
-class SelectBest(EvalCallback):
-    """SB3's EvalCallback on the same seeds each time; the best model is saved atomically with its result inside.
+class SelectBest(BaseCallback):
+    """Plays the same seeds each time; the best model is saved atomically with its result inside.
 
     Args:
-        venv: from `make_rows(..., seeded=True)`.
+        arena: where the seeds are played.
         path: where the best model goes.
         num_episodes: episodes per measurement.
         every_steps: environment steps between measurements; there is always one at the end.
     """
 
-    def __init__(self, venv: VecEnv, path: Path, num_episodes: int, every_steps: int) -> None:
-        """Continue from the result inside an existing file."""
-        super().__init__(
-            venv,
-            callback_on_new_best=_SaveBest(path),
-            n_eval_episodes=num_episodes,
-            eval_freq=1,
-            verbose=0,
-        )
-        self._path, self._every = path, every_steps
+    def __init__(self, arena: Arena, path: Path, num_episodes: int, every_steps: int) -> None:
+        """Nothing is measured yet."""
+        super().__init__()
+        self._arena, self._path, self._every = arena, path, every_steps
+        self._seeds = range(SELECTION_SEED, SELECTION_SEED + num_episodes)
         self._measured_at = 0
+        self.best_return = -np.inf
 
     def _on_training_start(self) -> None:
+        """Continue from the result inside an existing file."""
         self._measured_at = self.model.num_timesteps
         try:
-            self.best_mean_reward = float(read_note(self._path).get("selection_return", -np.inf))
+            self.best_return = float(read_note(self._path).get("selection_return", -np.inf))
         except zipfile.BadZipFile as error:
             raise UserError(f"{self._path} is damaged; remove it to go on without it") from error
 
     def _on_step(self) -> bool:
-        if self.num_timesteps - self._measured_at < self._every:
-            return True
-        return self._measure()
+        if self.num_timesteps - self._measured_at >= self._every:
+            self._measure()
+        return True
 
     def _on_training_end(self) -> None:
         if self._measured_at != self.num_timesteps:
             self._measure()
 
-    def _measure(self) -> bool:
+    def _measure(self) -> None:
         self._measured_at = self.num_timesteps
-        rows = self.eval_env.num_envs
-        first = SELECTION_SEED
-        for row in range(rows):
-            share = (self.n_eval_episodes + row) // rows  # as SB3's evaluate_policy divides them
-            self.eval_env.env_method("queue", list(range(first, first + share)), indices=[row])
-            first += share
-        return super()._on_step()
-
-
-class _SaveBest(BaseCallback):
-    """Saves the model that `SelectBest` found best so far."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__()
-        self._path = path
-
-    def _on_step(self) -> bool:
-        assert isinstance(self.parent, EvalCallback)
-        note = {"selection_return": self.parent.best_mean_reward, "steps": self.model.num_timesteps}
-        save_model(self.model, self._path, note)
-        return True
+        results = self._arena.play(self.model, self._seeds)
+        mean = float(np.mean([r.episode_return for r in results]))
+        self.logger.record("eval/mean_reward", mean)
+        self.logger.record("eval/mean_ep_length", float(np.mean([r.length for r in results])))
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)
+        if mean > self.best_return:
+            self.best_return = mean
+            save_model(self.model, self._path, {"selection_return": mean, "steps": self.num_timesteps})

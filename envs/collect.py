@@ -8,20 +8,19 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import gymnasium as gym
-import numpy as np
 import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from envs.egos import env_for_ego, make_ego
-from envs.readers import reader_for
-from envs.readers.highway_labels import ATTRIBUTE_NAMES, read_labels, with_labels
-from envs.registry import make_env
+from envs.readers.highway_labels import ATTRIBUTE_NAMES, SceneLabels, with_labels
+from envs.worlds import World, default_drivers, open_world
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.errors import UserError, run_entry_point
 from predictor.provenance import provenance
+from predictor.scene import Scene
+
+PACKAGES = ("highway-env", "mpe2", "pettingzoo", "envpool", "gymnasium", "numpy")
 
 
 @dataclass(frozen=True)
@@ -29,13 +28,14 @@ class CollectConfig:
     """Record episodes of an environment into an episode store."""
 
     env_id: str
-    """Gymnasium id, for example highway-fast-v0."""
+    """Gymnasium id (highway-fast-v0, envpool/HighwayFast-v0) or PettingZoo parallel id (simple_tag_v3)."""
     out: Path
     """Folder of the new store (Zarr)."""
     episodes: int = 400
     """Episodes to record."""
-    ego: tuple[str, ...] = ("varied", "random", "idle")
-    """Who drives the ego; episodes take turns: random, idle, varied, keep-lane, or the path of a policy .zip."""
+    ego: tuple[str, ...] = ()
+    """Who drives; episodes take turns. One ego: random, idle, varied, keep-lane, or the path of a policy .zip. Many
+    learners: random, idle, varied, heuristic, mixed. Left out: varied random idle, or mixed heuristic varied."""
     seed: int = 0
     """Episode i is seeded with seed + i; keep test seeds apart from training seeds."""
     max_steps: int = 200
@@ -59,14 +59,18 @@ class CollectConfig:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.seed < 0:
             raise UserError(f"seed must not be negative, got {self.seed}")
-        if not self.ego:
-            raise UserError("ego needs at least one name")
+
+    @property
+    def drivers(self) -> tuple[str, ...]:
+        """Who takes turns."""
+        return self.ego or default_drivers(self.env_id)
 
 
 def collect(config: CollectConfig) -> Iterator[Episode]:
     """Record the episodes of a config, in the order of their seeds."""
+    drivers = config.drivers
     tasks = [
-        _Task(config.env_id, config.ego[i % len(config.ego)], config.seed + i, config.max_steps, config.labels)
+        _Task(config.env_id, drivers[i % len(drivers)], config.seed + i, config.max_steps, config.labels)
         for i in range(config.episodes)
     ]
     if config.workers == 1:
@@ -84,7 +88,7 @@ class _Task(NamedTuple):
     labels: bool
 
 
-_worker_envs: dict[tuple[str, str], gym.Env] = {}
+_worlds: dict[tuple[str, str], World] = {}
 
 
 def _limit_threads() -> None:
@@ -94,25 +98,26 @@ def _limit_threads() -> None:
 
 
 def _record(task: _Task) -> Episode:
-    view = task.ego if task.ego.endswith(".zip") else ""
-    if (task.env_id, view) not in _worker_envs:
-        _worker_envs[task.env_id, view] = env_for_ego(make_env(task.env_id, disable_env_checker=True), task.ego)
-    env = _worker_envs[task.env_id, view]
-    reader = reader_for(env)
-    obs: Any
-    obs, _ = env.reset(seed=task.seed)
-    ego = make_ego(task.ego, env, np.random.default_rng(task.seed))
-    scenes = [reader.read_all(env)]
-    labels = [read_labels(env)] if task.labels else []
+    if (task.env_id, task.ego) not in _worlds:
+        _worlds[task.env_id, task.ego] = open_world(task.env_id, task.ego)
+    world = _worlds[task.env_id, task.ego]
+    world.reset(task.seed)
+    scenes: list[Scene] = []
+    labels: list[SceneLabels] = []
+
+    def note() -> None:
+        scenes.append(world.everyone())
+        if task.labels and (found := world.labels()) is not None:
+            labels.append(found)
+
+    note()
     for _ in range(task.max_steps):
-        obs, _, terminated, truncated, _ = env.step(ego(obs))
-        scenes.append(reader.read_all(env))
-        if task.labels:
-            labels.append(read_labels(env))
-        if terminated or truncated:
+        ended = world.step()
+        note()
+        if ended:
             break
     episode = Episode.from_scenes(scenes, label=task.ego, seed=task.seed)
-    return with_labels(episode, scenes, labels) if task.labels else episode
+    return with_labels(episode, scenes, labels) if labels else episode
 
 
 def main() -> None:
@@ -121,15 +126,17 @@ def main() -> None:
     config.check()
     if config.out.exists() and not config.overwrite:
         raise UserError(f"{config.out} exists; choose another path or pass --overwrite")
-    env = make_env(config.env_id)
-    for name in config.ego:
-        make_ego(name, env_for_ego(env, name), np.random.default_rng(0))
+    worlds = [open_world(config.env_id, name) for name in config.drivers]
+    worlds[0].reset(config.seed)
+    labelled = config.labels and worlds[0].labels() is not None
     info = StoreInfo(
-        reader_for(env).spec,
+        worlds[0].spec,
         config.env_id,
-        provenance(("highway-env", "gymnasium", "numpy")) | {"seed": config.seed},
-        ATTRIBUTE_NAMES if config.labels else (),
+        provenance(PACKAGES) | {"seed": config.seed},
+        ATTRIBUTE_NAMES if labelled else (),
     )
+    for world in worlds:
+        world.close()
     episodes = []
     columns = (TextColumn(f"collect {config.env_id}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns) as progress:

@@ -1,14 +1,15 @@
-"""Accuracy where it is deployed: `python -m envs.evaluate --env-ids roundabout-v1 --episodes 50`.
+"""Accuracy where it is deployed: `python -m envs.evaluate --env-ids roundabout-v1 --episodes 50 --out runs/accuracy`.
 
-Drives the live environment through `ForecastObservation`, reads each step's forecast out of the policy's observation,
-and compares it with what then happened to those agents, seen by the ego or not. Constant velocity forecasts the same
-scenes. The ego itself is not counted: its future is the policy's choice.
+Drives the live environment through the deployed wrapper, reads each step's forecast out of the policy's observation,
+and compares it with what then happened to those agents, seen again or not. Constant velocity forecasts the same scenes,
+and, given recorded data, so does a memoryless nearest-neighbour forecaster. An ego is not counted: its future is the
+policy's choice. Several checkpoints make a transfer matrix: trained on A, measured on B.
 """
 
 import multiprocessing
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,48 +19,58 @@ import tyro
 from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
-from envs.egos import make_ego, require_view, sees_forecasts
-from envs.observation import into_ego_axes, others_by_distance
-from envs.readers import HighwayReader, reader_for
-from envs.registry import CHECKPOINTS, checkpoint_for, make_env
-from envs.wrappers import ForecastObservation
-from predictor.accuracy import Accuracy, Outcome, fitted_std_m, summarise
-from predictor.baselines.constant_velocity import ConstantVelocity
+from envs import evaluate_report as report
+from envs.live import MODEL, NEIGHBOURS, STRAIGHT, Case, Episode, EpisodeTask, memory_key, play
+from envs.parallel_registry import PARALLEL_CHECKPOINTS, is_parallel_id, parallel_checkpoint_for
+from envs.registry import CHECKPOINTS, checkpoint_for
+from envs.worlds import default_drivers, open_world
+from predictor.accuracy import Accuracy, Outcome, Tally, fitted_std_m
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, read_info, resolve
 from predictor.errors import UserError, run_entry_point
-from predictor.evaluate import accuracy_table, markdown_table
-from predictor.metrics import min_ade
-from predictor.online import OnlineForecaster
+from predictor.evaluate import accuracy_table
+from predictor.graph import pair_mask
+from predictor.graph_metrics import GraphAccuracy, GraphTally
+from predictor.metrics import MISS_THRESHOLD_M, min_ade
 from predictor.provenance import provenance, write_json
-from predictor.scene import Scene, SceneBatch
+from predictor.scene import SceneSpec
+
+PACKAGES = ("highway-env", "mpe2", "pettingzoo", "envpool", "gymnasium", "torch", "numpy")
+GALLERY_CASES = 6
+"""Worst forecasts that are drawn, at most one per episode."""
 
 
 @dataclass(frozen=True)
 class EvaluateConfig:
     """Measure forecasts inside live environments, through the deployed wrapper, beside constant velocity."""
 
-    env_ids: tuple[str, ...] = tuple(CHECKPOINTS)
-    """Environments; all ids with a shipped checkpoint by default."""
-    checkpoint: str | None = None
-    """Shipped name or folder; None takes the one that ships for each id."""
+    env_ids: tuple[str, ...] = (*CHECKPOINTS, *PARALLEL_CHECKPOINTS)
+    """Environments, gymnasium or PettingZoo parallel; all ids with a shipped checkpoint by default."""
+    checkpoint: tuple[str, ...] = ()
+    """Shipped name or folder; left out, the one that ships for each id. Several make a transfer matrix."""
     episodes: int = 50
     """Episodes per environment."""
-    ego: str = "varied"
-    """Who drives: random, idle, varied, keep-lane, or the path of a policy .zip (which gets the measured forecasts)."""
+    ego: str | None = None
+    """Who drives. One ego: random, idle, varied (default), keep-lane, or the path of a policy .zip (which gets the
+    measured forecasts). Many learners: random, idle, varied, heuristic, mixed (default)."""
     seed: int = 900_000
     """Episode i is seeded with seed + i; the shipped checkpoints were trained on seeds from 100,000 on."""
     samples: int = 20
     """K of the second row; the first is K = 1, the most likely forecast."""
     horizon_steps: int | None = None
     """Steps to forecast; None takes each checkpoint's."""
+    history_steps: tuple[int, ...] = ()
+    """Also measure the model with a memory of so many steps only: what its memory is worth."""
+    neighbours: Path | None = None
+    """Recorded data for the nearest-neighbour row: a store, or a folder of stores named by env id."""
+    miss_m: float | None = None
+    """Final displacement above which a forecast misses [m]; None: 2 m on roads, a tenth of a small arena's scale."""
     max_steps: int = 200
     """Cut longer episodes here [policy steps]."""
     workers: int = os.cpu_count() or 1
     """Parallel processes."""
     out: Path | None = None
-    """Folder for accuracy.json and accuracy.md."""
+    """Folder for accuracy.json, accuracy.md, and per environment a figure by horizon and a gallery of worst cases."""
 
     def check(self) -> None:
         """Check ranges.
@@ -70,20 +81,24 @@ class EvaluateConfig:
         for name in ("episodes", "samples", "max_steps", "workers"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.horizon_steps is not None and self.horizon_steps < 1:
-            raise UserError(f"horizon_steps must be at least 1, got {self.horizon_steps}")
         if self.seed < 0:
             raise UserError(f"seed must not be negative, got {self.seed}")
+        if min(self.history_steps, default=1) < 1:
+            raise UserError(f"history_steps must be at least 1, got {self.history_steps}")
+        if self.miss_m is not None and self.miss_m <= 0:
+            raise UserError(f"miss_m must be positive, got {self.miss_m}")
 
 
 @dataclass(frozen=True)
 class EnvAccuracy:
-    """Accuracy in one environment."""
+    """Accuracy of one checkpoint in one environment."""
 
     env_id: str
     """The environment."""
     checkpoint: str
     """The forecaster's name or folder."""
+    driver: str
+    """Who drove."""
     dt_s: float
     """Time step [s]."""
     model: Accuracy
@@ -96,119 +111,131 @@ class EnvAccuracy:
     """1 − minADE(K = 1) / ADE of constant velocity."""
     reduction_interval: tuple[float, float]
     """95 % bootstrap interval of the reduction over episodes."""
+    nearest_neighbours: Accuracy | None = None
+    """The memoryless baseline on the same scenes, where data was given."""
+    histories: dict[int, Accuracy] = field(default_factory=dict)
+    """The model (K = 1) with so many steps of memory."""
+    graph: GraphAccuracy | None = None
+    """Believed against true edges, where the simulator knows them."""
+    latency_median_ms: float = float("nan")
+    """Time to observe one scene and forecast it (K = 1), one thread, all workers busy."""
+    latency_p95_ms: float = float("nan")
+    """The same, 95th percentile."""
+
+    @property
+    def rows(self) -> list[Accuracy]:
+        """All rows of its table."""
+        extra = [] if self.nearest_neighbours is None else [self.nearest_neighbours]
+        return [self.model, self.model_samples, *self.histories.values(), *extra, self.constant_velocity]
 
 
-@dataclass(frozen=True)
-class _Task:
-    env_id: str
-    checkpoint: str
-    ego: str
-    seed: int
-    samples: int
-    horizon_steps: int
-    max_steps: int
-
-
-def evaluate_env(config: EvaluateConfig, env_id: str) -> EnvAccuracy:
+def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = None) -> tuple[EnvAccuracy, list[Case]]:
     """Run the episodes of one environment and summarise them.
+
+    Args:
+        config: what to run.
+        env_id: the environment.
+        checkpoint: shipped name or folder; None takes the one that ships for the id.
+
+    Returns:
+        The numbers, and the worst forecasts.
 
     Raises:
         UserError: unknown env or checkpoint, or episodes too short to compare anything.
     """
-    checkpoint = config.checkpoint if config.checkpoint is not None else checkpoint_for(env_id)
+    shipped = parallel_checkpoint_for if is_parallel_id(env_id) else checkpoint_for
+    checkpoint = checkpoint if checkpoint is not None else shipped(env_id)
     if checkpoint != CONSTANT_VELOCITY:
         checkpoint = str(resolve(checkpoint))
-    env = make_env(env_id)
-    spec = reader_for(env).spec
-    forecaster = load_forecaster(checkpoint, spec, f"env '{env_id}'")
-    horizon = config.horizon_steps or forecaster.horizon_steps
-    measured = ForecastObservation(env, checkpoint, horizon_steps=horizon)
-    require_view(measured if sees_forecasts(config.ego) else env, config.ego)
-    make_ego(config.ego, env, np.random.default_rng(0))
+    driver = config.ego or default_drivers(env_id)[0]
+    world = open_world(env_id, driver, checkpoint, horizon_steps=config.horizon_steps)
+    spec = world.spec
+    world.close()
+    horizon = config.horizon_steps or load_forecaster(checkpoint, spec, f"env '{env_id}'").horizon_steps
+    episodes = _play_all(config, env_id, checkpoint, driver, horizon)
+    result = _summary(config, env_id, checkpoint, driver, spec, episodes)
+    if not result.model.agents:
+        raise UserError(f"{env_id}: no forecast has {horizon} steps of truth; lower --horizon-steps or add episodes")
+    cases = sorted((e.worst for e in episodes if e.worst is not None), key=lambda case: -case.error_m)
+    return result, cases[:GALLERY_CASES]
+
+
+def _play_all(config: EvaluateConfig, env_id: str, checkpoint: str, driver: str, horizon: int) -> list[Episode]:
+    neighbours = _neighbour_store(config.neighbours, env_id)
     tasks = [
-        _Task(env_id, checkpoint, config.ego, config.seed + i, config.samples, horizon, config.max_steps)
+        EpisodeTask(
+            env_id, checkpoint, driver, config.seed + i, config.samples, horizon, config.max_steps,
+            neighbours, config.history_steps,
+        )
         for i in range(config.episodes)
-    ]
-    results: list[tuple[Outcome, Outcome]] = []
+    ]  # fmt: skip
     context = multiprocessing.get_context("spawn")
     with context.Pool(min(config.workers, len(tasks)), initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        results.extend(track(pool.imap(_episode, tasks, chunksize=2), f"evaluate {env_id}", total=len(tasks)))
-    model = [m for m, _ in results]
-    baseline = [b for _, b in results]
-    first = [Outcome(m.forecast[:, :1], m.future, m.valid) for m in model]
-    std_m = () if checkpoint == CONSTANT_VELOCITY else read_info(Path(checkpoint)).std_m
-    rows = (
-        summarise("dG-VAE", first, std_m),
-        summarise("dG-VAE", model, std_m),
-        # Its spread is fitted on these very errors, in its favour: it has no training data of its own.
-        summarise("constant velocity", baseline, fitted_std_m(baseline)),
+        return list(track(pool.imap(play, tasks, chunksize=2), f"evaluate {env_id}", total=len(tasks)))
+
+
+def _neighbour_store(root: Path | None, env_id: str) -> str | None:
+    if root is None:
+        return None
+    store = root / env_id if (root / env_id).is_dir() else root
+    if not store.is_dir():
+        raise UserError(f"neighbours: there is no episode store at {store}; record one with python -m envs.collect")
+    return str(store)
+
+
+def _summary(
+    config: EvaluateConfig, env_id: str, checkpoint: str, driver: str, spec: SceneSpec, episodes: Sequence[Episode]
+) -> EnvAccuracy:
+    miss_m = config.miss_m or (MISS_THRESHOLD_M if spec.feature_scales[0] >= 50 else 0.1 * spec.feature_scales[0])
+    outcomes = {key: [e.outcomes[key] for e in episodes] for key in episodes[0].outcomes}
+    first = [Outcome(o.forecast[:, :1], o.future, o.valid) for o in outcomes[MODEL]]
+    learned = checkpoint != CONSTANT_VELOCITY
+    std_m = read_info(Path(checkpoint)).std_m if learned else fitted_std_m(first)
+    name = MODEL_NAMES.get(read_info(Path(checkpoint)).model, "model") if learned else "constant velocity (deployed)"
+
+    def row(title: str, found: Sequence[Outcome], spread: Sequence[float]) -> Accuracy:
+        tally = Tally(spread, miss_m)
+        for outcome in found:
+            tally.add(outcome)
+        return tally.accuracy(title, batch_intervals=True)
+
+    # The spread of the baselines is fitted on these very errors, in their favour: they have no validation data.
+    straight = row("constant velocity", outcomes[STRAIGHT], fitted_std_m(outcomes[STRAIGHT]))
+    near = outcomes.get(NEIGHBOURS)
+    reduction, interval = _reduction(first, outcomes[STRAIGHT])
+    latencies_ms = 1e3 * np.concatenate([e.latencies_s[1:] or e.latencies_s for e in episodes])  # the first warms up
+    return EnvAccuracy(
+        env_id,
+        Path(checkpoint).name if learned else checkpoint,
+        driver,
+        spec.dt_s,
+        row(name, first, std_m),
+        row(name, outcomes[MODEL], std_m),
+        straight,
+        reduction,
+        interval,
+        None if near is None else row(NEIGHBOURS, near, fitted_std_m(near)),
+        {n: row(f"{name}, {n} of history", outcomes[memory_key(n)], std_m) for n in config.history_steps},
+        _graph(episodes) if learned else None,
+        float(np.median(latencies_ms)),
+        float(np.percentile(latencies_ms, 95)),
     )
-    if not rows[0].agents:
-        raise UserError(f"{env_id}: no forecast has {horizon} steps of truth; lower --horizon-steps or add episodes")
-    reduction, interval = _reduction(first, baseline)
-    name = Path(checkpoint).name
-    return EnvAccuracy(env_id, name, spec.dt_s, *rows, reduction, interval)
 
 
-def _episode(task: _Task) -> tuple[Outcome, Outcome]:
-    env = ForecastObservation(
-        make_env(task.env_id, disable_env_checker=True),
-        task.checkpoint,
-        horizon_steps=task.horizon_steps,
-        num_samples=max(2, task.samples),  # keeps the samples axis; sample 0 is the most likely
-    )
-    reader: HighwayReader = env.get_wrapper_attr("reader")
-    obs, _ = env.reset(seed=task.seed)
-    ego = make_ego(task.ego, env, np.random.default_rng(task.seed))
-    baseline = OnlineForecaster(ConstantVelocity(reader.spec, task.horizon_steps), 1, reader.spec.max_agents)
-    scenes, truths, forecasts, straight = [], [], [], []
-    for step in range(task.max_steps + 1):
-        scene = env.scene
-        scenes.append(scene)
-        truths.append(reader.read_all(env))
-        forecasts.append(_world_forecast(obs, scene)[: task.samples])
-        baseline.observe(SceneBatch.stack([scene]))
-        straight.append(baseline.forecast().xy[0])
-        if step == task.max_steps:
-            break
-        seen = {**obs, "forecast": obs["forecast"][:, 0]} if sees_forecasts(task.ego) else obs["observation"]
-        obs, _, terminated, truncated, _ = env.step(ego(seen))
-        if terminated or truncated:
-            truths.append(reader.read_all(env))
-            break
-    env.close()
-    future, valid = _futures(scenes, truths, task.horizon_steps)
-    return Outcome(torch.stack(forecasts), future, valid), Outcome(torch.stack(straight), future, valid)
+MODEL_NAMES = {"dgvae": "dG-VAE", "dnri": "dNRI", "imma": "IMMA", "lstm": "LSTM", "mlp": "MLP"}
+"""By the names of `predictor.models`."""
 
 
-def _world_forecast(obs: dict[str, Any], scene: Scene) -> torch.Tensor:
-    """The observation's forecast, back in the rows of the scene and world axes, relative to the ego: (K, A, H, 2)."""
-    batch = SceneBatch.stack([scene])
-    rotation = into_ego_axes(batch.heading_rad)[0]
-    world = obs["forecast"].astype(np.float64) @ rotation
-    samples, horizon = world.shape[1], world.shape[2]
-    rows = np.zeros((samples, len(scene.ids), horizon, 2))
-    rows[:, 1 + others_by_distance(batch)[0]] = world.swapaxes(0, 1)
-    return torch.from_numpy(rows).float()
-
-
-def _futures(scenes: Sequence[Scene], truths: Sequence[Scene], horizon_steps: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where the agents of each scene then were, relative to the ego at the scene's instant, and whether they were."""
-    agents = len(scenes[0].ids)
-    future = np.zeros((len(scenes), agents, horizon_steps, 2))
-    valid = np.zeros((len(scenes), agents, horizon_steps), dtype=np.bool_)
-    positions = [dict(zip(t.ids.tolist(), t.states[:, :2], strict=True)) for t in truths]
-    for now, scene in enumerate(scenes):
-        for row in range(1, agents):
-            for ahead in range(horizon_steps):
-                later = now + ahead + 1
-                if not scene.valid[row] or later >= len(positions):
-                    continue
-                position = positions[later].get(int(scene.ids[row]))
-                if position is not None:
-                    future[now, row, ahead] = position - scene.states[0, :2]
-                    valid[now, row, ahead] = True
-    return torch.from_numpy(future).float(), torch.from_numpy(valid)
+def _graph(episodes: Sequence[Episode]) -> GraphAccuracy | None:
+    """Believed against true edges over all scenes; None where the simulator knows none."""
+    if not any(e.edge_types for e in episodes):
+        return None
+    tally = GraphTally(episodes[0].edge_probs[0].shape[-1])
+    for episode in episodes:
+        types = torch.from_numpy(np.stack(episode.edge_types))
+        known = pair_mask((types != -1).any(-1) | (types != -1).any(-2)) & (types != -1)
+        tally.add(torch.from_numpy(np.stack(episode.edge_probs)), types, known)
+    return tally.results()
 
 
 def _reduction(model: Sequence[Outcome], baseline: Sequence[Outcome]) -> tuple[float, tuple[float, float]]:
@@ -230,35 +257,29 @@ def _relative(totals: Float[np.ndarray, "*draws 2"]) -> Float[np.ndarray, "*draw
     return np.where(second > 0, 1 - first / np.where(second > 0, second, 1.0), 0.0)
 
 
-def overview(rows: Sequence[EnvAccuracy]) -> Table:
-    """One line per environment."""
-    table = Table(title="in-env accuracy, held-out seeds")
-    for heading in ("env", "checkpoint", r"dt \[s]", "steps"):
-        table.add_column(heading)
-    for heading in ("minADE₁", "minFDE₁", "minADE_K", "CV ADE", "CV FDE", "ADE below CV", "95 %", "forecasts"):
-        table.add_column(heading, justify="right")
-    for row in rows:
-        table.add_row(*_overview_cells(row))
-    return table
+def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy], dict[tuple[str, str], str]]:
+    """All environments with all checkpoints; files under `config.out` as they come.
 
-
-def overview_markdown(rows: Sequence[EnvAccuracy]) -> str:
-    """The same as Markdown."""
-    heads = ["env", "checkpoint", "dt [s]", "steps", "minADE₁ [m]", "minFDE₁ [m]", "minADE_K [m]", "CV ADE [m]",
-             "CV FDE [m]", "ADE below CV", "95 % interval", "forecasts"]  # fmt: skip
-    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    return "\n".join(lines + ["| " + " | ".join(_overview_cells(r)) + " |" for r in rows]) + "\n"
-
-
-def _overview_cells(row: EnvAccuracy) -> list[str]:
-    low, high = row.reduction_interval
-    one, many, straight = row.model, row.model_samples, row.constant_velocity
-    return [
-        row.env_id, row.checkpoint, f"{row.dt_s:g}", str(len(one.by_step_m)),
-        f"{one.min_ade_m:.2f}", f"{one.min_fde_m:.2f}", f"{many.min_ade_m:.2f}",
-        f"{straight.min_ade_m:.2f}", f"{straight.min_fde_m:.2f}",
-        f"{100 * row.reduction:.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %", str(one.agents),
-    ]  # fmt: skip
+    Returns:
+        The results, and for each (env, checkpoint) of a transfer matrix that do not fit, why.
+    """
+    results: list[EnvAccuracy] = []
+    misfits: dict[tuple[str, str], str] = {}
+    for env_id in config.env_ids:
+        for checkpoint in config.checkpoint or (None,):
+            try:
+                result, cases = evaluate_env(config, env_id, checkpoint)
+            except UserError as error:
+                if len(config.checkpoint) < 2 or checkpoint is None:
+                    raise
+                misfits[env_id, Path(checkpoint).name] = str(error)
+                continue
+            results.append(result)
+            console.print(accuracy_table(result.rows, result.dt_s, report.title(result)))
+            console.print(report.remarks(result))
+            if config.out is not None:
+                report.write_pictures(config.out, result, cases)
+    return results, misfits
 
 
 def main() -> None:
@@ -267,24 +288,22 @@ def main() -> None:
     config.check()
     console = Console(width=170)
     for env_id in config.env_ids:
-        make_env(env_id).close()  # complain about any unknown id before hours of work
-    results = []
-    for env_id in config.env_ids:
-        result = evaluate_env(config, env_id)
-        results.append(result)
-        rows = (result.model, result.model_samples, result.constant_velocity)
-        console.print(accuracy_table(rows, result.dt_s, f"{env_id}, checkpoint {result.checkpoint}"))
-    console.print(overview(results))
+        open_world(env_id, default_drivers(env_id)[0]).close()  # complain about any unknown id before hours of work
+    for checkpoint in config.checkpoint:
+        if checkpoint != CONSTANT_VELOCITY:
+            resolve(checkpoint)
+    results, misfits = evaluate(config, console)
+    if not results:
+        raise UserError("no checkpoint fits any environment: " + "; ".join(misfits.values()))
+    console.print(report.overview(results))
+    if len(config.checkpoint) > 1:
+        console.print(report.transfer(results, misfits))
     if config.out is not None:
-        config.out.mkdir(parents=True, exist_ok=True)
-        made = provenance(("highway-env", "gymnasium", "torch", "numpy"))
-        content = {"config": asdict(config), "results": [asdict(r) for r in results], "provenance": made}
-        write_json(config.out / "accuracy.json", content)
-        sections = [
-            f"### {r.env_id}\n\n" + markdown_table((r.model, r.model_samples, r.constant_velocity), r.dt_s)
-            for r in results
-        ]
-        (config.out / "accuracy.md").write_text(overview_markdown(results) + "\n" + "\n".join(sections))
+        made = provenance(PACKAGES)
+        content: dict[str, Any] = {"config": asdict(config), "results": [asdict(r) for r in results]}
+        misfit = [{"env_id": e, "checkpoint": c, "why": why} for (e, c), why in misfits.items()]
+        write_json(config.out / "accuracy.json", content | {"misfits": misfit, "provenance": made})
+        (config.out / "accuracy.md").write_text(report.markdown(results, misfits))
 
 
 if __name__ == "__main__":

@@ -8,18 +8,24 @@ function from an observation to an action.
 
 import os
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
-import imageio_ffmpeg  # type: ignore[import-untyped]
 import numpy as np
 from highway_env.envs.common.graphics import EnvViewer
 from jaxtyping import Float, UInt8
-from PIL import Image
 
-from envs.overlay import AgentOverlay, OverlayStyle, View, decode_png, draw_overlay, encode_png
+from envs.overlay import (
+    AgentOverlay,
+    OverlayStyle,
+    View,
+    decode_png,
+    draw_overlay,
+    encode_png,
+    write_picture,
+    write_video,
+)
 from envs.readers.highway import HighwayReader, is_highway_env
 from envs.wrappers import ForecastObservation
 from predictor.errors import UserError
@@ -110,23 +116,11 @@ class Recording:
 
     def write_video(self, path: Path) -> None:
         """Encode as MP4 (H.264, yuv420p); `path` is always a whole file."""
-        partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
-        size = decode_png(self._frames[0].png).size
-        writer = imageio_ffmpeg.write_frames(
-            partial, size, fps=self.fps, codec="libx264", quality=7, macro_block_size=2
-        )
-        try:
-            with closing(writer):
-                writer.send(None)
-                for index in range(len(self)):
-                    writer.send(np.ascontiguousarray(self.draw(index)))
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
+        write_video(path, (self.draw(index) for index in range(len(self))), self.fps)
 
     def write_frame(self, path: Path, index: int) -> None:
         """Save one annotated picture as PNG."""
-        Image.fromarray(self.draw(index)).save(path, format="PNG")
+        write_picture(path, self.draw(index))
 
     def _truth(self, key: int, step: _Step) -> Float[np.ndarray, "points 2"]:
         """Where an agent went within the horizon of a forecast, picture by picture, while it was on the road."""

@@ -5,12 +5,13 @@ The forecaster runs once per step on the shared scene. Each agent then gets what
 An agent's view is cut to its perception; the forecast behind it is everyone's.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
+from jaxtyping import Bool, Int
 from numpy.typing import NDArray
 
 from envs.observation import ForecastConfig, ForecastStream, ego_entries
@@ -31,13 +32,14 @@ class SharedStream:
         scene_spec: layout of the shared scenes.
         config: how the forecast enters the observations.
         perception_m: how far an agent sees [m]; None takes the spec's.
-        max_agents: rows of a view, the agent itself included; None takes the spec's.
+        max_agents: rows of a view, the agent itself included; None takes the spec's, which is everyone. More than the
+            scene has are padding, so that a policy can move between environments.
 
     Attributes:
-        forecast: the latest forecast, rows as in the shared scene, world coordinates.
+        forecast: the latest forecast, a batch of one, rows as in the shared scene, world coordinates.
 
     Raises:
-        UserError: the forecaster needs an ego.
+        UserError: the forecaster needs an ego, the scenes have one or are not flat, or a bound is out of range.
     """
 
     def __init__(
@@ -54,12 +56,17 @@ class SharedStream:
                 "this forecaster sees positions relative to one ego, but these scenes have many learners; "
                 "train one on this environment (frame 'world' or 'centroid')"
             )
+        if scene_spec.has_ego or scene_spec.position_dim != 2:
+            raise UserError(
+                "shared scenes need has_ego=False and positions on two axes, got "
+                f"has_ego={scene_spec.has_ego} and {scene_spec.position_dim} axes; change the reader's spec"
+            )
         self.forecaster = forecaster
         self.scene_spec = scene_spec
         self.view_spec = replace(
             scene_spec,
             perception_m=scene_spec.perception_m if perception_m is None else perception_m,
-            max_agents=min(scene_spec.max_agents, max_agents or scene_spec.max_agents),
+            max_agents=scene_spec.max_agents if max_agents is None else max_agents,
         )
         self.config = config
         self.horizon_steps = config.horizon_steps or forecaster.horizon_steps
@@ -74,7 +81,7 @@ class SharedStream:
         self._generator.manual_seed(seed)
 
     def spaces(self) -> dict[str, gym.Space]:
-        """Spaces of one agent's entries."""
+        """Spaces of one agent's entries; new objects at each call, since a space carries its own seed."""
         return ForecastStream(self.forecaster, self.view_spec, 1, self.config).spaces()
 
     def reset(self) -> None:
@@ -82,8 +89,8 @@ class SharedStream:
         self._online.reset()
 
     def observe(self, shared: SharedScene) -> dict[str, dict[str, NDArray[np.float32]]]:
-        """Take in the scene; the entries of each living agent, by its name."""
-        self._online.observe(SceneBatch.stack([_behind_absent_ego(shared.scene, self._front)]))
+        """Take in the scene; the entries of each agent in its `rows`, by name."""
+        self._online.observe(SceneBatch.stack([shared.scene.behind_absent(self._front)]))
         forecast = self._online.forecast(self.horizon_steps, self.config.num_samples, self._generator)
         front = self._front
         self.forecast = Forecast(
@@ -98,25 +105,22 @@ class SharedStream:
 def agent_entries(
     shared: SharedScene, forecast: Forecast, view: SceneSpec
 ) -> dict[str, dict[str, NDArray[np.float32]]]:
-    """Each living agent's forecast entries, cut from one forecast.
+    """Each agent's forecast entries, cut from one forecast; `envs.observation.ego_entries` gives the shapes.
 
     Args:
         shared: the scene that was forecast.
-        forecast: a batch of one, world coordinates.
+        forecast: a batch of one, rows as in the scene, world coordinates.
         view: its `perception_m` and `max_agents` bound what an agent sees.
+
+    Returns:
+        The entries of each agent in `shared.rows`, by name.
     """
     names = list(shared.rows)
     if not names:
         return {}
-    scene = shared.scene
+    scene, axes = shared.scene, view.position_dim
     egos = np.array([shared.rows[name] for name in names])
-    axes = view.position_dim
-    offsets = scene.states[None, :, :axes] - scene.states[egos, None, :axes]
-    distance_m = np.where(scene.valid, np.linalg.norm(offsets, axis=-1), np.inf)
-    distance_m[np.arange(len(egos)), egos] = -1.0
-    order = np.argsort(distance_m, axis=1, kind="stable")[:, : view.max_agents]
-    seen = np.take_along_axis(distance_m, order, axis=1) <= view.perception_m
-    scenes = SceneBatch(scene.states[order], scene.ids[order], seen, shared.heading_rad[egos])
+    order, seen = _views(scene, egos, view)
     rows = torch.from_numpy(order).to(forecast.xy.device)
     origin = torch.from_numpy(scene.states[egos, :axes]).to(forecast.xy)
     views = Forecast(
@@ -125,14 +129,48 @@ def agent_entries(
         forecast.edge_features[0][rows[:, :, None], rows[:, None, :]],
         torch.from_numpy(seen).to(forecast.valid.device),
     )
-    entries: Mapping[str, NDArray[np.float32]] = ego_entries(scenes, views)
+    scenes = SceneBatch(scene.states[order], scene.ids[order], seen, shared.heading_rad[egos])
+    entries = ego_entries(scenes, views)
     return {name: {key: value[i] for key, value in entries.items()} for i, name in enumerate(names)}
 
 
-def _behind_absent_ego(scene: Scene, rows: int) -> Scene:
-    """The scene with `rows` absent rows in front."""
-    return Scene(
-        np.pad(scene.states, ((rows, 0), (0, 0))),
-        np.pad(scene.ids, (rows, 0), constant_values=-1),
-        np.pad(scene.valid, (rows, 0)),
-    )
+def check_shared(shared: Any, spec: SceneSpec, source: str = "reader") -> SharedScene:
+    """What a reader gave, which must keep the contract of `envs.readers.base.SharedScene`.
+
+    Args:
+        shared: a `SharedScene`, one hopes.
+        spec: the reader's.
+        source: who read it, for messages.
+
+    Raises:
+        UserError: something else, as `Scene.check`, or the rows or headings of the agents do not fit the scene.
+    """
+    if not isinstance(shared, SharedScene):
+        raise UserError(f"{source}: reading must give a SharedScene (envs.readers), got {type(shared).__name__}")
+    shared.scene.check(source, spec, rows=spec.max_agents)
+    heading = shared.heading_rad
+    if heading.shape != (spec.max_agents,) or not np.isfinite(heading).all():
+        raise UserError(
+            f"{source}: heading_rad must hold {spec.max_agents} finite numbers, one per row, got {heading.tolist()}"
+        )
+    taken = list(shared.rows.values())
+    if len(set(taken)) != len(taken):
+        raise UserError(f"{source}: every agent needs a row of its own, got {dict(shared.rows)}")
+    for name, row in shared.rows.items():
+        if not 0 <= row < spec.max_agents or not shared.scene.valid[row]:
+            raise UserError(f"{source}: agent '{name}' should be in row {row}, but the scene has nobody there")
+    return shared
+
+
+def _views(
+    scene: Scene, egos: Int[np.ndarray, " egos"], view: SceneSpec
+) -> tuple[Int[np.ndarray, "egos seen"], Bool[np.ndarray, "egos seen"]]:
+    """For each ego the rows it sees, itself first and the nearest next, and which of them are not padding."""
+    positions = scene.states[:, : view.position_dim]
+    distance_m = np.linalg.norm(positions[None] - positions[egos, None], axis=-1)
+    distance_m = np.where(scene.valid, distance_m, np.inf)
+    distance_m[np.arange(len(egos)), egos] = -1.0  # first, also when another agent lies on top of it
+    order = np.argsort(distance_m, axis=1, kind="stable")[:, : view.max_agents]
+    seen = scene.valid[order] & (np.take_along_axis(distance_m, order, axis=1) <= view.perception_m)
+    padding = ((0, 0), (0, view.max_agents - order.shape[1]))
+    return np.pad(order, padding), np.pad(seen, padding)

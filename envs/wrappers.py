@@ -22,6 +22,7 @@ from envs.observation import (
     scene_spaces,
 )
 from envs.readers import MakeReader, reader_for
+from envs.readers.base import build_reader, require_scene, show
 from predictor.errors import ProtocolError, UserError
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 
@@ -30,6 +31,10 @@ def scene_source(env: gym.Env) -> str:
     """What to call an env in messages, and where to look for its checkpoint: the id, else the class."""
     spec = env.unwrapped.spec
     return spec.id if spec is not None else type(env.unwrapped).__name__
+
+
+def _reader_of(env: gym.Env, make_reader: MakeReader | None, perception_m: float | None, max_agents: int | None) -> Any:
+    return reader_for(env, perception_m, max_agents) if make_reader is None else build_reader(make_reader, env)
 
 
 class SceneObservation(gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstructorArgs):
@@ -65,7 +70,7 @@ class SceneObservation(gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstru
                 f"the env's own observation must be one array, got {type(own).__name__}; "
                 "apply gymnasium.wrappers.FlattenObservation first"
             )
-        self.reader = reader(env) if reader is not None else reader_for(env, perception_m, max_agents)
+        self.reader = _reader_of(env, reader, perception_m, max_agents)
         self._scene: Scene | None = None
         self.observation_space = gym.spaces.Dict({"observation": own, **scene_spaces(self.reader.spec)})
 
@@ -99,10 +104,12 @@ class SceneObservation(gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstru
         return self._observe(obs), reward, bool(terminated), bool(truncated), info
 
     def _observe(self, obs: Any) -> dict[str, Any]:
-        self._scene = self.reader.read(self.env)
-        spec = self.reader.spec
-        self._scene.check(f"scene reader of '{self.scene_source}'", spec, rows=spec.max_agents)
-        return {"observation": obs, **scene_entries(self._scene)}
+        show(self.reader, obs)
+        name, spec = f"scene reader of '{self.scene_source}'", self.reader.spec
+        scene = require_scene(self.reader.read(self.env), name)
+        scene.check(name, spec, rows=spec.max_agents)
+        self._scene = scene
+        return {"observation": obs, **scene_entries(scene)}
 
 
 class ForecastObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -159,7 +166,7 @@ class ForecastObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
                     f"({spec.perception_m:g}, {spec.max_agents}); give them to that wrapper"
                 )
         else:
-            spec = (reader(env) if reader is not None else reader_for(env, perception_m, max_agents)).spec
+            spec = _reader_of(env, reader, perception_m, max_agents).spec
         forecaster = open_forecaster(checkpoint, spec, source, device)
         if not ready:
             trained = forecaster.spec

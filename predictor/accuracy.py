@@ -14,7 +14,7 @@ from torch import Tensor
 
 from predictor import metrics
 from predictor.outcomes import Outcome, run_sequence_batch, run_window_batch, run_windows, sequence_indices
-from predictor.subsets import NUM_SUBSETS, Statistic, ratio_statistics, subset_statistics
+from predictor.subsets import NUM_SUBSETS, Statistic, batch_interval, ratio_statistics, subset_statistics
 
 __all__ = [
     "Accuracy",
@@ -76,6 +76,11 @@ class Accuracy:
     steps; without those that could not be measured."""
     step_errors: dict[str, list[float | None]] = field(default_factory=dict)
     """Standard error over the same subsets at each step, by name of the list fields above."""
+    intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """95 % bootstrap interval over batches (episodes, in a live environment), by name of the scalar fields; where asked
+    for."""
+    step_intervals: dict[str, list[tuple[float, float] | None]] = field(default_factory=dict)
+    """The same at each step, by name of the list fields."""
 
     @property
     def rmse_per_axis_m(self) -> float:
@@ -130,13 +135,16 @@ class Tally:
             self._sums.setdefault(name, []).append(known.cpu().numpy())
             self._counts.setdefault(name, []).append(count.cpu().numpy())
 
-    def accuracy(self, name: str, num_subsets: int = NUM_SUBSETS, seed: int = 0) -> Accuracy:
+    def accuracy(
+        self, name: str, num_subsets: int = NUM_SUBSETS, seed: int = 0, batch_intervals: bool = False
+    ) -> Accuracy:
         """One row of what was collected.
 
         Args:
             name: the forecaster's name.
             num_subsets: subsets of windows behind the standard errors.
             seed: of the subsets.
+            batch_intervals: also bootstrap over the batches that were added, where each is an independent episode.
 
         Raises:
             ValueError: nothing was collected.
@@ -154,6 +162,7 @@ class Tally:
             if counts[key].ndim == 2
         }
         statistics, step_errors = _spread(sums, counts, num_subsets, seed)
+        intervals, step_intervals = self._bootstrap(seed) if batch_intervals else ({}, {})
         return Accuracy(
             name=name,
             num_samples=samples,
@@ -170,7 +179,28 @@ class Tally:
             coverage=steps.get("coverage", []),
             statistics=statistics,
             step_errors=step_errors,
+            intervals=intervals,
+            step_intervals=step_intervals,
         )
+
+    def _bootstrap(
+        self, seed: int
+    ) -> tuple[dict[str, tuple[float, float]], dict[str, list[tuple[float, float] | None]]]:
+        """`Accuracy.intervals` and `Accuracy.step_intervals`."""
+        scalars: dict[str, tuple[float, float]] = {}
+        by_step: dict[str, list[tuple[float, float] | None]] = {}
+        for key, parts in self._sums.items():
+            sums = np.stack([part.sum(0) for part in parts])
+            counts = np.stack([part.sum(0) for part in self._counts[key]])
+            root = key == "rmse_m"
+            if sums.ndim == 1:
+                found = batch_interval(sums, counts, seed, root)
+                scalars |= {} if found is None else {key: found}
+                continue
+            if key in SCALAR_NAMES and (found := batch_interval(sums.sum(1), counts.sum(1), seed, root)) is not None:
+                scalars[SCALAR_NAMES[key]] = found
+            by_step[key] = [batch_interval(s, c, seed, root) for s, c in zip(sums.T, counts.T, strict=True)]
+        return scalars, by_step
 
     def _measure(self, outcome: Outcome) -> dict[str, tuple[Tensor, Tensor]]:
         """Every metric's values and mask: per agent, per scene, and per agent and step."""

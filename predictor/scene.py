@@ -119,6 +119,15 @@ class Scene:
     heading_rad: float = 0.0
     """The ego's heading, which turns world axes into ego axes; 0 where agents have none."""
 
+    def behind_absent(self, rows: int) -> "Scene":
+        """The same with `rows` absent rows in front: what a forecaster with an ego gets where nobody is the ego."""
+        return Scene(
+            np.pad(self.states, ((rows, 0), (0, 0))),
+            np.pad(self.ids, (rows, 0), constant_values=PADDING_ID),
+            np.pad(self.valid, (rows, 0)),
+            self.heading_rad,
+        )
+
     def check(self, source: str = "reader", spec: SceneSpec | None = None, rows: int | None = None) -> None:
         """Raise unless the scene keeps the contract.
 

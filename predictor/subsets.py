@@ -13,6 +13,8 @@ from jaxtyping import Bool, Float
 
 NUM_SUBSETS = 20
 """The paper's."""
+BOOTSTRAP_DRAWS = 2000
+"""Of an interval."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,31 @@ def ratio_statistics(
         return None
     error = float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
     return Statistic(float(values.mean()), error, len(values))
+
+
+def batch_interval(
+    sums: Float[np.ndarray, " batches"], counts: Float[np.ndarray, " batches"], seed: int = 0, root: bool = False
+) -> tuple[float, float] | None:
+    """95 % percentile bootstrap of Σ sums / Σ counts over batches (episodes), which are drawn whole.
+
+    Equal seeds and numbers of batches give equal draws, so rows of one table are resampled alike.
+
+    Args:
+        sums: numerator of each batch.
+        counts: denominator of each batch.
+        seed: of the draws.
+        root: take the root of each draw's ratio.
+
+    Returns:
+        None with fewer than two batches that count anything.
+    """
+    if np.count_nonzero(counts) < 2:
+        return None
+    drawn = np.random.default_rng(seed).multinomial(len(sums), np.full(len(sums), 1 / len(sums)), size=BOOTSTRAP_DRAWS)
+    totals, numbers = drawn @ sums, drawn @ counts
+    ratios = totals[numbers > 0] / numbers[numbers > 0]
+    low, high = np.percentile(np.sqrt(ratios) if root else ratios, [2.5, 97.5])
+    return float(low), float(high)
 
 
 def subset_ratios(

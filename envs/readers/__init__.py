@@ -6,10 +6,14 @@ from typing import Any
 import gymnasium as gym
 
 from envs.readers.base import Reader, SceneReader, SharedScene, SharedSceneReader, perceive, share
+from envs.readers.entities import EntityRowsReader
+from envs.readers.function import FunctionReader
 from envs.readers.highway import HighwayReader, is_highway_env
 from predictor.errors import UserError
 
 __all__ = [
+    "EntityRowsReader",
+    "FunctionReader",
     "HighwayReader",
     "MakeReader",
     "Reader",

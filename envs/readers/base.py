@@ -54,13 +54,73 @@ class Reader(ABC):
     def reset(self) -> None:  # noqa: B027 (a default, not a duty)
         """Forget all identities; a reader whose environment names its agents has none to forget."""
 
+    def see(self, observation: Any) -> None:  # noqa: B027
+        """Take in the env's own observation, once after each reset and step, before anything is read.
+
+        For a reader that lives on observations; one that looks into the environment has no use for them.
+        """
+
     @abstractmethod
     def read_all(self, env: Any) -> Scene:
-        """Everyone, ego first, unpadded."""
+        """Everyone, ego first, unpadded. The same at each call until the environment steps."""
 
     def read(self, env: Any) -> Scene:
         """What the ego perceives of everyone, padded to `max_agents` rows."""
-        return perceive(self.read_all(env), self._spec, type(self).__name__)
+        name = type(self).__name__
+        return perceive(require_scene(self.read_all(env), name), self._spec, name)
+
+
+def build_reader(make_reader: Any, env: Any) -> Any:
+    """The `SceneReader` that comes of calling what a user gave as `reader=`, or registered, on an environment.
+
+    Raises:
+        UserError: none comes; the message says what to pass instead.
+    """
+    name = getattr(make_reader, "__name__", type(make_reader).__name__)
+    advice = f"for a function that reads a scene, pass reader=FunctionReader({name}, SceneSpec(dt_s=...))"
+    if not callable(make_reader):
+        raise UserError(f"reader= takes what makes a reader, a Reader class for example, got an object of {name}")
+    if getattr(make_reader, "__annotations__", {}).get("return") in (Scene, Scene.__name__):
+        raise UserError(f"reader= takes what makes a reader, but {name} gives a Scene; {advice}")
+    try:
+        reader = make_reader(env)
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(
+            f"reader= takes what makes a reader for an env that is not reset yet, but {name} failed with "
+            f"{type(error).__name__}: {error}; {advice}"
+        ) from error
+    lacks = [part for part in ("spec", "reset", "read") if not hasattr(reader, part)]
+    if lacks:
+        raise UserError(
+            f"reader= takes what makes a reader, but {name} gives {type(reader).__name__} without {', '.join(lacks)}; "
+            + advice
+        )
+    if not isinstance(reader.spec, SceneSpec):
+        raise UserError(
+            f"{name}: the spec of a reader must be a SceneSpec, got {type(reader.spec).__name__}; a class of one's own "
+            "is called with the env and gives a spec to Reader.__init__"
+        )
+    return reader
+
+
+def show(reader: Any, observation: Any) -> None:
+    """Hand the env's own observation to a reader that wants to `see` it; once after each reset and step."""
+    see = getattr(reader, "see", None)
+    if see is not None:
+        see(observation)
+
+
+def require_scene(scene: Any, source: str) -> Scene:
+    """What a reader gave, which must be a `Scene`.
+
+    Raises:
+        UserError: it is something else.
+    """
+    if not isinstance(scene, Scene):
+        raise UserError(f"{source}: reading must give a Scene (predictor.scene), got {type(scene).__name__}")
+    return scene
 
 
 def perceive(everyone: Scene, spec: SceneSpec, source: str = "reader") -> Scene:

@@ -6,6 +6,7 @@ parameters.
 """
 
 import weakref
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -82,20 +83,28 @@ class HighwayReader(Reader):
 
     def read_all(self, env: gym.Env) -> Scene:
         """Every vehicle on the road, ego first, unpadded: ground truth for collection and evaluation."""
+        return self.read_vehicles(env, vehicles_of(env))
+
+    def read_vehicles(self, env: gym.Env, vehicles: Sequence[Vehicle]) -> Scene:
+        """These vehicles of the environment, a row each; the heading is the first one's.
+
+        Raises:
+            UserError: the environment's time step is no longer the one of the spec.
+        """
         dt_s = _dt_s(env.unwrapped.config)  # type: ignore[attr-defined]
         if dt_s != self._spec.dt_s:
             raise UserError(
                 f"the env was wrapped at dt_s={self._spec.dt_s:g} but now steps at dt_s={dt_s:g}; "
                 "pass its config to gym.make, not to reset"
             )
-        vehicles = vehicles_of(env)
-        kinematics = np.array([(*v.position, v.speed, v.heading) for v in vehicles])
+        kinematics = np.array([(*v.position, v.speed, v.heading) for v in vehicles]).reshape(len(vehicles), 4)
         states = np.empty((len(vehicles), len(KINEMATIC_FEATURES)))
         states[:, :2] = kinematics[:, :2]
         states[:, 2] = kinematics[:, 2] * np.cos(kinematics[:, 3])
         states[:, 3] = kinematics[:, 2] * np.sin(kinematics[:, 3])
         ids = np.array([self._identify(v) for v in vehicles], dtype=np.int64)
-        return Scene(states, ids, np.ones(len(vehicles), dtype=np.bool_), float(vehicles[0].heading))
+        heading_rad = float(vehicles[0].heading) if len(vehicles) else 0.0
+        return Scene(states, ids, np.ones(len(vehicles), dtype=np.bool_), heading_rad)
 
     def _identify(self, vehicle: Vehicle) -> int:
         number = self._ids.get(vehicle)

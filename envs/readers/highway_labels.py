@@ -1,8 +1,9 @@
 """Who follows whom in highway-env, read from the drivers themselves: labels for training and for scores.
 
 A vehicle driven by the intelligent driver model (IDM) brakes for the vehicle in front of it on its lane, and while it
-changes lane for the one on the lane it changes to as well. Those are its leaders. A perception system could not know
-this (nor the driver's parameters), so labels never enter an observation; scenes are read in `envs.readers.highway`.
+changes lane for the one on the lane it changes to as well. Those are its leaders. highway-env's linear drivers, and the
+mixed ones of `envs.scenarios`, look at the same vehicles. A perception system could not know this (nor the driver's
+parameters), so labels never enter an observation; scenes are read in `envs.readers.highway`.
 
 Only the longitudinal driving is labelled. A lane change also weighs the gaps on the other lane, for one frame.
 """
@@ -12,19 +13,26 @@ from dataclasses import dataclass, replace
 
 import gymnasium as gym
 import numpy as np
-from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.behavior import AggressiveVehicle, DefensiveVehicle, IDMVehicle, LinearVehicle
 from highway_env.vehicle.objects import RoadObject
 from jaxtyping import Float, Int
 
 from envs.readers.highway import vehicles_of
+from envs.scenarios import DRIVER_KINDS, MixedDriver
 from predictor.data.store import Episode
 from predictor.scene import Scene
 
 UNKNOWN, NO_EDGE, LEADER = -1, 0, 1
 """Edge types: not known, the sender does not lead the receiver, the sender leads the receiver."""
-ATTRIBUTE_NAMES = ("time_gap_s", "desired_time_gap_s", "headway_m")
+ATTRIBUTE_NAMES = ("time_gap_s", "desired_time_gap_s", "headway_m", "desired_speed_mps", "driver_kind")
 """Attributes of a leader edge: headway over the receiver's speed; the driver's own TIME_WANTED; from centre to centre
-along the receiver's lane, as its driver measures it (see `leaders_of`)."""
+along the receiver's lane, as its driver measures it (see `leaders_of`); see `desired_speed_mps`; see `driver_kind`."""
+OTHER_KIND = -1
+"""Kind of a driver by a law that is not in `envs.scenarios.DRIVER_KINDS`."""
+_LINEAR_KINDS = {
+    AggressiveVehicle: DRIVER_KINDS.index("aggressive"),
+    DefensiveVehicle: DRIVER_KINDS.index("defensive"),
+}
 MAX_TIME_GAP_S = 10.0
 """Longer time gaps are given as this; a receiver at rest has no other."""
 
@@ -60,7 +68,8 @@ def read_labels(env: gym.Env) -> SceneLabels:
             if leader in row:
                 time_gap_s = min(headway_m / max(vehicle.speed, 1e-6), MAX_TIME_GAP_S)
                 types[receiver, row[leader]] = LEADER
-                attributes[receiver, row[leader]] = time_gap_s, vehicle.TIME_WANTED, headway_m
+                driver = vehicle.TIME_WANTED, headway_m, desired_speed_mps(vehicle), driver_kind(vehicle)
+                attributes[receiver, row[leader]] = time_gap_s, *driver
     np.fill_diagonal(types, UNKNOWN)
     return SceneLabels(types, attributes)
 
@@ -68,6 +77,7 @@ def read_labels(env: gym.Env) -> SceneLabels:
 def leaders_of(vehicle: IDMVehicle) -> dict[RoadObject, float]:
     """Whom the driver brakes for in `IDMVehicle.act`, with the headway [m]: on its lane, and on the one it changes to.
 
+    IDM reacts to its leader however far it is; a linear driver only to one that is slower, or nearer than it wishes.
     A driver that has crashed reacts to nobody. The headway is the driver's own: its lane is extended past its end, and
     the sign is lost in a square. So it is short of the road between two vehicles where the lane bends, and drivers who
     leave intersection-v2 brake for oncoming ones, as near as they are: highway-env takes the lanes for connected.
@@ -80,6 +90,21 @@ def leaders_of(vehicle: IDMVehicle) -> dict[RoadObject, float]:
         if leader is not None:
             found[leader] = abs(float(vehicle.lane_distance_to(leader)))
     return found
+
+
+def driver_kind(vehicle: IDMVehicle) -> int:
+    """Place of the driver's law of acceleration in `envs.scenarios.DRIVER_KINDS`, or OTHER_KIND."""
+    if isinstance(vehicle, MixedDriver):
+        return DRIVER_KINDS.index(vehicle.traits.kind)
+    if isinstance(vehicle, LinearVehicle):
+        return _LINEAR_KINDS.get(type(vehicle), OTHER_KIND)
+    return DRIVER_KINDS.index("idm")
+
+
+def desired_speed_mps(vehicle: IDMVehicle) -> float:
+    """The speed that the driver would keep with nobody ahead, now: 0 while it yields. IDM heeds its lane's limit."""
+    limit_mps = vehicle.lane.speed_limit if driver_kind(vehicle) == DRIVER_KINDS.index("idm") else None
+    return float(vehicle.target_speed if limit_mps is None else np.clip(vehicle.target_speed, 0, limit_mps))
 
 
 def with_labels(episode: Episode, scenes: Sequence[Scene], labels: Sequence[SceneLabels]) -> Episode:

@@ -42,8 +42,9 @@ def visible(episode: Episode, spec: SceneSpec) -> Bool[np.ndarray, "time agents"
     """Who the ego (column 0) perceives: the nearest `max_agents` within `perception_m`; everyone without an ego."""
     if not spec.has_ego:
         return episode.valid
-    offsets = episode.states[..., :2] - episode.states[:, :1, :2]
-    distance_m = np.where(episode.valid, np.hypot(offsets[..., 0], offsets[..., 1]), np.inf)
+    axes = spec.position_dim
+    offsets = episode.states[..., :axes] - episode.states[:, :1, :axes]
+    distance_m = np.where(episode.valid, np.linalg.norm(offsets, axis=-1), np.inf)
     distance_m[:, 0] = -1.0
     rank = np.argsort(np.argsort(distance_m, axis=1, kind="stable"), axis=1, kind="stable")
     seen: np.ndarray = episode.valid & (distance_m <= spec.perception_m) & (rank < spec.max_agents)

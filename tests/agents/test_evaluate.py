@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from agents.evaluate import Evaluation, mean_and_standard_error, summarize, wilson_interval
-from agents.rows import EpisodeResult
+from agents.episodes import EpisodeResult
 from predictor.errors import UserError
 
 EPISODES = [

@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
-from agents.rows import EpisodeResult, SeededEpisodes, Task, make_rows, resolve_device, run_episodes
+from agents.episodes import EpisodeResult, SeededEpisodes, run_episodes
+from agents.rows import make_rows
+from agents.task import Task, resolve_device
 from predictor.errors import UserError
 
 

@@ -1,11 +1,12 @@
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from highway_env.vehicle.behavior import DefensiveVehicle, IDMVehicle
+from highway_env.vehicle.behavior import AggressiveVehicle, DefensiveVehicle, IDMVehicle, LinearVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark, Obstacle, RoadObject
 
@@ -13,8 +14,20 @@ from envs.collect import CollectConfig, collect
 from envs.egos import make_ego
 from envs.readers import HighwayReader
 from envs.readers.highway import vehicles_of
-from envs.readers.highway_labels import LEADER, UNKNOWN, SceneLabels, leaders_of, read_labels, with_labels
+from envs.readers.highway_labels import (
+    ATTRIBUTE_NAMES,
+    LEADER,
+    OTHER_KIND,
+    UNKNOWN,
+    SceneLabels,
+    desired_speed_mps,
+    driver_kind,
+    leaders_of,
+    read_labels,
+    with_labels,
+)
 from envs.registry import CHECKPOINTS, make_env
+from envs.scenarios import BASE_ID, DRIVER_KINDS, DriverMix, MixedDriver
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.data.windows import Windows
 from predictor.errors import ProtocolError
@@ -56,8 +69,8 @@ def test_who_follows_has_exactly_its_leader(env: gym.Env):
         [0, 0, -1, 0],
         [0, 0, 0, -1],
     ]
-    expected = np.zeros((4, 4, 3))
-    expected[1, 2] = 30.0 / 20.0, 1.5, 30.0
+    expected = np.zeros((4, 4, 5))
+    expected[1, 2] = 30.0 / 20.0, 1.5, 30.0, 20.0, 0.0
     np.testing.assert_allclose(labels.edge_attributes, expected)
     assert (labels.edge_types.dtype, labels.edge_attributes.dtype) == (np.int8, np.float32)
 
@@ -79,7 +92,7 @@ def test_the_ego_alone_has_no_pair(env: gym.Env):
     place(env)
     labels = read_labels(env)
     assert labels.edge_types.tolist() == [[UNKNOWN]]
-    assert labels.edge_attributes.shape == (1, 1, 3)
+    assert labels.edge_attributes.shape == (1, 1, len(ATTRIBUTE_NAMES))
 
 
 def test_who_changes_lane_has_a_leader_on_both(env: gym.Env):
@@ -150,7 +163,7 @@ def test_time_gap_is_headway_over_speed_up_to_a_limit(
 ):
     follower, _ = place(env, (0.0, 4.0), (headway_m, 4.0))
     follower.speed = speed_mps
-    np.testing.assert_allclose(read_labels(env).edge_attributes[1, 2], [time_gap_s, 1.5, headway_m], rtol=1e-6)
+    np.testing.assert_allclose(read_labels(env).edge_attributes[1, 2, :3], [time_gap_s, 1.5, headway_m], rtol=1e-6)
 
 
 def test_the_desired_time_gap_is_the_drivers_own(env: gym.Env):
@@ -162,25 +175,132 @@ def test_the_desired_time_gap_is_the_drivers_own(env: gym.Env):
     assert read_labels(env).edge_attributes[1, 2, 1] == DefensiveVehicle.TIME_WANTED
 
 
+def drivers_of_all_kinds(road: Any) -> list[IDMVehicle]:
+    """highway-env's own and ours, at 20 m/s on a lane with a limit of 30 m/s; ours wish for 21 m/s."""
+    own = [law(road, np.array([0.0, 4.0]), 0.0, 20.0) for law in (IDMVehicle, AggressiveVehicle, DefensiveVehicle)]
+    ours = []
+    for kind in DRIVER_KINDS:
+        traits = replace(DriverMix().draw(np.random.default_rng(0)), kind=kind, speed_factor=0.7)
+        ours.append(MixedDriver(road, np.array([0.0, 4.0]), 0.0, 20.0, traits=traits))
+    return own + ours
+
+
+def acceleration_of(vehicle: IDMVehicle) -> float:
+    """What the driver would do now [m/s²], were it not for the limits of its car."""
+    vehicle.enable_lane_change, vehicle.ACC_MAX = False, np.inf
+    vehicle.act()
+    return float(vehicle.action["acceleration"])
+
+
+def test_kinds_and_desired_speeds_are_the_drivers_own(env: gym.Env):
+    made = drivers_of_all_kinds(env.unwrapped.road)
+    assert [driver_kind(vehicle) for vehicle in made] == [0, 1, 2, 0, 1, 2]
+    assert [desired_speed_mps(vehicle) for vehicle in made] == [20.0] * 3 + [21.0] * 3
+    assert driver_kind(LinearVehicle(env.unwrapped.road, np.array([0.0, 4.0]))) == OTHER_KIND
+
+
+@pytest.mark.parametrize("asked_mps", [0.0, 12.0, 25.0, 40.0])
+def test_with_nobody_ahead_the_desired_speed_is_kept(env: gym.Env, asked_mps: float):
+    for vehicle in drivers_of_all_kinds(env.unwrapped.road):
+        env.unwrapped.road.vehicles = [vehicle]
+        vehicle.target_speed = asked_mps
+        vehicle.speed = desired_speed_mps(vehicle)
+        expected = vehicle.COMFORT_ACC_MAX if driver_kind(vehicle) == 0 and asked_mps == 0 else 0.0
+        assert acceleration_of(vehicle) == pytest.approx(expected, abs=1e-9)  # IDM at rest takes 0 for 0.01 m/s
+
+
+def test_the_kind_and_the_desired_speed_stand_on_the_followers_edge(env: gym.Env):
+    road = env.unwrapped.road
+    for follower in drivers_of_all_kinds(road):
+        leader = IDMVehicle(road, np.array([30.0, 4.0]), 0.0, 17.0)
+        road.vehicles = [follower, leader, env.unwrapped.vehicle]
+        found = read_labels(env).edge_attributes[1, 2]
+        np.testing.assert_allclose(
+            found, [1.5, follower.TIME_WANTED, 30.0, desired_speed_mps(follower), driver_kind(follower)], rtol=1e-6
+        )
+
+
+@pytest.mark.parametrize("env_id", BASE_ID)
+def test_labels_hold_the_traits_of_each_driver(env_id: str):
+    env, seen = make_env(env_id), 0
+    for seed in range(3):
+        env.reset(seed=seed)
+        for action in random_actions(env, 4, seed):
+            labels = read_labels(env)
+            for receiver, sender in edges(labels):
+                driver = vehicles_of(env)[receiver]
+                _, gap_s, _, speed_mps, kind = labels.edge_attributes[receiver, sender]
+                assert gap_s == np.float32(driver.traits.time_gap_s)
+                assert DRIVER_KINDS[int(kind)] == driver.traits.kind
+                asked_mps = 0.0 if getattr(driver, "is_yielding", False) else driver.target_speed
+                assert speed_mps == pytest.approx(min(asked_mps, driver.target_speed), rel=1e-6)
+                assert driver.target_speed <= driver.traits.speed_factor * 30.0
+                seen += 1
+            if any(env.step(action)[2:4]):
+                break
+    assert seen
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_who_is_labelled_a_leader_moves_the_driver_and_nobody_else_does(env: gym.Env, seed: int):
+    """By intervention: each other vehicle in turn drives back at full speed; who may pull out is not asked."""
+    rng, road = np.random.default_rng(seed), env.unwrapped.road
+    road.vehicles = []
+    for x_m in rng.permutation(np.arange(8) * 13.0):
+        lane = int(rng.integers(4))
+        road.vehicles.append(MixedDriver(road, np.array([x_m, 4.0 * lane]), 0.0, 20.0))
+        if rng.random() < 0.4:
+            road.vehicles[-1].target_lane_index = ("0", "1", lane + (1 if lane < 3 else -1))
+    vehicles = [env.unwrapped.vehicle, *road.vehicles]
+    env.unwrapped.vehicle.position = np.array(ASIDE)
+    road.vehicles = vehicles[1:] + vehicles[:1]
+    found = set()
+    for receiver, driver in enumerate(vehicles[1:], start=1):
+        before = acceleration_of(driver)
+        for sender, other in enumerate(vehicles):
+            if other is not driver:
+                other.speed = -1e5
+                if acceleration_of(driver) != before:
+                    found.add((receiver, sender))
+                other.speed = 20.0
+    assert found == edges(read_labels(env)) != set()
+
+
+@pytest.mark.parametrize("kind", DRIVER_KINDS)
+@pytest.mark.parametrize(
+    ("gap_m", "leader_mps", "linear_cares"), [(90.0, 25.0, False), (90.0, 15.0, True), (25.0, 25.0, True)]
+)
+def test_only_idm_reacts_to_a_faster_leader_farther_than_it_wishes(
+    env: gym.Env, kind: str, gap_m: float, leader_mps: float, linear_cares: bool
+):
+    follower = drivers_of_all_kinds(env.unwrapped.road)[3 + DRIVER_KINDS.index(kind)]
+    leader = IDMVehicle(env.unwrapped.road, np.array([gap_m, 4.0]), 0.0, leader_mps)
+    env.unwrapped.road.vehicles = [follower]
+    alone = acceleration_of(follower)
+    env.unwrapped.road.vehicles.append(leader)
+    assert (acceleration_of(follower) != alone) == (kind == "idm" or linear_cares)
+    assert set(leaders_of(follower)) == {leader}
+
+
 def test_without_a_road_it_says_so(env: gym.Env):
     env.unwrapped.road = None
     with pytest.raises(ProtocolError, match="has no vehicles yet; call reset"):
         read_labels(env)
 
 
-@pytest.mark.parametrize("env_id", CHECKPOINTS)
+@pytest.mark.parametrize("env_id", [*CHECKPOINTS, *BASE_ID])
 def test_leaders_are_those_that_the_drivers_then_brake_for(env_id: str, monkeypatch: pytest.MonkeyPatch):
     """Of all who ask for an acceleration, only `act` passes the rear vehicle; it looks at its own lane first."""
     env = light_env(env_id)
     asked: list[tuple[Vehicle, Vehicle | None]] = []
-    original = IDMVehicle.acceleration
+    for law in (IDMVehicle, MixedDriver):
 
-    def spied(self: IDMVehicle, *args: Any, **kwargs: Any) -> float:
-        if "rear_vehicle" in kwargs:
-            asked.append((kwargs["ego_vehicle"], kwargs["front_vehicle"]))
-        return float(original(self, *args, **kwargs))
+        def spied(self: IDMVehicle, *args: Any, original: Any = law.acceleration, **kwargs: Any) -> float:
+            if "rear_vehicle" in kwargs:
+                asked.append((kwargs["ego_vehicle"], kwargs["front_vehicle"]))
+            return float(original(self, *args, **kwargs))
 
-    monkeypatch.setattr(IDMVehicle, "acceleration", spied)
+        monkeypatch.setattr(law, "acceleration", spied)
     checked = 0
     for seed in range(2):
         env.reset(seed=seed)
@@ -228,9 +348,9 @@ def scene(*ids: int) -> Scene:
 
 def label(rows: int, leads: Sequence[tuple[int, int]]) -> SceneLabels:
     types = np.zeros((rows, rows), dtype=np.int8)
-    attributes = np.zeros((rows, rows, 3), dtype=np.float32)
+    attributes = np.zeros((rows, rows, len(ATTRIBUTE_NAMES)), dtype=np.float32)
     for receiver, sender in leads:
-        types[receiver, sender], attributes[receiver, sender] = LEADER, (receiver, sender, 7)
+        types[receiver, sender], attributes[receiver, sender] = LEADER, (receiver, sender, 7, 8, 9)
     return SceneLabels(types, attributes)
 
 
@@ -245,8 +365,8 @@ def test_labels_go_to_the_columns_of_their_agents():
         [[0, 0, 0], [1, 0, 0], [0, 1, 0]],
         [[0, -1, 0], [-1, -1, -1], [1, -1, 0]],
     ]
-    assert labelled.edge_attributes[1, 2, 1].tolist() == [1, 2, 7]  # receiver id 7 in row 1, sender id 3 in row 2
-    assert labelled.edge_attributes[1, 1, 0].tolist() == [2, 0, 7]
+    assert labelled.edge_attributes[1, 2, 1].tolist() == [1, 2, 7, 8, 9]  # receiver id 7 in row 1, sender id 3 in row 2
+    assert labelled.edge_attributes[1, 1, 0].tolist() == [2, 0, 7, 8, 9]
     assert ((labelled.edge_attributes != 0).any(-1) == (labelled.edge_types == LEADER)).all()
 
 
@@ -275,7 +395,7 @@ def test_labels_follow_their_agents_through_the_store_into_windows(tmp_path: Pat
     env_id = "intersection-v2"
     recorded = list(collect(config(env_id, episodes=2, seed=28)))
     assert any(not e.valid[0].all() for e in recorded) and any(not e.valid[-1].all() for e in recorded)
-    info = StoreInfo(HighwayReader(make_env(env_id)).spec, env_id, edge_attribute_names=("a", "b", "c"))
+    info = StoreInfo(HighwayReader(make_env(env_id)).spec, env_id, edge_attribute_names=ATTRIBUTE_NAMES)
     write_store(tmp_path / "store", info, recorded)
     episodes = read_store(tmp_path / "store").episodes
     truths = [replay(episode, env_id) for episode in episodes]
@@ -291,7 +411,9 @@ def test_labels_follow_their_agents_through_the_store_into_windows(tmp_path: Pat
             for i, j in np.argwhere(~np.eye(len(ids), dtype=np.bool_)):
                 found = int(batch.edge_types[row, t, i, j]), batch.edge_attributes[row, t, i, j].tolist()
                 both = valid[i] and valid[j]
-                assert found == (truths[number][begin + t][ids[i], ids[j]] if both else (UNKNOWN, [0, 0, 0]))
+                assert found == (
+                    truths[number][begin + t][ids[i], ids[j]] if both else (UNKNOWN, [0.0] * len(ATTRIBUTE_NAMES))
+                )
                 edges_seen += found[0] == LEADER
     assert moved and edges_seen > 50
 

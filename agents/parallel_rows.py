@@ -1,0 +1,181 @@
+"""PettingZoo tasks: agents as rows of one policy for training, and episodes on given seeds for evaluation.
+
+Agents that do not learn are driven by name (`envs.drivers`), anew in each episode. As in `agents.rows`, one place
+decides what a policy sees.
+"""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pettingzoo import ParallelEnv
+from pettingzoo.utils import BaseParallelWrapper
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from agents.episodes import EpisodeResult
+from agents.task import Task, resolve_device
+from envs.drivers import Driver, make_driver
+from envs.multiagent import AgentMonitor, ParallelVecEnv
+from envs.parallel import ForecastParallelEnv
+from envs.parallel_registry import make_parallel_env
+from predictor.errors import UserError
+
+
+class DrivenEnv(BaseParallelWrapper):
+    """Has a fresh driver in each episode, for the agents that do not learn.
+
+    Args:
+        env: what is driven.
+        driver: its name in `envs.drivers`.
+
+    Attributes:
+        driver: of this episode.
+        episodes: resets so far.
+    """
+
+    def __init__(self, env: ParallelEnv, driver: str) -> None:
+        """Nothing is reset yet."""
+        super().__init__(env)
+        self._name = driver
+        self._rng = np.random.default_rng(0)
+        self.driver: Driver
+        self.episodes = 0
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], Any]:
+        """Reset; a seed also fixes the drivers of this and the following episodes."""
+        observations, infos = self.env.reset(seed=seed, options=options)
+        if seed is not None:
+            self._rng = np.random.default_rng(seed)
+        self.driver = make_driver(self._name, self.env, self._rng)
+        self.episodes += 1
+        return observations, infos
+
+
+def drive(env: Any, observations: Mapping[str, Any], generator: np.random.Generator) -> dict[str, Any]:
+    """The partner of `ParallelVecEnv`: the episode's driver acts on the agents' own observations."""
+    return env.driver(own_observations(observations))
+
+
+def own_observations(observations: Mapping[str, Any]) -> dict[str, Any]:
+    """What the environment itself gave each agent, without forecasts."""
+    return {name: seen["observation"] if isinstance(seen, dict) else seen for name, seen in observations.items()}
+
+
+@dataclass(frozen=True)
+class MakeCopy:
+    """Picklable constructor of one copy of a task's environment."""
+
+    task: Task
+    """What to make."""
+    render_mode: str | None = None
+    """Passed on to the environment."""
+
+    def __call__(self) -> DrivenEnv:
+        """The environment, with forecasts unless the task observes none, and a driver."""
+        options = {} if self.render_mode is None else {"render_mode": self.render_mode}
+        env = make_parallel_env(self.task.env_id, **options)
+        if self.task.observe != "none":
+            env = ForecastParallelEnv(env, self.task.forecaster, device=resolve_device(self.task.device))
+        return DrivenEnv(env, self.task.partner)
+
+
+def learners_of(task: Task, env: ParallelEnv) -> list[str]:
+    """The agents that learn.
+
+    Raises:
+        UserError: a learner of the task is neither an agent nor a role of the environment.
+    """
+    if not task.learners:
+        return list(env.possible_agents)
+    for name in task.learners:
+        if not any(name in (agent, role_of(agent)) for agent in env.possible_agents):
+            raise UserError(
+                f"learners: '{name}' is neither an agent nor a role of {task.env_id}; it has "
+                f"{', '.join(env.possible_agents)}"
+            )
+    return [a for a in env.possible_agents if a in task.learners or role_of(a) in task.learners]
+
+
+def role_of(agent: str) -> str:
+    """An agent's name without its number."""
+    return re.sub(r"[_\s]?\d+$", "", agent) or agent
+
+
+def make_parallel_rows(task: Task, copies: int) -> AgentMonitor:
+    """All learners of some copies of a task's environment, with statistics over lives."""
+    make = MakeCopy(task)
+    env = make()
+    learners = learners_of(task, env)
+    env.close()
+    partner = None if len(learners) == len(env.possible_agents) else drive
+    return AgentMonitor(ParallelVecEnv([make] * copies, agents=learners, partner=partner))
+
+
+class ParallelArena:
+    """Plays seeds with a policy or with a driver in the learners' place; see `agents.arena.Arena`.
+
+    Args:
+        task: a PettingZoo task.
+    """
+
+    baselines = ("random", "heuristic")
+
+    def __init__(self, task: Task) -> None:
+        """One copy; results do not depend on how many there are."""
+        self._monitor = make_parallel_rows(task, 1)
+        venv = self._monitor.venv
+        assert isinstance(venv, ParallelVecEnv)
+        self._venv = venv
+        self._env: DrivenEnv = venv.envs[0]  # type: ignore[assignment]
+
+    def play(
+        self, policy: BaseAlgorithm | str, seeds: Sequence[int], on_episode: Callable[[], None] = lambda: None
+    ) -> list[EpisodeResult]:
+        """One episode per seed; the return is the mean over the learners."""
+        results = []
+        for seed in seeds:
+            results.append(self._driven(policy, seed) if isinstance(policy, str) else self._learned(policy, seed))
+            on_episode()
+        return results
+
+    def close(self) -> None:
+        """Close the environment."""
+        self._venv.close()
+
+    def _learned(self, policy: BaseAlgorithm, seed: int) -> EpisodeResult:
+        self._venv.seed(seed)
+        observations: Any = self._venv.reset()
+        episode, steps = self._env.episodes, 0
+        returns = dict.fromkeys(self._venv.row_agents, 0.0)
+        while self._env.episodes == episode:
+            actions = policy.predict(observations, deterministic=True)[0]
+            observations, rewards, _, _ = self._venv.step(actions)
+            for agent, reward in zip(self._venv.row_agents, rewards.tolist(), strict=True):
+                returns[agent] += reward
+            steps += 1
+        return _result(seed, steps, returns)
+
+    def _driven(self, name: str, seed: int) -> EpisodeResult:
+        env = self._env
+        observations, _ = env.reset(seed=seed)
+        driver = make_driver(name, env.env, np.random.default_rng(seed))
+        returns = dict.fromkeys(self._venv.row_agents, 0.0)
+        steps = 0
+        while env.agents:
+            own = own_observations(observations)
+            actions = env.driver(own) | {a: v for a, v in driver(own).items() if a in returns}
+            observations, rewards, *_ = env.step(actions)
+            for agent in returns:
+                returns[agent] += float(rewards.get(agent, 0.0))
+            steps += 1
+        return _result(seed, steps, returns)
+
+
+def _result(seed: int, steps: int, returns: Mapping[str, float]) -> EpisodeResult:
+    roles: dict[str, list[float]] = {}
+    for agent, value in returns.items():
+        roles.setdefault(role_of(agent), []).append(value)
+    by_role = {role: float(np.mean(values)) for role, values in roles.items()} if len(roles) > 1 else {}
+    return EpisodeResult(seed, float(np.mean(list(returns.values()))), steps, None, float("nan"), by_role)

@@ -1,0 +1,117 @@
+"""What is driven and what the policy sees of it; the one description that training, evaluation and video share."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import gymnasium as gym
+import torch
+
+from envs.drivers import DRIVER_NAMES
+from envs.multiagent import ParallelVecEnv
+from envs.native import check_envpool, envpool_id_of
+from envs.parallel import ForecastParallelEnv
+from envs.parallel_registry import is_parallel_id, make_parallel_env
+from envs.registry import make_env
+from envs.wrappers import ForecastObservation
+from predictor.errors import UserError
+from predictor.scene import SceneSpec
+
+Observe = Literal["forecast", "none", "constant-velocity"]
+Backend = Literal["gymnasium", "envpool"]
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is driven and what the policy sees of it."""
+
+    env_id: str
+    """Gymnasium id (highway-fast-v0) or PettingZoo parallel id (simple_tag_v3)."""
+    observe: Observe = "forecast"
+    """Learned forecasts, the env's own observation alone, or constant-velocity forecasts in the same shape."""
+    checkpoint: str | None = None
+    """Forecaster for `observe="forecast"`: shipped name or path; None takes the one that ships for the id."""
+    device: str = "cpu"
+    """Where the forecaster runs: cpu, cuda or auto."""
+    backend: Backend = "gymnasium"
+    """Who simulates in training: the gymnasium environment itself, or EnvPool's native copy of it."""
+    learners: tuple[str, ...] = ()
+    """PettingZoo: agents or roles ("adversary") that learn; none named are all."""
+    partner: str = "heuristic"
+    """PettingZoo: who drives the agents that do not learn (`envs.drivers`)."""
+
+    def __post_init__(self) -> None:
+        """Check that the fields fit together."""
+        if self.is_parallel and self.backend != "gymnasium":
+            raise UserError(f"backend {self.backend} has no {self.env_id}; leave it out")
+        if self.learners and not self.is_parallel:
+            raise UserError(f"learners are for PettingZoo environments, {self.env_id} has one ego; leave them out")
+        if self.partner not in DRIVER_NAMES:
+            raise UserError(f"partner must be one of {', '.join(DRIVER_NAMES)}, got '{self.partner}'")
+        if self.backend == "envpool":
+            envpool_id_of(self.env_id)
+            check_envpool()
+        if self.checkpoint is not None and self.observe != "forecast":
+            raise UserError(f"checkpoint '{self.checkpoint}' has no effect with observe={self.observe}; leave one out")
+        resolve_device(self.device)
+
+    @property
+    def is_parallel(self) -> bool:
+        """Whether it is a PettingZoo environment with many learners."""
+        return is_parallel_id(self.env_id)
+
+    @property
+    def forecaster(self) -> str | None:
+        """What to pass as `checkpoint` to the wrappers."""
+        return "constant-velocity" if self.observe == "constant-velocity" else self.checkpoint
+
+    @property
+    def scene_spec(self) -> SceneSpec | None:
+        """Scenes as the forecaster was trained on them; None if the policy sees none.
+
+        Raises:
+            UserError: unknown env, missing checkpoint, or a checkpoint that does not fit the env.
+        """
+        if self.observe == "none":
+            return None
+        env = ForecastObservation(make_env(self.env_id), self.forecaster, device=resolve_device(self.device))
+        spec: SceneSpec = env.get_wrapper_attr("scene_spec")
+        env.close()
+        return spec
+
+    def check(self) -> gym.Space:
+        """Make the environment, with its forecaster, and return its action space.
+
+        Raises:
+            UserError: as `scene_spec`.
+        """
+        if self.is_parallel:
+            return self._check_parallel()
+        env = make_env(self.env_id)
+        env.close()
+        _ = self.scene_spec
+        return env.action_space
+
+    def _check_parallel(self) -> gym.Space:
+        env = make_parallel_env(self.env_id)
+        if self.observe != "none":
+            env = ForecastParallelEnv(env, self.forecaster, device=resolve_device(self.device))
+        space = ParallelVecEnv([lambda: env]).action_space
+        env.close()
+        return space
+
+
+def resolve_device(device: str) -> str:
+    """The torch device of a name; auto takes cuda where there is one.
+
+    Raises:
+        UserError: no such device here.
+    """
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        usable = torch.device(device).type != "cuda" or torch.cuda.is_available()
+    except RuntimeError as error:
+        raise UserError(f"device must be cpu, cuda or auto, got '{device}'") from error
+    if not usable:
+        raise UserError(f"device '{device}' was asked for but torch finds no CUDA device; use --device cpu")
+    return device

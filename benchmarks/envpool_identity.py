@@ -1,0 +1,181 @@
+"""How often EnvPool's vehicles keep their identity from step to step, when only their motion tells who is who.
+
+`python benchmarks/envpool_identity.py` drives each task with random actions, hides the order of the vehicles from the
+reader by shuffling it anew at each step, and compares the identities with the true ones: EnvPool 1.2.5 never reorders
+or removes a vehicle, which is checked in the same run where each driver has an exponent of its own. `--replay` does the
+same to scenes of highway-env, where vehicles also come and go and the simulator names them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from envs.native import make_pool
+from envs.readers import HighwayReader
+from envs.readers.envpool import HIGHWAY_ENV_OF, PoolIdentity, PoolReader, native_spec
+from envs.registry import make_env
+from predictor.errors import UserError, run_entry_point
+
+
+@dataclass(frozen=True)
+class IdentityConfig:
+    """Count kept and lost identities of EnvPool's vehicles."""
+
+    task_ids: tuple[str, ...] = tuple(HIGHWAY_ENV_OF)
+    """EnvPool tasks."""
+    vehicle_steps: int = 100_000
+    """Pairs of a vehicle and a step to count per task, the ego not among them."""
+    envs: int = 32
+    """Parallel environments."""
+    seed: int = 0
+    """Of environments, actions and shuffles."""
+    replay: tuple[str, ...] = ()
+    """highway-env ids whose scenes are tracked as well, for example intersection-v2."""
+    replay_vehicle_steps: int = 10_000
+    """Pairs per replayed id; highway-env makes about a thousand per second."""
+
+    def check(self) -> None:
+        """Check ranges.
+
+        Raises:
+            UserError: a value that makes no sense.
+        """
+        for field in fields(self):
+            if field.type is int and getattr(self, field.name) < (field.name != "seed"):
+                raise UserError(f"{field.name} is too small: {getattr(self, field.name)}")
+
+
+@dataclass
+class Count:
+    """What became of the vehicles that were there at the step before."""
+
+    kept: int = 0
+    """Still have their number."""
+    split: int = 0
+    """Got a new number."""
+    wrong: int = 0
+    """Got the number of another vehicle."""
+    resets: int = 0
+    """Episodes that ended meanwhile."""
+
+    @property
+    def pairs(self) -> int:
+        """Vehicle steps."""
+        return self.kept + self.split + self.wrong
+
+    def add(self, before: np.ndarray, now: np.ndarray) -> None:
+        """Count the vehicles of one environment: their numbers before and now, -1 where a vehicle is not there."""
+        there = (before >= 0) & (now >= 0)
+        same = there & (before == now)
+        taken = (now[:, None] == before[before >= 0]).any(axis=1)
+        self.kept += int(same.sum())
+        self.split += int((there & ~taken).sum())
+        self.wrong += int(((now >= 0) & taken & ~same).sum())
+
+
+def count_envpool(task_id: str, config: IdentityConfig) -> Count:
+    """Drive a task until enough vehicle steps are counted; no count where nobody but the ego drives."""
+    rng = np.random.default_rng(config.seed)
+    pool = make_pool(task_id, [config.seed + i for i in range(config.envs)])
+    pool.reset()
+    reader = PoolReader(native_spec(task_id, pool.config), config.envs)
+    rows = np.arange(config.envs)
+    states = pool.debug_states()
+    agents = len(states[0].vehicles)
+    count = Count()
+    before, drivers = _numbers(reader, states, rows, rng), _drivers(states)
+    while agents > 1 and count.pairs < config.vehicle_steps:
+        clock = [state.elapsed_step for state in states]
+        pool.step(_actions(pool.action_space, config.envs, rng))
+        states = pool.debug_states()
+        now, after = _numbers(reader, states, rows, rng), _drivers(states)
+        for i in rows:
+            if states[i].elapsed_step <= clock[i]:
+                count.resets += 1
+                continue
+            if not np.array_equal(drivers[i], after[i]):
+                raise UserError(f"EnvPool's list of vehicles changed its order in {task_id}; this truth holds no more")
+            count.add(before[i], now[i])
+        before, drivers = now, after
+    return count
+
+
+def _numbers(reader: PoolReader, states: Sequence[Any], rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The reader's numbers of the other vehicles in the simulator's order, which it is not shown: (rows, others)."""
+    order = 1 + rng.permutation(len(states[0].vehicles) - 1)
+    lists = [state.vehicles for state in states]
+    shown = [
+        SimpleNamespace(elapsed_step=state.elapsed_step, vehicles=[own[0], *(own[i] for i in order)])
+        for state, own in zip(states, lists, strict=True)
+    ]
+    numbers = np.empty((len(states), len(order)), dtype=np.int64)
+    numbers[:, order - 1] = reader.read_all(shown, rows).ids[:, 1:]
+    return numbers
+
+
+def _drivers(states: Sequence[Any]) -> np.ndarray:
+    return np.array([[vehicle.idm_delta for vehicle in state.vehicles] for state in states])
+
+
+def _actions(space: gym.Space, count: int, rng: np.random.Generator) -> np.ndarray:
+    if isinstance(space, gym.spaces.Discrete):
+        return rng.integers(space.n, size=count)
+    assert isinstance(space, gym.spaces.Box)
+    return rng.uniform(space.low, space.high, (count, *space.shape)).astype(np.float32)
+
+
+def count_replay(env_id: str, config: IdentityConfig) -> Count:
+    """The same for scenes of highway-env, whose vehicles have names, come and go."""
+    rng = np.random.default_rng(config.seed)
+    env = make_env(env_id, disable_env_checker=True)
+    reader, tracker, count = HighwayReader(env), PoolIdentity(1), Count()
+    row, passed_s = np.zeros(1, dtype=np.int64), np.array([reader.spec.dt_s])
+    ended, episode = True, 0
+    numbers: dict[int, int] = {}
+    while count.pairs < config.replay_vehicle_steps:
+        if ended:
+            env.reset(seed=config.seed + episode)
+            reader.reset()
+            tracker.reset(row)
+            numbers, episode = {}, episode + 1
+        else:
+            _, _, terminated, truncated, _ = env.step(_actions(env.action_space, 1, rng)[0])
+        scene = reader.read_all(env)
+        order = 1 + rng.permutation(len(scene.ids) - 1)
+        states, present = scene.states[None, order], np.ones((1, len(order)), dtype=np.bool_)
+        found = tracker.update(states[..., :2], states[..., 2:4], present, row, passed_s)[0]
+        now = dict(zip(scene.ids[order].tolist(), found.tolist(), strict=True))
+        if not ended:
+            names = [*now, *(name for name in numbers if name not in now)]
+            count.add(*(np.array([known.get(name, -1) for name in names]) for known in (numbers, now)))
+        numbers, ended = now, not ended and (terminated or truncated)
+    count.resets = episode - 1
+    env.close()
+    return count
+
+
+def main() -> None:
+    """Entry point."""
+    config = tyro.cli(IdentityConfig, description=__doc__)
+    config.check()
+    table = Table(title=f"identity from motion, random ego, seed {config.seed}")
+    for heading in ("env", "vehicle steps", "correct", "id switches", "split", "wrong", "episodes"):
+        table.add_column(heading, justify="left" if heading == "env" else "right")
+    rows = [(f"envpool {task_id}", count_envpool(task_id, config)) for task_id in config.task_ids]
+    rows += [(f"highway-env {env_id}", count_replay(env_id, config)) for env_id in config.replay]
+    for name, count in rows:
+        share = f"{100 * count.kept / count.pairs:.3f} %" if count.pairs else "no other vehicles"
+        switches = count.split + count.wrong
+        table.add_row(name, *map(str, (count.pairs, share, switches, count.split, count.wrong, count.resets)))
+    Console(width=120).print(table)
+
+
+if __name__ == "__main__":
+    run_entry_point(main)

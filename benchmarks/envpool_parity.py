@@ -1,0 +1,275 @@
+"""How far EnvPool's highway environments are from highway-env's: the same state in both, and episodes of each.
+
+`python benchmarks/envpool_parity.py` copies the states that EnvPool's episodes begin in (positions, speeds, lanes,
+routes, target speeds, drivers' exponents and timers) into the mirrored highway-env id, steps both with the same random
+actions, and reports by how much vehicles differ in position. Then it compares what episodes of each are like on their
+own terms, and with `--policy` how one trained policy fares in both.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import tyro
+from highway_env.vehicle.behavior import IDMVehicle
+from rich.console import Console
+from rich.table import Table
+
+from envs.egos import make_ego, sees_forecasts
+from envs.native import ENV_IDS, register_envpool_ids
+from envs.observation import open_forecaster
+from envs.readers import HighwayReader, SceneReader
+from envs.readers.envpool import HIGHWAY_ENV_OF, EnvPoolReader, is_envpool_env
+from envs.registry import checkpoint_for, make_env
+from envs.wrappers import ForecastObservation
+from predictor.errors import UserError, run_entry_point
+from predictor.provenance import provenance, write_json
+
+_DRIVER = ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN")
+
+
+@dataclass(frozen=True)
+class ParityConfig:
+    """Compare EnvPool's highway environments with highway-env's."""
+
+    task_ids: tuple[str, ...] = ("HighwayFast-v0", "Intersection-v0")
+    """EnvPool tasks with discrete actions."""
+    starts: int = 20
+    """Copied initial states per task."""
+    steps: int = 10
+    """Steps from each [policy steps]."""
+    episodes: int = 30
+    """Episodes per task, simulator and ego; 0 leaves these tables out."""
+    egos: tuple[str, ...] = ("random", "idle")
+    """Who drives: random, idle or varied."""
+    policy: Path | None = None
+    """A Stable-Baselines3 policy .zip that drives as well, in both."""
+    checkpoint: str | None = None
+    """Whose forecasts the policy sees; None takes the one that ships for the highway-env id."""
+    seed: int = 0
+    """Of environments and actions."""
+    out: Path | None = None
+    """JSON file for the results."""
+
+    def check(self) -> None:
+        """Check ranges.
+
+        Raises:
+            UserError: a value that makes no sense.
+        """
+        for name, least in (("starts", 1), ("steps", 1), ("episodes", 0), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise UserError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        unknown = [t for t in self.task_ids if t not in HIGHWAY_ENV_OF or t.startswith("Racetrack")]
+        if unknown:
+            raise UserError(f"cannot compare {', '.join(unknown)}: unknown, or without other vehicles")
+
+
+# --- The same state in both -------------------------------------------------------------------------------------------
+
+
+def _index(start: str, end: str, lane: int) -> tuple[str, str, int | None]:
+    return start, end, None if lane < 0 else lane
+
+
+def copy_state(state: Any, env: gym.Env) -> list[Any]:
+    """Put EnvPool's vehicles on highway-env's road; the vehicles there, in the same order, ego first."""
+    inner: Any = env.unwrapped
+    road, vehicles = inner.road, []
+    for i, source in enumerate(state.vehicles):
+        make = inner.action_type.vehicle_class if i == 0 else IDMVehicle
+        vehicle = make(road, [source.x, source.y], source.heading, source.speed)
+        vehicle.lane_index = (source.lane_from, source.lane_to, source.lane_index)
+        vehicle.lane = road.network.get_lane(vehicle.lane_index)
+        vehicle.target_lane_index = (source.target_lane_from, source.target_lane_to, source.target_lane_index)
+        vehicle.target_speed = source.target_speed
+        route = zip(source.route_from, source.route_to, source.route_id, strict=True)
+        vehicle.route = [_index(*lane) for lane in route] or None
+        vehicle.check_collisions = source.check_collisions
+        if i == 0:
+            vehicle.speed_index = source.speed_index
+        else:
+            vehicle.DELTA, vehicle.timer = source.idm_delta, source.timer
+            vehicle.enable_lane_change = source.enable_lane_change
+        vehicles.append(vehicle)
+    road.vehicles, inner.controlled_vehicles = list(vehicles), vehicles[:1]
+    if hasattr(road, "steps"):
+        road.steps = 3 * state.simulation_frequency  # both warm the traffic lights' clock up by three seconds
+    return vehicles
+
+
+@contextmanager
+def untouched_drivers() -> Iterator[None]:
+    """highway-env's intersection changes every IDM driver of the process; put them back afterwards."""
+    kept = {name: getattr(IDMVehicle, name) for name in _DRIVER}
+    try:
+        yield
+    finally:
+        for name, value in kept.items():
+            setattr(IDMVehicle, name, value)
+
+
+def step_both(task_id: str, config: ParityConfig) -> list[np.ndarray]:
+    """For each step, the distances between the copies of each vehicle [m], all starts together."""
+    register_envpool_ids()
+    native = gym.make(_env_id(task_id), disable_env_checker=True).unwrapped
+    # vehicles come and go in highway-env alone
+    still = {"spawn_probability": 0.0} if task_id.startswith("Intersection") else None
+    mirrored = make_env(HIGHWAY_ENV_OF[task_id], disable_env_checker=True, config=still)
+    rng = np.random.default_rng(config.seed)
+    apart: list[list[float]] = [[] for _ in range(config.steps)]
+    assert isinstance(native.action_space, gym.spaces.Discrete)
+    for start in range(config.starts):
+        native.reset(seed=config.seed + start)
+        mirrored.reset(seed=config.seed + start)
+        copies = copy_state(native.debug_states()[0], mirrored)  # type: ignore[attr-defined]
+        for step in range(config.steps):
+            action = int(rng.integers(native.action_space.n))
+            ends = [env.step(action)[2:4] for env in (native, mirrored)]
+            present = {id(vehicle) for vehicle in mirrored.unwrapped.road.vehicles}  # type: ignore[attr-defined]
+            for source, copy in zip(native.debug_states()[0].vehicles, copies, strict=True):  # type: ignore[attr-defined]
+                if id(copy) in present:
+                    apart[step].append(float(np.hypot(*(np.array([source.x, source.y]) - copy.position))))
+            if any(map(any, ends)):
+                break
+    mirrored.close()
+    return [np.array(distances) for distances in apart]
+
+
+# --- Episodes of each -------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Episodes:
+    """What the episodes of one simulator are like."""
+
+    returns: list[float]
+    """Sum of rewards."""
+    lengths: list[float]
+    """Policy steps."""
+    crashed: list[float]
+    """1 where the ego crashed."""
+    vehicles: list[float]
+    """Others on the road, by scene."""
+    near: list[float]
+    """Others within `SceneSpec`'s perception, by scene."""
+    nearest_m: list[float]
+    """Distance from the ego to the nearest other [m], by scene."""
+    speed_mps: list[float]
+    """Speed of the others [m/s], by scene and vehicle."""
+    starts: int
+    """Different initial scenes."""
+
+
+def play(env: gym.Env, ego: str, config: ParityConfig) -> Episodes:
+    """Episodes of the config's seeds."""
+    reader: SceneReader = EnvPoolReader(env) if is_envpool_env(env) else HighwayReader(env)
+    seen = Episodes([], [], [], [], [], [], [], 0)
+    starts = set()
+    for seed in range(config.seed, config.seed + config.episodes):
+        obs, _ = env.reset(seed=seed)
+        act = make_ego(ego, env, np.random.default_rng(seed))
+        reader.reset()
+        scene = reader.read_all(env)
+        starts.add(scene.states.round(6).tobytes())
+        total, length, over = 0.0, 0, False
+        info: dict[str, Any] = {}
+        while not over:
+            obs, reward, terminated, truncated, info = env.step(act(obs))
+            total, length, over = total + float(reward), length + 1, terminated or truncated
+            _note(seen, reader.read_all(env).states, reader.spec.perception_m)
+        seen.returns.append(total)
+        seen.lengths.append(length)
+        seen.crashed.append(float(info["crashed"]))
+    seen.starts = len(starts)
+    return seen
+
+
+def _note(seen: Episodes, states: np.ndarray, perception_m: float) -> None:
+    distance_m = np.linalg.norm(states[1:, :2] - states[0, :2], axis=1)
+    seen.vehicles.append(len(distance_m))
+    seen.near.append(int((distance_m <= perception_m).sum()))
+    if len(distance_m):
+        seen.nearest_m.append(float(distance_m.min()))
+    seen.speed_mps.extend(np.linalg.norm(states[1:, 2:4], axis=1).tolist())
+
+
+def _env_id(task_id: str) -> str:
+    return next(env_id for env_id, task in ENV_IDS.items() if task == task_id)
+
+
+def _for_policy(env: gym.Env, task_id: str, config: ParityConfig) -> gym.Env:
+    """The env as the policy wants to see it."""
+    if not sees_forecasts(str(config.policy)):
+        return env
+    name = config.checkpoint or checkpoint_for(HIGHWAY_ENV_OF[task_id])
+    make = EnvPoolReader if is_envpool_env(env) else HighwayReader
+    spec = open_forecaster(name, make(env).spec, _env_id(task_id)).spec
+    reader = partial(make, perception_m=spec.perception_m, max_agents=spec.max_agents)
+    return ForecastObservation(env, name, reader=reader)
+
+
+# --- Report -----------------------------------------------------------------------------------------------------------
+
+
+def distances_table(task_id: str, apart: Sequence[np.ndarray]) -> Table:
+    """Differences of position by step."""
+    table = Table(title=f"{task_id} and {HIGHWAY_ENV_OF[task_id]} from the same states, difference of position \\[m]")
+    for heading in ("step", "vehicles", "median", "95 %", "max", "within 0.01 m"):
+        table.add_column(heading, justify="right")
+    for step, distances in enumerate(apart, start=1):
+        if len(distances):
+            numbers = (np.median(distances), np.percentile(distances, 95), distances.max())
+            share = f"{100 * (distances < 0.01).mean():.1f} %"
+            table.add_row(str(step), str(len(distances)), *(f"{n:.3g}" for n in numbers), share)
+    return table
+
+
+def episodes_table(task_id: str, ego: str, both: Sequence[tuple[str, Episodes]]) -> Table:
+    """Episodes of both simulators, mean ± standard deviation (of returns and crashes: standard error)."""
+    table = Table(title=f"{task_id}, ego {ego}, {len(both[0][1].returns)} episodes each")
+    heads = ("simulator", "return", "crashed", "steps", "others", "near", "nearest \\[m]", "their speed \\[m/s]", "starts")
+    for heading in heads:
+        table.add_column(heading, justify="left" if heading == "simulator" else "right")
+    for name, seen in both:
+        error = np.sqrt(len(seen.returns))
+        cells = [(seen.returns, error), (seen.crashed, error)]
+        cells += [(v, 1.0) for v in (seen.lengths, seen.vehicles, seen.near, seen.nearest_m, seen.speed_mps)]
+        numbers = [f"{np.mean(v):.2f} ± {np.std(v) / scale:.2f}" for v, scale in cells]
+        table.add_row(name, *numbers, str(seen.starts))
+    return table
+
+
+def main() -> None:
+    """Entry point."""
+    config = tyro.cli(ParityConfig, description=__doc__)
+    config.check()
+    register_envpool_ids()
+    console, results = Console(width=140), {}
+    for task_id in config.task_ids:
+        with untouched_drivers():
+            apart = step_both(task_id, config)
+        console.print(distances_table(task_id, apart))
+        results[task_id] = {"apart_m": [distances.tolist() for distances in apart]}
+        egos = [*config.egos, *([str(config.policy)] if config.policy else [])] if config.episodes else []
+        for ego in egos:
+            with untouched_drivers():
+                made = [("envpool", _env_id(task_id)), ("highway-env", HIGHWAY_ENV_OF[task_id])]
+                envs = [(name, make_env(env_id, disable_env_checker=True)) for name, env_id in made]
+                if ego == str(config.policy):
+                    envs = [(name, _for_policy(env, task_id, config)) for name, env in envs]
+                both = [(name, play(env, ego, config)) for name, env in envs]
+            console.print(episodes_table(task_id, ego, both))
+            results[task_id][ego] = {name: asdict(seen) for name, seen in both}
+    if config.out is not None:
+        made_with = provenance(("envpool", "highway-env", "gymnasium", "numpy"))
+        write_json(config.out, {"config": asdict(config), "results": results, "provenance": made_with})
+
+
+if __name__ == "__main__":
+    run_entry_point(main)

@@ -1,0 +1,197 @@
+"""Who is who between two steps, for environments that report agents without names: `IdentityTracker`.
+
+Each agent of the last step is matched to the observation that its motion explains best. Both velocities are known, so
+the position is predicted with their mean, which is exact under constant acceleration. The matching is the best one for
+all agents together. It is only as good as the motion is smooth: where the environment knows its agents' names, use
+those.
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+
+from predictor.errors import UserError
+from predictor.scene import PADDING_ID
+
+_CHANGE_WEIGHT = 0.1
+
+
+class IdentityTracker:
+    """Gives the agents of one environment numbers that stay with them from step to step.
+
+    What it costs to take an observation for an agent [m]: √(r² + c²), with r how far it is from where the mean of both
+    velocities leads, and c a tenth of the change of velocity times the time between them; without c, two that meet
+    head-on could as well have turned round. At `gate_m` and beyond, and where `keys` differ, it is not the same agent.
+    Among all ways to pair agents and observations, the one that stays below the gate by the most in sum is taken.
+
+    Args:
+        dt_s: time between two updates [s].
+        gate_m: an agent is not found again at this cost or more [m]; half the least distance between two agents is a
+            good start, more where agents brake hard within a step (10 m for cars at 1 s).
+        memory_steps: for how many updates an agent that is not seen is remembered, keeping its velocity; 0 forgets it
+            at once, and it comes back as a new agent.
+    """
+
+    def __init__(self, dt_s: float, gate_m: float, memory_steps: int = 0) -> None:
+        """Start with nobody known."""
+        if not 0 < dt_s < np.inf or not 0 < gate_m < np.inf or memory_steps < 0:
+            raise UserError(
+                "IdentityTracker needs a positive dt_s and gate_m and memory_steps of at least 0, "
+                f"got {dt_s}, {gate_m}, {memory_steps}"
+            )
+        self._dt_s, self._gate_m, self._memory_steps = dt_s, gate_m, memory_steps
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everyone: a new episode has begun. Numbering starts anew at 0."""
+        self._next_id = 0
+        self._ids: np.ndarray = np.empty(0, dtype=np.int64)
+        self._place: np.ndarray = np.empty((0, 0))
+        self._motion: np.ndarray = np.empty((0, 0))
+        self._kinds: np.ndarray = np.empty((0, 0))
+        self._steps: np.ndarray = np.empty(0)
+
+    def update(
+        self,
+        positions: Float[np.ndarray, "agents axes"],
+        velocities: Float[np.ndarray, "agents axes"],
+        present: Bool[np.ndarray, " agents"] | None = None,
+        keys: Shaped[np.ndarray, "agents ..."] | None = None,
+    ) -> Int[np.ndarray, " agents"]:
+        """Take in one step; the number of each row's agent.
+
+        Args:
+            positions: one axis system for all steps [m].
+            velocities: in the same axes [m/s].
+            present: which rows hold an agent; None means all.
+            keys: what an agent keeps for as long as it is there (its kind, a driver's parameter), in one column or
+                several; compared exactly. The same columns at every step.
+
+        Returns:
+            Numbers from 0 on in the order of first sight; -1 in rows that are not present.
+
+        Raises:
+            UserError: positions or velocities that are not finite, or axes or keys other than those of the last step.
+        """
+        rows = np.arange(len(positions)) if present is None else np.flatnonzero(present)
+        place, motion = np.asarray(positions[rows], np.float64), np.asarray(velocities[rows], np.float64)
+        if not (np.isfinite(place).all() and np.isfinite(motion).all()):
+            raise UserError("IdentityTracker needs finite positions and velocities of agents that are present")
+        kinds = np.zeros((len(rows), 0)) if keys is None else np.asarray(keys)[rows]
+        kinds = kinds.reshape(len(rows), math.prod(kinds.shape[1:]))
+        found = self._recognise(place, motion, kinds)
+        fresh = found == PADDING_ID
+        found[fresh] = np.arange(self._next_id, self._next_id + fresh.sum())
+        self._next_id += int(fresh.sum())
+        self._remember(found, place, motion, kinds)
+        ids = np.full(len(positions), PADDING_ID, dtype=np.int64)
+        ids[rows] = found
+        return ids
+
+    def _recognise(self, place: np.ndarray, motion: np.ndarray, kinds: np.ndarray) -> np.ndarray:
+        """The number of each observation's agent; -1 for a newcomer."""
+        found = np.full(len(place), PADDING_ID, dtype=np.int64)
+        if not len(self._ids) or not len(place):
+            return found
+        if kinds.shape[1] != self._kinds.shape[1] or place.shape[1] != self._place.shape[1]:
+            raise UserError(
+                f"IdentityTracker needs the same axes and keys at every step, got {place.shape[1]} and "
+                f"{kinds.shape[1]} after {self._place.shape[1]} and {self._kinds.shape[1]}; call reset() between"
+            )
+        cost = self._costs(place, motion)
+        for column in range(kinds.shape[1]):
+            cost[self._kinds[:, None, column] != kinds[:, column]] = np.inf
+        agents, observations = best_pairs(cost, self._gate_m)
+        found[observations] = self._ids[agents]
+        return found
+
+    def _costs(self, place: np.ndarray, motion: np.ndarray) -> np.ndarray:
+        """What it would cost to take each observation for each known agent [m], without gate and keys."""
+        half_s = (0.5 * self._dt_s * self._steps)[:, None]
+        weight_s = 2 * _CHANGE_WEIGHT * half_s
+        straight = self._place + half_s * self._motion
+        total = np.zeros((len(self._ids), len(place)))
+        for axis in range(place.shape[1]):
+            miss = place[:, axis] - straight[:, axis, None] - half_s * motion[:, axis]
+            change = weight_s * (motion[:, axis] - self._motion[:, axis, None])
+            total += miss * miss + change * change
+        return np.sqrt(total)
+
+    def _remember(self, ids: np.ndarray, place: np.ndarray, motion: np.ndarray, kinds: np.ndarray) -> None:
+        """Keep what was seen now, and who was seen lately."""
+        steps = np.ones(len(ids))
+        if self._memory_steps and len(self._ids):
+            lost = np.flatnonzero(~np.isin(self._ids, ids) & (self._steps <= self._memory_steps))
+            ids = np.concatenate([ids, self._ids[lost]])
+            place, motion = np.concatenate([place, self._place[lost]]), np.concatenate([motion, self._motion[lost]])
+            kinds = np.concatenate([kinds, self._kinds[lost]])
+            steps = np.concatenate([steps, self._steps[lost] + 1])
+        self._ids, self._place, self._motion, self._kinds, self._steps = ids, place, motion, kinds, steps
+
+
+def best_pairs(
+    cost: Float[np.ndarray, "rows columns"], gate: float
+) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
+    """The pairing with the largest sum of `gate` − cost, of pairs that cost less than `gate`.
+
+    Args:
+        cost: not NaN; infinite where a pair is out of the question.
+        gate: what it costs to leave a row and a column without a partner.
+
+    Returns:
+        Rows and columns of the pairs; each row and each column at most once.
+    """
+    # If everyone's first choice is somebody else's first choice of nobody, no other pairing is better.
+    rows, columns = np.arange(cost.shape[0]), cost.argmin(axis=1)
+    near = cost[rows, columns] < gate
+    if _distinct(columns[near], cost.shape[1]):
+        return rows[near], columns[near]
+    columns, rows = np.arange(cost.shape[1]), cost.argmin(axis=0)
+    near = cost[rows, columns] < gate
+    if _distinct(rows[near], cost.shape[0]):
+        return rows[near], columns[near]
+    clipped = np.minimum(cost, gate)  # a pair at the gate brings as much as none
+    if cost.shape[0] <= cost.shape[1]:
+        rows, columns = np.arange(cost.shape[0]), assign(clipped)
+    else:
+        rows, columns = assign(clipped.T), np.arange(cost.shape[1])
+    near = cost[rows, columns] < gate
+    return rows[near], columns[near]
+
+
+def assign(cost: Float[np.ndarray, "rows columns"]) -> Int[np.ndarray, " rows"]:
+    """A column for each row, no column twice, with the least sum of costs (shortest augmenting paths).
+
+    Args:
+        cost: finite; at least as many columns as rows.
+    """
+    count, width = cost.shape
+    row_price, column_price = np.zeros(count), np.zeros(width)
+    owner = np.full(width, -1)
+    for start in range(count):
+        reach, through = np.full(width, np.inf), np.full(width, -1)
+        settled = np.zeros(width, dtype=np.bool_)
+        row, column, length = start, -1, 0.0
+        while row >= 0:
+            offer = length + cost[row] - row_price[row] - column_price
+            better = ~settled & (offer < reach)
+            reach[better], through[better] = offer[better], column
+            column = int(np.where(settled, np.inf, reach).argmin())
+            settled[column], length = True, float(reach[column])
+            row = int(owner[column])
+        row_price[owner[settled & (owner >= 0)]] += length - reach[settled & (owner >= 0)]
+        row_price[start] += length
+        column_price[settled] -= length - reach[settled]
+        while column >= 0:  # back along the path, each row takes the column that was found from it
+            before = int(through[column])
+            owner[column] = start if before < 0 else owner[before]
+            column = before
+    held = np.flatnonzero(owner >= 0)
+    columns = np.empty(count, dtype=np.int64)
+    columns[owner[held]] = held
+    return columns
+
+
+def _distinct(values: np.ndarray, limit: int) -> bool:
+    return len(values) < 2 or int(np.bincount(values, minlength=limit).max()) == 1

@@ -1,0 +1,55 @@
+"""A plain function as a reader: `FunctionReader(read, spec)`, for environments that name their agents themselves."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from envs.readers.base import Reader, perceive, require_scene
+from predictor.errors import UserError
+from predictor.scene import Scene, SceneSpec
+
+
+@dataclass(frozen=True)
+class FunctionReader:
+    """Makes readers of a function that says who is there; what the ego perceives of it is decided as everywhere.
+
+        >>> def read_walkers(env) -> Scene:
+        ...     world = env.unwrapped
+        ...     return Scene(world.states, world.ids, np.ones(len(world.ids), dtype=bool))
+        >>> reader = FunctionReader(read_walkers, SceneSpec(dt_s=0.1))
+        >>> ForecastObservation(env, checkpoint, reader=reader)
+        >>> register_reader(MyEnv, reader)  # from then on, no wrapper and no command needs to be told
+
+    It can be pickled, for environments in processes of their own, if the function can: one at the top of a module.
+    """
+
+    read: Callable[[Any], Scene]
+    """From the environment (as it was wrapped; `env.unwrapped` is the innermost) to everyone in it: ego first, any
+    number of rows, an id that stays with its agent."""
+    spec: SceneSpec
+    """What the scenes look like; `dt_s` has no default."""
+
+    def __post_init__(self) -> None:
+        """Check that a function and a spec are what was given."""
+        if not callable(self.read) or not isinstance(self.spec, SceneSpec):
+            raise UserError(
+                "FunctionReader needs a function read(env) -> Scene and a SceneSpec, got "
+                f"{type(self.read).__name__} and {type(self.spec).__name__}"
+            )
+
+    def __call__(self, env: Any) -> Reader:
+        """A reader for this environment."""
+        return _Reading(self)
+
+
+class _Reading(Reader):
+    def __init__(self, config: FunctionReader) -> None:
+        super().__init__(config.spec)
+        self._read = config.read
+        self._name = getattr(config.read, "__name__", type(config.read).__name__)
+
+    def read_all(self, env: Any) -> Scene:
+        return require_scene(self._read(env), self._name)
+
+    def read(self, env: Any) -> Scene:
+        return perceive(self.read_all(env), self.spec, self._name)

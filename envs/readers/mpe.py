@@ -1,0 +1,143 @@
+"""Reads scenes out of mpe2, PettingZoo's particle worlds: every agent and, by choice, the landmarks.
+
+One layout for all scenarios, so that what was learned in one can be run in another. An agent's identity is the
+simulator's own object, never its place in a list. Goals, messages and what an agent carries are not read: nobody who
+looks at the arena sees them.
+"""
+
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from envs.readers.base import SharedScene, share
+from predictor.errors import ProtocolError, UserError
+from predictor.scene import KINEMATIC_FEATURES, Scene, SceneSpec
+
+MPE_CONSTANTS = ("adversary", "landmark", "radius_m")
+"""What a look tells of an entity besides its motion: 1 or 0, 1 or 0, and its size."""
+MPE_FEATURES = (*KINEMATIC_FEATURES, *MPE_CONSTANTS)
+_SCALES = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.1)
+_EVERYTHING_M = 1000.0  # the arena is 2 m wide; it has no walls, but nobody gets this far in an episode
+
+
+def is_mpe_env(env: Any) -> bool:
+    """Whether the environment comes from mpe2; needs no mpe2 to say no."""
+    return any(_module_path(cls)[0] == "mpe2" for cls in type(env.unwrapped).__mro__)
+
+
+def mpe_scenario(env: Any) -> str:
+    """Which mpe2 scenario it is, without the version ("simple_tag"); "" for an own one, or what is not from mpe2.
+
+    Not `metadata["name"]`: mpe2's environments share one such dictionary, which names whichever was made last.
+    """
+    paths = (_module_path(cls) for cls in type(env.unwrapped).__mro__)
+    return next((path[1] for path in paths if path[0] == "mpe2" and path[1] != "_mpe_utils"), "")
+
+
+def _module_path(cls: type) -> tuple[str, str]:
+    parts = [*cls.__module__.split("."), ""]
+    return parts[0], parts[1]
+
+
+def agents_in_sight(env: Any) -> Sequence[str]:
+    """Names of the agents that get a row: the living, or all of them right after an episode's last step.
+
+    The last observation of an agent shows it where it ended, although PettingZoo counts nobody as living by then.
+
+    Raises:
+        ProtocolError: before the first reset.
+    """
+    living: Sequence[str] | None = getattr(env, "agents", None)
+    if living is None:
+        raise ProtocolError("the environment has no agents yet; call reset() first")
+    return living or env.possible_agents
+
+
+@dataclass(frozen=True)
+class _Known:
+    number: int
+    place: tuple[float, ...] | None
+    """Where a thing that cannot move stands; None for what moves."""
+
+
+class MpeReader:
+    """Reads mpe2's parallel environments; nobody is the ego.
+
+    Args:
+        env: the environment, wrapped or not; its world gives `dt_s`.
+        landmarks: also read landmarks (obstacles, goals, treasures), as agents that stand still. A treasure that is
+            collected leaves the scene; the one that appears elsewhere is a new one.
+        max_agents: rows of a scene; None takes as many as the world holds.
+        perception_m: how far an agent sees [m]; None sees the whole arena and far beyond.
+
+    Raises:
+        UserError: not from mpe2, or nothing can move in it (simple_crypto).
+    """
+
+    def __init__(
+        self, env: Any, landmarks: bool = False, max_agents: int | None = None, perception_m: float | None = None
+    ) -> None:
+        """Derive the spec from the environment."""
+        if not is_mpe_env(env):
+            raise UserError(f"MpeReader needs an mpe2 environment, got {type(env.unwrapped).__name__}")
+        world = env.unwrapped.world
+        if not any(agent.movable for agent in world.agents):
+            raise UserError(f"nothing moves in {mpe_scenario(env) or env}, so there is nothing to forecast")
+        self.landmarks = landmarks
+        self._spec = SceneSpec(
+            dt_s=float(world.dt),
+            feature_names=MPE_FEATURES,
+            feature_scales=_SCALES,
+            has_ego=False,
+            perception_m=_EVERYTHING_M if perception_m is None else float(perception_m),
+            max_agents=len(self._listed(world)) if max_agents is None else int(max_agents),
+            constant_features=MPE_CONSTANTS,
+        )
+        self.reset()
+
+    @property
+    def spec(self) -> SceneSpec:
+        """What the scenes look like; ``("world", "world")`` frame: the arena is fixed."""
+        return self._spec
+
+    def reset(self) -> None:
+        """Forget all identities; numbers start anew in the order of `world.entities`."""
+        # Keyed by the living object: id() is reused after garbage collection and would join two entities.
+        self._known: weakref.WeakKeyDictionary[Any, _Known] = weakref.WeakKeyDictionary()
+        self._next_id = 0
+
+    def read(self, env: Any) -> SharedScene:
+        """Everyone who is there now, at rest or not.
+
+        Raises:
+            ProtocolError: before the first reset.
+            UserError: more than `max_agents`.
+        """
+        names = set(agents_in_sight(env))
+        world = env.unwrapped.world
+        entities = [entity for entity in self._listed(world) if getattr(entity, "alive", True)]
+        still = {id(landmark) for landmark in world.landmarks}
+        states = np.array([_state(entity, id(entity) in still) for entity in entities], dtype=np.float64)
+        ids = np.array([self._identify(entity) for entity in entities], dtype=np.int64)
+        rows = {entity.name: row for row, entity in enumerate(entities) if entity.name in names}
+        scene = Scene(states, ids, np.ones(len(entities), dtype=np.bool_))
+        return share(scene, rows, np.zeros(len(entities)), self._spec, type(self).__name__)
+
+    def _listed(self, world: Any) -> list[Any]:
+        return list(world.entities if self.landmarks else world.agents)
+
+    def _identify(self, entity: Any) -> int:
+        place = None if entity.movable else tuple(float(x) for x in entity.state.p_pos)
+        known = self._known.get(entity)
+        if known is None or known.place != place:  # what cannot move but is elsewhere is another thing
+            known = self._known[entity] = _Known(self._next_id, place)
+            self._next_id += 1
+        return known.number
+
+
+def _state(entity: Any, landmark: bool) -> tuple[float, ...]:
+    adversary = bool(getattr(entity, "adversary", False))
+    return (*entity.state.p_pos, *entity.state.p_vel, float(adversary), float(landmark), entity.size)

@@ -1,0 +1,198 @@
+"""The guide and its examples run: every Python block, every command, the environment and its reader."""
+
+import re
+import shlex
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import tyro
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
+
+import envs.readers
+from envs.collect import CollectConfig, collect
+from envs.evaluate import EvaluateConfig
+from envs.readers import EntityRowsReader, reader_for
+from envs.wrappers import ForecastObservation, SceneObservation
+from predictor.data.store import StoreInfo, write_store
+from predictor.scene import SceneSpec
+from predictor.train import train
+from predictor.train_config import TrainConfig
+from train_policy import TrainPolicyConfig
+
+ROOT = Path(__file__).resolve().parents[1]
+GUIDE = ROOT / "docs" / "wrap_your_env.md"
+EXAMPLES = ROOT / "docs" / "examples"
+CROSSING = "crossing_reader:Crossing-v0"
+COMMANDS = {
+    "-m envs.collect": CollectConfig,
+    "-m predictor.train": TrainConfig,
+    "-m envs.evaluate": EvaluateConfig,
+    "train_policy.py": TrainPolicyConfig,
+}
+
+
+@pytest.fixture(autouse=True)
+def examples_on_the_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """As with `export PYTHONPATH=docs/examples`; what the examples register is gone afterwards."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    monkeypatch.setattr(envs.readers, "_REGISTERED", {})
+    yield
+    gym.registry.pop("Crossing-v0", None)
+    for name in ("crossing_env", "crossing_reader"):
+        sys.modules.pop(name, None)
+
+
+def sections() -> dict[str, str]:
+    parts = re.split(r"^## (.+)$", GUIDE.read_text(), flags=re.MULTILINE)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
+def blocks(text: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)
+
+
+WITH_PYTHON = [title for title, text in sections().items() if blocks(text, "python")]
+
+
+# SB3's make_vec_env asks every environment for pictures first; the crossing draws none.
+@pytest.mark.filterwarnings("ignore:.*render_mode='rgb_array' that is not in the possible render_modes:UserWarning")
+@pytest.mark.parametrize("title", WITH_PYTHON)
+def test_the_guides_python_runs(title: str):
+    namespace: dict[str, Any] = {"__name__": "guide"}
+    for block in blocks(sections()[title], "python"):
+        exec(compile(block, f"{GUIDE.name}, {title}", "exec"), namespace)
+    env = namespace["env"]
+    if isinstance(env, gym.Env):
+        obs, _ = env.reset(seed=0)
+        assert obs in env.observation_space
+        assert obs["valid"].any()
+
+
+def test_the_guide_has_python_where_it_says():
+    assert set(sections()) - set(WITH_PYTHON) == {"rl-baselines3-zoo", "Collect, train, wrap", "What a reader owes"}
+    assert sum(len(blocks(text, "python")) for text in sections().values()) == GUIDE.read_text().count("```python")
+
+
+def test_the_guides_links_lead_somewhere():
+    text = GUIDE.read_text()
+    anchors = {title.lower().replace(" ", "-").replace(",", "") for title in sections()}
+    for target in re.findall(r"\]\(([^)]+)\)", text):
+        assert target[1:] in anchors if target.startswith("#") else (GUIDE.parent / target).exists(), target
+
+
+def commands() -> list[str]:
+    return [line for text in sections().values() for block in blocks(text, "bash") for line in block.splitlines()]
+
+
+@pytest.mark.parametrize("line", commands())
+def test_the_guides_commands_are_understood(line: str):
+    (name,) = [name for name in COMMANDS if line.startswith(f"python {name} ")]
+    config = tyro.cli(COMMANDS[name], args=shlex.split(line.removeprefix(f"python {name} ")))
+    config.check()
+
+
+def test_every_command_is_in_the_guide():
+    assert [next(name for name in COMMANDS if name in line) for line in commands()] == list(COMMANDS)
+
+
+def make_crossing() -> gym.Env:
+    return gym.make(CROSSING)
+
+
+# --- The example environment ------------------------------------------------------------------------------------------
+
+
+def test_the_crossing_is_an_environment():
+    check_env(make_crossing().unwrapped, skip_render_check=True)
+
+
+@pytest.mark.filterwarnings(
+    "ignore:Your observation .*has an unconventional shape:UserWarning"
+)  # a table, not an image
+def test_the_crossing_is_one_for_sb3():
+    check_env_for_sb3(make_crossing())
+
+
+def test_walkers_enter_leave_and_make_way():
+    env = make_crossing()
+    env.reset(seed=0)
+    world = env.unwrapped
+    present: list[set[int]] = []
+    turns = 0.0
+    for _ in range(60):
+        _, _, terminated, truncated, _ = env.step(np.zeros(2, np.float32))
+        present.append(set(world.numbers.tolist()))
+        turns = max(turns, float(np.abs(world.walkers[:, 3]).max()))
+    assert truncated and not terminated
+    everyone = set.union(*present)
+    assert everyone - present[0]
+    assert everyone - present[-1]
+    assert turns > 0.3  # they wish to walk straight along x
+
+
+def test_the_reader_of_the_crossing_is_short():
+    assert len((EXAMPLES / "crossing_reader.py").read_text().splitlines()) <= 20
+    source = (EXAMPLES / "crossing_env.py").read_text()
+    assert len(source.splitlines()) <= 80
+    imported = re.findall(r"^(?:from|import) (\w+)", source, flags=re.MULTILINE)
+    assert set(imported) == {"typing", "gymnasium", "numpy"}  # nothing of this project
+
+
+def test_the_table_tells_what_the_world_knows():
+    """The example is read in both ways: asked by its reader, and recognised from its observation alone."""
+    env = SceneObservation(make_crossing())
+    spec = SceneSpec(dt_s=0.25, perception_m=100.0)
+    table = EntityRowsReader(("presence", "x", "y", "vx", "vy"), spec, relative=True, gate_m=0.5)(env.env)
+    obs, _ = env.reset(seed=1)
+    number_of: dict[int, int] = {}
+    before: dict[int, int] = {}
+    for _ in range(30):
+        table.see(obs["observation"])
+        scene, truth = table.read_all(env), env.reader.read_all(env)
+        row = np.linalg.norm(scene.states[:, None] - truth.states, axis=-1).argmin(axis=1)
+        np.testing.assert_allclose(scene.states, truth.states[row], atol=1e-5)
+        now = dict(zip(truth.ids[row].tolist(), scene.ids.tolist(), strict=True))
+        for agent, number in now.items():
+            assert before.get(agent, number) == number
+            assert number_of.setdefault(number, agent) == agent
+        before = now
+        obs, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
+            break
+    assert len(number_of) > 8
+
+
+def test_collect_train_wrap(tmp_path: Path):
+    """The commands' own functions, on a few episodes and with a tiny network."""
+    config = CollectConfig(CROSSING, tmp_path / "data", episodes=3, ego=("random",), max_steps=12, workers=1)
+    episodes = list(collect(config))
+    spec = reader_for(make_crossing()).spec
+    write_store(config.out, StoreInfo(spec, CROSSING), episodes)
+    assert all(episode.states.shape[2] == 4 and len(episode.ids) > 6 for episode in episodes)
+    sizes = ("hidden_dim=4", "rnn_dim=4", "head_dim=4", "message_dim=4", "decoder_dim=4", "edge_feature_dim=2")
+    checkpoint = train(
+        TrainConfig(
+            (config.out,),
+            tmp_path / "run",
+            set=sizes,
+            steps=2,
+            batch_size=2,
+            history_steps=3,
+            horizon_steps=3,
+            val_fraction=0.4,
+            val_windows=4,
+            eval_every=2,
+        )  # fmt: skip
+    )
+    env = ForecastObservation(make_crossing(), str(checkpoint))
+    obs, _ = env.reset(seed=0)
+    for _ in range(3):
+        assert obs in env.observation_space
+        assert obs["forecast"].shape == (11, 3, 2)
+        obs, *_ = env.step(env.action_space.sample())
