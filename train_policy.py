@@ -18,6 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.evaluate import EVALUATION_SEED, PACKAGES, evaluate_with_progress
 from agents.features import EGO_KEY, AttentionConfig
+from agents.parallel_rows import record_task
 from agents.runs import load_model, open_run
 from agents.task import Task
 from agents.training import TrainingPlan, train
@@ -50,8 +51,8 @@ class TrainPolicyConfig:
     steps: int = 20_000
     """Environment steps to train for, over all environments."""
     envs: int | None = None
-    """Parallel environments: processes, native ones with EnvPool, copies of a PettingZoo environment. None takes 6, with
-    EnvPool 64."""
+    """Parallel environments: processes, native ones with EnvPool, copies of a PettingZoo environment. None takes 6,
+    with EnvPool 64."""
     backend: Literal["gymnasium", "envpool"] = "gymnasium"
     """Who simulates in training; measured and filmed on the gymnasium environment in any case."""
     learners: tuple[str, ...] | None = None

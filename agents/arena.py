@@ -15,8 +15,9 @@ from agents.task import Task
 class Arena(Protocol):
     """Plays episodes; results depend on policy and seeds alone."""
 
-    baselines: tuple[str, ...]
-    """Drivers to stand beside a trained policy."""
+    @property
+    def baselines(self) -> tuple[str, ...]:
+        """Drivers to stand beside a trained policy."""
 
     def play(
         self, policy: BaseAlgorithm | str, seeds: Sequence[int], on_episode: Callable[[], None] = lambda: None

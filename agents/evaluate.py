@@ -170,7 +170,8 @@ def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
         length_mean,
         length_se,
         sum(crashes) / len(crashes) if crashes else None,
-        *interval,
+        interval[0],
+        interval[1],
         float(np.mean([e.mean_speed_mps for e in episodes])),
         {role: mean_and_standard_error([e.returns_by_role[role] for e in episodes]) for role in roles},
     )

@@ -6,8 +6,8 @@ decides what a policy sees.
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 from pettingzoo import ParallelEnv
@@ -19,7 +19,9 @@ from agents.task import Task, resolve_device
 from envs.drivers import Driver, make_driver
 from envs.multiagent import AgentMonitor, ParallelVecEnv
 from envs.parallel import ForecastParallelEnv
-from envs.parallel_registry import make_parallel_env
+from envs.parallel_registry import PARALLEL_CHECKPOINTS, make_parallel_env
+from envs.render_shared import SharedRecording, record_parallel_episode
+from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.errors import UserError
 
 
@@ -128,7 +130,7 @@ class ParallelArena:
         venv = self._monitor.venv
         assert isinstance(venv, ParallelVecEnv)
         self._venv = venv
-        self._env: DrivenEnv = venv.envs[0]  # type: ignore[assignment]
+        self._env: DrivenEnv = venv.envs[0]
 
     def play(
         self, policy: BaseAlgorithm | str, seeds: Sequence[int], on_episode: Callable[[], None] = lambda: None
@@ -179,3 +181,30 @@ def _result(seed: int, steps: int, returns: Mapping[str, float]) -> EpisodeResul
         roles.setdefault(role_of(agent), []).append(value)
     by_role = {role: float(np.mean(values)) for role, values in roles.items()} if len(roles) > 1 else {}
     return EpisodeResult(seed, float(np.mean(list(returns.values()))), steps, None, float("nan"), by_role)
+
+
+def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) -> SharedRecording:
+    """Play one episode for a film; forecasts are drawn also for a policy that sees none."""
+    filmed = task
+    if task.observe == "none":
+        shown = None if task.env_id in PARALLEL_CHECKPOINTS else CONSTANT_VELOCITY
+        filmed = replace(task, observe="forecast", checkpoint=shown)
+    env = MakeCopy(filmed)()
+    learners = learners_of(task, env)
+    rows = ParallelVecEnv([MakeCopy(task)], agents=learners, partner=drive)  # knows how spaces are padded
+
+    def act(observations: dict[str, Any]) -> dict[str, Any]:
+        own = own_observations(observations)
+        actions = env.driver(own)
+        for agent in observations:
+            if agent in learners:
+                seen = own[agent] if task.observe == "none" else observations[agent]
+                chosen = policy.predict(rows.row_of(agent, seen), deterministic=True)[0]
+                actions[agent] = rows.own_action(agent, chosen)
+        return actions
+
+    try:
+        return record_parallel_episode(cast(ForecastParallelEnv, env), act, seed=seed, max_steps=max_steps)
+    finally:
+        env.close()
+        rows.close()

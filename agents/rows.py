@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from agents.episodes import SeededEpisodes
 from agents.parallel_rows import make_parallel_rows
 from agents.task import Task, resolve_device
-from envs.native import EnvPoolVecEnv, envpool_id_of
+from envs.native import EnvPoolVecEnv, native_task_of
 from envs.registry import make_env
 from envs.vector import VecForecast
 from envs.wrappers import SceneObservation
@@ -36,8 +36,13 @@ def make_rows(task: Task, num_rows: int, seeded: bool = False) -> VecEnv:
     venv: VecEnv
     spec = task.scene_spec
     if task.backend == "envpool":
-        limits = {} if spec is None else {"perception_m": spec.perception_m, "max_agents": spec.max_agents}
-        venv = EnvPoolVecEnv(envpool_id_of(task.env_id), num_rows, scenes=spec is not None, **limits)
+        venv = EnvPoolVecEnv(
+            native_task_of(task.env_id),
+            num_rows,
+            scenes=spec is not None,
+            perception_m=None if spec is None else spec.perception_m,
+            max_agents=None if spec is None else spec.max_agents,
+        )
     else:
         row = _MakeRow(task.env_id, spec, seeded)
         venv = DummyVecEnv([row]) if num_rows == 1 else SubprocVecEnv([row] * num_rows, start_method="spawn")

@@ -8,7 +8,7 @@ import torch
 
 from envs.drivers import DRIVER_NAMES
 from envs.multiagent import ParallelVecEnv
-from envs.native import check_envpool, envpool_id_of
+from envs.native import native_task_of
 from envs.parallel import ForecastParallelEnv
 from envs.parallel_registry import is_parallel_id, make_parallel_env
 from envs.registry import make_env
@@ -48,8 +48,7 @@ class Task:
         if self.partner not in DRIVER_NAMES:
             raise UserError(f"partner must be one of {', '.join(DRIVER_NAMES)}, got '{self.partner}'")
         if self.backend == "envpool":
-            envpool_id_of(self.env_id)
-            check_envpool()
+            native_task_of(self.env_id)
         if self.checkpoint is not None and self.observe != "forecast":
             raise UserError(f"checkpoint '{self.checkpoint}' has no effect with observe={self.observe}; leave one out")
         resolve_device(self.device)

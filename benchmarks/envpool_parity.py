@@ -233,7 +233,17 @@ def distances_table(task_id: str, apart: Sequence[np.ndarray]) -> Table:
 def episodes_table(task_id: str, ego: str, both: Sequence[tuple[str, Episodes]]) -> Table:
     """Episodes of both simulators, mean ± standard deviation (of returns and crashes: standard error)."""
     table = Table(title=f"{task_id}, ego {ego}, {len(both[0][1].returns)} episodes each")
-    heads = ("simulator", "return", "crashed", "steps", "others", "near", "nearest \\[m]", "their speed \\[m/s]", "starts")
+    heads = (
+        "simulator",
+        "return",
+        "crashed",
+        "steps",
+        "others",
+        "near",
+        "nearest \\[m]",
+        "their speed \\[m/s]",
+        "starts",
+    )
     for heading in heads:
         table.add_column(heading, justify="left" if heading == "simulator" else "right")
     for name, seen in both:
@@ -250,7 +260,8 @@ def main() -> None:
     config = tyro.cli(ParityConfig, description=__doc__)
     config.check()
     register_envpool_ids()
-    console, results = Console(width=140), {}
+    console = Console(width=140)
+    results: dict[str, Any] = {}
     for task_id in config.task_ids:
         with untouched_drivers():
             apart = step_both(task_id, config)

@@ -8,6 +8,7 @@ import functools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from envs.observation import ForecastConfig, ForecastStream, into_ego_axes, othe
 from envs.readers.highway_labels import SceneLabels
 from envs.shared import SharedStream
 from envs.worlds import EgoWorld, SharedWorld, World, open_world
+from envs.wrappers import ForecastObservation
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.baselines.nearest_neighbour import NearestNeighbour, fit_from_store
 from predictor.checkpoint import load_forecaster
@@ -29,6 +31,8 @@ from predictor.scene import Scene, SceneBatch, SceneSpec
 
 MODEL, STRAIGHT, NEIGHBOURS = "model", "constant velocity", "nearest neighbours"
 """Keys of the forecasters of an episode; ablations of memory are `memory_key(steps)`."""
+LANDMARK = "landmark"
+"""Feature that marks what never moves."""
 CASE_HISTORY_STEPS = 20
 """Past shown of a worst case."""
 
@@ -145,7 +149,7 @@ def play(task: EpisodeTask) -> Episode:
         truths.append(world.everyone())
         if ended:
             break
-    future, valid = futures(scenes, truths, task.horizon_steps, world.spec.has_ego)
+    future, valid = futures(scenes, truths, task.horizon_steps, world.spec)
     episode.outcomes = {key: Outcome(torch.stack(found), future, valid) for key, found in forecasts.items()}
     episode.worst = _worst(episode.outcomes, scenes, task.seed, world.spec.has_ego)
     return episode
@@ -168,7 +172,7 @@ def _kept_forecaster(checkpoint: str, spec: SceneSpec, source: str) -> Forecaste
 
 @functools.lru_cache(maxsize=2)
 def _kept_neighbours(store: str, spec: SceneSpec, horizon_steps: int) -> NearestNeighbour:
-    return fit_from_store(store, spec, horizon_steps)
+    return fit_from_store(Path(store), spec, horizon_steps)
 
 
 def _baselines(task: EpisodeTask, spec: SceneSpec) -> dict[str, _Baseline]:
@@ -223,22 +227,31 @@ def world_forecast(forecast: Float[np.ndarray, "others samples horizon 2"], scen
 
 
 def futures(
-    scenes: Sequence[Scene], truths: Sequence[Scene], horizon_steps: int, has_ego: bool
+    scenes: Sequence[Scene], truths: Sequence[Scene], horizon_steps: int, spec: SceneSpec
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where the agents of each scene then were, and whether they were; the ego, if there is one, is not counted.
+    """Where the agents of each scene then were, and whether they were.
 
-    Relative to the ego's position at the scene's instant, or in world coordinates without an ego.
+    Relative to the ego's position at the scene's instant, or in world coordinates without an ego. Not counted are the
+    ego, whose future is the policy's choice, and landmarks, which have none.
+
+    Args:
+        scenes: as perceived, padded.
+        truths: everyone, at the same instants and beyond.
+        horizon_steps: steps ahead.
+        spec: layout of the scenes.
     """
     agents = len(scenes[0].ids)
+    fixed = spec.feature_names.index(LANDMARK) if LANDMARK in spec.feature_names else None
     future = np.zeros((len(scenes), agents, horizon_steps, 2))
     valid = np.zeros((len(scenes), agents, horizon_steps), dtype=np.bool_)
     positions = [dict(zip(t.ids.tolist(), t.states[:, :2], strict=True)) for t in truths]
     for now, scene in enumerate(scenes):
-        origin = scene.states[0, :2] if has_ego else np.zeros(2)
-        for row in range(int(has_ego), agents):
+        origin = scene.states[0, :2] if spec.has_ego else np.zeros(2)
+        moving = scene.valid if fixed is None else scene.valid & (scene.states[:, fixed] == 0)
+        for row in range(int(spec.has_ego), agents):
             for ahead in range(horizon_steps):
                 later = now + ahead + 1
-                if not scene.valid[row] or later >= len(positions):
+                if not moving[row] or later >= len(positions):
                     continue
                 position = positions[later].get(int(scene.ids[row]))
                 if position is not None:
@@ -252,8 +265,8 @@ def _note_edges(episode: Episode, world: World, scene: Scene, everyone: Scene) -
     labels = world.labels()
     if labels is None or not isinstance(world, EgoWorld):
         return
-    forecast = world.env.forecast
-    episode.edge_probs.append(forecast.edge_probs[0].cpu().numpy())
+    assert isinstance(world.env, ForecastObservation)
+    episode.edge_probs.append(world.env.forecast.edge_probs[0].cpu().numpy())
     episode.edge_types.append(_types_of(scene, everyone, labels))
 
 

@@ -162,6 +162,14 @@ class ParallelVecEnv(VecEnv):
         dones = np.array([turn.done for turn in turns], dtype=np.bool_)
         return self._observe(), rewards, dones, [self._info(*row) for row in zip(self.row_agents, turns, strict=True)]
 
+    def row_of(self, agent: str, observation: Any) -> Any:
+        """A learner's own observation as its row would show it: padded, with the indicator."""
+        return self._observation.one(agent, observation)
+
+    def own_action(self, agent: str, action: Any) -> Any:
+        """A learner's own action for one of the shared space."""
+        return own_action(action, self._own_actions[agent])
+
     def close(self) -> None:
         """Close all copies."""
         for env in self.envs:

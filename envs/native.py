@@ -154,7 +154,9 @@ class EnvPoolEnv(gym.Env[NDArray[Any], Any]):
         space = self.action_space
         if isinstance(space, gym.spaces.Discrete) and not 0 <= int(action) < space.n:
             raise UserError(f"action must be in 0…{space.n - 1}, got {action}")
-        observations, rewards, terminated, truncated, info = self._pool.step(np.asarray(action, dtype=space.dtype)[None])
+        observations, rewards, terminated, truncated, info = self._pool.step(
+            np.asarray(action, dtype=space.dtype)[None]
+        )
         over = bool(_ends(terminated, truncated, info["crashed"])[0])
         self._running = not (over or truncated[0])
         return observations[0], float(rewards[0]), over, bool(truncated[0]), _info(info, 0)
@@ -267,7 +269,9 @@ class EnvPoolVecEnv(VecEnv):
         dones, cut = over | truncated, truncated & ~over
         infos = [
             {"speed": speed, "crashed": crashed, "TimeLimit.truncated": limit}
-            for speed, crashed, limit in zip(info["speed"].tolist(), info["crashed"].tolist(), cut.tolist(), strict=True)
+            for speed, crashed, limit in zip(
+                info["speed"].tolist(), info["crashed"].tolist(), cut.tolist(), strict=True
+            )
         ]
         ended = np.flatnonzero(dones)
         if len(ended):

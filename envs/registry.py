@@ -5,6 +5,8 @@ from typing import Any
 import gymnasium as gym
 import highway_env  # noqa: F401  (registers the ids)
 
+from envs import scenarios  # noqa: F401  (registers the ids)
+from envs.readers.envpool import HIGHWAY_ENV_OF
 from predictor.errors import UserError
 
 CHECKPOINTS: dict[str, str] = {
@@ -25,8 +27,16 @@ CHECKPOINTS: dict[str, str] = {
 """Env id → name of the checkpoint under predictor/pretrained."""
 
 
+ENVPOOL = "envpool/"
+"""Namespace of EnvPool's native environments."""
+
+
 def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     """`gym.make` with a one-line error for an unknown id."""
+    if env_id.startswith(ENVPOOL):
+        from envs.native import register_envpool_ids  # needs what needs this module
+
+        register_envpool_ids()
     try:
         return gym.make(env_id, **kwargs)
     except (gym.error.UnregisteredEnv, gym.error.Error, ModuleNotFoundError) as error:
@@ -39,6 +49,9 @@ def checkpoint_for(env_id: str) -> str:
     Raises:
         UserError: none ships for the id.
     """
+    if env_id.startswith(ENVPOOL):
+        copied = HIGHWAY_ENV_OF.get(env_id.removeprefix(ENVPOOL), "").rpartition("-v")[0]
+        env_id = next((known for known in CHECKPOINTS if copied and known.rpartition("-v")[0] == copied), env_id)
     if env_id not in CHECKPOINTS:
         raise UserError(
             f"no checkpoint ships for env '{env_id}'; pass one (a name or a path), or 'constant-velocity'. "

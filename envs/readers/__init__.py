@@ -7,12 +7,14 @@ import gymnasium as gym
 
 from envs.readers.base import Reader, SceneReader, SharedScene, SharedSceneReader, perceive, share
 from envs.readers.entities import EntityRowsReader
+from envs.readers.envpool import EnvPoolReader, is_envpool_env
 from envs.readers.function import FunctionReader
 from envs.readers.highway import HighwayReader, is_highway_env
 from predictor.errors import UserError
 
 __all__ = [
     "EntityRowsReader",
+    "EnvPoolReader",
     "FunctionReader",
     "HighwayReader",
     "MakeReader",
@@ -58,6 +60,8 @@ def reader_for(env: gym.Env, perception_m: float | None = None, max_agents: int 
             return _REGISTERED[env_class](env)
     if is_highway_env(env):
         return HighwayReader(env, perception_m=perception_m, max_agents=max_agents)
+    if is_envpool_env(env):
+        return EnvPoolReader(env, perception_m=perception_m, max_agents=max_agents)
     raise UserError(
         f"no scene reader knows {type(env.unwrapped).__name__}; pass reader= (FunctionReader for a function "
         "read(env) -> Scene, EntityRowsReader for observations whose rows are entities, or an own Reader), or call "

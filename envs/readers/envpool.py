@@ -103,8 +103,8 @@ class PoolIdentity:
         """Start with nobody known."""
         self._gate_m = gate_m
         self._next_id = np.zeros(rows, dtype=np.int64)
-        self._ids = np.zeros((rows, 0), dtype=np.int64)
-        self._known = np.zeros((rows, 0), dtype=np.bool_)
+        self._ids: np.ndarray = np.zeros((rows, 0), dtype=np.int64)
+        self._known: np.ndarray = np.zeros((rows, 0), dtype=np.bool_)
         self._place = np.zeros((rows, 0, 2))
         self._motion = np.zeros((rows, 0, 2))
 
@@ -137,19 +137,19 @@ class PoolIdentity:
         first = cost.argmin(axis=2)
         near = np.take_along_axis(cost, first[:, :, None], axis=2)[:, :, 0] < self._gate_m
         found = np.full(present.shape, PADDING_ID, dtype=np.int64)
-        some, agents = np.nonzero(near)
-        found[some, first[some, agents]] = self._ids[rows[some], agents]
+        some, known = np.nonzero(near)
+        found[some, first[some, known]] = self._ids[rows[some], known]
         for i in np.flatnonzero((found != PADDING_ID).sum(axis=1) != near.sum(axis=1)):
             found[i] = PADDING_ID
-            known, seen = best_pairs(cost[i], self._gate_m)
-            found[i, seen] = self._ids[rows[i], known]
+            agents, seen = best_pairs(cost[i], self._gate_m)
+            found[i, seen] = self._ids[rows[i], agents]
         fresh = present & (found == PADDING_ID)
         found[fresh] = (self._next_id[rows, None] + fresh.cumsum(axis=1) - 1)[fresh]
         self._next_id[rows] += fresh.sum(axis=1)
-        agents = place.shape[1]
+        width = place.shape[1]
         self._known[rows] = False
-        self._ids[rows, :agents], self._known[rows, :agents] = found, present
-        self._place[rows, :agents], self._motion[rows, :agents] = place, motion
+        self._ids[rows, :width], self._known[rows, :width] = found, present
+        self._place[rows, :width], self._motion[rows, :width] = place, motion
         return found
 
     def _costs(
@@ -157,9 +157,9 @@ class PoolIdentity:
     ) -> Float[np.ndarray, "some known agents"]:
         # Both parts of the cost are differences between something of the old and something of the new alone.
         half_s, weight_s = 0.5 * passed_s[:, None, None], _CHANGE_WEIGHT * passed_s[:, None, None]
-        was, is_now = self._motion[rows], motion
-        old = np.concatenate([self._place[rows] + was * half_s, was * weight_s], axis=-1)
-        new = np.concatenate([place - is_now * half_s, is_now * weight_s], axis=-1)
+        old_motion = self._motion[rows]
+        old = np.concatenate([self._place[rows] + old_motion * half_s, old_motion * weight_s], axis=-1)
+        new = np.concatenate([place - motion * half_s, motion * weight_s], axis=-1)
         squares = np.zeros((len(rows), old.shape[1], new.shape[1]))
         for column in range(old.shape[-1]):
             squares += np.square(new[:, None, :, column] - old[:, :, None, column])

@@ -26,6 +26,7 @@ _FRAMES: dict[str, tuple[AxisFrame, AxisFrame]] = {
     "highway-v0": _UNBOUNDED_X,
     "highway-fast-v0": _UNBOUNDED_X,
     "two-way-v0": _UNBOUNDED_X,
+    "highway-mixed-v0": _UNBOUNDED_X,
 }
 
 

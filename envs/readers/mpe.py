@@ -68,7 +68,8 @@ class MpeReader:
 
     Args:
         env: the environment, wrapped or not; its world gives `dt_s`.
-        landmarks: also read landmarks (obstacles, goals, treasures), as agents that stand still. A treasure that is
+        landmarks: also read landmarks (obstacles, goals, treasures), as agents that stand still: they explain where the
+            others go. A treasure that is
             collected leaves the scene; the one that appears elsewhere is a new one.
         max_agents: rows of a scene; None takes as many as the world holds.
         perception_m: how far an agent sees [m]; None sees the whole arena and far beyond.
@@ -78,7 +79,7 @@ class MpeReader:
     """
 
     def __init__(
-        self, env: Any, landmarks: bool = False, max_agents: int | None = None, perception_m: float | None = None
+        self, env: Any, landmarks: bool = True, max_agents: int | None = None, perception_m: float | None = None
     ) -> None:
         """Derive the spec from the environment."""
         if not is_mpe_env(env):

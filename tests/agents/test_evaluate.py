@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from agents.evaluate import Evaluation, mean_and_standard_error, summarize, wilson_interval
 from agents.episodes import EpisodeResult
+from agents.evaluate import Evaluation, mean_and_standard_error, summarize, wilson_interval
 from predictor.errors import UserError
 
 EPISODES = [

@@ -9,13 +9,13 @@ import torch
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
+from agents.episodes import SeededEpisodes
 from agents.evaluate import EVALUATION_SEED
 from agents.features import ForecastAttention
 from agents.presets import DQNPreset, PPOPreset, preset_for
-from agents.episodes import SeededEpisodes
 from agents.rows import make_rows
-from agents.task import Task
 from agents.runs import read_note, save_model
+from agents.task import Task
 from agents.training import SELECTION_SEED, SaveCheckpoint, SelectBest, TrainingPlan, make_model
 from predictor.errors import UserError
 

@@ -155,7 +155,9 @@ def test_a_crash_is_a_termination():
 
 def test_a_crash_in_the_last_step_is_both():
     """EnvPool calls it a truncation only; highway-env, whose flags these are, says both."""
-    terminated, truncated, crashed = (np.array(flags, dtype=np.bool_) for flags in ([1, 0, 0, 0], [0, 1, 1, 0], [1, 1, 0, 0]))
+    terminated, truncated, crashed = (
+        np.array(flags, dtype=np.bool_) for flags in ([1, 0, 0, 0], [0, 1, 1, 0], [1, 1, 0, 0])
+    )
     assert _ends(terminated, truncated, crashed).tolist() == [True, True, False, False]
 
 
@@ -222,7 +224,10 @@ def test_observations_lie_in_the_space(task_id: str):
     observations: list[Any] = [pool.reset()]
     for _ in range(12):
         obs, _, _, infos = pool.step(np.array([pool.action_space.sample() for _ in range(2)]))
-        observations += [obs, *({k: v[None] for k, v in i["terminal_observation"].items()} for i in infos if len(i) > 3)]
+        observations += [
+            obs,
+            *({k: v[None] for k, v in i["terminal_observation"].items()} for i in infos if len(i) > 3),
+        ]
     assert all(row_of(o, i) in pool.observation_space for o in observations for i in range(len(o["scene_ids"])))
 
 
@@ -259,6 +264,7 @@ def test_forecasts_are_those_of_single_environments(highway_checkpoint: str):
     venv = VecForecast(VecMonitor(small_pool()), highway_checkpoint)
     alone = [play_alone(row, highway_checkpoint) for row in range(ROWS)]
     obs: Any = venv.reset()
+    infos: list[Any] = []
     closings = 0
     for t in range(STEPS + 1):
         for row in range(ROWS):
@@ -293,7 +299,9 @@ def test_ppo_learns_on_it(scenes: bool, highway_checkpoint: str):
     if scenes:
         venv = VecForecast(VecMonitor(venv), highway_checkpoint)
     policy = "MultiInputPolicy" if scenes else "MlpPolicy"
-    model = PPO(policy, venv, n_steps=8, batch_size=8, n_epochs=1, policy_kwargs={"net_arch": [8]}, device="cpu", seed=0)
+    model = PPO(
+        policy, venv, n_steps=8, batch_size=8, n_epochs=1, policy_kwargs={"net_arch": [8]}, device="cpu", seed=0
+    )
     before = model.policy.action_net.weight.detach().clone()
     model.learn(24)
     assert model.num_timesteps == 24

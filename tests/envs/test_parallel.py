@@ -316,6 +316,24 @@ def test_reset_forgets_and_nothing_else_does():
         assert largest_difference(first[-1][name], last[name]) > 1e-3
 
 
+def test_identities_are_forgotten_before_a_new_episode_is_read():
+    calls = []
+
+    class Noted(ToyReader):
+        def reset(self) -> None:
+            calls.append("reset")
+
+        def read(self, env: Any) -> SharedScene:
+            calls.append("read")
+            return super().read(env)
+
+    env = ForecastParallelEnv(Toy(), "constant-velocity", reader=Noted)
+    env.reset(seed=0)
+    env.step(act(env))
+    env.reset()
+    assert calls == ["reset", "read", "read", "reset", "read"]
+
+
 @pytest.mark.parametrize("learns", [True, False], ids=["learners", "traffic"])
 def test_who_takes_a_leavers_row_gets_none_of_its_memory(learns: bool):
     """The newcomer of step 4 stands in the row of the leaver of step 3 and has the edges of a first sight."""
