@@ -12,7 +12,7 @@ help: ## list the targets
 
 .venv/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	.venv/bin/python -m pip install -c constraints.txt -e '.[all,dev]'
+	.venv/bin/python -m pip install -c constraints.txt -e '.[all,envpool,dev]'
 	touch $@
 
 train: .venv/.installed ## train a policy on highway-fast-v0 into RUN_DIR (continues a run that was stopped), evaluate and film it

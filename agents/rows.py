@@ -15,8 +15,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from agents.episodes import SeededEpisodes
 from agents.parallel_rows import make_parallel_rows
 from agents.task import Task, resolve_device
-from envs.native import EnvPoolVecEnv, native_task_of
-from envs.registry import make_env
+from envs.native import EnvPoolVecEnv
+from envs.registry import make_env, native_task_of
 from envs.vector import VecForecast
 from envs.wrappers import SceneObservation
 from predictor.scene import SceneSpec

@@ -1,5 +1,6 @@
 """What is driven and what the policy sees of it; the one description that training, evaluation and video share."""
 
+import importlib.util
 from dataclasses import dataclass
 from typing import Literal
 
@@ -8,10 +9,9 @@ import torch
 
 from envs.drivers import DRIVER_NAMES
 from envs.multiagent import ParallelVecEnv
-from envs.native import native_task_of
 from envs.parallel import ForecastParallelEnv
 from envs.parallel_registry import is_parallel_id, make_parallel_env
-from envs.registry import make_env
+from envs.registry import make_env, native_task_of
 from envs.wrappers import ForecastObservation
 from predictor.errors import UserError
 from predictor.scene import SceneSpec
@@ -49,6 +49,8 @@ class Task:
             raise UserError(f"partner must be one of {', '.join(DRIVER_NAMES)}, got '{self.partner}'")
         if self.backend == "envpool":
             native_task_of(self.env_id)
+            if importlib.util.find_spec("envpool") is None:
+                raise UserError("backend envpool needs the envpool package; pip install 'dgvae-rl[envpool]'")
         if self.checkpoint is not None and self.observe != "forecast":
             raise UserError(f"checkpoint '{self.checkpoint}' has no effect with observe={self.observe}; leave one out")
         resolve_device(self.device)

@@ -35,7 +35,7 @@ class CollectConfig:
     """Episodes to record."""
     ego: tuple[str, ...] = ()
     """Who drives; episodes take turns. One ego: random, idle, varied, keep-lane, or the path of a policy .zip. Many
-    learners: random, idle, varied, heuristic, mixed. Left out: varied random idle, or mixed heuristic varied."""
+    learners: random, idle, varied, heuristic, mixed. Left out: varied random idle, or heuristic mixed varied."""
     seed: int = 0
     """Episode i is seeded with seed + i; keep test seeds apart from training seeds."""
     max_steps: int = 200

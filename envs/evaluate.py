@@ -52,7 +52,7 @@ class EvaluateConfig:
     """Episodes per environment."""
     ego: str | None = None
     """Who drives. One ego: random, idle, varied (default), keep-lane, or the path of a policy .zip (which gets the
-    measured forecasts). Many learners: random, idle, varied, heuristic, mixed (default)."""
+    measured forecasts). Many learners: random, idle, varied, heuristic (default), mixed."""
     seed: int = 900_000
     """Episode i is seeded with seed + i; the shipped checkpoints were trained on seeds from 100,000 on."""
     samples: int = 20

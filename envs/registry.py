@@ -43,6 +43,22 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
         raise UserError(f"cannot make env '{env_id}': {error}; known here: {', '.join(CHECKPOINTS)}") from error
 
 
+def native_task_of(env_id: str) -> str:
+    """EnvPool's task that re-implements a highway-env id: its own version, else the first one it has.
+
+    Raises:
+        UserError: it has none.
+    """
+    exact = [task for task, copied in HIGHWAY_ENV_OF.items() if copied == env_id]
+    near = [task for task, copied in HIGHWAY_ENV_OF.items() if copied.rpartition("-v")[0] == env_id.rpartition("-v")[0]]
+    if not exact + near:
+        raise UserError(
+            f"EnvPool has no copy of '{env_id}'; it has {', '.join(HIGHWAY_ENV_OF.values())}: train without "
+            "--backend envpool"
+        )
+    return (exact + near)[0]
+
+
 def checkpoint_for(env_id: str) -> str:
     """Name of the shipped checkpoint for an env id.
 

@@ -198,4 +198,4 @@ def open_world(
 
 def default_drivers(env_id: str) -> tuple[str, ...]:
     """Who takes turns in data collection if nobody is named; the first one drives where accuracy is measured."""
-    return ("mixed", "heuristic", "varied") if is_parallel_id(env_id) else ("varied", "random", "idle")
+    return ("heuristic", "mixed", "varied") if is_parallel_id(env_id) else ("varied", "random", "idle")

@@ -1,4 +1,4 @@
-"""Reads scenes out of mpe2, PettingZoo's particle worlds: every agent and, by choice, the landmarks.
+"""Reads scenes out of mpe2, PettingZoo's particle worlds: every agent and, unless left out, every landmark.
 
 One layout for all scenarios, so that what was learned in one can be run in another. An agent's identity is the
 simulator's own object, never its place in a list. Goals, messages and what an agent carries are not read: nobody who
@@ -68,9 +68,8 @@ class MpeReader:
 
     Args:
         env: the environment, wrapped or not; its world gives `dt_s`.
-        landmarks: also read landmarks (obstacles, goals, treasures), as agents that stand still: they explain where the
-            others go. A treasure that is
-            collected leaves the scene; the one that appears elsewhere is a new one.
+        landmarks: also read landmarks (obstacles, goals, treasures), as agents that stand still: they explain where
+            the others go. A treasure that is collected leaves the scene; the one that appears elsewhere is a new one.
         max_agents: rows of a scene; None takes as many as the world holds.
         perception_m: how far an agent sees [m]; None sees the whole arena and far beyond.
 

@@ -40,6 +40,15 @@ def test_no_assignment_is_cheaper(seed: int, rows: int, more: int, ties: bool):
     assert cost[np.arange(rows), columns].sum() == pytest.approx(cheapest(cost), abs=1e-9)
 
 
+def test_on_a_line_the_best_assignment_keeps_the_order():
+    rng = np.random.default_rng(0)
+    for agents in (10, 40):
+        first, second = rng.random(agents), rng.random(agents)
+        wanted = np.empty(agents, dtype=np.int64)
+        wanted[np.argsort(first)] = np.argsort(second)
+        np.testing.assert_array_equal(assign((first[:, None] - second) ** 2), wanted)
+
+
 def test_large_assignments_agree_with_scipy():
     scipy = pytest.importorskip("scipy.optimize")
     for seed in range(5):

@@ -96,7 +96,7 @@ def test_every_scenario_reads(env_id: str, landmarks: bool):
 def test_velocity_and_time_step_are_the_simulators(env_id: str):
     """mpe2 moves an entity with its old velocity before it changes it, so the next position is known exactly."""
     env = make(env_id, max_cycles=9)
-    reader = MpeReader(env)
+    reader = MpeReader(env, landmarks=False)
     env.reset(seed=1)
     rng = np.random.default_rng(1)
     moved = 0.0
@@ -132,9 +132,9 @@ def test_constants_tell_adversaries_and_landmarks(env_id: str):
     assert radius.tolist() == [entity.size for entity in world_of(env).entities]
 
 
-def test_landmarks_are_read_by_choice_only(tag: ParallelEnv):
-    assert MpeReader(tag).read(tag).scene.valid.sum() == 4
-    scene = MpeReader(tag, landmarks=True).read(tag).scene
+def test_landmarks_are_left_out_by_choice(tag: ParallelEnv):
+    assert MpeReader(tag, landmarks=False).read(tag).scene.valid.sum() == 4
+    scene = MpeReader(tag).read(tag).scene
     assert scene.valid.sum() == 6
     np.testing.assert_array_equal(scene.states[4:, :2], [m.state.p_pos for m in world_of(tag).landmarks])
     assert not scene.states[4:, 2:4].any()
@@ -149,15 +149,15 @@ def test_wrapped_environments_read_alike(tag: ParallelEnv):
 
 @pytest.mark.parametrize("rows", [4, 7])
 def test_scenes_are_padded_to_their_rows(tag: ParallelEnv, rows: int):
-    scene = MpeReader(tag, max_agents=rows).read(tag).scene
+    scene = MpeReader(tag, landmarks=False, max_agents=rows).read(tag).scene
     assert scene.valid.tolist() == [True] * 4 + [False] * (rows - 4)
     assert (scene.ids[4:] == PADDING_ID).all()
     assert not scene.states[4:].any()
 
 
 def test_too_few_rows_are_named(tag: ParallelEnv):
-    with pytest.raises(UserError, match="MpeReader: 4 agents do not fit max_agents=3; raise max_agents"):
-        MpeReader(tag, max_agents=3).read(tag)
+    with pytest.raises(UserError, match="MpeReader: 6 agents do not fit max_agents=5; raise max_agents"):
+        MpeReader(tag, max_agents=5).read(tag)
 
 
 def test_perception_is_a_choice(tag: ParallelEnv):
@@ -190,7 +190,7 @@ def test_an_id_stays_with_its_entity_when_lists_are_sorted_anew(tag: ParallelEnv
 
 
 def test_who_leaves_takes_its_number_along_although_python_reuses_addresses(tag: ParallelEnv):
-    reader = MpeReader(tag, max_agents=5)
+    reader = MpeReader(tag, landmarks=False, max_agents=5)
     world = world_of(tag)
     numbers, addresses = [], []
     for step in range(20):
@@ -209,7 +209,7 @@ def test_who_leaves_takes_its_number_along_although_python_reuses_addresses(tag:
 
 
 def test_one_leaves_as_another_comes(tag: ParallelEnv):
-    reader = MpeReader(tag)
+    reader = MpeReader(tag, landmarks=False)
     before = entity_of_id(tag, reader.read(tag))
     world = world_of(tag)
     gone = world.agents[1]
@@ -282,8 +282,7 @@ def test_last_observations_have_rows_although_nobody_lives_by_then():
     env = make("simple_tag_v3", max_cycles=2)
     env.reset(seed=0)
     reader = MpeReader(env)
-    rng = np.random.default_rng(0)
-    random_step(env, rng)
+    random_step(env, np.random.default_rng(0))
     rows = reader.read(env).rows
     observations, *_ = env.step(dict.fromkeys(env.agents, 1))
     assert env.agents == []

@@ -244,8 +244,8 @@ def test_a_registered_reader_comes_first_and_holds_for_derived_classes():
     register_shared_reader(ReadableWalk, lambda env: second)
     assert shared_reader_for(ReadableWalk()) is second
     env = make_parallel_env("simple_tag_v3")
-    register_shared_reader(type(env.unwrapped), functools.partial(MpeReader, landmarks=True))
-    assert shared_reader_for(env).spec.max_agents == 6
+    register_shared_reader(type(env.unwrapped), functools.partial(MpeReader, landmarks=False))
+    assert shared_reader_for(env).spec.max_agents == 4
 
 
 def test_an_environment_may_bring_its_own_reader():
