@@ -287,8 +287,6 @@ class EnvPoolVecEnv(VecEnv):
         own, info = self._pool.reset(rows.astype(np.int32))
         for place, row in enumerate(rows):
             self.reset_infos[row] = _info(info, place)
-        if self._reader is not None:
-            self._reader.reset(rows)
         return self._observe(own, rows)
 
     def _observe(self, own: NDArray[Any], rows: NDArray[np.int64]) -> dict[str, NDArray[Any]]:

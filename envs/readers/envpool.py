@@ -250,7 +250,7 @@ def _perceive(everyone: SceneBatch, spec: SceneSpec) -> SceneBatch:
     rows = len(everyone)
     offsets = everyone.states[..., :2] - everyone.states[:, :1, :2]
     distance_m = np.where(everyone.valid, np.linalg.norm(offsets, axis=-1), np.inf)
-    distance_m[:, 0] = -1.0
+    # a stable sort leaves the ego, listed first and at distance 0, in row 0
     order = np.argsort(distance_m, axis=1, kind="stable")[:, : spec.max_agents]
     kept = np.take_along_axis(distance_m, order, axis=1) <= spec.perception_m
     width = order.shape[1]

@@ -93,7 +93,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "no_ego": ({"valid": np.array([False, True, True])}, "row 0 must hold the ego, but it is not valid"),
     "nan": ({"states": GOOD["states"] * [1, 1, np.nan, 1]}, r"states must be finite, got \[\[.*nan"),
     "infinite": ({"states": GOOD["states"] + [np.inf, 0, 0, 0]}, "states must be finite"),
-    "nan_heading": ({"heading_rad": float("nan")}, "heading_rad must be finite, got nan"),
+    "nan_heading": ({"heading_rad": float("nan")}, "heading_rad must be .*finite.*, got nan"),
     "object_states": (
         {"states": GOOD["states"].astype(object)},
         r"states must be a NumPy array of floating point with 2 axes, got object \(\d, 4\)",

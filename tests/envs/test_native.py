@@ -356,6 +356,28 @@ def test_returned_observations_are_not_written_to_later():
         assert_same(obs, copy, tolerance=0.0)
 
 
+class Frugal:
+    """A pool that hands out the same buffer at each step, as EnvPool may and does not."""
+
+    def __init__(self, pool: Any) -> None:
+        self._pool, self._buffer = pool, np.zeros((ROWS, 5, 5), np.float32)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._pool, name)
+
+    def step(self, actions: Any) -> Any:
+        observations, *rest = self._pool.step(actions)
+        self._buffer[:] = observations
+        return self._buffer, *rest
+
+
+def test_a_buffer_of_the_simulator_is_not_handed_out():
+    venv, frugal = small_pool(), small_pool()
+    frugal._pool = Frugal(frugal._pool)
+    for obs, expected in zip(sequence(frugal), sequence(venv), strict=True):
+        assert_same(obs, expected, tolerance=0.0)
+
+
 def test_attributes_are_shared_by_the_rows():
     venv = small_pool()
     assert venv.get_attr("scene_source") == ["envpool/HighwayFast-v0"] * ROWS

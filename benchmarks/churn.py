@@ -1,0 +1,152 @@
+"""Does `VecForecast` leak? Agents come and go at every step; resident memory, slots and values are watched.
+
+`python benchmarks/churn.py` steps a synthetic traffic of which a share is replaced at each step, with episodes that end
+at different times, and reports the slope of the resident memory [bytes per vector step], measured after a warm-up.
+"""
+
+import gc
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+import tyro
+from rich.progress import track
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from envs.readers import FunctionReader
+from envs.vector import VecForecast
+from envs.wrappers import SceneObservation
+from predictor.checkpoint import load_checkpoint
+from predictor.errors import UserError, run_entry_point
+from predictor.provenance import provenance, write_json
+from predictor.scene import Scene, SceneSpec
+
+
+@dataclass(frozen=True)
+class ChurnConfig:
+    """Step `VecForecast` under constant coming and going."""
+
+    steps: int = 200_000
+    """Vector steps."""
+    rows: int = 2
+    """Environments."""
+    agents: int = 6
+    """Agents around the ego, on average."""
+    replaced: float = 0.2
+    """Share of the agents that is replaced at each step."""
+    checkpoint: str = "highway"
+    """Whose forecasts."""
+    horizon_steps: int = 2
+    """Steps to forecast; memory is kept by observing, and short forecasts leave more steps for that."""
+    samples: int = 200
+    """Measurements of memory over the run."""
+    out: Path | None = None
+    """JSON file for the result."""
+
+    def check(self) -> None:
+        """Check ranges.
+
+        Raises:
+            UserError: a value that makes no sense.
+        """
+        for name in ("steps", "rows", "agents", "horizon_steps", "samples"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.steps < 2 * self.samples:
+            raise UserError(f"steps must be at least twice samples ({self.samples}), got {self.steps}")
+
+
+class Churning(gym.Env):
+    """Agents drift along a road; at each step some vanish and others appear, under ids never used before."""
+
+    observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, agents: int, replaced: float) -> None:
+        """Nothing is there yet."""
+        self._mean, self._replaced = agents, replaced
+        self._next = 1
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """A fresh crowd."""
+        super().reset(seed=seed)
+        self.states, self.ids = np.array([[0.0, 4.0, 25.0, 0.0]]), np.array([0])
+        self._enter(self._mean)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Everyone moves; some are replaced; the episode ends now and then."""
+        self.states[:, :2] += self.states[:, 2:]
+        stays = self.np_random.random(len(self.ids)) > self._replaced
+        stays[0] = True
+        self.states, self.ids = self.states[stays], self.ids[stays]
+        self._enter(int(self.np_random.poisson(max(0.0, self._mean + 1 - len(self.ids)))))
+        ended = bool(self.np_random.random() < 0.03)
+        return np.zeros(1, np.float32), 0.0, ended, False, {}
+
+    def _enter(self, count: int) -> None:
+        near = self.np_random.normal(size=(count, 4)) * (30, 4, 3, 0.1) + self.states[0] * (1, 0, 1, 0)
+        self.states = np.concatenate([self.states, near])
+        self.ids = np.concatenate([self.ids, self._next + np.arange(count)])
+        self._next += count
+
+
+def read(env: gym.Env) -> Scene:
+    """Everyone on the road."""
+    inner: Any = env.unwrapped
+    return Scene(inner.states.copy(), inner.ids.astype(np.int64), np.ones(len(inner.ids), dtype=np.bool_))
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+
+def main() -> None:
+    """Entry point."""
+    config = tyro.cli(ChurnConfig, description=__doc__)
+    config.check()
+    torch.set_num_threads(1)
+    _, info = load_checkpoint(config.checkpoint)
+    spec: SceneSpec = info.spec
+    reader = FunctionReader(read, spec)
+    venv = VecForecast(
+        DummyVecEnv([lambda: SceneObservation(Churning(config.agents, config.replaced), reader=reader)] * config.rows),
+        config.checkpoint,
+        horizon_steps=config.horizon_steps,
+    )
+    venv.seed(0)
+    venv.reset()
+    actions = np.zeros(config.rows, dtype=np.int64)
+    measured: list[tuple[int, int]] = []
+    tensors: list[int] = []
+    began = time.perf_counter()
+    for step in track(range(config.steps), "churn"):
+        observations: Any = venv.step(actions)[0]
+        if not all(np.isfinite(value).all() for value in observations.values()):
+            raise UserError(f"step {step}: an observation is not finite")
+        if (step + 1) % (config.steps // config.samples) == 0:
+            gc.collect()
+            measured.append((step + 1, resident_bytes()))
+            tensors.append(sum(type(thing) is torch.Tensor for thing in gc.get_objects()))
+    late = measured[len(measured) // 4 :]
+    slope = float(np.polyfit(*np.array(late, dtype=np.float64).T, 1)[0])
+    online = venv.stream._online
+    seen = sum(env.unwrapped._next for env in venv.unwrapped.envs)  # type: ignore[attr-defined]
+    print(
+        f"{config.steps} vector steps of {config.rows} rows, {seen} agents, "
+        f"{config.steps / (time.perf_counter() - began):.0f} steps/s: resident memory {late[0][1] / 2**20:.1f} to "
+        f"{late[-1][1] / 2**20:.1f} MiB after a quarter of the run, slope {slope:.3f} bytes per vector step; "
+        f"tensors alive {tensors[0]} then {tensors[-1]}; slots {online._ids.shape}, all observations finite"
+    )
+    if config.out is not None:
+        content = {"slope_bytes_per_step": slope, "memory": measured, "tensors": tensors, "agents": seen}
+        write_json(config.out, content | {"provenance": provenance(("stable-baselines3", "torch", "numpy"))})
+
+
+if __name__ == "__main__":
+    run_entry_point(main)

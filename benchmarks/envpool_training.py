@@ -1,0 +1,152 @@
+"""PPO with forecasts on EnvPool against plain PPO on highway-env: steps/s of whole training loops, in one run.
+
+`python benchmarks/envpool_training.py` trains both in turn, block by block (rollouts and updates, no evaluation), each
+with the preset that `train_policy.py` uses for it, and prints the median ratio and where the time of the first goes.
+Absolute numbers depend on the machine; the ratio is the result.
+"""
+
+import platform
+import statistics
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+
+from agents.rows import make_rows
+from agents.task import Task
+from agents.training import TrainingPlan, make_model
+from predictor.errors import UserError, run_entry_point
+from predictor.provenance import provenance, write_json
+
+
+@dataclass(frozen=True)
+class TrainingSpeedConfig:
+    """Compare steps/s of two PPO trainings."""
+
+    env_id: str = "highway-fast-v0"
+    """highway-env's id; EnvPool trains on its native copy."""
+    native_envs: int = 64
+    """Environments in EnvPool."""
+    plain_envs: int = 6
+    """Processes of highway-env, as many as train_policy.py takes."""
+    blocks: int = 5
+    """Pairs of blocks; the median of their ratios is reported."""
+    plain_steps: int = 768
+    """Environment steps in a plain block (one rollout of 128 steps and its update)."""
+    native_steps: int = 8192
+    """Environment steps in a block with forecasts."""
+    threads: int = 2
+    """torch threads of the forecaster and of both policies."""
+    out: Path | None = None
+    """JSON file for the result."""
+
+    def check(self) -> None:
+        """Check ranges.
+
+        Raises:
+            UserError: a value that makes no sense.
+        """
+        for name in ("native_envs", "plain_envs", "blocks", "plain_steps", "native_steps", "threads"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+
+
+class Timed:
+    """Adds up the time spent in some methods, innermost last."""
+
+    def __init__(self) -> None:
+        """Nothing is timed yet."""
+        self.seconds: dict[str, float] = {}
+
+    def watch(self, owner: Any, method: str, name: str) -> None:
+        """Time a method of an object under a name."""
+        call = getattr(owner, method)
+
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            began = time.perf_counter()
+            try:
+                return call(*args, **kwargs)
+            finally:
+                self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
+
+        setattr(owner, method, timed)
+
+
+class _Quiet(BaseCallback):
+    def _on_step(self) -> bool:
+        return True
+
+
+def make(task: Task, rows: int, seed: int) -> BaseAlgorithm:
+    """A model with its environments, as train_policy.py makes them."""
+    return make_model(TrainingPlan(task, "ppo", 1_000_000, rows, seed), make_rows(task, rows))
+
+
+def run_block(model: BaseAlgorithm, steps: int) -> float:
+    """Environment steps per second over whole rollouts and updates."""
+    before, began = model.num_timesteps, time.perf_counter()
+    model.learn(steps, callback=_Quiet(), reset_num_timesteps=False)
+    return (model.num_timesteps - before) / (time.perf_counter() - began)
+
+
+def profile(model: BaseAlgorithm, steps: int) -> dict[str, float]:
+    """Share of a block's time by part."""
+    timed = Timed()
+    forecast = model.env.venv  # type: ignore[union-attr]
+    timed.watch(forecast.venv, "step_wait", "simulation and scenes")
+    timed.watch(forecast, "step_wait", "_step")
+    timed.watch(model.policy, "forward", "policy")
+    timed.watch(model, "train", "update")
+    began = time.perf_counter()
+    run_block(model, steps)
+    total = time.perf_counter() - began
+    seconds = timed.seconds
+    seconds["forecasts"] = seconds.pop("_step") - seconds["simulation and scenes"]
+    seconds["rest of SB3"] = total - sum(seconds.values())
+    return {name: value / total for name, value in sorted(seconds.items(), key=lambda item: -item[1])}
+
+
+def main() -> None:
+    """Entry point."""
+    config = tyro.cli(TrainingSpeedConfig, description=__doc__)
+    config.check()
+    torch.set_num_threads(config.threads)
+    plain = make(Task(config.env_id, "none"), config.plain_envs, 0)
+    native = make(Task(config.env_id, "forecast", backend="envpool"), config.native_envs, 0)
+    run_block(plain, config.plain_steps)
+    run_block(native, config.native_steps)
+    pairs = []
+    for _ in range(config.blocks):
+        pairs.append((run_block(plain, config.plain_steps), run_block(native, config.native_steps)))
+        print(f"plain {pairs[-1][0]:.0f} steps/s, EnvPool with forecasts {pairs[-1][1]:.0f}", flush=True)
+    shares = profile(native, config.native_steps)
+    ratios = [fast / slow for slow, fast in pairs]
+    result = {
+        "plain_steps_per_s": statistics.median(slow for slow, _ in pairs),
+        "native_forecast_steps_per_s": statistics.median(fast for _, fast in pairs),
+        "ratio": statistics.median(ratios),
+        "ratios": ratios,
+        "shares": shares,
+        "machine": platform.processor() or platform.machine(),
+    }
+    print(
+        f"{config.env_id}: plain PPO on highway-env ({config.plain_envs} processes) "
+        f"{result['plain_steps_per_s']:.0f} steps/s, PPO with forecasts on EnvPool ({config.native_envs} environments) "
+        f"{result['native_forecast_steps_per_s']:.0f} steps/s, ratio {result['ratio']:.1f} "
+        f"({min(ratios):.1f} to {max(ratios):.1f})"
+    )
+    print("where its time goes: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items()))
+    if config.out is not None:
+        made = provenance(("envpool", "highway-env", "stable-baselines3", "torch"))
+        write_json(config.out, result | {"provenance": made})
+    for model in (plain, native):
+        model.env.close()  # type: ignore[union-attr]
+
+
+if __name__ == "__main__":
+    run_entry_point(main)
