@@ -22,6 +22,7 @@ from agents.parallel_rows import record_task
 from agents.runs import load_model, open_run
 from agents.task import Task
 from agents.training import TrainingPlan, train
+from envs.readers.highway import is_highway_env
 from envs.registry import CHECKPOINTS, make_env
 from envs.render import record_episode
 from envs.wrappers import ForecastObservation
@@ -130,6 +131,7 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
     plan = config.plan
     plan.check_action_space(plan.task.check())
     settings = asdict(config) | {"preset": asdict(plan.preset), "attention": asdict(AttentionConfig())}
+    settings |= {"learners": plan.task.learners, "envs": config.num_envs}
     for name in ("run_dir", "resume"):
         settings.pop(name)
     free = ("checkpoint_every", "eval_episodes", "video", "device")
@@ -143,11 +145,16 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
     console.print(evaluation.table())
     console.print(f"policy: {policy}")
     if config.video:
-        console.print(f"video: {film(config, model)}")
+        shown = film(config, model)
+        console.print(f"video: {shown or 'none, only highway-env and PettingZoo environments are drawn'}")
 
 
-def film(config: TrainPolicyConfig, model: BaseAlgorithm) -> Path:
-    """Film the first evaluation episode with the forecasts drawn in, also for a policy that sees none."""
+def film(config: TrainPolicyConfig, model: BaseAlgorithm) -> Path | None:
+    """Film the first evaluation episode with the forecasts drawn in, also for a policy that sees none.
+
+    Returns:
+        The video; None for an environment that cannot be drawn.
+    """
     path = config.folder / "video.mp4"
     task = config.plan.task
     if task.is_parallel:
@@ -156,6 +163,11 @@ def film(config: TrainPolicyConfig, model: BaseAlgorithm) -> Path:
     checkpoint = task.forecaster
     if config.observe == "none" and config.env_id not in CHECKPOINTS:
         checkpoint = "constant-velocity"
+    plain = make_env(config.env_id)
+    drawn = is_highway_env(plain)
+    plain.close()
+    if not drawn:
+        return None
     env = ForecastObservation(make_env(config.env_id, render_mode="rgb_array"), checkpoint)
     try:
         record_episode(env, _act(config, model), seed=EVALUATION_SEED, max_steps=MAX_VIDEO_STEPS).write_video(path)

@@ -4,7 +4,6 @@ Agents that do not learn are driven by name (`envs.drivers`), anew in each episo
 decides what a policy sees.
 """
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
@@ -17,12 +16,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from agents.episodes import EpisodeResult
 from agents.task import Task, resolve_device
 from envs.drivers import Driver, make_driver
-from envs.multiagent import AgentMonitor, ParallelVecEnv
+from envs.multiagent import AgentMonitor, ParallelVecEnv, learners_named, role_of
 from envs.parallel import ForecastParallelEnv
 from envs.parallel_registry import PARALLEL_CHECKPOINTS, make_parallel_env
 from envs.render_shared import SharedRecording, record_parallel_episode
 from predictor.checkpoint import CONSTANT_VELOCITY
-from predictor.errors import UserError
 
 
 class DrivenEnv(BaseParallelWrapper):
@@ -84,25 +82,8 @@ class MakeCopy:
 
 
 def learners_of(task: Task, env: ParallelEnv) -> list[str]:
-    """The agents that learn.
-
-    Raises:
-        UserError: a learner of the task is neither an agent nor a role of the environment.
-    """
-    if not task.learners:
-        return list(env.possible_agents)
-    for name in task.learners:
-        if not any(name in (agent, role_of(agent)) for agent in env.possible_agents):
-            raise UserError(
-                f"learners: '{name}' is neither an agent nor a role of {task.env_id}; it has "
-                f"{', '.join(env.possible_agents)}"
-            )
-    return [a for a in env.possible_agents if a in task.learners or role_of(a) in task.learners]
-
-
-def role_of(agent: str) -> str:
-    """An agent's name without its number."""
-    return re.sub(r"[_\s]?\d+$", "", agent) or agent
+    """The agents that learn."""
+    return learners_named(env.possible_agents, task.learners, task.env_id)
 
 
 def make_parallel_rows(task: Task, copies: int) -> AgentMonitor:

@@ -77,8 +77,6 @@ def _choosers(name: str, env: Any, rng: np.random.Generator) -> Callable[[str], 
         kinds = ("random", "varied", "heuristic") if _has_heuristic(env) else ("random", "varied")
         draws = [_choosers(kind, env, rng) for kind in kinds]
         return lambda agent: draws[rng.integers(len(draws))](agent)
-    if name.endswith(".zip"):
-        return _trained(name, env)
     raise UserError(f"driver must be one of {', '.join(DRIVER_NAMES)}, got '{name}'")
 
 
@@ -91,10 +89,6 @@ def idle_action(env: Any, agent: str) -> Any:
     if isinstance(space, gym.spaces.Discrete):
         return int(space.start) + (_PURSUIT_STAY if is_pursuit_env(env) else 0)
     return np.clip(np.zeros(space.shape, dtype=space.dtype), space.low, space.high)
-
-
-def _trained(path: str, env: Any) -> Callable[[str], Chooser]:
-    raise UserError(f"policies cannot drive parallel environments yet, got {path}; use {', '.join(DRIVER_NAMES)}")
 
 
 def _uniform(space: gym.Space, rng: np.random.Generator) -> Any:

@@ -6,6 +6,7 @@ and, given recorded data, so does a memoryless nearest-neighbour forecaster. An 
 policy's choice. Several checkpoints make a transfer matrix: trained on A, measured on B.
 """
 
+import math
 import multiprocessing
 import os
 from collections.abc import Sequence
@@ -87,6 +88,9 @@ class EvaluateConfig:
             raise UserError(f"history_steps must be at least 1, got {self.history_steps}")
         if self.miss_m is not None and self.miss_m <= 0:
             raise UserError(f"miss_m must be positive, got {self.miss_m}")
+        names = [Path(checkpoint).name for checkpoint in self.checkpoint]
+        if len(set(names)) < len(names):
+            raise UserError(f"each checkpoint needs a name of its own, got {', '.join(names)}; rename a folder")
 
 
 @dataclass(frozen=True)
@@ -266,6 +270,7 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
     results: list[EnvAccuracy] = []
     misfits: dict[tuple[str, str], str] = {}
     for env_id in config.env_ids:
+        _neighbour_store(config.neighbours, env_id)  # what is missing for all checkpoints is no misfit of one
         for checkpoint in config.checkpoint or (None,):
             try:
                 result, cases = evaluate_env(config, env_id, checkpoint)
@@ -282,13 +287,23 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
     return results, misfits
 
 
+def _finite(content: Any) -> Any:
+    """The same with null in place of NaN and infinity, which JSON does not have."""
+    if isinstance(content, dict):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
+
+
 def main() -> None:
     """Entry point."""
     config = tyro.cli(EvaluateConfig, description=__doc__)
     config.check()
     console = Console(width=170)
-    for env_id in config.env_ids:
-        open_world(env_id, default_drivers(env_id)[0]).close()  # complain about any unknown id before hours of work
+    for env_id in config.env_ids:  # complain about any unknown id or driver before hours of work
+        policy = config.ego is not None and config.ego.endswith(".zip")
+        open_world(env_id, "idle" if policy else config.ego or default_drivers(env_id)[0]).close()
     for checkpoint in config.checkpoint:
         if checkpoint != CONSTANT_VELOCITY:
             resolve(checkpoint)
@@ -302,7 +317,7 @@ def main() -> None:
         made = provenance(PACKAGES)
         content: dict[str, Any] = {"config": asdict(config), "results": [asdict(r) for r in results]}
         misfit = [{"env_id": e, "checkpoint": c, "why": why} for (e, c), why in misfits.items()]
-        write_json(config.out / "accuracy.json", content | {"misfits": misfit, "provenance": made})
+        write_json(config.out / "accuracy.json", _finite(content | {"misfits": misfit, "provenance": made}))
         (config.out / "accuracy.md").write_text(report.markdown(results, misfits))
 
 

@@ -4,11 +4,12 @@ Hides whether there is one ego (gymnasium) or many learners (PettingZoo). Scenes
 policy is trained with, so what is recorded and measured is what is deployed.
 """
 
-from typing import Any, Protocol
+import functools
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from envs.drivers import make_driver
+from envs.drivers import Driver, make_driver
 from envs.egos import env_for_ego, make_ego, require_view, sees_forecasts
 from envs.parallel import ForecastParallelEnv
 from envs.parallel_registry import is_parallel_id, make_parallel_env
@@ -16,11 +17,14 @@ from envs.readers import SceneReader
 from envs.readers.highway import is_highway_env
 from envs.readers.highway_labels import SceneLabels, read_labels
 from envs.registry import make_env
+from envs.trained_driver import trained_driver
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import CONSTANT_VELOCITY
+from predictor.errors import UserError
 from predictor.scene import Scene, SceneSpec
 
 
+@runtime_checkable
 class World(Protocol):
     """One environment with its drivers."""
 
@@ -108,14 +112,15 @@ class SharedWorld:
 
     Args:
         env: wrapped in `ForecastParallelEnv`.
-        driver: name of a driver from `envs.drivers`.
+        driver: name of a driver from `envs.drivers`, or the path of a policy .zip.
     """
 
     def __init__(self, env: ForecastParallelEnv, driver: str) -> None:
-        """Nothing is reset yet."""
+        """Nothing is reset yet; a driver that cannot drive this complains now."""
         self.env = env
         self._name = driver
         self._observations: dict[str, Any] = {}
+        self._make_driver(np.random.default_rng(0))
 
     @property
     def spec(self) -> SceneSpec:
@@ -125,12 +130,14 @@ class SharedWorld:
     def reset(self, seed: int) -> None:
         """Begin the episode of a seed."""
         self._observations, _ = self.env.reset(seed=seed)
-        self._driver = make_driver(self._name, self.env, np.random.default_rng(seed))
+        self._driver = self._make_driver(np.random.default_rng(seed))
 
     def step(self) -> bool:
         """Let everybody act."""
-        own = {name: seen["observation"] for name, seen in self._observations.items()}
-        self._observations, *_ = self.env.step(self._driver(own))
+        seen = self._observations
+        if not self._name.endswith(".zip"):
+            seen = {name: entries["observation"] for name, entries in seen.items()}
+        self._observations, *_ = self.env.step(self._driver(seen))
         return not self.env.agents
 
     def perceived(self) -> Scene:
@@ -149,6 +156,10 @@ class SharedWorld:
     def close(self) -> None:
         """Close the environment."""
         self.env.close()
+
+    def _make_driver(self, rng: np.random.Generator) -> Driver:
+        make = trained_driver if self._name.endswith(".zip") else make_driver
+        return make(self._name, self.env, rng)
 
 
 def open_world(
@@ -178,7 +189,6 @@ def open_world(
             horizon_steps=horizon_steps,
             num_samples=num_samples,
         )
-        make_driver(driver, shared, np.random.default_rng(0))  # complain early
         return SharedWorld(shared, driver)
     env = make_env(env_id, disable_env_checker=True)
     if checkpoint is None:
@@ -197,5 +207,23 @@ def open_world(
 
 
 def default_drivers(env_id: str) -> tuple[str, ...]:
-    """Who takes turns in data collection if nobody is named; the first one drives where accuracy is measured."""
-    return ("heuristic", "mixed", "varied") if is_parallel_id(env_id) else ("varied", "random", "idle")
+    """Who takes turns in data collection if nobody is named; the first one drives where accuracy is measured.
+
+    Raises:
+        UserError: a parallel environment that cannot be made.
+    """
+    if not is_parallel_id(env_id):
+        return ("varied", "random", "idle")
+    return ("heuristic", "mixed", "varied") if _has_heuristic(env_id) else ("varied", "random", "idle")
+
+
+@functools.cache
+def _has_heuristic(env_id: str) -> bool:
+    env = make_parallel_env(env_id)
+    try:
+        make_driver("heuristic", env, np.random.default_rng(0))
+    except UserError:
+        return False
+    finally:
+        env.close()
+    return True

@@ -8,8 +8,9 @@ from stable_baselines3 import PPO
 from envs import collect
 from envs.collect import CollectConfig
 from envs.egos import idle_action
+from envs.parallel_registry import make_parallel_env, shared_reader_for
 from envs.readers import HighwayReader
-from envs.readers.highway_labels import LEADER
+from envs.readers.highway_labels import ATTRIBUTE_NAMES, LEADER
 from envs.registry import make_env
 from predictor.data.store import Episode, read_store
 from predictor.data.windows import Windows
@@ -17,6 +18,7 @@ from predictor.errors import UserError
 from tests.envs.helpers import run_command, save_forecast_policy
 
 ENV_ID = "two-way-v0"
+TAG = "simple_tag_v3"
 STEPS = 3
 
 
@@ -78,7 +80,7 @@ def test_the_store_is_the_same_for_any_number_of_workers(
     assert [e.label for e in alone.episodes] == ["varied", "random", "idle", "varied", "random"]
     assert [e.seed for e in alone.episodes] == list(range(30, 35))
     assert all(e.edge_types is not None and (e.edge_types == LEADER).any() for e in alone.episodes)
-    assert alone.info.edge_attribute_names == ("time_gap_s", "desired_time_gap_s", "headway_m")
+    assert alone.info.edge_attribute_names == ATTRIBUTE_NAMES
     assert alone.info.source == ENV_ID
     assert alone.info.spec == HighwayReader(make_env(ENV_ID)).spec
     assert alone.info.provenance["seed"] == 30
@@ -123,6 +125,52 @@ def test_labels_can_be_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     assert (batch.edge_types, batch.edge_attributes) == (None, None)
 
 
+# --- Many learners ----------------------------------------------------------------------------------------------------
+
+
+def test_an_episode_of_many_learners_is_what_the_simulator_did():
+    (episode,) = collect.collect(config(episodes=1, env_id=TAG, ego=("idle",), seed=11))
+    env = make_parallel_env(TAG)
+    env.reset(seed=11)
+    reader = shared_reader_for(env)
+    assert (episode.label, episode.seed, len(episode.states)) == ("idle", 11, STEPS + 1)
+    assert (episode.edge_types, episode.edge_attributes) == (None, None)
+    assert episode.valid.all()
+    for t in range(STEPS + 1):
+        truth = reader.read(env).scene
+        assert episode.ids.tolist() == truth.ids.tolist()
+        np.testing.assert_allclose(episode.states[t], truth.states, rtol=1e-6)
+        env.step({name: 0 for name in env.agents})
+
+
+def test_an_episode_of_many_learners_ends_with_its_last_scene():
+    (episode,) = collect.collect(config(episodes=1, env_id=TAG, ego=("random",), max_steps=200))
+    assert len(episode.states) == 26  # mpe2 stops after 25 cycles
+    assert episode.valid.all()
+
+
+def test_many_learners_are_recorded_without_labels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    """Drivers take turns; labels are asked for, but no simulator of many learners knows its edges."""
+    arguments = ["--env-id", TAG, "--out", str(tmp_path / "s"), "--episodes", "4", "--seed", "30", "--workers", "1"]
+    code, errors, output = run_command(collect.main, [*arguments, "--max-steps", "5"], monkeypatch, capsys)
+    assert (code, errors) == (0, [])
+    assert "4 episodes, 24 scenes, seeds 30–33" in output
+    store = read_store(tmp_path / "s")
+    assert store.info.spec == shared_reader_for(make_parallel_env(TAG)).spec
+    assert (store.info.spec.has_ego, store.info.source) == (False, TAG)
+    assert store.info.edge_attribute_names == ()
+    assert all(e.edge_types is None for e in store.episodes)
+    assert [e.label for e in store.episodes] == ["heuristic", "mixed", "varied", "heuristic"]
+    again = list(collect.collect(config(episodes=4, env_id=TAG, seed=30, max_steps=5)))
+    assert_same_episodes(again, store.episodes)
+    landmark = store.info.spec.feature_names.index("landmark")
+    still = store.episodes[0].states[0, :, landmark] == 1
+    moved = np.ptp(store.episodes[0].states[..., :2], axis=0).max(-1)
+    assert (moved[still] == 0).all() and (moved[~still] > 0).all()
+
+
 ERRORS = {
     "unknown-id": (["--env-id", "nope-v0"], "cannot make env 'nope-v0'"),
     "unknown-version": (["--env-id", "merge-v9"], "cannot make env 'merge-v9'"),
@@ -134,6 +182,10 @@ ERRORS = {
     "unknown-ego": (["--ego", "random", "reckless"], "ego must be one of random, idle,"),
     "unfit-ego": (["--ego", "keep-lane"], "keep-lane needs continuous steering"),
     "missing-policy": (["--ego", "absent.zip"], "no policy at absent.zip"),
+    "unknown-driver": (["--env-id", TAG, "--ego", "heuristic", "reckless"], "driver must be one of random, idle,"),
+    "unfit-driver": (["--env-id", TAG, "--ego", "keep-lane"], "driver must be one of random, idle,"),
+    "policy-among-many": (["--env-id", TAG, "--ego", "absent.zip"], "policies cannot drive parallel environments yet"),
+    "nothing-moves": (["--env-id", "mpe2.simple_crypto_v3:parallel_env"], "nothing moves in simple_crypto"),
 }
 
 

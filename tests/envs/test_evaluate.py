@@ -1,58 +1,38 @@
 import json
 import multiprocessing
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import redirect_stdout
 from dataclasses import replace
-from itertools import pairwise
+from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import torch
+from matplotlib import pyplot as plt
 
 from envs import evaluate
-from envs.egos import idle_action, make_ego
-from envs.evaluate import EvaluateConfig, _episode, _futures, _reduction, _Task, _world_forecast, evaluate_env
-from envs.observation import ego_entries
+from envs.collect import CollectConfig, collect
+from envs.evaluate import EnvAccuracy, EvaluateConfig, _finite, _graph, _reduction, _summary, evaluate_env
+from envs.live import MODEL, STRAIGHT, Episode
+from envs.readers import HighwayReader
 from envs.registry import make_env
-from envs.wrappers import SceneObservation
-from predictor.accuracy import Outcome, summarise
-from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.accuracy import Outcome
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
+from predictor.data.store import StoreInfo, write_store
 from predictor.errors import UserError
-from predictor.forecaster import Belief
-from predictor.scene import PADDING_ID, Scene, SceneSpec
-from tests.envs.helpers import (
-    HIGHWAY_SPEC,
-    HORIZON,
-    SIZES,
-    cruising_env,
-    play,
-    random_forecast,
-    random_scenes,
-    run_command,
-    save_forecast_policy,
-    tiny_model,
-)
+from predictor.scene import SceneSpec
+from tests.envs.evaluation import TAG, forget, save_tag, tag_spec
+from tests.envs.helpers import HIGHWAY_SPEC, HORIZON, SIZES, run_command, save_forecast_policy, tiny_model
 
-OFFSET_M = torch.tensor([3.0, 4.0])
-"""A displacement of exactly 5 m."""
-
-
-class Drifting(ConstantVelocity):
-    """Constant velocity, off by `OFFSET_M` in the first sample, twice that in the second, and so on."""
-
-    def rollout(
-        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
-    ) -> torch.Tensor:
-        future = super().rollout(belief, horizon_steps, num_samples, generator).clone()
-        future[..., :2] += torch.arange(1.0, num_samples + 1)[:, None, None, None] * OFFSET_M
-        return future
+ROAD = "two-way-v0"
+STILL = "constant-velocity"
 
 
 class InProcessPool:
-    """Runs a pool's tasks here, so that what a test replaces is replaced in them too."""
+    """Runs a pool's tasks here: a process of its own takes seconds to start."""
 
     def __init__(self, processes: int, initializer: Any = None, initargs: Any = ()) -> None:
         assert processes >= 1
@@ -67,149 +47,28 @@ class InProcessPool:
         return map(function, tasks)
 
 
-@pytest.fixture
-def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(multiprocessing, "get_context", lambda method: SimpleNamespace(Pool=InProcessPool))
 
 
 @pytest.fixture
-def drifting(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every env wrapped from here on is forecast by `Drifting`."""
-
-    def open_drifting(checkpoint: str | None, spec: SceneSpec, source: str, device: str = "cpu") -> Drifting:
-        return Drifting(spec, HORIZON)
-
-    monkeypatch.setattr("envs.wrappers.open_forecaster", open_drifting)
+def in_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    no_processes(monkeypatch)
+    forget()
+    yield
+    forget()
 
 
-def task(env_id: str = "highway-fast-v0", **changes: Any) -> _Task:
-    made = _Task(env_id, "constant-velocity", "idle", seed=3, samples=2, horizon_steps=HORIZON, max_steps=6)
-    return replace(made, **changes)
+def read_json(path: Path) -> Any:
+    """Strictly: a reader other than Python's knows no NaN."""
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(path.read_text(), parse_constant=refuse)
 
 
-# --- Truth ------------------------------------------------------------------------------------------------------------
-
-
-def scene(*agents: tuple[int, float, float], rows: int = 3) -> Scene:
-    """Agents as (id, x, y); padded to `rows`."""
-    states, ids, valid = np.zeros((rows, 4)), np.full(rows, -1), np.zeros(rows, dtype=np.bool_)
-    for row, (number, x, y) in enumerate(agents):
-        states[row, :2], ids[row], valid[row] = (x, y), number, True
-    return Scene(states, ids, valid)
-
-
-def truth(*agents: tuple[int, float, float]) -> Scene:
-    return scene(*agents, rows=len(agents))
-
-
-def test_futures_follow_ids_beyond_perception_until_agents_leave_the_road():
-    """Agent 5 leaves perception after the first step and the road after the third; agent 6 enters late."""
-    scenes = [
-        scene((0, 10, 0), (5, 15, 1)),
-        scene((0, 20, 0), (6, 21, 2)),
-    ]
-    truths = [
-        truth((0, 10, 0), (5, 15, 1), (6, 500, 2)),
-        truth((0, 20, 0), (6, 21, 2), (5, 400, 1)),
-        truth((0, 30, 0), (6, 32, 2), (5, 450, 1)),
-        truth((0, 40, 0), (6, 43, 2)),
-    ]
-    future, valid = _futures(scenes, truths, horizon_steps=3)
-    assert valid.tolist() == [
-        [[False] * 3, [True, True, False], [False] * 3],  # the ego is not counted
-        [[False] * 3, [True, True, False], [False] * 3],  # the episode ends before the third step
-    ]
-    assert future[0, 1].tolist() == [[390, 1], [440, 1], [0, 0]]  # from where the ego is at that step
-    assert future[1, 1].tolist() == [[12, 2], [23, 2], [0, 0]]
-    assert (future[~valid] == 0).all()
-
-
-def test_an_episode_has_the_truth_of_its_last_step():
-    """The closing scene is no place to forecast from any more, but it is what earlier forecasts are judged by."""
-    env = make_env("u-turn-v1")
-    steps = play(env, [idle_action(env)] * 50, seed=3)
-    count = len(steps) - 1
-    assert steps[-1][2] or steps[-1][3]
-    model, baseline = _episode(task("u-turn-v1", seed=3, max_steps=200))
-    assert model.forecast.shape[0] == count
-    assert model.valid[count - 1, 1:].any(0).tolist() == [True, False, False]
-    assert model.valid[count - 2, 1:].any(0).tolist() == [True, True, False]
-    assert torch.equal(model.future, baseline.future)
-    assert torch.equal(model.valid, baseline.valid)
-
-
-def test_an_episode_that_is_cut_keeps_its_last_scene():
-    model, _ = _episode(task(max_steps=4))
-    assert model.forecast.shape[0] == 5
-    assert model.valid[3, 1:].any(0).tolist() == [True, False, False]
-    assert not model.valid[4].any()
-
-
-def test_out_of_sight_is_not_out_of_truth():
-    """Nobody leaves this road, so whoever is seen has a future up to the episode's end, seen again or not."""
-    steps, seed = 8, 2
-    env = SceneObservation(make_env("highway-fast-v0"))
-    ego = make_ego("random", env, np.random.default_rng(seed))
-    played = play(env, [ego(None) for _ in range(steps)], seed)
-    seen = [set(obs["scene_ids"].tolist()) for obs, *_ in played]
-    assert any(before - after - {PADDING_ID} for before, after in pairwise(seen))  # some are lost from sight
-    model, _ = _episode(task(seed=seed, ego="random", max_steps=steps))
-    assert len(model.valid) == len(seen) == steps + 1
-    for t in range(steps):
-        known = model.valid[t, :, 0]
-        assert int(known.sum()) == len(seen[t] - {0, PADDING_ID})
-        assert (model.valid[t, known].sum(-1) == min(HORIZON, steps - t)).all()
-
-
-# --- Forecasts, read out of the observation ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_way_back_undoes_the_ego_view(seed: int):
-    """For rows in any order, with gaps, and any heading."""
-    rng = np.random.default_rng(seed)
-    scenes = random_scenes(rng, 1, 6)
-    forecast = random_forecast(rng, scenes, 3, HORIZON, 2, 4)
-    obs = {key: value[0] for key, value in ego_entries(scenes, forecast).items()}
-    back = _world_forecast(obs, Scene(scenes.states[0], scenes.ids[0], scenes.valid[0], float(scenes.heading_rad[0])))
-    expected = forecast.xy[0] * forecast.valid[0][None, :, None, None]
-    expected[:, 0] = 0  # the ego has no entry
-    torch.testing.assert_close(back, expected, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("env_id", ["highway-fast-v0", "intersection-v2", "racetrack-v1"])
-def test_forecasts_come_back_into_rows_and_world_axes(env_id: str, drifting: None):
-    """Whatever the ego's heading and the order of agents: what returns is what the forecaster said."""
-    model, straight = _episode(task(env_id))
-    assert model.forecast.shape[1] == 2
-    seen = model.valid.any(-1)
-    assert seen.any()
-    for sample in range(2):
-        offset = (model.forecast[:, sample] - straight.forecast[:, 0])[seen]
-        expected = ((sample + 1) * OFFSET_M).expand_as(offset)
-        torch.testing.assert_close(offset, expected, rtol=0, atol=1e-3)
-
-
-def test_errors_in_closed_form(drifting: None, monkeypatch: pytest.MonkeyPatch):
-    """Among cars that hold their speed, constant velocity is right and the drifting forecaster 5 m and 10 m off."""
-    monkeypatch.setattr(evaluate, "make_env", lambda env_id, **kwargs: cruising_env(**kwargs))
-    model, straight = _episode(task())
-    assert summarise("straight", [straight]).min_ade_m == pytest.approx(0.0, abs=1e-3)
-    both = summarise("drifting", [model])
-    assert both.agents > 5
-    assert both.num_samples == 2
-    assert both.min_ade_m == pytest.approx(5.0, abs=1e-3)
-    assert both.min_fde_m == pytest.approx(5.0, abs=1e-3)
-    assert both.by_step_m == pytest.approx([5.0] * HORIZON, abs=1e-3)
-    assert both.rmse_m == pytest.approx([7.5] * HORIZON, abs=1e-3)  # of the samples' mean
-
-
-def test_one_sample_is_the_most_likely_one(drifting: None):
-    model, straight = _episode(task(samples=1))
-    assert model.forecast.shape[1] == straight.forecast.shape[1] == 1
-    seen = model.valid.any(-1)
-    offset = (model.forecast - straight.forecast)[:, 0][seen]
-    torch.testing.assert_close(offset, OFFSET_M.expand_as(offset), rtol=0, atol=1e-3)
+# --- Numbers of given episodes ----------------------------------------------------------------------------------------
 
 
 def outcome(error_m: float, agents: int = 2) -> Outcome:
@@ -227,34 +86,110 @@ def test_reduction_closed_form():
     assert (low, high) == pytest.approx((0.25, 0.75))
 
 
-# --- Whole runs -------------------------------------------------------------------------------------------------------
+def test_nothing_to_improve_on_is_no_improvement():
+    assert _reduction([outcome(1.0)] * 2, [outcome(0.0)] * 2) == (0.0, (0.0, 0.0))
+
+
+def summary(spec: SceneSpec, errors_m: list[float], latencies_s: list[list[float]], **changes: Any) -> EnvAccuracy:
+    episodes = [
+        Episode({MODEL: outcome(error), STRAIGHT: outcome(2 * error)}, latencies)
+        for error, latencies in zip(errors_m, latencies_s, strict=True)
+    ]
+    return _summary(EvaluateConfig(**changes), "here", STILL, "idle", spec, episodes)
+
+
+def test_rows_and_intervals_closed_form():
+    """Two episodes of equally many forecasts: a quarter of the draws is one of them twice."""
+    found = summary(HIGHWAY_SPEC, [1.0, 3.0], [[0.1], [0.1]])
+    assert (found.model.min_ade_m, found.constant_velocity.min_ade_m) == pytest.approx((2.0, 4.0))
+    assert found.model.intervals["min_ade_m"] == pytest.approx((1.0, 3.0))
+    assert found.model.step_intervals["by_step_m"] == [pytest.approx((1.0, 3.0))] * HORIZON
+    assert found.reduction == pytest.approx(0.5)
+    assert found.reduction_interval == pytest.approx((0.5, 0.5))
+    assert [row.name for row in found.rows] == ["constant velocity (deployed)"] * 2 + ["constant velocity"]
+
+
+def test_an_episodes_first_scene_warms_up_and_is_not_timed():
+    found = summary(HIGHWAY_SPEC, [1.0] * 3, [[9.0, 0.001, 0.003], [9.0, 0.002], [0.002]])
+    assert found.latency_median_ms == pytest.approx(2.0)
+    assert found.latency_p95_ms == pytest.approx(2.85)  # of 1, 2, 2 and 3 ms
+
+
+@pytest.mark.parametrize(
+    ("layout", "miss_m", "rate"),
+    [("road", None, 0.5), ("road", 0.3, 1.0), ("arena", None, 1.0), ("arena", 2.0, 0.5), ("arena", 4.0, 0.0)],
+)
+def test_what_a_miss_is_depends_on_the_scale_of_the_place(layout: str, miss_m: float | None, rate: float):
+    """Of errors of 0.5 m and 3 m, a road's 2 m let one pass, and an arena's 0.1 m none."""
+    spec = HIGHWAY_SPEC if layout == "road" else tag_spec()
+    assert summary(spec, [0.5, 3.0], [[0.1]] * 2, miss_m=miss_m).model.miss_rate == rate
+
+
+def test_graph_accuracy_closed_form():
+    """Of five pairs whose truth is known, over two episodes, three are believed rightly."""
+    edge, none = (0.1, 0.9), (0.8, 0.2)
+    probs = np.array([[none, edge, edge], [none, none, none], [edge, edge, none]])
+    first = np.array([[-1, 1, 0], [0, -1, -1], [-1, -1, -1]])  # right, wrong, right
+    second = np.array([[-1, -1, -1], [-1, -1, 1], [1, -1, -1]])  # wrong, right
+    episodes = [Episode({}, [], [probs], [types]) for types in (first, second)]
+    found = _graph(episodes)
+    assert found is not None
+    assert (found.pairs, found.accuracy) == (5, pytest.approx(3 / 5))
+    assert found.true_connectivity == pytest.approx(3 / 5)
+    assert found.f1 == pytest.approx(2 * 2 / (2 * 2 + 1 + 1))
+    assert _graph([Episode({}, [0.1])]) is None
+
+
+def test_json_has_null_for_what_is_no_number():
+    content = {"a": [1.0, float("nan")], "b": {"c": (float("inf"), None, "nan", 3)}}
+    assert _finite(content) == {"a": [1.0, None], "b": {"c": [None, None, "nan", 3]}}
+
+
+# --- One environment --------------------------------------------------------------------------------------------------
 
 
 def run_config(**changes: Any) -> EvaluateConfig:
-    base = {"env_ids": ("two-way-v0",), "checkpoint": "constant-velocity", "episodes": 2, "samples": 3, "workers": 1}
-    return EvaluateConfig(**{**base, "max_steps": 6, "horizon_steps": 2, **changes})
+    base = {"episodes": 2, "samples": 3, "workers": 1, "max_steps": 6, "horizon_steps": 2}
+    return EvaluateConfig(**{**base, **changes})
 
 
-def test_constant_velocity_is_its_own_baseline(in_process: None):
-    result = evaluate_env(run_config(), "two-way-v0")
+def measure(env_id: str, checkpoint: str, **changes: Any) -> EnvAccuracy:
+    return evaluate_env(run_config(**changes), env_id, checkpoint)[0]
+
+
+def timeless(result: EnvAccuracy) -> EnvAccuracy:
+    return replace(result, latency_median_ms=0.0, latency_p95_ms=0.0)
+
+
+@pytest.mark.parametrize("env_id", [ROAD, TAG])
+def test_constant_velocity_is_its_own_baseline(env_id: str, in_process: None):
+    result = measure(env_id, STILL)
     assert result.reduction == pytest.approx(0.0, abs=1e-4)
     assert result.reduction_interval == pytest.approx((0.0, 0.0), abs=1e-4)
-    assert (result.checkpoint, result.dt_s) == ("constant-velocity", 1.0)
+    assert (result.checkpoint, result.dt_s) == (STILL, {ROAD: 1.0, TAG: 0.1}[env_id])
+    assert result.driver == {ROAD: "varied", TAG: "heuristic"}[env_id]
     for row in (result.model, result.model_samples):
         assert row.agents == result.constant_velocity.agents > 0
         for name in ("min_ade_m", "min_fde_m", "by_step_m", "rmse_m"):
             assert getattr(row, name) == pytest.approx(getattr(result.constant_velocity, name), rel=1e-4)
     assert (result.model.num_samples, result.model_samples.num_samples) == (1, 3)
-    assert result.constant_velocity.min_ade_m > 0.1
+    assert result.constant_velocity.min_ade_m > 0.01
+    assert result.nearest_neighbours is None and result.graph is None and result.histories == {}
+    assert len(result.rows) == 3
+
+
+def test_everyone_counts_in_an_arena_but_its_obstacles(in_process: None):
+    """Four agents, at each of the five scenes that have two steps of truth, in two episodes."""
+    assert measure(TAG, STILL).model.agents == 2 * 5 * 4
 
 
 def test_a_learned_checkpoint_is_measured(in_process: None, tmp_path: Path):
     path = tmp_path / "learned"
     info = CheckpointInfo(HIGHWAY_SPEC, SIZES, HORIZON, std_m=(1.0, 2.0, 3.0))
     save_checkpoint(path, tiny_model(HIGHWAY_SPEC), info)
-    config = run_config(checkpoint=str(path), horizon_steps=None)
-    result, again = (evaluate_env(config, "two-way-v0") for _ in range(2))
-    assert result == again
+    settings = {"horizon_steps": None, "history_steps": (1, 9)}
+    result, again = (measure(ROAD, str(path), **settings) for _ in range(2))
+    assert timeless(result) == timeless(again)
     assert result.checkpoint == "learned"
     assert len(result.model.by_step_m) == HORIZON
     assert result.model_samples.min_ade_m < result.model.min_ade_m
@@ -262,27 +197,137 @@ def test_a_learned_checkpoint_is_measured(in_process: None, tmp_path: Path):
     low, high = result.reduction_interval
     assert low <= result.reduction <= high
     assert all(np.isfinite(row.nll).all() and len(row.nll) == HORIZON for row in (result.model, result.model_samples))
+    assert [row.name for row in result.rows] == [
+        "dG-VAE", "dG-VAE", "dG-VAE, 1 of history", "dG-VAE, 9 of history", "constant velocity",
+    ]  # fmt: skip
+    assert result.histories[9].by_step_m == pytest.approx(result.model.by_step_m, rel=1e-4)  # all of the episode
+    assert result.histories[1].by_step_m != pytest.approx(result.model.by_step_m, rel=1e-4)
+    assert result.graph is not None and result.graph.accuracy is not None and result.graph.pairs > 0
+    assert 0 < result.latency_median_ms <= result.latency_p95_ms
+    # each episode alone: the ends of the interval over both
+    alone = [measure(ROAD, str(path), horizon_steps=None, episodes=1, seed=900_000 + i).model for i in range(2)]
+    assert all(row.intervals == {} for row in alone)
+    assert result.model.intervals["min_ade_m"] == pytest.approx(sorted(row.min_ade_m for row in alone), rel=1e-5)
+
+
+def test_a_learned_checkpoint_is_measured_among_many_learners(in_process: None, tmp_path: Path):
+    result = measure(TAG, save_tag(tmp_path / "tag"), horizon_steps=None, history_steps=(1,))
+    assert (result.checkpoint, result.driver, result.graph) == ("tag", "heuristic", None)
+    assert len(result.model.by_step_m) == HORIZON
+    assert result.model.agents == result.histories[1].agents == 2 * 4 * 4
+    assert result.model.min_ade_m != pytest.approx(result.constant_velocity.min_ade_m, rel=1e-3)
+    assert result.model_samples.min_ade_m < result.model.min_ade_m
+    assert 0 < result.latency_median_ms <= result.latency_p95_ms
+
+
+def test_neighbours_have_a_row_where_there_is_data(in_process: None, tmp_path: Path):
+    """A folder of stores, of which one is named by the env; it holds the very episode, six times."""
+    settings: dict[str, Any] = {"ego": "idle", "seed": 5, "episodes": 1}
+    (recorded,) = collect(CollectConfig(ROAD, tmp_path, 1, ("idle",), 5, 6, False, 1))
+    write_store(tmp_path / ROAD, StoreInfo(HighwayReader(make_env(ROAD)).spec, ROAD), [recorded] * 6)
+    for root in (tmp_path, tmp_path / ROAD):
+        found = measure(ROAD, STILL, neighbours=root, **settings)
+        assert found.nearest_neighbours is not None
+        assert found.nearest_neighbours.name == "nearest neighbours"
+        assert found.nearest_neighbours.min_ade_m == pytest.approx(0.0, abs=1e-3)
+        assert found.constant_velocity.min_ade_m > 0.1
+        assert found.nearest_neighbours in found.rows and len(found.rows) == 4
 
 
 def test_a_policy_trained_on_forecasts_drives(in_process: None, tmp_path: Path, highway_checkpoint: str):
-    policy = str(save_forecast_policy(tmp_path, "two-way-v0", highway_checkpoint))
-    settings = {"checkpoint": highway_checkpoint, "horizon_steps": None}
-    driven = evaluate_env(run_config(**settings, ego=policy), "two-way-v0")
+    policy = str(save_forecast_policy(tmp_path, ROAD, highway_checkpoint))
+    driven = measure(ROAD, highway_checkpoint, horizon_steps=None, ego=policy)
     assert driven.model.agents > 0
-    assert driven != evaluate_env(run_config(**settings), "two-way-v0")
+    assert driven.driver == policy
+    assert driven.model != measure(ROAD, highway_checkpoint, horizon_steps=None).model
 
 
-@pytest.mark.parametrize(
-    "changes", [{"checkpoint": "constant-velocity"}, {"horizon_steps": 2}], ids=["edges", "horizon"]
-)
+@pytest.mark.parametrize(("checkpoint", "horizon"), [(STILL, HORIZON), (None, 2)], ids=["edges", "horizon"])
 def test_a_policy_trained_on_other_forecasts_is_named(
-    changes: dict[str, Any], in_process: None, tmp_path: Path, highway_checkpoint: str
+    checkpoint: str | None, horizon: int, in_process: None, tmp_path: Path, highway_checkpoint: str
 ):
     """It gets the forecasts that are measured; these have other edges, or fewer steps, than it was trained on."""
-    policy = str(save_forecast_policy(tmp_path, "two-way-v0", highway_checkpoint))
-    config = run_config(**{"checkpoint": highway_checkpoint, "horizon_steps": HORIZON, "ego": policy, **changes})
+    policy = str(save_forecast_policy(tmp_path, ROAD, highway_checkpoint))
     with pytest.raises(UserError, match="policy .*policy.zip was trained on"):
-        evaluate_env(config, "two-way-v0")
+        measure(ROAD, checkpoint or highway_checkpoint, horizon_steps=horizon, ego=policy)
+
+
+def test_worst_cases_are_of_different_episodes_worst_first(in_process: None):
+    _, cases = evaluate_env(run_config(episodes=8), TAG, STILL)
+    assert len(cases) == 6
+    errors = [case.error_m for case in cases]
+    assert errors == sorted(errors, reverse=True)
+    assert len({case.seed for case in cases}) == 6
+
+
+def test_episodes_too_short_are_named(in_process: None):
+    assert measure(TAG, STILL, max_steps=2, horizon_steps=2).model.agents > 0
+    with pytest.raises(UserError, match=f"{TAG}: no forecast has 3 steps of truth; lower --horizon-steps"):
+        measure(TAG, STILL, max_steps=2, horizon_steps=3)
+
+
+# --- Whole runs -------------------------------------------------------------------------------------------------------
+
+
+class Run(NamedTuple):
+    out: Path
+    text: str
+
+
+@pytest.fixture(scope="module")
+def transfer_run(tmp_path_factory: pytest.TempPathFactory, highway_checkpoint: str) -> Run:
+    """Two checkpoints in two environments; the one that learned at steps of 1 s does not fit racetrack-v1."""
+    out, text = tmp_path_factory.mktemp("transfer") / "results", StringIO()
+    arguments = ["--env-ids", ROAD, "racetrack-v1", "--checkpoint", STILL, highway_checkpoint, "--episodes", "2"]
+    arguments += ["--samples", "2", "--max-steps", "5", "--horizon-steps", "2", "--history-steps", "1"]
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(text):
+        no_processes(patch)
+        forget()
+        patch.setattr("sys.argv", ["evaluate", *arguments, "--workers", "1", "--out", str(out)])
+        evaluate.main()
+        forget()
+    return Run(out, text.getvalue())
+
+
+def test_a_transfer_matrix_says_what_does_not_fit_and_why(transfer_run: Run):
+    text = (transfer_run.out / "accuracy.md").read_text()
+    matrix = text[text.index("### Transfer") :].splitlines()
+    assert matrix[2] == "| env | constant-velocity | tiny-highway |"
+    two_way, racetrack = ([cell.strip() for cell in line.strip("|").split("|")] for line in matrix[4:6])
+    assert (two_way[0], racetrack[0], racetrack[2]) == (ROAD, "racetrack-v1", "–")
+    assert "–" not in (two_way[1], two_way[2], racetrack[1])
+    assert matrix[7].startswith("* racetrack-v1 with tiny-highway: ")
+    assert "was trained at dt_s=1 but env 'racetrack-v1' steps at dt_s=0.2" in matrix[7]
+    assert "transfer: minADE₁ [m]" in transfer_run.text
+
+
+def test_a_transfer_matrix_is_in_the_json(transfer_run: Run):
+    content = read_json(transfer_run.out / "accuracy.json")
+    assert content["config"]["episodes"] == 2
+    assert content["config"]["seed"] == 900_000
+    assert {"command", "commit", "versions", "time"} <= set(content["provenance"])
+    (misfit,) = content["misfits"]
+    assert (misfit["env_id"], misfit["checkpoint"]) == ("racetrack-v1", "tiny-highway")
+    assert "dt_s" in misfit["why"]
+    measured = [(r["env_id"], r["checkpoint"]) for r in content["results"]]
+    assert measured == [(ROAD, STILL), (ROAD, "tiny-highway"), ("racetrack-v1", STILL)]
+    straight, learned, _ = content["results"]
+    assert straight["reduction"] == pytest.approx(0.0, abs=1e-4)
+    assert straight["model"]["min_ade_m"] == pytest.approx(learned["constant_velocity"]["min_ade_m"], rel=1e-4)
+    assert set(learned["histories"]) == {"1"}
+    low, high = learned["model"]["intervals"]["min_ade_m"]
+    assert low <= learned["model"]["min_ade_m"] <= high
+    assert learned["graph"]["pairs"] > 0
+
+
+def test_each_pair_has_pictures(transfer_run: Run):
+    pairs = [f"{ROAD}.{STILL}", f"{ROAD}.tiny-highway", f"racetrack-v1.{STILL}"]
+    pictures = {f"{pair}.{kind}.png" for pair in pairs for kind in ("by_horizon", "worst")}
+    assert {p.name for p in transfer_run.out.iterdir()} == {*pictures, "accuracy.json", "accuracy.md"}
+    for name in pictures:
+        pixels = plt.imread(transfer_run.out / name)
+        assert min(pixels.shape[:2]) > 300
+        assert pixels[..., :3].std() > 0.05  # something is drawn
 
 
 def test_the_command_writes_json_and_markdown(
@@ -290,42 +335,44 @@ def test_the_command_writes_json_and_markdown(
 ):
     """With a real worker process, as a user runs it."""
     out = tmp_path / "results"
-    arguments = ["--env-ids", "two-way-v0", "--checkpoint", "constant-velocity", "--episodes", "2", "--samples", "2"]
+    arguments = ["--env-ids", TAG, "--checkpoint", STILL, "--episodes", "2", "--samples", "2"]
     arguments += ["--max-steps", "5", "--horizon-steps", "2", "--workers", "1", "--out", str(out)]
     code, errors, output = run_command(evaluate.main, arguments, monkeypatch, capsys)
     assert (code, errors) == (0, [])
-    assert "two-way-v0, checkpoint constant-velocity" in output
-    assert sorted(p.name for p in out.iterdir()) == ["accuracy.json", "accuracy.md"]
-    content = json.loads((out / "accuracy.json").read_text())
-    assert content["config"]["episodes"] == 2
-    assert content["config"]["seed"] == 900_000
-    assert {"command", "commit", "versions", "time"} <= set(content["provenance"])
-    (result,) = content["results"]
-    assert result["env_id"] == "two-way-v0"
-    assert result["reduction"] == pytest.approx(0.0, abs=1e-4)
-    assert result["model"]["min_ade_m"] == pytest.approx(result["constant_velocity"]["min_ade_m"], rel=1e-4)
+    assert f"{TAG}, checkpoint {STILL}, driven heuristic" in output
+    (result,) = read_json(out / "accuracy.json")["results"]
+    assert result["env_id"] == TAG
     lines = (out / "accuracy.md").read_text().splitlines()
     assert lines[0].startswith("| env | checkpoint | dt [s] | steps | minADE₁ [m] |")
-    assert lines[2].startswith("| two-way-v0 | constant-velocity | 1 | 2 | ")
-    assert "### two-way-v0" in lines
+    assert lines[2].startswith(f"| {TAG} | {STILL} | 0.1 | 2 | ")
+    assert f"### {TAG}, checkpoint {STILL}, driven heuristic" in lines
+    assert not any("Transfer" in line for line in lines)
 
 
-def test_episodes_too_short_are_named(in_process: None):
-    assert evaluate_env(run_config(max_steps=2, horizon_steps=2), "two-way-v0").model.agents > 0
-    with pytest.raises(UserError, match="two-way-v0: no forecast has 3 steps of truth; lower --horizon-steps"):
-        evaluate_env(run_config(max_steps=2, horizon_steps=3), "two-way-v0")
+def test_a_driver_is_named_where_no_heuristic_knows_the_env(in_process: None):
+    """Neither the default nor the early look at every id asks for a heuristic that does not exist."""
+    crossing = "intersection-multi-agent-v2"
+    assert measure(crossing, STILL, max_steps=2, horizon_steps=1, episodes=1).driver == "varied"
 
 
 ERRORS = {
-    "unknown-id": (["--env-ids", "two-way-v0", "nope-v0"], "cannot make env 'nope-v0'"),
+    "unknown-id": (["--env-ids", ROAD, "nope-v0"], "cannot make env 'nope-v0'"),
     "unknown-checkpoint": (["--checkpoint", "nowhere"], "no checkpoint 'nowhere'"),
+    "same-names": (["--checkpoint", "a/best", "b/best"], "each checkpoint needs a name of its own, got best, best"),
     "zero-episodes": (["--episodes", "0"], "episodes must be at least 1, got 0"),
     "zero-samples": (["--samples", "0"], "samples must be at least 1, got 0"),
+    "zero-workers": (["--workers", "0"], "workers must be at least 1, got 0"),
     "negative-steps": (["--max-steps", "-5"], "max_steps must be at least 1, got -5"),
     "zero-horizon": (["--horizon-steps", "0"], "horizon_steps must be at least 1, got 0"),
+    "zero-history": (["--history-steps", "3", "0"], "history_steps must be at least 1, got (3, 0)"),
     "negative-seed": (["--seed", "-1"], "seed must not be negative, got -1"),
+    "zero-miss": (["--miss-m", "0"], "miss_m must be positive, got 0"),
     "unfit-ego": (["--ego", "keep-lane"], "keep-lane needs continuous steering"),
-    "too-short": (["--max-steps", "1", "--episodes", "1"], "two-way-v0: no forecast has 5 steps of truth"),
+    "unknown-ego": (["--ego", "reckless"], "ego must be one of random"),
+    "unfit-driver": (["--env-ids", TAG, "--ego", "keep-lane"], "driver must be one of random"),
+    "no-neighbours": (["--neighbours", "nowhere"], "neighbours: there is no episode store at nowhere; record one"),
+    "no-store": (["--neighbours", "."], ". is not an episode store"),
+    "too-short": (["--max-steps", "1", "--episodes", "1"], f"{ROAD}: no forecast has 5 steps of truth"),
 }
 
 
@@ -334,8 +381,8 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     case: str, in_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):
     arguments, message = ERRORS[case]
-    base = ["--env-ids", "two-way-v0", "--checkpoint", "constant-velocity", "--workers", "1"]
-    base += ["--out", str(tmp_path / "results")]
+    base = ["--env-ids", ROAD, "--checkpoint", STILL, "--workers", "1", "--out", str(tmp_path / "results")]
+    monkeypatch.chdir(tmp_path)
     code, errors, _ = run_command(evaluate.main, [*base, *arguments], monkeypatch, capsys)
     assert code == 2
     assert len(errors) == 1
@@ -343,7 +390,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_checkpoint_of_another_time_step_is_one_line(
+def test_a_single_checkpoint_that_does_not_fit_is_one_line(
     in_process: None, highway_checkpoint: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):
     arguments = ["--env-ids", "racetrack-v1", "--checkpoint", highway_checkpoint, "--episodes", "1"]
@@ -351,3 +398,23 @@ def test_a_checkpoint_of_another_time_step_is_one_line(
     assert code == 2
     assert len(errors) == 1
     assert "was trained at dt_s=1 but env 'racetrack-v1' steps at dt_s=0.2" in errors[0]
+
+
+def test_two_checkpoints_of_which_none_fits_are_one_line(
+    in_process: None, highway_checkpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+):  # fmt: skip
+    arguments = ["--env-ids", "racetrack-v1", "--checkpoint", highway_checkpoint, save_tag(tmp_path / "tag")]
+    code, errors, _ = run_command(evaluate.main, arguments, monkeypatch, capsys)
+    assert code == 2
+    assert len(errors) == 1
+    assert errors[0].startswith("error: no checkpoint fits any environment: ")
+
+
+def test_missing_neighbours_are_no_misfit_of_a_checkpoint(
+    in_process: None, highway_checkpoint: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    arguments = ["--env-ids", ROAD, "--checkpoint", STILL, highway_checkpoint, "--neighbours", "nowhere"]
+    code, errors, _ = run_command(evaluate.main, arguments, monkeypatch, capsys)
+    assert (code, len(errors)) == (2, 1)
+    assert errors[0].startswith("error: neighbours: there is no episode store at nowhere")

@@ -15,7 +15,7 @@ from envs.shared import check_shared
 from predictor.errors import ProtocolError, UserError
 from predictor.scene import Scene
 
-IDLE, FASTER = 1, 2
+SLOWER, IDLE = 0, 1
 
 
 def empty_road(agents: int = 2, **config: Any) -> HighwayParallelEnv:
@@ -115,10 +115,11 @@ def test_a_vehicle_without_an_agent_drives_on_and_leaves_the_map():
     gone = place(env, 0, ("il2", "o2", 0), 30.0)
     target_mps = gone.target_speed
     place(env, 1, ("o0", "ir0", 0), 10.0)
+    env.step(all_idle(env))
     seen = []
-    for _ in range(12):
+    for _ in range(11):
         before = gone.position.copy()
-        env.step({agent: IDLE for agent in env.agents} | {"vehicle_0": FASTER})  # the last one's word no longer counts
+        env.step({"vehicle_0": SLOWER, "vehicle_1": IDLE})  # what the first one wants no longer counts
         seen.append(gone in env.highway.road.vehicles)
         if seen[-1]:
             assert np.linalg.norm(gone.position - before) > 5

@@ -9,7 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from predictor import metrics
-from predictor.accuracy import Outcome, Statistic, Tally, fitted_std_m, run_window_batch, run_windows, summarise
+from predictor.accuracy import (
+    Accuracy,
+    Outcome,
+    Statistic,
+    Tally,
+    fitted_std_m,
+    run_window_batch,
+    run_windows,
+    summarise,
+)
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.data.store import Episode
 from predictor.data.windows import WindowBatch, Windows
@@ -135,6 +144,47 @@ def test_one_window_has_no_standard_error():
     row = summarise("a", [OUTCOMES[0]])
     assert row.statistics["min_ade_m"] == Statistic(2.0, None, 1)
     assert row.step_errors["by_step_m"] == [None, None]
+
+
+def tallied(outcomes: list[Outcome], batch_intervals: bool = True) -> Accuracy:
+    tally = Tally((1.0, 2.0))
+    for o in outcomes:
+        tally.add(o)
+    return tally.accuracy("model", batch_intervals=batch_intervals)
+
+
+def test_intervals_over_batches_closed_form():
+    """Two of the three batches count something: the intervals end at what each of them says alone."""
+    row = tallied(OUTCOMES)
+    assert row.intervals["min_ade_m"] == pytest.approx((1.0, 2.0))
+    assert row.intervals["min_fde_m"] == pytest.approx((0.0, 3.0))
+    assert row.intervals["miss_rate"] == (0.0, 1.0)
+    assert row.intervals["overall_rmse_m"] == pytest.approx((math.sqrt(9 / 2), math.sqrt((1.5**2 + 9 + 4.5**2) / 3)))
+    assert row.step_intervals["by_step_m"] == [pytest.approx((1.0, 2.0)), pytest.approx((0.0, 3.0))]
+    assert row.step_intervals["rmse_m"] == [
+        pytest.approx((math.sqrt((1.5**2 + 9) / 2), 3.0)),
+        pytest.approx((0.0, 4.5)),
+    ]
+    assert len(row.step_intervals["nll"]) == 2
+    alone = [tallied([o]) for o in (OUTCOMES[0], OUTCOMES[2])]
+    assert row.step_intervals["nll"][0] == pytest.approx(sorted(one.nll[0] for one in alone))
+
+
+def test_equal_batches_have_intervals_without_width():
+    row = tallied([gaussian(0, windows=20)] * 3)
+    for name, (low, high) in row.intervals.items():
+        whole = np.mean(row.coverage) if name == "coverage" else getattr(row, name)
+        assert low == pytest.approx(high) == pytest.approx(whole, rel=1e-2)
+    for name, found in row.step_intervals.items():
+        assert found == [pytest.approx((value, value)) for value in getattr(row, name)]
+
+
+def test_one_batch_has_no_interval():
+    row = tallied([gaussian(0)])
+    assert row.intervals == {}
+    assert all(found == [None, None] for found in row.step_intervals.values())
+    assert tallied(OUTCOMES, batch_intervals=False).intervals == {}
+    assert tallied(OUTCOMES, batch_intervals=False).step_intervals == {}
 
 
 def test_a_row_is_json():

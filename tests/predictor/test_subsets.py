@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from predictor.subsets import Statistic, ratio_statistics, subset_ratios, subset_statistics
+from predictor.subsets import Statistic, batch_interval, ratio_statistics, subset_ratios, subset_statistics
 
 
 def parts(found: Statistic | None) -> tuple[float, float, int]:
@@ -71,3 +71,38 @@ def test_standard_error_is_about_right():
     rng = np.random.default_rng(0)
     errors = [parts(ratio_statistics(rng.normal(size=500) * 2, np.ones(500), seed=i))[1] for i in range(50)]
     assert np.mean(errors) == pytest.approx(2 / np.sqrt(500), rel=0.05)
+
+
+# --- Intervals over batches -------------------------------------------------------------------------------------------
+
+
+def test_the_interval_of_two_batches_spans_their_own_ratios():
+    """A quarter of the draws takes one batch twice, and a quarter the other."""
+    assert batch_interval(np.array([3.0, 30.0]), np.array([3.0, 10.0])) == pytest.approx((1.0, 3.0))
+    assert batch_interval(np.array([4.0, 32.0]), np.array([1.0, 2.0]), root=True) == pytest.approx((2.0, 4.0))
+
+
+@given(st.integers(2, 30), st.floats(0.1, 100), st.integers(0, 5))
+def test_equal_batches_leave_no_doubt(batches: int, value: float, seed: int):
+    counts = np.random.default_rng(seed).integers(1, 9, batches).astype(np.float64)
+    assert batch_interval(value * counts, counts, seed) == pytest.approx((value, value))
+
+
+@pytest.mark.parametrize("counts", [[], [4.0], [0.0, 4.0, 0.0], [0.0, 0.0]])
+def test_fewer_than_two_batches_that_count_have_no_interval(counts: list[float]):
+    assert batch_interval(np.ones(len(counts)), np.array(counts)) is None
+
+
+def test_batches_that_count_nothing_say_nothing():
+    """They are drawn like the others; a draw of nothing else has no ratio and is left out."""
+    assert batch_interval(np.array([0.0, 2.0, 6.0]), np.array([0.0, 1.0, 2.0])) == pytest.approx((2.0, 3.0))
+
+
+def test_intervals_depend_on_the_seed_alone_and_are_about_right():
+    """±1.96 × 2 / √400 for means of 400 batches of one with deviation 2."""
+    values, ones = 2 * np.random.default_rng(0).normal(size=400), np.ones(400)
+    first, again, other = (batch_interval(values, ones, seed=seed) for seed in (0, 0, 1))
+    assert first == again != other
+    assert first is not None
+    assert first[0] < values.mean() < first[1]
+    assert first[1] - first[0] == pytest.approx(2 * 1.96 * 2 / 20, rel=0.15)

@@ -1,0 +1,41 @@
+"""What the tests of the evaluation in live environments share: a small checkpoint for mpe2, and a clean slate."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from envs import live
+from envs.parallel_registry import make_parallel_env, shared_reader_for
+from predictor.checkpoint import CheckpointInfo, save_checkpoint
+from predictor.dgvae import DGVAE
+from predictor.scene import SceneSpec
+from tests.envs.helpers import HORIZON, SIZES
+
+TAG = "simple_tag_v3"
+TAG_CHANGES = (0.1, 0.1, 0.5, 0.5, 1.0, 1.0, 1.0)
+"""Typical change per step of each feature of mpe2's scenes."""
+
+
+def tag_spec() -> SceneSpec:
+    """Scenes of simple_tag_v3."""
+    return shared_reader_for(make_parallel_env(TAG)).spec
+
+
+def save_tag(path: Path, has_ego: bool = False) -> str:
+    """A small dG-VAE with random weights for simple_tag_v3, as it is or as trained around an ego."""
+    spec, sizes = replace(tag_spec(), has_ego=has_ego), replace(SIZES, delta_scales=TAG_CHANGES)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = DGVAE(spec, sizes, HORIZON)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.mul_(2.0)
+    save_checkpoint(path, model.eval(), CheckpointInfo(spec, sizes, HORIZON))
+    return str(path)
+
+
+def forget() -> None:
+    """Drop what `envs.live` keeps from episode to episode: nothing of one test may serve in another."""
+    for kept in (live._kept_world, live._kept_forecaster, live._kept_neighbours):
+        kept.cache_clear()
