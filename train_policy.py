@@ -158,7 +158,10 @@ def film(config: TrainPolicyConfig, model: BaseAlgorithm) -> Path | None:
     path = config.folder / "video.mp4"
     task = config.plan.task
     if task.is_parallel:
-        record_task(task, model, EVALUATION_SEED, MAX_VIDEO_STEPS).write_video(path)
+        recording = record_task(task, model, EVALUATION_SEED, MAX_VIDEO_STEPS)
+        if recording is None:
+            return None
+        recording.write_video(path)
         return path
     checkpoint = task.forecaster
     if config.observe == "none" and config.env_id not in CHECKPOINTS:

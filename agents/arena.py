@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -12,6 +12,7 @@ from agents.rows import make_rows
 from agents.task import Task
 
 
+@runtime_checkable
 class Arena(Protocol):
     """Plays episodes; results depend on policy and seeds alone."""
 

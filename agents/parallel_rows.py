@@ -4,9 +4,9 @@ Agents that do not learn are driven by name (`envs.drivers`), anew in each episo
 decides what a policy sees.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from pettingzoo import ParallelEnv
@@ -18,9 +18,10 @@ from agents.task import Task, resolve_device
 from envs.drivers import Driver, make_driver
 from envs.multiagent import AgentMonitor, ParallelVecEnv, learners_named, role_of
 from envs.parallel import ForecastParallelEnv
-from envs.parallel_registry import PARALLEL_CHECKPOINTS, make_parallel_env
+from envs.parallel_registry import PARALLEL_CHECKPOINTS, make_parallel_env, shared_reader_for
 from envs.render_shared import SharedRecording, record_parallel_episode
 from predictor.checkpoint import CONSTANT_VELOCITY
+from predictor.errors import UserError
 
 
 class DrivenEnv(BaseParallelWrapper):
@@ -31,7 +32,6 @@ class DrivenEnv(BaseParallelWrapper):
         driver: its name in `envs.drivers`.
 
     Attributes:
-        driver: of this episode.
         episodes: resets so far.
     """
 
@@ -40,15 +40,26 @@ class DrivenEnv(BaseParallelWrapper):
         super().__init__(env)
         self._name = driver
         self._rng = np.random.default_rng(0)
-        self.driver: Driver
+        self._driver: Driver | None = None
         self.episodes = 0
+
+    @property
+    def driver(self) -> Driver:
+        """Of this episode; made when somebody first needs it, as not every name can drive every environment.
+
+        Raises:
+            UserError: as `envs.drivers.make_driver`.
+        """
+        if self._driver is None:
+            self._driver = make_driver(self._name, self.env, self._rng)
+        return self._driver
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], Any]:
         """Reset; a seed also fixes the drivers of this and the following episodes."""
         observations, infos = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._rng = np.random.default_rng(seed)
-        self.driver = make_driver(self._name, self.env, self._rng)
+        self._driver = None
         self.episodes += 1
         return observations, infos
 
@@ -72,13 +83,13 @@ class MakeCopy:
     render_mode: str | None = None
     """Passed on to the environment."""
 
-    def __call__(self) -> DrivenEnv:
-        """The environment, with forecasts unless the task observes none, and a driver."""
+    def __call__(self) -> ParallelEnv:
+        """The environment in a `DrivenEnv`, with forecasts around it unless the task observes none."""
         options = {} if self.render_mode is None else {"render_mode": self.render_mode}
-        env = make_parallel_env(self.task.env_id, **options)
-        if self.task.observe != "none":
-            env = ForecastParallelEnv(env, self.task.forecaster, device=resolve_device(self.task.device))
-        return DrivenEnv(env, self.task.partner)
+        env = DrivenEnv(make_parallel_env(self.task.env_id, **options), self.task.partner)
+        if self.task.observe == "none":
+            return env
+        return ForecastParallelEnv(env, self.task.forecaster, device=resolve_device(self.task.device))
 
 
 def learners_of(task: Task, env: ParallelEnv) -> list[str]:
@@ -101,9 +112,10 @@ class ParallelArena:
 
     Args:
         task: a PettingZoo task.
-    """
 
-    baselines = ("random", "heuristic")
+    Attributes:
+        baselines: random and heuristic; idle where no heuristic drives the environment.
+    """
 
     def __init__(self, task: Task) -> None:
         """One copy; results do not depend on how many there are."""
@@ -111,7 +123,8 @@ class ParallelArena:
         venv = self._monitor.venv
         assert isinstance(venv, ParallelVecEnv)
         self._venv = venv
-        self._env: DrivenEnv = venv.envs[0]
+        self._env: Any = venv.envs[0]  # has what `DrivenEnv` has
+        self.baselines = ("random", "heuristic" if _has_heuristic(self._env) else "idle")
 
     def play(
         self, policy: BaseAlgorithm | str, seeds: Sequence[int], on_episode: Callable[[], None] = lambda: None
@@ -143,17 +156,32 @@ class ParallelArena:
     def _driven(self, name: str, seed: int) -> EpisodeResult:
         env = self._env
         observations, _ = env.reset(seed=seed)
-        driver = make_driver(name, env.env, np.random.default_rng(seed))
+        driver = make_driver(name, env, np.random.default_rng(seed))
         returns = dict.fromkeys(self._venv.row_agents, 0.0)
-        steps = 0
-        while env.agents:
+        steps, lived = 0, set(env.agents)
+        while not (lived.issuperset(returns) and returns.keys().isdisjoint(env.agents)) and env.agents:
             own = own_observations(observations)
-            actions = env.driver(own) | {a: v for a, v in driver(own).items() if a in returns}
-            observations, rewards, *_ = env.step(actions)
+            actions = driver({agent: seen for agent, seen in own.items() if agent in returns})
+            observations, rewards, *_ = env.step(_partners_actions(env, own, returns) | actions)
+            lived.update(env.agents)
             for agent in returns:
                 returns[agent] += float(rewards.get(agent, 0.0))
             steps += 1
         return _result(seed, steps, returns)
+
+
+def _partners_actions(env: Any, own: Mapping[str, Any], learners: Collection[str]) -> dict[str, Any]:
+    """Actions of those who do not learn."""
+    others = {agent: seen for agent, seen in own.items() if agent not in learners}
+    return env.driver(others) if others else {}
+
+
+def _has_heuristic(env: ParallelEnv) -> bool:
+    try:
+        make_driver("heuristic", env, np.random.default_rng(0))
+    except UserError:
+        return False
+    return True
 
 
 def _result(seed: int, steps: int, returns: Mapping[str, float]) -> EpisodeResult:
@@ -164,19 +192,27 @@ def _result(seed: int, steps: int, returns: Mapping[str, float]) -> EpisodeResul
     return EpisodeResult(seed, float(np.mean(list(returns.values()))), steps, None, float("nan"), by_role)
 
 
-def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) -> SharedRecording:
-    """Play one episode for a film; forecasts are drawn also for a policy that sees none."""
+def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) -> SharedRecording | None:
+    """Play one episode for a film; forecasts are drawn also for a policy that sees none.
+
+    Returns:
+        The recording; None if no reader knows the environment.
+    """
     filmed = task
     if task.observe == "none":
+        if not _has_reader(task.env_id):
+            return None
         shown = None if task.env_id in PARALLEL_CHECKPOINTS else CONSTANT_VELOCITY
         filmed = replace(task, observe="forecast", checkpoint=shown)
     env = MakeCopy(filmed)()
+    assert isinstance(env, ForecastParallelEnv)
     learners = learners_of(task, env)
-    rows = ParallelVecEnv([MakeCopy(task)], agents=learners, partner=drive)  # knows how spaces are padded
+    rows = make_parallel_rows(task, 1).venv  # knows how spaces are padded
+    assert isinstance(rows, ParallelVecEnv)
 
     def act(observations: dict[str, Any]) -> dict[str, Any]:
         own = own_observations(observations)
-        actions = env.driver(own)
+        actions = _partners_actions(env, own, learners)
         for agent in observations:
             if agent in learners:
                 seen = own[agent] if task.observe == "none" else observations[agent]
@@ -185,7 +221,18 @@ def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) ->
         return actions
 
     try:
-        return record_parallel_episode(cast(ForecastParallelEnv, env), act, seed=seed, max_steps=max_steps)
+        return record_parallel_episode(env, act, seed=seed, max_steps=max_steps)
     finally:
         env.close()
         rows.close()
+
+
+def _has_reader(env_id: str) -> bool:
+    env = make_parallel_env(env_id)
+    try:
+        shared_reader_for(env)
+    except UserError:
+        return False
+    finally:
+        env.close()
+    return True

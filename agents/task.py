@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import gymnasium as gym
+import numpy as np
 import torch
 
-from envs.drivers import DRIVER_NAMES
-from envs.multiagent import ParallelVecEnv
+from envs.drivers import DRIVER_NAMES, make_driver
+from envs.multiagent import ParallelVecEnv, learners_named
 from envs.parallel import ForecastParallelEnv
 from envs.parallel_registry import is_parallel_id, make_parallel_env
 from envs.registry import make_env, native_task_of
@@ -83,7 +84,7 @@ class Task:
         """Make the environment, with its forecaster, and return its action space.
 
         Raises:
-            UserError: as `scene_spec`.
+            UserError: as `scene_spec`; unknown learners, or a partner that cannot drive the others.
         """
         if self.is_parallel:
             return self._check_parallel()
@@ -96,7 +97,11 @@ class Task:
         env = make_parallel_env(self.env_id)
         if self.observe != "none":
             env = ForecastParallelEnv(env, self.forecaster, device=resolve_device(self.device))
-        space = ParallelVecEnv([lambda: env]).action_space
+        learners = learners_named(env.possible_agents, self.learners, self.env_id)
+        partnered = len(learners) < len(env.possible_agents)
+        if partnered:
+            make_driver(self.partner, env, np.random.default_rng(0))
+        space = ParallelVecEnv([lambda: env], agents=learners, partner="random" if partnered else None).action_space
         env.close()
         return space
 

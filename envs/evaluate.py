@@ -29,7 +29,8 @@ from envs.worlds import default_drivers, open_world
 from predictor.accuracy import Accuracy, Outcome, Tally, fitted_std_m
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, read_info, resolve
 from predictor.errors import UserError, run_entry_point
-from predictor.evaluate import accuracy_table
+from predictor.data.store import read_info_of
+from predictor.evaluate import ROW_NAMES, accuracy_table
 from predictor.graph import pair_mask
 from predictor.graph_metrics import GraphAccuracy, GraphTally
 from predictor.metrics import MISS_THRESHOLD_M, min_ade
@@ -62,8 +63,8 @@ class EvaluateConfig:
     """Steps to forecast; None takes each checkpoint's."""
     history_steps: tuple[int, ...] = ()
     """Also measure the model with a memory of so many steps only: what its memory is worth."""
-    neighbours: Path | None = None
-    """Recorded data for the nearest-neighbour row: a store, or a folder of stores named by env id."""
+    neighbours: tuple[Path, ...] = ()
+    """Recorded data for the nearest-neighbour row: stores, or folders of stores named by env id; others' are left."""
     miss_m: float | None = None
     """Final displacement above which a forecast misses [m]; None: 2 m on roads, a tenth of a small arena's scale."""
     max_steps: int = 200
@@ -165,7 +166,7 @@ def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = N
 
 
 def _play_all(config: EvaluateConfig, env_id: str, checkpoint: str, driver: str, horizon: int) -> list[Episode]:
-    neighbours = _neighbour_store(config.neighbours, env_id)
+    neighbours = _neighbour_stores(config.neighbours, env_id)
     tasks = [
         EpisodeTask(
             env_id, checkpoint, driver, config.seed + i, config.samples, horizon, config.max_steps,
@@ -178,13 +179,20 @@ def _play_all(config: EvaluateConfig, env_id: str, checkpoint: str, driver: str,
         return list(track(pool.imap(play, tasks, chunksize=2), f"evaluate {env_id}", total=len(tasks)))
 
 
-def _neighbour_store(root: Path | None, env_id: str) -> str | None:
-    if root is None:
-        return None
-    store = root / env_id if (root / env_id).is_dir() else root
-    if not store.is_dir():
-        raise UserError(f"neighbours: there is no episode store at {store}; record one with python -m envs.collect")
-    return str(store)
+def _neighbour_stores(roots: Sequence[Path], env_id: str) -> tuple[str, ...]:
+    """Those of the given stores that were recorded in this environment."""
+    found = []
+    for root in roots:
+        store = root / env_id if (root / env_id).is_dir() else root
+        if store == root and not (root / "zarr.json").exists() and any(root.glob("*/zarr.json")):
+            continue  # a folder of other environments' stores
+        if read_info_of(store).source == env_id:
+            found.append(str(store))
+    if roots and not found:
+        raise UserError(
+            f"neighbours: no store of {env_id} in {', '.join(map(str, roots))}; record one with python -m envs.collect"
+        )
+    return tuple(found)
 
 
 def _summary(
@@ -195,7 +203,7 @@ def _summary(
     first = [Outcome(o.forecast[:, :1], o.future, o.valid) for o in outcomes[MODEL]]
     learned = checkpoint != CONSTANT_VELOCITY
     std_m = read_info(Path(checkpoint)).std_m if learned else fitted_std_m(first)
-    name = MODEL_NAMES.get(read_info(Path(checkpoint)).model, "model") if learned else "constant velocity (deployed)"
+    name = ROW_NAMES.get(read_info(Path(checkpoint)).model, "model") if learned else "constant velocity (deployed)"
 
     def row(title: str, found: Sequence[Outcome], spread: Sequence[float]) -> Accuracy:
         tally = Tally(spread, miss_m)
@@ -224,10 +232,6 @@ def _summary(
         float(np.median(latencies_ms)),
         float(np.percentile(latencies_ms, 95)),
     )
-
-
-MODEL_NAMES = {"dgvae": "dG-VAE", "dnri": "dNRI", "imma": "IMMA", "lstm": "LSTM", "mlp": "MLP"}
-"""By the names of `predictor.models`."""
 
 
 def _graph(episodes: Sequence[Episode]) -> GraphAccuracy | None:
@@ -270,7 +274,7 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
     results: list[EnvAccuracy] = []
     misfits: dict[tuple[str, str], str] = {}
     for env_id in config.env_ids:
-        _neighbour_store(config.neighbours, env_id)  # what is missing for all checkpoints is no misfit of one
+        _neighbour_stores(config.neighbours, env_id)  # what is missing for all checkpoints is no misfit of one
         for checkpoint in config.checkpoint or (None,):
             try:
                 result, cases = evaluate_env(config, env_id, checkpoint)

@@ -92,7 +92,7 @@ def _matrix(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], 
     envs = list(dict.fromkeys([r.env_id for r in results] + [env for env, _ in misfits]))
     cells = {env: dict.fromkeys(names, "–") for env in envs}
     for r in results:
-        cells[r.env_id][r.checkpoint] = f"{r.model.min_ade_m:.2f} ({100 * r.reduction:.0f} %)"
+        cells[r.env_id][r.checkpoint] = f"{_metres(r.model.min_ade_m)} ({100 * r.reduction:.0f} %)"
     return cells
 
 
@@ -101,12 +101,16 @@ def _cells(row: "EnvAccuracy") -> list[str]:
     one, many, straight, near = row.model, row.model_samples, row.constant_velocity, row.nearest_neighbours
     return [
         row.env_id, row.checkpoint, f"{row.dt_s:g}", str(len(one.by_step_m)),
-        f"{one.min_ade_m:.2f}", f"{one.min_fde_m:.2f}", f"{many.min_ade_m:.2f}",
-        "–" if near is None else f"{near.min_ade_m:.2f}",
-        f"{straight.min_ade_m:.2f} / {straight.min_fde_m:.2f}",
+        _metres(one.min_ade_m), _metres(one.min_fde_m), _metres(many.min_ade_m),
+        "–" if near is None else _metres(near.min_ade_m),
+        f"{_metres(straight.min_ade_m)} / {_metres(straight.min_fde_m)}",
         f"{100 * row.reduction:.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %", str(one.agents),
         f"{row.latency_median_ms:.1f}",
     ]  # fmt: skip
+
+
+def _metres(value: float) -> str:
+    return f"{value:.2f}" if value >= 1 else f"{value:.3f}"
 
 
 def write_pictures(out: Path, result: "EnvAccuracy", cases: Sequence[Case]) -> None:
@@ -114,9 +118,15 @@ def write_pictures(out: Path, result: "EnvAccuracy", cases: Sequence[Case]) -> N
     matplotlib.use("Agg")
     out.mkdir(parents=True, exist_ok=True)
     stem = f"{result.env_id.replace('/', '-')}.{result.checkpoint}"
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    plot_by_horizon(axes[0], result.rows, result.dt_s, "by_step_m", "displacement of the best sample [m]")
-    plot_by_horizon(axes[1], [r for r in result.rows if r.nll], result.dt_s, "nll", "negative log-likelihood [nats]")
+    figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
+    threshold_m = result.model.miss_threshold_m
+    for ax, quantity, label in (
+        (axes[0, 0], "by_step_m", "displacement of the best sample [m]"),
+        (axes[0, 1], "rmse_m", "RMSE of the samples' mean [m]"),
+        (axes[1, 0], "nll", "negative log-likelihood [nats]"),
+        (axes[1, 1], "miss_by_step", f"share more than {threshold_m:g} m off"),
+    ):
+        plot_by_horizon(ax, [r for r in result.rows if getattr(r, quantity)], result.dt_s, quantity, label)
     figure.suptitle(f"{title(result)}; bands are 95 % intervals over episodes")
     figure.savefig(out / f"{stem}.by_horizon.png", dpi=130)
     plt.close(figure)

@@ -21,7 +21,7 @@ from envs.shared import SharedStream
 from envs.worlds import EgoWorld, SharedWorld, World, open_world
 from envs.wrappers import ForecastObservation
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.baselines.nearest_neighbour import NearestNeighbour, fit_from_store
+from predictor.baselines.nearest_neighbour import NearestNeighbour, fit_from_stores
 from predictor.checkpoint import load_forecaster
 from predictor.forecaster import Forecaster
 from predictor.metrics import displacement
@@ -60,8 +60,8 @@ class EpisodeTask:
     """Steps forecast."""
     max_steps: int
     """Cut longer episodes here."""
-    neighbours: str | None = None
-    """Store to fit the nearest-neighbour forecaster to; None leaves it out."""
+    neighbours: tuple[str, ...] = ()
+    """Stores to fit the nearest-neighbour forecaster to; none leaves it out."""
     histories: tuple[int, ...] = ()
     """Also forecast with memories of so many steps only."""
 
@@ -171,14 +171,14 @@ def _kept_forecaster(checkpoint: str, spec: SceneSpec, source: str) -> Forecaste
 
 
 @functools.lru_cache(maxsize=2)
-def _kept_neighbours(store: str, spec: SceneSpec, horizon_steps: int) -> NearestNeighbour:
-    return fit_from_store(Path(store), spec, horizon_steps)
+def _kept_neighbours(stores: tuple[str, ...], spec: SceneSpec, horizon_steps: int) -> NearestNeighbour:
+    return fit_from_stores([Path(store) for store in stores], spec, horizon_steps)
 
 
 def _baselines(task: EpisodeTask, spec: SceneSpec) -> dict[str, _Baseline]:
     """Fresh ones for an episode, by key."""
     found = {STRAIGHT: _Baseline(ConstantVelocity(spec), spec, task.horizon_steps)}
-    if task.neighbours is not None:
+    if task.neighbours:
         fitted = _kept_neighbours(task.neighbours, spec, task.horizon_steps)
         found[NEIGHBOURS] = _Baseline(fitted, spec, task.horizon_steps)
     for steps in task.histories:

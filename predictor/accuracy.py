@@ -67,6 +67,10 @@ class Accuracy:
     count together, so it is never below the mean displacement; see `rmse_per_axis_m`."""
     coverage: list[float] = field(default_factory=list)
     """Share of truths within the central 90 % of the samples at each step; empty with too few samples to say."""
+    miss_by_step: list[float] = field(default_factory=list)
+    """Share of agents whose best sample is further off than the threshold at each step."""
+    miss_threshold_m: float = metrics.MISS_THRESHOLD_M
+    """Of the misses [m]."""
     scenes: int = 0
     """Instants behind min_joint_ade_m."""
     axes: int = 2
@@ -174,6 +178,8 @@ class Tally:
             },
             overall_rmse_m=math.sqrt(whole["rmse_m"]),
             by_step_m=steps["by_step_m"],
+            miss_by_step=steps["miss_by_step"],
+            miss_threshold_m=self._threshold_m,
             rmse_m=[math.sqrt(value) for value in steps["rmse_m"]],
             nll=steps.get("nll", []),
             coverage=steps.get("coverage", []),
@@ -214,6 +220,7 @@ class Tally:
             "min_joint_ade_m": metrics.min_joint_ade(forecast, future, counted),
             "min_joint_fde_m": metrics.min_joint_fde(forecast, future, counted),
             "by_step_m": metrics.min_displacement(forecast, future, valid),
+            "miss_by_step": self._missed(forecast, future, valid),
             "rmse_m": metrics.squared_error(forecast, future, valid),
             "coverage": metrics.coverage(forecast, future, valid),
         }
@@ -221,6 +228,10 @@ class Tally:
             std_m = torch.tensor(self._std_m[:horizon], device=forecast.device)
             values["nll"] = metrics.gaussian_mixture_nll(forecast, future, valid, std_m)
         return values
+
+    def _missed(self, forecast: Tensor, future: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        distance, known = metrics.min_displacement(forecast, future, valid)
+        return (distance > self._threshold_m).to(distance.dtype), known
 
 
 def summarise(

@@ -26,7 +26,7 @@ from predictor.data.store import EpisodeStore, read_store
 from predictor.data.windows import Windows
 from predictor.errors import UserError, run_entry_point
 from predictor.forecaster import Forecaster
-from predictor.metrics import COVERAGE_SHARE, MISS_THRESHOLD_M
+from predictor.metrics import COVERAGE_SHARE
 from predictor.plots import plot_error_by_horizon, plot_scene
 from predictor.provenance import provenance, write_json
 from predictor.scene import SceneSpec
@@ -163,7 +163,7 @@ def accuracy_table(rows: Sequence[Accuracy], dt_s: float, title: str) -> Table:
         table.add_row(row.name, str(row.num_samples), *scalars, str(row.agents), *cells)
     table.caption = (
         r"by time ahead: displacement of the best sample \[m] / RMSE of the mean \[m] / NLL \[nats], top to bottom; "
-        f"± standard error over subsets of the windows; missed: ends more than {MISS_THRESHOLD_M:g} m off; "
+        f"± standard error over subsets of the windows; missed: ends more than {rows[0].miss_threshold_m:g} m off; "
         f"cover: truths within the central {100 * COVERAGE_SHARE:g} % of the samples"
     )
     return table

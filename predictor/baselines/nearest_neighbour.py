@@ -270,8 +270,8 @@ def collect_examples(
     return Examples(*(torch.cat(tensors) for tensors in zip(*found, strict=True)))
 
 
-def fit_from_store(
-    path: Path,
+def fit_from_stores(
+    paths: Sequence[Path],
     spec: SceneSpec,
     horizon_steps: int,
     source: str = "the scene",
@@ -281,33 +281,34 @@ def fit_from_store(
     num_edge_types: int = 2,
     edge_feature_dim: int = 1,
 ) -> NearestNeighbour:
-    """Nearest neighbours for scenes of `spec`, from an episode store.
+    """Nearest neighbours for scenes of `spec`, from episode stores.
 
     Args:
-        path: of the store.
+        paths: of the stores.
         spec: of the scenes to forecast; its perception and frame hold for the examples too.
         horizon_steps: steps to forecast.
         source: what the scenes come from, for messages (``env 'merge-v1'``).
         k: neighbours to average.
-        max_examples: if the store has more, as many are drawn.
+        max_examples: if the stores have more, as many are drawn.
         seed: of that draw.
         num_edge_types: as in `NearestNeighbour`.
         edge_feature_dim: as in `NearestNeighbour`.
 
     Raises:
-        UserError: no readable store, one of other features, time step or ego, or without an example.
+        UserError: no readable store, one of other features, time step or ego, or no example.
     """
-    store = read_store(path)
-    name = f"a forecaster of nearest neighbours in {path}"
-    store.info.spec.check_compatible(spec, name, source)
-    if store.info.spec.has_ego != spec.has_ego:
-        raise UserError(
-            f"{path} has has_ego={store.info.spec.has_ego} but {source} has has_ego={spec.has_ego}; "
-            "record a store of the same kind"
-        )
-    return NearestNeighbour.fit(
-        store.episodes, spec, horizon_steps, k, max_examples, seed, num_edge_types, edge_feature_dim
-    )
+    episodes: list[Episode] = []
+    for path in paths:
+        store = read_store(path)
+        name = f"a forecaster of nearest neighbours in {path}"
+        store.info.spec.check_compatible(spec, name, source)
+        if store.info.spec.has_ego != spec.has_ego:
+            raise UserError(
+                f"{path} has has_ego={store.info.spec.has_ego} but {source} has has_ego={spec.has_ego}; "
+                "record a store of the same kind"
+            )
+        episodes += store.episodes
+    return NearestNeighbour.fit(episodes, spec, horizon_steps, k, max_examples, seed, num_edge_types, edge_feature_dim)
 
 
 def _complete(

@@ -1,4 +1,4 @@
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 from stable_baselines3 import DQN, PPO
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
+from agents.arena import EgoArena
 from agents.episodes import SeededEpisodes
 from agents.evaluate import EVALUATION_SEED
 from agents.features import ForecastAttention
@@ -38,8 +39,16 @@ class Coin(gym.Env[np.ndarray, np.int64]):
         return np.zeros(1, np.float32), float(action), self._steps == 3, False, {}
 
 
-def make_selection(rows: int) -> VecEnv:
-    return VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Coin())] * rows))
+@pytest.fixture
+def make_selection(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], EgoArena]:
+    """From a number of rows to an arena of coins."""
+
+    def make_rows(task: Task, num_rows: int, seeded: bool) -> VecMonitor:
+        assert seeded
+        return VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Coin())] * num_rows))
+
+    monkeypatch.setattr("agents.arena.make_rows", make_rows)
+    return lambda rows: EgoArena(CONSTANT_VELOCITY, rows)
 
 
 def make_ppo() -> PPO:
@@ -53,7 +62,9 @@ def plan(**changes: Any) -> TrainingPlan:
 
 
 @pytest.mark.parametrize("rows", [1, 2, 3])
-def test_every_selection_plays_the_same_seeds(rows: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_every_selection_plays_the_same_seeds(
+    rows: int, make_selection: Callable[[int], EgoArena], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     played: list[int] = []
     queue = SeededEpisodes.queue
 
@@ -66,20 +77,22 @@ def test_every_selection_plays_the_same_seeds(rows: int, tmp_path: Path, monkeyp
     assert played == [SELECTION_SEED + i for i in range(5)] * 2
 
 
-def test_there_is_always_a_selection_at_the_end(tmp_path: Path):
+def test_there_is_always_a_selection_at_the_end(make_selection: Callable[[int], EgoArena], tmp_path: Path):
     make_ppo().learn(24, callback=SelectBest(make_selection(1), tmp_path / "best.zip", 2, every_steps=1000))
     assert read_note(tmp_path / "best.zip")["steps"] == 24
 
 
 @pytest.mark.parametrize(("stored", "replaced"), [(-1.0, True), (100.0, False)], ids=["worse", "better"])
-def test_best_model_of_an_earlier_start_counts(stored: float, replaced: bool, tmp_path: Path):
+def test_best_model_of_an_earlier_start_counts(
+    stored: float, replaced: bool, make_selection: Callable[[int], EgoArena], tmp_path: Path
+):
     path = tmp_path / "best.zip"
     save_model(make_ppo(), path, {"selection_return": stored, "steps": 0})
     make_ppo().learn(8, callback=SelectBest(make_selection(1), path, 2, every_steps=8))
     assert (read_note(path)["steps"] == 8) is replaced
 
 
-def test_damaged_best_model_is_one_clear_line(tmp_path: Path):
+def test_damaged_best_model_is_one_clear_line(make_selection: Callable[[int], EgoArena], tmp_path: Path):
     (tmp_path / "best.zip").write_bytes(b"not a zip")
     with pytest.raises(UserError, match="is damaged; remove it"):
         make_ppo().learn(8, callback=SelectBest(make_selection(1), tmp_path / "best.zip", 2, every_steps=8))

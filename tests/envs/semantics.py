@@ -288,12 +288,16 @@ class Subject:
     """Whether somebody comes into sight in the recorded episode."""
     leaves: bool = False
     """Whether somebody goes out of sight."""
+    dies: bool = False
+    """Whether a learner is gone before the end."""
+    sight_m: float = 1000.0
+    """Perception in the recorded episode; the default sees everybody."""
     tolerance_m: float = 1e-9
     """Between a scene and the simulator."""
 
 
-SIGHT_M, ROWS = 1000.0, 16
-"""Of a recorded episode, where there is one ego: everybody is in sight and has a row, with rows to spare."""
+ROWS = 16
+"""Of a scene around one ego in a recorded episode: enough for everybody in sight."""
 HIGHWAY = SceneSpec(dt_s=1.0, frame=("ego", "world"))
 CROWD = SceneSpec(dt_s=DT_S, frame=("ego", "ego"))
 KINEMATICS = {
@@ -323,11 +327,15 @@ UNNAMED = ("presence", "x", "y", "vx", "vy", "", "heading")
 SUBJECTS: dict[str, Subject] = {
     "highway": Subject(highway("highway-fast-v0", **SMALL), highway_bodies, 60.0),
     "highway-mixed": Subject(highway("highway-mixed-v0", **SMALL), highway_bodies, 60.0),
-    "intersection": Subject(highway("intersection-v2"), highway_bodies, 30.0, enters=True, leaves=True),
+    "intersection": Subject(
+        highway("intersection-v2", duration=11), highway_bodies, 25.0, enters=True, leaves=True, sight_m=40.0
+    ),
     "envpool-highway": Subject(
         partial(make_env, "envpool/HighwayFast-v0", vehicles_count=8, duration=8), envpool_bodies, 60.0
     ),
-    "envpool-intersection": Subject(partial(make_env, "envpool/Intersection-v0"), envpool_bodies, 30.0),
+    "envpool-intersection": Subject(partial(make_env, "envpool/Intersection-v0"), envpool_bodies, 25.0,
+        enters=True, leaves=True, sight_m=40.0,
+    ),
     "rows-highway": Subject(
         highway("highway-fast-v0", **SMALL, observation=KINEMATICS), highway_bodies, 60.0,
         reader=partial(rows_reader, columns=COLUMNS[:5], gate_m=10.0), spec=HIGHWAY, tolerance_m=1e-3,
@@ -339,19 +347,20 @@ SUBJECTS: dict[str, Subject] = {
     "tag": Subject(parallel("simple_tag_v3", max_cycles=10), mpe_bodies, 0.8, shared=True),
     "spread": Subject(parallel("simple_spread_v3", max_cycles=10), mpe_bodies, 0.8, shared=True),
     "treasure": Subject(
-        parallel("collect_treasure_v1", max_cycles=14), mpe_bodies, 0.8, shared=True, enters=True, leaves=True
+        parallel("collect_treasure_v1", num_collectors=5, num_treasures=8, max_cycles=8), mpe_bodies, 0.8, 6,
+        shared=True, enters=True, leaves=True,
     ),
     "pursuit": Subject(
         parallel("pursuit_v5", x_size=7, y_size=7, n_pursuers=4, n_evaders=6, n_catch=1, surround=False, max_cycles=10),
         pursuit_bodies, 3.0, shared=True, leaves=True,
     ),
     "intersection-agents": Subject(
-        parallel("intersection-multi-agent-v1", controlled_vehicles=3, initial_vehicle_count=4, duration=10),
-        highway_bodies, 30.0, shared=True, enters=True, leaves=True,
+        parallel("intersection-multi-agent-v1", controlled_vehicles=3, initial_vehicle_count=4, duration=8),
+        highway_bodies, 30.0, shared=True, enters=True, dies=True,
     ),
     "swarm": Subject(
         Swarm, swarm_bodies, 12.0, shared=True, reader=lambda spec: SwarmReader, spec=SwarmReader.spec,
-        enters=True, leaves=True,
+        enters=True, leaves=True, dies=True,
     ),
 }  # fmt: skip
 NATIVE = pytest.mark.skipif(importlib.util.find_spec("envpool") is None, reason="needs envpool")
@@ -404,13 +413,13 @@ class Session:
     Args:
         subject: what to wrap.
         folder: for the checkpoint.
-        sight_m: perception; None takes all there is.
+        sight_m: perception; None takes the recorded episode's.
         rows: of a view, the viewer included; None takes enough for everyone.
     """
 
     def __init__(self, subject: Subject, folder: Path, sight_m: float | None = None, rows: int | None = None) -> None:
         self.subject, bare = subject, subject.make()
-        sight_m = SIGHT_M if sight_m is None else sight_m
+        sight_m = subject.sight_m if sight_m is None else sight_m
         if subject.shared:
             maker = subject.reader and subject.reader(subject.spec)
             spec = (shared_reader_for(bare) if maker is None else maker(bare)).spec

@@ -460,14 +460,10 @@ def test_inattention_repeats_and_slips_are_random(attention: float, slip: float,
 # --- Errors -----------------------------------------------------------------------------------------------------------
 
 
-def test_unknown_names_are_listed():
-    with pytest.raises(UserError, match=rf"driver must be one of {', '.join(DRIVER_NAMES)}, got 'fast'"):
-        make_driver("fast", make_parallel_env("simple_tag_v3"), rng())
-
-
-def test_policies_do_not_drive_yet():
-    with pytest.raises(UserError, match="policies cannot drive parallel environments yet, got policy.zip; use random"):
-        make_driver("policy.zip", make_parallel_env("simple_tag_v3"), rng())
+@pytest.mark.parametrize("name", ["fast", "policy.zip"])
+def test_unknown_names_are_listed(name: str):
+    with pytest.raises(UserError, match=rf"driver must be one of {', '.join(DRIVER_NAMES)}, got '{name}'"):
+        make_driver(name, make_parallel_env("simple_tag_v3"), rng())
 
 
 def test_where_there_is_no_heuristic_the_others_are_named():

@@ -226,7 +226,7 @@ def test_neighbours_have_a_row_where_there_is_data(in_process: None, tmp_path: P
     (recorded,) = collect(CollectConfig(ROAD, tmp_path, 1, ("idle",), 5, 6, False, 1))
     write_store(tmp_path / ROAD, StoreInfo(HighwayReader(make_env(ROAD)).spec, ROAD), [recorded] * 6)
     for root in (tmp_path, tmp_path / ROAD):
-        found = measure(ROAD, STILL, neighbours=root, **settings)
+        found = measure(ROAD, STILL, neighbours=(root,), **settings)
         assert found.nearest_neighbours is not None
         assert found.nearest_neighbours.name == "nearest neighbours"
         assert found.nearest_neighbours.min_ade_m == pytest.approx(0.0, abs=1e-3)

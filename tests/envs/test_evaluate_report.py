@@ -68,7 +68,7 @@ def test_markdown_has_an_overview_and_a_table_per_environment():
     lines = report.markdown([full(), result("spread")], {}).splitlines()
     assert cells_of(lines[0]) == list(report.HEADS)
     assert cells_of(lines[2]) == [
-        "tag", "mine", "0.1", "3", "1.00", "2.00", "0.50", "1.25", "2.00 / 4.00", "50 %", "40 % to 60 %", "40", "1.2",
+        "tag", "mine", "0.1", "3", "1.00", "2.00", "0.50", "1.25", "2.00 / 4.00", "50 %", "40 to 60 %", "40", "1.2",
     ]  # fmt: skip
     assert cells_of(lines[3])[:2] == ["spread", "mine"] and cells_of(lines[3])[7] == "–"
     titles = [line for line in lines if line.startswith("### ")]
@@ -98,7 +98,7 @@ def shown(table: object) -> str:
 
 def test_tables_of_a_terminal_have_units_and_dashes():
     text = shown(report.overview([full()]))
-    assert "dt [s]" in text and "1.25" in text and "40 % to 60 %" in text  # no unit is taken for markup
+    assert "dt [s]" in text and "1.25" in text and "40 to 60 %" in text  # no unit is taken for markup
     matrix = shown(report.transfer([result("a", "x"), result("a", "y")], {("b", "x"): "another dt"}))
     (line,) = [line for line in matrix.splitlines() if line.split("│")[1:2] == [" b   "]]
     assert line.count("–") == 2

@@ -151,7 +151,7 @@ def test_an_episode_has_the_truth_of_its_last_step():
 
 
 def test_an_episode_that_is_cut_keeps_its_last_scene():
-    model, _ = played(task(max_steps=4))
+    model, _ = played(task("highway-fast-v0", max_steps=4))
     assert model.forecast.shape[0] == 5
     assert model.valid[3, 1:].any(0).tolist() == [True, False, False]
     assert not model.valid[4].any()
@@ -257,7 +257,7 @@ def test_a_short_memory_forecasts_from_the_last_scenes_alone(who: str, tmp_path:
     outcomes = play(replace(made, histories=(1, 2, steps))).outcomes
     everything = outcomes[MODEL].forecast[:, :1]
     known = outcomes[MODEL].valid.any(-1)
-    assert known[:-1].any(-1).all()
+    assert known.any(-1).sum() > 2
 
     def same(found: torch.Tensor, expected: torch.Tensor) -> bool:
         return torch.allclose(found[:, 0][known], expected[:, 0][known], rtol=1e-4, atol=1e-4)
@@ -283,7 +283,8 @@ def replayed(made: EpisodeTask, history_steps: int) -> torch.Tensor:
         for past in scenes[-history_steps:]:
             online.observe(SceneBatch.stack([past.behind_absent(front)]))
         found.append(online.forecast(made.horizon_steps).xy[0, :, front:])
-        world.step()
+        if world.step():
+            break
     return torch.stack(found)
 
 
@@ -297,7 +298,7 @@ def test_neighbours_that_lived_through_this_very_episode_are_exact(tmp_path: Pat
     (recorded,) = collect(config)
     store = tmp_path / "store"
     write_store(store, StoreInfo(HighwayReader(make_env(made.env_id)).spec, made.env_id), [recorded] * 6)
-    outcomes = play(replace(made, neighbours=str(store))).outcomes
+    outcomes = play(replace(made, neighbours=(str(store),))).outcomes
     near, straight = (summarise(key, [outcomes[key]]) for key in (NEIGHBOURS, STRAIGHT))
     assert near.agents == straight.agents > 0
     assert near.min_ade_m == pytest.approx(0.0, abs=1e-3)
@@ -318,7 +319,7 @@ def test_true_edges_are_moved_to_the_rows_of_who_is_perceived():
 
 
 def test_the_graph_is_noted_where_the_simulator_knows_one(highway_checkpoint: str):
-    episode = play(task(checkpoint=highway_checkpoint))
+    episode = play(task("highway-fast-v0", checkpoint=highway_checkpoint))
     assert len(episode.edge_probs) == len(episode.edge_types) == len(episode.latencies_s) == 7
     agents = HIGHWAY_SPEC.max_agents
     assert all(probs.shape == (agents, agents, 2) for probs in episode.edge_probs)

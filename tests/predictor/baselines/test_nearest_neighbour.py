@@ -20,7 +20,7 @@ from predictor.baselines.nearest_neighbour import (
     NearestNeighbour,
     collect_examples,
     feature_scales,
-    fit_from_store,
+    fit_from_stores,
     query_features,
 )
 from predictor.data.store import Episode, StoreInfo, write_store
@@ -501,33 +501,33 @@ def test_streamed_scenes_are_forecast_as_given_ones():
 
 def test_a_store_is_fitted_with_the_perception_asked_for(tmp_path: Path):
     path = write_circles(tmp_path / "store", agents=3)
-    forecaster = fit_from_store(path, spec(), HORIZON, max_examples=1000)
+    forecaster = fit_from_stores([path], spec(), HORIZON, max_examples=1000)
     expected = NearestNeighbour.fit([circling_episode(i, agents=3) for i in range(6)], spec(), HORIZON)
     assert torch.equal(forecaster.points, expected.points)
     assert forecaster.num_examples == 6 * 2 * 7
-    assert fit_from_store(path, spec(max_agents=2), HORIZON).num_examples == 6 * 7
-    small = fit_from_store(path, spec(), HORIZON, "here", 2, 10, 1, num_edge_types=3, edge_feature_dim=4)
+    assert fit_from_stores([path], spec(max_agents=2), HORIZON).num_examples == 6 * 7
+    small = fit_from_stores([path], spec(), HORIZON, "here", 2, 10, 1, num_edge_types=3, edge_feature_dim=4)
     assert (small.k, small.num_examples, small.num_edge_types, small.edge_feature_dim) == (2, 10, 3, 4)
 
 
 def test_a_store_of_another_kind_is_refused(tmp_path: Path):
     path = write_circles(tmp_path / "store")
     with pytest.raises(UserError, match=r"nearest neighbours in .*store was .* dt_s=1 but env 'x' steps at dt_s=0.2;"):
-        fit_from_store(path, spec(dt_s=0.2), HORIZON, "env 'x'")
+        fit_from_stores([path], spec(dt_s=0.2), HORIZON, "env 'x'")
     with pytest.raises(UserError, match=r"on features .*'vy_mps'\) but env 'x' gives .*'role'"):
-        fit_from_store(path, LAYOUTS["roles"], HORIZON, "env 'x'")
+        fit_from_stores([path], LAYOUTS["roles"], HORIZON, "env 'x'")
     with pytest.raises(UserError, match="store has has_ego=True but env 'x' has has_ego=False; record a store of the"):
-        fit_from_store(path, spec(has_ego=False), HORIZON, "env 'x'")
+        fit_from_stores([path], spec(has_ego=False), HORIZON, "env 'x'")
     with pytest.raises(UserError, match="there for horizon_steps=10, but 6 episodes of at most 10 steps have none"):
-        fit_from_store(path, spec(), 10)
-    assert fit_from_store(path, spec(), 9).num_examples == 6
+        fit_from_stores([path], spec(), 10)
+    assert fit_from_stores([path], spec(), 9).num_examples == 6
     with pytest.raises(UserError, match="no episode store at"):
-        fit_from_store(tmp_path / "nothing", spec(), HORIZON)
+        fit_from_stores([tmp_path / "nothing"], spec(), HORIZON)
 
 
 def test_a_store_without_an_ego_is_fitted(tmp_path: Path):
     layout = spec(has_ego=False)
     write_store(tmp_path / "store", StoreInfo(layout, "circles"), [circling_episode(i, agents=3) for i in range(4)])
-    forecaster = fit_from_store(tmp_path / "store", layout, HORIZON)
+    forecaster = fit_from_stores([tmp_path / "store"], layout, HORIZON)
     assert forecaster.num_examples == 4 * 3 * 7
     assert torch.isfinite(forecaster.rollout(observe(forecaster, random_states(0, 1, 3, 4)), HORIZON)).all()
