@@ -38,7 +38,9 @@ def trained_driver(path: str, env: Any, rng: np.random.Generator) -> Driver:
     actions = {agent: env.action_space(agent) for agent in learners}
     rows = SharedObservation(spaces, roles_of(spaces, actions), None)
     if rows.space != policy.observation_space:
-        raise UserError(f"policy {path} was trained on {policy.observation_space}, but the env gives {rows.space}")
+        raise UserError(
+            f"policy {path} was trained on {_line(policy.observation_space)}, but the env gives {_line(rows.space)}"
+        )
     others = (
         make_driver(run.get("partner", "heuristic"), env, rng) if set(learners) < set(env.possible_agents) else None
     )
@@ -56,9 +58,13 @@ def trained_driver(path: str, env: Any, rng: np.random.Generator) -> Driver:
 def _run_of(path: str) -> dict[str, Any]:
     try:
         config: dict[str, Any] = json.loads((Path(path).parent / "config.json").read_text())["config"]
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, TypeError):
         return {}
     return config
+
+
+def _line(space: gym.Space) -> str:
+    return " ".join(str(space).split())
 
 
 def _seen_space(space: gym.Space, sees_forecasts: bool) -> gym.Space:

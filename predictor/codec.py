@@ -47,14 +47,22 @@ class StateCodec(nn.Module):
         spec: layout, frame and scales.
         delta_scales: typical one-step change of each feature [SI]; empty takes the spec's feature scales.
         residual: what the predicted change of position is added to.
+        input_scales: divisors of the inputs; empty takes the spec's feature scales.
     """
 
-    def __init__(self, spec: SceneSpec, delta_scales: tuple[float, ...] = (), residual: Residual = "state") -> None:
+    def __init__(
+        self,
+        spec: SceneSpec,
+        delta_scales: tuple[float, ...] = (),
+        residual: Residual = "state",
+        input_scales: tuple[float, ...] = (),
+    ) -> None:
         """Buffers only; nothing is learned and nothing is saved."""
         super().__init__()
-        deltas = delta_scales or spec.feature_scales
-        if len(deltas) != spec.num_features:
-            raise UserError(f"delta_scales needs {spec.num_features} numbers, got {deltas}")
+        deltas, inputs = delta_scales or spec.feature_scales, input_scales or spec.feature_scales
+        for name, scales in (("delta_scales", deltas), ("input_scales", inputs)):
+            if len(scales) != spec.num_features:
+                raise UserError(f"{name} needs {spec.num_features} numbers, got {scales}")
         if residual not in ("state", "constant_velocity", "trapezoid"):
             raise UserError(f"residual must be 'state', 'constant_velocity' or 'trapezoid', got '{residual}'")
         self.spec = spec
@@ -65,7 +73,7 @@ class StateCodec(nn.Module):
         self._centroid_axes: Tensor
         self._predicted: Tensor
         for name, values in (
-            ("scales", spec.feature_scales),
+            ("scales", inputs),
             ("deltas", deltas),
             ("_ego_axes", [float(f == "ego") for f in spec.frame]),
             ("_centroid_axes", [float(f == "centroid") for f in spec.frame]),

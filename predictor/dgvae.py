@@ -66,7 +66,7 @@ class DGVAE(nn.Module):
         self.spec = spec
         self.config = config
         self.horizon_steps = horizon_steps
-        self.codec = StateCodec(spec, config.delta_scales, config.residual)
+        self.codec = StateCodec(spec, config.delta_scales, config.residual, config.input_scales)
         self.sees_changes = bool(config.change_scales)
         if self.sees_changes and len(config.change_scales) != spec.num_features:
             raise UserError(f"change_scales needs {spec.num_features} numbers, got {config.change_scales}")

@@ -47,6 +47,9 @@ class DGVAEConfig:
     at the mean of its own and the predicted velocity (velocity-consistent)."""
     delta_scales: tuple[float, ...] = ()
     """Typical one-step change of each feature [SI] beyond the residual; empty takes the spec's feature scales."""
+    input_scales: tuple[float, ...] = ()
+    """Spread of each feature over the map [SI], which divides the network's inputs; empty takes the spec's feature
+    scales. A road of 500 m by 12 m needs it: at 100 m for both axes its lanes lie 0.04 apart."""
     change_scales: tuple[float, ...] = ()
     """Typical one-step change of each input [SI]; given, the encoder also sees what changed since the last step."""
     forget_bias: float = 0.0

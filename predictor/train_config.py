@@ -30,6 +30,8 @@ class TrainConfig:
     """Single fields of the network's config, as field=value: --set hidden_dim=64 static_dim=16."""
     input_changes: bool = False
     """The dG-VAE's encoder also sees what changed since the last step (`change_scales`, fitted to the data)."""
+    fit_inputs: bool = False
+    """The dG-VAE's inputs are divided by their spread in the data (`input_scales`) instead of the spec's scales."""
     steps: int = 4000
     """Optimiser steps."""
     batch_size: int = 64

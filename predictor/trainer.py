@@ -17,7 +17,7 @@ import torch
 
 from predictor.accuracy import Accuracy, fitted_std_m, run_windows, summarise
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.codec import Residual, drift
+from predictor.codec import Residual, StateCodec, drift
 from predictor.data.store import Episode, EpisodeStore, read_store
 from predictor.data.windows import WindowBatch, Windows, concatenate, split_episodes
 from predictor.errors import UserError
@@ -113,11 +113,26 @@ def typical_change(episodes: Sequence[Episode], spec: SceneSpec, residual: Resid
     return tuple(float(s) for s in np.maximum(scale, 1e-3))
 
 
+def typical_spread(episodes: Sequence[Episode], spec: SceneSpec) -> tuple[float, ...]:
+    """Standard deviation of each input feature over the data [SI], positions as the spec's frame gives them."""
+    states = [_in_frame(episode, spec)[episode.valid] for episode in episodes]
+    spread = np.concatenate(states).astype(np.float64).std(axis=0)
+    least = 1e-2 * np.array(spec.feature_scales)
+    return tuple(float(s) for s in np.maximum(spread, least))
+
+
+def _in_frame(episode: Episode, spec: SceneSpec) -> np.ndarray:
+    codec = StateCodec(spec)
+    inputs = codec.inputs(torch.from_numpy(episode.states), torch.from_numpy(episode.valid))[..., : spec.num_features]
+    framed: np.ndarray = (inputs * codec.scales).numpy()
+    return framed
+
+
 def model_config(config: TrainConfig, data: TrainingData) -> Any:
     """The network's config, with scales fitted to the training data.
 
     Raises:
-        UserError: a field of --set that the model does not have, or --input-changes for a model without it.
+        UserError: a field of --set that the model does not have, or --input-changes or --fit-inputs for another model.
     """
     plain = configure(config.model, config.preset, config.set)
     fitted = {"delta_scales": typical_change(data.train_episodes, data.spec, plain.residual)}
@@ -125,6 +140,10 @@ def model_config(config: TrainConfig, data: TrainingData) -> Any:
         if config.model != "dgvae":
             raise UserError(f"--input-changes belongs to the dG-VAE; leave it out for --model {config.model}")
         fitted["change_scales"] = typical_change(data.train_episodes, data.spec, "state")
+    if config.fit_inputs:
+        if config.model != "dgvae":
+            raise UserError(f"--fit-inputs belongs to the dG-VAE; leave it out for --model {config.model}")
+        fitted["input_scales"] = typical_spread(data.train_episodes, data.spec)
     return configure(config.model, config.preset, config.set, **fitted)
 
 

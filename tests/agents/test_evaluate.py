@@ -5,8 +5,20 @@ from pathlib import Path
 import pytest
 
 from agents.episodes import EpisodeResult
-from agents.evaluate import Evaluation, mean_and_standard_error, summarize, wilson_interval
+from agents.evaluate import (
+    EVALUATION_SEED,
+    NUM_POLICIES,
+    Evaluation,
+    evaluate_policy_on_seeds,
+    mean_and_standard_error,
+    summarize,
+    wilson_interval,
+)
+from agents.parallel_rows import ParallelArena
+from agents.task import Task
 from predictor.errors import UserError
+from tests.agents.test_parallel_rows import policy_for
+from tests.agents.toys import TOY
 
 EPISODES = [
     EpisodeResult(seed=10, episode_return=20.0, length=30, crashed=False, mean_speed_mps=22.0),
@@ -72,3 +84,45 @@ def test_written_summary_is_valid_json_and_a_table(tmp_path: Path):
     assert lines[2].startswith("| ppo | 17.00 ± 3.51 | 24.0 ± 6.0 | 33 % (")
     assert lines[3].endswith("| – |")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["summary.json", "summary.md"]
+
+
+def herd(seed: int, ants: float, bees: float) -> EpisodeResult:
+    """An episode of several roles, without an ego."""
+    return EpisodeResult(seed, (ants + bees) / 2, 5, None, math.nan, {"ant": ants, "bee": bees})
+
+
+def test_without_an_ego_there_are_roles_but_no_crashes(tmp_path: Path):
+    evaluation = Evaluation("meadow", 1, {"ppo": [herd(1, 1.0, 4.0), herd(2, 3.0, 8.0)], "random": [herd(1, 0.0, 0.5)]})
+    evaluation.write(tmp_path)
+    lines = (tmp_path / "summary.md").read_text().splitlines()
+    assert lines[0] == "| policy | return | return of ant | return of bee | length |"
+    assert lines[2] == "| ppo | 4.00 ± 1.50 | 2.00 ± 1.00 | 6.00 ± 2.00 | 5.0 ± 0.0 |"
+    assert lines[3] == "| random | 0.25 | 0.00 | 0.50 | 5.0 |"
+    assert lines[-1].endswith("return: mean over the learners.")
+    assert [column.header for column in evaluation.table().columns] == lines[0].strip("| ").split(" | ")
+    content = json.loads((tmp_path / "summary.json").read_text())
+    row = content["policies"][0]
+    assert (row["crash_rate"], row["crash_low"], row["mean_speed_mps"]) == (None, None, None)
+    assert row["role_returns"] == {"ant": [2.0, 1.0], "bee": [6.0, 2.0]}
+    assert content["episodes"]["ppo"][1]["returns_by_role"] == {"ant": 3.0, "bee": 8.0}
+
+
+def test_the_caption_of_an_ego_explains_its_interval():
+    assert "95 % Wilson interval" in Evaluation("toy-v0", 10, {"ppo": EPISODES}).markdown()
+
+
+def test_one_role_needs_no_column():
+    single = EpisodeResult(1, 2.0, 5, None, math.nan)
+    assert Evaluation("meadow", 1, {"ppo": [single]}).markdown().startswith("| policy | return | length |")
+
+
+def test_everyone_plays_the_same_held_out_seeds():
+    task = Task(TOY, "none")
+    model, calls = policy_for(task), []
+    evaluation = evaluate_policy_on_seeds(task, model, "ppo", 3, on_episode=lambda: calls.append(None))
+    assert list(evaluation.results) == ["ppo", "random", "idle"]
+    assert len(calls) == 3 * NUM_POLICIES
+    seeds = range(EVALUATION_SEED, EVALUATION_SEED + 3)
+    for name, found in evaluation.results.items():
+        expected = ParallelArena(task).play(model if name == "ppo" else name, seeds)
+        assert [(e.seed, e.episode_return) for e in found] == [(e.seed, e.episode_return) for e in expected]

@@ -104,3 +104,22 @@ def test_rows_observe_what_the_task_says():
     assert isinstance(forecast.observation_space, gym.spaces.Dict)
     assert {"observation", "agents", "forecast", "valid"} <= set(forecast.observation_space)
     forecast.close()
+
+
+def test_native_rows_observe_what_the_others_do():
+    pytest.importorskip("envpool")
+    for observe in ("none", "constant-velocity"):
+        native = make_rows(Task("highway-fast-v0", observe, backend="envpool"), 3)
+        plain = make_rows(Task("highway-fast-v0", observe), 1)
+        assert native.num_envs == 3
+        assert native.get_attr("task_id") == ["HighwayFast-v0"] * 3
+        assert native.observation_space == plain.observation_space
+        assert native.action_space == plain.action_space
+        native.close()
+        plain.close()
+
+
+def test_agents_of_a_parallel_env_are_rows():
+    rows = make_rows(Task("simple_tag_v3", "none", learners=("adversary",)), 2)
+    assert rows.num_envs == 6
+    rows.close()

@@ -10,7 +10,7 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from agents.arena import EgoArena
-from agents.episodes import SeededEpisodes
+from agents.episodes import EpisodeResult, SeededEpisodes
 from agents.evaluate import EVALUATION_SEED
 from agents.features import ForecastAttention
 from agents.presets import DQNPreset, PPOPreset, preset_for
@@ -92,6 +92,28 @@ def test_best_model_of_an_earlier_start_counts(
     assert (read_note(path)["steps"] == 8) is replaced
 
 
+def test_the_model_with_the_best_return_is_kept(tmp_path: Path):
+    class Scripted:
+        baselines = ()
+
+        def __init__(self) -> None:
+            self.returns, self.seeds = [2.0, 5.0, 3.0, 5.0], list[range]()
+
+        def play(self, policy: Any, seeds: Any, on_episode: Any = None) -> list[EpisodeResult]:
+            self.seeds.append(seeds)
+            mean = self.returns.pop(0)
+            return [EpisodeResult(seed, mean + seed % 2 * 2 - 1, 3, None, float("nan")) for seed in seeds]
+
+        def close(self) -> None: ...
+
+    arena, path = Scripted(), tmp_path / "best.zip"
+    make_ppo().learn(32, callback=SelectBest(arena, path, 4, every_steps=8))
+    assert arena.returns == []
+    assert set(arena.seeds) == {range(SELECTION_SEED, SELECTION_SEED + 4)}
+    assert read_note(path) == {"selection_return": 5.0, "steps": 16}
+    assert PPO.load(path, device="cpu").num_timesteps == 16
+
+
 def test_damaged_best_model_is_one_clear_line(make_selection: Callable[[int], EgoArena], tmp_path: Path):
     (tmp_path / "best.zip").write_bytes(b"not a zip")
     with pytest.raises(UserError, match="is damaged; remove it"):
@@ -141,6 +163,13 @@ def test_presets():
     assert preset_for("highway-fast-v0", "ppo") == PPOPreset()
     assert preset_for("merge-v1", "dqn") == DQNPreset()
     assert preset_for("racetrack-oval-v1", "ppo").gamma == 0.9
+    particles = preset_for("simple_tag_v3", "ppo")
+    assert (particles.gamma, particles.n_steps) == (0.95, 100)  # type: ignore[union-attr]
+    assert preset_for("simple_tag_v3", "dqn") == DQNPreset()
+    native = preset_for("highway-fast-v0", "ppo", "envpool")
+    assert (native.gamma, native.batch_size) == (0.8, 512)
+    assert preset_for("racetrack-v1", "ppo", "envpool").gamma == 0.9
+    assert preset_for("highway-fast-v0", "dqn", "envpool") == DQNPreset()
 
 
 def test_same_seed_same_policy():

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from predictor import trainer as trainer_module
 from predictor.checkpoint import load_checkpoint
-from predictor.data.store import StoreInfo, write_store
+from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.dgvae import PRESETS
 from predictor.errors import UserError
 from predictor.models import name_of
@@ -21,7 +21,7 @@ from predictor.objective import window_loss
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from predictor.train import train
 from predictor.train_config import TrainConfig
-from predictor.trainer import Trainer, load_data, model_config, typical_change
+from predictor.trainer import Trainer, load_data, model_config, typical_change, typical_spread
 from tests.predictor.helpers import FAST_LIKE, circling_episode, random_states, spec, write_circles
 
 SMALL = {"steps": 2, "batch_size": 4, "history_steps": 3, "horizon_steps": 2, "val_fraction": 0.34, "eval_every": 2}
@@ -316,3 +316,17 @@ def test_weights_of_the_objective_are_felt(
         return check(terms)
 
     assert after(**changes) < 0.5 * after(**dict.fromkeys(changes, 0.0))
+
+
+def test_inputs_are_divided_by_their_spread_in_the_frame_of_the_spec():
+    """A road of 500 m by 12 m: the lane gets a scale of metres; relative to the ego, 10 km do not count."""
+    rng = np.random.default_rng(0)
+    states = np.zeros((40, 2, 4), dtype=np.float32)
+    states[..., 0] = 10_000 + rng.uniform(0, 500, (40, 2))
+    states[..., 1] = rng.uniform(0, 12, (40, 2))
+    states[..., 2] = 25 + rng.normal(size=(40, 2))
+    episode = Episode(states, np.ones((40, 2), dtype=np.bool_), np.arange(2))
+    world = typical_spread([episode], SceneSpec(dt_s=1.0))
+    assert world == pytest.approx([*states.reshape(-1, 4).std(axis=0)[:3], 0.3], rel=1e-3)  # a spread of 0 has a floor
+    relative = typical_spread([episode], SceneSpec(dt_s=1.0, frame=("ego", "world")))
+    assert relative[0] == pytest.approx((states[..., 0] - states[:, :1, 0]).std(), rel=1e-3)

@@ -1,0 +1,60 @@
+from typing import Any
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from agents.arena import Arena, EgoArena, open_arena
+from agents.parallel_rows import ParallelArena
+from agents.rows import make_rows
+from agents.task import Task
+from envs.registry import make_env
+
+
+def test_every_task_has_its_arena():
+    for task, kind in ((Task("highway-fast-v0", "none"), EgoArena), (Task("simple_tag_v3", "none"), ParallelArena)):
+        arena = open_arena(task, 1)
+        assert isinstance(arena, kind)
+        assert isinstance(arena, Arena)
+        arena.close()
+
+
+def test_native_policies_are_measured_on_the_original(monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("envpool")
+    asked: list[tuple[Task, int, bool]] = []
+
+    def note(task: Task, num_rows: int, seeded: bool) -> Any:
+        asked.append((task, num_rows, seeded))
+        return make_rows(task, num_rows, seeded)
+
+    monkeypatch.setattr("agents.arena.make_rows", note)
+    arena = open_arena(Task("highway-fast-v0", "none", backend="envpool"), 1)
+    assert asked == [(Task("highway-fast-v0", "none"), 1, True)]
+    arena.close()
+
+
+def test_an_ego_is_played_as_in_a_plain_loop():
+    arena = EgoArena(Task("highway-fast-v0", "none"), 1)
+    env = make_env("highway-fast-v0")
+    model = PPO("MlpPolicy", DummyVecEnv([lambda: make_env("highway-fast-v0")]), n_steps=4, batch_size=4, seed=1)
+    obs, _ = env.reset(seed=11)
+    rewards, crashed, ended = [], False, False
+    while not ended:
+        obs, reward, terminated, truncated, info = env.step(int(model.predict(obs, deterministic=True)[0]))
+        rewards.append(reward)
+        crashed |= info["crashed"]
+        ended = terminated or truncated
+    (result,) = arena.play(model, [11])
+    assert (result.length, result.crashed) == (len(rewards), crashed)
+    assert result.episode_return == pytest.approx(float(np.sum(rewards)))
+    assert result.returns_by_role == {}
+    arena.close()
+
+
+def test_random_and_idle_stand_beside_an_ego():
+    arena = EgoArena(Task("highway-fast-v0", "none"), 1)
+    random, idle = (arena.play(name, [2])[0] for name in arena.baselines)
+    assert random.episode_return != idle.episode_return
+    assert arena.play("random", [2]) == [random]
+    arena.close()
