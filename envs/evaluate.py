@@ -28,8 +28,8 @@ from envs.registry import CHECKPOINTS, checkpoint_for
 from envs.worlds import default_drivers, open_world
 from predictor.accuracy import Accuracy, Outcome, Tally, fitted_std_m
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, read_info, resolve
-from predictor.errors import UserError, run_entry_point
 from predictor.data.store import read_info_of
+from predictor.errors import UserError, run_entry_point
 from predictor.evaluate import ROW_NAMES, accuracy_table
 from predictor.graph import pair_mask
 from predictor.graph_metrics import GraphAccuracy, GraphTally

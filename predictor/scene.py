@@ -147,8 +147,9 @@ class Scene:
             raise UserError(f"{source}: ids must be unique within a scene, got {live.tolist()}")
         if (live < 0).any():
             raise UserError(f"{source}: ids of valid agents must be non-negative, got {live.tolist()}")
-        if not np.isfinite(self.heading_rad):
-            raise UserError(f"{source}: heading_rad must be finite, got {self.heading_rad}")
+        number = isinstance(self.heading_rad, int | float | np.integer | np.floating)
+        if not number or not np.isfinite(self.heading_rad):
+            raise UserError(f"{source}: heading_rad must be one finite number, got {self.heading_rad}")
         if not np.isfinite(self.states[self.valid]).all():
             raise UserError(f"{source}: states must be finite, got {self.states[self.valid].tolist()}")
 

@@ -10,14 +10,18 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
+import imageio_ffmpeg
 import pytest
+from stable_baselines3 import PPO as SB3PPO
 
 import train_policy
 from agents import evaluate
 from agents.runs import load_model, read_note
 from agents.training import SaveCheckpoint
 from predictor.errors import run_entry_point
+from tests.agents.helpers import TOY, policy_for
 
 # SB3 silences this warning at import, pytest makes it an error again.
 pytestmark = pytest.mark.filterwarnings("ignore:rich is experimental")
@@ -28,6 +32,8 @@ TINY = (
 )  # fmt: skip
 PPO = (*TINY, "--steps", "256")  # two rollouts of 128
 DQN = (*TINY, "--algorithm", "dqn", "--steps", "230")  # learns from step 200 on
+TAG = (*TINY[2:], "--env", "simple_tag_v3", "--checkpoint", "constant-velocity", "--steps", "600")
+"""Two rollouts of 100 steps of three pursuers."""
 
 
 @pytest.fixture
@@ -39,15 +45,33 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return run
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def trained(run: Path, *arguments: str) -> tuple[Path, str]:
     """A run and what it printed."""
-    run = tmp_path_factory.mktemp("finished") / "run"
     printed = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
-        patch.setattr(sys, "argv", ["train_policy.py", *PPO, "--run-dir", str(run)])
+        patch.setattr(sys, "argv", ["train_policy.py", *arguments, "--run-dir", str(run)])
         run_entry_point(train_policy.main)
     return run, printed.getvalue()
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """On the highway."""
+    return trained(tmp_path_factory.mktemp("finished") / "run", *PPO)
+
+
+@pytest.fixture(scope="module")
+def chased(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Of pursuers."""
+    return trained(tmp_path_factory.mktemp("chased") / "run", *TAG[:-1], "300")
+
+
+def assert_video(path: Path, least_s: float) -> None:
+    """The file is a video that decodes."""
+    assert path.read_bytes()[4:8] == b"ftyp"
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(path)
+    assert frames > 10
+    assert seconds >= least_s
 
 
 def error_line(capsys: pytest.CaptureFixture[str]) -> str:
@@ -74,6 +98,7 @@ def test_one_command_trains_evaluates_and_films(finished: tuple[Path, str]):
     assert list((run / "tb").rglob("events.out.tfevents.*"))
     for text in ("ppo", "random", "idle", "crash rate"):
         assert text in printed
+    assert_video(run / "video.mp4", least_s=1)
     assert "video.mp4" in printed.replace("\n", "")
 
 
@@ -94,9 +119,93 @@ def test_a_finished_policy_is_evaluated_again(finished: tuple[Path, str], monkey
     assert again["episodes"] == json.loads((run / "summary.json").read_text())["episodes"]
 
 
-@pytest.mark.parametrize("arguments", [PPO, DQN], ids=["ppo", "dqn"])
+def test_pursuers_learn_to_chase_a_prey_that_flees_by_rule(chased: tuple[Path, str]):
+    run, printed = chased
+    names = {p.name for p in run.iterdir()}
+    assert {"config.json", "policy.zip", "summary.json", "summary.md", "video.mp4"} <= names
+    config = json.loads((run / "config.json").read_text())["config"]
+    assert (config["env_id"], config["learners"], config["partner"]) == ("simple_tag_v3", ["adversary"], "heuristic")
+    assert config["envs"] == 1
+    assert load_model(run / "policy.zip", "ppo").num_timesteps == 300
+    summary = json.loads((run / "summary.json").read_text())
+    assert [row["policy"] for row in summary["policies"]] == ["ppo (forecast)", "random", "heuristic"]
+    assert all(row["crash_rate"] is None and row["length_mean"] == 25 for row in summary["policies"])
+    assert (run / "summary.md").read_text().startswith("| policy | return | length |")
+    assert "crash" not in printed
+    assert_video(run / "video.mp4", least_s=1)
+
+
+def test_pursuers_are_evaluated_again(chased: tuple[Path, str], monkeypatch: pytest.MonkeyPatch):
+    run, _ = chased
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--run-dir", str(run), "--episodes", "1"])
+    run_entry_point(evaluate.main)
+    again = json.loads((run / "evaluation" / "summary.json").read_text())
+    assert again["episodes"] == json.loads((run / "summary.json").read_text())["episodes"]
+
+
+def test_agents_without_forecasts_learn_and_are_filmed(tmp_path: Path):
+    arguments = [*TINY[2:], "--env", "simple_spread_v3", "--observe", "none", "--steps", "300"]
+    run, printed = trained(tmp_path / "run", *arguments)
+    assert json.loads((run / "config.json").read_text())["config"]["learners"] == []
+    assert load_model(run / "policy.zip", "ppo").observation_space.shape == (18,)
+    lines = (run / "summary.md").read_text().splitlines()
+    assert [line.split(" | ")[0] for line in lines[2:5]] == ["| ppo (none)", "| random", "| heuristic"]
+    assert "video.mp4" in printed.replace("\n", "")
+    assert_video(run / "video.mp4", least_s=1)
+
+
+def test_native_environments_train_what_is_measured_on_the_original(tmp_path: Path):
+    pytest.importorskip("envpool")
+    arguments = ["--envs", "16", *TINY[4:], "--backend", "envpool", "--checkpoint", "constant-velocity"]
+    run, _ = trained(tmp_path / "run", *arguments, "--steps", "512", "--no-video")
+    config = json.loads((run / "config.json").read_text())["config"]
+    assert (config["backend"], config["preset"]["n_steps"]) == ("envpool", 32)
+    assert load_model(run / "policy.zip", "ppo").num_timesteps == 512
+    summary = json.loads((run / "summary.json").read_text())
+    assert summary["env_id"] == "highway-fast-v0"
+    assert [row["policy"] for row in summary["policies"]] == ["ppo (forecast)", "random", "idle"]
+    assert all(0 < row["return_mean"] <= 30 for row in summary["policies"])
+    assert not (run / "video.mp4").exists()
+
+
+@pytest.mark.parametrize(("backend", "envs"), [("gymnasium", 6), ("envpool", 64)])
+def test_environments_by_default(backend: Literal["gymnasium", "envpool"], envs: int):
+    assert train_policy.TrainPolicyConfig(backend=backend).num_envs == envs
+    assert train_policy.TrainPolicyConfig(backend=backend, envs=3).num_envs == 3
+
+
+@pytest.mark.parametrize(
+    ("env_id", "asked", "learners"),
+    [
+        ("simple_tag_v3", None, ("adversary",)),
+        ("simple_tag_v3", (), ()),
+        ("simple_tag_v3", ("agent_0",), ("agent_0",)),
+        ("simple_spread_v3", None, ()),
+        ("highway-fast-v0", None, ()),
+    ],
+)
+def test_who_learns(env_id: str, asked: tuple[str, ...] | None, learners: tuple[str, ...]):
+    task = train_policy.TrainPolicyConfig(env_id, learners=asked).plan.task
+    assert task.learners == learners
+
+
+def test_what_cannot_be_drawn_gives_no_video_and_no_error(tmp_path: Path):
+    config = train_policy.TrainPolicyConfig("CartPole-v1", observe="none", run_dir=tmp_path)
+    assert train_policy.film(config, SB3PPO("MlpPolicy", "CartPole-v1", device="cpu")) is None
+    config = train_policy.TrainPolicyConfig(TOY, observe="none", run_dir=tmp_path)
+    assert train_policy.film(config, policy_for(config.plan.task)) is None
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "interrupted_at"), [(PPO, 128), (DQN, 128), (TAG, 300)], ids=["ppo", "dqn", "pursuers"]
+)
 def test_interrupted_run_goes_on_where_it_was(
-    command: Callable[..., None], arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: Callable[..., None],
+    arguments: tuple[str, ...],
+    interrupted_at: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ):
     run = tmp_path / "run"
     algorithm = "dqn" if "dqn" in arguments else "ppo"
@@ -104,7 +213,7 @@ def test_interrupted_run_goes_on_where_it_was(
 
     def save_then_die(self: SaveCheckpoint) -> None:
         save(self)
-        if self._saved_at >= 128:
+        if self._saved_at >= interrupted_at:
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
@@ -113,7 +222,7 @@ def test_interrupted_run_goes_on_where_it_was(
             command(*arguments, "--run-dir", str(run))
     assert exit_.value.code == 130
     interrupted = load_model(run / "checkpoint.zip", algorithm)
-    assert interrupted.num_timesteps == 128
+    assert interrupted.num_timesteps == interrupted_at
     assert not (run / "policy.zip").exists()
 
     started_at: list[int] = []
@@ -125,7 +234,7 @@ def test_interrupted_run_goes_on_where_it_was(
 
     monkeypatch.setattr(SaveCheckpoint, "_on_training_start", note_start)
     command(*arguments, "--run-dir", str(run), "--no-video", "--resume")
-    assert started_at == [128]
+    assert started_at == [interrupted_at]
     finished = load_model(run / "checkpoint.zip", algorithm)
     assert finished.num_timesteps == int(arguments[-1])
     if algorithm == "dqn":
@@ -183,6 +292,17 @@ def test_resume_with_another_config_names_the_field(
         (("--eval-episodes", "0"), "eval_episodes must be at least 1, got 0"),
         (("--seed", "-1"), "seed must lie in"),
         (("--device", "tpu9"), "device must be cpu, cuda or auto, got 'tpu9'"),
+        (("--env", "nonsense"), "cannot make env 'nonsense'"),
+        (
+            ("--env", "simple_tag_v3", "--observe", "none", "--learners", "nonsense"),
+            "learners: 'nonsense' is neither an agent nor a role of simple_tag_v3",
+        ),
+        (("--learners", "adversary"), "learners are for PettingZoo environments, highway-fast-v0 has one ego"),
+        (("--env", "simple_tag_v3", "--partner", "nonsense"), "partner must be one of random, idle, varied"),
+        (("--env", TOY, "--observe", "none", "--learners", "ant"), "no heuristic drives meadow_v0"),
+        (("--env", TOY, "--observe", "constant-velocity"), "no scene reader knows meadow_v0"),
+        (("--backend", "envpool", "--env", "roundabout-generic-v1"), "EnvPool has no copy of 'roundabout-generic-v1'"),
+        (("--backend", "envpool", "--env", "simple_tag_v3"), "backend envpool has no simple_tag_v3"),
         (
             ("--env-id", "racetrack-v1", "--algorithm", "dqn", "--observe", "none"),
             "dqn needs a discrete action space",
@@ -210,7 +330,10 @@ def test_help_explains_every_field(command: Callable[..., None], capsys: pytest.
         command("--help")
     assert exit_.value.code == 0
     text = " ".join(capsys.readouterr().out.split())
-    for option in ("--env-id", "--observe", "--checkpoint", "--resume", "--eval-episodes", "--no-video"):
+    for option in (
+        "--env-id", "--observe", "--checkpoint", "--resume", "--eval-episodes", "--no-video",
+        "--backend", "--learners", "--partner",
+    ):  # fmt: skip
         assert option in text
 
 

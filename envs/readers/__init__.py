@@ -5,7 +5,15 @@ from typing import Any
 
 import gymnasium as gym
 
-from envs.readers.base import Reader, SceneReader, SharedScene, SharedSceneReader, perceive, share
+from envs.readers.base import (
+    Reader,
+    SceneReader,
+    SharedScene,
+    SharedSceneReader,
+    build_reader,
+    perceive,
+    share,
+)
 from envs.readers.entities import EntityRowsReader
 from envs.readers.envpool import EnvPoolReader, is_envpool_env
 from envs.readers.function import FunctionReader
@@ -57,7 +65,8 @@ def reader_for(env: gym.Env, perception_m: float | None = None, max_agents: int 
     """
     for env_class in type(env.unwrapped).__mro__:
         if env_class in _REGISTERED:
-            return _REGISTERED[env_class](env)
+            reader: SceneReader = build_reader(_REGISTERED[env_class], env)
+            return reader
     if is_highway_env(env):
         return HighwayReader(env, perception_m=perception_m, max_agents=max_agents)
     if is_envpool_env(env):

@@ -17,8 +17,7 @@ from agents.evaluate import (
 from agents.parallel_rows import ParallelArena
 from agents.task import Task
 from predictor.errors import UserError
-from tests.agents.test_parallel_rows import policy_for
-from tests.agents.toys import TOY
+from tests.agents.helpers import TOY, policy_for
 
 EPISODES = [
     EpisodeResult(seed=10, episode_return=20.0, length=30, crashed=False, mean_speed_mps=22.0),

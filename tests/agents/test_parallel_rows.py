@@ -3,8 +3,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
-from stable_baselines3 import PPO
 
 from agents.episodes import EpisodeResult
 from agents.parallel_rows import DrivenEnv, MakeCopy, ParallelArena, drive, make_parallel_rows, record_task
@@ -12,20 +10,9 @@ from agents.task import Task
 from envs.drivers import make_driver
 from envs.parallel_registry import make_parallel_env
 from predictor.errors import UserError
-from tests.agents.toys import LIVES, TOY
+from tests.agents.helpers import LIVES, TOY, policy_for
 
 TAG, SPREAD = "simple_tag_v3", "simple_spread_v3"
-
-
-def policy_for(task: Task) -> PPO:
-    """Untrained, with weights large enough that its actions depend on what it sees."""
-    rows = make_parallel_rows(task, 1)
-    kind = "MultiInputPolicy" if isinstance(rows.observation_space, gym.spaces.Dict) else "MlpPolicy"
-    model = PPO(kind, rows, n_steps=4, batch_size=4 * rows.num_envs, policy_kwargs={"net_arch": [8]}, seed=0)
-    with torch.no_grad():
-        for parameter in model.policy.parameters():
-            parameter.mul_(5.0)
-    return model
 
 
 def told(results: list[EpisodeResult]) -> list[tuple]:

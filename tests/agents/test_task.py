@@ -3,7 +3,7 @@ import pytest
 
 from agents.task import Task
 from predictor.errors import UserError
-from tests.agents.toys import TOY
+from tests.agents.helpers import TOY
 
 TAG = "simple_tag_v3"
 

@@ -328,13 +328,14 @@ SUBJECTS: dict[str, Subject] = {
     "highway": Subject(highway("highway-fast-v0", **SMALL), highway_bodies, 60.0),
     "highway-mixed": Subject(highway("highway-mixed-v0", **SMALL), highway_bodies, 60.0),
     "intersection": Subject(
-        highway("intersection-v2", duration=11), highway_bodies, 25.0, enters=True, leaves=True, sight_m=40.0
+        highway("intersection-v2", duration=11), highway_bodies, 25.0, enters=True, leaves=True, sight_m=60.0
     ),
     "envpool-highway": Subject(
-        partial(make_env, "envpool/HighwayFast-v0", vehicles_count=8, duration=8), envpool_bodies, 60.0
+        partial(make_env, "envpool/HighwayFast-v0", vehicles_count=8, duration=8), envpool_bodies, 20.0, 1,
+        enters=True, leaves=True, sight_m=30.0,
     ),
-    "envpool-intersection": Subject(partial(make_env, "envpool/Intersection-v0"), envpool_bodies, 25.0,
-        enters=True, leaves=True, sight_m=40.0,
+    "envpool-intersection": Subject(
+        partial(make_env, "envpool/Intersection-v0"), envpool_bodies, 25.0, enters=True, sight_m=50.0
     ),
     "rows-highway": Subject(
         highway("highway-fast-v0", **SMALL, observation=KINEMATICS), highway_bodies, 60.0,

@@ -184,7 +184,7 @@ ERRORS = {
     "missing-policy": (["--ego", "absent.zip"], "no policy at absent.zip"),
     "unknown-driver": (["--env-id", TAG, "--ego", "heuristic", "reckless"], "driver must be one of random, idle,"),
     "unfit-driver": (["--env-id", TAG, "--ego", "keep-lane"], "driver must be one of random, idle,"),
-    "policy-among-many": (["--env-id", TAG, "--ego", "absent.zip"], "policies cannot drive parallel environments yet"),
+    "policy-among-many": (["--env-id", TAG, "--ego", "absent.zip"], "no policy at absent.zip"),
     "nothing-moves": (["--env-id", "mpe2.simple_crypto_v3:parallel_env"], "nothing moves in simple_crypto"),
 }
 

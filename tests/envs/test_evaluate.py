@@ -171,7 +171,8 @@ def test_constant_velocity_is_its_own_baseline(env_id: str, in_process: None):
     for row in (result.model, result.model_samples):
         assert row.agents == result.constant_velocity.agents > 0
         for name in ("min_ade_m", "min_fde_m", "by_step_m", "rmse_m"):
-            assert getattr(row, name) == pytest.approx(getattr(result.constant_velocity, name), rel=1e-4)
+            expected = getattr(result.constant_velocity, name)
+            assert getattr(row, name) == pytest.approx(expected, rel=1e-4, abs=1e-6)
     assert (result.model.num_samples, result.model_samples.num_samples) == (1, 3)
     assert result.constant_velocity.min_ade_m > 0.01
     assert result.nearest_neighbours is None and result.graph is None and result.histories == {}
@@ -370,8 +371,8 @@ ERRORS = {
     "unfit-ego": (["--ego", "keep-lane"], "keep-lane needs continuous steering"),
     "unknown-ego": (["--ego", "reckless"], "ego must be one of random"),
     "unfit-driver": (["--env-ids", TAG, "--ego", "keep-lane"], "driver must be one of random"),
-    "no-neighbours": (["--neighbours", "nowhere"], "neighbours: there is no episode store at nowhere; record one"),
-    "no-store": (["--neighbours", "."], ". is not an episode store"),
+    "no-neighbours": (["--neighbours", "nowhere"], "nowhere is not a readable episode store"),
+    "no-store": (["--neighbours", "."], ". is not a readable episode store"),
     "too-short": (["--max-steps", "1", "--episodes", "1"], f"{ROAD}: no forecast has 5 steps of truth"),
 }
 
@@ -417,4 +418,4 @@ def test_missing_neighbours_are_no_misfit_of_a_checkpoint(
     arguments = ["--env-ids", ROAD, "--checkpoint", STILL, highway_checkpoint, "--neighbours", "nowhere"]
     code, errors, _ = run_command(evaluate.main, arguments, monkeypatch, capsys)
     assert (code, len(errors)) == (2, 1)
-    assert errors[0].startswith("error: neighbours: there is no episode store at nowhere")
+    assert errors[0].startswith("error: nowhere is not a readable episode store")

@@ -250,7 +250,7 @@ def test_constant_velocity_in_the_deployed_place_is_the_baseline(env_id: str):
 def test_a_short_memory_forecasts_from_the_last_scenes_alone(who: str, tmp_path: Path, highway_checkpoint: str):
     """With one step it is a fresh memory at each scene; with as many as the episode has, it is the deployed model."""
     if who == "road":
-        made = task(checkpoint=highway_checkpoint, driver="varied")
+        made = task("highway-fast-v0", checkpoint=highway_checkpoint)
     else:
         made = task(TAG, checkpoint=save_tag(tmp_path / "tag", who != "tag"), driver="heuristic")
     steps = made.max_steps + 1

@@ -100,9 +100,10 @@ def test_an_episode_opens_with_one_step_of_history(name: str, take: Callable[[st
     session, (old, new) = take(name).session, take(name).episodes
     assert_same_views(new[0].views, session.windowed(new[:1]))
     stale = session.stream()
-    for moment in old:
+    for moment in old[:4]:
         stale.observe(moment.shared)
-    assert difference(stale.observe(new[0].shared), new[0].views) > 1e-3  # a history that stays would be noticed
+    leaks = [difference(stale.observe(moment.shared), moment.views) for moment in new]
+    assert max(leaks) > 1e-3  # a history that stays would be noticed
 
 
 @named()

@@ -3,32 +3,26 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from stable_baselines3 import PPO
 
-from agents.parallel_rows import ParallelArena, make_parallel_rows
+from agents.parallel_rows import ParallelArena
 from agents.task import Task
 from envs.parallel import ForecastParallelEnv
 from envs.parallel_registry import make_parallel_env
 from envs.trained_driver import trained_driver
 from envs.worlds import SharedWorld
 from predictor.errors import UserError
+from tests.agents.helpers import policy_for
 
 SPREAD = "simple_spread_v3"
 SEED = 5
 
 
 def save_run(folder: Path, task: Task, config: bool = True) -> tuple[str, PPO]:
-    """A run folder as train_policy leaves it; the policy's weights are large, so that it acts on what it sees."""
-    rows = make_parallel_rows(task, 1)
-    kind = "MultiInputPolicy" if isinstance(rows.observation_space, gym.spaces.Dict) else "MlpPolicy"
-    model = PPO(kind, rows, n_steps=4, batch_size=4 * rows.num_envs, policy_kwargs={"net_arch": [8]}, seed=0)
-    with torch.no_grad():
-        for parameter in model.policy.parameters():
-            parameter.mul_(5.0)
+    """A run folder as train_policy leaves it."""
+    model = policy_for(task)
     model.save(folder / "policy.zip")
     if config:
         settings = {"observe": task.observe, "learners": task.learners, "partner": task.partner}

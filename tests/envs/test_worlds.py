@@ -106,7 +106,7 @@ def test_a_policy_gets_the_most_likely_of_several_forecasts(tmp_path: Path, high
         (ROAD, "absent.zip", None, "no policy at absent.zip"),
         (ROAD, "idle", "nowhere", "no checkpoint 'nowhere'"),
         (TAG, "reckless", None, "driver must be one of random"),
-        (TAG, "absent.zip", None, "policies cannot drive parallel environments yet"),
+        (TAG, "absent.zip", None, "no policy at absent.zip"),
         (TAG, "idle", "nowhere", "no checkpoint 'nowhere'"),
     ],
 )

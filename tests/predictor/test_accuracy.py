@@ -193,7 +193,7 @@ def test_a_row_is_json():
 
     content = json.loads(json.dumps(asdict(summarise("a", [gaussian(0)], (1.0, 1.0)))), parse_constant=refuse)
     assert content["statistics"]["min_ade_m"]["subsets"] == 20
-    assert set(content["step_errors"]) == {"by_step_m", "rmse_m", "nll", "coverage"}
+    assert set(content["step_errors"]) == {"by_step_m", "miss_by_step", "rmse_m", "nll", "coverage"}
 
 
 @given(st.integers(0, 10**6), st.integers(1, 11), st.permutations(range(3)))

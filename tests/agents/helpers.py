@@ -1,10 +1,15 @@
-"""A tiny parallel environment that no reader knows and no heuristic drives."""
+"""What several test files of `agents` share: untrained policies, and an environment that nobody can read or drive."""
 
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 from pettingzoo import ParallelEnv
+from stable_baselines3 import PPO
+
+from agents.parallel_rows import make_parallel_rows
+from agents.task import Task
 
 TOY = f"{__name__}:Meadow"
 LIVES = {"ant_0": 2, "bee_0": 5}
@@ -45,3 +50,14 @@ class Meadow(ParallelEnv):
 
 
 _SEEN, _DONE = gym.spaces.Box(0, 10, (1,), np.float32), gym.spaces.Discrete(2)
+
+
+def policy_for(task: Task) -> PPO:
+    """Untrained, with weights large enough that its actions depend on what it sees."""
+    rows = make_parallel_rows(task, 1)
+    kind = "MultiInputPolicy" if isinstance(rows.observation_space, gym.spaces.Dict) else "MlpPolicy"
+    model = PPO(kind, rows, n_steps=4, batch_size=4 * rows.num_envs, policy_kwargs={"net_arch": [8]}, seed=0)
+    with torch.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.mul_(5.0)
+    return model
