@@ -159,7 +159,7 @@ class ParallelArena:
         driver = make_driver(name, env, np.random.default_rng(seed))
         returns = dict.fromkeys(self._venv.row_agents, 0.0)
         steps, lived = 0, set(env.agents)
-        while not (lived.issuperset(returns) and returns.keys().isdisjoint(env.agents)) and env.agents:
+        while env.agents and not (lived.issuperset(returns) and returns.keys().isdisjoint(env.agents)):
             own = own_observations(observations)
             actions = driver({agent: seen for agent, seen in own.items() if agent in returns})
             observations, rewards, *_ = env.step(_partners_actions(env, own, returns) | actions)

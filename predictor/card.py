@@ -44,6 +44,9 @@ def write_card(config: CardConfig) -> Path:
         raise UserError(
             f"{config.accuracy} has no row for checkpoint '{config.checkpoint.name}'; run envs.evaluate on it"
         )
+    who = "the ego included" if info.spec.has_ego else "nobody is the ego"
+    drivers = ", ".join(sorted({f"`{r.get('driver') or results['config']['ego']}`" for r in rows}))
+    left_out = "the ego itself is not counted" if info.spec.has_ego else "what never moves is not counted"
     parameters = sum(p.numel() for p in model.parameters())
     size_kb = (config.checkpoint / "model.safetensors").stat().st_size / 1000
     text = "\n\n".join(
@@ -51,11 +54,12 @@ def write_card(config: CardConfig) -> Path:
             f"# Predictor checkpoint `{config.checkpoint.name}`",
             f"dG-VAE, {parameters:,} parameters, {size_kb:.0f} kB of safetensors. Trained on recorded "
             f"{', '.join(info.sources)}; forecasts {info.horizon_steps} steps of {info.spec.dt_s:g} s. Sees at most "
-            f"{info.spec.max_agents} agents (the ego included) within {info.spec.perception_m:g} m.",
+            f"{info.spec.max_agents} agents ({who}) within {info.spec.perception_m:g} m.",
             "## Accuracy in the live environment",
-            f"Held-out seeds from {results['config']['seed']:,}, {results['config']['episodes']} episodes each, ego "
-            f"driven `{results['config']['ego']}`; the ego itself is not counted. minADE₁ is the most likely forecast, "
-            f"minADE_K the best of {results['config']['samples']} samples. Interval: bootstrap over episodes.",
+            f"Held-out seeds from {results['config']['seed']:,}, {results['config']['episodes']} episodes each, driven "
+            f"{drivers}; {left_out}. minADE₁ is the most likely forecast, minADE_K the best of "
+            f"{results['config']['samples']} samples; neighbours: memoryless nearest neighbours on the training data. "
+            "Interval: bootstrap over episodes.",
             _accuracy(rows),
             f"Command: `{results['provenance']['command']}`",
             "## Data",
@@ -75,18 +79,25 @@ def write_card(config: CardConfig) -> Path:
 
 def _accuracy(rows: Sequence[dict[str, Any]]) -> str:
     lines = [
-        "| env | minADE₁ [m] | minFDE₁ [m] | minADE_K [m] | CV ADE / FDE [m] | below CV | 95 % interval |",
-        "|" + "---|" * 7,
+        "| env | minADE₁ [m] | minFDE₁ [m] | minADE_K [m] | neighbours ADE [m] | CV ADE / FDE [m] | below CV "
+        "| 95 % interval |",
+        "|" + "---|" * 8,
     ]
     for row in rows:
         one, straight = row["model"], row["constant_velocity"]
         low, high = row["reduction_interval"]
+        near = row.get("nearest_neighbours")
         lines.append(
-            f"| {row['env_id']} | {one['min_ade_m']:.2f} | {one['min_fde_m']:.2f} | "
-            f"{row['model_samples']['min_ade_m']:.2f} | {straight['min_ade_m']:.2f} / {straight['min_fde_m']:.2f} | "
+            f"| {row['env_id']} | {_metres(one['min_ade_m'])} | {_metres(one['min_fde_m'])} | "
+            f"{_metres(row['model_samples']['min_ade_m'])} | {'–' if near is None else _metres(near['min_ade_m'])} | "
+            f"{_metres(straight['min_ade_m'])} / {_metres(straight['min_fde_m'])} | "
             f"{100 * row['reduction']:.0f} % | {100 * low:.0f} to {100 * high:.0f} % |"
         )
     return "\n".join(lines)
+
+
+def _metres(value: float) -> str:
+    return f"{value:.2f}" if value >= 1 else f"{value:.3f}"
 
 
 def _store_line(path: Path, store: EpisodeStore) -> str:

@@ -34,7 +34,7 @@ from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 from tests.envs.helpers import HORIZON, SIZES
 
 Views = dict[str, dict[str, Any]]
-Bodies = list[tuple[Hashable, tuple[float, float]]]
+Bodies = list[tuple[Hashable, tuple[float, ...]]]
 EGO = "ego"
 _serials = itertools.count()
 
@@ -118,7 +118,7 @@ class Crowd(gym.Env):
         return table
 
 
-def read_crowd(env: gym.Env) -> Scene:
+def read_crowd(env: Any) -> Scene:
     """A plain function as a reader."""
     people = env.unwrapped.people
     states = np.array([walker.state for walker in people])
@@ -133,7 +133,7 @@ class CrowdReader(Reader):
         self._ids: weakref.WeakKeyDictionary[Walker, int] = weakref.WeakKeyDictionary()
         self._next = itertools.count()
 
-    def read_all(self, env: gym.Env) -> Scene:
+    def read_all(self, env: Any) -> Scene:
         for walker in env.unwrapped.people:
             if walker not in self._ids:
                 self._ids[walker] = next(self._next)
@@ -282,8 +282,8 @@ class Subject:
     """Whether many learn, with `ForecastParallelEnv`."""
     reader: Callable[[SceneSpec], Any] | None = None
     """From a spec to what makes a reader; None takes the family's."""
-    spec: SceneSpec | None = None
-    """For `reader`."""
+    spec: Any = None
+    """A `SceneSpec` for `reader`."""
     enters: bool = False
     """Whether somebody comes into sight in the recorded episode."""
     leaves: bool = False
@@ -420,6 +420,7 @@ class Session:
 
     def __init__(self, subject: Subject, folder: Path, sight_m: float | None = None, rows: int | None = None) -> None:
         self.subject, bare = subject, subject.make()
+        self.env: Any
         sight_m = subject.sight_m if sight_m is None else sight_m
         if subject.shared:
             maker = subject.reader and subject.reader(subject.spec)
@@ -477,7 +478,7 @@ class Session:
         return obs
 
     def _moment(self, seen: Any) -> Moment:
-        scene = self.env.scene
+        scene: Any = self.env.scene
         if not self.subject.shared:
             scene, seen = SharedScene(scene, {EGO: 0}, np.full(len(scene.ids), scene.heading_rad)), {EGO: seen}
         views = {name: {key: view[key] for key in view if key != "observation"} for name, view in seen.items()}

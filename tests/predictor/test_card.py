@@ -46,11 +46,11 @@ def test_card_says_what_the_files_say(config: CardConfig):
     assert path == config.checkpoint / "README.md"
     assert text.startswith("# Predictor checkpoint `toy`\n")
     assert [line for line in text.splitlines() if line.startswith("| toy-v0")] == [
-        "| toy-v0 | 1.25 | 2.50 | 0.75 | 5.00 / 9.00 | 75 % | 50 to 88 % |"
+        "| toy-v0 | 1.25 | 2.50 | 0.750 | – | 5.00 / 9.00 | 75 % | 50 to 88 % |"
     ]
     for fact in (
         "forecasts 3 steps of 1 s",
-        "Held-out seeds from 10,000, 40 episodes each, ego driven `idle`",
+        "Held-out seeds from 10,000, 40 episodes each, driven `idle`; the ego itself is not counted",
         "* circles: 6 episodes, 60 scenes.",
         "`python -m envs.evaluate --all`",
         "`python -m predictor.train --data a`",
