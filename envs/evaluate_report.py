@@ -77,7 +77,7 @@ def markdown(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str],
 
 def transfer(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], str]) -> Table:
     """Checkpoints (columns) measured in environments (rows)."""
-    table = Table(title="transfer: minADE₁ [m] (below constant velocity)", caption="–: does not fit, see accuracy.md")
+    table = Table(title=r"transfer: minADE₁ \[m] (below constant velocity)", caption="–: does not fit, see accuracy.md")
     cells = _matrix(results, misfits)
     table.add_column("env")
     for name in next(iter(cells.values())):

@@ -97,8 +97,6 @@ def build_reader(make_reader: Any, env: Any) -> Any:
             f"reader= takes what makes a reader, but {name} gives {type(reader).__name__} without {', '.join(lacks)}; "
             + advice
         )
-    if isinstance(reader.spec, SceneSpec) and not reader.spec.has_ego:
-        raise UserError(f"{name}: an environment with one ego needs a reader whose spec has has_ego=True")
     if not isinstance(reader.spec, SceneSpec):
         raise UserError(
             f"{name}: the spec of a reader must be a SceneSpec, got {type(reader.spec).__name__}; a class of one's own "

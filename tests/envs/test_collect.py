@@ -44,7 +44,7 @@ def test_an_episode_is_what_the_simulator_did():
         truth = reader.read_all(env)
         present = episode.valid[t]
         assert episode.ids[present].tolist() == truth.ids.tolist()
-        np.testing.assert_allclose(episode.states[t, present], truth.states, rtol=1e-6)
+        np.testing.assert_allclose(episode.states[t, present], truth.states, rtol=1e-6, atol=1e-12)
         np.testing.assert_allclose(episode.states[t, 0, :2], env.unwrapped.vehicle.position, rtol=1e-6)
         env.step(idle_action(env))
 
@@ -139,7 +139,7 @@ def test_an_episode_of_many_learners_is_what_the_simulator_did():
     for t in range(STEPS + 1):
         truth = reader.read(env).scene
         assert episode.ids.tolist() == truth.ids.tolist()
-        np.testing.assert_allclose(episode.states[t], truth.states, rtol=1e-6)
+        np.testing.assert_allclose(episode.states[t], truth.states, rtol=1e-6, atol=1e-12)
         env.step({name: 0 for name in env.agents})
 
 
@@ -229,5 +229,5 @@ def test_an_existing_store_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_ranges_are_checked_before_anything_runs():
     config(episodes=1, max_steps=1).check()
-    with pytest.raises(UserError, match="ego needs at least one name"):
-        config(ego=()).check()
+    with pytest.raises(UserError, match="episodes must be at least 1, got 0"):
+        config(episodes=0).check()

@@ -214,7 +214,7 @@ def test_streaming_is_the_full_window(name: str, take: Callable[[str], Take]):
 @named()
 def test_another_future_leaves_the_past_alone(name: str, take: Callable[[str], Take], fresh: Callable[..., Session]):
     episode = take(name).episodes[0]
-    other = fresh(name).play(SUBJECTS[name].seed, steps=TURN + 3, turn=TURN)
+    other = fresh(name).play(SUBJECTS[name].seed, steps=TURN + 6, turn=TURN)
     for seen, wanted in zip(other[: TURN + 1], episode, strict=False):
         assert_same_views(seen.views, wanted.views, tolerance=0.0)
     later = list(zip(other, episode, strict=False))[TURN + 1 :]
