@@ -443,7 +443,7 @@ class Session:
         """An episode, or its first steps, with random actions: from step `turn` on, others."""
         moments = [self._moment(self.env.reset(seed=seed)[0])]
         for t in range(steps):
-            rng = np.random.default_rng([seed, t, turn is not None and t >= turn])
+            rng = np.random.default_rng([seed, t, 5 * (turn is not None and t >= turn)])
             moments.append(self._moment(self._step(rng)))
             if self.ended:
                 break
