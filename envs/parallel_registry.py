@@ -51,7 +51,11 @@ PARALLEL_IDS: dict[str, ParallelEntry] = {
 }
 """Id → how to make it. simple_crypto is left out: nothing moves in it."""
 
-PARALLEL_CHECKPOINTS: dict[str, str] = {"simple_tag_v3": "simple-tag", "simple_spread_v3": "simple-spread"}
+PARALLEL_CHECKPOINTS: dict[str, str] = {
+    "simple_tag_v3": "simple-tag",
+    "simple_spread_v3": "simple-spread",
+    "intersection-multi-agent-v1": "intersection",
+}
 """Id → name of the checkpoint under predictor/pretrained."""
 
 MakeSharedReader = Callable[[Any], SharedSceneReader]

@@ -23,6 +23,7 @@ CHECKPOINTS: dict[str, str] = {
     "racetrack-large-v1": "racetrack-large",
     "racetrack-oval-v1": "racetrack-oval",
     "u-turn-v1": "u-turn",
+    "highway-mixed-v0": "highway-mixed",
 }
 """Env id → name of the checkpoint under predictor/pretrained."""
 
