@@ -119,6 +119,8 @@ def make_model(plan: TrainingPlan, venv: VecEnv, tensorboard_log: str | None = N
     preset = plan.preset
     options = asdict(preset)
     layers = list(options.pop("net_arch"))
+    if isinstance(preset, PPOPreset):
+        options["batch_size"] = min(preset.batch_size, preset.n_steps * venv.num_envs)  # few rows give small rollouts
     policy_kwargs: dict[str, Any] = {
         "net_arch": {"pi": layers, "vf": layers} if isinstance(preset, PPOPreset) else layers
     }

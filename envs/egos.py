@@ -110,7 +110,7 @@ def env_for_ego(env: gym.Env, name: str) -> gym.Env:
     if sees_forecasts(name):
         from envs.wrappers import ForecastObservation  # the wrappers need no egos; most egos need no wrappers
 
-        env = ForecastObservation(env, _forecaster_of(Path(name)))
+        env = ForecastObservation(env, forecaster_of(Path(name)))
     require_view(env, name)
     return env
 
@@ -153,7 +153,7 @@ def _trained(path: str) -> Ego:
     return lambda obs: policy.predict(obs, deterministic=True)[0]
 
 
-def _forecaster_of(policy: Path) -> str | None:
+def forecaster_of(policy: Path) -> str | None:
     """The checkpoint that the policy's run folder names; None (the one that ships) if there is no such folder."""
     try:
         config = json.loads((policy.parent / "config.json").read_text())["config"]

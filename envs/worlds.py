@@ -5,14 +5,15 @@ policy is trained with, so what is recorded and measured is what is deployed.
 """
 
 import functools
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from envs.drivers import Driver, make_driver
-from envs.egos import env_for_ego, make_ego, require_view, sees_forecasts
+from envs.egos import env_for_ego, forecaster_of, make_ego, require_view, sees_forecasts
 from envs.parallel import ForecastParallelEnv
-from envs.parallel_registry import is_parallel_id, make_parallel_env
+from envs.parallel_registry import is_parallel_id, make_parallel_env, parallel_checkpoint_for
 from envs.readers import SceneReader
 from envs.readers.highway import is_highway_env
 from envs.readers.highway_labels import SceneLabels, read_labels
@@ -185,7 +186,7 @@ def open_world(
     if is_parallel_id(env_id):
         shared = ForecastParallelEnv(
             make_parallel_env(env_id),
-            checkpoint or CONSTANT_VELOCITY,
+            checkpoint or _forecaster_for(env_id, driver),
             horizon_steps=horizon_steps,
             num_samples=num_samples,
         )
@@ -204,6 +205,13 @@ def open_world(
         )
     make_ego(driver, world.env, np.random.default_rng(0))
     return world
+
+
+def _forecaster_for(env_id: str, driver: str) -> str:
+    """Whose forecasts a PettingZoo environment is recorded with: those that its driver was trained on, if any."""
+    if not sees_forecasts(driver):
+        return CONSTANT_VELOCITY
+    return forecaster_of(Path(driver)) or parallel_checkpoint_for(env_id)
 
 
 def default_drivers(env_id: str) -> tuple[str, ...]:
