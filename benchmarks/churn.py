@@ -31,8 +31,8 @@ class ChurnConfig:
     """Step `VecForecast` under constant coming and going."""
 
     steps: int = 200_000
-    """Vector steps."""
-    rows: int = 2
+    """Environment steps, over all rows."""
+    rows: int = 8
     """Environments."""
     agents: int = 6
     """Agents around the ego, on average."""
@@ -56,8 +56,9 @@ class ChurnConfig:
         for name in ("steps", "rows", "agents", "horizon_steps", "samples"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.steps < 2 * self.samples:
-            raise UserError(f"steps must be at least twice samples ({self.samples}), got {self.steps}")
+        if self.steps < 2 * self.samples * self.rows:
+            least = 2 * self.samples * self.rows
+            raise UserError(f"steps must be at least {least} (2 · samples · rows), got {self.steps}")
 
 
 class Churning(gym.Env):
@@ -125,11 +126,12 @@ def main() -> None:
     measured: list[tuple[int, int]] = []
     tensors: list[int] = []
     began = time.perf_counter()
-    for step in track(range(config.steps), "churn"):
+    vector_steps = config.steps // config.rows
+    for step in track(range(vector_steps), "churn"):
         observations: Any = venv.step(actions)[0]
         if not all(np.isfinite(value).all() for value in observations.values()):
             raise UserError(f"step {step}: an observation is not finite")
-        if (step + 1) % (config.steps // config.samples) == 0:
+        if (step + 1) % (vector_steps // config.samples) == 0:
             gc.collect()
             measured.append((step + 1, resident_bytes()))
             tensors.append(sum(type(thing) is torch.Tensor for thing in gc.get_objects()))
@@ -138,7 +140,7 @@ def main() -> None:
     online = venv.stream._online
     seen = sum(env.unwrapped._next for env in venv.unwrapped.envs)  # type: ignore[attr-defined]
     print(
-        f"{config.steps} vector steps of {config.rows} rows, {seen} agents, "
+        f"{config.steps} steps in {config.rows} rows, {seen} agents, "
         f"{config.steps / (time.perf_counter() - began):.0f} steps/s: resident memory {late[0][1] / 2**20:.1f} to "
         f"{late[-1][1] / 2**20:.1f} MiB after a quarter of the run, slope {slope:.3f} bytes per vector step; "
         f"tensors alive {tensors[0]} then {tensors[-1]}; slots {online._ids.shape}, all observations finite"
