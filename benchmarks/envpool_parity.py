@@ -9,7 +9,6 @@ own terms, and with `--policy` how one trained policy fares in both.
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +20,10 @@ from rich.console import Console
 from rich.table import Table
 
 from envs.egos import make_ego, sees_forecasts
-from envs.native import ENV_IDS, register_envpool_ids
-from envs.observation import open_forecaster
-from envs.readers import HighwayReader, SceneReader
-from envs.readers.envpool import HIGHWAY_ENV_OF, EnvPoolReader, is_envpool_env
-from envs.registry import checkpoint_for, make_env
+from envs.native import ENV_IDS
+from envs.readers import reader_for
+from envs.readers.envpool import HIGHWAY_ENV_OF
+from envs.registry import make_env
 from envs.wrappers import ForecastObservation
 from predictor.errors import UserError, run_entry_point
 from predictor.provenance import provenance, write_json
@@ -50,7 +48,7 @@ class ParityConfig:
     policy: Path | None = None
     """A Stable-Baselines3 policy .zip that drives as well, in both."""
     checkpoint: str | None = None
-    """Whose forecasts the policy sees; None takes the one that ships for the highway-env id."""
+    """Whose forecasts the policy sees; None takes the one that ships for the id."""
     seed: int = 0
     """Of environments and actions."""
     out: Path | None = None
@@ -116,23 +114,21 @@ def untouched_drivers() -> Iterator[None]:
 
 def step_both(task_id: str, config: ParityConfig) -> list[np.ndarray]:
     """For each step, the distances between the copies of each vehicle [m], all starts together."""
-    register_envpool_ids()
-    native = gym.make(_env_id(task_id), disable_env_checker=True).unwrapped
+    native: Any = make_env(_env_id(task_id), disable_env_checker=True).unwrapped
     # vehicles come and go in highway-env alone
     still = {"spawn_probability": 0.0} if task_id.startswith("Intersection") else None
     mirrored = make_env(HIGHWAY_ENV_OF[task_id], disable_env_checker=True, config=still)
     rng = np.random.default_rng(config.seed)
     apart: list[list[float]] = [[] for _ in range(config.steps)]
-    assert isinstance(native.action_space, gym.spaces.Discrete)
     for start in range(config.starts):
         native.reset(seed=config.seed + start)
         mirrored.reset(seed=config.seed + start)
-        copies = copy_state(native.debug_states()[0], mirrored)  # type: ignore[attr-defined]
+        copies = copy_state(native.debug_states()[0], mirrored)
         for step in range(config.steps):
             action = int(rng.integers(native.action_space.n))
             ends = [env.step(action)[2:4] for env in (native, mirrored)]
             present = {id(vehicle) for vehicle in mirrored.unwrapped.road.vehicles}  # type: ignore[attr-defined]
-            for source, copy in zip(native.debug_states()[0].vehicles, copies, strict=True):  # type: ignore[attr-defined]
+            for source, copy in zip(native.debug_states()[0].vehicles, copies, strict=True):
                 if id(copy) in present:
                     apart[step].append(float(np.hypot(*(np.array([source.x, source.y]) - copy.position))))
             if any(map(any, ends)):
@@ -168,7 +164,7 @@ class Episodes:
 
 def play(env: gym.Env, ego: str, config: ParityConfig) -> Episodes:
     """Episodes of the config's seeds."""
-    reader: SceneReader = EnvPoolReader(env) if is_envpool_env(env) else HighwayReader(env)
+    reader = reader_for(env)
     seen = Episodes([], [], [], [], [], [], [], 0)
     starts = set()
     for seed in range(config.seed, config.seed + config.episodes):
@@ -203,15 +199,9 @@ def _env_id(task_id: str) -> str:
     return next(env_id for env_id, task in ENV_IDS.items() if task == task_id)
 
 
-def _for_policy(env: gym.Env, task_id: str, config: ParityConfig) -> gym.Env:
+def _for_policy(env: gym.Env, config: ParityConfig) -> gym.Env:
     """The env as the policy wants to see it."""
-    if not sees_forecasts(str(config.policy)):
-        return env
-    name = config.checkpoint or checkpoint_for(HIGHWAY_ENV_OF[task_id])
-    make = EnvPoolReader if is_envpool_env(env) else HighwayReader
-    spec = open_forecaster(name, make(env).spec, _env_id(task_id)).spec
-    reader = partial(make, perception_m=spec.perception_m, max_agents=spec.max_agents)
-    return ForecastObservation(env, name, reader=reader)
+    return ForecastObservation(env, config.checkpoint) if sees_forecasts(str(config.policy)) else env
 
 
 # --- Report -----------------------------------------------------------------------------------------------------------
@@ -259,7 +249,6 @@ def main() -> None:
     """Entry point."""
     config = tyro.cli(ParityConfig, description=__doc__)
     config.check()
-    register_envpool_ids()
     console = Console(width=140)
     results: dict[str, Any] = {}
     for task_id in config.task_ids:
@@ -273,7 +262,7 @@ def main() -> None:
                 made = [("envpool", _env_id(task_id)), ("highway-env", HIGHWAY_ENV_OF[task_id])]
                 envs = [(name, make_env(env_id, disable_env_checker=True)) for name, env_id in made]
                 if ego == str(config.policy):
-                    envs = [(name, _for_policy(env, task_id, config)) for name, env in envs]
+                    envs = [(name, _for_policy(env, config)) for name, env in envs]
                 both = [(name, play(env, ego, config)) for name, env in envs]
             console.print(episodes_table(task_id, ego, both))
             results[task_id][ego] = {name: asdict(seen) for name, seen in both}

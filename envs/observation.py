@@ -122,6 +122,8 @@ class ForecastStream:
 
     def __init__(self, forecaster: Forecaster, scene_spec: SceneSpec, rows: int, config: ForecastConfig) -> None:
         """Start with empty memory."""
+        if scene_spec.position_dim != 2:
+            raise UserError(f"observations are of positions in a plane, got {scene_spec.position_dim} axes")
         self.forecaster = forecaster
         self.config = config
         self.scene_spec = scene_spec

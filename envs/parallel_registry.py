@@ -54,7 +54,7 @@ PARALLEL_IDS: dict[str, ParallelEntry] = {
 PARALLEL_CHECKPOINTS: dict[str, str] = {
     "simple_tag_v3": "simple-tag",
     "simple_spread_v3": "simple-spread",
-    "intersection-multi-agent-v1": "intersection",
+    "intersection-multi-agent-v2": "intersection",
 }
 """Id → name of the checkpoint under predictor/pretrained."""
 

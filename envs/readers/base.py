@@ -141,7 +141,7 @@ def perceive(everyone: Scene, spec: SceneSpec, source: str = "reader") -> Scene:
     distance_m = np.where(everyone.valid, np.linalg.norm(offsets, axis=1), np.inf)
     distance_m[0] = -1.0  # the ego stays in row 0, also when another agent lies on top of it
     order = np.argsort(distance_m, kind="stable")[: spec.max_agents]
-    order = order[distance_m[order] <= spec.perception_m]
+    order = order[everyone.valid[order] & (distance_m[order] <= spec.perception_m)]
     return padded(everyone, order, spec.max_agents)
 
 
@@ -163,7 +163,7 @@ class SharedScene:
     scene: Scene
     """Everyone, padded to `max_agents` rows; a row need not stay an agent's, its id does."""
     rows: Mapping[str, int]
-    """Row of each living agent, by the name the environment gives it."""
+    """Row of each agent that is observed now, by its name: the living, and those whose last observation this is."""
     heading_rad: Float[np.ndarray, " agents"]
     """Heading of each row, which turns world axes into the agent's; 0 where agents have none."""
 

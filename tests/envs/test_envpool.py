@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 pytest.importorskip("envpool")
 
 from envs.native import EnvPoolEnv, make_pool  # noqa: E402
-from envs.readers import HighwayReader, perceive  # noqa: E402
+from envs.readers import HighwayReader, perceive, reader_for  # noqa: E402
 from envs.readers.assignment import IdentityTracker  # noqa: E402
 from envs.readers.envpool import (  # noqa: E402
     GATE_M,
@@ -79,6 +79,7 @@ def test_a_spec_is_that_of_the_mirrored_env(task_id: str):
     env = EnvPoolEnv(task_id)
     assert EnvPoolReader(env).spec == HighwayReader(mirrored).spec
     assert EnvPoolReader(env, 60.0, 6).spec == HighwayReader(mirrored, 60.0, 6).spec
+    assert isinstance(reader_for(env), EnvPoolReader) and reader_for(env, 60.0, 6).spec.max_agents == 6
     assert env.observation_space.shape == mirrored.observation_space.shape
     assert isinstance(env.action_space, type(mirrored.action_space))
     assert getattr(env.action_space, "n", env.action_space.shape) == getattr(

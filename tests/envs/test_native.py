@@ -17,7 +17,7 @@ pytest.importorskip("envpool")
 from envs.egos import idle_action  # noqa: E402
 from envs.native import ENV_IDS, EnvPoolEnv, EnvPoolVecEnv, _ends, make_pool, register_envpool_ids  # noqa: E402
 from envs.observation import SCENE_KEYS  # noqa: E402
-from envs.readers.envpool import HIGHWAY_ENV_OF, EnvPoolReader  # noqa: E402
+from envs.readers.envpool import HIGHWAY_ENV_OF  # noqa: E402
 from envs.vector import VecForecast  # noqa: E402
 from envs.wrappers import ForecastObservation, SceneObservation  # noqa: E402
 from predictor.errors import ProtocolError, UserError  # noqa: E402
@@ -29,7 +29,6 @@ ROWS = 3
 STEPS = 12
 SMALL = {"vehicles_count": 8, "duration": 5}
 """Short episodes on a road with few vehicles: rows crash or run out of time, at different steps."""
-READER = partial(EnvPoolReader, perception_m=PERCEPTION_M, max_agents=MAX_AGENTS)
 ACTIONS = np.random.default_rng(3).integers(5, size=(STEPS, ROWS))
 
 CHECKER_WARNINGS = (
@@ -55,7 +54,7 @@ def small_pool(**kwargs: Any) -> EnvPoolVecEnv:
 def small_env(scenes: bool = True) -> gym.Env:
     register_envpool_ids()
     env = gym.make("envpool/HighwayFast-v0", disable_env_checker=True, **SMALL)
-    return SceneObservation(env, reader=READER) if scenes else env
+    return SceneObservation(env, PERCEPTION_M, MAX_AGENTS) if scenes else env
 
 
 def row_of(observations: Any, row: int) -> Any:
@@ -76,7 +75,7 @@ def test_gymnasium_accepts(env_id: str):
 @pytest.mark.parametrize("env_id", ["envpool/HighwayFast-v0", "envpool/Intersection-v0", "envpool/Racetrack-v0"])
 def test_sb3_accepts(env_id: str):
     register_envpool_ids()
-    check_env_for_sb3(SceneObservation(gym.make(env_id), reader=EnvPoolReader))
+    check_env_for_sb3(SceneObservation(gym.make(env_id)))
 
 
 def test_every_task_has_one_id():
