@@ -8,7 +8,7 @@ own terms, and with `--policy` how one trained policy fares in both.
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,8 @@ from envs.wrappers import ForecastObservation
 from predictor.errors import UserError, run_entry_point
 from predictor.provenance import provenance, write_json
 
+_SAME_M = 1e-6
+"""Vehicles closer than this are in the same place."""
 _DRIVER = ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN")
 
 
@@ -97,7 +99,8 @@ def copy_state(state: Any, env: gym.Env) -> list[Any]:
         vehicles.append(vehicle)
     road.vehicles, inner.controlled_vehicles = list(vehicles), vehicles[:1]
     if hasattr(road, "steps"):
-        road.steps = 3 * state.simulation_frequency  # both warm the traffic lights' clock up by three seconds
+        road.steps = 3 * state.simulation_frequency  # both have warmed the clock of right of way up by three seconds
+    inner.define_spaces()  # observe the new ego
     return vehicles
 
 
@@ -112,29 +115,50 @@ def untouched_drivers() -> Iterator[None]:
             setattr(IDMVehicle, name, value)
 
 
-def step_both(task_id: str, config: ParityConfig) -> list[np.ndarray]:
-    """For each step, the distances between the copies of each vehicle [m], all starts together."""
+@dataclass
+class Apart:
+    """By how much the two differ from the same states."""
+
+    distance_m: list[list[float]]
+    """By step: distances between the copies of each vehicle [m], all starts together."""
+    observation: list[float] = field(default_factory=list)
+    """Largest difference of an entry, by step in which all vehicles still agree."""
+    reward: list[float] = field(default_factory=list)
+    """Of the same steps."""
+    ends: list[bool] = field(default_factory=list)
+    """Whether terminated and truncated were the same, of the same steps."""
+
+
+def step_both(task_id: str, config: ParityConfig) -> Apart:
+    """Differences over the config's starts and steps."""
     native: Any = make_env(_env_id(task_id), disable_env_checker=True).unwrapped
     # vehicles come and go in highway-env alone
     still = {"spawn_probability": 0.0} if task_id.startswith("Intersection") else None
     mirrored = make_env(HIGHWAY_ENV_OF[task_id], disable_env_checker=True, config=still)
     rng = np.random.default_rng(config.seed)
-    apart: list[list[float]] = [[] for _ in range(config.steps)]
+    apart = Apart([[] for _ in range(config.steps)])
     for start in range(config.starts):
         native.reset(seed=config.seed + start)
         mirrored.reset(seed=config.seed + start)
         copies = copy_state(native.debug_states()[0], mirrored)
         for step in range(config.steps):
             action = int(rng.integers(native.action_space.n))
-            ends = [env.step(action)[2:4] for env in (native, mirrored)]
+            ours, theirs = native.step(action), mirrored.step(action)
             present = {id(vehicle) for vehicle in mirrored.unwrapped.road.vehicles}  # type: ignore[attr-defined]
-            for source, copy in zip(native.debug_states()[0].vehicles, copies, strict=True):
-                if id(copy) in present:
-                    apart[step].append(float(np.hypot(*(np.array([source.x, source.y]) - copy.position))))
-            if any(map(any, ends)):
+            distances = [
+                float(np.hypot(*(np.array([source.x, source.y]) - copy.position)))
+                for source, copy in zip(native.debug_states()[0].vehicles, copies, strict=True)
+                if id(copy) in present
+            ]
+            apart.distance_m[step] += distances
+            if max(distances) < _SAME_M:
+                apart.observation.append(float(np.abs(ours[0] - theirs[0]).max()))
+                apart.reward.append(abs(float(ours[1]) - float(theirs[1])))
+                apart.ends.append(ours[2:4] == tuple(map(bool, theirs[2:4])))
+            if any(ours[2:4]) or any(theirs[2:4]):
                 break
     mirrored.close()
-    return [np.array(distances) for distances in apart]
+    return apart
 
 
 # --- Episodes of each -------------------------------------------------------------------------------------------------
@@ -207,16 +231,21 @@ def _for_policy(env: gym.Env, config: ParityConfig) -> gym.Env:
 # --- Report -----------------------------------------------------------------------------------------------------------
 
 
-def distances_table(task_id: str, apart: Sequence[np.ndarray]) -> Table:
-    """Differences of position by step."""
+def distances_table(task_id: str, apart: Apart) -> Table:
+    """Differences of position by step; below, those of what the ego gets."""
     table = Table(title=f"{task_id} and {HIGHWAY_ENV_OF[task_id]} from the same states, difference of position \\[m]")
     for heading in ("step", "vehicles", "median", "95 %", "max", "within 0.01 m"):
         table.add_column(heading, justify="right")
-    for step, distances in enumerate(apart, start=1):
+    for step, distances in enumerate(map(np.array, apart.distance_m), start=1):
         if len(distances):
             numbers = (np.median(distances), np.percentile(distances, 95), distances.max())
             share = f"{100 * (distances < 0.01).mean():.1f} %"
             table.add_row(str(step), str(len(distances)), *(f"{n:.3g}" for n in numbers), share)
+    if apart.ends:
+        table.caption = (
+            f"while all vehicles agree ({len(apart.ends)} steps), observations differ by at most "
+            f"{max(apart.observation):.1g}, rewards by {max(apart.reward):.1g}, ends in {apart.ends.count(False)} steps"
+        )
     return table
 
 
@@ -255,7 +284,7 @@ def main() -> None:
         with untouched_drivers():
             apart = step_both(task_id, config)
         console.print(distances_table(task_id, apart))
-        results[task_id] = {"apart_m": [distances.tolist() for distances in apart]}
+        results[task_id] = {"apart": asdict(apart)}
         egos = [*config.egos, *([str(config.policy)] if config.policy else [])] if config.episodes else []
         for ego in egos:
             with untouched_drivers():

@@ -227,7 +227,10 @@ def _summary(
         reduction,
         interval,
         None if near is None else row(NEIGHBOURS, near, fitted_std_m(near)),
-        {n: row(f"{name}, {n} of history", outcomes[memory_key(n)], std_m) for n in config.history_steps},
+        {
+            n: row(f"{name}, {n} step{'s' * (n > 1)} of history", outcomes[memory_key(n)], std_m)
+            for n in config.history_steps
+        },
         _graph(episodes) if learned else None,
         float(np.median(latencies_ms)),
         float(np.percentile(latencies_ms, 95)),

@@ -199,7 +199,7 @@ def test_a_learned_checkpoint_is_measured(in_process: None, tmp_path: Path):
     assert low <= result.reduction <= high
     assert all(np.isfinite(row.nll).all() and len(row.nll) == HORIZON for row in (result.model, result.model_samples))
     assert [row.name for row in result.rows] == [
-        "dG-VAE", "dG-VAE", "dG-VAE, 1 of history", "dG-VAE, 9 of history", "constant velocity",
+        "dG-VAE", "dG-VAE", "dG-VAE, 1 step of history", "dG-VAE, 9 steps of history", "constant velocity",
     ]  # fmt: skip
     assert result.histories[9].by_step_m == pytest.approx(result.model.by_step_m, rel=1e-4)  # all of the episode
     assert result.histories[1].by_step_m != pytest.approx(result.model.by_step_m, rel=1e-4)

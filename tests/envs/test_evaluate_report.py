@@ -34,7 +34,7 @@ def result(env_id: str = "tag", checkpoint: str = "mine", reduction: float = 0.5
 
 def full() -> EnvAccuracy:
     graph = GraphAccuracy(120, 0.3, accuracy=0.875, f1=0.5, true_connectivity=0.25)
-    histories = {1: row("dG-VAE, 1 of history", 1.5)}
+    histories = {1: row("dG-VAE, 1 step of history", 1.5)}
     return replace(result(), nearest_neighbours=row(NEIGHBOURS, 1.25), histories=histories, graph=graph)
 
 
