@@ -22,8 +22,9 @@ from agents.parallel_rows import record_task
 from agents.runs import load_model, open_run
 from agents.task import Task
 from agents.training import TrainingPlan, train
+from envs.readers.envpool import ONE_START
 from envs.readers.highway import is_highway_env
-from envs.registry import CHECKPOINTS, make_env
+from envs.registry import CHECKPOINTS, make_env, native_task_of
 from envs.render import record_episode
 from envs.wrappers import ForecastObservation
 from predictor.errors import UserError, run_entry_point
@@ -136,6 +137,8 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
         settings.pop(name)
     free = ("checkpoint_every", "eval_episodes", "video", "device")
     open_run(config.folder, settings, provenance(PACKAGES) | {"seed": config.seed}, config.resume, free)
+    if config.backend == "envpool" and (copy := native_task_of(config.env_id)) in ONE_START:
+        console.print(f"note: EnvPool's {copy} begins every episode in the same state; the original does not")
     policy = train(plan, config.folder)
     model = load_model(policy, config.algorithm)
     evaluation = evaluate_with_progress(
