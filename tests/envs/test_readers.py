@@ -18,6 +18,7 @@ FRAMES = {
     "highway-v0": ("ego", "world"),
     "highway-fast-v0": ("ego", "world"),
     "two-way-v0": ("ego", "world"),
+    "highway-mixed-v0": ("ego", "world"),
     "merge-v1": ("world", "world"),
     "merge-generic-v1": ("world", "world"),
     "roundabout-v1": ("world", "world"),

@@ -392,7 +392,7 @@ def test_particle_worlds_are_filmed_to_the_last_step():
     recording = record_parallel_episode(env, act, seed=3)
     assert (recording.env_id, recording.dt_s, recording.focus) == ("simple_tag_v3", 0.1, "adversary_0")
     assert recording.num_steps == 4
-    assert all(len(moment.bodies) == 4 for moment in recording._moments)
+    assert all(len(moment.bodies) == 6 for moment in recording._moments)  # four agents, two obstacles
     assert set(recording.returns) == {"adversary", "agent"}
     again = record_parallel_episode(env, act, seed=3)
     np.testing.assert_array_equal(again.draw(9), recording.draw(9))

@@ -256,7 +256,8 @@ def test_everything_that_ships_is_small_and_forecasts():
     for name in checkpoint.shipped():
         forecaster, info = load_checkpoint(name)
         agents = info.spec.max_agents
-        states = random_states(0, 1, agents, info.spec.num_features)
+        states = torch.zeros(1, agents, info.spec.num_features)  # what lies beyond velocity is a role or a size
+        states[..., :4] = random_states(0, 1, agents, 4)
         belief = forecaster.observe(forecaster.empty_memory(1, agents), states, torch.ones(1, agents).bool())[1]
         assert torch.isfinite(forecaster.rollout(belief, info.horizon_steps)).all(), name
         assert len(info.std_m) == info.horizon_steps and info.provenance["command"], name
