@@ -111,7 +111,8 @@ def test_lines_by_horizon_carry_the_numbers():
     report.plot_by_horizon(ax, full().rows, 0.1, "by_step_m", "displacement [m]")
     lines = {str(line.get_label()): line for line in ax.get_lines()}
     assert list(lines) == [
-        "dG-VAE, K = 1", "dG-VAE, K = 20", "dG-VAE, 1 step of history, K = 1", "nearest neighbours", "constant velocity",
+        "dG-VAE, K = 1", "dG-VAE, K = 20", "dG-VAE, 1 step of history, K = 1", "nearest neighbours",
+        "constant velocity",
     ]  # fmt: skip
     np.testing.assert_allclose(lines["constant velocity"].get_xdata(), [0.1, 0.2, 0.3])
     np.testing.assert_allclose(lines["constant velocity"].get_ydata(), [1.0, 2.0, 4.0])
