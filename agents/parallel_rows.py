@@ -16,7 +16,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from agents.episodes import EpisodeResult
 from agents.task import Task, resolve_device
 from envs.drivers import Driver, make_driver
-from envs.multiagent import AgentMonitor, ParallelVecEnv, learners_named, role_of
+from envs.multiagent import AgentMonitor, ParallelVecEnv
+from envs.multiagent_spaces import learners_named, role_of
 from envs.parallel import ForecastParallelEnv
 from envs.parallel_registry import PARALLEL_CHECKPOINTS, make_parallel_env, shared_reader_for
 from envs.render_shared import SharedRecording, record_parallel_episode

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from envs.drivers import DRIVER_NAMES, make_driver
-from envs.multiagent import ParallelVecEnv, learners_named
+from envs.multiagent import ParallelVecEnv
+from envs.multiagent_spaces import learners_named
 from envs.parallel import ForecastParallelEnv
 from envs.parallel_registry import is_parallel_id, make_parallel_env
 from envs.registry import make_env, native_task_of

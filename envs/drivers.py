@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 from jaxtyping import Float
 
+from envs.habits import uniform_action, varied_actions
 from envs.parallel_registry import parallel_env_id
 from envs.readers.mpe import mpe_scenario
 from envs.readers.sisl import is_pursuit_env
@@ -23,6 +24,7 @@ Driver = Callable[[Mapping[str, Any]], dict[str, Any]]
 Chooser = Callable[[Any], Any]
 """From one agent's observation to its action."""
 
+WHO = "drivers"
 DRIVER_NAMES = ("random", "idle", "varied", "heuristic", "mixed")
 
 _PURSUIT_STAY = 4
@@ -49,7 +51,7 @@ def make_driver(name: str, env: Any, rng: np.random.Generator) -> Driver:
             bounded Box.
     """
     for agent in getattr(env, "possible_agents", ()):
-        _uniform(env.action_space(agent), np.random.default_rng(0))
+        uniform_action(env.action_space(agent), np.random.default_rng(0), WHO)
     draw = _choosers(name, env, rng)
     choosers: dict[str, Chooser] = {}
 
@@ -66,11 +68,11 @@ def make_driver(name: str, env: Any, rng: np.random.Generator) -> Driver:
 def _choosers(name: str, env: Any, rng: np.random.Generator) -> Callable[[str], Chooser]:
     """From an agent to how it chooses."""
     if name == "random":
-        return lambda agent: lambda seen: _uniform(env.action_space(agent), rng)
+        return lambda agent: lambda seen: uniform_action(env.action_space(agent), rng, WHO)
     if name == "idle":
         return lambda agent: lambda seen: idle_action(env, agent)
     if name == "varied":
-        return lambda agent: _varied(env.action_space(agent), rng)
+        return lambda agent: varied_actions(env.action_space(agent), rng, WHO)
     if name == "heuristic":
         return _heuristic(env, rng)
     if name == "mixed":
@@ -89,31 +91,6 @@ def idle_action(env: Any, agent: str) -> Any:
     if isinstance(space, gym.spaces.Discrete):
         return int(space.start) + (_PURSUIT_STAY if is_pursuit_env(env) else 0)
     return np.clip(np.zeros(space.shape, dtype=space.dtype), space.low, space.high)
-
-
-def _uniform(space: gym.Space, rng: np.random.Generator) -> Any:
-    if isinstance(space, gym.spaces.Discrete):
-        return int(space.start + rng.integers(space.n))
-    if isinstance(space, gym.spaces.Box) and space.is_bounded():
-        return rng.uniform(space.low, space.high).astype(space.dtype)
-    raise UserError(f"drivers need a Discrete or a bounded Box action space, got {space}")
-
-
-def _varied(space: gym.Space, rng: np.random.Generator) -> Chooser:
-    persistence = rng.uniform(0.0, 0.9)
-    taste = rng.dirichlet(np.full(int(space.n), 0.7)) if isinstance(space, gym.spaces.Discrete) else None
-    last: list[Any] = []
-
-    def choose(seen: Any) -> Any:
-        if last and rng.random() <= persistence:
-            return last[0]
-        if isinstance(space, gym.spaces.Discrete):
-            last[:] = [int(space.start + rng.choice(int(space.n), p=taste))]
-        else:
-            last[:] = [_uniform(space, rng)]
-        return last[0]
-
-    return choose
 
 
 @dataclass(frozen=True)
@@ -163,7 +140,7 @@ def _heuristic(env: Any, rng: np.random.Generator) -> Callable[[str], Chooser]:
 
         def choose(seen: Any) -> Any:
             if not last or rng.random() < habits.attention:
-                last[:] = [_uniform(space, rng) if rng.random() < habits.slip else intend()]
+                last[:] = [uniform_action(space, rng, WHO) if rng.random() < habits.slip else intend()]
             return last[0]
 
         return choose

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 from highway_env.vehicle.controller import ControlledVehicle
 
+from envs.habits import uniform_action, varied_actions
 from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.errors import UserError
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 Ego = Callable[[Any], Any]
 """From an observation to an action."""
 
+WHO = "random egos"
 EGO_NAMES = ("random", "idle", "varied", "keep-lane")
 
 
@@ -36,12 +38,12 @@ def make_ego(name: str, env: gym.Env, rng: np.random.Generator) -> Ego:
         UserError: unknown name, or an ego that cannot drive this action space.
     """
     if name == "random":
-        return lambda obs: _uniform(env.action_space, rng)
+        return lambda obs: uniform_action(env.action_space, rng, WHO)
     if name == "idle":
         action = idle_action(env)
         return lambda obs: np.copy(action) if isinstance(action, np.ndarray) else action
     if name == "varied":
-        return _varied(env.action_space, rng)
+        return varied_actions(env.action_space, rng, WHO)
     if name == "keep-lane":
         return _keep_lane(env, rng)
     if name.endswith(".zip"):
@@ -58,27 +60,6 @@ def idle_action(env: gym.Env) -> Any:
     if isinstance(space, gym.spaces.Box):
         return np.zeros(space.shape, dtype=space.dtype)
     raise UserError(f"no idle action is known for {space}")
-
-
-def _uniform(space: gym.Space, rng: np.random.Generator) -> Any:
-    if isinstance(space, gym.spaces.Discrete):
-        return int(rng.integers(space.n))
-    if isinstance(space, gym.spaces.Box):
-        return rng.uniform(space.low, space.high).astype(space.dtype)
-    raise UserError(f"random egos need a Discrete or Box action space, got {space}")
-
-
-def _varied(space: gym.Space, rng: np.random.Generator) -> Ego:
-    persistence = rng.uniform(0.0, 0.9)
-    weights = rng.dirichlet(np.full(int(space.n), 0.7)) if isinstance(space, gym.spaces.Discrete) else None
-    last: list[Any] = []
-
-    def act(obs: Any) -> Any:
-        if not last or rng.random() > persistence:
-            last[:] = [_uniform(space, rng) if weights is None else int(rng.choice(len(weights), p=weights))]
-        return last[0]
-
-    return act
 
 
 def _keep_lane(env: gym.Env, rng: np.random.Generator) -> Ego:

@@ -248,30 +248,6 @@ class AgentMonitor(VecMonitor):
         return obs, rewards, dones, infos
 
 
-def role_of(agent: str) -> str:
-    """An agent's name without its number."""
-    return agent.rstrip("0123456789").rstrip("_- ") or agent
-
-
-def learners_named(possible_agents: Sequence[str], names: Sequence[str], source: str) -> list[str]:
-    """The agents that names of agents or roles stand for; no name stands for all.
-
-    Args:
-        possible_agents: of the environment.
-        names: agents ("adversary_0") or roles ("adversary").
-        source: whose environment it is, for messages.
-
-    Raises:
-        UserError: a name is neither.
-    """
-    for name in names:
-        if not any(name in (agent, role_of(agent)) for agent in possible_agents):
-            raise UserError(
-                f"learners: '{name}' is neither an agent nor a role of {source}; it has {', '.join(possible_agents)}"
-            )
-    return [a for a in possible_agents if not names or a in names or role_of(a) in names]
-
-
 @dataclass
 class _Turn:
     """What one step was for one row."""

@@ -7,7 +7,6 @@ observations to actions. highway-env with one ego is filmed by `envs.render`.
 """
 
 import itertools
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -19,6 +18,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from envs.highway_parallel import HighwayParallelEnv
+from envs.multiagent_spaces import role_of
 from envs.overlay import (
     Arena,
     Color,
@@ -380,7 +380,8 @@ def _tick(velocity_mps: Float[np.ndarray, "2"], heading_rad: float | None) -> Fl
 
 def _role(name: str) -> str:
     """An agent's name without its number."""
-    return re.sub(r"[\W_]*\d*$", "", name) or OTHER
+    role = role_of(name)
+    return OTHER if role.isdigit() else role
 
 
 def _unnamed_role(state: Float[np.ndarray, " features"], spec: SceneSpec) -> str:

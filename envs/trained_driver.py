@@ -14,8 +14,7 @@ import numpy as np
 
 from envs.drivers import Driver, make_driver
 from envs.egos import load_policy
-from envs.multiagent import learners_named
-from envs.multiagent_spaces import SharedObservation, own_action, roles_of
+from envs.multiagent_spaces import SharedObservation, learners_named, own_action, roles_of
 from predictor.errors import UserError
 
 

@@ -82,6 +82,19 @@ class Belief:
     """What the forecaster itself needs to roll out."""
 
 
+def edgeless_belief(
+    states: Float[Tensor, "batch agents state"],
+    valid: Bool[Tensor, "batch agents"],
+    num_edge_types: int,
+    edge_feature_dim: int,
+) -> Belief:
+    """The belief of who knows no interactions: every pair has "no edge"."""
+    batch, agents, _ = states.shape
+    probs = states.new_zeros(batch, agents, agents, num_edge_types)
+    probs[..., 0] = 1.0
+    return Belief(states, valid, probs, states.new_zeros(batch, agents, agents, edge_feature_dim))
+
+
 @runtime_checkable
 class Forecaster(Protocol):
     """Anything that forecasts scenes step by step."""

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from predictor.forecaster import Belief, Memory
+from predictor.forecaster import Belief, Memory, edgeless_belief
 from predictor.scene import SceneSpec
 
 
@@ -28,11 +28,7 @@ class ConstantVelocity:
         self, memory: Memory, states: Float[Tensor, "batch agents state"], valid: Bool[Tensor, "batch agents"]
     ) -> tuple[Memory, Belief]:
         """Keep the states; every pair has "no edge"."""
-        batch, agents, _ = states.shape
-        probs = states.new_zeros(batch, agents, agents, self.num_edge_types)
-        probs[..., 0] = 1.0
-        features = states.new_zeros(batch, agents, agents, self.edge_feature_dim)
-        return memory, Belief(states, valid, probs, features)
+        return memory, edgeless_belief(states, valid, self.num_edge_types, self.edge_feature_dim)
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from predictor.data.store import Episode, read_store
 from predictor.data.windows import visible
 from predictor.errors import UserError
-from predictor.forecaster import Belief, Memory
+from predictor.forecaster import Belief, Memory, edgeless_belief
 from predictor.scene import SceneSpec
 
 K = 5
@@ -123,11 +123,7 @@ class NearestNeighbour(nn.Module):
         self, memory: Memory, states: Float[Tensor, "batch agents state"], valid: Bool[Tensor, "batch agents"]
     ) -> tuple[Memory, Belief]:
         """Keep the states; every pair has "no edge"."""
-        batch, agents, _ = states.shape
-        probs = states.new_zeros(batch, agents, agents, self.num_edge_types)
-        probs[..., 0] = 1.0
-        features = states.new_zeros(batch, agents, agents, self.edge_feature_dim)
-        return memory, Belief(states, valid, probs, features)
+        return memory, edgeless_belief(states, valid, self.num_edge_types, self.edge_feature_dim)
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None

@@ -233,8 +233,8 @@ def test_varied_agents_differ_in_persistence():
 def test_mixed_agents_are_of_all_kinds_and_stay_so(monkeypatch: pytest.MonkeyPatch):
     env = make_parallel_env("simple_tag_v3")
     env.reset(seed=0)
-    monkeypatch.setattr(drivers, "_uniform", lambda space, rng: 1)
-    monkeypatch.setattr(drivers, "_varied", lambda space, rng: lambda seen: 2)
+    monkeypatch.setattr(drivers, "uniform_action", lambda space, rng, who: 1)
+    monkeypatch.setattr(drivers, "varied_actions", lambda space, rng, who: lambda seen: 2)
     monkeypatch.setattr(drivers, "_heuristic", lambda env, rng: lambda agent: lambda seen: 3)
     kinds = []
     for seed in range(100):
@@ -245,7 +245,7 @@ def test_mixed_agents_are_of_all_kinds_and_stay_so(monkeypatch: pytest.MonkeyPat
 
 
 def test_mixed_does_without_a_heuristic_where_there_is_none(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(drivers, "_varied", lambda space, rng: lambda seen: 9)
+    monkeypatch.setattr(drivers, "varied_actions", lambda space, rng, who: lambda seen: 9)
     env = Booth(gym.spaces.Discrete(5))
     found = [set(make_driver("mixed", env, rng(seed))(seen(env)).values()) for seed in range(20)]
     assert {9} < set.union(*found) <= {0, 1, 2, 3, 4, 9}

@@ -165,7 +165,7 @@ def test_spaces_without_an_idle_or_random_action_are_named():
     env = make_env("intersection-multi-agent-v2")
     with pytest.raises(UserError, match="no idle action is known for Tuple"):
         idle_action(env)
-    with pytest.raises(UserError, match="random egos need a Discrete or Box action space, got Tuple"):
+    with pytest.raises(UserError, match="random egos need a Discrete or a bounded Box action space, got Tuple"):
         make_ego("random", env, np.random.default_rng(0))(None)
 
 

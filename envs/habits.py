@@ -1,0 +1,51 @@
+"""Ways to act that know nothing of the environment: shared by egos (one driver) and drivers (one for each agent)."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from predictor.errors import UserError
+
+
+def uniform_action(space: gym.Space, rng: np.random.Generator, who: str) -> Any:
+    """An action drawn evenly.
+
+    Args:
+        space: Discrete or a bounded Box.
+        rng: source of the draw.
+        who: acts, for the message.
+
+    Raises:
+        UserError: another space.
+    """
+    if isinstance(space, gym.spaces.Discrete):
+        return int(space.start + rng.integers(space.n))
+    if isinstance(space, gym.spaces.Box) and space.is_bounded():
+        return rng.uniform(space.low, space.high).astype(space.dtype)
+    raise UserError(f"{who} need a Discrete or a bounded Box action space, got {space}")
+
+
+def varied_actions(space: gym.Space, rng: np.random.Generator, who: str) -> Callable[[Any], Any]:
+    """Acts by preferences, and keeps to a choice for a while; both are drawn now, once for an episode.
+
+    Args:
+        space: Discrete or a bounded Box.
+        rng: source of all draws.
+        who: acts, for the message.
+    """
+    persistence = rng.uniform(0.0, 0.9)
+    taste = rng.dirichlet(np.full(int(space.n), 0.7)) if isinstance(space, gym.spaces.Discrete) else None
+    last: list[Any] = []
+
+    def act(seen: Any) -> Any:
+        if last and rng.random() <= persistence:
+            return last[0]
+        if isinstance(space, gym.spaces.Discrete):
+            last[:] = [int(space.start + rng.choice(int(space.n), p=taste))]
+        else:
+            last[:] = [uniform_action(space, rng, who)]
+        return last[0]
+
+    return act
