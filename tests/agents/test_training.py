@@ -185,3 +185,14 @@ def test_same_seed_same_policy():
     assert first.keys() == second.keys()
     for name, value in first.items():
         torch.testing.assert_close(second[name], value, rtol=0, atol=0)
+
+
+def test_a_batch_is_never_larger_than_a_rollout():
+    """EnvPool's preset is made for many rows; SB3 would warn of a cut batch with few."""
+    pytest.importorskip("envpool")
+    task = Task("highway-fast-v0", "none", backend="envpool")
+    few = TrainingPlan(task, "ppo", 100, 2, 0)
+    venv = DummyVecEnv([lambda: gym.make("CartPole-v1")] * 2)
+    model = make_model(few, venv)
+    assert few.preset.n_steps * 2 < few.preset.batch_size
+    assert model.batch_size == few.preset.n_steps * 2

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from envs.readers import FunctionReader, Reader
+from envs.readers import FunctionReader, Reader, perceive
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.errors import UserError
 from predictor.scene import PADDING_ID, Scene, SceneSpec
@@ -220,3 +220,16 @@ def test_a_scene_without_the_specs_features_never_reaches_a_checkpoint():
     spec = replace(SPEC, feature_names=names, feature_scales=(1.0,) * 5)
     with pytest.raises(UserError, match=r"states need 5 features .*'radius_m'\), got 4"):
         SceneObservation(Room(), reader=FunctionReader(lambda env: crowd(2), spec)).reset(seed=0)
+
+
+def test_an_absent_agent_is_out_of_sight_also_of_an_ego_that_sees_everything():
+    everyone = Scene(**GOOD | {"valid": np.array([True, False, True])})
+    seen = perceive(everyone, replace(SPEC, perception_m=np.inf))
+    assert seen.ids.tolist() == [0, 3, PADDING_ID, PADDING_ID]
+    assert seen.valid.tolist() == [True, True, False, False]
+
+
+def test_a_reader_without_an_ego_is_refused_where_there_is_one():
+    reader = FunctionReader(lambda env: Scene(**GOOD), replace(SPEC, has_ego=False))
+    with pytest.raises(UserError, match="an environment with one ego needs a reader whose spec has has_ego=True"):
+        SceneObservation(Room(), reader=reader)

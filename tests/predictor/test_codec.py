@@ -202,3 +202,19 @@ def test_unknown_residuals_are_refused():
     unchecked: Any = inspect.unwrap(StateCodec.__init__)  # shape checks would refuse it first
     with pytest.raises(UserError, match="residual must be 'state', 'constant_velocity' or 'trapezoid', got 'midpoint'"):
         unchecked(StateCodec.__new__(StateCodec), spec(), (), "midpoint")
+
+
+def test_constant_features_are_given_but_never_predicted():
+    """A role stays what it is, whatever a network says of its change."""
+    names = (*KINEMATIC_FEATURES, "role", "size_m")
+    layout = SceneSpec(dt_s=1.0, feature_names=names, feature_scales=(1.0,) * 6, constant_features=("role",))
+    codec = StateCodec(layout)
+    states = torch.tensor([[1.0, 2.0, 3.0, 4.0, 1.0, 0.5]])
+    after = codec.advance(states, torch.ones_like(states))
+    assert after.tolist() == [[2.0, 3.0, 4.0, 5.0, 1.0, 1.5]]
+    assert codec.inputs(states, torch.ones(1, dtype=torch.bool))[0, 4] == 1.0
+
+
+def test_constant_features_lie_beyond_velocity():
+    with pytest.raises(UserError, match="constant_features must be among the features beyond velocity, got"):
+        SceneSpec(dt_s=1.0, constant_features=("vx_mps",))
