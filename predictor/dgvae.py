@@ -3,15 +3,16 @@
 Encoder: linear embedding → EdgeConv → edge embedding → forward LSTM per pair → learned prior and edge features;
 forward ‖ backward LSTM → posterior (training only). Decoder: messages along sampled edges, with edge features → GRU →
 change of state. `observe` and `rollout` make it a `Forecaster`; `window` is what training runs; both use the same
-layers and differ only in how many steps enter at once.
+layers and differ only in how many steps enter at once. Without gradients, single steps go through `predictor.stepper`,
+which computes the same with fewer operations.
 
 Two things the paper leaves open are settled here. An agent without edges would not see itself, so the decoder adds a
 linear term of the agent's own state to its messages. And while true states are fed, the graph is the prior's
 expectation, so that a history has one meaning; samples branch off at the first forecast step.
 """
 
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,12 +21,21 @@ from torch import Tensor, nn
 from predictor.codec import StateCodec
 from predictor.disentangle import running_mean, window_mean
 from predictor.errors import UserError
-from predictor.forecaster import Belief, Memory, WindowOutput
-from predictor.graph import pair_mask
-from predictor.networks import PRESETS, Decoder, DGVAEConfig, Edges, Encoder, concrete_sample
+from predictor.forecaster import NOBODY, Belief, Memory, WindowOutput
+from predictor.graph import among_nearest, nearest, off_diagonal, others, pair_mask, with_diagonal
+from predictor.networks import PRESETS, Decoder, DGVAEConfig, Edges, Encoder, concrete_sample, no_edge_where_absent
+from predictor.recurrent import masked_gru
 from predictor.scene import SceneSpec
+from predictor.stepper import Stepper
 
 __all__ = ["DGVAE", "PRESETS", "DGVAEConfig", "Decoder", "Edges", "Encoder", "WindowOutput", "concrete_sample"]
+
+
+class _Graph(NamedTuple):
+    """Who may interact; axes as in `predictor.graph`."""
+
+    present: Bool[Tensor, "*batch agents slots"]
+    senders: Int[Tensor, "*some agents slots"] | None
 
 
 class _Past(NamedTuple):
@@ -44,6 +54,7 @@ class _Encoding(NamedTuple):
 
 
 class _Internal(NamedTuple):
+    graph: _Graph
     past: _Past
     logits: Tensor
     node_before: Tensor  # GRU state before the latest observation was decoded
@@ -76,6 +87,7 @@ class DGVAE(nn.Module):
         self._per_change: Tensor
         per_change = self.codec.scales / torch.tensor(config.change_scales) if self.sees_changes else torch.ones(0)
         self.register_buffer("_per_change", per_change, persistent=False)
+        self._stepper: Stepper | None = None
 
     @property
     def num_edge_types(self) -> int:
@@ -87,44 +99,70 @@ class DGVAE(nn.Module):
         """Size of an edge's features."""
         return self.config.edge_feature_dim
 
+    def variant(self, **changes: Any) -> "DGVAE":
+        """The same weights under a changed config: `num_neighbours`, `rollout_graph`, `temperature`, `hard_samples`.
+
+        Raises:
+            UserError: the weights do not fit the changed config.
+        """
+        config = replace(self.config, **changes)
+        other = DGVAE(self.spec, config, self.horizon_steps).to(self.codec.scales)
+        try:
+            other.load_state_dict(self.state_dict())
+        except RuntimeError as error:
+            raise UserError(f"a network with {changes} has other weights; train one instead") from error
+        return other.train(self.training).requires_grad_(next(self.parameters()).requires_grad)
+
     # --- Forecaster ---------------------------------------------------------------------------------------------
 
     def empty_memory(self, batch: int, agents: int) -> Memory:
         """Zeros on the model's device."""
-        zeros = self.codec.scales.new_zeros
-        pair = zeros(batch, agents, agents, self.config.rnn_dim)
-        static = zeros(batch, agents, agents, self.config.static_dim + 1 if self.config.static_dim else 0)
-        seen = zeros(batch, agents, self.codec.num_inputs + 1 if self.sees_changes else 0)
-        return Memory(nodes=(zeros(batch, agents, self.config.decoder_dim), seen), pairs=(pair, pair.clone(), static))
+        near = self.config.num_neighbours
+        nodes, pairs = self._nothing_seen(batch, agents, near or agents)
+        senders = torch.full((batch, agents, near), NOBODY, device=nodes[0].device) if near else None
+        return Memory(nodes, pairs, senders)
 
     def observe(
         self, memory: Memory, states: Float[Tensor, "batch agents state"], valid: Bool[Tensor, "batch agents"]
     ) -> tuple[Memory, Belief]:
         """One encoder step and one decoder step under the prior's expected graph."""
-        node_before, _ = memory.nodes
-        past, logits, features = self._encode_step(states, valid, self._past(memory))
+        graph = self._graph_now(states, valid)
+        if graph.senders is not None:
+            memory = memory.to_slots(graph.senders, graph.present)
+        (node_before, seen), (hidden, cell, static) = memory.nodes, memory.pairs
+        past, logits, features = self._encode_step(states, valid, graph, _Past(hidden, cell, static, seen))
         probs = torch.softmax(logits, dim=-1)
-        node_after, next_states = self._move(states, valid, probs, features, node_before)
-        internal = _Internal(past, logits, node_before, node_after, next_states)
-        after = Memory((node_after, past.seen), (past.hidden, past.cell, past.static))
-        return after, Belief(states, valid, probs, features, internal)
+        node_after, next_states = self._move(states, valid, graph, probs, features, node_before)
+        internal = _Internal(graph, past, logits, node_before, node_after, next_states)
+        after = Memory((node_after, past.seen), (past.hidden, past.cell, past.static), memory.senders)
+        return after, Belief(states, valid, probs, features, internal, graph.senders)
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
         """Feed predictions back through the encoder, so that the graph evolves; sample 0 takes expected graphs."""
         known: _Internal = belief.internal
-        futures = [self._continue(known.next_states, belief.valid, known.past, known.node_after, horizon_steps, None)]
+        kept = (belief.edge_probs, belief.edge_features)
+        futures = [
+            self._continue(
+                known.next_states, belief.valid, known.graph, known.past, known.node_after, kept, horizon_steps, None
+            )
+        ]
         if num_samples > 1:
             draws = num_samples - 1
-            states, valid, features, node, logits, *past = (
+            states, valid, features, node, logits, present, *past = (
                 t.repeat_interleave(draws, dim=0)
                 for t in (
-                    belief.states, belief.valid, belief.edge_features, known.node_before, known.logits, *known.past
+                    belief.states, belief.valid, belief.edge_features, known.node_before, known.logits,
+                    known.graph.present, *known.past,
                 )
             )  # fmt: skip
+            senders = known.graph.senders
+            graph = _Graph(present, None if senders is None else senders.repeat_interleave(draws, dim=0))
             sampler = self._sampler(generator)
-            futures.append(self._free_run(states, valid, features, _Past(*past), node, logits, horizon_steps, sampler))
+            futures.append(
+                self._free_run(states, valid, graph, features, _Past(*past), node, logits, horizon_steps, sampler)
+            )
         batch = len(belief.states)
         stacked = [f.unflatten(0, (batch, -1)) for f in futures]
         return torch.cat(stacked, dim=1) if num_samples > 1 else stacked[0]
@@ -140,105 +178,163 @@ class DGVAE(nn.Module):
         generator: torch.Generator | None = None,
     ) -> WindowOutput:
         """Teacher-forced pass under the posterior and free-running roll-out under the prior, from the same encoding."""
-        inputs, pairs = self.codec.inputs(states, valid), pair_mask(valid)
-        memory = self.empty_memory(states.shape[0], states.shape[2])
-        node, _ = memory.nodes
-        edges, features, past = self._encode(inputs, valid, self._past(memory))
-        posterior = self.encoder.posterior_logits(edges, pairs)
+        inputs, graph = self.codec.inputs(states, valid), self._graph_of_window(states, valid)
+        (node, seen), pairs = self._nothing_seen(states.shape[0], states.shape[2], graph.present.shape[-1])
+        edges, features, past = self._encode(inputs, valid, graph, _Past(*pairs, seen))
+        posterior = self.encoder.posterior_logits(edges, graph.present)
         sampled = self._sampler(generator)(posterior)
-        shown = self._match_window(edges.features, features, pairs)
-        messages = self.decoder.messages(inputs, pairs, sampled, shown)
-        nodes = self._remember(messages, valid, node)
-        one_step = self._integrate(states, valid, pairs, sampled, shown, nodes, messages)
+        shown = self._match_window(edges.features, features, graph.present)
+        layer = self.decoder.pair_layer(inputs, shown, graph.senders)
+        messages = self.decoder.combine(inputs, layer, graph.present, sampled)
+        nodes = masked_gru(messages, self.decoder.gru, valid, node)
+        one_step = self._integrate(states, valid, graph, sampled, shown, nodes, messages)
+        outputs = self._dense(graph, edges.prior_logits, posterior, shown)
         if not rollout_steps:
             nothing = states.new_zeros(len(states), states.shape[2], 0, states.shape[3])
-            return WindowOutput(one_step, nothing, edges.prior_logits, posterior, shown)
+            return WindowOutput(one_step, nothing, *outputs)
 
-        steps = int(last_observed.max())
+        # the longest history; asking a GPU for it would make it wait
+        steps = states.shape[1] if last_observed.is_cuda else int(last_observed.max())
         expected = torch.softmax(edges.prior_logits[:, :steps], dim=-1)
-        messages = self.decoder.messages(inputs[:, :steps], pairs[:, :steps], expected, features[:, :steps])
-        burned_in = torch.cat([node[:, None], self._remember(messages, valid[:, :steps], node)], dim=1)
+        if shown is not features:
+            layer = self.decoder.pair_layer(inputs, features, graph.senders)
+        messages = self.decoder.combine(inputs[:, :steps], layer[:, :steps], graph.present[:, :steps], expected)
+        remembered = masked_gru(messages, self.decoder.gru, valid[:, :steps], node)
+        burned_in = torch.cat([node[:, None], remembered], dim=1)
         now = (torch.arange(len(states), device=states.device), last_observed)
         future = self._free_run(
-            states[now], valid[now], features[now], _Past(*(t[now] for t in past)), burned_in[now],
-            edges.prior_logits[now], rollout_steps, self._sampler(generator),
+            states[now], valid[now], _Graph(graph.present[now], graph.senders), features[now],
+            _Past(*(t[now] for t in past)), burned_in[now], edges.prior_logits[now], rollout_steps,
+            self._sampler(generator),
         )  # fmt: skip
-        return WindowOutput(one_step, future, edges.prior_logits, posterior, shown)
+        return WindowOutput(one_step, future, *outputs)
+
+    def _graph_of_window(self, states: Tensor, valid: Tensor) -> _Graph:
+        """Pairs of each step: of everyone with all others, where the encoder does not need the square."""
+        present, near = pair_mask(valid), self.config.num_neighbours
+        if near:
+            present = present & among_nearest(states[..., : self.spec.position_dim], valid, near)
+        agents = valid.shape[-1]
+        if self.config.innovation_rounds or agents == 1:
+            return _Graph(present, None)
+        return _Graph(off_diagonal(present), others(agents, valid.device))
+
+    def _dense(self, graph: _Graph, prior: Tensor, posterior: Tensor, features: Tensor) -> tuple[Tensor, ...]:
+        """What a window says of pairs, with everyone's own entry in it: no edge, and zeros."""
+        if graph.senders is None:
+            return prior, posterior, features
+        nothing = features.new_zeros(features.shape[-1])
+        no_edge = no_edge_where_absent(prior.new_zeros(prior.shape[-1]), graph.present.new_zeros(1))
+        return with_diagonal(prior, no_edge), with_diagonal(posterior, no_edge), with_diagonal(features, nothing)
 
     # --- Shared -------------------------------------------------------------------------------------------------
 
-    def _past(self, memory: Memory) -> _Past:
-        hidden, cell, static = memory.pairs
-        return _Past(hidden, cell, static, memory.nodes[1])
+    def _graph_now(self, states: Tensor, valid: Tensor) -> _Graph:
+        near = self.config.num_neighbours
+        if not near:
+            return _Graph(pair_mask(valid), None)
+        senders, present = nearest(states[..., : self.spec.position_dim], valid, near)
+        return _Graph(present, senders)
+
+    def _nothing_seen(
+        self, batch: int, agents: int, slots: int
+    ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
+        """Node and pair memory before any observation."""
+        zeros, config = self.codec.scales.new_zeros, self.config
+        pair = zeros(batch, agents, slots, config.rnn_dim)
+        static = zeros(batch, agents, slots, config.static_dim + 1 if config.static_dim else 0)
+        seen = zeros(batch, agents, self.codec.num_inputs + 1 if self.sees_changes else 0)
+        return (zeros(batch, agents, config.decoder_dim), seen), (pair, pair.clone(), static)
 
     def _sampler(self, generator: torch.Generator | None) -> "_Sampler":
         return _Sampler(self.config.temperature, self.config.hard_samples, generator)
 
-    def _encode(self, inputs: Tensor, valid: Tensor, past: _Past) -> _Encoding:
+    def _layers(self) -> "_Modules | Stepper":
+        """For single steps: with gradients the modules themselves, otherwise the same with its weights folded."""
+        dropout = self.training and self.config.dropout > 0
+        if torch.is_grad_enabled() or dropout or self.config.innovation_rounds:
+            return _Modules(self.encoder, self.decoder)
+        if self._stepper is None or not self._stepper.is_current():
+            self._stepper = Stepper(self.encoder, self.decoder)
+        return self._stepper
+
+    def _encode(self, inputs: Tensor, valid: Tensor, graph: _Graph, past: _Past) -> _Encoding:
         """Encode a stretch of steps after `past`."""
-        pairs, seen = pair_mask(valid), inputs.new_zeros(*inputs.shape[:-1], 0)
-        if self.sees_changes:
-            seen = torch.cat([inputs, torch.ones_like(inputs[..., :1])], dim=-1) * valid[..., None]
-            before = torch.cat([past.seen[:, None], seen[:, :-1]], dim=1)
-            known = before[..., -1:] * valid[..., None]
-            features = self.spec.num_features
-            changes = (inputs[..., :features] - before[..., :features]) * self._per_change * known
-            inputs = torch.cat([inputs, changes], dim=-1)
-        edges = self.encoder(inputs, pairs, past.hidden, past.cell)
-        matched, static = edges.features, inputs.new_zeros(*pairs.shape, 0)
-        if self.config.static_dim:
-            static = running_mean(edges.features[..., : self.config.static_dim], pairs, past.static)
-            matched = torch.cat([static[..., :-1], edges.features[..., self.config.static_dim :]], dim=-1)
-        return _Encoding(edges, matched, _Past(edges.hidden, edges.cell, static, seen))
+        inputs, seen = self._with_changes(inputs, valid, past.seen)
+        edges = self.encoder(inputs, graph.present, past.hidden, past.cell, graph.senders)
+        features, static = self._match(edges.features, graph.present, past.static)
+        return _Encoding(edges, features, _Past(edges.hidden, edges.cell, static, seen))
 
-    def _encode_step(self, states: Tensor, valid: Tensor, past: _Past) -> tuple[_Past, Tensor, Tensor]:
+    def _encode_step(self, states: Tensor, valid: Tensor, graph: _Graph, past: _Past) -> tuple[_Past, Tensor, Tensor]:
         """The same for one step: memory, prior logits and features after it."""
-        inputs = self.codec.inputs(states, valid)[:, None]
-        edges, features, after = self._encode(inputs, valid[:, None], past)
-        return _Past(*(t[:, 0] for t in after)), edges.prior_logits[:, 0], features[:, 0]
+        inputs, seen = self.codec.inputs(states, valid), past.seen
+        if self.sees_changes:
+            stretch, after = self._with_changes(inputs[:, None], valid[:, None], seen)
+            inputs, seen = stretch[:, 0], after[:, 0]
+        hidden, cell, logits, features = self._layers().encode(inputs, *graph, past.hidden, past.cell)
+        static = past.static
+        if self.config.static_dim:
+            matched, after = self._match(features[:, None], graph.present[:, None], static)
+            features, static = matched[:, 0], after[:, 0]
+        return _Past(hidden, cell, static, seen), logits, features
 
-    def _match_window(self, features: Tensor, causal: Tensor, pairs: Tensor) -> Tensor:
+    def _with_changes(self, inputs: Tensor, valid: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+        """What the encoder sees of a stretch of steps, and what it remembers of each for the next one."""
+        if not self.sees_changes:
+            return inputs, inputs.new_zeros(*inputs.shape[:-1], 0)
+        seen = torch.cat([inputs, torch.ones_like(inputs[..., :1])], dim=-1) * valid[..., None]
+        earlier = torch.cat([before[:, None], seen[:, :-1]], dim=1)
+        known = earlier[..., -1:] * valid[..., None]
+        features = self.spec.num_features
+        changes = (inputs[..., :features] - earlier[..., :features]) * self._per_change * known
+        return torch.cat([inputs, changes], dim=-1), seen
+
+    def _match(self, features: Tensor, present: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+        """Pair matching from the past: features whose static dimensions are running means, and these after each step.
+
+        Time axis second.
+        """
+        static = self.config.static_dim
+        if not static:
+            return features, features.new_zeros(*present.shape, 0)
+        mean = running_mean(features[..., :static], present, before)
+        return torch.cat([mean[..., :-1], features[..., static:]], dim=-1), mean
+
+    def _match_window(self, features: Tensor, causal: Tensor, present: Tensor) -> Tensor:
         """Features for the teacher-forced pass: the static ones from the whole window, if the config asks for that."""
         static = self.config.static_dim
         if not static or self.config.pair_matching == "causal":
             return causal
-        return torch.cat([window_mean(features[..., :static], pairs), features[..., static:]], dim=-1)
-
-    def _remember(self, messages: Tensor, valid: Tensor, hidden: Tensor) -> Float[Tensor, "batch time agents decoder"]:
-        """GRU states of all agents after each step."""
-        nodes = []
-        for message, present in zip(messages.unbind(1), valid.unbind(1), strict=True):
-            hidden = self.decoder.step(message, present, hidden)
-            nodes.append(hidden)
-        return torch.stack(nodes, dim=1) if nodes else messages.new_zeros(len(hidden), 0, *hidden.shape[1:])
+        return torch.cat([window_mean(features[..., :static], present), features[..., static:]], dim=-1)
 
     def _move(
-        self, states: Tensor, valid: Tensor, graph: Tensor, features: Tensor, node: Tensor
+        self, states: Tensor, valid: Tensor, graph: _Graph, weights: Tensor, features: Tensor, node: Tensor
     ) -> tuple[Tensor, Tensor]:
         """One decoder step: GRU states after it, and the next states."""
-        pairs = pair_mask(valid)
-        messages = self.decoder.messages(self.codec.inputs(states, valid), pairs, graph, features)
-        node = self.decoder.step(messages, valid, node)
-        return node, self._integrate(states, valid, pairs, graph, features, node, messages)
+        inputs = self.codec.inputs(states, valid)
+        node, messages = self._layers().drive(inputs, *graph, weights, features, valid, node)
+        return node, self._integrate(states, valid, graph, weights, features, node, messages)
 
     def _integrate(
         self,
         states: Tensor,
         valid: Tensor,
-        pairs: Tensor,
-        graph: Tensor,
+        graph: _Graph,
+        weights: Tensor,
         features: Tensor,
         node: Tensor,
-        messages: Tensor,
+        messages: Tensor | None,
     ) -> Float[Tensor, "*batch agents state"]:
         """States one step later; with substeps, messages are evaluated anew as the agents move."""
         change = self.decoder.change(node)
         substeps = self.config.substeps
         if not substeps:
             return self.codec.advance(states, change)
+        assert messages is not None
         for substep in range(substeps):
             if substep:
-                messages = self.decoder.messages(self.codec.inputs(states, valid), pairs, graph, features)
+                inputs = self.codec.inputs(states, valid)
+                messages = self.decoder.messages(inputs, graph.present, weights, features, graph.senders)
             states = self.codec.advance(states, change + self.decoder.direct(messages), 1 / substeps)
         return states
 
@@ -246,6 +342,7 @@ class DGVAE(nn.Module):
         self,
         states: Tensor,
         valid: Tensor,
+        graph: _Graph,
         features: Tensor,
         past: _Past,
         node: Tensor,
@@ -254,26 +351,60 @@ class DGVAE(nn.Module):
         sampler: "_Sampler",
     ) -> Float[Tensor, "batch agents horizon state"]:
         """Roll out from an observation whose decoder step is still to be taken."""
-        node, states = self._move(states, valid, sampler(logits), features, node)
-        return self._continue(states, valid, past, node, horizon_steps, sampler)
+        drawn = sampler(logits)
+        node, states = self._move(states, valid, graph, drawn, features, node)
+        return self._continue(states, valid, graph, past, node, (drawn, features), horizon_steps, sampler)
 
     def _continue(
         self,
         states: Tensor,
         valid: Tensor,
+        graph: _Graph,
         past: _Past,
         node: Tensor,
+        edges: tuple[Tensor, Tensor],
         horizon_steps: int,
         sampler: "_Sampler | None",
     ) -> Float[Tensor, "batch agents horizon state"]:
-        """Roll out from predicted states; without a sampler along expected graphs."""
-        future = [states]
+        """Roll out from predicted states; without a sampler along expected graphs.
+
+        Who may interact with whom stays as it was observed; `edges` are weights and features, kept if frozen.
+        """
+        future, (weights, features) = [states], edges
         for _ in range(horizon_steps - 1):
-            past, logits, features = self._encode_step(states, valid, past)
-            graph = torch.softmax(logits, dim=-1) if sampler is None else sampler(logits)
-            node, states = self._move(states, valid, graph, features, node)
+            if self.config.rollout_graph == "evolving":
+                past, logits, features = self._encode_step(states, valid, graph, past)
+                weights = torch.softmax(logits, dim=-1) if sampler is None else sampler(logits)
+            node, states = self._move(states, valid, graph, weights, features, node)
             future.append(states)
         return torch.stack(future, dim=2)[:, :, :horizon_steps]
+
+
+@dataclass(frozen=True)
+class _Modules:
+    """Single steps through the modules themselves."""
+
+    encoder: Encoder
+    decoder: Decoder
+
+    def encode(
+        self, inputs: Tensor, present: Tensor, senders: Tensor | None, hidden: Tensor, cell: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        edges: Edges = self.encoder(inputs[:, None], present[:, None], hidden, cell, senders)
+        return edges.hidden[:, 0], edges.cell[:, 0], edges.prior_logits[:, 0], edges.features[:, 0]
+
+    def drive(
+        self,
+        inputs: Tensor,
+        present: Tensor,
+        senders: Tensor | None,
+        weights: Tensor,
+        features: Tensor,
+        valid: Tensor,
+        node: Tensor,
+    ) -> tuple[Tensor, Tensor | None]:
+        messages = self.decoder.messages(inputs, present, weights, features, senders)
+        return self.decoder.step(messages, valid, node), messages
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from predictor.losses import masked_mean
 
 
 def running_mean(
-    values: Float[Tensor, "batch time agents agents static"],
-    pairs: Bool[Tensor, "batch time agents agents"],
-    memory: Float[Tensor, "batch agents agents static_and_count"],
-) -> Float[Tensor, "batch time agents agents static_and_count"]:
+    values: Float[Tensor, "batch time agents slots static"],
+    pairs: Bool[Tensor, "batch time agents slots"],
+    memory: Float[Tensor, "batch agents slots static_and_count"],
+) -> Float[Tensor, "batch time agents slots static_and_count"]:
     """Mean over the steps at which a pair was there without a break, and their number; what streaming can know.
 
     Args:
@@ -32,8 +32,8 @@ def running_mean(
 
 
 def window_mean(
-    values: Float[Tensor, "batch time agents agents static"], pairs: Bool[Tensor, "batch time agents agents"]
-) -> Float[Tensor, "batch time agents agents static"]:
+    values: Float[Tensor, "batch time agents slots static"], pairs: Bool[Tensor, "batch time agents slots"]
+) -> Float[Tensor, "batch time agents slots static"]:
     """Mean over all steps of the window at which a pair is there (the paper's pair matching); training only."""
     present = pairs[..., None]
     mean = (values * present).sum(1, keepdim=True) / present.sum(1, keepdim=True).clamp(min=1)

@@ -4,6 +4,7 @@ Forecasters are stateless functions of an explicit `Memory`, so that a batch may
 forgotten one by one, and agents may be re-sorted. `predictor.online` keeps the memory for an environment.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -14,6 +15,9 @@ from torch.nn import functional
 
 from predictor.scene import SceneSpec
 
+NOBODY = -1
+"""Sender of an empty slot."""
+
 
 @dataclass(frozen=True)
 class Memory:
@@ -21,8 +25,10 @@ class Memory:
 
     nodes: tuple[Float[Tensor, "batch agents _"], ...] = ()
     """One tensor per kind of agent memory."""
-    pairs: tuple[Float[Tensor, "batch agents agents _"], ...] = ()
+    pairs: tuple[Float[Tensor, "batch agents slots _"], ...] = ()
     """One tensor per kind of pair memory, receiver first."""
+    senders: Int[Tensor, "batch agents slots"] | None = None
+    """Whose each slot is (`NOBODY` where empty); None if slot j is agent j's."""
 
     def reorder(self, source: Int[Tensor, "batch agents"], known: Bool[Tensor, "batch agents"]) -> "Memory":
         """Move memory along with agents that changed rows.
@@ -32,37 +38,76 @@ class Memory:
             known: which new rows had an old one; the others start from zero.
         """
         rows = torch.arange(len(source), device=source.device)
-        both = (known[:, :, None] & known[:, None, :])[..., None]
         nodes = tuple(m[rows[:, None], source] * known[..., None] for m in self.nodes)
-        pairs = tuple(m[rows[:, None, None], source[:, :, None], source[:, None, :]] * both for m in self.pairs)
-        return Memory(nodes, pairs)
+        if self.senders is None:
+            both = (known[:, :, None] & known[:, None, :])[..., None]
+            pairs = tuple(m[rows[:, None, None], source[:, :, None], source[:, None, :]] * both for m in self.pairs)
+            return Memory(nodes, pairs)
+        pairs = tuple(m[rows[:, None], source] * known[..., None, None] for m in self.pairs)
+        return Memory(nodes, pairs, self._moved_senders(source, known))
+
+    def _moved_senders(self, source: Tensor, known: Tensor) -> Tensor:
+        """The senders of `reorder`: their agents' new rows, in the receivers' new rows."""
+        assert self.senders is not None
+        agents = self.senders.shape[1]
+        # where each agent went; one more entry for nobody, and one for the writes of rows without a past
+        went = source.new_full((len(source), agents + 2), NOBODY)
+        new = torch.arange(source.shape[1], device=source.device).expand_as(source)
+        went.scatter_(1, torch.where(known, source, agents + 1), new)
+        went[:, agents:] = NOBODY
+        old = self.senders.gather(1, source[..., None].expand(-1, -1, self.senders.shape[2]))
+        old = torch.where((old == NOBODY) | ~known[..., None], agents, old)
+        return went.gather(1, old.flatten(1)).view_as(old)
+
+    def to_slots(
+        self, senders: Int[Tensor, "batch agents slots"], present: Bool[Tensor, "batch agents slots"]
+    ) -> "Memory":
+        """Move pair memory to where each receiver's senders now stand; who was not heard before starts from zero.
+
+        Args:
+            senders: who is in each slot.
+            present: which slots hold somebody.
+        """
+        assert self.senders is not None  # dense memory has a place for everyone
+        same = (senders[..., :, None] == self.senders[..., None, :]) & present[..., :, None]
+        place, known = same.to(torch.uint8).argmax(-1), same.any(-1)[..., None]
+        pairs = tuple(m.gather(2, place[..., None].expand(-1, -1, -1, m.shape[-1])) * known for m in self.pairs)
+        return Memory(self.nodes, pairs, senders.masked_fill(~present, NOBODY))
 
     def padded(self, agents: int) -> "Memory":
         """The same with room for `agents` agents; the new ones have no memory."""
 
-        def pad(memory: Tensor, axes: int) -> Tensor:
+        def pad(memory: Tensor, axes: int, value: int = 0) -> Tensor:
             missing = agents - memory.shape[1]
-            return functional.pad(memory, (0, 0) + (0, missing) * axes) if missing else memory
+            padding = (0, 0) * (memory.ndim - 1 - axes) + (0, missing) * axes
+            return functional.pad(memory, padding, value=value) if missing else memory
 
-        return Memory(tuple(pad(m, 1) for m in self.nodes), tuple(pad(m, 2) for m in self.pairs))
+        dense = self.senders is None
+        pairs = tuple(pad(m, 2 if dense else 1) for m in self.pairs)
+        senders = None if self.senders is None else pad(self.senders, 1, NOBODY)
+        return Memory(tuple(pad(m, 1) for m in self.nodes), pairs, senders)
 
     def select(self, rows: Int[Tensor, " rows"]) -> "Memory":
         """The memory of some batch rows."""
-        return Memory(tuple(m[rows] for m in self.nodes), tuple(m[rows] for m in self.pairs))
+        return self._map(lambda m: m[rows])
 
     def replace_rows(self, rows: Int[Tensor, " rows"], other: "Memory") -> "Memory":
         """A copy in which `rows` are those of `other`."""
-        return Memory(
-            tuple(m.index_copy(0, rows, o) for m, o in zip(self.nodes, other.nodes, strict=True)),
-            tuple(m.index_copy(0, rows, o) for m, o in zip(self.pairs, other.pairs, strict=True)),
-        )
+        return self._map(lambda m, o: m.index_copy(0, rows, o), other)
 
     @staticmethod
     def concatenate(first: "Memory", second: "Memory") -> "Memory":
         """The batch rows of `first`, then those of `second`."""
+        return first._map(lambda m, o: torch.cat([m, o]), second)
+
+    def _map(self, change: Callable[..., Tensor], *others: "Memory") -> "Memory":
+        """The same change to every tensor, with the tensors of other memories that belong to it."""
+        memories = (self, *others)
+        listed = [m.senders for m in memories if m.senders is not None]
         return Memory(
-            tuple(torch.cat(pair) for pair in zip(first.nodes, second.nodes, strict=True)),
-            tuple(torch.cat(pair) for pair in zip(first.pairs, second.pairs, strict=True)),
+            tuple(change(*tensors) for tensors in zip(*(m.nodes for m in memories), strict=True)),
+            tuple(change(*tensors) for tensors in zip(*(m.pairs for m in memories), strict=True)),
+            change(*listed) if listed else None,
         )
 
 
@@ -74,12 +119,14 @@ class Belief:
     """The observation itself, SI units."""
     valid: Bool[Tensor, "batch agents"]
     """Who is present."""
-    edge_probs: Float[Tensor, "batch agents agents types"]
+    edge_probs: Float[Tensor, "batch agents slots types"]
     """Prior over edge types, receiver first; [1, 0, …] where there is no pair."""
-    edge_features: Float[Tensor, "batch agents agents feature"]
+    edge_features: Float[Tensor, "batch agents slots feature"]
     """Edge features from the past only; zero where there is no pair."""
     internal: Any = None
     """What the forecaster itself needs to roll out."""
+    senders: Int[Tensor, "batch agents slots"] | None = None
+    """Whose each slot is; None if slot j is agent j's."""
 
 
 def edgeless_belief(

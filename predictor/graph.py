@@ -1,11 +1,14 @@
-"""Dense graphs of small scenes: who is paired with whom, and layers on pairs that work on nodes first.
+"""Graphs: who is paired with whom, and layers on pairs that work on nodes first.
 
-A pair is always (receiver, sender), in this axis order.
+A pair is always (receiver, sender), in this axis order. Pairs of a scene lie in an array of agents × slots. Without a
+list of senders, slot j is agent j ("dense"). With one, slot s of receiver i is agent `senders[i, s]`: all others, which
+leaves the diagonal out, or the nearest few, so that the cost grows with the number of agents and not with its square.
 """
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
+from torch.nn import functional
 
 
 def pair_mask(valid: Bool[Tensor, "*batch agents"]) -> Bool[Tensor, "*batch agents agents"]:
@@ -13,6 +16,66 @@ def pair_mask(valid: Bool[Tensor, "*batch agents"]) -> Bool[Tensor, "*batch agen
     agents = valid.shape[-1]
     distinct = ~torch.eye(agents, dtype=torch.bool, device=valid.device)
     return valid[..., :, None] & valid[..., None, :] & distinct
+
+
+def others(agents: int, device: torch.device | None = None) -> Int[Tensor, "agents slots"]:
+    """Senders of a graph in which everyone hears everyone else, in order."""
+    every = torch.arange(agents, device=device)
+    return off_diagonal(every.expand(agents, agents))
+
+
+def off_diagonal(dense: Shaped[Tensor, "*batch agents agents"]) -> Shaped[Tensor, "*batch agents slots"]:
+    """From dense pairs to those with `others`."""
+    agents = dense.shape[-1]
+    # row by row, the entries between two diagonal ones are as many as there are agents
+    between = dense.flatten(-2)[..., 1:].unflatten(-1, (agents - 1, agents + 1))[..., :-1]
+    return between.reshape(*dense.shape[:-2], agents, agents - 1)
+
+
+def with_diagonal(
+    pairs: Shaped[Tensor, "*batch agents slots feature"], diagonal: Shaped[Tensor, " feature"]
+) -> Shaped[Tensor, "*batch agents agents feature"]:
+    """From pairs with `others` to dense ones, every diagonal entry as given."""
+    agents = pairs.shape[-3]
+    between = pairs.reshape(*pairs.shape[:-3], agents - 1, agents, pairs.shape[-1])
+    first = diagonal.expand(*between.shape[:-2], 1, -1)
+    last = diagonal.expand(*between.shape[:-3], 1, -1)
+    flat = torch.cat([torch.cat([first, between], dim=-2).flatten(-3, -2), last], dim=-2)
+    return flat.unflatten(-2, (agents, agents))
+
+
+def nearest(
+    positions: Float[Tensor, "batch agents axes"], valid: Bool[Tensor, "batch agents"], count: int
+) -> tuple[Int[Tensor, "batch agents slots"], Bool[Tensor, "batch agents slots"]]:
+    """The nearest others of each agent, `count` at most, and which of the slots hold one.
+
+    Who is compared is everyone with everyone, by distances alone; that square is small beside what pairs cost.
+    """
+    agents = positions.shape[1]
+    distance = torch.cdist(positions, positions)
+    distance = distance.masked_fill(~pair_mask(valid), torch.inf)
+    found = distance.topk(min(count, agents), dim=-1, largest=False)
+    return found.indices, found.values < torch.inf
+
+
+def among_nearest(
+    positions: Float[Tensor, "*batch agents axes"], valid: Bool[Tensor, "*batch agents"], count: int
+) -> Bool[Tensor, "*batch agents agents"]:
+    """The dense mask of the pairs that `nearest` finds."""
+    senders, present = nearest(positions.flatten(0, -3), valid.flatten(0, -2), count)
+    mask = torch.zeros(*senders.shape[:2], senders.shape[1], dtype=torch.bool, device=valid.device)
+    return mask.scatter_(-1, senders, present).view(*valid.shape, valid.shape[-1])
+
+
+def to_pairs(
+    nodes: Float[Tensor, "*batch agents node"], senders: Int[Tensor, "*some agents slots"]
+) -> Float[Tensor, "*batch agents slots node"]:
+    """The node of each pair's sender; `senders` is one list for all, or one for each of the last batch axis."""
+    agents, slots = senders.shape[-2:]
+    if senders.ndim == 2:
+        return nodes.index_select(-2, senders.flatten()).unflatten(-2, (agents, slots))
+    rows = senders + agents * torch.arange(len(senders), device=senders.device)[:, None, None]
+    return nodes.flatten(-3, -2).index_select(-2, rows.flatten()).unflatten(-2, tuple(senders.shape))
 
 
 class PairLinear(nn.Module):
@@ -33,17 +96,41 @@ class PairLinear(nn.Module):
         self.sender = nn.Linear(inputs, outputs, bias=False)
         self.relative = relative
 
-    def forward(self, nodes: Float[Tensor, "*batch agents node"]) -> Float[Tensor, "*batch agents agents out"]:
-        """Pair features, before any non-linearity."""
-        sent = self.sender(nodes)
-        received = self.receiver(nodes)
+    def forward(
+        self,
+        nodes: Float[Tensor, "*batch agents node"],
+        senders: Int[Tensor, "*some agents slots"] | None = None,
+        after: nn.Linear | None = None,
+    ) -> Float[Tensor, "*batch agents slots out"]:
+        """Pair features, before any non-linearity.
+
+        Args:
+            nodes: one per agent.
+            senders: who is in which slot; None is dense.
+            after: a linear layer that `nodes` are still to pass; two in a row are folded into one.
+        """
+        sent = self._product(self.sender, nodes, after)
+        received = self._product(self.receiver, nodes, after)
         if self.relative:
             received = received - sent
-        return received[..., :, None, :] + sent[..., None, :, :]
+        if senders is None:
+            return received[..., :, None, :] + sent[..., None, :, :]
+        return to_pairs(sent, senders).add_(received[..., :, None, :])
+
+    def _product(self, layer: nn.Linear, nodes: Tensor, after: nn.Linear | None) -> Tensor:
+        if after is None:
+            return functional.linear(nodes, layer.weight, layer.bias)
+        return functional.linear(nodes, *folded(layer, after))
+
+
+def folded(outer: nn.Linear, inner: nn.Linear) -> tuple[Float[Tensor, "out in"], Float[Tensor, " out"]]:
+    """Weight and bias of two linear layers in a row: W (W' x + b') + b."""
+    bias = outer.weight @ inner.bias
+    return outer.weight @ inner.weight, bias if outer.bias is None else bias + outer.bias
 
 
 def sum_over_senders(
-    pairs: Float[Tensor, "*batch agents agents hidden"], weight: Float[Tensor, "*batch agents agents"]
+    pairs: Float[Tensor, "*batch agents slots hidden"], weight: Float[Tensor, "*batch agents slots"]
 ) -> Float[Tensor, "*batch agents hidden"]:
     """Σ_j weight_ij · pair_ij."""
     return torch.matmul(weight[..., None, :], pairs)[..., 0, :]

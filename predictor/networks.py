@@ -10,14 +10,15 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
 from predictor.codec import Residual
 from predictor.errors import UserError
-from predictor.graph import PairLinear, sum_over_senders
+from predictor.graph import PairLinear, folded, sum_over_senders
 from predictor.innovation import Innovation
+from predictor.recurrent import Correction, masked_lstm
 
 
 @dataclass(frozen=True)
@@ -72,19 +73,29 @@ class DGVAEConfig:
     random weights explodes."""
     hard_samples: bool = False
     """Sample one-hot graphs, with the gradient of the soft ones (straight-through)."""
+    num_neighbours: int = 0
+    """An agent hears at most so many others, the nearest; 0 is everyone. The cost then grows with the number of agents,
+    not with its square. A roll-out keeps the neighbours it starts with."""
+    rollout_graph: Literal["evolving", "frozen"] = "evolving"
+    """Whether a roll-out feeds predictions back through the encoder, or keeps the edges and features it starts with:
+    faster, and less accurate unless trained so."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
         for name in ("hidden_dim", "rnn_dim", "head_dim", "message_dim", "decoder_dim", "innovation_dim"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("edge_feature_dim", "innovation_rounds", "static_dim", "substeps"):
+        for name in ("edge_feature_dim", "innovation_rounds", "static_dim", "substeps", "num_neighbours"):
             if getattr(self, name) < 0:
                 raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
         if self.residual not in ("state", "constant_velocity", "trapezoid"):
             raise UserError(f"residual must be 'state', 'constant_velocity' or 'trapezoid', got '{self.residual}'")
         if self.pair_matching not in ("window", "causal"):
             raise UserError(f"pair_matching must be 'window' or 'causal', got '{self.pair_matching}'")
+        if self.rollout_graph not in ("evolving", "frozen"):
+            raise UserError(f"rollout_graph must be 'evolving' or 'frozen', got '{self.rollout_graph}'")
+        if self.num_neighbours and self.innovation_rounds:
+            raise UserError("innovation_rounds needs every pair and its reverse; set num_neighbours to 0")
         if self.static_dim > self.edge_feature_dim:
             raise UserError(
                 f"static_dim must be at most edge_feature_dim ({self.edge_feature_dim}), got {self.static_dim}"
@@ -111,13 +122,14 @@ PRESETS: dict[str, DGVAEConfig] = {
 
 
 class Edges(NamedTuple):
-    """Encoder outputs for a stretch of time; time axis second."""
+    """Encoder outputs for a stretch of time; time axis second; pairs as the encoder got them."""
 
-    hidden: Float[Tensor, "batch time agents agents rnn"]
-    cell: Float[Tensor, "batch time agents agents rnn"]
-    prior_logits: Float[Tensor, "batch time agents agents types"]
-    features: Float[Tensor, "batch time agents agents feature"]
-    embedding: Float[Tensor, "batch time agents agents hidden"]
+    hidden: Float[Tensor, "batch time agents slots rnn"]
+    cell: Float[Tensor, "batch time agents slots rnn"]
+    prior_logits: Float[Tensor, "batch time agents slots types"]
+    features: Float[Tensor, "batch time agents slots feature"]
+    hidden_layer: Float[Tensor, "batch time agents slots hidden"]
+    """Of the edge MLP; its second layer is folded into the gates."""
 
 
 def concrete_sample(
@@ -177,39 +189,47 @@ class Encoder(nn.Module):
         self.posterior_head = _head(2 * rnn, config.head_dim, config.num_edge_types)
 
     def embed_edges(
-        self, inputs: Float[Tensor, "*batch agents inputs"], pairs: Bool[Tensor, "*batch agents agents"]
-    ) -> Float[Tensor, "*batch agents agents hidden"]:
-        """The graph block; all steps at once."""
-        nodes = self.embed(inputs)
-        weight = pairs.to(nodes.dtype)
-        summed = sum_over_senders(functional.elu(self.conv_pair(nodes)), weight)
+        self,
+        inputs: Float[Tensor, "*batch agents inputs"],
+        pairs: Bool[Tensor, "*batch agents slots"],
+        senders: Int[Tensor, "*some agents slots"] | None = None,
+    ) -> Float[Tensor, "*batch agents slots hidden"]:
+        """The graph block up to the hidden layer of the edge MLP; all steps at once."""
+        weight = pairs.to(inputs.dtype)
+        summed = sum_over_senders(functional.elu(self.conv_pair(inputs, senders, self.embed), inplace=True), weight)
         # Σ_j (W h_ij + b) = W Σ_j h_ij + n b: the second layer of EdgeConv costs agents, not pairs.
         count = weight.sum(-1, keepdim=True)
         nodes = functional.elu(functional.linear(summed, self.conv_out.weight) + count * self.conv_out.bias)
-        edges: Tensor = self.edge_out(functional.elu(self.edge_pair(nodes)))
-        return edges
+        return functional.elu(self.edge_pair(nodes, senders), inplace=True)
+
+    def _gates(self, layer: nn.Linear, hidden: Tensor) -> Tensor:
+        """Input share of an LSTM's gates."""
+        weight, bias = folded(layer, self.edge_out)
+        return _time_first(lambda x: functional.linear(x, weight, bias), hidden)
 
     def forward(
         self,
         inputs: Float[Tensor, "batch time agents inputs"],
-        pairs: Bool[Tensor, "batch time agents agents"],
-        hidden: Float[Tensor, "batch agents agents rnn"],
-        cell: Float[Tensor, "batch agents agents rnn"],
+        pairs: Bool[Tensor, "batch time agents slots"],
+        hidden: Float[Tensor, "batch agents slots rnn"],
+        cell: Float[Tensor, "batch agents slots rnn"],
+        senders: Int[Tensor, "*some agents slots"] | None = None,
     ) -> Edges:
         """Run the forward LSTM from a given memory; a pair that is not present has its memory set to zero."""
-        embedding = self.embed_edges(inputs, pairs)
+        hidden_layer = _time_first(lambda x, mask: self.embed_edges(x, mask, senders), inputs, pairs)
         correct = self._correction(inputs, pairs) if self.config.innovation_rounds else None
-        gates = self.forward_input(embedding)
+        gates = self._gates(self.forward_input, hidden_layer)
         hiddens, cells = masked_lstm(gates, self.forward_hidden, pairs, hidden, cell, correct=correct)
         past = self.dropout(functional.elu(hiddens))
         present = pairs[..., None]
         if self.config.edge_feature_dim:
-            features = self.feature_head(past) * present
+            features = _time_first(self.feature_head, past) * present
         else:
             features = past.new_zeros(*pairs.shape, 0)
-        return Edges(hiddens, cells, no_edge_where_absent(self.prior_head(past), present), features, embedding)
+        logits = no_edge_where_absent(_time_first(self.prior_head, past), present)
+        return Edges(hiddens, cells, logits, features, hidden_layer)
 
-    def _correction(self, inputs: Tensor, pairs: Tensor) -> Callable[[int, Tensor], Tensor]:
+    def _correction(self, inputs: Tensor, pairs: Tensor) -> Correction:
         regressors, targets = self.innovation.prepare(inputs, pairs)
         steps = list(zip(regressors.unbind(1), targets.unbind(1), strict=True))
 
@@ -220,14 +240,19 @@ class Encoder(nn.Module):
         return gates
 
     def posterior_logits(
-        self, edges: Edges, pairs: Bool[Tensor, "batch time agents agents"]
-    ) -> Float[Tensor, "batch time agents agents types"]:
+        self, edges: Edges, pairs: Bool[Tensor, "batch time agents slots"]
+    ) -> Float[Tensor, "batch time agents slots types"]:
         """Logits that have seen the future; training only."""
         zeros = torch.zeros_like(edges.hidden[:, 0])
-        gates = self.backward_input(edges.embedding)
+        gates = self._gates(self.backward_input, edges.hidden_layer)
         backward, _ = masked_lstm(gates, self.backward_hidden, pairs, zeros, zeros, reverse=True)
         both = self.dropout(functional.elu(torch.cat([edges.hidden, backward], dim=-1)))
-        return no_edge_where_absent(self.posterior_head(both), pairs[..., None])
+        return no_edge_where_absent(_time_first(self.posterior_head, both), pairs[..., None])
+
+
+def _time_first(layer: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
+    """Apply a layer with time before batch, as the LSTMs hold it in memory; no copy is made of what they give."""
+    return layer(*(t.transpose(0, 1) for t in tensors)).transpose(0, 1)
 
 
 def no_edge_where_absent(
@@ -237,45 +262,6 @@ def no_edge_where_absent(
     absent = torch.full_like(logits, -1e4)
     absent[..., 0] = 0.0
     return torch.where(present, logits, absent)
-
-
-def masked_lstm(
-    gates: Float[Tensor, "batch time agents agents gates"],
-    recurrent: nn.Linear,
-    pairs: Bool[Tensor, "batch time agents agents"],
-    hidden: Float[Tensor, "batch agents agents rnn"],
-    cell: Float[Tensor, "batch agents agents rnn"],
-    reverse: bool = False,
-    correct: Callable[[int, Tensor], Tensor] | None = None,
-) -> tuple[Float[Tensor, "batch time agents agents rnn"], Float[Tensor, "batch time agents agents rnn"]]:
-    """An LSTM for each pair, from gate inputs of all steps; a pair that is not there has its memory set to zero.
-
-    Args:
-        gates: input share of the gates (input, forget, cell, output).
-        recurrent: hidden state to gates.
-        pairs: which pairs are there.
-        hidden: before the first step (after the last one, if reversed).
-        cell: likewise.
-        reverse: run from the last step to the first.
-        correct: what else to add to the gates, given the step and the hidden state before it.
-    """
-    hiddens, cells = [], []
-    # unbind, not [:, t]: the gradient of an index is a full-size tensor of zeros for every step
-    steps = list(zip(gates.unbind(1), pairs[..., None].unbind(1), strict=True))
-    assert correct is None or not reverse  # corrections know the steps in their order only
-    for t, (gate, present) in enumerate(reversed(steps) if reverse else steps):
-        gate = gate + recurrent(hidden)
-        if correct is not None:
-            gate = gate + correct(t, hidden)
-        i, f, g, o = gate.chunk(4, dim=-1)
-        cell = (torch.sigmoid(f) * cell + torch.sigmoid(i) * torch.tanh(g)) * present
-        hidden = torch.sigmoid(o) * torch.tanh(cell) * present
-        hiddens.append(hidden)
-        cells.append(cell)
-    if reverse:
-        hiddens.reverse()
-        cells.reverse()
-    return torch.stack(hiddens, dim=1), torch.stack(cells, dim=1)
 
 
 class Decoder(nn.Module):
@@ -304,32 +290,50 @@ class Decoder(nn.Module):
     def messages(
         self,
         inputs: Float[Tensor, "*batch agents inputs"],
-        pairs: Bool[Tensor, "*batch agents agents"],
-        graph: Float[Tensor, "*batch agents agents types"],
-        features: Float[Tensor, "*batch agents agents feature"],
+        pairs: Bool[Tensor, "*batch agents slots"],
+        graph: Float[Tensor, "*batch agents slots types"],
+        features: Float[Tensor, "*batch agents slots feature"],
+        senders: Int[Tensor, "*some agents slots"] | None = None,
     ) -> Float[Tensor, "*batch agents message"]:
         """Σ_j z_ij · h(x_i ‖ x_j ‖ e_ij) plus the agent's own term; all steps at once."""
-        hidden = self._hidden(inputs, features)
+        return self.combine(inputs, self.pair_layer(inputs, features, senders), pairs, graph)
+
+    def pair_layer(
+        self,
+        inputs: Float[Tensor, "*batch agents inputs"],
+        features: Float[Tensor, "*batch agents slots feature"],
+        senders: Int[Tensor, "*some agents slots"] | None = None,
+    ) -> Float[Tensor, "*batch agents slots hidden"]:
+        """The hidden layer of h, one block for each type that speaks; the same whatever the graph."""
+        pair: Tensor = self.message_pair(inputs, senders)
+        if not self.has_features:
+            return functional.elu(pair, inplace=True)
+        feature = self.message_feature(features)
+        if self.gated:
+            return functional.elu(pair, inplace=True) * (1 + feature)
+        return functional.elu(pair.add_(feature), inplace=True)
+
+    def combine(
+        self,
+        inputs: Float[Tensor, "*batch agents inputs"],
+        layer: Float[Tensor, "*batch agents slots hidden"],
+        pairs: Bool[Tensor, "*batch agents slots"],
+        graph: Float[Tensor, "*batch agents slots types"],
+    ) -> Float[Tensor, "*batch agents message"]:
+        """Messages from `pair_layer`, weighted by a graph."""
         total: Tensor = self.own(inputs)
-        layers = zip(
-            hidden.chunk(self.types, dim=-1),
+        blocks = zip(
+            layer.chunk(self.types, dim=-1),
             self.message_out.weight.chunk(self.types),
             self.message_out.bias.chunk(self.types),
             strict=True,
         )
-        for k, (hidden_k, matrix, bias) in enumerate(layers):
+        for k, (layer_k, matrix, bias) in enumerate(blocks):
             weight = graph[..., k + 1] * pairs
             # Σ_j z_ij (W h_ij + b) = W Σ_j z_ij h_ij + b Σ_j z_ij: the second layer costs agents, not pairs.
-            summed = functional.linear(sum_over_senders(hidden_k, weight), matrix)
+            summed = functional.linear(sum_over_senders(layer_k, weight), matrix)
             total = total + summed + weight.sum(-1, keepdim=True) * bias
         return total
-
-    def _hidden(self, inputs: Tensor, features: Tensor) -> Tensor:
-        pair: Tensor = self.message_pair(inputs)
-        if not self.has_features:
-            return functional.elu(pair)
-        feature = self.message_feature(features)
-        return functional.elu(pair) * (1 + feature) if self.gated else functional.elu(pair + feature)
 
     def step(
         self,

@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from predictor.baselines.unroll import mean_weight
 from predictor.graph import PairLinear, pair_mask, sum_over_senders
-from predictor.networks import masked_lstm
+from predictor.recurrent import masked_lstm
 
 
 class FrameEncoder(nn.Module):

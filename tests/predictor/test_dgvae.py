@@ -361,7 +361,7 @@ def test_zero_start_begins_at_the_residual_and_learns(substeps: int):
 
 @pytest.mark.parametrize("hard", [False, True])
 def test_graphs_are_drawn_as_the_config_says(hard: bool, monkeypatch: pytest.MonkeyPatch):
-    """Once for the whole teacher-forced pass, then once for each step of the free run."""
+    """Once for the whole teacher-forced pass, then once for each step of the free run; for pairs of two agents."""
     drawn = []
 
     def sample(logits: Tensor, temperature: float, generator: Any, hard: bool) -> Tensor:
@@ -372,7 +372,7 @@ def test_graphs_are_drawn_as_the_config_says(hard: bool, monkeypatch: pytest.Mon
     forecaster = DGVAE(spec(), replace(FAST_LIKE, temperature=0.75, hard_samples=hard), 3)
     states, valid = random_states(0, BATCH, TIME, AGENTS, 4), random_presence(0, BATCH, TIME, AGENTS)
     forecaster.window(states, valid, torch.tensor([1, 3]), 2)
-    pair = (AGENTS, AGENTS, 2)
+    pair = (AGENTS, AGENTS - 1, 2)
     assert drawn == [((BATCH, TIME, *pair), 0.75, hard)] + 2 * [((BATCH, *pair), 0.75, hard)]
     forecaster.window(states, valid, torch.tensor([1, 3]), 0)
     assert len(drawn) == 4

@@ -155,7 +155,8 @@ def test_corrections_enter_the_gates_of_the_forward_lstm():
     hidden = cell = torch.zeros(BATCH, AGENTS, AGENTS, 5).double()
     edges = encoder(inputs, pairs, hidden, cell)
     for t in range(3):
-        gates = encoder.forward_input(encoder.embed_edges(inputs[:, t], pairs[:, t])) + encoder.forward_hidden(hidden)
+        embedding = encoder.edge_out(encoder.embed_edges(inputs[:, t], pairs[:, t]))
+        gates = encoder.forward_input(embedding) + encoder.forward_hidden(hidden)
         added = encoder.innovation_gates(corrections(encoder.innovation, hidden, inputs[:, t], pairs[:, t]))
         assert added.abs().max() > 1e-2
         i, f, g, o = (gates + added).chunk(4, dim=-1)

@@ -52,10 +52,11 @@ def test_recurrence_of_each_pair_is_a_plain_lstm(seed: int, share: float):
     pairs = pair_mask(random_presence(seed, BATCH, TIME, AGENTS, ego=False, share=share))
     zeros = torch.zeros(BATCH, AGENTS, AGENTS, 7)
     edges = encoder(inputs, pairs, zeros, zeros)
-    forward = loop_over_pairs(lstm_cell(encoder.forward_input, encoder.forward_hidden), edges.embedding, pairs, False)
+    embedding = encoder.edge_out(edges.hidden_layer)
+    forward = loop_over_pairs(lstm_cell(encoder.forward_input, encoder.forward_hidden), embedding, pairs, False)
     torch.testing.assert_close((edges.hidden, edges.cell), forward, **TOLERANCE)
     backward, _ = loop_over_pairs(
-        lstm_cell(encoder.backward_input, encoder.backward_hidden), edges.embedding, pairs, True
+        lstm_cell(encoder.backward_input, encoder.backward_hidden), embedding, pairs, True
     )
     expected = encoder.posterior_head(functional.elu(torch.cat([forward[0], backward], dim=-1)))
     posterior = encoder.posterior_logits(edges, pairs)
@@ -82,7 +83,7 @@ def test_graph_block_against_a_loop():
                 first = conv.receiver(nodes[i]) + conv.sender(nodes[j] - nodes[i])
                 total = total + encoder.conv_out(functional.elu(first))
         updated.append(functional.elu(total))
-    embedding = encoder.embed_edges(inputs, pairs)
+    embedding = encoder.edge_out(encoder.embed_edges(inputs, pairs))
     for i, j in product(range(AGENTS), range(AGENTS)):
         first = edge.receiver(updated[i]) + edge.sender(updated[j])
         torch.testing.assert_close(embedding[i, j], encoder.edge_out(functional.elu(first)), **TOLERANCE)
