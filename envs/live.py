@@ -266,7 +266,7 @@ def _note_edges(episode: Episode, world: World, scene: Scene, everyone: Scene) -
     if labels is None or not isinstance(world, EgoWorld):
         return
     assert isinstance(world.env, ForecastObservation)
-    episode.edge_probs.append(world.env.forecast.edge_probs[0].cpu().numpy())
+    episode.edge_probs.append(world.env.forecast.dense().edge_probs[0].cpu().numpy())
     episode.edge_types.append(_types_of(scene, everyone, labels))
 
 

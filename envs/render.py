@@ -230,7 +230,7 @@ class _Recorder:
         rows = np.flatnonzero(scene.valid)[1:]  # the ego needs no forecast of itself
         keys = tuple(scene.ids[rows].tolist())
         xy_m = forecast.xy[0].double().cpu().numpy() + scene.states[0, :2]
-        probs = 1 - forecast.edge_probs[0, 0, :, 0].double().cpu().numpy()  # receiver ego: who acts on it
+        probs = 1 - forecast.ego_edges()[0][0, :, 0, 0].double().cpu().numpy()  # who acts on the ego
         step = _Step(len(self.recording._frames), keys, xy_m[:, rows].swapaxes(0, 1), probs[rows])
         self.recording._steps.append(step)
 

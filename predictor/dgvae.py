@@ -21,8 +21,8 @@ from torch import Tensor, nn
 from predictor.codec import StateCodec
 from predictor.disentangle import running_mean, window_mean
 from predictor.errors import UserError
-from predictor.forecaster import NOBODY, Belief, Memory, WindowOutput
-from predictor.graph import among_nearest, nearest, off_diagonal, others, pair_mask, with_diagonal
+from predictor.forecaster import Belief, Memory, WindowOutput
+from predictor.graph import NOBODY, among_nearest, nearest, off_diagonal, others, pair_mask, with_diagonal
 from predictor.networks import PRESETS, Decoder, DGVAEConfig, Edges, Encoder, concrete_sample, no_edge_where_absent
 from predictor.recurrent import masked_gru
 from predictor.scene import SceneSpec
@@ -135,7 +135,7 @@ class DGVAE(nn.Module):
         node_after, next_states = self._move(states, valid, graph, probs, features, node_before)
         internal = _Internal(graph, past, logits, node_before, node_after, next_states)
         after = Memory((node_after, past.seen), (past.hidden, past.cell, past.static), memory.senders)
-        return after, Belief(states, valid, probs, features, internal, graph.senders)
+        return after, Belief(states, valid, probs, features, internal, memory.senders)
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None

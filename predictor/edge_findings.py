@@ -102,7 +102,7 @@ def watch(forecaster: Forecaster, batch: WindowBatch) -> Watched:
     for step in range(int(batch.last_observed[0]) + 1):
         valid = batch.valid[:, step]
         memory, belief = forecaster.observe(memory, batch.states[:, step] * valid[..., None], valid)
-        beliefs.append(belief)
+        beliefs.append(belief.dense())
     return Watched(
         torch.stack([b.edge_features for b in beliefs], dim=1).cpu().numpy(),
         torch.stack([b.edge_probs for b in beliefs], dim=1).cpu().numpy(),

@@ -13,10 +13,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from predictor.scene import SceneSpec
-
-NOBODY = -1
-"""Sender of an empty slot."""
+from predictor.graph import NOBODY
+from predictor.scene import SceneSpec, dense_edges
 
 
 @dataclass(frozen=True)
@@ -126,7 +124,14 @@ class Belief:
     internal: Any = None
     """What the forecaster itself needs to roll out."""
     senders: Int[Tensor, "batch agents slots"] | None = None
-    """Whose each slot is; None if slot j is agent j's."""
+    """Whose each slot is (`NOBODY` where empty); None if slot j is agent j's."""
+
+    def dense(self) -> "Belief":
+        """The same with slot j for agent j; of use where scenes are small."""
+        if self.senders is None:
+            return self
+        probs, features = dense_edges(self.edge_probs, self.edge_features, self.senders)
+        return Belief(self.states, self.valid, probs, features, self.internal)
 
 
 def edgeless_belief(

@@ -10,6 +10,9 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
 from torch.nn import functional
 
+NOBODY = -1
+"""Sender of an empty slot."""
+
 
 def pair_mask(valid: Bool[Tensor, "*batch agents"]) -> Bool[Tensor, "*batch agents agents"]:
     """Pairs of two different, present agents."""
@@ -47,24 +50,38 @@ def with_diagonal(
 def nearest(
     positions: Float[Tensor, "batch agents axes"], valid: Bool[Tensor, "batch agents"], count: int
 ) -> tuple[Int[Tensor, "batch agents slots"], Bool[Tensor, "batch agents slots"]]:
-    """The nearest others of each agent, `count` at most, and which of the slots hold one.
+    """The nearest others of each agent in `count` slots, and which of the slots hold one.
 
-    Who is compared is everyone with everyone, by distances alone; that square is small beside what pairs cost.
+    Everyone is compared with everyone, by distance alone; that square is small beside what pairs cost.
     """
     agents = positions.shape[1]
     distance = torch.cdist(positions, positions)
     distance = distance.masked_fill(~pair_mask(valid), torch.inf)
     found = distance.topk(min(count, agents), dim=-1, largest=False)
-    return found.indices, found.values < torch.inf
+    missing = (0, count - found.indices.shape[-1])
+    return functional.pad(found.indices, missing), functional.pad(found.values < torch.inf, missing)
 
 
 def among_nearest(
     positions: Float[Tensor, "*batch agents axes"], valid: Bool[Tensor, "*batch agents"], count: int
 ) -> Bool[Tensor, "*batch agents agents"]:
     """The dense mask of the pairs that `nearest` finds."""
-    senders, present = nearest(positions.flatten(0, -3), valid.flatten(0, -2), count)
+    senders, present = nearest(positions.flatten(0, -3), valid.flatten(0, -2), min(count, valid.shape[-1]))
     mask = torch.zeros(*senders.shape[:2], senders.shape[1], dtype=torch.bool, device=valid.device)
     return mask.scatter_(-1, senders, present).view(*valid.shape, valid.shape[-1])
+
+
+def to_dense(
+    pairs: Float[Tensor, "batch agents slots feature"],
+    senders: Int[Tensor, "batch agents slots"],
+    absent: Float[Tensor, " feature"],
+) -> Float[Tensor, "batch agents agents feature"]:
+    """Slots put where their senders stand, `absent` everywhere else."""
+    batch, agents, _, width = pairs.shape
+    # one more column takes what the empty slots hold
+    dense = absent.expand(batch, agents, agents + 1, width).clone()
+    place = torch.where(senders == NOBODY, agents, senders)
+    return dense.scatter_(2, place[..., None].expand_as(pairs), pairs)[:, :, :agents]
 
 
 def to_pairs(

@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from predictor.errors import ProtocolError
 from predictor.forecaster import Belief, Forecaster, Memory
+from predictor.graph import NOBODY
 from predictor.scene import PADDING_ID, Forecast, SceneBatch
 
 
@@ -100,13 +101,17 @@ class OnlineForecaster:
         ego_now = belief.states[:, None, :1, None, :axes] * float(self.forecaster.spec.has_ego)
         xy = (states[..., :axes] - ego_now) * belief.valid[:, None, :, None, None]
         missing = self._ids.shape[1] - belief.valid.shape[1]
-        probs = functional.pad(belief.edge_probs, (0, 0, 0, missing, 0, missing))
-        probs[..., 0] = 1 - probs[..., 1:].sum(-1)  # padded pairs have no edge, as other absent ones
+        senders = belief.senders
+        pairs = (0, 0, 0, missing if senders is None else 0, 0, missing)
+        probs = functional.pad(belief.edge_probs, pairs)
+        if missing:
+            probs[..., 0] = 1 - probs[..., 1:].sum(-1)  # padded pairs have no edge, as other absent ones
         return Forecast(
             functional.pad(xy, (0, 0, 0, 0, 0, missing)),
             probs,
-            functional.pad(belief.edge_features, (0, 0, 0, missing, 0, missing)),
+            functional.pad(belief.edge_features, pairs),
             functional.pad(belief.valid, (0, missing)),
+            None if senders is None else functional.pad(senders, (0, 0, 0, missing), value=NOBODY),
         )
 
     def _take(

@@ -194,7 +194,7 @@ def _free_run(
     outcome = Outcome(forecast, truth, _without_ego(forecaster, valid))
     if not keep_beliefs:
         return outcome
-    now = (rows, batch.last_observed)
+    now, belief = (rows, batch.last_observed), belief.dense()
     return replace(
         outcome,
         edge_probs=belief.edge_probs,

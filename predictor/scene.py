@@ -9,10 +9,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from predictor.errors import UserError
+from predictor.graph import to_dense
 
 KINEMATIC_FEATURES = ("x_m", "y_m", "vx_mps", "vy_mps")
 KINEMATIC_FEATURES_3D = ("x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps")
@@ -224,9 +226,42 @@ class Forecast:
     xy: Float[Tensor, "batch samples agents horizon axes"]
     """Predicted positions [m], world axes; relative to the ego's position now, or to the world's origin where there is
     no ego (a spec without one, or an absent row 0). Zeros where `valid` is not."""
-    edge_probs: Float[Tensor, "batch agents agents types"]
+    edge_probs: Float[Tensor, "batch agents slots types"]
     """Prior over edge types now, receiver first; type 0 is "no edge"."""
-    edge_features: Float[Tensor, "batch agents agents feature"]
+    edge_features: Float[Tensor, "batch agents slots feature"]
     """Edge features now, receiver first."""
     valid: Bool[Tensor, "batch agents"]
     """Which agents are forecast."""
+    senders: Int[Tensor, "batch agents slots"] | None = None
+    """Whose each slot of an edge is (`predictor.graph.NOBODY` where empty); None if slot j is agent j's."""
+
+    def dense(self) -> "Forecast":
+        """The same with slot j for agent j; of use where scenes are small."""
+        if self.senders is None:
+            return self
+        return Forecast(self.xy, *dense_edges(self.edge_probs, self.edge_features, self.senders), self.valid)
+
+    def ego_edges(self) -> tuple[Float[Tensor, "batch agents 2 types"], Float[Tensor, "batch agents 2 feature"]]:
+        """Probabilities and features of the edges from each agent to agent 0, and from agent 0 to each agent."""
+        if self.senders is None:
+            probs, features = self.edge_probs, self.edge_features
+            return torch.stack([probs[:, 0], probs[:, :, 0]], 2), torch.stack([features[:, 0], features[:, :, 0]], 2)
+        agents = torch.arange(self.senders.shape[1], device=self.senders.device)
+        to_ego = (self.senders[:, 0, :, None] == agents).transpose(1, 2)
+        from_ego = self.senders == 0
+        heard = torch.stack([to_ego, from_ego], 2).to(self.xy.dtype)
+        slots = [torch.stack([t[:, :1].expand_as(t), t], 2) for t in (self.edge_probs, self.edge_features)]
+        probs, features = (torch.matmul(heard[..., None, :], t)[..., 0, :] for t in slots)
+        probs[..., 0] = 1 - probs[..., 1:].sum(-1)  # who is not heard has no edge
+        return probs, features
+
+
+def dense_edges(
+    probs: Float[Tensor, "batch agents slots types"],
+    features: Float[Tensor, "batch agents slots feature"],
+    senders: Int[Tensor, "batch agents slots"],
+) -> tuple[Float[Tensor, "batch agents agents types"], Float[Tensor, "batch agents agents feature"]]:
+    """Edge probabilities and features with slot j for agent j: "no edge", and zeros, where there is no slot."""
+    no_edge = probs.new_zeros(probs.shape[-1])
+    no_edge[0] = 1.0
+    return to_dense(probs, senders, no_edge), to_dense(features, senders, features.new_zeros(features.shape[-1]))
