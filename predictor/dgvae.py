@@ -23,7 +23,16 @@ from predictor.disentangle import running_mean, window_mean
 from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory, WindowOutput
 from predictor.graph import NOBODY, among_nearest, nearest, off_diagonal, others, pair_mask, with_diagonal
-from predictor.networks import PRESETS, Decoder, DGVAEConfig, Edges, Encoder, concrete_sample, no_edge_where_absent
+from predictor.networks import (
+    PRESETS,
+    Decoder,
+    DGVAEConfig,
+    Edges,
+    Encoder,
+    concrete_sample,
+    edge_probabilities,
+    no_edge_where_absent,
+)
 from predictor.recurrent import masked_gru
 from predictor.scene import SceneSpec
 from predictor.stepper import Stepper
@@ -131,7 +140,7 @@ class DGVAE(nn.Module):
             memory = memory.to_slots(graph.senders, graph.present)
         (node_before, seen), (hidden, cell, static) = memory.nodes, memory.pairs
         past, logits, features = self._encode_step(states, valid, graph, _Past(hidden, cell, static, seen))
-        probs = torch.softmax(logits, dim=-1)
+        probs = edge_probabilities(logits)
         node_after, next_states = self._move(states, valid, graph, probs, features, node_before)
         internal = _Internal(graph, past, logits, node_before, node_after, next_states)
         after = Memory((node_after, past.seen), (past.hidden, past.cell, past.static), memory.senders)
@@ -195,7 +204,7 @@ class DGVAE(nn.Module):
 
         # the longest history; asking a GPU for it would make it wait
         steps = states.shape[1] if last_observed.is_cuda else int(last_observed.max())
-        expected = torch.softmax(edges.prior_logits[:, :steps], dim=-1)
+        expected = edge_probabilities(edges.prior_logits[:, :steps])
         if shown is not features:
             layer = self.decoder.pair_layer(inputs, features, graph.senders)
         messages = self.decoder.combine(inputs[:, :steps], layer[:, :steps], graph.present[:, :steps], expected)
@@ -374,7 +383,7 @@ class DGVAE(nn.Module):
         for _ in range(horizon_steps - 1):
             if self.config.rollout_graph == "evolving":
                 past, logits, features = self._encode_step(states, valid, graph, past)
-                weights = torch.softmax(logits, dim=-1) if sampler is None else sampler(logits)
+                weights = edge_probabilities(logits) if sampler is None else sampler(logits)
             node, states = self._move(states, valid, graph, weights, features, node)
             future.append(states)
         return torch.stack(future, dim=2)[:, :, :horizon_steps]

@@ -149,7 +149,7 @@ def concrete_sample(
     uniform = torch.rand(logits.shape, generator=generator, device=logits.device, dtype=logits.dtype)
     tiny = torch.finfo(logits.dtype).tiny
     gumbel = -torch.log(-torch.log(uniform.clamp(tiny, 1 - torch.finfo(logits.dtype).eps)))
-    soft = torch.softmax((logits + gumbel) / temperature, dim=-1)
+    soft = edge_probabilities((logits + gumbel) / temperature)
     if not hard:
         return soft
     one_hot = torch.zeros_like(soft).scatter_(-1, soft.argmax(-1, keepdim=True), 1.0)
@@ -196,11 +196,11 @@ class Encoder(nn.Module):
     ) -> Float[Tensor, "*batch agents slots hidden"]:
         """The graph block up to the hidden layer of the edge MLP; all steps at once."""
         weight = pairs.to(inputs.dtype)
-        summed = sum_over_senders(functional.elu(self.conv_pair(inputs, senders, self.embed), inplace=True), weight)
+        summed = sum_over_senders(self.conv_pair.elu(inputs, senders, self.embed), weight)
         # Σ_j (W h_ij + b) = W Σ_j h_ij + n b: the second layer of EdgeConv costs agents, not pairs.
         count = weight.sum(-1, keepdim=True)
         nodes = functional.elu(functional.linear(summed, self.conv_out.weight) + count * self.conv_out.bias)
-        return functional.elu(self.edge_pair(nodes, senders), inplace=True)
+        return self.edge_pair.elu(nodes, senders)
 
     def _gates(self, layer: nn.Linear, hidden: Tensor) -> Tensor:
         """Input share of an LSTM's gates."""
@@ -255,6 +255,14 @@ def _time_first(layer: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
     return layer(*(t.transpose(0, 1) for t in tensors)).transpose(0, 1)
 
 
+def edge_probabilities(logits: Float[Tensor, "*batch types"]) -> Float[Tensor, "*batch types"]:
+    """Softmax over edge types; of two types, a logistic function, which is several times faster on a CPU."""
+    if logits.shape[-1] != 2:
+        return torch.softmax(logits, dim=-1)
+    edge = torch.sigmoid(logits[..., 1] - logits[..., 0])
+    return torch.stack([1 - edge, edge], dim=-1)
+
+
 def no_edge_where_absent(
     logits: Float[Tensor, "*batch types"], present: Bool[Tensor, "*batch 1"]
 ) -> Float[Tensor, "*batch types"]:
@@ -305,13 +313,12 @@ class Decoder(nn.Module):
         senders: Int[Tensor, "*some agents slots"] | None = None,
     ) -> Float[Tensor, "*batch agents slots hidden"]:
         """The hidden layer of h, one block for each type that speaks; the same whatever the graph."""
-        pair: Tensor = self.message_pair(inputs, senders)
         if not self.has_features:
-            return functional.elu(pair, inplace=True)
+            return self.message_pair.elu(inputs, senders)
         feature = self.message_feature(features)
         if self.gated:
-            return functional.elu(pair, inplace=True) * (1 + feature)
-        return functional.elu(pair.add_(feature), inplace=True)
+            return self.message_pair.elu(inputs, senders) * (1 + feature)
+        return self.message_pair.elu(inputs, senders, extra=feature)
 
     def combine(
         self,
