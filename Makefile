@@ -3,10 +3,10 @@ TEST_JOBS ?= 2
 RUN_DIR ?= runs/highway-fast-ppo
 
 .DEFAULT_GOAL := help
-.PHONY: help .venv train test check clean
+.PHONY: help .venv train test check bench bench-check clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[.a-z]+:.*## / { printf "make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[.a-z-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 .venv: .venv/.installed ## install the package and its tools, at the versions of constraints.txt, into .venv
 
@@ -26,6 +26,12 @@ check: .venv/.installed ## lint, formatting, types, who may import whom
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 	.venv/bin/lint-imports
+
+bench: .venv/.installed ## measure the speed of everything: one table, and runs/benchmarks.json
+	.venv/bin/python -m benchmarks
+
+bench-check: .venv/.installed ## a quick run, compared with the committed baseline by ratios; fails if anything got slower
+	.venv/bin/python -m benchmarks --quick --baseline benchmarks/baseline.json
 
 clean: ## remove .venv, builds and caches; keep runs and data
 	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

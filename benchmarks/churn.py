@@ -136,7 +136,8 @@ def main() -> None:
             measured.append((step + 1, resident_bytes()))
             tensors.append(sum(type(thing) is torch.Tensor for thing in gc.get_objects()))
     late = measured[len(measured) // 4 :]
-    slope = float(np.polyfit(*np.array(late, dtype=np.float64).T, 1)[0])
+    at, resident = np.array(late, dtype=np.float64).T
+    slope = float(np.polyfit(at, resident, 1)[0])
     online = venv.stream._online
     seen = sum(env.unwrapped._next for env in venv.unwrapped.envs)  # type: ignore[attr-defined]
     print(

@@ -8,7 +8,9 @@ Absolute numbers depend on the machine; the ratio is the result.
 import platform
 import statistics
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -111,22 +113,28 @@ def profile(model: BaseAlgorithm, steps: int) -> dict[str, float]:
     return {name: value / total for name, value in sorted(seconds.items(), key=lambda item: -item[1])}
 
 
-def main() -> None:
-    """Entry point."""
-    config = tyro.cli(TrainingSpeedConfig, description=__doc__)
-    config.check()
-    torch.set_num_threads(config.threads)
+def measure(config: TrainingSpeedConfig, report: Callable[[str], None]) -> dict[str, Any]:
+    """Steps/s of both, the ratio, and where the time of the one with forecasts goes.
+
+    Args:
+        config: shapes and repetitions.
+        report: is told what each pair of blocks gave.
+    """
     plain = make(Task(config.env_id, "none"), config.plain_envs, 0)
     native = make(Task(config.env_id, "forecast", backend="envpool"), config.native_envs, 0)
-    run_block(plain, config.plain_steps)
-    run_block(native, config.native_steps)
-    pairs = []
-    for _ in range(config.blocks):
-        pairs.append((run_block(plain, config.plain_steps), run_block(native, config.native_steps)))
-        print(f"plain {pairs[-1][0]:.0f} steps/s, EnvPool with forecasts {pairs[-1][1]:.0f}", flush=True)
-    shares = profile(native, config.native_steps)
+    try:
+        run_block(plain, config.plain_steps)
+        run_block(native, config.native_steps)
+        pairs = []
+        for _ in range(config.blocks):
+            pairs.append((run_block(plain, config.plain_steps), run_block(native, config.native_steps)))
+            report(f"plain {pairs[-1][0]:.0f} steps/s, EnvPool with forecasts {pairs[-1][1]:.0f}")
+        shares = profile(native, config.native_steps)
+    finally:
+        for model in (plain, native):
+            model.env.close()  # type: ignore[union-attr]
     ratios = [fast / slow for slow, fast in pairs]
-    result = {
+    return {
         "plain_steps_per_s": statistics.median(slow for slow, _ in pairs),
         "native_forecast_steps_per_s": statistics.median(fast for _, fast in pairs),
         "ratio": statistics.median(ratios),
@@ -134,18 +142,26 @@ def main() -> None:
         "shares": shares,
         "machine": platform.processor() or platform.machine(),
     }
+
+
+def main() -> None:
+    """Entry point."""
+    config = tyro.cli(TrainingSpeedConfig, description=__doc__)
+    config.check()
+    torch.set_num_threads(config.threads)
+    result = measure(config, partial(print, flush=True))
+    ratios = result["ratios"]
     print(
         f"{config.env_id}: plain PPO on highway-env ({config.plain_envs} processes) "
         f"{result['plain_steps_per_s']:.0f} steps/s, PPO with forecasts on EnvPool ({config.native_envs} environments) "
         f"{result['native_forecast_steps_per_s']:.0f} steps/s, ratio {result['ratio']:.1f} "
         f"({min(ratios):.1f} to {max(ratios):.1f})"
     )
-    print("where its time goes: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items()))
+    shares = result["shares"].items()
+    print("where its time goes: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares))
     if config.out is not None:
         made = provenance(("envpool", "highway-env", "stable-baselines3", "torch"))
         write_json(config.out, result | {"provenance": made})
-    for model in (plain, native):
-        model.env.close()  # type: ignore[union-attr]
 
 
 if __name__ == "__main__":

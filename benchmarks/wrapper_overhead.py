@@ -7,7 +7,9 @@ the median ratio. Absolute numbers depend on the machine; the ratio is the resul
 import json
 import platform
 import statistics
+import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -18,10 +20,17 @@ import tyro
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
+if not __package__:  # run as a file: the packages are beside this folder
+    sys.path[0] = str(Path(__file__).resolve().parents[1])
+
+from benchmarks.timing import alternate, quartiles
 from envs.vector import VecForecast
 from envs.wrappers import SceneObservation
+from predictor.dgvae import DGVAE, PRESETS
 from predictor.errors import UserError, run_entry_point
+from predictor.forecaster import Forecaster
 from predictor.provenance import provenance, write_json
+from predictor.scene import SceneSpec
 
 
 @dataclass(frozen=True)
@@ -32,6 +41,8 @@ class OverheadConfig:
     """Environment."""
     checkpoint: str | None = None
     """Shipped name or folder; None takes the one that ships for the id."""
+    paper_size: bool = False
+    """Forecast with an untrained network of the paper's size instead of a checkpoint."""
     envs: int = 8
     """Parallel environments."""
     vec: Literal["dummy", "subproc"] = "dummy"
@@ -54,18 +65,41 @@ class OverheadConfig:
         for name in ("envs", "steps", "blocks", "threads"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.paper_size and self.checkpoint is not None:
+            raise UserError(f"checkpoint '{self.checkpoint}' and --paper-size exclude each other; leave one out")
 
 
-def run_block(venv: VecEnv, config: OverheadConfig, seed: int) -> float:
+def run_block(venv: VecEnv, steps: int, seed: int) -> float:
     """Seconds for one block, from a seeded reset; the reset itself is not timed."""
     rng = np.random.default_rng(seed)
     venv.seed(seed)
     venv.reset()
-    actions = [np.array([rng.integers(venv.action_space.n) for _ in range(config.envs)]) for _ in range(config.steps)]  # type: ignore[attr-defined]
+    count = int(venv.action_space.n)  # type: ignore[attr-defined]
+    actions = [rng.integers(count, size=venv.num_envs) for _ in range(steps)]
     began = time.perf_counter()
     for action in actions:
         venv.step(action)
     return time.perf_counter() - began
+
+
+def blocks_of(venv: VecEnv, steps: int) -> Callable[[], float]:
+    """Blocks one after the other, the n-th always from the same seed and with the same actions; a warm one is made."""
+    seeds = iter(range(1, 2**31))
+    run_block(venv, steps, 0)
+    return lambda: run_block(venv, steps, next(seeds))
+
+
+def make_rows(env_id: str, envs: int, vec: Literal["dummy", "subproc"], scenes: bool) -> VecEnv:
+    """Environments as they are, or reporting scenes for `VecForecast`."""
+    vec_class = DummyVecEnv if vec == "dummy" else SubprocVecEnv
+    return make_vec_env(env_id, envs, vec_env_cls=vec_class, wrapper_class=SceneObservation if scenes else None)
+
+
+def paper_sized(scenes: VecEnv, horizon_steps: int = 5) -> Forecaster:
+    """An untrained network of the paper's size for these scenes; what it costs does not depend on its weights."""
+    spec: SceneSpec = scenes.get_attr("scene_spec")[0]
+    torch.manual_seed(0)
+    return DGVAE(spec, PRESETS["paper"], horizon_steps).eval().requires_grad_(False)
 
 
 def main() -> None:
@@ -73,31 +107,26 @@ def main() -> None:
     config = tyro.cli(OverheadConfig, description=__doc__)
     config.check()
     torch.set_num_threads(config.threads)
-    vec_class = DummyVecEnv if config.vec == "dummy" else SubprocVecEnv
-    plain = make_vec_env(config.env_id, config.envs, vec_env_cls=vec_class)
-    scenes = make_vec_env(config.env_id, config.envs, vec_env_cls=vec_class, wrapper_class=SceneObservation)
-    forecast = VecForecast(scenes, config.checkpoint)
-    run_block(plain, config, 0)
-    run_block(forecast, config, 0)
-    pairs = []
-    for block in range(config.blocks):
-        order = [plain, forecast] if block % 2 == 0 else [forecast, plain]  # a drifting machine favours neither
-        times = {id(venv): run_block(venv, config, block + 1) for venv in order}
-        pairs.append((times[id(plain)], times[id(forecast)]))
+    plain, scenes = (make_rows(config.env_id, config.envs, config.vec, scenes) for scenes in (False, True))
+    paper = paper_sized(scenes) if config.paper_size else None
+    forecast = VecForecast(scenes, config.checkpoint, forecaster=paper)
+    made = {name: blocks_of(venv, config.steps) for name, venv in (("plain", plain), ("forecast", forecast))}
+    seconds = alternate(made, config.blocks)  # a drifting machine favours neither
     plain.close()
     forecast.close()
     steps = config.steps * config.envs
-    ratios = [with_ / without for without, with_ in pairs]
+    ratios = seconds["forecast"] / seconds["plain"]
     result = {
         "env_id": config.env_id,
         "envs": config.envs,
         "vec": config.vec,
+        "paper_size": config.paper_size,
         "agents": forecast.stream.scene_spec.max_agents,
         "horizon_steps": forecast.stream.horizon_steps,
-        "plain_steps_per_s": steps / statistics.median(p for p, _ in pairs),
-        "forecast_steps_per_s": steps / statistics.median(f for _, f in pairs),
-        "overhead_median": statistics.median(ratios) - 1,
-        "overhead_quartiles": [q - 1 for q in statistics.quantiles(ratios, n=4)[::2]],
+        "plain_steps_per_s": steps / statistics.median(seconds["plain"].tolist()),
+        "forecast_steps_per_s": steps / statistics.median(seconds["forecast"].tolist()),
+        "overhead_median": statistics.median(ratios.tolist()) - 1,
+        "overhead_quartiles": [q - 1 for q in quartiles(ratios)],
         "machine": platform.processor() or platform.machine(),
         "provenance": provenance(("torch", "gymnasium", "highway-env", "stable-baselines3")),
     }

@@ -1,0 +1,64 @@
+"""Measures the speed of everything and prints one table.
+
+`python -m benchmarks` runs every section, `--only forecast streaming` some, `--quick` a short version. With
+`--baseline benchmarks/baseline.json` the run is compared with an earlier one by ratios alone, and the exit status is 1
+if anything got slower. docs/speed.md says how to read the table.
+"""
+
+import sys
+import time
+
+import torch
+import tyro
+from rich.console import Console
+
+from benchmarks.compare import Comparison, read_baseline, write_baseline
+from benchmarks.settings import Settings
+from benchmarks.suite import measure, report, settle
+from benchmarks.table import plain, rich_table
+from predictor.errors import run_entry_point
+from predictor.provenance import write_json
+from predictor.runtime import keep_freed_memory, processor
+
+
+def main() -> None:
+    """Entry point."""
+    settings = tyro.cli(Settings, description=__doc__)
+    settings.check()
+    if settings.reference is not None:
+        from benchmarks.reference import load
+
+        load(settings.reference)  # a wrong path is said now, not in half an hour
+    baseline = None if settings.baseline is None else read_baseline(settings.baseline, settings)
+    began = time.perf_counter()
+    keeps_memory = keep_freed_memory()
+    torch.set_num_threads(settings.threads)
+    console, progress = Console(), Console(stderr=True)
+
+    def say(section: str) -> None:
+        progress.print(f"[{time.perf_counter() - began:5.0f} s] {section} …", markup=False, highlight=False)
+
+    rows = measure(settings, settings.sections, say)
+    comparison: Comparison | None = None
+    if baseline is not None:
+        rows, comparison = settle(settings, baseline, rows, say)
+    result = report(settings, rows, keeps_memory, began)
+    kept = "kept" if keeps_memory else "handed back"
+    versions = ", ".join(f"{name} {version}" for name, version in result["provenance"]["versions"].items())
+    print(f"{result['machine']}; {settings.threads} torch threads; freed memory is {kept}; {settings.mode} run")
+    print(f"commit {result['provenance']['commit']}; {versions}")
+    console.print(rich_table(rows)) if console.is_terminal else print(plain(rows))
+    settings.out.parent.mkdir(parents=True, exist_ok=True)
+    write_json(settings.out, result)
+    if settings.write_baseline is not None:
+        write_baseline(settings.write_baseline, settings, rows, processor(), result["provenance"])
+    if comparison is not None and baseline is not None:
+        if baseline.processor != processor():
+            print(f"the baseline is of another processor ({baseline.processor}): wider tolerances for equivalents")
+        print("\n".join(comparison.lines()))
+        if comparison.slower:
+            sys.exit(1)
+
+
+if __name__ == "__main__":
+    run_entry_point(main)

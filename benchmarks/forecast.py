@@ -1,0 +1,100 @@
+"""Latency and throughput of a forecast: observing and rolling out apart, over batch × agents × horizon × samples."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+
+from benchmarks.flops import Work
+from benchmarks.models import SIZES, forecaster, inference, observed, road, scenes, sized
+from benchmarks.rows import Row
+from benchmarks.settings import Settings
+from benchmarks.timing import Meter, Timing, rate_row, timed_row
+from predictor.dgvae import DGVAE
+from predictor.runtime import matmul_precision
+
+
+class Case(NamedTuple):
+    """One shape."""
+
+    batch: int
+    agents: int
+    horizon: int
+    samples: int
+
+
+CASES: dict[str, tuple[Case, ...]] = {
+    "quick": (Case(1, 6, 5, 1), Case(8, 12, 5, 1), Case(64, 12, 5, 1), Case(8, 12, 5, 6)),
+    "full": (
+        Case(1, 6, 5, 1),
+        Case(1, 12, 15, 1),
+        Case(8, 12, 5, 1),
+        Case(8, 12, 15, 1),
+        Case(64, 12, 5, 1),
+        Case(64, 12, 15, 1),
+        Case(8, 12, 5, 20),
+        Case(8, 10, 20, 1),
+        Case(8, 30, 20, 1),
+    ),
+}
+EVOLVING = "evolving graph, float32"
+
+
+def run(settings: Settings) -> list[Row]:
+    """Both presets at every shape."""
+    meter = Meter.of(settings)
+    return [row for preset in SIZES for case in CASES[settings.mode] for row in _case(preset, case, meter)]
+
+
+def _case(preset: str, case: Case, meter: Meter) -> list[Row]:
+    model = forecaster(sized(preset), road(case.agents), case.horizon)
+    timings = meter.measure(_calls(model, case))
+    work = Work(model.config, case.agents)
+    what = {"preset": preset} | case._asdict()
+    look, run_on = work.observe(case.batch), work.rollout(case.horizon, case.samples, case.batch)
+    frozen = work.rollout(case.horizon, case.samples, case.batch, frozen=True)
+    seen, rolled = timings["observe"], timings["roll-out"]
+
+    def row(name: str, flop: float, base: Timing | None = None) -> Row:
+        return timed_row("forecast", name, what, timings[name], flop=flop, base=base, ratio_to=EVOLVING if base else "")
+
+    forecasts = case.batch * case.agents * case.samples
+    return [
+        row("observe", look),
+        row("roll-out", run_on),
+        row("roll-out, frozen graph", frozen, rolled),
+        row("observe, bfloat16", look, seen).noted("share is of the float32 rate"),
+        row("roll-out, bfloat16", run_on, rolled).noted("share is of the float32 rate"),
+        rate_row(
+            "forecast", "observe + roll-out", what, seen.plus(rolled), forecasts, "agent-forecasts/s",
+            flop=look + run_on,
+        ),
+    ]  # fmt: skip
+
+
+def _calls(model: DGVAE, case: Case) -> dict[str, Callable[[], Any]]:
+    states, valid = scenes(case.batch, case.agents)
+    frozen = model.variant(rollout_graph="frozen")
+    memory, belief = observed(model, states, valid)
+    frozen_belief = observed(frozen, states, valid)[1]
+    generator = torch.Generator().manual_seed(0)
+    observe = inference(partial(model.observe, memory, states, valid))
+    rollout = inference(partial(model.rollout, belief, case.horizon, case.samples, generator))
+    return {
+        "observe": observe,
+        "roll-out": rollout,
+        "roll-out, frozen graph": inference(
+            partial(frozen.rollout, frozen_belief, case.horizon, case.samples, generator)
+        ),
+        "observe, bfloat16": _in_bfloat16(observe),
+        "roll-out, bfloat16": _in_bfloat16(rollout),
+    }
+
+
+def _in_bfloat16(call: Callable[[], Any]) -> Callable[[], Any]:
+    def rounded() -> Any:
+        with matmul_precision("bfloat16"):
+            return call()
+
+    return rounded

@@ -1,0 +1,353 @@
+"""Paper-size training of 5-Spring on one GPU, as one command: `python benchmarks/gpu_springs.py --data data`.
+
+Makes the data where it is missing, trains the dG-VAE for 150 epochs of 50,000 sequences at batch 128, measures it as
+the table does (`python -m predictor.suite --table springs --budget paper --rows dgvae`, whose row this is) and writes
+summary.json: steps/s, minutes, accuracy. Killed, it goes on where it was.
+
+Where there is no GPU, `--project` times a step of the same shapes here, counts what it is made of (products, bytes,
+kernels), and says what that would come to on a card. That is arithmetic on assumptions, not a measurement.
+"""
+
+import json
+import statistics
+import tempfile
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from torch import Tensor
+from torch.utils import _pytree as pytree
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.flop_counter import flop_registry
+
+from predictor.data.springs import SpringsConfig, make
+from predictor.errors import UserError, run_entry_point
+from predictor.feed import Shapes
+from predictor.objective import window_loss
+from predictor.provenance import provenance, write_json
+from predictor.runtime import Precision, processor
+from predictor.suite import SuiteConfig, row_config, row_folder, run_row
+from predictor.tables import SPRINGS, Budget
+from predictor.train_config import TrainConfig
+from predictor.trainer import Trainer, load_data
+
+SPLITS = ("train", "val", "test", "ood")
+ROW = next(row for row in SPRINGS.rows if row.key == "dgvae")
+ATEN = torch.ops.aten
+NO_KERNEL = {
+    ATEN.empty, ATEN.empty_like, ATEN.empty_strided, ATEN.new_empty, ATEN.new_empty_strided, ATEN.detach,
+    ATEN._unsafe_view, ATEN.lift_fresh, ATEN.is_same_size, ATEN._local_scalar_dense, ATEN.resize_,
+}  # fmt: skip
+"""They move no data; views are left out besides."""
+FLOP = {packet: flop_registry[packet] for packet in (ATEN.mm, ATEN.addmm, ATEN.bmm, ATEN.baddbmm)} | {
+    ATEN.addmm_: flop_registry[ATEN.addmm],
+    ATEN.baddbmm_: flop_registry[ATEN.baddbmm],
+}
+"""Only products count."""
+UPDATE_KERNELS = 10
+"""Of clipping and fused Adam on a GPU; here they are hundreds, and are not counted."""
+
+
+@dataclass(frozen=True)
+class GpuSpringsConfig:
+    """Train the paper-size dG-VAE on 5-Spring, measure it, and write down how long it took."""
+
+    data: Path = Path("data")
+    """Folder of the stores; springs/ below it is made where it is missing (a few minutes)."""
+    out: Path = Path("runs/gpu_springs")
+    """Run folder: the suite's row, and summary.json (or projection.json)."""
+    device: str = "cuda"
+    """"cpu" or "cuda"; `--project` takes the CPU."""
+    precision: Precision = "float32"
+    """"bfloat16" rounds the inputs of matrix products in training."""
+    budget: Budget = "paper"
+    """Of the table; "paper" is 150 epochs at batch 128, "smoke" a minute on a CPU."""
+    steps: int = 0
+    """Optimiser steps in place of the budget's; 0 keeps them."""
+    seed: int = 0
+    """Of data, training and samples."""
+    sequences: int = 50_000
+    """Training sequences to make where there are none (paper: 50,000)."""
+    held_out: int = 10_000
+    """Sequences of each of the other splits (paper: 10,000)."""
+    project: bool = False
+    """Time and count a step here, and project it onto a card."""
+    timed_steps: int = 3
+    """Steps to time for the projection, after one to warm up."""
+    batch_size: int = 0
+    """Of the projection, in place of the budget's; 0 keeps it."""
+    peak_tflops: float = 67.0
+    """Of the card at the precision in question (H200: 67 in float32 without tensor cores, 989 in dense bfloat16)."""
+    bandwidth_gbs: float = 4800.0
+    """Of the card's memory (H200: 4,800)."""
+    share: float = 0.0
+    """Share of the peak that products of these shapes reach; 0 takes the share of this machine's own rate."""
+    kernel_us: float = 2.5
+    """What a kernel in a replayed graph takes at least, start included: an assumption."""
+    target_minutes: float = 30.0
+    """What the run is to stay below."""
+
+    def check(self) -> None:
+        """Check ranges.
+
+        Raises:
+            UserError: a value that makes no sense.
+        """
+        for name in ("sequences", "held_out", "timed_steps"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("steps", "seed", "batch_size"):
+            if getattr(self, name) < 0:
+                raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
+        for name in ("peak_tflops", "bandwidth_gbs", "kernel_us", "target_minutes"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise UserError(f"{name} must be positive, got {getattr(self, name)}")
+        if not 0 <= self.share <= 1:
+            raise UserError(f"share must lie between 0 and 1, got {self.share}")
+        if not self.project and self.device.startswith("cuda") and not torch.cuda.is_available():
+            raise UserError(
+                f"device '{self.device}' asked for but torch sees no CUDA device; pass --project for an estimate"
+            )
+
+    @property
+    def suite(self) -> SuiteConfig:
+        """The table's row that is run."""
+        device = "cpu" if self.project else self.device
+        return SuiteConfig(
+            "springs", self.data, self.out, self.budget, (ROW.key,), self.steps, 1, self.seed, device, self.precision
+        )
+
+
+# --- The run ----------------------------------------------------------------------------------------------------------
+
+
+def make_missing(config: GpuSpringsConfig) -> dict[str, float]:
+    """Simulate the splits that are not there; the seconds each took."""
+    folder = config.data / "springs"
+    sizes = {name: config.sequences if name == "train" else config.held_out for name in SPLITS}
+    missing = {name: 0 if (folder / name).exists() else size for name, size in sizes.items()}
+    return make(SpringsConfig(folder, **missing, seed=config.seed)) if any(missing.values()) else {}
+
+
+def run(config: GpuSpringsConfig) -> dict[str, Any]:
+    """Data, training, measuring, summary; what is there already is not done again."""
+    made = make_missing(config)
+    config.suite.check()
+    folder = row_folder(config.suite, ROW)
+    before, result = _steps_done(folder / "run"), folder / "result.json"
+    measured = json.loads(result.read_text()) if result.exists() else run_row(config.suite, ROW)
+    steps = config.suite.sizes.steps
+    minutes = measured["train_seconds"] / 60
+    test = measured["tests"]["test"]
+    summary = {
+        "device": torch.cuda.get_device_name() if config.device.startswith("cuda") else processor(),
+        "steps": steps,
+        "steps_of_the_last_call": steps - before if before < steps else steps,
+        "train_minutes_of_the_last_call": minutes,
+        "steps_per_s_with_validation": (steps - before if before < steps else steps) / measured["train_seconds"],
+        "measure_minutes": measured["measure_seconds"] / 60,
+        "data_seconds": made,
+        "below_target": minutes <= config.target_minutes if before == 0 or before >= steps else None,
+        "min_ade_m": test["horizon_only"]["min_ade_m"],
+        "graph_accuracy": test["graph"]["accuracy"],
+        "tests": measured["tests"],
+        "config": _plain(config),
+        "provenance": provenance(("torch", "numpy", "zarr")),
+    }
+    write_json(config.out / "summary.json", summary)
+    return summary
+
+
+def _steps_done(folder: Path) -> int:
+    state = folder / "train_state.pt"
+    return int(torch.load(state, weights_only=True, map_location="cpu")["step"]) if state.exists() else 0
+
+
+# --- The projection ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """One operation that moves data."""
+
+    flop: float
+    """Of a matrix product, else 0."""
+    moved_bytes: float
+    """Inputs and outputs."""
+
+
+class Counter(TorchDispatchMode):
+    """Notes every operation, those of the backward pass included."""
+
+    def __init__(self) -> None:
+        """Nothing yet."""
+        super().__init__()
+        self.kernels: list[Kernel] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Run it, and note it unless it is a view."""
+        kwargs = kwargs or {}
+        out = func(*args, **kwargs)
+        packet = func._overloadpacket
+        if not func.is_view and packet not in NO_KERNEL:
+            tensors = [t for t in pytree.tree_leaves((args, kwargs, out)) if isinstance(t, Tensor)]
+            moved = sum(t.numel() * t.element_size() for t in tensors)
+            flop = FLOP[packet](*args, **kwargs, out_val=out) if packet in FLOP else 0
+            self.kernels.append(Kernel(float(flop), float(moved)))
+        return out
+
+
+def projected_config(config: GpuSpringsConfig, data: Path) -> TrainConfig:
+    """The row's training, at the mean of its history lengths: what a step costs on average."""
+    settings = row_config(replace(config.suite, data=data), ROW, config.out / "unused")
+    shapes = Shapes(1, settings.history_steps, settings.horizon_steps)
+    lengths = range(settings.min_history_steps, settings.history_steps + 1)
+    mean = statistics.mean(shapes.time(n) for n in lengths) - settings.horizon_steps
+    batch = config.batch_size or settings.batch_size
+    return replace(settings, batch_size=batch, history_steps=round(mean), min_history_steps=0, val_history_steps=1)
+
+
+def count(trainer: Trainer) -> list[Kernel]:
+    """What forward, loss and backward of one step are made of."""
+    now = trainer.plan(0)
+    batch = trainer.feed.batch(now)
+    with Counter() as counter:
+        output = trainer.model.window(
+            batch.states, batch.valid, batch.last_observed, now.rollout_steps, trainer.noise.manual_seed(0)
+        )
+        loss, _ = window_loss(trainer.model, batch, output, trainer.config)
+        loss.backward()
+    trainer.optimizer.zero_grad(set_to_none=True)
+    return counter.kernels
+
+
+def time_steps(trainer: Trainer, steps: int) -> list[float]:
+    """Seconds of each step, after one to warm up."""
+    trainer.read(trainer.train_step())
+    seconds = []
+    for _ in range(steps):
+        began = time.perf_counter()
+        trainer.read(trainer.train_step())
+        seconds.append(time.perf_counter() - began)
+    return seconds
+
+
+def matmul_rate(size: int = 1024, repeats: int = 5) -> float:
+    """FLOP/s of a plain float32 product on this machine, the best of a few."""
+    left, right, out = torch.randn(size, size), torch.randn(size, size), torch.empty(size, size)
+    seconds = []
+    for _ in range(repeats + 1):
+        began = time.perf_counter()
+        torch.mm(left, right, out=out)
+        seconds.append(time.perf_counter() - began)
+    return float(2 * size**3 / min(seconds[1:]))
+
+
+def project(config: GpuSpringsConfig) -> dict[str, Any]:
+    """Time and count a step here, and say what it would take on the card."""
+    with tempfile.TemporaryDirectory() as folder:
+        data, rows = Path(folder), config.batch_size or config.suite.sizes.batch_size
+        make(SpringsConfig(data / "springs", train=2 * rows, val=8, test=0, ood=0, seed=config.seed))
+        settings = projected_config(config, data)
+        trainer = Trainer(settings, load_data(settings))
+    kernels, seconds, rate = count(trainer), time_steps(trainer, config.timed_steps), matmul_rate()
+    flop, moved = sum(k.flop for k in kernels), sum(k.moved_bytes for k in kernels)
+    step_s = statistics.median(seconds)
+    here = {
+        "machine": processor(),
+        "threads": torch.get_num_threads(),
+        "step_s": seconds,
+        "median_step_s": step_s,
+        "flop_per_step": flop,
+        "bytes_per_step": moved,
+        "kernels_per_step": len(kernels) + UPDATE_KERNELS,
+        "flop_per_s": flop / step_s,
+        "matmul_flop_per_s": rate,
+        "share_of_matmul_rate": flop / step_s / rate,
+    }
+    content = {
+        "what": "a projection from counts and assumptions, not a measurement on the card",
+        "batch_size": settings.batch_size,
+        "history_steps": settings.history_steps,
+        "horizon_steps": settings.horizon_steps,
+        "here": here,
+        "card": on_card(config, kernels, here["share_of_matmul_rate"], config.suite.sizes.steps),
+        "config": _plain(config),
+        "provenance": provenance(("torch", "numpy")),
+    }
+    config.out.mkdir(parents=True, exist_ok=True)
+    write_json(config.out / "projection.json", content)
+    return content
+
+
+def on_card(config: GpuSpringsConfig, kernels: list[Kernel], measured_share: float, steps: int) -> dict[str, float]:
+    """Seconds of a step on the card, by each of its limits and with every kernel at its own limit; minutes of all.
+
+    Args:
+        config: the card.
+        kernels: of a step.
+        measured_share: of this machine's matmul rate, taken where the config has none.
+        steps: of the run.
+    """
+    share = config.share or min(1.0, measured_share)
+    rate, bandwidth, least = config.peak_tflops * 1e12 * share, config.bandwidth_gbs * 1e9, config.kernel_us * 1e-6
+    step_s = sum(max(least, k.flop / rate, k.moved_bytes / bandwidth) for k in kernels) + UPDATE_KERNELS * least
+    return {
+        "share_of_peak": share,
+        "products_s": sum(k.flop for k in kernels) / rate,
+        "memory_s": sum(k.moved_bytes for k in kernels) / bandwidth,
+        "kernels_s": (len(kernels) + UPDATE_KERNELS) * least,
+        "step_s": step_s,
+        "steps": steps,
+        "minutes": steps * step_s / 60,
+        "target_minutes": config.target_minutes,
+    }
+
+
+def _plain(config: GpuSpringsConfig) -> dict[str, Any]:
+    return {name: str(value) if isinstance(value, Path) else value for name, value in asdict(config).items()}
+
+
+def describe(content: dict[str, Any]) -> str:
+    """The projection in words."""
+    here, card = content["here"], content["card"]
+    verdict = "below" if card["minutes"] <= card["target_minutes"] else "ABOVE"
+    return "\n".join(
+        [
+            f"a step of {content['batch_size']} windows of {content['history_steps']} + {content['horizon_steps']} steps",
+            f"  here ({here['machine']}, {here['threads']} threads): {here['median_step_s']:.3f} s",
+            f"  {here['flop_per_step'] / 1e9:,.1f} GFLOP in products, {here['bytes_per_step'] / 1e9:,.2f} GB moved, "
+            f"{here['kernels_per_step']:,} kernels",
+            f"  {here['flop_per_s'] / 1e9:,.1f} GFLOP/s, {here['share_of_matmul_rate']:.0%} of the rate of plain "
+            f"products here ({here['matmul_flop_per_s'] / 1e9:,.1f} GFLOP/s)",
+            "PROJECTION, not a measurement: on the card a step takes",
+            f"  {1e3 * card['products_s']:.1f} ms by products (at {card['share_of_peak']:.0%} of its peak), "
+            f"{1e3 * card['memory_s']:.1f} ms by memory, {1e3 * card['kernels_s']:.1f} ms by the number of kernels",
+            f"  {1e3 * card['step_s']:.1f} ms with every kernel at its own limit; {card['steps']:,} steps: "
+            f"{card['minutes']:.1f} minutes, {verdict} the target of {card['target_minutes']:g}",
+        ]
+    )
+
+
+def main() -> None:
+    """Entry point."""
+    config = tyro.cli(GpuSpringsConfig, description=__doc__)
+    config.check()
+    if config.project:
+        print(describe(project(config)))
+        print(f"written to {config.out / 'projection.json'}")
+        return
+    summary = run(config)
+    print(
+        f"{summary['steps_of_the_last_call']:,} steps in {summary['train_minutes_of_the_last_call']:.1f} minutes "
+        f"({summary['steps_per_s_with_validation']:.1f} steps/s, validation included) on {summary['device']}; "
+        f"minADE {summary['min_ade_m']:.4f} m, graph accuracy {summary['graph_accuracy']:.3f}"
+    )
+    print(f"written to {config.out / 'summary.json'}")
+
+
+if __name__ == "__main__":
+    run_entry_point(main)

@@ -1,0 +1,124 @@
+"""Time and memory of a forecast against the number of agents: all pairs, and the nearest neighbours only.
+
+Exponents are the slopes of straight lines through log time and log memory over log agents. Memory is the rise of the
+resident size of another process whose allocator hands every larger block back at once.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.child import Child, exact_memory
+from benchmarks.flops import Work
+from benchmarks.models import SIZES, forecaster, inference, road, scenes, sized
+from benchmarks.rows import Compared, Row, skipped
+from benchmarks.settings import Settings
+from benchmarks.timing import Meter, timed_row
+from predictor.dgvae import DGVAE, DGVAEConfig
+
+NEIGHBOURS = 8
+HORIZON = 20
+COUNTS: dict[str, tuple[int, ...]] = {"quick": (20, 50, 100, 200), "full": (10, 20, 50, 100, 200, 500)}
+MOST_DENSE = {"quick": 100, "full": 500}
+"""All pairs up to so many agents, where they fit into memory."""
+MEMORY_COUNTS: dict[str, tuple[int, ...]] = {"quick": (50, 200), "full": (50, 100, 200, 500)}
+FIT_FROM = 50
+"""Exponents are fitted from so many agents on: below, the cost of calls hides that of agents."""
+MOST_BYTES = 4 * 2**30
+EXPONENT_TOLERANCE = 1.25
+Costs = dict[int, float]
+
+
+def exponent(costs: Costs) -> float:
+    """Slope of log cost over log count, least squares."""
+    counts, values = np.array(list(costs), dtype=np.float64), np.array(list(costs.values()))
+    return float(np.polyfit(np.log(counts), np.log(values), 1)[0])
+
+
+def dense_bytes(config: DGVAEConfig, agents: int) -> float:
+    """About how much all pairs take at once: embedding, gates, memory before and after, heads, messages."""
+    width = 2 * config.hidden_dim + 8 * config.rnn_dim + 2 * config.head_dim + 2 * config.message_dim
+    return 4.0 * agents**2 * width
+
+
+def run(settings: Settings) -> list[Row]:
+    """Both presets, both graphs."""
+    rows = []
+    with Child(settings.threads, exact_memory()) as child:
+        for preset in SIZES:
+            for neighbours in (0, NEIGHBOURS):
+                times, timed = _times(preset, neighbours, settings)
+                peaks, measured = _memory(preset, neighbours, settings, child)
+                rows += timed + measured
+                rows += _exponents(preset, neighbours, times, peaks)
+    return rows
+
+
+def _what(preset: str, neighbours: int) -> dict[str, Any]:
+    graph = f"{neighbours} nearest" if neighbours else "all pairs"
+    return {"preset": preset, "graph": graph, "horizon": HORIZON}
+
+
+def _counts(counts: Sequence[int], preset: str, neighbours: int, settings: Settings) -> tuple[list[int], list[Row]]:
+    """Which numbers of agents to measure, and rows for those that do not fit."""
+    if neighbours:
+        return list(counts), []
+    chosen = [count for count in counts if count <= MOST_DENSE[settings.mode]]
+    small = [count for count in chosen if dense_bytes(sized(preset), count) <= MOST_BYTES]
+    why = f"all pairs need more than {MOST_BYTES / 2**30:.0f} GiB"
+    what = _what(preset, neighbours)
+    return small, [skipped("agents", "forecast", why, what | {"agents": c}) for c in chosen if c not in small]
+
+
+def _times(preset: str, neighbours: int, settings: Settings) -> tuple[Costs, list[Row]]:
+    meter = Meter.of(settings)
+    counts, absent = _counts(COUNTS[settings.mode], preset, neighbours, settings)
+    times: Costs = {}
+    rows = []
+    for agents in counts:
+        config = replace(sized(preset), num_neighbours=neighbours)
+        model = forecaster(config, road(agents), HORIZON)
+        timing = meter.measure({"forecast": inference(partial(_forecast, model, *scenes(1, agents)))})["forecast"]
+        work = Work(config, agents, neighbours=neighbours)
+        flop = work.observe() + work.rollout(HORIZON)
+        rows.append(timed_row("agents", "forecast", _what(preset, neighbours) | {"agents": agents}, timing, flop=flop))
+        times[agents] = timing.equivalents  # the machine may drift between two counts
+    return times, rows + absent
+
+
+def _forecast(model: DGVAE, states: torch.Tensor, valid: torch.Tensor) -> None:
+    _, belief = model.observe(model.empty_memory(*valid.shape), states, valid)
+    model.rollout(belief, HORIZON)
+
+
+def _memory(preset: str, neighbours: int, settings: Settings, child: Child) -> tuple[Costs, list[Row]]:
+    counts, _ = _counts(MEMORY_COUNTS[settings.mode], preset, neighbours, settings)
+    peaks: Costs = {}
+    rows = []
+    for agents in counts:
+        what = _what(preset, neighbours) | {"agents": agents}
+        arguments = {"preset": preset, "agents": agents, "neighbours": neighbours, "horizon": HORIZON}
+        peak = child.ask("forecast", **arguments)["peak_bytes"]
+        if peak is None:
+            return {}, [skipped("agents", "peak memory", "needs /proc/self/clear_refs (Linux)", what)]
+        rows.append(Row("agents", "peak memory", what, peak / 2**20, "MiB"))
+        peaks[agents] = max(1.0, peak)
+    return peaks, rows
+
+
+def _exponents(preset: str, neighbours: int, times: Costs, peaks: Costs) -> list[Row]:
+    rows = []
+    for name, costs in (("time", times), ("memory", peaks)):
+        fitted = {agents: cost for agents, cost in costs.items() if agents >= FIT_FROM}
+        if len(fitted) < 2:
+            continue
+        slope = exponent(fitted)
+        what = _what(preset, neighbours) | {"agents": f"{min(fitted)} to {max(fitted)}"}
+        compared = Compared(slope, "ratio", "lower", EXPONENT_TOLERANCE)
+        note = f"{name} grows with agents to this power"
+        rows.append(Row("agents", f"exponent of {name}", what, slope, "", compared=compared, note=note))
+    return rows

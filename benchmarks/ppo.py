@@ -1,0 +1,41 @@
+"""Whole PPO training with forecasts on EnvPool against plain PPO on highway-env (`benchmarks.envpool_training`)."""
+
+from typing import Any
+
+import numpy as np
+
+from benchmarks.envpool_training import TrainingSpeedConfig, measure
+from benchmarks.needs import missing
+from benchmarks.rows import Row, skipped
+from benchmarks.settings import Settings
+from benchmarks.timing import ratio_row
+
+SHAPES: dict[str, dict[str, Any]] = {
+    "quick": {"native_envs": 64, "plain_envs": 2, "blocks": 2, "plain_steps": 256, "native_steps": 4096},
+    "full": {"blocks": 5},
+}
+"""Fields of `TrainingSpeedConfig`."""
+NAME = "PPO with forecasts on EnvPool / plain PPO on highway-env"
+TOLERANCE = 1.6
+"""Few blocks, and processes that share the cores."""
+
+
+def run(settings: Settings) -> list[Row]:
+    """Steps/s of both, their ratio, and where the time goes."""
+    absent = missing("envpool")
+    if absent:
+        return [skipped("ppo", NAME, absent, {"env": settings.env_id})]
+    config = TrainingSpeedConfig(settings.env_id, threads=settings.threads, **SHAPES[settings.mode])
+    result = measure(config, lambda _: None)
+    what = {"env": settings.env_id}
+    plain, native = what | {"processes": config.plain_envs}, what | {"envs": config.native_envs}
+    both = native | {"processes": config.plain_envs}
+    rows = [
+        Row("ppo", "plain PPO on highway-env", plain, result["plain_steps_per_s"], "steps/s"),
+        Row("ppo", "PPO with forecasts on EnvPool", native, result["native_forecast_steps_per_s"], "steps/s"),
+        ratio_row(
+            "ppo", NAME, both, np.array(result["ratios"]), "plain, steps/s", better="higher", tolerance=TOLERANCE
+        ),
+    ]
+    shares = result["shares"].items()
+    return rows + [Row("ppo", f"share of time: {name}", native, 100 * share, "%") for name, share in shares]

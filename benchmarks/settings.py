@@ -1,0 +1,71 @@
+"""What can be set in a run of the benchmarks, and which sections there are."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from predictor.errors import UserError
+
+SECTIONS: dict[str, str] = {
+    "machine": "benchmarks.machine",
+    "forecast": "benchmarks.forecast",
+    "streaming": "benchmarks.streaming",
+    "training": "benchmarks.training",
+    "wrappers": "benchmarks.wrappers",
+    "ppo": "benchmarks.ppo",
+    "agents": "benchmarks.many_agents",
+    "data": "benchmarks.reading",
+    "reference": "benchmarks.reference",
+}
+"""Name of a section → its module, in the order in which they run."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Measure the speed of everything, print one table, write it as JSON; compare it with a baseline if asked to."""
+
+    only: tuple[str, ...] = ()
+    """Run these sections only (machine, forecast, streaming, training, wrappers, ppo, agents, data, reference)."""
+    quick: bool = False
+    """Fewer shapes and repetitions: a minute or two instead of half an hour."""
+    threads: int = 2
+    """torch threads."""
+    reference: Path | None = None
+    """A checkout of github.com/cgraber/cvpr_dNRI, whose model is timed beside ours."""
+    env_id: str = "highway-fast-v0"
+    """Environment of the wrappers and of PPO; needs a shipped checkpoint and a copy in EnvPool."""
+    out: Path = Path("runs/benchmarks.json")
+    """JSON file for machine, versions and all rows."""
+    baseline: Path | None = None
+    """Compare with this file and exit with status 1 if anything got slower."""
+    write_baseline: Path | None = None
+    """Write what later runs are compared with."""
+
+    @property
+    def mode(self) -> str:
+        """Either "quick" or "full"."""
+        return "quick" if self.quick else "full"
+
+    @property
+    def sections(self) -> tuple[str, ...]:
+        """What to run, in order; the reference only where there is one."""
+        chosen = self.only or tuple(SECTIONS)
+        return tuple(s for s in SECTIONS if s in chosen and (s != "reference" or self.reference is not None))
+
+    def check(self) -> None:
+        """Check ranges.
+
+        Raises:
+            UserError: a value that makes no sense.
+        """
+        unknown = [name for name in self.only if name not in SECTIONS]
+        if unknown:
+            raise UserError(f"there is no section {', '.join(unknown)}; there are {', '.join(SECTIONS)}")
+        if self.threads < 1:
+            raise UserError(f"threads must be at least 1, got {self.threads}")
+        if "reference" in self.only and self.reference is None:
+            raise UserError("section reference needs --reference PATH, a checkout of github.com/cgraber/cvpr_dNRI")
+        if self.only and self.write_baseline is not None:
+            raise UserError("a baseline holds every section; leave --only out")
+        for folder in (self.out, self.write_baseline):
+            if folder is not None and folder.is_dir():
+                raise UserError(f"{folder} is a folder; name a file")

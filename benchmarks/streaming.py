@@ -1,0 +1,121 @@
+"""Does a step cost more after a long history? Three forecasters, each with another history, take turns.
+
+All of them see the same scenes. One whose history has grown a fifth beyond its mark is reset and streams anew, outside
+the clock, so the marks hold. Beside them stands what encoding the history anew would cost at every step.
+"""
+
+import time
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.models import forecaster, inference, road, scenes, sized
+from benchmarks.rows import Row
+from benchmarks.settings import Settings
+from benchmarks.timing import Meter, ratio_row, timed_row
+from predictor.dgvae import DGVAE
+from predictor.online import OnlineForecaster
+from predictor.scene import SceneBatch
+
+HISTORIES = (10, 100, 1000)
+"""Steps."""
+ANEW = (10, 100)
+"""Histories to encode anew."""
+BATCH, AGENTS, HORIZON = 8, 12, 5
+STEPS_PER_BLOCK = 3
+MOST_GROWTH = 1.2
+ROUNDS = {"quick": 31, "full": 101}
+TOLERANCE = 1.2
+
+
+class Streamed:
+    """A forecaster that is kept near one length of history.
+
+    Args:
+        model: whose forecasts.
+        history: steps.
+        stream: scenes, used over and over.
+    """
+
+    def __init__(self, model: DGVAE, history: int, stream: list[SceneBatch]) -> None:
+        """Stream the history."""
+        self.history, self.seen = history, 0
+        self._online = OnlineForecaster(model, len(stream[0]), stream[0].valid.shape[1])
+        self._stream = stream
+        self._refill()
+
+    def block(self) -> float:
+        """Seconds of one observation and forecast; the first one is not timed, as it fetches the model into cache."""
+        if self.seen > MOST_GROWTH * self.history:
+            self._refill()
+        self._step()
+        began = time.perf_counter()
+        for _ in range(STEPS_PER_BLOCK):
+            self._step()
+        return (time.perf_counter() - began) / STEPS_PER_BLOCK
+
+    def _refill(self) -> None:
+        self._online.reset()
+        self.seen = 0
+        for _ in range(self.history - 1):
+            self._observe()
+
+    def _observe(self) -> None:
+        self._online.observe(self._stream[self.seen % len(self._stream)])
+        self.seen += 1
+
+    def _step(self) -> None:
+        self._observe()
+        self._online.forecast()
+
+
+def run(settings: Settings) -> list[Row]:
+    """Cost of a step by history, its ratio, and what encoding anew would cost."""
+    presets = ("fast",) if settings.quick else ("fast", "paper")
+    return [row for preset in presets for row in _measure(preset, settings)]
+
+
+def _measure(preset: str, settings: Settings) -> list[Row]:
+    model = forecaster(sized(preset), road(AGENTS), HORIZON)
+    stream = _stream()
+    meter = Meter(ROUNDS[settings.mode], budget_s=60.0)
+    streamed = {str(h): Streamed(model, h, stream) for h in HISTORIES}
+    timings = meter.time_blocks({name: s.block for name, s in streamed.items()})
+    what = {"preset": preset, "batch": BATCH, "agents": AGENTS, "horizon": HORIZON}
+    rows = [
+        timed_row("streaming", "observe + forecast", what | {"history": int(name)}, timing)
+        for name, timing in timings.items()
+    ]
+    short, long = (str(h) for h in (min(HISTORIES), max(HISTORIES)))
+    ratios = timings[long].seconds / timings[short].seconds
+    base = f"history {short} in the same run"
+    name = f"a step after {long} steps / after {short}"
+    rows.append(ratio_row("streaming", name, what, ratios, base, tolerance=TOLERANCE))
+    return rows + _encoding_anew(model, what, Meter.of(settings))
+
+
+def _encoding_anew(model: DGVAE, what: dict[str, Any], meter: Meter) -> list[Row]:
+    calls = {}
+    for steps in ANEW:
+        states, valid = scenes(BATCH, AGENTS)
+        window = states[:, None].expand(-1, steps, -1, -1).contiguous()
+        present = valid[:, None].expand(-1, steps, -1).contiguous()
+        last = torch.full((BATCH,), steps - 1)
+        calls[steps] = inference(partial(model.window, window, present, last, HORIZON))
+    timings = meter.measure({str(steps): call for steps, call in calls.items()})
+    note = "training's window path, posterior included"
+    return [
+        timed_row("streaming", "whole history anew + forecast", what | {"history": int(s)}, timing).noted(note)
+        for s, timing in timings.items()
+    ]
+
+
+def _stream(length: int = 64) -> list[SceneBatch]:
+    """Scenes of a steady cast that drifts along."""
+    states, valid = (tensor.numpy() for tensor in scenes(BATCH, AGENTS))
+    ids = np.tile(np.arange(AGENTS), (BATCH, 1))
+    move = np.array([1.0, 0.0, 0.0, 0.0])
+    heading = np.zeros(BATCH)
+    return [SceneBatch(states.astype(np.float64) + t * move, ids, valid, heading) for t in range(length)]

@@ -1,0 +1,239 @@
+"""How things are timed: warm-up, blocks of calls that take turns, medians and quartiles, and two yardsticks.
+
+A machine that is shared drifts by tens of per cent within a minute, so what is compared is measured in turns, in
+alternating order, and divided block by block. In the same turns runs a yardstick: plain float32 matrix products for
+what is made of products, or a fixed loop of Python for what the interpreter spends its time on. A time divided by the
+yardstick's means about the same on another day.
+"""
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.rows import TOLERANCE, Compared, Kind, Row
+from benchmarks.settings import Settings
+
+Product = tuple[int, int, int]
+REFERENCE_PRODUCTS: tuple[Product, ...] = ((9216, 48, 96), (12800, 64, 256), (4096, 128, 256), (1024, 256, 768))
+"""Rows, inner, columns: the recurrent and input products of pairs, and those of agents, at both sizes of the model."""
+_LEAST_ROUNDS = 3
+_MOST_REPEATS = 1000
+_SLOW_S = 0.5
+_PYTHON_TURNS = 2000
+
+
+@dataclass(frozen=True)
+class Yardstick:
+    """Something fixed to divide times by."""
+
+    kind: Kind
+    """Which."""
+    call: Callable[[], Any]
+    """Runs it once, some milliseconds."""
+    flop: float = 0.0
+    """Of one call; 0 where that has no meaning."""
+
+
+@cache
+def products(shapes: Sequence[Product] = REFERENCE_PRODUCTS) -> Yardstick:
+    """Matrix products of these shapes into existing memory, float32."""
+    generator = torch.Generator().manual_seed(0)
+    operands = [
+        (torch.randn(m, k, generator=generator), torch.randn(k, n, generator=generator), torch.empty(m, n))
+        for m, k, n in shapes
+    ]
+
+    def multiply() -> None:
+        for left, right, out in operands:
+            torch.mm(left, right, out=out)
+
+    return Yardstick("matmul", multiply, sum(2.0 * m * k * n for m, k, n in shapes))
+
+
+@cache
+def interpreter() -> Yardstick:
+    """A loop of Python over small arrays, which is what simulators and loaders are made of."""
+
+    def loop() -> float:
+        states, total = np.zeros((16, 4)), 0.0
+        for turn in range(_PYTHON_TURNS):
+            states = states * 0.99 + turn
+            total += float(states[0, 0])
+        return total
+
+    return Yardstick("interpreter", loop)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of one call in each block, and of the yardstick in the same turns."""
+
+    seconds: np.ndarray
+    """Of the call."""
+    yard: np.ndarray
+    """Of the yardstick."""
+    yardstick: Yardstick
+    """Which."""
+
+    @property
+    def median(self) -> float:
+        """Seconds."""
+        return float(np.median(self.seconds))
+
+    @property
+    def equivalents(self) -> float:
+        """How many runs of the yardstick one call takes."""
+        return float(np.median(self.seconds / self.yard))
+
+    def plus(self, other: "Timing") -> "Timing":
+        """One call of each."""
+        return Timing(self.seconds + other.seconds, self.yard, self.yardstick)
+
+    def matmul_share(self, flop: float) -> float | None:
+        """Rate of the call over the rate of plain products."""
+        if not self.yardstick.flop:
+            return None
+        return float(np.median(flop / self.seconds * self.yard / self.yardstick.flop))
+
+
+def alternate(
+    blocks: Mapping[str, Callable[[], float]], rounds: int, budget_s: float = math.inf
+) -> dict[str, np.ndarray]:
+    """Run all blocks in turns, every other round in reverse; what each returned, round by round.
+
+    Args:
+        blocks: each times itself and returns seconds.
+        rounds: at most so many.
+        budget_s: no further round begins after so many seconds, once there are three.
+    """
+    names, began = list(blocks), time.perf_counter()
+    taken: dict[str, list[float]] = {name: [] for name in names}
+    for turn in range(rounds):
+        if turn >= _LEAST_ROUNDS and time.perf_counter() - began > budget_s:
+            break
+        for name in names if turn % 2 == 0 else reversed(names):
+            taken[name].append(blocks[name]())
+    return {name: np.array(values) for name, values in taken.items()}
+
+
+@dataclass(frozen=True)
+class Meter:
+    """How long and how often to measure."""
+
+    rounds: int = 15
+    """Blocks of each call."""
+    block_s: float = 0.03
+    """A block repeats its call for at least so long."""
+    budget_s: float = 20.0
+    """For all blocks of one comparison; at least three rounds are made."""
+
+    @staticmethod
+    def of(settings: Settings) -> "Meter":
+        """For a quick or a full run."""
+        return Meter(7, 0.01, 2.0) if settings.quick else Meter()
+
+    def measure(self, calls: Mapping[str, Callable[[], Any]], yardstick: Yardstick | None = None) -> dict[str, Timing]:
+        """Time calls in turns, after a warm-up, the yardstick among them."""
+        return self.time_blocks({name: self._block(call) for name, call in calls.items()}, yardstick)
+
+    def time_blocks(
+        self, blocks: Mapping[str, Callable[[], float]], yardstick: Yardstick | None = None
+    ) -> dict[str, Timing]:
+        """The same for blocks that time themselves."""
+        yardstick = yardstick or products()
+        yardstick.call()
+        seconds = alternate({"": partial(_repeat, yardstick.call, 1), **blocks}, self.rounds, self.budget_s)
+        yard = seconds.pop("")
+        return {name: Timing(values, yard, yardstick) for name, values in seconds.items()}
+
+    def _block(self, call: Callable[[], Any]) -> Callable[[], float]:
+        took = _repeat(call, 1)
+        if took < _SLOW_S:
+            took = _repeat(call, 1)  # the first one also loads kernels
+        repeats = min(_MOST_REPEATS, max(1, math.ceil(self.block_s / max(took, 1e-9))))
+        return partial(_repeat, call, repeats)
+
+
+def _repeat(call: Callable[[], Any], repeats: int) -> float:
+    began = time.perf_counter()
+    for _ in range(repeats):
+        call()
+    return (time.perf_counter() - began) / repeats
+
+
+def quartiles(values: np.ndarray) -> tuple[float, float]:
+    """First and third."""
+    low, high = np.quantile(values, (0.25, 0.75))
+    return float(low), float(high)
+
+
+def timed_row(
+    section: str,
+    name: str,
+    what: Mapping[str, Any],
+    timing: Timing,
+    *,
+    flop: float | None = None,
+    base: Timing | None = None,
+    ratio_to: str = "",
+    tolerance: float = TOLERANCE,
+) -> Row:
+    """Milliseconds of a call."""
+    ms = 1e3 * timing.seconds
+    return Row(
+        section,
+        name,
+        what,
+        float(np.median(ms)),
+        "ms",
+        quartiles(ms),
+        ratio=None if base is None else float(np.median(timing.seconds / base.seconds)),
+        ratio_to=ratio_to,
+        flop=flop,
+        flops_per_s=None if flop is None else flop / timing.median,
+        matmul_share=None if flop is None else timing.matmul_share(flop),
+        compared=Compared(timing.equivalents, timing.yardstick.kind, "lower", tolerance),
+    )
+
+
+def rate_row(
+    section: str,
+    name: str,
+    what: Mapping[str, Any],
+    timing: Timing,
+    count: float,
+    unit: str,
+    *,
+    flop: float | None = None,
+    tolerance: float = TOLERANCE,
+) -> Row:
+    """So many things per second, `count` of them in one call."""
+    rates = count / timing.seconds
+    row = timed_row(section, name, what, timing, flop=flop, tolerance=tolerance)
+    return Row(
+        section, name, what, float(np.median(rates)), unit, quartiles(rates), flop=flop, flops_per_s=row.flops_per_s,
+        matmul_share=row.matmul_share, compared=row.compared,
+    )  # fmt: skip
+
+
+def ratio_row(
+    section: str,
+    name: str,
+    what: Mapping[str, Any],
+    ratios: np.ndarray,
+    ratio_to: str,
+    *,
+    better: str = "lower",
+    tolerance: float = TOLERANCE,
+) -> Row:
+    """A ratio of two things of the same run, block by block."""
+    median = float(np.median(ratios))
+    direction: Any = better
+    compared = Compared(median, "ratio", direction, tolerance)
+    return Row(section, name, what, median, "×", quartiles(ratios), ratio_to=ratio_to, compared=compared)

@@ -1,0 +1,125 @@
+"""Every section that needs no simulator, shrunk to almost nothing."""
+
+from typing import Any
+
+import pytest
+
+from benchmarks import forecast, machine, ppo, reading, streaming, suite, training, wrappers
+from benchmarks.settings import Settings
+from benchmarks.timing import Meter
+
+QUICK = Settings(quick=True, threads=1)
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Meter, "of", staticmethod(lambda settings: Meter(3, 0.0, 0.0)))
+
+
+def test_the_machines_rate_is_of_all_products_together():
+    rows = machine.run(QUICK)
+    assert len(rows) == 6
+    assert all(r.unit == "GFLOP/s" and (r.value or 0) > 0 and r.compared is None for r in rows)
+    assert rows[-1].flop == sum(r.flop or 0 for r in rows[:4])
+
+
+def test_forecasts_have_rates_and_ratios_to_the_evolving_graph(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(forecast, "CASES", {"quick": (forecast.Case(2, 3, 4, 2),)})
+    rows = {r.name: r for r in forecast.run(QUICK) if r.what["preset"] == "fast"}
+    assert len(rows) == 6
+    assert all((r.flop or 0) > 0 and r.compared is not None for r in rows.values())
+    assert {name for name, r in rows.items() if r.ratio is not None} == {
+        "roll-out, frozen graph", "observe, bfloat16", "roll-out, bfloat16",
+    }  # fmt: skip
+    frozen, evolving = rows["roll-out, frozen graph"], rows["roll-out"]
+    assert (frozen.flop or 0) < (evolving.flop or 0)
+    assert rows["observe + roll-out"].unit == "agent-forecasts/s"
+
+
+def test_streaming_keeps_each_history_near_its_mark(monkeypatch: pytest.MonkeyPatch):
+    seen: dict[int, list[int]] = {}
+    block = streaming.Streamed.block
+
+    def watched(self: streaming.Streamed) -> float:
+        seconds = block(self)
+        seen.setdefault(self.history, []).append(self.seen)
+        return seconds
+
+    monkeypatch.setattr(streaming.Streamed, "block", watched)
+    monkeypatch.setattr(streaming, "HISTORIES", (10, 30))
+    monkeypatch.setattr(streaming, "ANEW", (2,))
+    monkeypatch.setattr(streaming, "BATCH", 1)
+    monkeypatch.setattr(streaming, "AGENTS", 3)
+    monkeypatch.setattr(streaming, "ROUNDS", {"quick": 5})
+    rows = streaming.run(QUICK)
+    assert seen == {10: [13, 13, 13, 13, 13], 30: [33, 37, 33, 37, 33]}
+    ratio = next(r for r in rows if r.unit == "×")
+    assert ratio.name == "a step after 30 steps / after 10" and ratio.compared is not None
+    assert [r.what["history"] for r in rows if r.unit == "ms"] == [10, 30, 2]
+
+
+class _Child:
+    def __init__(self, threads: int, environment: dict[str, str] | None = None) -> None:
+        pass
+
+    def __enter__(self) -> "_Child":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+    def ask(self, task: str, **arguments: Any) -> dict[str, Any]:
+        return {"seconds": 1.0, "peak_bytes": 3 * 2**20}
+
+
+def test_training_counts_windows_memory_and_the_allocator(monkeypatch: pytest.MonkeyPatch):
+    case = training.Case("fast", 3, 6, 4, 2)
+    monkeypatch.setattr(training, "CASES", {"quick": (case,)})
+    monkeypatch.setattr(training, "ALLOCATOR_CASE", case)
+    monkeypatch.setattr(training, "Child", _Child)
+    monkeypatch.setattr(training, "keep_freed_memory", lambda: True)
+    steps, windows, memory, allocator = training.run(QUICK)
+    assert (steps.unit, windows.unit, memory.unit, memory.value) == ("steps/s", "windows/s", "MiB", 3.0)
+    assert windows.value == pytest.approx(4 * (steps.value or 0))
+    assert steps.matmul_share is not None and windows.compared is None
+    assert allocator.unit == "×" and allocator.compared is None
+    monkeypatch.setattr(training, "keep_freed_memory", lambda: False)
+    assert training.run(QUICK)[-1].note == "skipped: needs glibc"
+
+
+def test_data_is_read_and_cut_and_absent_simulators_are_skipped(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(reading, "EPISODES", {"quick": 8})
+    monkeypatch.setattr(reading, "missing", lambda *modules: f"needs {modules[0]}")
+    rows = reading.run(QUICK)
+    assert [r.unit for r in rows] == ["MB/s", "windows/s"] * 2 + ["rollouts/s", "", ""]
+    assert [r.note for r in rows[-2:]] == ["skipped: needs highway_env", "skipped: needs envpool"]
+
+
+def test_without_envpool_its_rows_are_skipped_in_one_line_each(monkeypatch: pytest.MonkeyPatch):
+    for module in (wrappers, ppo):
+        monkeypatch.setattr(module, "missing", lambda *modules: "needs envpool")
+    monkeypatch.setattr(wrappers, "CASES", {"quick": (wrappers.Case("EnvPool", 2, "native", False, 1, 1),)})
+    for section in (wrappers, ppo):
+        (row,) = section.run(QUICK)
+        assert row.value is None and row.note == "skipped: needs envpool"
+
+
+def test_without_simulators_whole_sections_are_skipped(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(suite, "missing", lambda *modules: f"needs {modules[-1]}" if modules else "")
+    names: list[str] = []
+    rows = suite.measure(QUICK, ("wrappers", "ppo"), names.append)
+    assert names == ["wrappers", "ppo"]
+    assert [r.note for r in rows] == ["skipped: needs stable_baselines3"] * 2
+
+
+def test_an_environment_is_measured_plain_with_forecasts_and_at_the_papers_size(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(wrappers, "CASES", {"quick": (wrappers.Case("highway-env", 1, "dummy", True, 1, 3),)})
+    rows = wrappers.run(QUICK)
+    assert [(r.name, r.unit) for r in rows] == [
+        ("plain", "steps/s"),
+        ("with forecasts", "steps/s"),
+        ("with forecasts, paper size", "steps/s"),
+        ("with forecasts / plain", "×"),
+        ("with forecasts, paper size / plain", "×"),
+    ]
+    assert [r.compared is not None for r in rows] == [False, True, True, True, True]
