@@ -61,7 +61,7 @@ class Stepper:
         """Memory of each pair after a step (hidden, cell), prior logits and features."""
         weight = present.to(inputs.dtype)
         summed = sum_over_senders(elu_(_spread(inputs, self._conv, senders)), weight)
-        nodes = functional.linear(summed, self._conv_out[0]).addcmul_(weight.sum(-1, keepdim=True), self._conv_out[1])
+        nodes = _product(summed, (self._conv_out[0], None)).addcmul_(weight.sum(-1, keepdim=True), self._conv_out[1])
         edges = elu_(_spread(elu_(nodes), self._edge, senders))
         gates = _product(hidden.reshape(-1, hidden.shape[-1]), self._recurrent)
         gates = _product(edges.flatten(0, 2), self._gates, gates)
@@ -94,10 +94,10 @@ class Stepper:
             messages = self._decoder.messages(inputs, present, weights, features, senders)
             return self._decoder.step(messages, valid, node), messages
         layer = self._message_layer(inputs, features, senders)
-        gates = functional.linear(inputs, *self._own)
+        gates = _product(inputs, self._own)
         for k, (block, (matrix, bias)) in enumerate(zip(layer.chunk(len(self._out), -1), self._out, strict=True)):
             weight = weights[..., k + 1] * present
-            gates += functional.linear(sum_over_senders(block, weight), matrix)
+            gates = _product(sum_over_senders(block, weight), (matrix, None), gates)
             gates.addcmul_(weight.sum(-1, keepdim=True), bias)
         flat = node.reshape(-1, node.shape[-1])
         after = gru_step_(gates.flatten(0, 1), _product(flat, self._remembered), flat)
@@ -142,10 +142,10 @@ class Stepper:
 
 
 def _product(rows: Tensor, layer: tuple[Tensor, Tensor | None], plus: Tensor | None = None) -> Tensor:
-    """A linear layer on rows, plus what is there already."""
+    """A linear layer, plus what is there already (which may be overwritten)."""
     weight, bias = layer
     if _ONEDNN and rows.device.type == "cpu" and rows.dtype is torch.float32:
-        if len(rows) * weight.numel() >= _LARGE:
+        if rows.shape[:-1].numel() * weight.numel() >= _LARGE:
             linear = torch.ops.mkldnn._linear_pointwise
             if plus is None:
                 return linear(rows, weight, bias, "none", [], "")
@@ -156,7 +156,7 @@ def _product(rows: Tensor, layer: tuple[Tensor, Tensor | None], plus: Tensor | N
 
 def _spread(nodes: Tensor, layer: Layer, senders: Tensor | None) -> Tensor:
     """A `PairLinear` whose two products are one."""
-    received, sent = functional.linear(nodes, *layer).chunk(2, dim=-1)
+    received, sent = _product(nodes, layer).chunk(2, dim=-1)
     if senders is None:
         return received[..., :, None, :] + sent[..., None, :, :]
     return to_pairs(sent, senders).add_(received[..., :, None, :])

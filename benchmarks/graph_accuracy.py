@@ -1,0 +1,133 @@
+"""What cheaper graphs cost in accuracy: `python -m benchmarks.graph_accuracy --checkpoints A B --stores C D`.
+
+Each checkpoint is measured on the same windows of each store with all pairs, with the nearest k, and with a graph that
+stays as it is when the roll-out begins, whatever it was trained with. minADE of the most likely forecast, beside
+constant velocity; the time is of streaming the histories and forecasting, one window at a time.
+"""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from predictor.accuracy import Tally
+from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.checkpoint import load_checkpoint
+from predictor.data.store import read_store
+from predictor.data.windows import Windows
+from predictor.dgvae import DGVAE, DGVAEConfig
+from predictor.errors import UserError, run_entry_point
+from predictor.forecaster import Forecaster
+from predictor.outcomes import run_windows
+from predictor.provenance import provenance, write_json
+from predictor.runtime import tune
+from predictor.suite_measure import protocol_indices
+
+
+@dataclass(frozen=True)
+class GraphConfig:
+    """Measure checkpoints with several graphs."""
+
+    checkpoints: tuple[Path, ...]
+    """dG-VAE checkpoints."""
+    stores: tuple[Path, ...]
+    """Episode stores to measure on."""
+    neighbours: tuple[int, ...] = (2, 4, 8, 16)
+    """Numbers of neighbours; all pairs, evolving and frozen, are always measured."""
+    history_steps: int = 40
+    """Steps observed."""
+    horizon_steps: int = 10
+    """Steps forecast."""
+    windows: int = 100
+    """Windows of each store, drawn evenly."""
+    stride: int = 5
+    """Steps between two windows of an episode."""
+    threads: int = 2
+    """Of torch."""
+    out: Path | None = None
+    """JSON file for the result."""
+
+    def check(self) -> None:
+        """Check ranges.
+
+        Raises:
+            UserError: a value that makes no sense.
+        """
+        if not self.checkpoints or not self.stores:
+            raise UserError("give at least one of --checkpoints and one of --stores")
+        for name in ("history_steps", "horizon_steps", "windows", "stride", "threads"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if min(self.neighbours, default=1) < 1:
+            raise UserError(f"neighbours must be at least 1, got {self.neighbours}")
+
+
+def measure(forecaster: Forecaster, windows: Windows, config: GraphConfig) -> dict[str, float]:
+    """Errors [m] over the windows, and seconds for all of them."""
+    chosen = protocol_indices(windows, config.stride, config.windows, seed=0)
+    tally, began = Tally(), time.perf_counter()
+    for outcome in run_windows(forecaster, windows, chosen, config.horizon_steps, batch_size=1):
+        tally.add(outcome)
+    accuracy = tally.accuracy("")
+    return {
+        "min_ade_m": accuracy.min_ade_m,
+        "min_fde_m": accuracy.min_fde_m,
+        "seconds": time.perf_counter() - began,
+        "windows": len(chosen),
+    }
+
+
+def variants(checkpoint: Path, config: GraphConfig) -> list[DGVAE]:
+    """The checkpoint's network with each graph; all pairs first.
+
+    Raises:
+        UserError: the checkpoint is of another model.
+    """
+    forecaster, _ = load_checkpoint(checkpoint)
+    if not isinstance(forecaster, DGVAE):
+        raise UserError(f"{checkpoint} is no dG-VAE; only its graph can be changed")
+    graphs = [forecaster.variant(num_neighbours=count, rollout_graph="evolving") for count in (0, *config.neighbours)]
+    return [*graphs, forecaster.variant(num_neighbours=0, rollout_graph="frozen")]
+
+
+def main() -> None:
+    """Entry point."""
+    config = tyro.cli(GraphConfig, description=__doc__)
+    config.check()
+    tune()
+    torch.set_num_threads(config.threads)
+    table = Table("store", "agents", "trained on", "graph", "minADE [m]", "minFDE [m]", "s per window")
+    rows: list[dict[str, Any]] = []
+    for path in config.stores:
+        store = read_store(path)
+        spec, history, horizon = store.info.spec, config.history_steps, config.horizon_steps
+        windows = Windows(store.episodes, spec, history, horizon, horizon, history)
+        agents = float(np.mean([e.valid.sum(axis=1).mean() for e in store.episodes]))
+        cases: list[tuple[str, str, Forecaster]] = [("", "constant velocity", ConstantVelocity(spec, horizon))]
+        for checkpoint in config.checkpoints:
+            trained = load_checkpoint(checkpoint)[1].config
+            cases += [(_graph(trained), _graph(other.config), other) for other in variants(checkpoint, config)]
+        for trained_on, graph, forecaster in cases:
+            row = measure(forecaster, windows, config)
+            rows.append({"store": path.name, "agents": agents, "trained_on": trained_on, "graph": graph} | row)
+            errors = (f"{row[key]:.3f}" for key in ("min_ade_m", "min_fde_m"))
+            seconds = f"{row['seconds'] / row['windows']:.3f}"
+            table.add_row(path.name, f"{agents:.0f}", trained_on, graph, *errors, seconds)
+    Console(width=120).print(table)
+    if config.out is not None:
+        write_json(config.out, {"rows": rows, "provenance": provenance(("torch",))})
+
+
+def _graph(config: DGVAEConfig) -> str:
+    pairs = f"nearest {config.num_neighbours}" if config.num_neighbours else "all pairs"
+    return pairs if config.rollout_graph == "evolving" else f"{pairs}, {config.rollout_graph}"
+
+
+if __name__ == "__main__":
+    run_entry_point(main)
