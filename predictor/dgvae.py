@@ -12,14 +12,14 @@ expectation, so that a history has one meaning; samples branch off at the first 
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from predictor.codec import StateCodec
-from predictor.disentangle import running_mean, window_mean
+from predictor.disentangle import running_mean, running_mean_step, window_mean
 from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory, WindowOutput
 from predictor.graph import NOBODY, among_nearest, nearest, off_diagonal, others, pair_mask, with_diagonal
@@ -33,18 +33,12 @@ from predictor.networks import (
     edge_probabilities,
     no_edge_where_absent,
 )
+from predictor.packing import Packed, Padded
 from predictor.recurrent import masked_gru
 from predictor.scene import SceneSpec
 from predictor.stepper import Stepper
 
 __all__ = ["DGVAE", "PRESETS", "DGVAEConfig", "Decoder", "Edges", "Encoder", "WindowOutput", "concrete_sample"]
-
-
-class _Graph(NamedTuple):
-    """Who may interact; axes as in `predictor.graph`."""
-
-    present: Bool[Tensor, "*batch agents slots"]
-    senders: Int[Tensor, "*some agents slots"] | None
 
 
 class _Past(NamedTuple):
@@ -62,10 +56,29 @@ class _Encoding(NamedTuple):
     past: _Past  # after each step
 
 
+@runtime_checkable
+class _Layers(Protocol):
+    """What single steps need of the networks; `graph` is `Padded` for the modules, `Packed` for the stepper."""
+
+    def encode(self, inputs: Tensor, graph: Any, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Memory of each pair after a step (hidden, cell), prior logits and features."""
+
+    def drive(
+        self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, node: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        """GRU states after a step along a graph; and the messages, unless nobody else needs them."""
+
+    def messages(self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor) -> Tensor:
+        """What reaches each agent along a graph."""
+
+
 class _Internal(NamedTuple):
-    graph: _Graph
+    layers: "_Layers"
+    graph: Padded | Packed  # of all that follows but states
     past: _Past
     logits: Tensor
+    probs: Tensor
+    features: Tensor
     node_before: Tensor  # GRU state before the latest observation was decoded
     node_after: Tensor  # … and after, under the prior's expectation
     next_states: Tensor
@@ -135,46 +148,47 @@ class DGVAE(nn.Module):
         self, memory: Memory, states: Float[Tensor, "batch agents state"], valid: Bool[Tensor, "batch agents"]
     ) -> tuple[Memory, Belief]:
         """One encoder step and one decoder step under the prior's expected graph."""
-        graph = self._graph_now(states, valid)
-        if graph.senders is not None:
-            memory = memory.to_slots(graph.senders, graph.present)
-        (node_before, seen), (hidden, cell, static) = memory.nodes, memory.pairs
-        past, logits, features = self._encode_step(states, valid, graph, _Past(hidden, cell, static, seen))
+        padded = self._graph_now(states, valid)
+        if padded.senders is not None:
+            memory = memory.to_slots(padded.senders, padded.present)
+        layers = self._layers()
+        graph: Padded | Packed = Packed.of(padded, valid) if isinstance(layers, Stepper) else padded
+        (node, seen), pairs = memory.nodes, memory.pairs
+        node_before, (hidden, cell, static) = graph.pack_nodes(node), map(graph.pack_pairs, pairs)
+        past, logits, features = self._encode_step(layers, states, valid, graph, _Past(hidden, cell, static, seen))
         probs = edge_probabilities(logits)
-        node_after, next_states = self._move(states, valid, graph, probs, features, node_before)
-        internal = _Internal(graph, past, logits, node_before, node_after, next_states)
-        after = Memory((node_after, past.seen), (past.hidden, past.cell, past.static), memory.senders)
-        return after, Belief(states, valid, probs, features, internal, memory.senders)
+        node_after, next_states = self._move(layers, states, valid, graph, probs, features, node_before)
+        known = _Internal(layers, graph, past, logits, probs, features, node_before, node_after, next_states)
+        remembered = tuple(graph.unpack_pairs(t) for t in (past.hidden, past.cell, past.static))
+        after = Memory((graph.unpack_nodes(node_after), past.seen), remembered, memory.senders)
+        shown = graph.unpack_pairs(probs, no_edge=True), graph.unpack_pairs(features)
+        return after, Belief(states, valid, *shown, known, memory.senders)
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
         """Feed predictions back through the encoder, so that the graph evolves; sample 0 takes expected graphs."""
         known: _Internal = belief.internal
-        kept = (belief.edge_probs, belief.edge_features)
-        futures = [
-            self._continue(
-                known.next_states, belief.valid, known.graph, known.past, known.node_after, kept, horizon_steps, None
-            )
-        ]
-        if num_samples > 1:
-            draws = num_samples - 1
-            states, valid, features, node, logits, present, *past = (
-                t.repeat_interleave(draws, dim=0)
-                for t in (
-                    belief.states, belief.valid, belief.edge_features, known.node_before, known.logits,
-                    known.graph.present, *known.past,
-                )
-            )  # fmt: skip
-            senders = known.graph.senders
-            graph = _Graph(present, None if senders is None else senders.repeat_interleave(draws, dim=0))
-            sampler = self._sampler(generator)
-            futures.append(
-                self._free_run(states, valid, graph, features, _Past(*past), node, logits, horizon_steps, sampler)
-            )
-        batch = len(belief.states)
-        stacked = [f.unflatten(0, (batch, -1)) for f in futures]
-        return torch.cat(stacked, dim=1) if num_samples > 1 else stacked[0]
+        layers, graph, edges = known.layers, known.graph, (known.probs, known.features)
+        future = self._continue(
+            layers, known.next_states, belief.valid, graph, known.past, known.node_after, edges, horizon_steps, None
+        )
+        if num_samples == 1:
+            return future[:, None]
+        draws = num_samples - 1
+        states, valid, seen = (
+            t.repeat_interleave(draws, dim=0) for t in (belief.states, belief.valid, known.past.seen)
+        )
+        hidden, cell, static, features, logits = (
+            graph.repeat_pairs(t, draws)
+            for t in (known.past.hidden, known.past.cell, known.past.static, known.features, known.logits)
+        )
+        node = graph.repeat_nodes(known.node_before, draws)
+        drawn = self._free_run(
+            layers, states, valid, graph.repeat(draws), features, _Past(hidden, cell, static, seen), node, logits,
+            horizon_steps, self._sampler(generator),
+        )  # fmt: skip
+        return torch.cat([future[:, None], drawn.unflatten(0, (len(future), draws))], dim=1)
 
     # --- Training -----------------------------------------------------------------------------------------------
 
@@ -196,7 +210,8 @@ class DGVAE(nn.Module):
         layer = self.decoder.pair_layer(inputs, shown, graph.senders)
         messages = self.decoder.combine(inputs, layer, graph.present, sampled)
         nodes = masked_gru(messages, self.decoder.gru, valid, node)
-        one_step = self._integrate(states, valid, graph, sampled, shown, nodes, messages)
+        change = self.decoder.change(nodes)
+        one_step = self._integrate(self._plain(), states, valid, graph, sampled, shown, change, messages)
         outputs = self._dense(graph, edges.prior_logits, posterior, shown)
         if not rollout_steps:
             nothing = states.new_zeros(len(states), states.shape[2], 0, states.shape[3])
@@ -212,23 +227,23 @@ class DGVAE(nn.Module):
         burned_in = torch.cat([node[:, None], remembered], dim=1)
         now = (torch.arange(len(states), device=states.device), last_observed)
         future = self._free_run(
-            states[now], valid[now], _Graph(graph.present[now], graph.senders), features[now],
+            self._layers(), states[now], valid[now], Padded(graph.present[now], graph.senders), features[now],
             _Past(*(t[now] for t in past)), burned_in[now], edges.prior_logits[now], rollout_steps,
             self._sampler(generator),
         )  # fmt: skip
         return WindowOutput(one_step, future, *outputs)
 
-    def _graph_of_window(self, states: Tensor, valid: Tensor) -> _Graph:
+    def _graph_of_window(self, states: Tensor, valid: Tensor) -> Padded:
         """Pairs of each step: of everyone with all others, where the encoder does not need the square."""
         present, near = pair_mask(valid), self.config.num_neighbours
         if near:
             present = present & among_nearest(states[..., : self.spec.position_dim], valid, near)
         agents = valid.shape[-1]
         if self.config.innovation_rounds or agents == 1:
-            return _Graph(present, None)
-        return _Graph(off_diagonal(present), others(agents, valid.device))
+            return Padded(present, None)
+        return Padded(off_diagonal(present), others(agents, valid.device))
 
-    def _dense(self, graph: _Graph, prior: Tensor, posterior: Tensor, features: Tensor) -> tuple[Tensor, ...]:
+    def _dense(self, graph: Padded, prior: Tensor, posterior: Tensor, features: Tensor) -> tuple[Tensor, ...]:
         """What a window says of pairs, with everyone's own entry in it: no edge, and zeros."""
         if graph.senders is None:
             return prior, posterior, features
@@ -238,12 +253,12 @@ class DGVAE(nn.Module):
 
     # --- Shared -------------------------------------------------------------------------------------------------
 
-    def _graph_now(self, states: Tensor, valid: Tensor) -> _Graph:
+    def _graph_now(self, states: Tensor, valid: Tensor) -> Padded:
         near = self.config.num_neighbours
         if not near:
-            return _Graph(pair_mask(valid), None)
+            return Padded(pair_mask(valid), None)
         senders, present = nearest(states[..., : self.spec.position_dim], valid, near)
-        return _Graph(present, senders)
+        return Padded(present, senders)
 
     def _nothing_seen(
         self, batch: int, agents: int, slots: int
@@ -258,33 +273,42 @@ class DGVAE(nn.Module):
     def _sampler(self, generator: torch.Generator | None) -> "_Sampler":
         return _Sampler(self.config.temperature, self.config.hard_samples, generator)
 
-    def _layers(self) -> "_Modules | Stepper":
+    def _plain(self) -> "_Layers":
+        return _Modules(self.encoder, self.decoder)
+
+    def _layers(self) -> "_Layers":
         """For single steps: with gradients the modules themselves, otherwise the same with its weights folded."""
         dropout = self.training and self.config.dropout > 0
         if torch.is_grad_enabled() or dropout or self.config.innovation_rounds:
-            return _Modules(self.encoder, self.decoder)
+            return self._plain()
         if self._stepper is None or not self._stepper.is_current():
             self._stepper = Stepper(self.encoder, self.decoder)
         return self._stepper
 
-    def _encode(self, inputs: Tensor, valid: Tensor, graph: _Graph, past: _Past) -> _Encoding:
+    def _encode(self, inputs: Tensor, valid: Tensor, graph: Padded, past: _Past) -> _Encoding:
         """Encode a stretch of steps after `past`."""
         inputs, seen = self._with_changes(inputs, valid, past.seen)
         edges = self.encoder(inputs, graph.present, past.hidden, past.cell, graph.senders)
         features, static = self._match(edges.features, graph.present, past.static)
         return _Encoding(edges, features, _Past(edges.hidden, edges.cell, static, seen))
 
-    def _encode_step(self, states: Tensor, valid: Tensor, graph: _Graph, past: _Past) -> tuple[_Past, Tensor, Tensor]:
+    def _encode_step(
+        self, layers: "_Layers", states: Tensor, valid: Tensor, graph: Padded | Packed, past: _Past
+    ) -> tuple[_Past, Tensor, Tensor]:
         """The same for one step: memory, prior logits and features after it."""
         inputs, seen = self.codec.inputs(states, valid), past.seen
         if self.sees_changes:
             stretch, after = self._with_changes(inputs[:, None], valid[:, None], seen)
             inputs, seen = stretch[:, 0], after[:, 0]
-        hidden, cell, logits, features = self._layers().encode(inputs, *graph, past.hidden, past.cell)
+        inputs = graph.pack_nodes(inputs)
+        hidden, cell, logits, features = layers.encode(inputs, graph, past.hidden, past.cell)
         static = past.static
         if self.config.static_dim:
-            matched, after = self._match(features[:, None], graph.present[:, None], static)
-            features, static = matched[:, 0], after[:, 0]
+            present = torch.ones_like(static[..., 0], dtype=torch.bool)
+            if isinstance(graph, Padded):
+                present = graph.present
+            static = running_mean_step(features[..., : self.config.static_dim], present, static)
+            features = torch.cat([static[..., :-1], features[..., self.config.static_dim :]], dim=-1)
         return _Past(hidden, cell, static, seen), logits, features
 
     def _with_changes(self, inputs: Tensor, valid: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
@@ -317,41 +341,53 @@ class DGVAE(nn.Module):
         return torch.cat([window_mean(features[..., :static], present), features[..., static:]], dim=-1)
 
     def _move(
-        self, states: Tensor, valid: Tensor, graph: _Graph, weights: Tensor, features: Tensor, node: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """One decoder step: GRU states after it, and the next states."""
-        inputs = self.codec.inputs(states, valid)
-        node, messages = self._layers().drive(inputs, *graph, weights, features, valid, node)
-        return node, self._integrate(states, valid, graph, weights, features, node, messages)
-
-    def _integrate(
         self,
+        layers: "_Layers",
         states: Tensor,
         valid: Tensor,
-        graph: _Graph,
+        graph: Padded | Packed,
         weights: Tensor,
         features: Tensor,
         node: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """One decoder step: GRU states after it, and the next states."""
+        inputs = graph.pack_nodes(self.codec.inputs(states, valid))
+        node, messages = layers.drive(inputs, graph, weights, features, node)
+        if isinstance(graph, Padded):
+            node = node * valid[..., None]
+        change = graph.unpack_nodes(self.decoder.change(node))
+        return node, self._integrate(layers, states, valid, graph, weights, features, change, messages)
+
+    def _integrate(
+        self,
+        layers: "_Layers",
+        states: Tensor,
+        valid: Tensor,
+        graph: Padded | Packed,
+        weights: Tensor,
+        features: Tensor,
+        change: Tensor,
         messages: Tensor | None,
     ) -> Float[Tensor, "*batch agents state"]:
         """States one step later; with substeps, messages are evaluated anew as the agents move."""
-        change = self.decoder.change(node)
         substeps = self.config.substeps
         if not substeps:
             return self.codec.advance(states, change)
         assert messages is not None
         for substep in range(substeps):
             if substep:
-                inputs = self.codec.inputs(states, valid)
-                messages = self.decoder.messages(inputs, graph.present, weights, features, graph.senders)
-            states = self.codec.advance(states, change + self.decoder.direct(messages), 1 / substeps)
+                inputs = graph.pack_nodes(self.codec.inputs(states, valid))
+                messages = layers.messages(inputs, graph, weights, features)
+            pushed = graph.unpack_nodes(self.decoder.direct(messages))
+            states = self.codec.advance(states, change + pushed, 1 / substeps)
         return states
 
     def _free_run(
         self,
+        layers: "_Layers",
         states: Tensor,
         valid: Tensor,
-        graph: _Graph,
+        graph: Padded | Packed,
         features: Tensor,
         past: _Past,
         node: Tensor,
@@ -361,14 +397,15 @@ class DGVAE(nn.Module):
     ) -> Float[Tensor, "batch agents horizon state"]:
         """Roll out from an observation whose decoder step is still to be taken."""
         drawn = sampler(logits)
-        node, states = self._move(states, valid, graph, drawn, features, node)
-        return self._continue(states, valid, graph, past, node, (drawn, features), horizon_steps, sampler)
+        node, states = self._move(layers, states, valid, graph, drawn, features, node)
+        return self._continue(layers, states, valid, graph, past, node, (drawn, features), horizon_steps, sampler)
 
     def _continue(
         self,
+        layers: "_Layers",
         states: Tensor,
         valid: Tensor,
-        graph: _Graph,
+        graph: Padded | Packed,
         past: _Past,
         node: Tensor,
         edges: tuple[Tensor, Tensor],
@@ -382,9 +419,9 @@ class DGVAE(nn.Module):
         future, (weights, features) = [states], edges
         for _ in range(horizon_steps - 1):
             if self.config.rollout_graph == "evolving":
-                past, logits, features = self._encode_step(states, valid, graph, past)
+                past, logits, features = self._encode_step(layers, states, valid, graph, past)
                 weights = edge_probabilities(logits) if sampler is None else sampler(logits)
-            node, states = self._move(states, valid, graph, weights, features, node)
+            node, states = self._move(layers, states, valid, graph, weights, features, node)
             future.append(states)
         return torch.stack(future, dim=2)[:, :, :horizon_steps]
 
@@ -396,24 +433,18 @@ class _Modules:
     encoder: Encoder
     decoder: Decoder
 
-    def encode(
-        self, inputs: Tensor, present: Tensor, senders: Tensor | None, hidden: Tensor, cell: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        edges: Edges = self.encoder(inputs[:, None], present[:, None], hidden, cell, senders)
+    def encode(self, inputs: Tensor, graph: Any, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        edges: Edges = self.encoder(inputs[:, None], graph.present[:, None], hidden, cell, graph.senders)
         return edges.hidden[:, 0], edges.cell[:, 0], edges.prior_logits[:, 0], edges.features[:, 0]
 
     def drive(
-        self,
-        inputs: Tensor,
-        present: Tensor,
-        senders: Tensor | None,
-        weights: Tensor,
-        features: Tensor,
-        valid: Tensor,
-        node: Tensor,
+        self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, node: Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        messages = self.decoder.messages(inputs, present, weights, features, senders)
-        return self.decoder.step(messages, valid, node), messages
+        messages = self.messages(inputs, graph, weights, features)
+        return self.decoder.step(messages, node), messages
+
+    def messages(self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor) -> Tensor:
+        return self.decoder.messages(inputs, graph.present, weights, features, graph.senders)
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,17 @@ def running_mean(
     """
     after = []
     for value, present in zip(values.unbind(1), pairs[..., None].unbind(1), strict=True):
-        mean, count = memory[..., :-1], memory[..., -1:] + 1
-        memory = torch.cat([mean + (value - mean) / count, count], dim=-1) * present
+        memory = running_mean_step(value, present[..., 0], memory)
         after.append(memory)
     return torch.stack(after, dim=1)
+
+
+def running_mean_step(
+    value: Float[Tensor, "*pairs static"], present: Bool[Tensor, "*pairs"], memory: Float[Tensor, "*pairs _"]
+) -> Float[Tensor, "*pairs _"]:
+    """The same for one step, whatever the layout of pairs."""
+    mean, count = memory[..., :-1], memory[..., -1:] + 1
+    return torch.cat([mean + (value - mean) / count, count], dim=-1) * present[..., None]
 
 
 def window_mean(

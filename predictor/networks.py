@@ -345,13 +345,12 @@ class Decoder(nn.Module):
     def step(
         self,
         messages: Float[Tensor, "batch agents message"],
-        valid: Bool[Tensor, "batch agents"],
         hidden: Float[Tensor, "batch agents decoder"],
     ) -> Float[Tensor, "batch agents decoder"]:
-        """One GRU step for every agent; absent agents keep no memory."""
+        """One GRU step for every agent."""
         batch, agents, width = hidden.shape
-        after = self.gru(messages.reshape(batch * agents, -1), hidden.reshape(batch * agents, width))
-        return after.view(batch, agents, width) * valid[..., None]
+        after: Tensor = self.gru(messages.reshape(batch * agents, -1), hidden.reshape(batch * agents, width))
+        return after.view(batch, agents, width)
 
     def change(self, hidden: Float[Tensor, "*batch decoder"]) -> Float[Tensor, "*batch state"]:
         """Change of state, in units of `delta_scales`."""

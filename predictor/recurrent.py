@@ -80,14 +80,12 @@ def masked_gru(
 
 
 def lstm_step_(
-    gates: Float[Tensor, "pairs gates"], cell: Float[Tensor, "pairs rnn"], present: Float[Tensor, "pairs 1"] | None
+    gates: Float[Tensor, "pairs gates"], cell: Float[Tensor, "pairs rnn"]
 ) -> tuple[Float[Tensor, "pairs rnn"], Float[Tensor, "pairs rnn"]]:
     """Hidden and cell state after one step; `gates` (input and recurrent share) is overwritten."""
     _squash(gates)
     i, f, s, o = gates.chunk(4, dim=-1)
     cell = f.mul(cell).addcmul_(i, s, value=2).sub_(i)
-    if present is not None:
-        cell.mul_(present)
     return cell.mul(2).sigmoid_().mul_(2).sub_(1).mul_(o), cell
 
 

@@ -1,17 +1,19 @@
 """Single steps of the dG-VAE without gradients: what streaming and roll-outs run.
 
-The same function as the modules of `predictor.networks`, with fewer operations: linear layers in a row are folded into
-one, layers on the same input are one product, and everything edge-sized is done in place. The folded weights are a
-snapshot; `is_current` tells whether the modules have changed since.
+The same function as the modules of `predictor.networks`, with fewer operations: only agents and pairs that are there
+are computed (`predictor.packing`), linear layers in a row are folded into one, layers on the same input are one
+product, and everything edge-sized is done in place. The folded weights are a snapshot; `is_current` tells whether the
+modules have changed since.
 """
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from predictor.graph import PairLinear, folded, sum_over_senders, to_pairs
-from predictor.networks import Decoder, Encoder, no_edge_where_absent
+from predictor.graph import PairLinear, folded
+from predictor.networks import Decoder, Encoder
+from predictor.packing import Packed
 from predictor.recurrent import elu_, gru_step_, lstm_step_
 
 Layer = tuple[Tensor, Tensor]
@@ -36,7 +38,6 @@ class Stepper:
         modules = [m for part in (encoder, decoder) for m in part.modules()]
         self._weights = [m._parameters for m in modules if m._parameters]
         self._snapshot = self._versions()
-        self._decoder = decoder
         with torch.no_grad():
             self._take_encoder(encoder)
             self._take_decoder(decoder)
@@ -47,70 +48,72 @@ class Stepper:
 
     def encode(
         self,
-        inputs: Float[Tensor, "batch agents inputs"],
-        present: Bool[Tensor, "batch agents slots"],
-        senders: Int[Tensor, "*some agents slots"] | None,
-        hidden: Float[Tensor, "batch agents slots rnn"],
-        cell: Float[Tensor, "batch agents slots rnn"],
+        inputs: Float[Tensor, "listed inputs"],
+        graph: Packed,
+        hidden: Float[Tensor, "pairs rnn"],
+        cell: Float[Tensor, "pairs rnn"],
     ) -> tuple[
-        Float[Tensor, "batch agents slots rnn"],
-        Float[Tensor, "batch agents slots rnn"],
-        Float[Tensor, "batch agents slots types"],
-        Float[Tensor, "batch agents slots feature"],
+        Float[Tensor, "pairs rnn"],
+        Float[Tensor, "pairs rnn"],
+        Float[Tensor, "pairs types"],
+        Float[Tensor, "pairs feature"],
     ]:
         """Memory of each pair after a step (hidden, cell), prior logits and features."""
-        weight = present.to(inputs.dtype)
-        summed = sum_over_senders(elu_(_spread(inputs, self._conv, senders)), weight)
-        nodes = _product(summed, (self._conv_out[0], None)).addcmul_(weight.sum(-1, keepdim=True), self._conv_out[1])
-        edges = elu_(_spread(elu_(nodes), self._edge, senders))
-        gates = _product(hidden.reshape(-1, hidden.shape[-1]), self._recurrent)
-        gates = _product(edges.flatten(0, 2), self._gates, gates)
-        after, cell_after = lstm_step_(gates, cell.reshape(-1, cell.shape[-1]), weight.view(-1, 1))
-        logits, features = self._read(after, weight.view(-1, 1))
-        shape = (*present.shape, -1)
-        logits = no_edge_where_absent(logits.view(shape), present[..., None])
-        return after.view(shape), cell_after.view(shape), logits, features.view(*present.shape, features.shape[-1])
-
-    def _read(self, hidden: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-        """Prior logits and features from pair memory."""
+        summed = graph.gather(elu_(_spread(inputs, self._conv, graph)))
+        nodes = _product(summed, (self._conv_out[0], None))
+        nodes = elu_(nodes.addcmul_(graph.count().to(nodes.dtype), self._conv_out[1]))
+        edges = elu_(_spread(nodes, self._edge, graph))
+        gates = _product(edges, self._gates, _product(hidden, self._recurrent))
+        hidden, cell = lstm_step_(gates, cell)
         heads = elu_(_product(elu_(hidden.clone()), self._heads))
         if self._features is None:
-            return _product(heads, self._logits), heads.new_zeros(len(heads), 0)
+            return hidden, cell, _product(heads, self._logits), heads.new_zeros(len(heads), 0)
         width = heads.shape[1] // 2
-        return _product(heads[:, :width], self._logits), _product(heads[:, width:], self._features).mul_(weight)
+        return hidden, cell, _product(heads[:, :width], self._logits), _product(heads[:, width:], self._features)
 
     def drive(
         self,
-        inputs: Float[Tensor, "batch agents inputs"],
-        present: Bool[Tensor, "batch agents slots"],
-        senders: Int[Tensor, "*some agents slots"] | None,
-        weights: Float[Tensor, "batch agents slots types"],
-        features: Float[Tensor, "batch agents slots feature"],
-        valid: Bool[Tensor, "batch agents"],
-        node: Float[Tensor, "batch agents decoder"],
-    ) -> tuple[Float[Tensor, "batch agents decoder"], Float[Tensor, "batch agents message"] | None]:
+        inputs: Float[Tensor, "listed inputs"],
+        graph: Packed,
+        weights: Float[Tensor, "pairs types"],
+        features: Float[Tensor, "pairs feature"],
+        node: Float[Tensor, "listed decoder"],
+    ) -> tuple[Float[Tensor, "listed decoder"], Float[Tensor, "listed message"] | None]:
         """GRU states after a step along a graph; and the messages, if substeps need them."""
-        if self._own is None:
-            messages = self._decoder.messages(inputs, present, weights, features, senders)
-            return self._decoder.step(messages, valid, node), messages
-        layer = self._message_layer(inputs, features, senders)
-        gates = _product(inputs, self._own)
-        for k, (block, (matrix, bias)) in enumerate(zip(layer.chunk(len(self._out), -1), self._out, strict=True)):
-            weight = weights[..., k + 1] * present
-            gates = _product(sum_over_senders(block, weight), (matrix, None), gates)
-            gates.addcmul_(weight.sum(-1, keepdim=True), bias)
-        flat = node.reshape(-1, node.shape[-1])
-        after = gru_step_(gates.flatten(0, 1), _product(flat, self._remembered), flat)
-        return after.view(node.shape).mul_(valid[..., None]), None
+        if self._driven is None:
+            messages = self.messages(inputs, graph, weights, features)
+            gates = _product(messages, self._gru)
+        else:
+            messages = None
+            gates = self._along(inputs, graph, weights, features, *self._driven)
+        return gru_step_(gates, _product(node, self._remembered), node), messages
 
-    def _message_layer(self, inputs: Tensor, features: Tensor, senders: Tensor | None) -> Tensor:
-        layer = _spread(inputs, self._message, senders)
+    def messages(
+        self,
+        inputs: Float[Tensor, "listed inputs"],
+        graph: Packed,
+        weights: Float[Tensor, "pairs types"],
+        features: Float[Tensor, "pairs feature"],
+    ) -> Float[Tensor, "listed message"]:
+        """What reaches each agent along a graph, its own term included."""
+        return self._along(inputs, graph, weights, features, self._own, self._out)
+
+    def _along(
+        self, inputs: Tensor, graph: Packed, weights: Tensor, features: Tensor, own: Layer, out: list[Layer]
+    ) -> Tensor:
+        layer = _spread(inputs, self._message, graph)
         if self._feature is None:
-            return elu_(layer)
-        if self._decoder.gated:
-            return elu_(layer).mul_(functional.linear(features, self._feature).add_(1))
-        layer.flatten(0, 2).addmm_(features.flatten(0, 2), self._feature.t())
-        return elu_(layer)
+            elu_(layer)
+        elif self._gated:
+            elu_(layer).mul_(_product(features, self._feature).add_(1))
+        else:
+            elu_(layer.addmm_(features, self._feature[0].t()))
+        total = _product(inputs, own)
+        for k, (block, (matrix, bias)) in enumerate(zip(layer.chunk(len(out), -1), out, strict=True)):
+            weight = weights[:, k + 1].contiguous()
+            total = _product(graph.gather(block.contiguous(), weight), (matrix, None), total)
+            total.addcmul_(graph.count(weight), bias)
+        return total
 
     def _take_encoder(self, encoder: Encoder) -> None:
         self._conv = _roles(encoder.conv_pair, encoder.embed)
@@ -125,17 +128,19 @@ class Stepper:
         self._features = layers[1][1] if len(layers) > 1 else None
 
     def _take_decoder(self, decoder: Decoder) -> None:
-        self._message = _roles(decoder.message_pair)
-        self._feature = decoder.message_feature.weight.detach() if decoder.has_features else None
-        gru = decoder.gru
+        gru, types = decoder.gru, decoder.types
+        self._message, self._gated = _roles(decoder.message_pair), decoder.gated
+        self._feature = (decoder.message_feature.weight.detach(), None) if decoder.has_features else None
+        self._own = _layer(decoder.own)
+        parts = (t.detach().chunk(types) for t in (decoder.message_out.weight, decoder.message_out.bias))
+        self._out: list[Layer] = list(zip(*parts, strict=True))
+        self._gru = (gru.weight_ih.detach(), gru.bias_ih.detach())
         self._remembered = (gru.weight_hh.detach(), gru.bias_hh.detach())
-        self._own: Layer | None = None
-        if hasattr(decoder, "direct"):
-            return  # substeps need the messages themselves
-        weight, bias = gru.weight_ih, gru.bias_ih
-        self._own = (weight @ decoder.own.weight, weight @ decoder.own.bias + bias)
-        matrices, biases = (t.chunk(decoder.types) for t in (decoder.message_out.weight, decoder.message_out.bias))
-        self._out = [(weight @ m, weight @ b) for m, b in zip(matrices, biases, strict=True)]
+        self._driven: tuple[Layer, list[Layer]] | None = None
+        if not hasattr(decoder, "direct"):  # nothing but the GRU needs the messages
+            weight, bias = self._gru
+            own = (weight @ self._own[0], weight @ self._own[1] + bias)
+            self._driven = (own, [(weight @ matrix, weight @ share) for matrix, share in self._out])
 
     def _versions(self) -> list[tuple[int, int]]:
         return [(p.data_ptr(), p._version) for owner in self._weights for p in owner.values() if p is not None]
@@ -145,7 +150,7 @@ def _product(rows: Tensor, layer: tuple[Tensor, Tensor | None], plus: Tensor | N
     """A linear layer, plus what is there already (which may be overwritten)."""
     weight, bias = layer
     if _ONEDNN and rows.device.type == "cpu" and rows.dtype is torch.float32:
-        if rows.shape[:-1].numel() * weight.numel() >= _LARGE:
+        if len(rows) * weight.numel() >= _LARGE:
             linear = torch.ops.mkldnn._linear_pointwise
             if plus is None:
                 return linear(rows, weight, bias, "none", [], "")
@@ -154,12 +159,9 @@ def _product(rows: Tensor, layer: tuple[Tensor, Tensor | None], plus: Tensor | N
     return product if plus is None else product.add_(plus)
 
 
-def _spread(nodes: Tensor, layer: Layer, senders: Tensor | None) -> Tensor:
+def _spread(nodes: Tensor, layer: Layer, graph: Packed) -> Tensor:
     """A `PairLinear` whose two products are one."""
-    received, sent = _product(nodes, layer).chunk(2, dim=-1)
-    if senders is None:
-        return received[..., :, None, :] + sent[..., None, :, :]
-    return to_pairs(sent, senders).add_(received[..., :, None, :])
+    return graph.spread(*_product(nodes, layer).chunk(2, dim=-1))
 
 
 def _roles(pair: PairLinear, after: nn.Linear | None = None) -> Layer:

@@ -117,7 +117,7 @@ def test_recurrence_of_each_agent_is_a_plain_gru():
     hidden = torch.zeros(BATCH, AGENTS, 13)
     ours = []
     for t in range(TIME):
-        hidden = decoder.step(messages[:, t], valid[:, t], hidden)
+        hidden = decoder.step(messages[:, t], hidden) * valid[:, t, :, None]
         ours.append(hidden)
     for b, i in product(range(BATCH), range(AGENTS)):
         state = torch.zeros(13)

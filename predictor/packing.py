@@ -1,0 +1,156 @@
+"""Scenes of different sizes without padding: agents and pairs of a whole batch in two flat lists.
+
+A batch of scenes is padded to its largest, and pairs to its square; in traffic most of that is empty. Single steps
+without gradients work on lists of those who are there. `Padded` has the same methods and leaves everything in place.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+
+class Padded(NamedTuple):
+    """Pairs as an array of agents × slots; axes as in `predictor.graph`."""
+
+    present: Bool[Tensor, "*batch agents slots"]
+    """Who may interact."""
+    senders: Int[Tensor, "*some agents slots"] | None
+    """Whose each slot is; None if slot j is agent j's."""
+
+    def pack_nodes(self, nodes: Tensor) -> Tensor:
+        """The same."""
+        return nodes
+
+    def pack_pairs(self, pairs: Tensor) -> Tensor:
+        """The same."""
+        return pairs
+
+    def unpack_nodes(self, nodes: Tensor) -> Tensor:
+        """The same."""
+        return nodes
+
+    def unpack_pairs(self, pairs: Tensor, no_edge: bool = False) -> Tensor:
+        """The same."""
+        return pairs
+
+    def repeat_nodes(self, nodes: Tensor, times: int) -> Tensor:
+        """Each scene so many times in a row."""
+        return nodes.repeat_interleave(times, dim=0)
+
+    def repeat_pairs(self, pairs: Tensor, times: int) -> Tensor:
+        """Each scene so many times in a row."""
+        return pairs.repeat_interleave(times, dim=0)
+
+    def repeat(self, times: int) -> "Padded":
+        """The pairs of a batch with each scene so many times in a row."""
+        senders = None if self.senders is None else self.senders.repeat_interleave(times, dim=0)
+        return Padded(self.present.repeat_interleave(times, dim=0), senders)
+
+
+@dataclass(frozen=True)
+class Packed:
+    """Lists of the agents and pairs that are there, scene by scene, pairs by receiver."""
+
+    padded: Padded
+    """Where they come from."""
+    valid: Bool[Tensor, "batch agents"]
+    """Likewise."""
+    agents: Int[Tensor, " listed"]
+    """Places of the listed agents in the flattened batch."""
+    slots: Int[Tensor, " pairs"]
+    """Places of the listed pairs in the flattened array of pairs."""
+    receivers: Int[Tensor, " pairs"]
+    """Which listed agent."""
+    senders: Int[Tensor, " pairs"]
+    """Which listed agent."""
+    offsets: Int[Tensor, " listed"]
+    """Where each listed agent's pairs begin."""
+
+    @staticmethod
+    def of(padded: Padded, valid: Bool[Tensor, "batch agents"]) -> "Packed":
+        """List what is there."""
+        present = padded.present
+        width, slots_each = valid.shape[1], present.shape[2]
+        place = valid.flatten().cumsum(0) - 1  # in the list of agents
+        agents = valid.flatten().nonzero()[:, 0]
+        slots = present.flatten().nonzero()[:, 0]
+        receiver = slots // slots_each
+        if padded.senders is None:
+            sender = slots % slots_each
+        else:
+            sender = padded.senders.flatten()[slots]
+        count = present.sum(-1).flatten()[agents]
+        scene = receiver // width * width
+        return Packed(padded, valid, agents, slots, place[receiver], place[scene + sender], count.cumsum(0) - count)
+
+    def pack_nodes(self, nodes: Float[Tensor, "batch agents node"]) -> Float[Tensor, "listed node"]:
+        """Rows of the listed agents."""
+        return nodes.flatten(0, 1).index_select(0, self.agents)
+
+    def pack_pairs(self, pairs: Float[Tensor, "batch agents slots pair"]) -> Float[Tensor, "pairs pair"]:
+        """Rows of the listed pairs."""
+        return pairs.flatten(0, 2).index_select(0, self.slots)
+
+    def unpack_nodes(self, nodes: Float[Tensor, "listed node"]) -> Float[Tensor, "batch agents node"]:
+        """Zeros for who is not listed."""
+        padded = nodes.new_zeros(self.valid.numel(), nodes.shape[-1])
+        return padded.index_copy_(0, self.agents, nodes).unflatten(0, self.valid.shape)
+
+    def unpack_pairs(
+        self, pairs: Float[Tensor, "pairs pair"], no_edge: bool = False
+    ) -> Float[Tensor, "batch agents slots pair"]:
+        """Zeros for pairs that are not listed; with `no_edge`, certainty of the first type."""
+        shape = self.padded.present.shape
+        padded = pairs.new_zeros(shape.numel(), pairs.shape[-1])
+        if no_edge:
+            padded[:, 0] = 1.0
+        return padded.index_copy_(0, self.slots, pairs).unflatten(0, shape)
+
+    def repeat_nodes(self, nodes: Float[Tensor, "listed node"], times: int) -> Float[Tensor, "more node"]:
+        """Each scene so many times in a row."""
+        scene = self.agents // self.valid.shape[1]
+        return nodes.index_select(0, _repeated(scene, len(self.valid), times))
+
+    def repeat_pairs(self, pairs: Float[Tensor, "pairs pair"], times: int) -> Float[Tensor, "more pair"]:
+        """Each scene so many times in a row."""
+        scene = self.slots // self.padded.present[0].numel()
+        return pairs.index_select(0, _repeated(scene, len(self.valid), times))
+
+    def repeat(self, times: int) -> "Packed":
+        """The lists of a batch with each scene so many times in a row."""
+        return Packed.of(self.padded.repeat(times), self.valid.repeat_interleave(times, dim=0))
+
+    def spread(
+        self, received: Float[Tensor, "listed out"], sent: Float[Tensor, "listed out"]
+    ) -> Float[Tensor, "pairs out"]:
+        """Receiver's plus sender's share of each pair."""
+        return received.index_select(0, self.receivers).add_(sent.index_select(0, self.senders))
+
+    def gather(
+        self, pairs: Float[Tensor, "pairs out"], weight: Float[Tensor, " pairs"] | None = None
+    ) -> Float[Tensor, "listed out"]:
+        """Sum over senders, weighted."""
+        if not len(self.slots):
+            return pairs.new_zeros(len(self.agents), pairs.shape[-1])
+        each = torch.arange(len(self.slots), device=pairs.device)
+        return functional.embedding_bag(each, pairs, self.offsets, mode="sum", per_sample_weights=weight)
+
+    def count(self, weight: Float[Tensor, " pairs"] | None = None) -> Float[Tensor, "listed 1"]:
+        """Number, or total weight, of each agent's senders."""
+        if weight is None:
+            weight = torch.ones(len(self.slots), dtype=torch.get_default_dtype(), device=self.slots.device)
+        return weight.new_zeros(len(self.agents)).index_add_(0, self.receivers, weight)[:, None]
+
+
+def _repeated(scene: Tensor, scenes: int, times: int) -> Tensor:
+    """Places of a list's entries, sorted by scene, when each scene is repeated."""
+    sizes = torch.bincount(scene, minlength=scenes)
+    starts = (sizes.cumsum(0) - sizes).repeat_interleave(times)
+    sizes = sizes.repeat_interleave(times)
+    total = sizes.cumsum(0)
+    within = torch.arange(int(sizes.sum()), device=scene.device) - (total - sizes).repeat_interleave(sizes)
+    return starts.repeat_interleave(sizes) + within
