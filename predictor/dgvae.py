@@ -11,7 +11,7 @@ linear term of the agent's own state to its messages. And while true states are 
 expectation, so that a history has one meaning; samples branch off at the first forecast step.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -125,15 +125,23 @@ class DGVAE(nn.Module):
         """The same weights under a changed config: `num_neighbours`, `rollout_graph`, `temperature`, `hard_samples`.
 
         Raises:
-            UserError: the weights do not fit the changed config.
+            UserError: an unknown field, or the weights do not fit the changed config.
         """
-        config = replace(self.config, **changes)
-        other = DGVAE(self.spec, config, self.horizon_steps).to(self.codec.scales)
+        unknown = sorted(set(changes) - {f.name for f in fields(self.config)})
+        if unknown:
+            raise UserError(f"DGVAEConfig has no field '{unknown[0]}'")
+        with torch.random.fork_rng(devices=[]):  # the initial weights are not kept
+            other = DGVAE(self.spec, replace(self.config, **changes), self.horizon_steps).to(self.codec.scales)
         try:
             other.load_state_dict(self.state_dict())
         except RuntimeError as error:
             raise UserError(f"a network with {changes} has other weights; train one instead") from error
         return other.train(self.training).requires_grad_(next(self.parameters()).requires_grad)
+
+    def train(self, mode: bool = True) -> "DGVAE":
+        """As any module's; what was folded from the weights is forgotten."""
+        self._stepper = None
+        return super().train(mode)
 
     # --- Forecaster ---------------------------------------------------------------------------------------------
 
@@ -278,10 +286,10 @@ class DGVAE(nn.Module):
 
     def _layers(self) -> "_Layers":
         """For single steps: with gradients the modules themselves, otherwise the same with its weights folded."""
-        dropout = self.training and self.config.dropout > 0
+        dropout = self.encoder.dropout.training and self.config.dropout > 0
         if torch.is_grad_enabled() or dropout or self.config.innovation_rounds:
             return self._plain()
-        if self._stepper is None or not self._stepper.is_current():
+        if self._stepper is None or not self._stepper.is_current(self.encoder, self.decoder):
             self._stepper = Stepper(self.encoder, self.decoder)
         return self._stepper
 

@@ -58,7 +58,8 @@ def nearest(
     Everyone is compared with everyone, by distance alone; that square is small beside what pairs cost.
     """
     agents = positions.shape[1]
-    distance = torch.cdist(positions, positions)
+    # exact: the fast way squares coordinates, and 10 km down a road nothing is left of a metre
+    distance = torch.cdist(positions, positions, compute_mode="donot_use_mm_for_euclid_dist")
     distance = distance.masked_fill(~pair_mask(valid), torch.inf)
     found = distance.topk(min(count, agents), dim=-1, largest=False)
     missing = (0, count - found.indices.shape[-1])
@@ -69,7 +70,8 @@ def among_nearest(
     positions: Float[Tensor, "*batch agents axes"], valid: Bool[Tensor, "*batch agents"], count: int
 ) -> Bool[Tensor, "*batch agents agents"]:
     """The dense mask of the pairs that `nearest` finds."""
-    senders, present = nearest(positions.flatten(0, -3), valid.flatten(0, -2), min(count, valid.shape[-1]))
+    agents, axes = positions.shape[-2:]
+    senders, present = nearest(positions.reshape(-1, agents, axes), valid.reshape(-1, agents), min(count, agents))
     mask = torch.zeros(*senders.shape[:2], senders.shape[1], dtype=torch.bool, device=valid.device)
     return mask.scatter_(-1, senders, present).view(*valid.shape, valid.shape[-1])
 

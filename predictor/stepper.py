@@ -35,16 +35,17 @@ class Stepper:
 
     def __init__(self, encoder: Encoder, decoder: Decoder) -> None:
         """Fold the weights."""
-        modules = [m for part in (encoder, decoder) for m in part.modules()]
-        self._weights = [m._parameters for m in modules if m._parameters]
-        self._snapshot = self._versions()
+        self._snapshot = _versions(encoder, decoder)
         with torch.no_grad():
             self._take_encoder(encoder)
             self._take_decoder(decoder)
 
-    def is_current(self) -> bool:
-        """Whether the modules still have the weights that were folded."""
-        return self._snapshot == self._versions()
+    def is_current(self, encoder: Encoder, decoder: Decoder) -> bool:
+        """Whether these modules still have the weights that were folded.
+
+        What writes into a tensor behind autograd's back is not seen: `.data`, or the replay of a CUDA graph.
+        """
+        return self._snapshot == _versions(encoder, decoder)
 
     def encode(
         self,
@@ -142,8 +143,10 @@ class Stepper:
             own = (weight @ self._own[0], weight @ self._own[1] + bias)
             self._driven = (own, [(weight @ matrix, weight @ share) for matrix, share in self._out])
 
-    def _versions(self) -> list[tuple[int, int]]:
-        return [(p.data_ptr(), p._version) for owner in self._weights for p in owner.values() if p is not None]
+
+def _versions(*modules: nn.Module) -> list[tuple[int, int]]:
+    parameters = (p for part in modules for m in part.modules() for p in m._parameters.values() if p is not None)
+    return [(p.data_ptr(), 0 if p.is_inference() else p._version) for p in parameters]
 
 
 def _product(rows: Tensor, layer: tuple[Tensor, Tensor | None], plus: Tensor | None = None) -> Tensor:
