@@ -29,6 +29,7 @@ from envs.render import record_episode
 from envs.wrappers import ForecastObservation
 from predictor.errors import UserError, run_entry_point
 from predictor.provenance import provenance
+from predictor.runtime import tune
 
 MAX_VIDEO_STEPS = 200
 """Longest video [policy steps]; racetracks go on for 1500."""
@@ -192,6 +193,7 @@ def _act(config: TrainPolicyConfig, model: BaseAlgorithm) -> Callable[[Any], Any
 
 def main() -> None:
     """Entry point."""
+    tune()
     torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
     run(tyro.cli(TrainPolicyConfig, description=__doc__), Console())
 

@@ -26,6 +26,7 @@ from agents.runs import POLICY_FILE, load_model, read_config, write_text
 from agents.task import Task
 from predictor.errors import UserError, run_entry_point
 from predictor.provenance import provenance, write_json
+from predictor.runtime import tune
 
 EVALUATION_SEED = 2_000_000_000
 """First seed of the final evaluation; training stays below 1e9, model selection between 1e9 and 2e9."""
@@ -278,6 +279,7 @@ class EvaluateConfig:
 
 def main() -> None:
     """Entry point."""
+    tune()
     torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
     config = tyro.cli(EvaluateConfig, description=__doc__)
     config.check()

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import gymnasium as gym
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
+from torch.nn import functional
 
 from predictor.errors import UserError
 
@@ -87,40 +88,49 @@ class ForecastAttention(BaseFeaturesExtractor):
     def forward(self, observations: dict[str, Tensor]) -> Float[Tensor, "batch features"]:
         """The ego's embedding beside what it attends to."""
         ego = self.ego(observations[EGO_KEY].flatten(1))
-        tokens, valid = self._tokens(ego, observations)
-        return torch.cat([ego, self.attended(self._attend(ego, tokens, valid))], dim=-1)
+        tokens, slots = self._tokens(ego, observations)
+        return torch.cat([ego, self.attended(self._attend(ego, tokens, slots))], dim=-1)
 
     def _tokens(
         self, ego: Float[Tensor, "batch width"], observations: dict[str, Tensor]
-    ) -> tuple[Float[Tensor, "batch tokens width"], Bool[Tensor, "batch tokens"]]:
-        """One token per agent, the null token last."""
-        batch = len(ego)
-        null = self.null_token.expand(batch, 1, -1)
-        present = torch.ones(batch, 1, dtype=torch.bool, device=ego.device)
-        if self.token_in is None:
-            return null, present
-        inputs = self._token_inputs(observations)
-        valid = torch.ones(inputs.shape[:2], dtype=torch.bool, device=ego.device)
-        if VALID_KEY in observations:
-            valid = observations[VALID_KEY] > 0.5
-        inputs = inputs.masked_fill(~valid[..., None], 0.0)
-        tokens = self.token_out(self.token_in(inputs) + self.token_ego(ego)[:, None])
-        return torch.cat([tokens, null], dim=1), torch.cat([valid, present], dim=1)
+    ) -> tuple[Float[Tensor, "tokens width"], Int[Tensor, "batch slots"]]:
+        """A token for each agent that is there, the null token last; and for each row, which ones it attends to.
 
-    def _token_inputs(self, observations: dict[str, Tensor]) -> Float[Tensor, "batch agents feature"]:
-        """The token keys, scaled to order one and concatenated per agent."""
+        Padding, which can be most of a scene, is left out before any layer.
+        """
+        null = self.null_token[None]
+        if self.token_in is None:
+            return null, torch.zeros(len(ego), 1, dtype=torch.long, device=ego.device)
+        valid = self._valid(observations)
+        row, column = valid.nonzero(as_tuple=True)
+        inputs = self._token_inputs({k: observations[k][row, column] for k in self._keys})
+        # embedding() is indexing with a faster gradient
+        of_ego = functional.embedding(row, functional.linear(ego, self.token_ego.weight, self.token_in.bias))
+        tokens = self.token_out(torch.addmm(of_ego, inputs, self.token_in.weight.T))
+        slots = torch.full((len(ego), valid.shape[1] + 1), len(row), device=ego.device)
+        slots[row, column] = torch.arange(len(row), device=ego.device)
+        return torch.cat([tokens, null]), slots
+
+    def _valid(self, observations: dict[str, Tensor]) -> Bool[Tensor, "batch agents"]:
+        if VALID_KEY in observations:
+            return observations[VALID_KEY] > 0.5
+        agents = observations[self._keys[0]]
+        return torch.ones(agents.shape[:2], dtype=torch.bool, device=agents.device)
+
+    def _token_inputs(self, present: dict[str, Tensor]) -> Float[Tensor, "agents feature"]:
+        """The token keys of some agents, scaled to order one and concatenated."""
         parts: list[Tensor] = []
         if "agents" in self._keys:
-            agents = observations["agents"]
-            parts += [self._squash(agents[..., :2]), agents[..., 2:4] / self.config.speed_mps, agents[..., 4:]]
+            agents = present["agents"]
+            parts += [self._squash(agents[:, :2]), agents[:, 2:4] / self.config.speed_mps, agents[:, 4:]]
         if "forecast" in self._keys:
-            forecast = observations["forecast"]  # agents [samples] horizon 2
-            parts.append(self._squash(forecast).flatten(2))
+            forecast = present["forecast"]  # agents [samples] horizon 2
+            parts.append(self._squash(forecast).flatten(1))
             if "agents" in self._keys:
-                now = observations["agents"][..., :2]
-                now = now.reshape(*now.shape[:2], *(1,) * (forecast.ndim - 3), 2)
-                parts.append(self._squash(forecast - now).flatten(2))
-        parts += [observations[k].flatten(2) for k in ("edge_probs", "edge_features") if k in self._keys]
+                now = present["agents"][:, :2]
+                now = now.reshape(len(now), *(1,) * (forecast.ndim - 2), 2)
+                parts.append(self._squash(forecast - now).flatten(1))
+        parts += [present[k].flatten(1) for k in ("edge_probs", "edge_features") if k in self._keys]
         return torch.cat(parts, dim=-1)
 
     def _squash(self, metres: Float[Tensor, "*axes 2"]) -> Float[Tensor, "*axes 4"]:
@@ -130,19 +140,26 @@ class ForecastAttention(BaseFeaturesExtractor):
         """Size of `_token_inputs`, by running it on zeros."""
         if not self._keys:
             return 0
-        return self._token_inputs({k: torch.zeros(1, *shapes[k]) for k in self._keys}).shape[-1]
+        return self._token_inputs({k: torch.zeros(1, *shapes[k][1:]) for k in self._keys}).shape[-1]
 
     def _attend(
         self,
         ego: Float[Tensor, "batch width"],
-        tokens: Float[Tensor, "batch tokens width"],
-        valid: Bool[Tensor, "batch tokens"],
+        tokens: Float[Tensor, "tokens width"],
+        slots: Int[Tensor, "batch slots"],
     ) -> Float[Tensor, "batch width"]:
-        """Multi-head attention with one query, the ego."""
+        """Multi-head attention with one query, the ego.
+
+        With one query, keys and values need not be made for each token: q · (K t) = (Kᵀ q) · t, and the mean of V t is
+        V times the mean of t. The key's bias adds the same to all logits, which is nothing.
+        """
         heads = self.config.heads
         query = self.query(ego).unflatten(-1, (heads, -1))
-        key = self.key(tokens).unflatten(-1, (heads, -1))
-        value = self.value(tokens).unflatten(-1, (heads, -1))
-        logits = torch.einsum("bhw,bthw->bht", query, key) / math.sqrt(query.shape[-1])
-        weights = logits.masked_fill(~valid[:, None], -torch.inf).softmax(dim=-1)
-        return torch.einsum("bht,bthw->bhw", weights, value).flatten(1)
+        key, value = (layer.weight.unflatten(0, (heads, -1)) for layer in (self.key, self.value))
+        absent = slots == len(tokens) - 1
+        absent[:, -1] = False  # the null token is always there
+        seen = functional.embedding(slots, tokens)
+        logits = seen @ torch.einsum("bhd,hdw->bwh", query / math.sqrt(query.shape[-1]), key)
+        weights = logits.masked_fill(absent[..., None], -torch.inf).softmax(dim=1)
+        attended = weights.transpose(1, 2) @ seen
+        return torch.einsum("bhw,hdw->bhd", attended, value).flatten(1) + self.value.bias

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
+from torch import Tensor
 
 from envs.registry import checkpoint_for
 from predictor.checkpoint import load_forecaster
@@ -185,29 +186,45 @@ def ego_entries(scenes: SceneBatch, forecast: Forecast) -> dict[str, NDArray[np.
         edge_features: (B, A−1, 2D) in the same order.
         valid: (B, A−1) 1 where there is an agent; everything else is zero in the other rows.
     """
-    relative = scenes.states[:, 1:].copy()
-    relative[..., :4] -= scenes.states[:, :1, :4]
-    valid = scenes.valid[:, 1:]
     order = others_by_distance(scenes)
-    rotation = into_ego_axes(scenes.heading_rad)
-    relative[..., :2] = np.einsum("bxy,bay->bax", rotation, relative[..., :2])
-    relative[..., 2:4] = np.einsum("bxy,bay->bax", rotation, relative[..., 2:4])
-    xy = forecast.xy[:, :, 1:].cpu().numpy()
-    xy = np.einsum("bxy,bkahy->bakhx", rotation.astype(np.float32), xy)
-    probs, features = forecast.edge_probs.cpu().numpy(), forecast.edge_features.cpu().numpy()
-    entries = {
-        "agents": relative,
-        "forecast": xy[:, :, 0] if xy.shape[2] == 1 else xy,
-        "edge_probs": np.concatenate([probs[:, 0, 1:, 1:], probs[:, 1:, 0, 1:]], axis=-1),
-        "edge_features": np.concatenate([features[:, 0, 1:], features[:, 1:, 0]], axis=-1),
-        "valid": valid,
-    }
-    rows = np.arange(len(order))[:, None]
-    present = valid[rows, order]
+    present = scenes.valid[np.arange(len(order))[:, None], 1 + order]
+    row, place = present.nonzero()  # what follows is done for agents that are there, not for padding
+    agent = 1 + order[row, place]
+    cos, sin = np.cos(scenes.heading_rad)[row], np.sin(scenes.heading_rad)[row]
+    agents = scenes.states[row, agent]
+    agents[:, :4] -= scenes.states[row, 0, :4]
+    agents[:, :4] = _turned(agents[:, :4].reshape(-1, 2, 2), cos, sin).reshape(-1, 4)
+    xy = _turned(forecast.xy.cpu().numpy()[row, :, agent], cos, sin)
+
+    def of_edges(edges: Tensor) -> NDArray[np.float32]:
+        both: NDArray[np.float32] = edges.flatten(2).cpu().numpy()[row, agent]
+        return both
+
+    def padded(values: NDArray[Any]) -> NDArray[np.float32]:
+        entries = np.zeros((*present.shape, *values.shape[1:]), dtype=np.float32)
+        entries[row, place] = values
+        return entries
+
+    probs, features = forecast.ego_edges()
     return {
-        key: (value[rows, order] * present.reshape(*present.shape, *(1,) * (value.ndim - 2))).astype(np.float32)
-        for key, value in entries.items()
+        "agents": padded(agents),
+        "forecast": padded(xy[:, 0] if xy.shape[1] == 1 else xy),
+        "edge_probs": padded(of_edges(probs[..., 1:])),
+        "edge_features": padded(of_edges(features)),
+        "valid": present.astype(np.float32),
     }
+
+
+def _turned(
+    vectors: Float[np.ndarray, "agents *_ 2"], cos: Float[np.ndarray, " agents"], sin: Float[np.ndarray, " agents"]
+) -> Float[np.ndarray, "agents *_ 2"]:
+    """Each agent's vectors in axes that are turned by the angle with this cosine and sine."""
+    cos, sin = (part.astype(vectors.dtype).reshape(-1, *(1,) * (vectors.ndim - 2)) for part in (cos, sin))
+    x, y = vectors[..., 0], vectors[..., 1]
+    turned = np.empty_like(vectors)
+    np.add(cos * x, sin * y, out=turned[..., 0])
+    np.subtract(cos * y, sin * x, out=turned[..., 1])
+    return turned
 
 
 def others_by_distance(scenes: SceneBatch) -> Int[np.ndarray, "batch others"]:

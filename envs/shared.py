@@ -91,7 +91,7 @@ class SharedStream:
     def observe(self, shared: SharedScene) -> dict[str, dict[str, NDArray[np.float32]]]:
         """Take in the scene; the entries of each agent in its `rows`, by name."""
         self._online.observe(SceneBatch.stack([shared.scene.behind_absent(self._front)]))
-        forecast = self._online.forecast(self.horizon_steps, self.config.num_samples, self._generator)
+        forecast = self._online.forecast(self.horizon_steps, self.config.num_samples, self._generator).dense()
         front = self._front
         self.forecast = Forecast(
             forecast.xy[:, :, front:],

@@ -16,7 +16,6 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from envs.observation import (
-    SCENE_KEYS,
     ForecastConfig,
     ForecastStream,
     open_forecaster,
@@ -180,16 +179,17 @@ def _observe_ended(
     opening = scenes_from(observations)
     if not len(ended):
         return dict(stream.observe(opening)), []
-    last = scenes_from({key: np.stack([c[key] for c in closing]) for key in SCENE_KEYS})
     scenes = SceneBatch(*(field.copy() for field in (opening.states, opening.ids, opening.valid, opening.heading_rad)))
-    scenes.states[ended], scenes.ids[ended] = last.states, last.ids
-    scenes.valid[ended], scenes.heading_rad[ended] = last.valid, last.heading_rad
+    for row, last in zip(ended, closing, strict=True):
+        scenes.states[row], scenes.ids[row] = last["scene_states"], last["scene_ids"]
+        scenes.valid[row], scenes.heading_rad[row] = last["scene_valid"], last["scene_heading_rad"][0]
     both = stream.observe_boundary(scenes, ended, opening[ended])
     rows = len(opening)
-    running = {key: value[:rows].copy() for key, value in both.items()}
-    for key, value in both.items():
-        running[key][ended] = value[rows:]
-    return dict(running), [{key: value[i] for key, value in both.items()} for i in ended]
+    of_closing = {key: value[ended] for key, value in both.items()}
+    for value in both.values():
+        value[ended] = value[rows:]
+    entries = {key: value[:rows] for key, value in both.items()}
+    return entries, [{key: value[i] for key, value in of_closing.items()} for i in range(len(ended))]
 
 
 def _join(observations: Observations, entries: Observations) -> Observations:

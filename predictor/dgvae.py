@@ -235,7 +235,7 @@ class DGVAE(nn.Module):
         burned_in = torch.cat([node[:, None], remembered], dim=1)
         now = (torch.arange(len(states), device=states.device), last_observed)
         future = self._free_run(
-            self._layers(), states[now], valid[now], Padded(graph.present[now], graph.senders), features[now],
+            self._plain(), states[now], valid[now], Padded(graph.present[now], graph.senders), features[now],
             _Past(*(t[now] for t in past)), burned_in[now], edges.prior_logits[now], rollout_steps,
             self._sampler(generator),
         )  # fmt: skip

@@ -144,11 +144,11 @@ class Scene:
         self._check_arrays(source, spec, rows)
         if (spec is None or spec.has_ego) and not (len(self.valid) and self.valid[0]):
             raise UserError(f"{source}: row 0 must hold the ego, but it is not valid")
-        live = self.ids[self.valid]
-        if len(np.unique(live)) != len(live):
-            raise UserError(f"{source}: ids must be unique within a scene, got {live.tolist()}")
-        if (live < 0).any():
-            raise UserError(f"{source}: ids of valid agents must be non-negative, got {live.tolist()}")
+        live = self.ids[self.valid].tolist()
+        if len(set(live)) != len(live):
+            raise UserError(f"{source}: ids must be unique within a scene, got {live}")
+        if min(live, default=0) < 0:
+            raise UserError(f"{source}: ids of valid agents must be non-negative, got {live}")
         number = isinstance(self.heading_rad, int | float | np.integer | np.floating)
         if not number or not np.isfinite(self.heading_rad):
             raise UserError(f"{source}: heading_rad must be one finite number, got {self.heading_rad}")

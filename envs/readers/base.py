@@ -138,7 +138,7 @@ def perceive(everyone: Scene, spec: SceneSpec, source: str = "reader") -> Scene:
     """
     everyone.check(source, spec)
     offsets = everyone.states[:, : spec.position_dim] - everyone.states[0, : spec.position_dim]
-    distance_m = np.where(everyone.valid, np.linalg.norm(offsets, axis=1), np.inf)
+    distance_m = np.where(everyone.valid, np.sqrt(np.square(offsets).sum(axis=1)), np.inf)
     distance_m[0] = -1.0  # the ego stays in row 0, also when another agent lies on top of it
     order = np.argsort(distance_m, kind="stable")[: spec.max_agents]
     order = order[everyone.valid[order] & (distance_m[order] <= spec.perception_m)]

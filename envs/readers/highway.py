@@ -98,11 +98,12 @@ class HighwayReader(Reader):
                 f"the env was wrapped at dt_s={self._spec.dt_s:g} but now steps at dt_s={dt_s:g}; "
                 "pass its config to gym.make, not to reset"
             )
-        kinematics = np.array([(*v.position, v.speed, v.heading) for v in vehicles]).reshape(len(vehicles), 4)
+        speed_mps = np.array([v.speed for v in vehicles], dtype=np.float64)
+        headings_rad = np.array([v.heading for v in vehicles], dtype=np.float64)
         states = np.empty((len(vehicles), len(KINEMATIC_FEATURES)))
-        states[:, :2] = kinematics[:, :2]
-        states[:, 2] = kinematics[:, 2] * np.cos(kinematics[:, 3])
-        states[:, 3] = kinematics[:, 2] * np.sin(kinematics[:, 3])
+        states[:, :2] = np.array([v.position for v in vehicles]).reshape(-1, 2)
+        states[:, 2] = speed_mps * np.cos(headings_rad)
+        states[:, 3] = speed_mps * np.sin(headings_rad)
         ids = np.array([self._identify(v) for v in vehicles], dtype=np.int64)
         heading_rad = float(vehicles[0].heading) if len(vehicles) else 0.0
         return Scene(states, ids, np.ones(len(vehicles), dtype=np.bool_), heading_rad)

@@ -47,6 +47,53 @@ def test_size_is_ego_and_attended():
     assert extractor(make_observations(SHAPES)).shape == (BATCH, extractor.features_dim) == (BATCH, 128)
 
 
+def by_loop(extractor: ForecastAttention, observations: dict[str, torch.Tensor]) -> torch.Tensor:
+    """The features, one row and one agent at a time: tokens, keys, values and weights as in the textbook."""
+    config, rows = extractor.config, []
+    for b in range(BATCH):
+        ego = extractor.ego(observations["observation"][b].flatten())
+        tokens = [extractor.null_token]
+        for a in range(AGENTS):
+            if "valid" in observations and not observations["valid"][b, a]:
+                continue
+            now, motion = observations["agents"][b, a, :2], observations["agents"][b, a, 2:]
+            forecast = observations["forecast"][b, a].flatten(0, -2)
+            parts = [torch.tanh(now / config.near_m), now / config.far_m, motion / config.speed_mps]
+            for places in (forecast, forecast - now):
+                parts.append(torch.cat([torch.tanh(places / config.near_m), places / config.far_m], -1).flatten())
+            parts += [observations["edge_probs"][b, a], observations["edge_features"][b, a]]
+            hidden = extractor.token_in(torch.cat(parts)) + extractor.token_ego(ego)
+            tokens.append(extractor.token_out(hidden))
+        tokens = torch.stack(tokens)
+        projected = extractor.query(ego), extractor.key(tokens), extractor.value(tokens)
+        heads = [
+            torch.softmax(key @ query / len(query) ** 0.5, dim=0) @ value
+            for query, key, value in zip(*(p.chunk(config.heads, dim=-1) for p in projected), strict=True)
+        ]
+        rows.append(torch.cat([ego, extractor.attended(torch.cat(heads))]))
+    return torch.stack(rows)
+
+
+@pytest.mark.parametrize("absent", [0, 1, AGENTS], ids=lambda n: f"{n} absent")
+@pytest.mark.parametrize("samples", [(), (3,)], ids=lambda s: f"{len(s)} sample axes")
+def test_features_and_gradients_equal_a_plain_loop(absent: int, samples: tuple[int, ...]):
+    shapes = SHAPES | {"forecast": (AGENTS, *samples, HORIZON, 2)}
+    extractor, observations = make_extractor(shapes), make_observations(shapes)
+    observations["valid"][1, 1 : 1 + absent] = 0
+    observations["valid"][2, :absent] = 0
+    results = []
+    for features in (extractor(observations), by_loop(extractor, observations)):
+        extractor.zero_grad()
+        (features * torch.linspace(-1, 1, features.shape[1])).square().sum().backward()
+        results.append((features.detach(), {n: p.grad for n, p in extractor.named_parameters() if p.grad is not None}))
+    (features, gradients), (expected, expected_gradients) = results
+    torch.testing.assert_close(features, expected, rtol=1e-5, atol=1e-5)
+    # a key's bias adds the same to all logits: rounding is all that the loop finds there
+    assert expected_gradients.pop("key.bias").abs().max() < 1e-5
+    assert set(gradients) == set(expected_gradients) == {n for n, _ in extractor.named_parameters()} - {"key.bias"}
+    torch.testing.assert_close(gradients, expected_gradients, rtol=1e-4, atol=1e-4)
+
+
 def test_order_of_agents_does_not_matter():
     extractor, observations = make_extractor(SHAPES), make_observations(SHAPES)
     observations["valid"][1, 3:] = 0

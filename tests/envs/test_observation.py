@@ -148,6 +148,8 @@ def test_padding_is_zero_whatever_the_forecast_holds():
     rng = np.random.default_rng(0)
     scenes = random_scenes(rng, 2, 5, present=[1, 3])
     forecast = random_forecast(rng, scenes, 2, 3, 2, 4)
+    absent = ~torch.from_numpy(scenes.valid)
+    forecast.xy.transpose(1, 2)[absent] = forecast.edge_probs[absent] = forecast.edge_features[absent] = torch.nan
     entries = ego_entries(scenes, forecast)
     assert entries["valid"].tolist() == [[0, 0, 0, 0], [1, 1, 0, 0]]
     for value in entries.values():
