@@ -18,7 +18,7 @@ from benchmarks.suite import measure, report, settle
 from benchmarks.table import plain, rich_table
 from predictor.errors import run_entry_point
 from predictor.provenance import write_json
-from predictor.runtime import keep_freed_memory, processor
+from predictor.runtime import keep_freed_memory, processor, tune
 
 
 def main() -> None:
@@ -31,6 +31,7 @@ def main() -> None:
         load(settings.reference)  # a wrong path is said now, not in half an hour
     baseline = None if settings.baseline is None else read_baseline(settings.baseline, settings)
     began = time.perf_counter()
+    tune()
     keeps_memory = keep_freed_memory()
     torch.set_num_threads(settings.threads)
     console, progress = Console(), Console(stderr=True)

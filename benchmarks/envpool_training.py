@@ -24,6 +24,7 @@ from agents.task import Task
 from agents.training import TrainingPlan, make_model
 from predictor.errors import UserError, run_entry_point
 from predictor.provenance import provenance, write_json
+from predictor.runtime import tune
 
 
 @dataclass(frozen=True)
@@ -148,6 +149,7 @@ def main() -> None:
     """Entry point."""
     config = tyro.cli(TrainingSpeedConfig, description=__doc__)
     config.check()
+    tune()
     torch.set_num_threads(config.threads)
     result = measure(config, partial(print, flush=True))
     ratios = result["ratios"]

@@ -12,7 +12,6 @@ from benchmarks.rows import Row
 from benchmarks.settings import Settings
 from benchmarks.timing import Meter, Timing, rate_row, timed_row
 from predictor.dgvae import DGVAE
-from predictor.runtime import matmul_precision
 
 
 class Case(NamedTuple):
@@ -64,8 +63,7 @@ def _case(preset: str, case: Case, meter: Meter) -> list[Row]:
         row("observe", look),
         row("roll-out", run_on),
         row("roll-out, frozen graph", frozen, rolled),
-        row("observe, bfloat16", look, seen).noted("share is of the float32 rate"),
-        row("roll-out, bfloat16", run_on, rolled).noted("share is of the float32 rate"),
+        row("observe and roll-out, half of the agents there", 0.0),
         rate_row(
             "forecast", "observe + roll-out", what, seen.plus(rolled), forecasts, "agent-forecasts/s",
             flop=look + run_on,
@@ -87,14 +85,13 @@ def _calls(model: DGVAE, case: Case) -> dict[str, Callable[[], Any]]:
         "roll-out, frozen graph": inference(
             partial(frozen.rollout, frozen_belief, case.horizon, case.samples, generator)
         ),
-        "observe, bfloat16": _in_bfloat16(observe),
-        "roll-out, bfloat16": _in_bfloat16(rollout),
+        "observe and roll-out, half of the agents there": inference(partial(_half, model, case)),
     }
 
 
-def _in_bfloat16(call: Callable[[], Any]) -> Callable[[], Any]:
-    def rounded() -> Any:
-        with matmul_precision("bfloat16"):
-            return call()
-
-    return rounded
+def _half(model: DGVAE, case: Case) -> Any:
+    """The same with every other agent absent, as where scenes differ in size."""
+    states, valid = scenes(case.batch, case.agents)
+    valid[:, 1::2] = False
+    _, belief = model.observe(model.empty_memory(*valid.shape), states * valid[..., None], valid)
+    return model.rollout(belief, case.horizon, case.samples, torch.Generator().manual_seed(0))

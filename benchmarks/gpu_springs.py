@@ -12,6 +12,8 @@ import json
 import statistics
 import tempfile
 import time
+from collections import Counter as Counts
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,10 +30,10 @@ from predictor.errors import UserError, run_entry_point
 from predictor.feed import Shapes
 from predictor.objective import window_loss
 from predictor.provenance import provenance, write_json
-from predictor.runtime import Precision, processor
+from predictor.runtime import processor, tune
 from predictor.suite import SuiteConfig, row_config, row_folder, run_row
 from predictor.tables import SPRINGS, Budget
-from predictor.train_config import TrainConfig
+from predictor.train_config import TrainConfig, TrainPrecision
 from predictor.trainer import Trainer, load_data
 
 SPLITS = ("train", "val", "test", "ood")
@@ -47,6 +49,10 @@ FLOP = {packet: flop_registry[packet] for packet in (ATEN.mm, ATEN.addmm, ATEN.b
     ATEN.baddbmm_: flop_registry[ATEN.baddbmm],
 }
 """Only products count."""
+H200_TFLOPS = {"float32": 67.0, "tf32": 494.0, "bfloat16": 989.0}
+"""Dense products, from the vendor's data sheet."""
+OTHER_KERNEL_US = (1.5, 2.0, 2.5, 3.0)
+"""The projection is repeated for these."""
 UPDATE_KERNELS = 10
 """Of clipping and fused Adam on a GPU; here they are hundreds, and are not counted."""
 
@@ -61,8 +67,8 @@ class GpuSpringsConfig:
     """Run folder: the suite's row, and summary.json (or projection.json)."""
     device: str = "cuda"
     """"cpu" or "cuda"; `--project` takes the CPU."""
-    precision: Precision = "float32"
-    """"bfloat16" rounds the inputs of matrix products in training."""
+    precision: TrainPrecision = "float32"
+    """Of matrix products in training, see `python -m predictor.train --help`."""
     budget: Budget = "paper"
     """Of the table; "paper" is 150 epochs at batch 128, "smoke" a minute on a CPU."""
     steps: int = 0
@@ -79,14 +85,14 @@ class GpuSpringsConfig:
     """Steps to time for the projection, after one to warm up."""
     batch_size: int = 0
     """Of the projection, in place of the budget's; 0 keeps it."""
-    peak_tflops: float = 67.0
-    """Of the card at the precision in question (H200: 67 in float32 without tensor cores, 989 in dense bfloat16)."""
+    peak_tflops: float = 0.0
+    """Of the card's products at this precision; 0 takes an H200's (67 in float32, 494 in TF32, 989 in bfloat16)."""
     bandwidth_gbs: float = 4800.0
     """Of the card's memory (H200: 4,800)."""
     share: float = 0.0
     """Share of the peak that products of these shapes reach; 0 takes the share of this machine's own rate."""
-    kernel_us: float = 2.5
-    """What a kernel in a replayed graph takes at least, start included: an assumption."""
+    kernel_us: float = 2.0
+    """What a kernel in a replayed graph takes at least, start included: the assumption that matters most."""
     target_minutes: float = 30.0
     """What the run is to stay below."""
 
@@ -99,10 +105,10 @@ class GpuSpringsConfig:
         for name in ("sequences", "held_out", "timed_steps"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("steps", "seed", "batch_size"):
+        for name in ("steps", "seed", "batch_size", "peak_tflops"):
             if getattr(self, name) < 0:
                 raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
-        for name in ("peak_tflops", "bandwidth_gbs", "kernel_us", "target_minutes"):
+        for name in ("bandwidth_gbs", "kernel_us", "target_minutes"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise UserError(f"{name} must be positive, got {getattr(self, name)}")
         if not 0 <= self.share <= 1:
@@ -128,8 +134,8 @@ def make_missing(config: GpuSpringsConfig) -> dict[str, float]:
     """Simulate the splits that are not there; the seconds each took."""
     folder = config.data / "springs"
     sizes = {name: config.sequences if name == "train" else config.held_out for name in SPLITS}
-    missing = {name: 0 if (folder / name).exists() else size for name, size in sizes.items()}
-    return make(SpringsConfig(folder, **missing, seed=config.seed)) if any(missing.values()) else {}
+    train, val, test, ood = (0 if (folder / name).exists() else size for name, size in sizes.items())
+    return make(SpringsConfig(folder, train, val, test, ood, seed=config.seed)) if train + val + test + ood else {}
 
 
 def run(config: GpuSpringsConfig) -> dict[str, Any]:
@@ -173,6 +179,8 @@ def _steps_done(folder: Path) -> int:
 class Kernel:
     """One operation that moves data."""
 
+    name: str
+    """Of the operation."""
     flop: float
     """Of a matrix product, else 0."""
     moved_bytes: float
@@ -196,7 +204,7 @@ class Counter(TorchDispatchMode):
             tensors = [t for t in pytree.tree_leaves((args, kwargs, out)) if isinstance(t, Tensor)]
             moved = sum(t.numel() * t.element_size() for t in tensors)
             flop = FLOP[packet](*args, **kwargs, out_val=out) if packet in FLOP else 0
-            self.kernels.append(Kernel(float(flop), float(moved)))
+            self.kernels.append(Kernel(packet.__name__, float(flop), float(moved)))
         return out
 
 
@@ -207,7 +215,15 @@ def projected_config(config: GpuSpringsConfig, data: Path) -> TrainConfig:
     lengths = range(settings.min_history_steps, settings.history_steps + 1)
     mean = statistics.mean(shapes.time(n) for n in lengths) - settings.horizon_steps
     batch = config.batch_size or settings.batch_size
-    return replace(settings, batch_size=batch, history_steps=round(mean), min_history_steps=0, val_history_steps=1)
+    precision = "float32" if settings.precision == "tf32" else settings.precision  # as exact as a CPU can
+    return replace(
+        settings,
+        batch_size=batch,
+        history_steps=round(mean),
+        min_history_steps=0,
+        val_history_steps=1,
+        precision=precision,
+    )
 
 
 def count(trainer: Trainer) -> list[Kernel]:
@@ -248,33 +264,23 @@ def matmul_rate(size: int = 1024, repeats: int = 5) -> float:
 
 def project(config: GpuSpringsConfig) -> dict[str, Any]:
     """Time and count a step here, and say what it would take on the card."""
+    tune()
     with tempfile.TemporaryDirectory() as folder:
         data, rows = Path(folder), config.batch_size or config.suite.sizes.batch_size
         make(SpringsConfig(data / "springs", train=2 * rows, val=8, test=0, ood=0, seed=config.seed))
         settings = projected_config(config, data)
         trainer = Trainer(settings, load_data(settings))
     kernels, seconds, rate = count(trainer), time_steps(trainer, config.timed_steps), matmul_rate()
-    flop, moved = sum(k.flop for k in kernels), sum(k.moved_bytes for k in kernels)
-    step_s = statistics.median(seconds)
-    here = {
-        "machine": processor(),
-        "threads": torch.get_num_threads(),
-        "step_s": seconds,
-        "median_step_s": step_s,
-        "flop_per_step": flop,
-        "bytes_per_step": moved,
-        "kernels_per_step": len(kernels) + UPDATE_KERNELS,
-        "flop_per_s": flop / step_s,
-        "matmul_flop_per_s": rate,
-        "share_of_matmul_rate": flop / step_s / rate,
-    }
+    here, steps = measured_here(kernels, seconds, rate), config.suite.sizes.steps
+    cards = {us: on_card(replace(config, kernel_us=us), kernels, here, steps) for us in OTHER_KERNEL_US}
     content = {
         "what": "a projection from counts and assumptions, not a measurement on the card",
         "batch_size": settings.batch_size,
         "history_steps": settings.history_steps,
         "horizon_steps": settings.horizon_steps,
         "here": here,
-        "card": on_card(config, kernels, here["share_of_matmul_rate"], config.suite.sizes.steps),
+        "card": on_card(config, kernels, here, steps),
+        "minutes_by_kernel_us": {us: card["minutes"] for us, card in cards.items()},
         "config": _plain(config),
         "provenance": provenance(("torch", "numpy")),
     }
@@ -283,19 +289,39 @@ def project(config: GpuSpringsConfig) -> dict[str, Any]:
     return content
 
 
-def on_card(config: GpuSpringsConfig, kernels: list[Kernel], measured_share: float, steps: int) -> dict[str, float]:
+def measured_here(kernels: list[Kernel], seconds: list[float], matmul_flop_per_s: float) -> dict[str, Any]:
+    """What a step is made of and how fast this machine does it."""
+    flop, step_s = sum(k.flop for k in kernels), statistics.median(seconds)
+    return {
+        "machine": processor(),
+        "threads": torch.get_num_threads(),
+        "step_s": seconds,
+        "median_step_s": step_s,
+        "flop_per_step": flop,
+        "bytes_per_step": sum(k.moved_bytes for k in kernels),
+        "kernels_per_step": len(kernels) + UPDATE_KERNELS,
+        "kernels_by_operation": dict(Counts(k.name for k in kernels).most_common()),
+        "flop_per_s": flop / step_s,
+        "matmul_flop_per_s": matmul_flop_per_s,
+        "share_of_matmul_rate": flop / step_s / matmul_flop_per_s,
+    }
+
+
+def on_card(config: GpuSpringsConfig, kernels: list[Kernel], here: Mapping[str, Any], steps: int) -> dict[str, float]:
     """Seconds of a step on the card, by each of its limits and with every kernel at its own limit; minutes of all.
 
     Args:
         config: the card.
         kernels: of a step.
-        measured_share: of this machine's matmul rate, taken where the config has none.
+        here: of `measured_here`; its share of the matmul rate is taken where the config has none.
         steps: of the run.
     """
-    share = config.share or min(1.0, measured_share)
-    rate, bandwidth, least = config.peak_tflops * 1e12 * share, config.bandwidth_gbs * 1e9, config.kernel_us * 1e-6
+    share = config.share or min(1.0, here["share_of_matmul_rate"])
+    peak = config.peak_tflops or H200_TFLOPS[config.precision]
+    rate, bandwidth, least = peak * 1e12 * share, config.bandwidth_gbs * 1e9, config.kernel_us * 1e-6
     step_s = sum(max(least, k.flop / rate, k.moved_bytes / bandwidth) for k in kernels) + UPDATE_KERNELS * least
     return {
+        "peak_tflops": peak,
         "share_of_peak": share,
         "products_s": sum(k.flop for k in kernels) / rate,
         "memory_s": sum(k.moved_bytes for k in kernels) / bandwidth,
@@ -315,19 +341,22 @@ def describe(content: dict[str, Any]) -> str:
     """The projection in words."""
     here, card = content["here"], content["card"]
     verdict = "below" if card["minutes"] <= card["target_minutes"] else "ABOVE"
+    other = ", ".join(f"{us} µs: {minutes:.1f} minutes" for us, minutes in content["minutes_by_kernel_us"].items())
+    most = ", ".join(f"{name} {number:,}" for name, number in list(here["kernels_by_operation"].items())[:5])
     return "\n".join(
         [
-            f"a step of {content['batch_size']} windows of {content['history_steps']} + {content['horizon_steps']} steps",
+            f"a step: {content['batch_size']} windows of {content['history_steps']} + {content['horizon_steps']} steps",
             f"  here ({here['machine']}, {here['threads']} threads): {here['median_step_s']:.3f} s",
             f"  {here['flop_per_step'] / 1e9:,.1f} GFLOP in products, {here['bytes_per_step'] / 1e9:,.2f} GB moved, "
-            f"{here['kernels_per_step']:,} kernels",
+            f"{here['kernels_per_step']:,} kernels (most of them {most})",
             f"  {here['flop_per_s'] / 1e9:,.1f} GFLOP/s, {here['share_of_matmul_rate']:.0%} of the rate of plain "
             f"products here ({here['matmul_flop_per_s'] / 1e9:,.1f} GFLOP/s)",
             "PROJECTION, not a measurement: on the card a step takes",
-            f"  {1e3 * card['products_s']:.1f} ms by products (at {card['share_of_peak']:.0%} of its peak), "
-            f"{1e3 * card['memory_s']:.1f} ms by memory, {1e3 * card['kernels_s']:.1f} ms by the number of kernels",
+            f"  {1e3 * card['products_s']:.1f} ms by products ({card['share_of_peak']:.0%} of {card['peak_tflops']:g} "
+            f"TFLOP/s), {1e3 * card['memory_s']:.1f} ms by memory, {1e3 * card['kernels_s']:.1f} ms by its kernels",
             f"  {1e3 * card['step_s']:.1f} ms with every kernel at its own limit; {card['steps']:,} steps: "
             f"{card['minutes']:.1f} minutes, {verdict} the target of {card['target_minutes']:g}",
+            f"  if the least a kernel takes is {other}",
         ]
     )
 

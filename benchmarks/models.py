@@ -11,8 +11,9 @@ from torch import Tensor
 
 from predictor.data.windows import WindowBatch
 from predictor.dgvae import DGVAE, PRESETS, DGVAEConfig
-from predictor.forecaster import Belief, Memory
+from predictor.forecaster import Belief, Memory, WindowOutput
 from predictor.objective import window_loss
+from predictor.runtime import Precision, precision
 from predictor.scene import AxisFrame, SceneSpec
 from predictor.train_config import TrainConfig
 
@@ -72,13 +73,23 @@ class TrainingStep:
         steps: of each window.
         batch: windows.
         rollout_steps: of the free run at the window's end; 0 trains teacher-forced only.
+        kind: precision of products.
     """
 
-    def __init__(self, config: DGVAEConfig, agents: int, steps: int, batch: int, rollout_steps: int = 0) -> None:
+    def __init__(
+        self,
+        config: DGVAEConfig,
+        agents: int,
+        steps: int,
+        batch: int,
+        rollout_steps: int = 0,
+        kind: Precision = "float32",
+    ) -> None:
         """Build model, optimiser and windows."""
         torch.manual_seed(0)
         self.model = DGVAE(box(agents), config, max(1, rollout_steps)).train()
         self.rollout_steps = rollout_steps
+        self._kind: Precision = kind
         self.last = steps - 1 - max(1, rollout_steps)
         self._optimizer = torch.optim.Adam(self.model.parameters(), lr=5e-4)
         states = 0.3 * torch.randn(batch, steps, agents, 4)
@@ -98,7 +109,11 @@ class TrainingStep:
     def __call__(self) -> None:
         """Make one step."""
         batch = self._batch
-        output = self.model.window(batch.states, batch.valid, batch.last_observed, self.rollout_steps, self._generator)
+        with precision(self._kind, "cpu"):
+            output = self.model.window(
+                batch.states, batch.valid, batch.last_observed, self.rollout_steps, self._generator
+            )
+        output = WindowOutput(*(None if t is None else t.float() for t in output))  # type: ignore[arg-type]
         loss, _ = window_loss(self.model, batch, output, self._config, 1.0)
         self._optimizer.zero_grad(set_to_none=True)
         loss.backward()

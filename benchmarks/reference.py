@@ -39,6 +39,10 @@ REFERENCE: dict[str, Any] = {
 """Its settings, as its own scripts set them for a dynamic graph."""
 
 
+AS_SHIPPED = "the reference with torch's own choice of library"
+"""`predictor.runtime.tune` sets who multiplies for the whole process, the reference included; here it is undone."""
+
+
 class Training(NamedTuple):
     """Shape of a training step."""
 
@@ -114,13 +118,17 @@ def _training(model_class: Any, meter: Meter) -> list[Row]:
         optimizer.step()
 
     ours = TrainingStep(EQUAL, shape.agents, shape.steps, shape.batch)
-    timings = meter.measure({"reference": step, "ours": ours})
+    timings = meter.measure({"reference": step, AS_SHIPPED: as_shipped(step), "ours": ours})
     what = shape._asdict()
     sizes = [
         Row("reference", f"parameters, {name}", {}, float(parameters(model)), "")
         for name, model in (("reference", theirs), ("ours at equal sizes", ours.model))
     ]
-    return [*sizes, *_pair("training step", what, timings["reference"], timings["ours"])]
+    return [
+        *sizes,
+        *_pair("training step", what, timings["reference"], timings["ours"]),
+        *_pair(f"training step, {AS_SHIPPED}", what, timings[AS_SHIPPED], timings["ours"]),
+    ]
 
 
 def _pair(name: str, what: dict[str, Any], theirs: Timing, ours: Timing) -> list[Row]:
@@ -143,6 +151,7 @@ def _prediction(model_class: Any, meter: Meter) -> list[Row]:
     timings = meter.time_blocks(
         {
             "reference": lambda: _seconds(whole),
+            AS_SHIPPED: lambda: _seconds(as_shipped(whole)),
             "reference, free run": inference(lambda: free_run_seconds(theirs, states, shape.future)),
             "streamed": lambda: _seconds(streamed),
             "anew": lambda: _seconds(anew),
@@ -151,6 +160,7 @@ def _prediction(model_class: Any, meter: Meter) -> list[Row]:
     what, free = shape._asdict(), {"batch": shape.batch, "agents": shape.agents, "future": shape.future}
     return [
         *_pair("prediction, our history streamed", what, timings["reference"], timings["streamed"]),
+        *_pair(f"prediction, our history streamed, {AS_SHIPPED}", what, timings[AS_SHIPPED], timings["streamed"]),
         *_pair("free run alone", free, timings["reference, free run"], timings["streamed"]),
         *_pair("prediction, both encode the history", what, timings["reference"], timings["anew"]),
     ]
@@ -190,6 +200,20 @@ def free_run_seconds(model: Any, states: torch.Tensor, future: int) -> float:
         logits, prior_hidden = model.encoder.single_step_forward(predicted, prior_hidden)
         predicted, hidden, _ = model.single_step_forward(predicted, hidden, logits, True)
     return time.perf_counter() - began
+
+
+def as_shipped(call: Callable[[], Any]) -> Callable[[], Any]:
+    """The same with products as torch does them by default."""
+
+    def untuned() -> Any:
+        before = torch.get_float32_matmul_precision()
+        torch.set_float32_matmul_precision("highest")
+        try:
+            return call()
+        finally:
+            torch.set_float32_matmul_precision(before)
+
+    return untuned
 
 
 def _seconds(call: Callable[[], Any]) -> float:

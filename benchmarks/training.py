@@ -50,6 +50,7 @@ def run(settings: Settings) -> list[Row]:
     """Every shape; then memory, then the allocator."""
     cases = CASES[settings.mode]
     rows = [row for case in cases for row in _speed(case, Meter.of(settings))]
+    rows.append(_bfloat16(cases[-1], Meter.of(settings)))
     rows += _memory(cases if not settings.quick else cases[:1], settings.threads)
     return [*rows, _allocator(settings)]
 
@@ -71,6 +72,15 @@ def _speed(case: Case, meter: Meter) -> list[Row]:
     steps = rate_row("training", _name(case), what, timing, 1, "steps/s", flop=flop)
     windows = rate_row("training", f"{_name(case)}, windows", what, timing, case.batch, "windows/s")
     return [steps, replace(windows, compared=None)]  # the same number twice
+
+
+def _bfloat16(case: Case, meter: Meter) -> Row:
+    shape = (case.agents, case.steps, case.batch, case.rollout)
+    steps = {kind: TrainingStep(sized(case.preset), *shape, kind) for kind in ("float32", "bfloat16")}
+    timings = meter.measure(steps)
+    ratios = timings["float32"].seconds / timings["bfloat16"].seconds
+    row = ratio_row("training", f"{_name(case)}, float32 / bfloat16", case._asdict(), ratios, "--precision bfloat16")
+    return replace(row, compared=None)  # says something about the processor
 
 
 def _memory(cases: tuple[Case, ...], threads: int) -> list[Row]:

@@ -30,6 +30,7 @@ from predictor.dgvae import DGVAE, PRESETS
 from predictor.errors import UserError, run_entry_point
 from predictor.forecaster import Forecaster
 from predictor.provenance import provenance, write_json
+from predictor.runtime import tune
 from predictor.scene import SceneSpec
 
 
@@ -106,6 +107,7 @@ def main() -> None:
     """Entry point."""
     config = tyro.cli(OverheadConfig, description=__doc__)
     config.check()
+    tune()
     torch.set_num_threads(config.threads)
     plain, scenes = (make_rows(config.env_id, config.envs, config.vec, scenes) for scenes in (False, True))
     paper = paper_sized(scenes) if config.paper_size else None

@@ -29,6 +29,7 @@ from predictor.forecaster import Forecaster
 from predictor.metrics import COVERAGE_SHARE
 from predictor.plots import plot_error_by_horizon, plot_scene
 from predictor.provenance import provenance, write_json
+from predictor.runtime import tune
 from predictor.scene import SceneSpec
 
 SCALARS = (
@@ -258,6 +259,7 @@ def main() -> None:
     """Entry point."""
     config = tyro.cli(EvaluateConfig, description=__doc__)
     config.check()
+    tune(config.device)
     subject = _load(config)
     rows = _evaluate(config, subject)
     title = f"{config.checkpoint} on {config.data}"

@@ -146,6 +146,8 @@ def concrete_sample(
         generator: source of the Gumbel noise.
         hard: one-hot samples whose gradient is that of the soft ones (straight-through).
     """
+    if logits.dtype in (torch.bfloat16, torch.float16):
+        logits = logits.float()  # the tails of the noise are what draws the rare type
     uniform = torch.rand(logits.shape, generator=generator, device=logits.device, dtype=logits.dtype)
     tiny = torch.finfo(logits.dtype).tiny
     gumbel = -torch.log(-torch.log(uniform.clamp(tiny, 1 - torch.finfo(logits.dtype).eps)))

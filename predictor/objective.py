@@ -18,7 +18,12 @@ Terms = dict[str, Tensor]
 
 
 def window_loss(
-    model: TrainableForecaster, batch: WindowBatch, output: WindowOutput, config: TrainConfig, kl_scale: float = 1.0
+    model: TrainableForecaster,
+    batch: WindowBatch,
+    output: WindowOutput,
+    config: TrainConfig,
+    kl_scale: float | Float[Tensor, ""] = 1.0,
+    scales: Float[Tensor, " state"] | None = None,
 ) -> tuple[Float[Tensor, ""], Terms]:
     """The objective and its terms for one batch of windows.
 
@@ -28,8 +33,10 @@ def window_loss(
         output: what the model made of them.
         config: weights.
         kl_scale: share of the KL's full weight (warm-up).
+        scales: the spec's feature scales on the batch's device; None copies them there, which a captured step cannot.
     """
-    scales = torch.tensor(model.spec.feature_scales, device=batch.states.device)
+    if scales is None:
+        scales = torch.tensor(model.spec.feature_scales, device=batch.states.device)
     rows = torch.arange(len(batch.states), device=batch.states.device)
     both = batch.valid[:, 1:] & batch.valid[:, :-1]
     terms: Terms = {}
@@ -51,7 +58,9 @@ def window_loss(
     return total, {k: v.detach() for k, v in terms.items()}
 
 
-def _graph_loss(batch: WindowBatch, output: WindowOutput, config: TrainConfig, kl_scale: float) -> tuple[Tensor, Terms]:
+def _graph_loss(
+    batch: WindowBatch, output: WindowOutput, config: TrainConfig, kl_scale: float | Tensor
+) -> tuple[Tensor, Terms]:
     assert output.prior_logits is not None and output.posterior_logits is not None
     prior, posterior = output.prior_logits, output.posterior_logits
     pairs = pair_mask(batch.valid)

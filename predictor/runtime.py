@@ -22,10 +22,15 @@ _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4
 _LARGEST = 2**31 - 1
 
 
-def tune() -> None:
-    """Settings for a process of our own: freed memory is kept, products take the faster library."""
+def tune(device: str = "cpu") -> None:
+    """Settings for a process of our own: freed memory is kept, products take the faster library.
+
+    Args:
+        device: where tensors live; the setting behind the second would let products on CUDA round to TF32.
+    """
     keep_freed_memory()
-    prefer_onednn()
+    if device == "cpu":
+        prefer_onednn()
 
 
 @cache
@@ -77,17 +82,6 @@ def precision(kind: Precision, device: str) -> Iterator[None]:
     """Products at this precision while it lasts, by autocast; pays where the processor multiplies bfloat16 natively."""
     with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=kind == "bfloat16"):
         yield
-
-
-@contextlib.contextmanager
-def matmul_precision(kind: Precision) -> Iterator[None]:
-    """Matrix products of float32 tensors at this precision, while it lasts; of torch's global setting."""
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("medium" if kind == "bfloat16" else "highest")
-    try:
-        yield
-    finally:
-        torch.set_float32_matmul_precision(before)
 
 
 def processor() -> str:

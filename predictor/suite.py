@@ -25,11 +25,12 @@ from predictor.data.store import read_info_of
 from predictor.errors import UserError, run_entry_point
 from predictor.plots import plot_rows_by_step
 from predictor.provenance import provenance, write_json
+from predictor.runtime import tune
 from predictor.suite_measure import measure_row
 from predictor.suite_report import latex_table, markdown_report
 from predictor.tables import BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, TABLES, Budget, Row, Sizes
 from predictor.train import train
-from predictor.train_config import TrainConfig
+from predictor.train_config import TrainConfig, TrainPrecision
 
 TableName = Literal["springs", "recipe", "mocap", "nba", "sdd", "ind"]
 
@@ -56,6 +57,8 @@ class SuiteConfig:
     """Of training and of the samples."""
     device: str = "cpu"
     """"cpu" or "cuda"."""
+    precision: TrainPrecision = "float32"
+    """Of matrix products in training (see `python -m predictor.train --help`); measuring is done in float32."""
     only_row: str = ""
     """Run this row in this very process; what the suite itself calls."""
 
@@ -75,6 +78,8 @@ class SuiteConfig:
                 raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
         if self.device.startswith("cuda") and not torch.cuda.is_available():
             raise UserError(f"device '{self.device}' asked for but torch sees no CUDA device; use --device cpu")
+        if self.precision == "tf32" and not self.device.startswith("cuda"):
+            raise UserError("precision 'tf32' needs a CUDA device; use --precision float32 or --device cuda")
         missing = [s for s in (table.train, table.val, *table.tests.values()) if s and not (self.data / s).exists()]
         if missing:
             commands = "; ".join(c.format(data=self.data) for c in table.commands)
@@ -120,6 +125,7 @@ def row_config(config: SuiteConfig, row: Row, out: Path) -> TrainConfig:
         patience=1000,
         seed=config.seed,
         device=config.device,
+        precision=config.precision,
         threads=0 if config.device != "cpu" else max(1, (os.cpu_count() or 1) // config.workers),
         resume=True,
     )
@@ -136,8 +142,10 @@ def row_folder(config: SuiteConfig, row: Row) -> Path:
     }
     if row.model not in ("constant-velocity", "least-squares"):
         values = asdict(row_config(config, row, Path()))
-        for name in ("data", "val_data", "out", "threads", "device", "resume"):
+        for name in ("data", "val_data", "out", "threads", "device", "data_device", "capture", "resume"):
             del values[name]
+        if values["precision"] == "float32":
+            del values["precision"]  # rows that were trained before there was a choice keep their folder
         content["train"] = values
     digest = hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:10]
     return config.folder / "rows" / f"{row.key}-{digest}"
@@ -251,7 +259,8 @@ def _start(config: SuiteConfig, row: Row) -> "tuple[subprocess.Popen[bytes], Pat
     command = [
         sys.executable, "-m", "predictor.suite", "--table", config.table, "--data", str(config.data),
         "--out", str(config.out), "--budget", config.budget, "--steps", str(config.steps), "--jobs",
-        str(config.workers), "--seed", str(config.seed), "--device", config.device, "--only-row", row.key,
+        str(config.workers), "--seed", str(config.seed), "--device", config.device,
+        "--precision", config.precision, "--only-row", row.key,
     ]  # fmt: skip
     with log.open("wb") as stream:
         return subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT), log
@@ -269,6 +278,7 @@ def main() -> None:
     """Entry point."""
     config = tyro.cli(SuiteConfig, description=__doc__)
     config.check()
+    tune(config.device)
     if config.only_row:
         run_row(config, next(r for r in TABLES[config.table].rows if r.key == config.only_row))
         return

@@ -5,7 +5,7 @@ The best checkpoint is chosen by free-running minADE on held-out episodes, not b
 
 import json
 import time
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +17,16 @@ from torch.utils.tensorboard import SummaryWriter
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.errors import UserError, run_entry_point
 from predictor.provenance import provenance, write_json
+from predictor.runtime import tune
 from predictor.train_config import TrainConfig
-from predictor.trainer import Trainer, load_data
+from predictor.trainer import LOG_EVERY, Trainer, load_data
 
 
 def train(config: TrainConfig) -> Path:
     """Train until done or stale; returns the folder of the best checkpoint."""
     state_file, config_file = config.out / "train_state.pt", config.out / "config.json"
     _check_run_folder(config, config_file)
+    tune(config.device)
     if config.threads:
         torch.set_num_threads(config.threads)
     data = load_data(config)
@@ -34,34 +36,47 @@ def train(config: TrainConfig) -> Path:
         trainer.restore(state_file)
     made = provenance(("torch", "numpy", "zarr", "safetensors"))
     write_json(config_file, {"config": _comparable(config), "provenance": made})
-    columns = (
-        TextColumn("train"),
-        BarColumn(20),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
-    )
-    note = ""
-    with SummaryWriter(str(config.out / "tb"), purge_step=trainer.step) as writer, Progress(*columns) as progress:
-        task = progress.add_task("", total=config.steps, completed=trainer.step, note="")
-        while not trainer.finished:
-            began = time.perf_counter()
-            terms = trainer.train_step()
-            terms["steps_per_s"] = 1 / (time.perf_counter() - began)
-            if trainer.step % config.eval_every == 0 or trainer.step == config.steps:
-                note = _validate_and_save(trainer, writer, made)
-                trainer.save(state_file)
-            if trainer.step % 25 == 0:
-                for name, value in terms.items():
-                    writer.add_scalar(f"train/{name}", value, trainer.step)
-            shown = " ".join(f"{k} {terms[k]:.3g}" for k in ("nll_rollout", "nll_one_step", "kl") if k in terms)
-            progress.update(task, completed=trainer.step, note=f"{shown} {note}")
+    try:
+        _run(trainer, state_file, made)
+    finally:
+        trainer.close()
     if not (config.out / "checkpoint").exists():
         raise UserError(
             f"no validation episode has {config.horizon_steps} steps of future, so no checkpoint was chosen; "
             "lower --horizon-steps or collect longer episodes"
         )
     return config.out / "checkpoint"
+
+
+def _run(trainer: Trainer, state_file: Path, made: dict[str, Any]) -> None:
+    """Step, look, validate and save, until the run is finished."""
+    config, columns = trainer.config, (TextColumn("train"), BarColumn(20), MofNCompleteColumn(), TimeRemainingColumn())
+    note, said = "", 0
+    with (
+        SummaryWriter(str(config.out / "tb"), purge_step=trainer.step) as writer,
+        Progress(*columns, TextColumn("{task.fields[note]}")) as progress,
+    ):
+        task = progress.add_task("", total=config.steps, completed=trainer.step, note="")
+        began, since = time.perf_counter(), trainer.step
+        while not trainer.finished:
+            terms = trainer.train_step()
+            for line in trainer.notes[said:]:
+                progress.console.print(line, highlight=False)
+            said = len(trainer.notes)
+            due = trainer.step % config.eval_every == 0 or trainer.step == config.steps
+            if not due and trainer.step % trainer.read_every:
+                continue
+            seen = trainer.read(terms)
+            seen["steps_per_s"] = (trainer.step - since) / (time.perf_counter() - began)
+            if due:
+                note = _validate_and_save(trainer, writer, made)
+                trainer.save(state_file)
+            if trainer.step % LOG_EVERY == 0:
+                for name, value in seen.items():
+                    writer.add_scalar(f"train/{name}", value, trainer.step)
+            shown = " ".join(f"{k} {seen[k]:.3g}" for k in ("nll_rollout", "nll_one_step", "kl") if k in seen)
+            progress.update(task, completed=trainer.step, note=f"{shown} {note}")
+            began, since = time.perf_counter(), trainer.step
 
 
 def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, Any]) -> str:
@@ -96,7 +111,7 @@ def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, 
 
 def _comparable(config: TrainConfig) -> dict[str, Any]:
     values = asdict(config)
-    for name in ("resume", "threads", "device"):
+    for name in ("resume", "threads", "device", "data_device", "capture"):
         del values[name]
     values["data"] = [str(p) for p in config.data]
     values["val_data"] = [str(p) for p in config.val_data]
@@ -116,9 +131,11 @@ def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
         before, now = json.loads(config_file.read_text())["config"], _comparable(config)
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{config_file} cannot be read ({error}); train anew into another --out") from error
+    defaults = {f.name: f.default for f in fields(TrainConfig)}  # of fields that a run begun earlier did not know
     for name, value in now.items():
-        if name != "steps" and before.get(name) != value:
-            raise UserError(f"cannot resume: {name} was {before.get(name)} and is now {value}; use the same arguments")
+        known = before.get(name, defaults[name])
+        if name != "steps" and known != value:
+            raise UserError(f"cannot resume: {name} was {known} and is now {value}; use the same arguments")
 
 
 def main() -> None:

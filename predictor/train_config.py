@@ -3,13 +3,17 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 
 from predictor.errors import UserError
 from predictor.losses import Likelihood
 from predictor.models import ModelName
+
+TrainPrecision = Literal["float32", "tf32", "bfloat16"]
+DataDevice = Literal["auto", "cpu", "device"]
+Capture = Literal["auto", "off"]
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,14 @@ class TrainConfig:
     """Drives initial weights, split, order and noise."""
     device: str = "cpu"
     """"cpu" or "cuda"."""
+    precision: TrainPrecision = "float32"
+    """Of matrix products in training: "tf32" (CUDA) rounds their inputs to 10 bits, which tensor cores multiply;
+    "bfloat16" rounds inputs and results to 7 (autocast). Weights, memories and losses stay float32."""
+    data_device: DataDevice = "auto"
+    """Where windows are cut: by the CPU, or on the training device, which then holds all the data. "auto" takes the
+    device if that is CUDA and the data fits into half of its free memory."""
+    capture: Capture = "auto"
+    """"auto" records training steps as CUDA graphs where that is possible; "off" launches kernels one by one."""
     threads: int = 0
     """CPU threads for torch; 0 leaves torch's choice."""
     resume: bool = False
@@ -117,7 +129,19 @@ class TrainConfig:
         ):  # fmt: skip
             if not 0 <= getattr(self, name) < math.inf:
                 raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
+        self._check_machine()
+
+    def _check_machine(self) -> None:
         if self.device != "cpu" and not self.device.startswith("cuda"):
             raise UserError(f"device must be 'cpu' or 'cuda', got '{self.device}'")
-        if self.device.startswith("cuda") and not torch.cuda.is_available():
+        for name, kind in (("precision", TrainPrecision), ("data_device", DataDevice), ("capture", Capture)):
+            if getattr(self, name) not in get_args(kind):
+                raise UserError(f"{name} must be one of {', '.join(get_args(kind))}, got '{getattr(self, name)}'")
+        if not self.device.startswith("cuda"):
+            if self.precision == "tf32":
+                raise UserError("precision 'tf32' needs a CUDA device; use --precision float32 or --device cuda")
+            return
+        if not torch.cuda.is_available():
             raise UserError(f"device '{self.device}' asked for but torch sees no CUDA device; use --device cpu")
+        if self.precision == "bfloat16" and not torch.cuda.is_bf16_supported(including_emulation=False):
+            raise UserError(f"device '{self.device}' has no bfloat16 arithmetic; use --precision float32")

@@ -7,24 +7,41 @@ that was not.
 import math
 import os
 import pickle
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from predictor.accuracy import Accuracy, fitted_std_m, run_windows, summarise
 from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.capture import (
+    CapturedStep,
+    CudaRecorder,
+    NotCapturableError,
+    Recorder,
+    default_generator,
+    signature,
+)
 from predictor.codec import Residual, StateCodec, drift
 from predictor.data.store import Episode, EpisodeStore, read_store
-from predictor.data.windows import WindowBatch, Windows, concatenate, split_episodes
+from predictor.data.windows import WindowBatch, Windows, split_episodes
 from predictor.errors import UserError
+from predictor.feed import Plan, open_feed, plan
+from predictor.forecaster import WindowOutput
 from predictor.models import build, configure
 from predictor.objective import window_loss
+from predictor.runtime import precision
 from predictor.scene import SceneSpec
 from predictor.train_config import TrainConfig
+
+LOG_EVERY = 25
+"""Steps between two points of the training curves; on a CUDA device also between two looks at the numbers."""
 
 
 @dataclass(frozen=True)
@@ -147,60 +164,156 @@ def model_config(config: TrainConfig, data: TrainingData) -> Any:
     return configure(config.model, config.preset, config.set, **fitted)
 
 
+@contextmanager
+def _tensor_cores(allowed: bool) -> Iterator[None]:
+    """Let products of float32 on CUDA round their inputs to TF32 while it lasts; else leave torch's setting."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if allowed else before)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
 class Trainer:
-    """One training run: model, optimiser, data, and where it stands."""
+    """One training run: model, optimiser, data, and where it stands.
+
+    On a CUDA device a step is recorded and replayed (`predictor.capture`), the data lives there if it fits, and nothing
+    is read back between calls of `read`.
+    """
 
     def __init__(self, config: TrainConfig, data: TrainingData) -> None:
         """Build everything from the config and the seed."""
         self.config = config
         self.data = data
         self.device = torch.device(config.device)
+        on_cuda = self.device.type == "cuda"
+        if on_cuda and self.device.index is not None:
+            torch.cuda.set_device(self.device)
         torch.manual_seed(config.seed)
         self.model: Any = build(config.model, data.spec, model_config(config, data), config.horizon_steps)
         self.model.to(self.device)
-        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=config.lr)
         self.step = 0
         self.best = math.inf
         self.stale = 0
         self.baseline_m = self._baseline()
+        self.noise = torch.Generator(device=self.device)
+        source = open_feed(config, data.train, self.device)
+        self.feed, self.notes = source.feed, source.notes
+        self.read_every = LOG_EVERY if on_cuda else 1
+        self._looks = not on_cuda
+        self._recorder: Recorder | None = CudaRecorder(self.device, self.noise) if source.capture else None
+        self._recorded: dict[Any, CapturedStep] = {}
+        self.optimizer = self._adam(capturable=source.capture)
+        self._scales = torch.tensor(data.spec.feature_scales, device=self.device)
+        self._kl_scale = torch.ones((), device=self.device)
+        self._finite = torch.ones((), dtype=torch.bool, device=self.device)
+        self._finite_until = 0
 
     @property
     def finished(self) -> bool:
         """All steps done, or no progress for `patience` validations."""
         return self.step >= self.config.steps or self.stale >= self.config.patience
 
-    def train_step(self) -> dict[str, float]:
-        """One optimiser step; the batch and all noise depend on (seed, step) alone."""
-        config = self.config
-        rng = np.random.default_rng([config.seed, 1, self.step])
-        torch.manual_seed(int(rng.integers(2**62)))  # dropout
-        generator = torch.Generator(device=self.device).manual_seed(int(rng.integers(2**62)))
-        history = config.history_steps
-        if config.min_history_steps:
-            history = int(rng.integers(config.min_history_steps, config.history_steps + 1))
-        batch = self._draw(self.data.train, rng, config.batch_size, history).to(self.device)
-        for group in self.optimizer.param_groups:
-            group["lr"] = config.lr * _schedule(self.step, config.steps)
-        self.model.train()
-        output = self.model.window(batch.states, batch.valid, batch.last_observed, self._rollout_steps(), generator)
-        warm = min(1.0, (self.step + 1) / config.kl_warmup_steps) if config.kl_warmup_steps else 1.0
-        loss, terms = window_loss(self.model, batch, output, config, warm)
-        if not torch.isfinite(loss):
-            raise UserError(f"the loss is {float(loss.detach())} at step {self.step}; lower --lr or check the data")
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), config.clip_norm)
-        self.optimizer.step()
-        self.step += 1
-        return {"loss": float(loss.detach()), "grad_norm": float(norm), **{k: float(v) for k, v in terms.items()}}
+    def train_step(self) -> Mapping[str, Tensor]:
+        """One optimiser step; the batch and all noise depend on (seed, step) alone.
 
-    def _rollout_steps(self) -> int:
-        config = self.config
-        if not config.rollout_weight:
-            return 0
-        if self.step >= config.curriculum_steps:
-            return config.horizon_steps
-        return 1 + (config.horizon_steps - 1) * self.step // config.curriculum_steps
+        Returns:
+            Loss, gradient norm and the objective's terms, on the device; a later step may overwrite them.
+
+        Raises:
+            UserError: the loss is not finite (on a CUDA device, `read` says so).
+        """
+        now = self.plan(self.step)
+        batch = self.feed.batch(now)
+        torch.manual_seed(now.dropout_seed)
+        self.noise.manual_seed(now.noise_seed)
+        for group in self.optimizer.param_groups:
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(now.lr)
+            else:
+                group["lr"] = now.lr
+        self._kl_scale.fill_(now.kl_scale)
+        self.model.train()
+        if self._recorder is not None:
+            terms = self._replayed(self._recorder, batch, now.rollout_steps)
+        else:
+            terms = self._optimise(batch, now.rollout_steps)
+        self.step += 1
+        return terms
+
+    def plan(self, step: int) -> Plan:
+        """Batch, seeds and schedules of a step."""
+        return plan(self.config, [len(w) for w in self.data.train], step)
+
+    def read(self, terms: Mapping[str, Tensor]) -> dict[str, float]:
+        """Numbers of the latest step; waits for the device.
+
+        Raises:
+            UserError: the loss was not finite in a step since the last reading.
+        """
+        first, self._finite_until = self._finite_until, self.step
+        finite, *values = torch.stack([self._finite, *terms.values()]).tolist()
+        if not finite:
+            raise UserError(
+                f"the loss was not finite in some step from {first} to {self.step - 1}; lower --lr or check the data"
+            )
+        return dict(zip(terms, values, strict=True))
+
+    def _optimise(self, batch: WindowBatch, rollout_steps: int) -> Mapping[str, Tensor]:
+        """Forward, loss, backward, clipping, update; on a CUDA device the host never looks at a result."""
+        kind = self.config.precision
+        with _tensor_cores(kind == "tf32"):
+            with precision("bfloat16" if kind == "bfloat16" else "float32", self.device.type):
+                output = self.model.window(batch.states, batch.valid, batch.last_observed, rollout_steps, self.noise)
+            exact = WindowOutput(*(None if t is None else t.float() for t in output))  # type: ignore[arg-type]
+            loss, terms = window_loss(self.model, batch, exact, self.config, self._kl_scale, self._scales)
+            if self._looks and not torch.isfinite(loss):
+                raise UserError(f"the loss is {float(loss.detach())} at step {self.step}; lower --lr or check the data")
+            self.optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.clip_norm)
+        self.optimizer.step()
+        self._finite.logical_and_(torch.isfinite(loss.detach()))
+        return {"loss": loss.detach(), "grad_norm": norm, **terms}
+
+    def _replayed(self, recorder: Recorder, batch: WindowBatch, rollout_steps: int) -> Mapping[str, Tensor]:
+        """The same from a recording, made where there is none for this kind of batch."""
+        key = (rollout_steps, signature(batch))
+        if key not in self._recorded:
+            if any(steps != rollout_steps for steps, _ in self._recorded):  # the free run has grown, and never shrinks
+                self._forget()
+            try:
+                self._recorded[key] = CapturedStep(
+                    partial(self._optimise, rollout_steps=rollout_steps),
+                    batch,
+                    self._state,
+                    (self.noise, default_generator(self.device)),
+                    recorder,
+                )
+            except NotCapturableError as error:
+                self._recorder = None
+                self.notes = (*self.notes, f"steps are not captured: {error}")
+                return self._optimise(batch, rollout_steps)
+        return self._recorded[key](batch)
+
+    def _state(self) -> list[Tensor]:
+        """Everything that a step changes."""
+        moments = (v for values in self.optimizer.state.values() for v in values.values() if isinstance(v, Tensor))
+        return [*self.model.parameters(), *self.model.buffers(), *moments, self._finite]
+
+    def _forget(self) -> None:
+        self._recorded.clear()
+        if self._recorder is not None:
+            self._recorder.forget()
+
+    def _adam(self, capturable: bool) -> torch.optim.Adam:
+        """Adam; captured, its rate is a tensor, and running it uncaptured for a while is no mistake."""
+        rate: Any = torch.tensor(self.config.lr, device=self.device) if capturable else self.config.lr
+        fused = True if self.device.type == "cuda" else None
+        optimizer = torch.optim.Adam(self.model.parameters(), lr=rate, capturable=capturable, fused=fused)
+        optimizer._warned_capturable_if_run_uncaptured = True
+        return optimizer
 
     def validate(self) -> tuple[Accuracy, tuple[float, ...]]:
         """Free-running accuracy of the most likely forecast on held-out episodes, and its spread."""
@@ -225,15 +338,24 @@ class Trainer:
         os.replace(partial, path)
 
     def restore(self, path: Path) -> None:
-        """Continue from a saved training state."""
+        """Continue from a saved training state, of this kind of device or another."""
+        self._forget()  # recordings know tensors that are replaced here
         try:
             state = torch.load(path, weights_only=True, map_location=self.device)
             self.model.load_state_dict(state["model"])
+            # how Adam runs is this run's own; what it remembers is the saved one's
+            groups = zip(self.optimizer.state_dict()["param_groups"], state["optimizer"]["param_groups"], strict=True)
+            state["optimizer"]["param_groups"] = [ours | {"params": theirs["params"]} for ours, theirs in groups]
             self.optimizer.load_state_dict(state["optimizer"])
             self.step, self.best, self.stale = int(state["step"]), float(state["best"]), int(state["stale"])
-        except (RuntimeError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
+            self._finite_until = self.step
+        except (RuntimeError, KeyError, TypeError, ValueError, EOFError, pickle.UnpicklingError) as error:
             reason = " ".join(str(error).split())[:200]
             raise UserError(f"{path} cannot be read ({reason}); train anew into another --out") from error
+
+    def close(self) -> None:
+        """Stop what prepares batches."""
+        self.feed.close()
 
     def _baseline(self) -> float:
         spec, steps = self.data.spec, self.config.horizon_steps
@@ -244,16 +366,3 @@ class Trainer:
         share = max(1, self.config.val_windows // len(self.data.val))
         rng = np.random.default_rng([self.config.seed, 2])
         return [(w, rng.permutation(len(w))[:share]) for w in self.data.val]
-
-    def _draw(self, windows: Sequence[Windows], rng: np.random.Generator, size: int, history: int) -> WindowBatch:
-        sizes = np.array([len(w) for w in windows])
-        counts = rng.multinomial(size, sizes / sizes.sum())
-        drawn = zip(windows, counts, strict=True)
-        return concatenate([w.batch(rng.integers(len(w), size=c), history) for w, c in drawn if c])
-
-
-def _schedule(step: int, steps: int, warmup: int = 100) -> float:
-    if step < warmup:
-        return (step + 1) / warmup
-    progress = (step - warmup) / max(1, steps - warmup)
-    return 0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))

@@ -223,7 +223,8 @@ class DNRI(UnrolledForecaster):
         one_step = self.codec.advance(states, self.change(inputs, valid, (nodes[:, 1:],)))
         rollout = one_step.new_zeros(*states[:, 0].shape[:2], 0, states.shape[-1])
         if rollout_steps:
-            past = slice(int(last_observed.max()))
+            # the longest history; asking a GPU for it would make it wait
+            past = slice(states.shape[1] if last_observed.is_cuda else int(last_observed.max()))
             expected = self.expected(edges.prior_logits[:, past])
             (before,) = self.remember(inputs[:, past], valid[:, past], expected, empty.nodes)
             now = (torch.arange(len(states), device=states.device), last_observed)

@@ -4,14 +4,16 @@ History is masked to perception (range and nearest N at each step). After the la
 then are followed for as long as they exist, seen or not: that is the truth a forecast is judged by.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from predictor.data.flat import UNKNOWN_TYPE, Casts, Cut, cast, cut, flatten
 from predictor.data.store import Episode
 from predictor.errors import UserError
 from predictor.scene import SceneSpec
@@ -34,8 +36,16 @@ class WindowBatch:
 
     def to(self, device: torch.device) -> "WindowBatch":
         """The same windows on another device."""
-        tensors = (self.states, self.valid, self.last_observed, self.edge_types, self.edge_attributes)
-        return WindowBatch(*(None if t is None else t.to(device) for t in tensors))  # type: ignore[arg-type]
+        return self._each(lambda tensor: tensor.to(device))
+
+    def pinned_to(self, device: torch.device) -> "WindowBatch":
+        """The same windows on an accelerator, by a copy that neither side waits for."""
+        return self._each(lambda tensor: tensor.pin_memory().to(device, non_blocking=True))
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> "WindowBatch":
+        given = {f.name: getattr(self, f.name) for f in fields(self)}
+        changed: dict[str, Any] = {name: None if tensor is None else change(tensor) for name, tensor in given.items()}
+        return WindowBatch(**changed)
 
 
 def visible(episode: Episode, spec: SceneSpec) -> Bool[np.ndarray, "time agents"]:
@@ -76,23 +86,20 @@ class Windows:
         self.spec = spec
         self.history_steps = history_steps
         self.horizon_steps = horizon_steps
-        self._states = [e.states for e in episodes]
-        self._present = [e.valid for e in episodes]
-        self._visible = [visible(e, spec) for e in episodes]
-        self._labels = [(e.edge_types, e.edge_attributes) for e in episodes]
-        self.index = np.array(
-            [
-                (i, t)
-                for i, e in enumerate(episodes)
-                for t in range(min_history_steps - 1, len(e.states) - min_future_steps)
-            ],
-            dtype=np.int64,
-        ).reshape(-1, 2)
+        lengths = np.array([len(e.states) for e in episodes], dtype=np.int64)
+        self.index = _index(lengths, min_history_steps - 1, min_future_steps)
         if not len(self.index):
             raise UserError(
-                f"no window fits: episodes have at most {max((len(e.states) for e in episodes), default=0)} steps, "
+                f"no window fits: episodes have at most {lengths.max(initial=0)} steps, "
                 f"a window needs {min_history_steps + min_future_steps}"
             )
+        self.flat = flatten(
+            [e.states for e in episodes],
+            [e.valid for e in episodes],
+            [visible(e, spec) for e in episodes],
+            [e.edge_types for e in episodes],
+            [e.edge_attributes for e in episodes],
+        )
 
     def __len__(self) -> int:
         """Number of windows."""
@@ -104,68 +111,44 @@ class Windows:
         Args:
             indices: which windows.
             history_steps: a shorter history than the longest one.
+
+        Raises:
+            UserError: the ego is missing at an observed step.
         """
-        cuts = [
-            self._cut(episode, now, history_steps or self.history_steps)
-            for episode, now in self.index[indices].tolist()
-        ]
-        agents = max(len(cut.columns) for cut in cuts)
-        time = max(cut.last for cut in cuts) + 1 + self.horizon_steps
-        states = np.zeros((len(cuts), time, agents, self.spec.num_features), dtype=np.float32)
-        valid = np.zeros((len(cuts), time, agents), dtype=np.bool_)
-        for row, cut in enumerate(cuts):
-            steps, seen = cut.seen.shape
-            states[row, :steps, :seen] = cut.states
-            valid[row, :steps, :seen] = cut.seen
-        types, attributes = (self._edge_labels(cuts, which, valid) for which in (0, 1))
-        last_observed = np.array([cut.last for cut in cuts], dtype=np.int64)
-        return WindowBatch(
-            torch.from_numpy(states), torch.from_numpy(valid), torch.from_numpy(last_observed), types, attributes
-        )
+        history = history_steps or self.history_steps
+        episode, now = (torch.from_numpy(column) for column in self.index[indices].T.copy())
+        casts = self.cast(episode, now, history)
+        agents = int(casts.size.max())
+        time = min(history, int(now.max()) + 1) + self.horizon_steps
+        return window_batch(cut(self.flat, episode, now, casts, history, self.horizon_steps, time, agents))
 
-    def _edge_labels(self, cuts: "Sequence[_Cut]", which: int, valid: np.ndarray) -> Tensor | None:
-        first = self._labels[cuts[0].episode][which]
-        if first is None:
-            return None
-        batch, time, agents = valid.shape
-        padded = np.full((batch, time, agents, agents, *first.shape[3:]), -1 if which == 0 else 0, dtype=first.dtype)
-        for row, cut in enumerate(cuts):
-            labels = self._labels[cut.episode][which]
-            assert labels is not None
-            steps, seen = cut.seen.shape
-            stretch = labels if len(labels) == 1 else labels[cut.begin : cut.begin + steps]
-            padded[row, :steps, :seen, :seen] = stretch[:, cut.columns][:, :, cut.columns]
-        pairs = valid[..., :, None] & valid[..., None, :] & ~np.eye(agents, dtype=np.bool_)
-        padded[~pairs] = -1 if which == 0 else 0
-        return torch.from_numpy(padded)
+    def cast(self, episode: Int[Tensor, " batch"], now: Int[Tensor, " batch"], history_steps: int) -> Casts:
+        """Who takes part in windows, given by their episodes and last observed steps.
 
-    def _cut(self, episode: int, now: int, history_steps: int) -> "_Cut":
-        begin = max(0, now - history_steps + 1)
-        end = now + 1 + self.horizon_steps
-        last = now - begin
-        seen = self._visible[episode][begin:end].copy()
-        seen[last + 1 :] = self._present[episode][begin:end][last + 1 :] & seen[last]
-        # Columns: the ego, who is visible now, who was visible before (it sent messages then); nobody else matters.
-        # Without an ego the order is the episode's, so that a fixed cast keeps its columns.
-        weight = seen[: last + 1].sum(axis=0) + 1000 * seen[last]
-        weight[0] += 1_000_000 * self.spec.has_ego
-        columns = np.argsort(-weight, kind="stable") if self.spec.has_ego else np.arange(len(weight))
-        columns = columns[weight[columns] > 0]
-        seen = seen[:, columns]
-        states = self._states[episode][begin:end][:, columns] * seen[..., None]
-        if self.spec.has_ego and (states.shape[1] == 0 or not seen[: last + 1, 0].all()):
-            raise UserError(f"episode {episode}: the ego (column 0) must be present at every step up to {now}")
-        return _Cut(int(episode), int(begin), int(last), columns, states, seen)
+        Raises:
+            UserError: the ego is missing at an observed step.
+        """
+        width = int(self.flat.columns[episode].max())
+        casts = cast(self.flat, episode, now, history_steps, width, self.spec.has_ego)
+        if self.spec.has_ego and not casts.ego_stays.all():
+            row = int((~casts.ego_stays).nonzero()[0])
+            raise UserError(
+                f"episode {int(episode[row])}: the ego (column 0) must be present at every step up to {int(now[row])}"
+            )
+        return casts
 
 
-@dataclass(frozen=True)
-class _Cut:
-    episode: int
-    begin: int
-    last: int
-    columns: np.ndarray
-    states: np.ndarray
-    seen: np.ndarray
+def window_batch(parts: Cut) -> WindowBatch:
+    """Windows as a batch."""
+    return WindowBatch(parts.states, parts.valid, parts.last_observed, parts.edge_types, parts.edge_attributes)
+
+
+def _index(lengths: Int[np.ndarray, " episodes"], first: int, future_steps: int) -> Int[np.ndarray, "windows 2"]:
+    """Episode and last observed step of each window."""
+    counts = np.maximum(lengths - future_steps - first, 0)
+    episode = np.repeat(np.arange(len(lengths)), counts)
+    begins = np.repeat(np.cumsum(counts) - counts, counts)
+    return np.stack([episode, np.arange(len(episode)) - begins + first], axis=1)
 
 
 def split_episodes(count: int, fraction: float, seed: int) -> tuple[list[int], list[int]]:
@@ -175,32 +158,36 @@ def split_episodes(count: int, fraction: float, seed: int) -> tuple[list[int], l
     return sorted(order[held_out:].tolist()), sorted(order[:held_out].tolist())
 
 
+def padded(batch: WindowBatch, time: int, agents: int) -> WindowBatch:
+    """The same windows with absent agents and steps appended, up to the given size."""
+    if batch.valid.shape[1:] == (time, agents):
+        return batch
+    states, valid = _grown(batch.states, (time, agents), 0), _grown(batch.valid, (time, agents), 0)
+    pairs = (time, agents, agents)
+    types = None if batch.edge_types is None else _grown(batch.edge_types, pairs, UNKNOWN_TYPE)
+    attributes = None if batch.edge_attributes is None else _grown(batch.edge_attributes, pairs, 0)
+    return WindowBatch(states, valid, batch.last_observed, types, attributes)
+
+
+def _grown(tensor: Tensor, size: tuple[int, ...], fill: int) -> Tensor:
+    """With its axes after the first grown to `size`."""
+    grown = tensor.new_full((len(tensor), *size, *tensor.shape[1 + len(size) :]), fill)
+    grown[(slice(None), *(slice(n) for n in tensor.shape[1 : 1 + len(size)]))] = tensor
+    return grown
+
+
 def concatenate(batches: Sequence[WindowBatch]) -> WindowBatch:
     """One batch of windows that were cut from different stores."""
+    if len(batches) == 1:
+        return batches[0]
     time = max(b.states.shape[1] for b in batches)
     agents = max(b.states.shape[2] for b in batches)
-
-    def pad(tensor: Tensor) -> Tensor:
-        widened = tensor.new_zeros(len(tensor), time, agents, *tensor.shape[3:])
-        widened[:, : tensor.shape[1], : tensor.shape[2]] = tensor
-        return widened
-
-    return WindowBatch(
-        torch.cat([pad(b.states) for b in batches]),
-        torch.cat([pad(b.valid) for b in batches]),
-        torch.cat([b.last_observed for b in batches]),
-        *(_joined_labels(batches, name, time, agents) for name in ("edge_types", "edge_attributes")),
-    )
+    parts = [padded(b, time, agents) for b in batches]
+    joined: dict[str, Any] = {f.name: _joined([getattr(p, f.name) for p in parts]) for f in fields(WindowBatch)}
+    return WindowBatch(**joined)
 
 
-def _joined_labels(batches: Sequence[WindowBatch], name: str, time: int, agents: int) -> Tensor | None:
-    labels = [getattr(b, name) for b in batches]
-    if any(label is None for label in labels):
-        return None  # some stores have labels and others do not: none are used
-    padded = []
-    for label in labels:
-        fill = -1 if name == "edge_types" else 0
-        widened = label.new_full((len(label), time, agents, agents, *label.shape[4:]), fill)
-        widened[:, : label.shape[1], : label.shape[2], : label.shape[3]] = label
-        padded.append(widened)
-    return torch.cat(padded)
+def _joined(tensors: Sequence[Tensor | None]) -> Tensor | None:
+    known = [t for t in tensors if t is not None]
+    # some stores have labels and others do not: none are used
+    return torch.cat(known) if len(known) == len(tensors) else None

@@ -134,7 +134,7 @@ def test_other_seeds_give_other_weights(tiny: None, circles: Path, tmp_path: Pat
 def test_steps_differ_in_batch_and_noise(tiny: None, circles: Path, tmp_path: Path):
     settings = config(circles, tmp_path, lr=1e-12)
     trainer = Trainer(settings, load_data(settings))
-    losses = [trainer.train_step()["loss"] for _ in range(4)]
+    losses = [float(trainer.train_step()["loss"]) for _ in range(4)]
     assert len(set(losses)) == 4
 
 
@@ -187,7 +187,7 @@ def stop_at(step: int) -> Callable[[pytest.MonkeyPatch], None]:
     def patch(monkeypatch: pytest.MonkeyPatch) -> None:
         original = Trainer.train_step
 
-        def train_step(trainer: Trainer) -> dict[str, float]:
+        def train_step(trainer: Trainer) -> Mapping[str, torch.Tensor]:
             if trainer.step == step:
                 raise KeyboardInterrupt
             return original(trainer)
@@ -514,7 +514,7 @@ def test_stores_are_mixed_by_their_windows(tiny: None, circles: Path, tmp_path: 
     assert data.sources == ("circles", "short")
     assert [len(w) for w in data.train] == [4 * 9, 4 * 1]
     trainer = Trainer(settings, data)
-    batch = trainer._draw(data.train, np.random.default_rng(0), 400, settings.history_steps)
+    batch = trainer.feed.batch(trainer.plan(0))
     longest = batch.valid[..., 0].sum(dim=1)
     assert len(batch.states) == 400
     assert 20 < int((longest == 2).sum()) < 130  # 1 in 10 from the short store, and the last windows of the other

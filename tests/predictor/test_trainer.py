@@ -234,10 +234,10 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> list[Seen]:
     """Filled by every training step."""
     seen: list[Seen] = []
 
-    def watching(model: Any, batch: Any, output: Any, settings: Any, kl_scale: float) -> Any:
+    def watching(model: Any, batch: Any, output: Any, settings: Any, kl_scale: Tensor, scales: Tensor) -> Any:
         longest = int(batch.last_observed.max()) + 1
-        seen.append(Seen(longest, output.rollout.shape[2], kl_scale, batch.states.clone()))
-        return window_loss(model, batch, output, settings, kl_scale)
+        seen.append(Seen(longest, output.rollout.shape[2], float(kl_scale), batch.states.clone()))
+        return window_loss(model, batch, output, settings, kl_scale, scales)
 
     monkeypatch.setattr(trainer_module, "window_loss", watching)
     return seen
@@ -313,7 +313,7 @@ def test_weights_of_the_objective_are_felt(
         trainer = made(config(circles, tmp_path, lr=0.2, batch_size=16, variance=1.0, **weights))
         for _ in range(20):
             terms = trainer.train_step()
-        return check(terms)
+        return check(trainer.read(terms))
 
     assert after(**changes) < 0.5 * after(**dict.fromkeys(changes, 0.0))
 

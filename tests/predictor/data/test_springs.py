@@ -421,7 +421,7 @@ def test_charges_train_a_model_of_three_edge_types(tmp_path: Path):
     trainer = Trainer(settings, load_data(settings))
     first = trainer.train_step()
     assert {"type_label", "label", "graph_accuracy"} <= first.keys() and all(map(math.isfinite, first.values()))
-    assert trainer.data.val[0]._labels[0][0].max() == 2
+    assert trainer.data.val[0].flat.edge_types.values.max() == 2
     for _ in range(30):
         last = trainer.train_step()
     assert last["type_label"] < first["type_label"]
