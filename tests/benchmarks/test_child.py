@@ -15,7 +15,7 @@ def test_a_child_measures_memory_and_reports_what_it_cannot_do():
         again = other.ask("forecast", agents=120, **arguments)["peak_bytes"]
     if many is None:
         pytest.skip("no /proc/self/clear_refs here")
-    assert many > 10 * few  # 36 times the pairs
+    assert many > 3 * few  # 36 times the pairs, beside what any call takes
     assert again == pytest.approx(many, rel=0.3)
 
 
