@@ -69,6 +69,10 @@ class Packed:
     """Which listed agent."""
     offsets: Int[Tensor, " listed"]
     """Where each listed agent's pairs begin."""
+    each: Int[Tensor, " pairs"]
+    """0, 1, 2, …"""
+    counts: Int[Tensor, "listed 1"]
+    """Number of each agent's senders."""
 
     @staticmethod
     def of(padded: Padded, valid: Bool[Tensor, "batch agents"]) -> "Packed":
@@ -85,7 +89,11 @@ class Packed:
             sender = padded.senders.flatten()[slots]
         count = present.sum(-1).flatten()[agents]
         scene = receiver // width * width
-        return Packed(padded, valid, agents, slots, place[receiver], place[scene + sender], count.cumsum(0) - count)
+        each = torch.arange(len(slots), device=slots.device)
+        offsets = count.cumsum(0) - count
+        return Packed(
+            padded, valid, agents, slots, place[receiver], place[scene + sender], offsets, each, count[:, None]
+        )
 
     def pack_nodes(self, nodes: Float[Tensor, "batch agents node"]) -> Float[Tensor, "listed node"]:
         """Rows of the listed agents."""
@@ -136,13 +144,10 @@ class Packed:
         """Sum over senders, weighted."""
         if not len(self.slots):
             return pairs.new_zeros(len(self.agents), pairs.shape[-1])
-        each = torch.arange(len(self.slots), device=pairs.device)
-        return functional.embedding_bag(each, pairs, self.offsets, mode="sum", per_sample_weights=weight)
+        return functional.embedding_bag(self.each, pairs, self.offsets, mode="sum", per_sample_weights=weight)
 
-    def count(self, weight: Float[Tensor, " pairs"] | None = None) -> Float[Tensor, "listed 1"]:
-        """Number, or total weight, of each agent's senders."""
-        if weight is None:
-            weight = torch.ones(len(self.slots), dtype=torch.get_default_dtype(), device=self.slots.device)
+    def total(self, weight: Float[Tensor, " pairs"]) -> Float[Tensor, "listed 1"]:
+        """Total weight of each agent's senders."""
         return weight.new_zeros(len(self.agents)).index_add_(0, self.receivers, weight)[:, None]
 
 

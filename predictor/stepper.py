@@ -62,7 +62,7 @@ class Stepper:
         """Memory of each pair after a step (hidden, cell), prior logits and features."""
         summed = graph.gather(elu_(_spread(inputs, self._conv, graph)))
         nodes = _product(summed, (self._conv_out[0], None))
-        nodes = elu_(nodes.addcmul_(graph.count().to(nodes.dtype), self._conv_out[1]))
+        nodes = elu_(nodes.addcmul_(graph.counts, self._conv_out[1]))
         edges = elu_(_spread(nodes, self._edge, graph))
         gates = _product(edges, self._gates, _product(hidden, self._recurrent))
         hidden, cell = lstm_step_(gates, cell)
@@ -113,7 +113,7 @@ class Stepper:
         for k, (block, (matrix, bias)) in enumerate(zip(layer.chunk(len(out), -1), out, strict=True)):
             weight = weights[:, k + 1].contiguous()
             total = _product(graph.gather(block.contiguous(), weight), (matrix, None), total)
-            total.addcmul_(graph.count(weight), bias)
+            total.addcmul_(graph.total(weight), bias)
         return total
 
     def _take_encoder(self, encoder: Encoder) -> None:
