@@ -3,10 +3,15 @@
 from itertools import product
 
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
 
-from predictor.forecaster import Memory
+from predictor.forecaster import Belief, Memory, edgeless_belief
+from predictor.graph import NOBODY
 
-BATCH, AGENTS = 3, 4
+BATCH, AGENTS, SLOTS = 3, 4, 2
+seeds = st.integers(0, 2**16)
 
 
 def memory(seed: int, batch: int = BATCH) -> Memory:
@@ -71,3 +76,139 @@ def test_forecasters_without_memory_have_an_empty_one():
     empty, rows = Memory(), torch.tensor([0])
     assert empty.reorder(torch.zeros(1, 2).long(), torch.ones(1, 2).bool()) == empty
     assert empty.select(rows) == empty.replace_rows(rows, empty) == Memory.concatenate(empty, empty) == empty
+
+
+# --- With a list of senders -------------------------------------------------------------------------------------------
+
+
+def listed(seed: int, batch: int = BATCH, slots: int = SLOTS) -> Memory:
+    """Nobody hears anybody twice, nor itself; empty slots hold nothing."""
+    generator = torch.Generator().manual_seed(seed)
+    score = torch.rand(batch, AGENTS, AGENTS, generator=generator) + 9 * torch.eye(AGENTS)
+    senders = score.argsort(-1)[..., :slots]
+    senders[torch.rand(senders.shape, generator=generator) > 0.6] = NOBODY
+    held = (senders != NOBODY)[..., None]
+    pairs = tuple(torch.randn(batch, AGENTS, slots, width, generator=generator) * held for width in (2, 3))
+    return Memory((torch.randn(batch, AGENTS, 5, generator=generator),), pairs, senders)
+
+
+def heard(memory: Memory, kind: int, row: int) -> dict[tuple[int, int], list[float]]:
+    """What each receiver remembers of each sender in a row."""
+    assert memory.senders is not None
+    found: dict[tuple[int, int], list[float]] = {}
+    for i, senders in enumerate(memory.senders[row].tolist()):
+        for slot, j in enumerate(senders):
+            if j != NOBODY:
+                assert (i, j) not in found
+                found[i, j] = memory.pairs[kind][row, i, slot].tolist()
+    return found
+
+
+@st.composite
+def moves(draw: st.DrawFn) -> tuple[Tensor, Tensor]:
+    """Where the agents of new rows stood before: fewer or more rows than before, newcomers pointing at any old row."""
+    agents = draw(st.integers(1, AGENTS + 2))
+    source, known = torch.zeros(BATCH, agents, dtype=torch.long), torch.zeros(BATCH, agents, dtype=torch.bool)
+    for b in range(BATCH):
+        old = draw(st.permutations([*range(AGENTS), *[None] * agents]))[:agents]
+        known[b] = torch.tensor([o is not None for o in old])
+        source[b] = torch.tensor([draw(st.integers(0, AGENTS - 1)) if o is None else o for o in old])
+    return source, known
+
+
+@settings(max_examples=10)
+@given(seed=seeds, move=moves())
+def test_reorder_with_senders_against_a_loop(seed: int, move: tuple[Tensor, Tensor]):
+    before, (source, known) = listed(seed), move
+    after = before.reorder(source, known)
+    assert after.senders is not None and after.senders.shape == (*source.shape, SLOTS)
+    for b in range(BATCH):
+        new = {int(source[b, i]): i for i in range(source.shape[1]) if known[b, i]}
+        for i in range(source.shape[1]):
+            expected = before.nodes[0][b, source[b, i]] if known[b, i] else torch.zeros(5)
+            assert torch.equal(after.nodes[0][b, i], expected)
+        for kind in (0, 1):
+            old = heard(before, kind, b)
+            assert heard(after, kind, b) == {(new[i], new[j]): m for (i, j), m in old.items() if {i, j} <= new.keys()}
+
+
+@settings(max_examples=10)
+@given(seed=seeds, slots=st.integers(1, 3))
+def test_to_slots_against_a_loop(seed: int, slots: int):
+    before, now = listed(seed), listed(seed + 1, slots=slots).senders
+    assert now is not None
+    present = now != NOBODY
+    place = now.clamp(min=0)  # as `nearest` gives it: an empty slot points at somebody
+    after = before.to_slots(place, present)
+    assert after.nodes is before.nodes and torch.equal(after.senders, now)
+    for b, (kind, width) in product(range(BATCH), enumerate((2, 3))):
+        old = heard(before, kind, b)
+        for i, slot in product(range(AGENTS), range(slots)):
+            expected = old.get((i, int(now[b, i, slot])), [0.0] * width)
+            assert after.pairs[kind][b, i, slot].tolist() == expected
+
+
+def test_who_lost_its_slot_starts_from_zero_when_it_is_back():
+    before = listed(0, batch=1)
+    senders = torch.tensor([[[1, 2], [0, 2], [0, 1], [0, 1]]])
+    everyone = torch.ones(1, AGENTS, SLOTS).bool()
+    first = Memory(before.nodes, tuple(torch.ones_like(m) for m in before.pairs), senders)
+    away = first.to_slots(torch.tensor([[[2, 3], [0, 2], [0, 1], [0, 1]]]), everyone)
+    back = away.to_slots(senders, everyone)
+    for memory in back.pairs:
+        assert not memory[0, 0, 0].any() and memory[0, 0, 1].all() and memory[0, 1:].all()
+
+
+def test_padding_adds_agents_that_hear_nobody():
+    before = listed(0)
+    after = before.padded(AGENTS + 2)
+    assert after.senders is not None and before.senders is not None
+    assert torch.equal(after.senders[:, :AGENTS], before.senders) and (after.senders[:, AGENTS:] == NOBODY).all()
+    for ours, expected in zip((*after.nodes, *after.pairs), (*before.nodes, *before.pairs), strict=True):
+        assert ours.shape == (BATCH, AGENTS + 2, *expected.shape[2:])
+        assert torch.equal(ours[:, :AGENTS], expected) and not ours[:, AGENTS:].any()
+
+
+def tensors(memory: Memory) -> list[Tensor]:
+    assert memory.senders is not None
+    return [*memory.nodes, *memory.pairs, memory.senders]
+
+
+def test_rows_take_their_senders_with_them():
+    before, other, rows = listed(0), listed(1, batch=2), torch.tensor([2, 0])
+    for ours, old, new in zip(tensors(before.replace_rows(rows, other)), tensors(before), tensors(other), strict=True):
+        assert [torch.equal(ours[b], e) for b, e in enumerate((new[1], old[1], new[0]))] == [True] * 3
+    for ours, old in zip(tensors(before.select(rows)), tensors(before), strict=True):
+        assert torch.equal(ours, torch.stack([old[2], old[0]]))
+    joined = tensors(Memory.concatenate(before, other))
+    for ours, old, new in zip(joined, tensors(before), tensors(other), strict=True):
+        assert torch.equal(ours, torch.cat([old, new]))
+    assert all(torch.equal(a, b) for a, b in zip(tensors(before), tensors(listed(0)), strict=True))  # not in place
+
+
+def belief(senders: Tensor | None, slots: int) -> Belief:
+    generator = torch.Generator().manual_seed(0)
+    probs = torch.rand(BATCH, AGENTS, slots, 3, generator=generator).softmax(-1)
+    features = torch.randn(BATCH, AGENTS, slots, 2, generator=generator)
+    valid = torch.ones(BATCH, AGENTS).bool()
+    return Belief(torch.zeros(BATCH, AGENTS, 4), valid, probs, features, senders=senders)
+
+
+def test_dense_belief_against_a_loop():
+    senders = listed(0).senders
+    assert senders is not None
+    sparse = belief(senders, SLOTS)
+    dense = sparse.dense()
+    assert dense.senders is None
+    assert dense.states is sparse.states and dense.valid is sparse.valid
+    for b, i, j in product(range(BATCH), range(AGENTS), range(AGENTS)):
+        slot = senders[b, i].tolist().index(j) if j in senders[b, i] else None
+        probs = torch.tensor([1.0, 0.0, 0.0]) if slot is None else sparse.edge_probs[b, i, slot]
+        features = torch.zeros(2) if slot is None else sparse.edge_features[b, i, slot]
+        assert torch.equal(dense.edge_probs[b, i, j], probs)
+        assert torch.equal(dense.edge_features[b, i, j], features)
+
+
+def test_dense_belief_of_a_dense_one_is_itself():
+    for already in (belief(None, AGENTS), edgeless_belief(torch.zeros(1, 2, 4), torch.ones(1, 2).bool(), 2, 3)):
+        assert already.dense() is already

@@ -1,12 +1,25 @@
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from predictor.errors import UserError
-from predictor.scene import KINEMATIC_FEATURES, KINEMATIC_FEATURES_3D, Scene, SceneBatch, SceneSpec
+from predictor.graph import NOBODY
+from predictor.scene import (
+    KINEMATIC_FEATURES,
+    KINEMATIC_FEATURES_3D,
+    Forecast,
+    Scene,
+    SceneBatch,
+    SceneSpec,
+    dense_edges,
+)
 from tests.predictor.helpers import batch, scene
 
 IN_SPACE: dict[str, Any] = {
@@ -152,3 +165,68 @@ def test_rows_of_a_batch():
     assert joined.heading_rad.tolist() == [3.0, 1.0, 0.0]
     assert joined.states[:, 0, 0].tolist() == [3.0, 1.0, 0.0]
     assert joined.valid.tolist() == [[True, False]] * 3
+
+
+# --- Forecasts --------------------------------------------------------------------------------------------------------
+
+BATCH, AGENTS, SLOTS, NO_EDGE = 2, 5, 3, (1.0, 0.0, 0.0)
+
+
+def forecast(seed: int, agents: int = AGENTS, slots: int = SLOTS) -> Forecast:
+    """With a list of senders; a slot that holds nobody has no edge, as a forecaster gives it."""
+    generator = torch.Generator().manual_seed(seed)
+    score = torch.rand(BATCH, agents, agents, generator=generator) + 9 * torch.eye(agents)
+    senders = score.argsort(-1)[..., :slots]
+    senders[torch.rand(senders.shape, generator=generator) > 0.7] = NOBODY
+    heard = (senders != NOBODY)[..., None]
+    probs = torch.randn(BATCH, agents, slots, 3, generator=generator).softmax(-1)
+    features = torch.randn(BATCH, agents, slots, 2, generator=generator)
+    xy, valid = torch.zeros(BATCH, 1, agents, 4, 2), torch.ones(BATCH, agents).bool()
+    return Forecast(xy, torch.where(heard, probs, torch.tensor(NO_EDGE)), features * heard, valid, senders)
+
+
+def test_dense_edges_against_a_loop():
+    sparse = forecast(0)
+    assert sparse.senders is not None
+    garbage = torch.where((sparse.senders == NOBODY)[..., None], torch.tensor(7.0), sparse.edge_features)
+    probs, features = dense_edges(sparse.edge_probs, garbage, sparse.senders)
+    for b, i, j in product(range(BATCH), range(AGENTS), range(AGENTS)):
+        slot = sparse.senders[b, i].tolist().index(j) if j in sparse.senders[b, i] else None
+        expected = torch.tensor(NO_EDGE) if slot is None else sparse.edge_probs[b, i, slot]
+        assert torch.equal(probs[b, i, j], expected)
+        assert torch.equal(features[b, i, j], torch.zeros(2) if slot is None else sparse.edge_features[b, i, slot])
+
+
+def test_dense_forecast():
+    sparse = forecast(0)
+    dense = sparse.dense()
+    assert dense.senders is None and dense.dense() is dense
+    assert dense.xy is sparse.xy and dense.valid is sparse.valid
+    assert sparse.senders is not None
+    expected = dense_edges(sparse.edge_probs, sparse.edge_features, sparse.senders)
+    assert torch.equal(dense.edge_probs, expected[0]) and torch.equal(dense.edge_features, expected[1])
+
+
+def test_edges_of_the_ego_against_a_loop():
+    dense = forecast(0).dense()
+    probs, features = dense.ego_edges()
+    assert probs.shape == (BATCH, AGENTS, 2, 3) and features.shape == (BATCH, AGENTS, 2, 2)
+    for b, i in product(range(BATCH), range(AGENTS)):
+        assert torch.equal(probs[b, i], torch.stack([dense.edge_probs[b, 0, i], dense.edge_probs[b, i, 0]]))
+        assert torch.equal(features[b, i], torch.stack([dense.edge_features[b, 0, i], dense.edge_features[b, i, 0]]))
+
+
+@settings(max_examples=10)
+@given(seed=st.integers(0, 2**16), agents=st.integers(1, 6), slots=st.integers(1, 6))
+def test_edges_of_the_ego_are_those_of_the_dense_forecast(seed: int, agents: int, slots: int):
+    sparse = forecast(seed, agents, min(slots, agents))
+    for ours, expected in zip(sparse.ego_edges(), sparse.dense().ego_edges(), strict=True):
+        torch.testing.assert_close(ours, expected, rtol=0, atol=1e-6)
+
+
+def test_where_there_is_no_slot_the_ego_has_no_edge():
+    full = forecast(0)
+    lonely = replace(full, senders=torch.full_like(full.senders, NOBODY))
+    for one in (lonely, lonely.dense()):
+        probs, features = one.ego_edges()
+        assert torch.equal(probs, torch.tensor(NO_EDGE).expand(BATCH, AGENTS, 2, 3)) and not features.any()
