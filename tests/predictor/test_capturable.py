@@ -48,6 +48,8 @@ KINDS: dict[str, tuple[str, Any]] = EVERY_MODEL | {
     ),
     "dgvae-no-features": ("dgvae", replace(RICH, edge_feature_dim=0, static_dim=0)),
 }
+
+
 class FromHostError(AssertionError):
     pass
 

@@ -55,9 +55,7 @@ def test_recurrence_of_each_pair_is_a_plain_lstm(seed: int, share: float):
     embedding = encoder.edge_out(edges.hidden_layer)
     forward = loop_over_pairs(lstm_cell(encoder.forward_input, encoder.forward_hidden), embedding, pairs, False)
     torch.testing.assert_close((edges.hidden, edges.cell), forward, **TOLERANCE)
-    backward, _ = loop_over_pairs(
-        lstm_cell(encoder.backward_input, encoder.backward_hidden), embedding, pairs, True
-    )
+    backward, _ = loop_over_pairs(lstm_cell(encoder.backward_input, encoder.backward_hidden), embedding, pairs, True)
     expected = encoder.posterior_head(functional.elu(torch.cat([forward[0], backward], dim=-1)))
     posterior = encoder.posterior_logits(edges, pairs)
     torch.testing.assert_close(posterior[pairs], expected[pairs], **TOLERANCE)
