@@ -9,6 +9,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
+import torch
 from stable_baselines3.common.vec_env import VecEnv
 
 from benchmarks.needs import missing
@@ -50,6 +51,8 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("EnvPool", 64, "native", False, 100, 15),
     ),
 }
+FEW = 16
+"""Environments up to which the forecaster gets one thread: scenes so few are done before a second one is awake."""
 TOLERANCES = {"highway-env": 1.15, "EnvPool": 1.6}
 """Of (with forecasts / plain): highway-env itself takes most of the time; EnvPool takes so little that it is noise."""
 
@@ -72,7 +75,7 @@ def _what(case: Case, settings: Settings) -> dict[str, Any]:
 
 def _overhead(case: Case, settings: Settings) -> list[Row]:
     meter = Meter(case.rounds)
-    with _environments(case, settings.env_id) as venvs:
+    with _environments(case, settings.env_id) as venvs, _threads(settings.threads if case.envs > FEW else 1):
         blocks = {name: blocks_of(venv, case.steps) for name, venv in venvs.items()}
         timings = meter.time_blocks(blocks, interpreter())
     what, count = _what(case, settings), case.steps * case.envs
@@ -81,6 +84,16 @@ def _overhead(case: Case, settings: Settings) -> list[Row]:
     rates = [replace(row, compared=None) if row.name == "plain" else row for row in rates]
     plain = timings.pop("plain")
     return rates + [_ratio(name, what, timing, plain) for name, timing in timings.items()]
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _ratio(name: str, what: dict[str, Any], timing: Timing, plain: Timing) -> Row:
