@@ -12,7 +12,7 @@ expectation, so that a history has one meaning; samples branch off at the first 
 """
 
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -37,51 +37,9 @@ from predictor.packing import Packed, Padded
 from predictor.recurrent import masked_gru
 from predictor.scene import SceneSpec
 from predictor.stepper import Stepper
+from predictor.steps import Encoding, Internal, Layers, Modules, Past
 
 __all__ = ["DGVAE", "PRESETS", "DGVAEConfig", "Decoder", "Edges", "Encoder", "WindowOutput", "concrete_sample"]
-
-
-class _Past(NamedTuple):
-    """What the encoder remembers; tensors with a time axis, or without one."""
-
-    hidden: Tensor
-    cell: Tensor
-    static: Tensor  # pair matching: mean and count (no column if off)
-    seen: Tensor  # the latest inputs and a 1 (no column if changes are not looked at)
-
-
-class _Encoding(NamedTuple):
-    edges: Edges
-    features: Tensor  # with the static dimensions averaged over the past of each step
-    past: _Past  # after each step
-
-
-@runtime_checkable
-class _Layers(Protocol):
-    """What single steps need of the networks; `graph` is `Padded` for the modules, `Packed` for the stepper."""
-
-    def encode(self, inputs: Tensor, graph: Any, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Memory of each pair after a step (hidden, cell), prior logits and features."""
-
-    def drive(
-        self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, node: Tensor
-    ) -> tuple[Tensor, Tensor | None]:
-        """GRU states after a step along a graph; and the messages, unless nobody else needs them."""
-
-    def messages(self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor) -> Tensor:
-        """What reaches each agent along a graph."""
-
-
-class _Internal(NamedTuple):
-    layers: "_Layers"
-    graph: Padded | Packed  # of all that follows but states
-    past: _Past
-    logits: Tensor
-    probs: Tensor
-    features: Tensor
-    node_before: Tensor  # GRU state before the latest observation was decoded
-    node_after: Tensor  # … and after, under the prior's expectation
-    next_states: Tensor
 
 
 class DGVAE(nn.Module):
@@ -163,10 +121,10 @@ class DGVAE(nn.Module):
         graph: Padded | Packed = Packed.of(padded, valid) if isinstance(layers, Stepper) else padded
         (node, seen), pairs = memory.nodes, memory.pairs
         node_before, (hidden, cell, static) = graph.pack_nodes(node), map(graph.pack_pairs, pairs)
-        past, logits, features = self._encode_step(layers, states, valid, graph, _Past(hidden, cell, static, seen))
+        past, logits, features = self._encode_step(layers, states, valid, graph, Past(hidden, cell, static, seen))
         probs = edge_probabilities(logits)
         node_after, next_states = self._move(layers, states, valid, graph, probs, features, node_before)
-        known = _Internal(layers, graph, past, logits, probs, features, node_before, node_after, next_states)
+        known = Internal(layers, graph, past, logits, probs, features, node_before, node_after, next_states)
         remembered = tuple(graph.unpack_pairs(t) for t in (past.hidden, past.cell, past.static))
         after = Memory((graph.unpack_nodes(node_after), past.seen), remembered, memory.senders)
         shown = graph.unpack_pairs(probs, no_edge=True), graph.unpack_pairs(features)
@@ -176,7 +134,7 @@ class DGVAE(nn.Module):
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
         """Feed predictions back through the encoder, so that the graph evolves; sample 0 takes expected graphs."""
-        known: _Internal = belief.internal
+        known: Internal = belief.internal
         layers, graph, edges = known.layers, known.graph, (known.probs, known.features)
         future = self._continue(
             layers, known.next_states, belief.valid, graph, known.past, known.node_after, edges, horizon_steps, None
@@ -193,7 +151,7 @@ class DGVAE(nn.Module):
         )
         node = graph.repeat_nodes(known.node_before, draws)
         drawn = self._free_run(
-            layers, states, valid, graph.repeat(draws), features, _Past(hidden, cell, static, seen), node, logits,
+            layers, states, valid, graph.repeat(draws), features, Past(hidden, cell, static, seen), node, logits,
             horizon_steps, self._sampler(generator),
         )  # fmt: skip
         return torch.cat([future[:, None], drawn.unflatten(0, (len(future), draws))], dim=1)
@@ -211,7 +169,7 @@ class DGVAE(nn.Module):
         """Teacher-forced pass under the posterior and free-running roll-out under the prior, from the same encoding."""
         inputs, graph = self.codec.inputs(states, valid), self._graph_of_window(states, valid)
         (node, seen), pairs = self._nothing_seen(states.shape[0], states.shape[2], graph.present.shape[-1])
-        edges, features, past = self._encode(inputs, valid, graph, _Past(*pairs, seen))
+        edges, features, past = self._encode(inputs, valid, graph, Past(*pairs, seen))
         posterior = self.encoder.posterior_logits(edges, graph.present)
         sampled = self._sampler(generator)(posterior)
         shown = self._match_window(edges.features, features, graph.present)
@@ -236,7 +194,7 @@ class DGVAE(nn.Module):
         now = (torch.arange(len(states), device=states.device), last_observed)
         future = self._free_run(
             self._plain(), states[now], valid[now], Padded(graph.present[now], graph.senders), features[now],
-            _Past(*(t[now] for t in past)), burned_in[now], edges.prior_logits[now], rollout_steps,
+            Past(*(t[now] for t in past)), burned_in[now], edges.prior_logits[now], rollout_steps,
             self._sampler(generator),
         )  # fmt: skip
         return WindowOutput(one_step, future, *outputs)
@@ -281,10 +239,10 @@ class DGVAE(nn.Module):
     def _sampler(self, generator: torch.Generator | None) -> "_Sampler":
         return _Sampler(self.config.temperature, self.config.hard_samples, generator)
 
-    def _plain(self) -> "_Layers":
-        return _Modules(self.encoder, self.decoder)
+    def _plain(self) -> Layers:
+        return Modules(self.encoder, self.decoder)
 
-    def _layers(self) -> "_Layers":
+    def _layers(self) -> Layers:
         """For single steps: with gradients the modules themselves, otherwise the same with its weights folded."""
         dropout = self.encoder.dropout.training and self.config.dropout > 0
         if torch.is_grad_enabled() or dropout or self.config.innovation_rounds:
@@ -293,16 +251,16 @@ class DGVAE(nn.Module):
             self._stepper = Stepper(self.encoder, self.decoder)
         return self._stepper
 
-    def _encode(self, inputs: Tensor, valid: Tensor, graph: Padded, past: _Past) -> _Encoding:
+    def _encode(self, inputs: Tensor, valid: Tensor, graph: Padded, past: Past) -> Encoding:
         """Encode a stretch of steps after `past`."""
         inputs, seen = self._with_changes(inputs, valid, past.seen)
         edges = self.encoder(inputs, graph.present, past.hidden, past.cell, graph.senders)
         features, static = self._match(edges.features, graph.present, past.static)
-        return _Encoding(edges, features, _Past(edges.hidden, edges.cell, static, seen))
+        return Encoding(edges, features, Past(edges.hidden, edges.cell, static, seen))
 
     def _encode_step(
-        self, layers: "_Layers", states: Tensor, valid: Tensor, graph: Padded | Packed, past: _Past
-    ) -> tuple[_Past, Tensor, Tensor]:
+        self, layers: Layers, states: Tensor, valid: Tensor, graph: Padded | Packed, past: Past
+    ) -> tuple[Past, Tensor, Tensor]:
         """The same for one step: memory, prior logits and features after it."""
         inputs, seen = self.codec.inputs(states, valid), past.seen
         if self.sees_changes:
@@ -317,7 +275,7 @@ class DGVAE(nn.Module):
                 present = graph.present
             static = running_mean_step(features[..., : self.config.static_dim], present, static)
             features = torch.cat([static[..., :-1], features[..., self.config.static_dim :]], dim=-1)
-        return _Past(hidden, cell, static, seen), logits, features
+        return Past(hidden, cell, static, seen), logits, features
 
     def _with_changes(self, inputs: Tensor, valid: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
         """What the encoder sees of a stretch of steps, and what it remembers of each for the next one."""
@@ -350,7 +308,7 @@ class DGVAE(nn.Module):
 
     def _move(
         self,
-        layers: "_Layers",
+        layers: Layers,
         states: Tensor,
         valid: Tensor,
         graph: Padded | Packed,
@@ -368,7 +326,7 @@ class DGVAE(nn.Module):
 
     def _integrate(
         self,
-        layers: "_Layers",
+        layers: Layers,
         states: Tensor,
         valid: Tensor,
         graph: Padded | Packed,
@@ -392,12 +350,12 @@ class DGVAE(nn.Module):
 
     def _free_run(
         self,
-        layers: "_Layers",
+        layers: Layers,
         states: Tensor,
         valid: Tensor,
         graph: Padded | Packed,
         features: Tensor,
-        past: _Past,
+        past: Past,
         node: Tensor,
         logits: Tensor,
         horizon_steps: int,
@@ -410,11 +368,11 @@ class DGVAE(nn.Module):
 
     def _continue(
         self,
-        layers: "_Layers",
+        layers: Layers,
         states: Tensor,
         valid: Tensor,
         graph: Padded | Packed,
-        past: _Past,
+        past: Past,
         node: Tensor,
         edges: tuple[Tensor, Tensor],
         horizon_steps: int,
@@ -432,27 +390,6 @@ class DGVAE(nn.Module):
             node, states = self._move(layers, states, valid, graph, weights, features, node)
             future.append(states)
         return torch.stack(future, dim=2)[:, :, :horizon_steps]
-
-
-@dataclass(frozen=True)
-class _Modules:
-    """Single steps through the modules themselves."""
-
-    encoder: Encoder
-    decoder: Decoder
-
-    def encode(self, inputs: Tensor, graph: Any, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        edges: Edges = self.encoder(inputs[:, None], graph.present[:, None], hidden, cell, graph.senders)
-        return edges.hidden[:, 0], edges.cell[:, 0], edges.prior_logits[:, 0], edges.features[:, 0]
-
-    def drive(
-        self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, node: Tensor
-    ) -> tuple[Tensor, Tensor | None]:
-        messages = self.messages(inputs, graph, weights, features)
-        return self.decoder.step(messages, node), messages
-
-    def messages(self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor) -> Tensor:
-        return self.decoder.messages(inputs, graph.present, weights, features, graph.senders)
 
 
 @dataclass(frozen=True)

@@ -65,8 +65,8 @@ class Packed:
     """Places of the listed pairs in the flattened array of pairs."""
     receivers: Int[Tensor, " pairs"]
     """Which listed agent."""
-    senders: Int[Tensor, " pairs"]
-    """Which listed agent."""
+    roles: Int[Tensor, "pairs 2"]
+    """Rows of receiver and sender where each listed agent has two in a row, as a receiver and as a sender."""
     offsets: Int[Tensor, " listed"]
     """Where each listed agent's pairs begin."""
     each: Int[Tensor, " pairs"]
@@ -91,9 +91,9 @@ class Packed:
         scene = receiver // width * width
         each = torch.arange(len(slots), device=slots.device)
         offsets = count.cumsum(0) - count
-        return Packed(
-            padded, valid, agents, slots, place[receiver], place[scene + sender], offsets, each, count[:, None]
-        )
+        receivers, senders = place[receiver], place[scene + sender]
+        roles = torch.stack([2 * receivers, 2 * senders + 1], dim=1)
+        return Packed(padded, valid, agents, slots, receivers, roles, offsets, each, count[:, None])
 
     def pack_nodes(self, nodes: Float[Tensor, "batch agents node"]) -> Float[Tensor, "listed node"]:
         """Rows of the listed agents."""
@@ -132,11 +132,10 @@ class Packed:
         """The lists of a batch with each scene so many times in a row."""
         return Packed.of(self.padded.repeat(times), self.valid.repeat_interleave(times, dim=0))
 
-    def spread(
-        self, received: Float[Tensor, "listed out"], sent: Float[Tensor, "listed out"]
-    ) -> Float[Tensor, "pairs out"]:
-        """Receiver's plus sender's share of each pair."""
-        return received.index_select(0, self.receivers).add_(sent.index_select(0, self.senders))
+    def spread(self, shares: Float[Tensor, "listed two_out"]) -> Float[Tensor, "pairs out"]:
+        """Receiver's plus sender's share of each pair; an agent's two shares stand beside each other."""
+        of_roles = shares.view(-1, shares.shape[1] // 2)
+        return functional.embedding_bag(self.roles, of_roles, mode="sum")
 
     def gather(
         self, pairs: Float[Tensor, "pairs out"], weight: Float[Tensor, " pairs"] | None = None

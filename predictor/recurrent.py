@@ -89,7 +89,7 @@ def lstm_step_(
     _squash(gates)
     i, f, s, o = gates.chunk(4, dim=-1)
     cell = f.mul(cell).addcmul_(i, s, value=2).sub_(i)
-    return cell.mul(2).sigmoid_().mul_(2).sub_(1).mul_(o), cell
+    return _tanh(cell).mul_(o), cell
 
 
 def gru_step_(
@@ -109,6 +109,20 @@ def elu_(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         return torch.nn.functional.elu_(x)
     below = x.clamp(max=0).neg_().sigmoid_().reciprocal_()
     return x.clamp_(min=0).add_(below).sub_(2)
+
+
+def elu(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """The same, not in place."""
+    if x.device.type != "cpu" or x.numel() < _MANY:
+        return torch.nn.functional.elu(x)
+    return x.clamp(min=0).add_(x.clamp(max=0).neg_().sigmoid_().reciprocal_()).sub_(2)
+
+
+def _tanh(x: Tensor) -> Tensor:
+    """tanh; of many numbers on a CPU from the logistic function."""
+    if x.device.type != "cpu" or x.numel() < _MANY:
+        return torch.tanh(x)
+    return x.mul(2).sigmoid_().mul_(2).sub_(1)
 
 
 def _squash(gates: Tensor) -> None:

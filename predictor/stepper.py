@@ -14,7 +14,7 @@ from torch.nn import functional
 from predictor.graph import PairLinear, folded
 from predictor.networks import Decoder, Encoder
 from predictor.packing import Packed
-from predictor.recurrent import elu_, gru_step_, lstm_step_
+from predictor.recurrent import elu, elu_, gru_step_, lstm_step_
 
 Layer = tuple[Tensor, Tensor]
 """Weight (out, in) and bias (out)."""
@@ -66,7 +66,7 @@ class Stepper:
         edges = elu_(_spread(nodes, self._edge, graph))
         gates = _product(edges, self._gates, _product(hidden, self._recurrent))
         hidden, cell = lstm_step_(gates, cell)
-        heads = elu_(_product(elu_(hidden.clone()), self._heads))
+        heads = elu_(_product(elu(hidden), self._heads))
         if self._features is None:
             return hidden, cell, _product(heads, self._logits), heads.new_zeros(len(heads), 0)
         width = heads.shape[1] // 2
@@ -164,7 +164,7 @@ def _product(rows: Tensor, layer: tuple[Tensor, Tensor | None], plus: Tensor | N
 
 def _spread(nodes: Tensor, layer: Layer, graph: Packed) -> Tensor:
     """A `PairLinear` whose two products are one."""
-    return graph.spread(*_product(nodes, layer).chunk(2, dim=-1))
+    return graph.spread(_product(nodes, layer))
 
 
 def _roles(pair: PairLinear, after: nn.Linear | None = None) -> Layer:
