@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -24,6 +25,7 @@ if not __package__:  # run as a file: the packages are beside this folder
     sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 from benchmarks.timing import alternate, quartiles
+from envs.registry import make_env
 from envs.vector import VecForecast
 from envs.wrappers import SceneObservation
 from predictor.dgvae import DGVAE, PRESETS
@@ -93,7 +95,9 @@ def blocks_of(venv: VecEnv, steps: int) -> Callable[[], float]:
 def make_rows(env_id: str, envs: int, vec: Literal["dummy", "subproc"], scenes: bool) -> VecEnv:
     """Environments as they are, or reporting scenes for `VecForecast`."""
     vec_class = DummyVecEnv if vec == "dummy" else SubprocVecEnv
-    return make_vec_env(env_id, envs, vec_env_cls=vec_class, wrapper_class=SceneObservation if scenes else None)
+    # a function of ours: a worker that unpickles it has the ids registered
+    made, wrapper = partial(make_env, env_id), SceneObservation if scenes else None
+    return make_vec_env(made, envs, vec_env_cls=vec_class, wrapper_class=wrapper)
 
 
 def paper_sized(scenes: VecEnv, horizon_steps: int = 5) -> Forecaster:
