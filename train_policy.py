@@ -29,7 +29,7 @@ from envs.render import record_episode
 from envs.wrappers import ForecastObservation
 from predictor.errors import UserError, run_entry_point
 from predictor.provenance import provenance
-from predictor.runtime import tune
+from predictor.runtime import keep_freed_memory
 
 MAX_VIDEO_STEPS = 200
 """Longest video [policy steps]; racetracks go on for 1500."""
@@ -193,7 +193,7 @@ def _act(config: TrainPolicyConfig, model: BaseAlgorithm) -> Callable[[Any], Any
 
 def main() -> None:
     """Entry point."""
-    tune()
+    keep_freed_memory()
     torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
     run(tyro.cli(TrainPolicyConfig, description=__doc__), Console())
 

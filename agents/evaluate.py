@@ -26,7 +26,7 @@ from agents.runs import POLICY_FILE, load_model, read_config, write_text
 from agents.task import Task
 from predictor.errors import UserError, run_entry_point
 from predictor.provenance import provenance, write_json
-from predictor.runtime import tune
+from predictor.runtime import keep_freed_memory
 
 EVALUATION_SEED = 2_000_000_000
 """First seed of the final evaluation; training stays below 1e9, model selection between 1e9 and 2e9."""
@@ -279,7 +279,7 @@ class EvaluateConfig:
 
 def main() -> None:
     """Entry point."""
-    tune()
+    keep_freed_memory()
     torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
     config = tyro.cli(EvaluateConfig, description=__doc__)
     config.check()

@@ -24,7 +24,7 @@ from agents.task import Task
 from agents.training import TrainingPlan, make_model
 from predictor.errors import UserError, run_entry_point
 from predictor.provenance import provenance, write_json
-from predictor.runtime import tune
+from predictor.runtime import keep_freed_memory
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def main() -> None:
     """Entry point."""
     config = tyro.cli(TrainingSpeedConfig, description=__doc__)
     config.check()
-    tune()
+    keep_freed_memory()
     torch.set_num_threads(config.threads)
     result = measure(config, partial(print, flush=True))
     ratios = result["ratios"]

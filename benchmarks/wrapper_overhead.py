@@ -32,7 +32,7 @@ from predictor.dgvae import DGVAE, PRESETS
 from predictor.errors import UserError, run_entry_point
 from predictor.forecaster import Forecaster
 from predictor.provenance import provenance, write_json
-from predictor.runtime import tune
+from predictor.runtime import keep_freed_memory
 from predictor.scene import SceneSpec
 
 
@@ -111,7 +111,7 @@ def main() -> None:
     """Entry point."""
     config = tyro.cli(OverheadConfig, description=__doc__)
     config.check()
-    tune()
+    keep_freed_memory()
     torch.set_num_threads(config.threads)
     plain, scenes = (make_rows(config.env_id, config.envs, config.vec, scenes) for scenes in (False, True))
     paper = paper_sized(scenes) if config.paper_size else None

@@ -35,7 +35,7 @@ from predictor.graph import pair_mask
 from predictor.graph_metrics import GraphAccuracy, GraphTally
 from predictor.metrics import MISS_THRESHOLD_M, min_ade
 from predictor.provenance import provenance, write_json
-from predictor.runtime import tune
+from predictor.runtime import keep_freed_memory
 from predictor.scene import SceneSpec
 
 PACKAGES = ("highway-env", "mpe2", "pettingzoo", "envpool", "gymnasium", "torch", "numpy")
@@ -306,7 +306,7 @@ def _finite(content: Any) -> Any:
 
 def main() -> None:
     """Entry point."""
-    tune()
+    keep_freed_memory()
     config = tyro.cli(EvaluateConfig, description=__doc__)
     config.check()
     console = Console(width=170)

@@ -37,7 +37,7 @@ from predictor.packing import Packed, Padded
 from predictor.recurrent import masked_gru
 from predictor.scene import SceneSpec
 from predictor.stepper import Stepper
-from predictor.steps import Encoding, Internal, Layers, Modules, Past
+from predictor.steps import Encoding, Internal, Layers, Modules, Past, unpacked
 
 __all__ = ["DGVAE", "PRESETS", "DGVAEConfig", "Decoder", "Edges", "Encoder", "WindowOutput", "concrete_sample"]
 
@@ -135,6 +135,8 @@ class DGVAE(nn.Module):
     ) -> Float[Tensor, "batch samples agents horizon state"]:
         """Feed predictions back through the encoder, so that the graph evolves; sample 0 takes expected graphs."""
         known: Internal = belief.internal
+        if torch.is_grad_enabled():  # the history may have been seen without gradients
+            known = unpacked(known, self._plain())
         layers, graph, edges = known.layers, known.graph, (known.probs, known.features)
         future = self._continue(
             layers, known.next_states, belief.valid, graph, known.past, known.node_after, edges, horizon_steps, None
@@ -362,7 +364,7 @@ class DGVAE(nn.Module):
         sampler: "_Sampler",
     ) -> Float[Tensor, "batch agents horizon state"]:
         """Roll out from an observation whose decoder step is still to be taken."""
-        drawn = sampler(logits)
+        drawn = graph.per_pair(sampler, logits)
         node, states = self._move(layers, states, valid, graph, drawn, features, node)
         return self._continue(layers, states, valid, graph, past, node, (drawn, features), horizon_steps, sampler)
 
@@ -386,7 +388,7 @@ class DGVAE(nn.Module):
         for _ in range(horizon_steps - 1):
             if self.config.rollout_graph == "evolving":
                 past, logits, features = self._encode_step(layers, states, valid, graph, past)
-                weights = edge_probabilities(logits) if sampler is None else sampler(logits)
+                weights = edge_probabilities(logits) if sampler is None else graph.per_pair(sampler, logits)
             node, states = self._move(layers, states, valid, graph, weights, features, node)
             future.append(states)
         return torch.stack(future, dim=2)[:, :, :horizon_steps]

@@ -52,7 +52,6 @@ class Memory:
         went = source.new_full((len(source), agents + 2), NOBODY)
         new = torch.arange(source.shape[1], device=source.device).expand_as(source)
         went.scatter_(1, torch.where(known, source, agents + 1), new)
-        went[:, agents:] = NOBODY
         old = self.senders.gather(1, source[..., None].expand(-1, -1, self.senders.shape[2]))
         old = torch.where((old == NOBODY) | ~known[..., None], agents, old)
         return went.gather(1, old.flatten(1)).view_as(old)

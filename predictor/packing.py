@@ -2,8 +2,12 @@
 
 A batch of scenes is padded to its largest, and pairs to its square; in traffic most of that is empty. Single steps
 without gradients work on lists of those who are there. `Padded` has the same methods and leaves everything in place.
+
+The lists' lengths are rounded up by a few per cent, with entries that nobody reads: oneDNN compiles its products for
+each length it meets, which takes longer than the product, and so it meets few.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,6 +15,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
+
+_LEAST_STEP = 8
+"""Lengths are multiples of it."""
 
 
 class Padded(NamedTuple):
@@ -37,6 +44,10 @@ class Padded(NamedTuple):
         """The same."""
         return pairs
 
+    def per_pair(self, change: Callable[[Tensor], Tensor], pairs: Tensor) -> Tensor:
+        """A change to each pair by itself."""
+        return change(pairs)
+
     def repeat_nodes(self, nodes: Tensor, times: int) -> Tensor:
         """Each scene so many times in a row."""
         return nodes.repeat_interleave(times, dim=0)
@@ -59,17 +70,17 @@ class Packed:
     """Where they come from."""
     valid: Bool[Tensor, "batch agents"]
     """Likewise."""
-    agents: Int[Tensor, " listed"]
+    agents: Int[Tensor, " agents_there"]
     """Places of the listed agents in the flattened batch."""
-    slots: Int[Tensor, " pairs"]
+    slots: Int[Tensor, " pairs_there"]
     """Places of the listed pairs in the flattened array of pairs."""
-    receivers: Int[Tensor, " pairs"]
+    receivers: Int[Tensor, " pairs_there"]
     """Which listed agent."""
     roles: Int[Tensor, "pairs 2"]
     """Rows of receiver and sender where each listed agent has two in a row, as a receiver and as a sender."""
-    offsets: Int[Tensor, " listed"]
-    """Where each listed agent's pairs begin."""
-    each: Int[Tensor, " pairs"]
+    offsets: Int[Tensor, " listed_and_end"]
+    """Where each listed agent's pairs begin, and where the last one's end."""
+    each: Int[Tensor, " pairs_there"]
     """0, 1, 2, …"""
     counts: Int[Tensor, "listed 1"]
     """Number of each agent's senders."""
@@ -89,24 +100,41 @@ class Packed:
             sender = padded.senders.flatten()[slots]
         count = present.sum(-1).flatten()[agents]
         scene = receiver // width * width
-        each = torch.arange(len(slots), device=slots.device)
-        offsets = count.cumsum(0) - count
         receivers, senders = place[receiver], place[scene + sender]
         roles = torch.stack([2 * receivers, 2 * senders + 1], dim=1)
-        return Packed(padded, valid, agents, slots, receivers, roles, offsets, each, count[:, None])
+        beyond = _rounded(len(agents)) - len(agents)
+        offsets = functional.pad(count.cumsum(0), (1, 0))
+        return Packed(
+            padded=padded,
+            valid=valid,
+            agents=agents,
+            slots=slots,
+            receivers=receivers,
+            roles=functional.pad(roles, (0, 0, 0, _rounded(len(slots)) - len(slots))),
+            offsets=torch.cat([offsets, offsets[-1:].expand(beyond)]),
+            each=torch.arange(len(slots), device=slots.device),
+            counts=functional.pad(count[:, None], (0, 0, 0, beyond)),
+        )
 
     def pack_nodes(self, nodes: Float[Tensor, "batch agents node"]) -> Float[Tensor, "listed node"]:
         """Rows of the listed agents."""
-        return nodes.flatten(0, 1).index_select(0, self.agents)
+        return nodes.flatten(0, 1).index_select(0, _lengthened(self.agents))
 
     def pack_pairs(self, pairs: Float[Tensor, "batch agents slots pair"]) -> Float[Tensor, "pairs pair"]:
         """Rows of the listed pairs."""
-        return pairs.flatten(0, 2).index_select(0, self.slots)
+        return pairs.flatten(0, 2).index_select(0, _lengthened(self.slots))
+
+    def per_pair(
+        self, change: Callable[[Tensor], Tensor], pairs: Float[Tensor, "pairs before"]
+    ) -> Float[Tensor, "pairs after"]:
+        """A change to each pair by itself; what draws noise draws none for nobody."""
+        changed = change(pairs[: len(self.slots)])
+        return functional.pad(changed, (0, 0, 0, len(pairs) - len(changed)))
 
     def unpack_nodes(self, nodes: Float[Tensor, "listed node"]) -> Float[Tensor, "batch agents node"]:
         """Zeros for who is not listed."""
         padded = nodes.new_zeros(self.valid.numel(), nodes.shape[-1])
-        return padded.index_copy_(0, self.agents, nodes).unflatten(0, self.valid.shape)
+        return padded.index_copy_(0, self.agents, nodes[: len(self.agents)]).unflatten(0, self.valid.shape)
 
     def unpack_pairs(
         self, pairs: Float[Tensor, "pairs pair"], no_edge: bool = False
@@ -116,17 +144,17 @@ class Packed:
         padded = pairs.new_zeros(shape.numel(), pairs.shape[-1])
         if no_edge:
             padded[:, 0] = 1.0
-        return padded.index_copy_(0, self.slots, pairs).unflatten(0, shape)
+        return padded.index_copy_(0, self.slots, pairs[: len(self.slots)]).unflatten(0, shape)
 
     def repeat_nodes(self, nodes: Float[Tensor, "listed node"], times: int) -> Float[Tensor, "more node"]:
         """Each scene so many times in a row."""
         scene = self.agents // self.valid.shape[1]
-        return nodes.index_select(0, _repeated(scene, len(self.valid), times))
+        return nodes.index_select(0, _lengthened(_repeated(scene, len(self.valid), times)))
 
     def repeat_pairs(self, pairs: Float[Tensor, "pairs pair"], times: int) -> Float[Tensor, "more pair"]:
         """Each scene so many times in a row."""
         scene = self.slots // self.padded.present[0].numel()
-        return pairs.index_select(0, _repeated(scene, len(self.valid), times))
+        return pairs.index_select(0, _lengthened(_repeated(scene, len(self.valid), times)))
 
     def repeat(self, times: int) -> "Packed":
         """The lists of a batch with each scene so many times in a row."""
@@ -141,13 +169,27 @@ class Packed:
         self, pairs: Float[Tensor, "pairs out"], weight: Float[Tensor, " pairs"] | None = None
     ) -> Float[Tensor, "listed out"]:
         """Sum over senders, weighted."""
-        if not len(self.slots):
-            return pairs.new_zeros(len(self.agents), pairs.shape[-1])
-        return functional.embedding_bag(self.each, pairs, self.offsets, mode="sum", per_sample_weights=weight)
+        if weight is not None:
+            weight = weight[: len(self.slots)]
+        return functional.embedding_bag(
+            self.each, pairs, self.offsets, mode="sum", per_sample_weights=weight, include_last_offset=True
+        )
 
     def total(self, weight: Float[Tensor, " pairs"]) -> Float[Tensor, "listed 1"]:
         """Total weight of each agent's senders."""
-        return weight.new_zeros(len(self.agents)).index_add_(0, self.receivers, weight)[:, None]
+        total = weight.new_zeros(len(self.counts))
+        return total.index_add_(0, self.receivers, weight[: len(self.slots)])[:, None]
+
+
+def _rounded(length: int) -> int:
+    """At least so much, one of sixteen lengths between a number and its double."""
+    step = max(_LEAST_STEP, 1 << max(0, length.bit_length() - 5))
+    return -(-max(length, 1) // step) * step
+
+
+def _lengthened(places: Int[Tensor, " there"]) -> Int[Tensor, " rounded"]:
+    """The list, rounded up with the first place."""
+    return functional.pad(places, (0, _rounded(len(places)) - len(places)))
 
 
 def _repeated(scene: Tensor, scenes: int, times: int) -> Tensor:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from predictor.networks import Decoder, Edges, Encoder
+from predictor.networks import Decoder, Edges, Encoder, no_edge_where_absent
 from predictor.packing import Packed, Padded
 
 
@@ -82,3 +82,16 @@ class Modules:
     def messages(self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor) -> Tensor:
         """As `Layers.messages`."""
         return self.decoder.messages(inputs, graph.present, weights, features, graph.senders)
+
+
+def unpacked(known: Internal, layers: Layers) -> Internal:
+    """The same for other layers, which take padded arrays."""
+    graph = known.graph
+    if isinstance(graph, Padded):
+        return known
+    hidden, cell, static, seen = known.past
+    past = Past(graph.unpack_pairs(hidden), graph.unpack_pairs(cell), graph.unpack_pairs(static), seen)
+    logits = no_edge_where_absent(graph.unpack_pairs(known.logits), graph.padded.present[..., None])
+    probs, features = graph.unpack_pairs(known.probs, no_edge=True), graph.unpack_pairs(known.features)
+    nodes = graph.unpack_nodes(known.node_before), graph.unpack_nodes(known.node_after)
+    return Internal(layers, graph.padded, past, logits, probs, features, *nodes, known.next_states)

@@ -202,7 +202,6 @@ def test_samples_do_not_depend_on_padding(name: str):
     torch.testing.assert_close(*forecasts, **EXACT)
 
 
-@pytest.mark.xfail(strict=True, reason="a belief keeps the folded layers it came from, which autograd cannot follow")
 def test_a_belief_from_without_gradients_is_rolled_out_with_them():
     """Burn in without gradients, free-run with them."""
     forecaster, (states, valid) = made(FAST_LIKE), scenes()
