@@ -194,8 +194,10 @@ def _act(config: TrainPolicyConfig, model: BaseAlgorithm) -> Callable[[Any], Any
 def main() -> None:
     """Entry point."""
     keep_freed_memory()
-    torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
-    run(tyro.cli(TrainPolicyConfig, description=__doc__), Console())
+    config = tyro.cli(TrainPolicyConfig, description=__doc__)
+    if config.backend != "envpool":  # its environments wait while networks compute
+        torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
+    run(config, Console())
 
 
 if __name__ == "__main__":

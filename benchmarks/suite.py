@@ -5,6 +5,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import torch
+
 from benchmarks.compare import Baseline, Comparison, better_of, compare
 from benchmarks.needs import missing
 from benchmarks.rows import Row, skipped
@@ -36,9 +38,21 @@ def measure(settings: Settings, sections: Sequence[str], began: Callable[[str], 
     return rows
 
 
+WITH_POLICIES = {"wrappers", "ppo"}
+"""Sections that leave products to torch's own library, as `train_policy.py` does: `predictor.runtime.tune` is undone."""
+
+
 def _run(section: str, settings: Settings) -> list[Row]:
     module: Any = importlib.import_module(SECTIONS[section])
-    rows: list[Row] = module.run(settings)
+    if section not in WITH_POLICIES:
+        rows: list[Row] = module.run(settings)
+        return rows
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("highest")
+    try:
+        rows = module.run(settings)
+    finally:
+        torch.set_float32_matmul_precision(before)
     return rows
 
 
