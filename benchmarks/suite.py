@@ -39,7 +39,7 @@ def measure(settings: Settings, sections: Sequence[str], began: Callable[[str], 
 
 
 WITH_POLICIES = {"wrappers", "ppo"}
-"""Sections that leave products to torch's own library, as `train_policy.py` does: `predictor.runtime.tune` is undone."""
+"""Sections that leave products to torch's own library, as `train_policy.py` does."""
 
 
 def _run(section: str, settings: Settings) -> list[Row]:
