@@ -323,6 +323,7 @@ def test_every_model_comes_back_and_forecasts_the_same(tmp_path: Path, kind: str
     loaded, read = load_checkpoint(tmp_path / "toy")
     assert read == info
     assert type(loaded) is type(any_model(kind)) and not loaded.training
+    loaded.requires_grad_(False)  # as the original: with gradients, torch may sum in another order
     states, valid = random_states(0, 4, 2, 4, 4), random_presence(0, 4, 2, 4)
     beliefs, forecasts = [], []
     for forecaster in (any_model(kind), loaded):

@@ -32,7 +32,8 @@ def assert_same(ours: Forecast, expected: Forecast, tolerance: float = 1e-5) -> 
     assert torch.equal(ours.valid, expected.valid)
     torch.testing.assert_close(ours.edge_probs, expected.edge_probs, rtol=0, atol=tolerance)
     torch.testing.assert_close(ours.edge_features, expected.edge_features, rtol=0, atol=tolerance)
-    torch.testing.assert_close(ours.xy, expected.xy, rtol=1e-5, atol=10 * tolerance)
+    # a free run through untrained weights amplifies what is left: 1 % of a position, where edges agree to `tolerance`
+    torch.testing.assert_close(ours.xy, expected.xy, rtol=1e-5 if tolerance < 1e-4 else 1e-2, atol=10 * tolerance)
 
 
 def rows_of(forecast: Forecast, rows: Sequence[int]) -> Forecast:
