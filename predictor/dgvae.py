@@ -272,10 +272,8 @@ class DGVAE(nn.Module):
         hidden, cell, logits, features = layers.encode(inputs, graph, past.hidden, past.cell)
         static = past.static
         if self.config.static_dim:
-            present = torch.ones_like(static[..., 0], dtype=torch.bool)
-            if isinstance(graph, Padded):
-                present = graph.present
-            static = running_mean_step(features[..., : self.config.static_dim], present, static)
+            first = features[..., : self.config.static_dim]
+            static = running_mean_step(first, graph.among_pairs(static), static)
             features = torch.cat([static[..., :-1], features[..., self.config.static_dim :]], dim=-1)
         return Past(hidden, cell, static, seen), logits, features
 
@@ -321,8 +319,7 @@ class DGVAE(nn.Module):
         """One decoder step: GRU states after it, and the next states."""
         inputs = graph.pack_nodes(self.codec.inputs(states, valid))
         node, messages = layers.drive(inputs, graph, weights, features, node)
-        if isinstance(graph, Padded):
-            node = node * valid[..., None]
+        node = graph.forget_absent(node, valid)
         change = graph.unpack_nodes(self.decoder.change(node))
         return node, self._integrate(layers, states, valid, graph, weights, features, change, messages)
 

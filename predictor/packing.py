@@ -36,6 +36,14 @@ class Padded(NamedTuple):
         """The same."""
         return pairs
 
+    def among_pairs(self, pairs: Tensor) -> Tensor:
+        """Which entries are of pairs that are there."""
+        return self.present
+
+    def forget_absent(self, nodes: Tensor, valid: Tensor) -> Tensor:
+        """Zeros for who is not there."""
+        return nodes * valid[..., None]
+
     def unpack_nodes(self, nodes: Tensor) -> Tensor:
         """The same."""
         return nodes
@@ -123,6 +131,16 @@ class Packed:
     def pack_pairs(self, pairs: Float[Tensor, "batch agents slots pair"]) -> Float[Tensor, "pairs pair"]:
         """Rows of the listed pairs."""
         return pairs.flatten(0, 2).index_select(0, _lengthened(self.slots))
+
+    def among_pairs(self, pairs: Float[Tensor, "pairs pair"]) -> Bool[Tensor, " pairs"]:
+        """All of them."""
+        return torch.ones(len(pairs), dtype=torch.bool, device=pairs.device)
+
+    def forget_absent(
+        self, nodes: Float[Tensor, "listed node"], valid: Bool[Tensor, "batch agents"]
+    ) -> Float[Tensor, "listed node"]:
+        """The same: who is not there is not listed."""
+        return nodes
 
     def per_pair(
         self, change: Callable[[Tensor], Tensor], pairs: Float[Tensor, "pairs before"]

@@ -12,14 +12,12 @@ from torch import Tensor
 from predictor import trainer as trainer_module
 from predictor.capture import CapturedStep, NotCapturableError, default_generator, signature
 from predictor.data.windows import WindowBatch
-from predictor.dgvae import PRESETS
 from predictor.errors import UserError
 from predictor.feed import HostFeed, PrefetchedFeed, Shapes
 from predictor.objective import window_loss
 from predictor.train import train
 from predictor.train_config import TrainConfig
 from predictor.trainer import Trainer, load_data
-from tests.predictor.helpers import FAST_LIKE, write_circles
 
 SCHEDULES: dict[str, Any] = {
     "min_history_steps": 1,
@@ -63,14 +61,7 @@ class Refusing(FakeRecorder):
         raise NotCapturableError("this model looks at results from the host while it runs")
 
 
-@pytest.fixture(autouse=True)
-def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PRESETS, "fast", FAST_LIKE)
-
-
-@pytest.fixture(scope="module")
-def circles(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_circles(tmp_path_factory.mktemp("data") / "circles")
+pytestmark = pytest.mark.usefixtures("tiny")
 
 
 def config(data: Path, out: Path, **changes: Any) -> TrainConfig:

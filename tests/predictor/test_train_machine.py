@@ -13,7 +13,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from predictor import train as training
 from predictor import trainer as trainer_module
-from predictor.dgvae import PRESETS
 from predictor.errors import UserError
 from predictor.objective import window_loss
 from predictor.suite import SuiteConfig, row_config, row_folder
@@ -21,17 +20,8 @@ from predictor.tables import TABLES
 from predictor.train import train
 from predictor.train_config import TrainConfig
 from predictor.trainer import Trainer, load_data
-from tests.predictor.helpers import FAST_LIKE, write_circles
 
-
-@pytest.fixture(autouse=True)
-def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PRESETS, "fast", FAST_LIKE)
-
-
-@pytest.fixture(scope="module")
-def circles(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_circles(tmp_path_factory.mktemp("data") / "circles")
+pytestmark = pytest.mark.usefixtures("tiny")
 
 
 def config(data: Path, out: Path, **changes: Any) -> TrainConfig:

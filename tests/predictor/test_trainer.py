@@ -14,7 +14,6 @@ from torch import Tensor
 from predictor import trainer as trainer_module
 from predictor.checkpoint import load_checkpoint
 from predictor.data.store import Episode, StoreInfo, write_store
-from predictor.dgvae import PRESETS
 from predictor.errors import UserError
 from predictor.models import name_of
 from predictor.objective import window_loss
@@ -40,14 +39,7 @@ MODELS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.fixture(autouse=True)
-def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PRESETS, "fast", FAST_LIKE)
-
-
-@pytest.fixture(scope="module")
-def circles(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_circles(tmp_path_factory.mktemp("data") / "circles")
+pytestmark = pytest.mark.usefixtures("tiny")
 
 
 def config(data: Path, out: Path, **changes: Any) -> TrainConfig:
