@@ -6,35 +6,29 @@ selection seeds), policy.zip (the final policy: the best), summary.json, summary
 """
 
 import os
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import torch
 import tyro
 from rich.console import Console
-from stable_baselines3.common.base_class import BaseAlgorithm
 
-from agents.evaluate import EVALUATION_SEED, PACKAGES, evaluate_with_progress
-from agents.features import EGO_KEY, AttentionConfig
-from agents.parallel_rows import record_task
+from agents.evaluate import PACKAGES, evaluate_with_progress
+from agents.features import AttentionConfig
 from agents.runs import load_model, open_run
 from agents.task import Task
 from agents.training import TrainingPlan, train
-from envs.readers.envpool import ONE_START
-from envs.readers.highway import is_highway_env
-from envs.registry import CHECKPOINTS, make_env, native_task_of
-from envs.render import record_episode
-from envs.wrappers import ForecastObservation
+from agents.video import film
+from envs.registry import native_task_of
+from envs.simulators.envpool import ONE_START
 from predictor.errors import UserError, run_entry_point
 from predictor.provenance import provenance
 from predictor.runtime import keep_freed_memory
 
-MAX_VIDEO_STEPS = 200
-"""Longest video [policy steps]; racetracks go on for 1500."""
 ENVS = {"gymnasium": 6, "envpool": 64}
 """Parallel environments by default."""
+
 LEARNERS: dict[str, tuple[str, ...]] = {"simple_tag_v3": ("adversary",), "simple_world_comm_v3": ("adversary",)}
 """Who learns by default where the sides are opponents: pursuers, against a prey that flees by rule."""
 
@@ -149,46 +143,8 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
     console.print(evaluation.table())
     console.print(f"policy: {policy}")
     if config.video:
-        shown = film(config, model)
+        shown = film(plan.task, model, config.folder / "video.mp4")
         console.print(f"video: {shown or 'none, only highway-env and PettingZoo environments are drawn'}")
-
-
-def film(config: TrainPolicyConfig, model: BaseAlgorithm) -> Path | None:
-    """Film the first evaluation episode with the forecasts drawn in, also for a policy that sees none.
-
-    Returns:
-        The video; None for an environment that cannot be drawn.
-    """
-    path = config.folder / "video.mp4"
-    task = config.plan.task
-    if task.is_parallel:
-        recording = record_task(task, model, EVALUATION_SEED, MAX_VIDEO_STEPS)
-        if recording is None:
-            return None
-        recording.write_video(path)
-        return path
-    checkpoint = task.forecaster
-    if config.observe == "none" and config.env_id not in CHECKPOINTS:
-        checkpoint = "constant-velocity"
-    plain = make_env(config.env_id)
-    drawn = is_highway_env(plain)
-    plain.close()
-    if not drawn:
-        return None
-    env = ForecastObservation(make_env(config.env_id, render_mode="rgb_array"), checkpoint)
-    try:
-        record_episode(env, _act(config, model), seed=EVALUATION_SEED, max_steps=MAX_VIDEO_STEPS).write_video(path)
-    finally:
-        env.close()
-    return path
-
-
-def _act(config: TrainPolicyConfig, model: BaseAlgorithm) -> Callable[[Any], Any]:
-    def act(obs: dict[str, Any]) -> Any:
-        seen = obs[EGO_KEY] if config.observe == "none" else obs
-        return model.predict(seen, deterministic=True)[0]
-
-    return act
 
 
 def main() -> None:

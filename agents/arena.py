@@ -1,15 +1,20 @@
 """Where policies are measured: plays given seeds with a trained policy or with a named driver in its place."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+from pettingzoo import ParallelEnv
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
 
-from agents.episodes import EpisodeResult, run_episodes
-from agents.parallel_rows import ParallelArena
-from agents.rows import make_rows
 from agents.task import Task
+from agents.vec_envs import EPISODE_INFO, EpisodeResult, make_parallel_rows, make_rows, own_observations
+from envs.drivers.all_agents import make_driver
+from envs.readers.base import role_of
+from envs.sb3.agents_as_rows import ParallelVecEnv
+from predictor.errors import UserError
 
 
 @runtime_checkable
@@ -59,3 +64,124 @@ class EgoArena:
 def open_arena(task: Task, num_rows: int) -> Arena:
     """An arena for a task."""
     return ParallelArena(task) if task.is_parallel else EgoArena(task, num_rows)
+
+
+def run_episodes(
+    venv: VecEnv,
+    policy: Callable[[Any], Any] | str,
+    seeds: Sequence[int],
+    on_episode: Callable[[], None] = lambda: None,
+) -> list[EpisodeResult]:
+    """Play one episode per seed, all rows in parallel.
+
+    Args:
+        venv: from `make_rows(..., seeded=True)`.
+        policy: from a batch of observations to a batch of actions, or the name of an ego from `envs.drivers.ego`.
+        seeds: one per episode, all different.
+        on_episode: called after each episode (progress bars).
+
+    Returns:
+        Results in the order of the seeds.
+    """
+    ego = policy if isinstance(policy, str) else None
+    if ego is not None:
+        venv = venv.unwrapped  # nobody looks at the forecasts, so none are made
+    for row in range(venv.num_envs):
+        venv.env_method("queue", list(seeds[row :: venv.num_envs]), ego, indices=[row])
+    no_actions = np.zeros((venv.num_envs, *(venv.action_space.shape or ())), dtype=venv.action_space.dtype)
+    results: dict[int, EpisodeResult] = {}
+    obs = venv.reset()
+    while len(results) < len(seeds):
+        actions = no_actions if isinstance(policy, str) else policy(obs)
+        obs, _, _, infos = venv.step(actions)
+        for info in infos:
+            if EPISODE_INFO in info:
+                result = info[EPISODE_INFO]
+                results[result.seed] = result
+                on_episode()
+    return [results[seed] for seed in seeds]
+
+
+class ParallelArena:
+    """Plays seeds with a policy or with a driver in the learners' place; see `agents.arena.Arena`.
+
+    Args:
+        task: a PettingZoo task.
+
+    Attributes:
+        baselines: random and heuristic; idle where no heuristic drives the environment.
+    """
+
+    def __init__(self, task: Task) -> None:
+        """One copy; results do not depend on how many there are."""
+        self._monitor = make_parallel_rows(task, 1)
+        venv = self._monitor.venv
+        assert isinstance(venv, ParallelVecEnv)
+        self._venv = venv
+        self._env: Any = venv.envs[0]  # has what `DrivenEnv` has
+        self.baselines = ("random", "heuristic" if _has_heuristic(self._env) else "idle")
+
+    def play(
+        self, policy: BaseAlgorithm | str, seeds: Sequence[int], on_episode: Callable[[], None] = lambda: None
+    ) -> list[EpisodeResult]:
+        """One episode per seed; the return is the mean over the learners."""
+        results = []
+        for seed in seeds:
+            results.append(self._driven(policy, seed) if isinstance(policy, str) else self._learned(policy, seed))
+            on_episode()
+        return results
+
+    def close(self) -> None:
+        """Close the environment."""
+        self._venv.close()
+
+    def _learned(self, policy: BaseAlgorithm, seed: int) -> EpisodeResult:
+        self._venv.seed(seed)
+        observations: Any = self._venv.reset()
+        episode, steps = self._env.episodes, 0
+        returns = dict.fromkeys(self._venv.row_agents, 0.0)
+        while self._env.episodes == episode:
+            actions = policy.predict(observations, deterministic=True)[0]
+            observations, rewards, _, _ = self._venv.step(actions)
+            for agent, reward in zip(self._venv.row_agents, rewards.tolist(), strict=True):
+                returns[agent] += reward
+            steps += 1
+        return _result(seed, steps, returns)
+
+    def _driven(self, name: str, seed: int) -> EpisodeResult:
+        env = self._env
+        observations, _ = env.reset(seed=seed)
+        driver = make_driver(name, env, np.random.default_rng(seed))
+        returns = dict.fromkeys(self._venv.row_agents, 0.0)
+        steps, lived = 0, set(env.agents)
+        while env.agents and not (lived.issuperset(returns) and returns.keys().isdisjoint(env.agents)):
+            own = own_observations(observations)
+            actions = driver({agent: seen for agent, seen in own.items() if agent in returns})
+            observations, rewards, *_ = env.step(partner_actions(env, own, returns) | actions)
+            lived.update(env.agents)
+            for agent in returns:
+                returns[agent] += float(rewards.get(agent, 0.0))
+            steps += 1
+        return _result(seed, steps, returns)
+
+
+def partner_actions(env: Any, own: Mapping[str, Any], learners: Collection[str]) -> dict[str, Any]:
+    """Actions of those who do not learn."""
+    others = {agent: seen for agent, seen in own.items() if agent not in learners}
+    return env.driver(others) if others else {}
+
+
+def _has_heuristic(env: ParallelEnv) -> bool:
+    try:
+        make_driver("heuristic", env, np.random.default_rng(0))
+    except UserError:
+        return False
+    return True
+
+
+def _result(seed: int, steps: int, returns: Mapping[str, float]) -> EpisodeResult:
+    roles: dict[str, list[float]] = {}
+    for agent, value in returns.items():
+        roles.setdefault(role_of(agent), []).append(value)
+    by_role = {role: float(np.mean(values)) for role, values in roles.items()} if len(roles) > 1 else {}
+    return EpisodeResult(seed, float(np.mean(list(returns.values()))), steps, None, float("nan"), by_role)

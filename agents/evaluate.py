@@ -21,18 +21,17 @@ from rich.table import Table
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.arena import open_arena
-from agents.episodes import EpisodeResult
-from agents.runs import POLICY_FILE, load_model, read_config, write_text
-from agents.task import Task
+from agents.runs import POLICY_FILE, load_model, read_config
+from agents.task import EVALUATION_SEED, Task
+from agents.vec_envs import EpisodeResult
 from predictor.errors import UserError, run_entry_point
-from predictor.provenance import provenance, write_json
+from predictor.files import write_json, write_text
+from predictor.provenance import provenance
 from predictor.runtime import keep_freed_memory
-
-EVALUATION_SEED = 2_000_000_000
-"""First seed of the final evaluation; training stays below 1e9, model selection between 1e9 and 2e9."""
 
 NUM_POLICIES = 3
 """The trained one and an arena's two baselines."""
+
 _WILSON_Z = 1.959963984540054  # two-sided 95 %
 PACKAGES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2", "envpool", "torch", "numpy")
 

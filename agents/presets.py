@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from agents.task import Backend
-from envs.parallel_registry import is_parallel_id
+from envs.registry import is_parallel_id
 
 Algorithm = Literal["ppo", "dqn"]
 

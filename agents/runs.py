@@ -6,9 +6,7 @@ the same zip, so the two can never disagree. SB3 zips hold pickled data: load on
 
 import io
 import json
-import os
 import pickle
-import shutil
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,13 +19,12 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.presets import Algorithm
 from predictor.errors import UserError
-from predictor.provenance import write_json
+from predictor.files import partial_path, publish, write_json
 
 CONFIG_FILE = "config.json"
 CHECKPOINT_FILE = "checkpoint.zip"
 BEST_FILE = "best_model.zip"
 POLICY_FILE = "policy.zip"
-
 _ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "dqn": DQN}
 _BUFFER_ENTRY = "replay_buffer.pkl"
 _NOTE_ENTRY = "note.json"
@@ -82,7 +79,7 @@ def save_model(model: BaseAlgorithm, path: Path, note: dict[str, Any] | None = N
         note: small JSON content that travels inside.
         buffer: put the replay buffer inside as well, if the algorithm has one.
     """
-    partial = _partial(path)
+    partial = partial_path(path)
     with partial.open("wb") as file:
         model.save(file)
     with zipfile.ZipFile(partial, "a") as archive:
@@ -90,7 +87,7 @@ def save_model(model: BaseAlgorithm, path: Path, note: dict[str, Any] | None = N
         if buffer and isinstance(model, OffPolicyAlgorithm):
             with archive.open(_BUFFER_ENTRY, "w", force_zip64=True) as entry:
                 pickle.dump(model.replay_buffer, entry, protocol=pickle.HIGHEST_PROTOCOL)
-    _publish(partial, path)
+    publish(partial, path)
 
 
 def load_model(path: Path, algorithm: Algorithm, venv: VecEnv | None = None, device: str = "cpu") -> BaseAlgorithm:
@@ -118,36 +115,6 @@ def read_note(path: Path) -> dict[str, Any]:
         return {}
     with zipfile.ZipFile(path) as archive:
         return json.loads(archive.read(_NOTE_ENTRY)) if _NOTE_ENTRY in archive.namelist() else {}
-
-
-def copy_file(source: Path, target: Path) -> None:
-    """Copy so that `target` is always a whole file."""
-    partial = _partial(target)
-    shutil.copyfile(source, partial)
-    _publish(partial, target)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write so that `path` is always a whole file."""
-    partial = _partial(path)
-    partial.write_text(text)
-    _publish(partial, path)
-
-
-def _partial(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{os.getpid()}.partial")
-
-
-def _publish(partial: Path, path: Path) -> None:
-    """Flush to disk, then rename: a reader finds the old file or the whole new one, also after a power cut."""
-    for target in (partial, partial.parent):
-        descriptor = os.open(target, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-        if target is partial:
-            os.replace(partial, path)
 
 
 def _read(file: Path) -> dict[str, Any]:

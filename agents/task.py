@@ -8,15 +8,20 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from envs.drivers import DRIVER_NAMES, make_driver
-from envs.multiagent import ParallelVecEnv
-from envs.multiagent_spaces import learners_named
+from envs.drivers.all_agents import DRIVER_NAMES, make_driver
 from envs.parallel import ForecastParallelEnv
-from envs.parallel_registry import is_parallel_id, make_parallel_env
-from envs.registry import make_env, native_task_of
+from envs.registry import is_parallel_id, make_env, make_parallel_env, native_task_of
+from envs.sb3.agents_as_rows import ParallelVecEnv
+from envs.sb3.padded_spaces import learners_named
 from envs.wrappers import ForecastObservation
 from predictor.errors import UserError
 from predictor.scene import SceneSpec
+
+EVALUATION_SEED = 2_000_000_000
+"""First seed of the final evaluation; training stays below 1e9, model selection between 1e9 and 2e9."""
+
+SELECTION_SEED = 1_000_000_000
+"""First seed of model selection; training seeds stay below it, those of the final evaluation start at 2e9."""
 
 Observe = Literal["forecast", "none", "constant-velocity"]
 Backend = Literal["gymnasium", "envpool"]
@@ -39,7 +44,7 @@ class Task:
     learners: tuple[str, ...] = ()
     """PettingZoo: agents or roles ("adversary") that learn; none named are all."""
     partner: str = "heuristic"
-    """PettingZoo: who drives the agents that do not learn (`envs.drivers`)."""
+    """PettingZoo: who drives the agents that do not learn (`envs.drivers.all_agents`)."""
 
     def __post_init__(self) -> None:
         """Check that the fields fit together."""

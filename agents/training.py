@@ -19,13 +19,11 @@ from stable_baselines3.common.vec_env import VecEnv
 from agents.arena import Arena, open_arena
 from agents.features import AttentionConfig, ForecastAttention
 from agents.presets import Algorithm, PPOPreset, Preset, preset_for
-from agents.rows import make_rows
-from agents.runs import BEST_FILE, CHECKPOINT_FILE, POLICY_FILE, copy_file, load_model, read_note, save_model
-from agents.task import Task, resolve_device
+from agents.runs import BEST_FILE, CHECKPOINT_FILE, POLICY_FILE, load_model, read_note, save_model
+from agents.task import SELECTION_SEED, Task, resolve_device
+from agents.vec_envs import make_rows
 from predictor.errors import UserError
-
-SELECTION_SEED = 1_000_000_000
-"""First seed of model selection; training seeds stay below it, those of the final evaluation start at 2e9."""
+from predictor.files import copy_file
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from benchmarks.settings import Settings
 from benchmarks.suite import measure, report, settle
 from benchmarks.table import plain, rich_table
 from predictor.errors import run_entry_point
-from predictor.provenance import write_json
+from predictor.files import write_json
 from predictor.runtime import keep_freed_memory, processor, tune
 
 

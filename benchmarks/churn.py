@@ -17,12 +17,13 @@ import tyro
 from rich.progress import track
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from envs.readers import FunctionReader
-from envs.vector import VecForecast
+from envs.readers.function import FunctionReader
+from envs.sb3.forecast import VecForecast
 from envs.wrappers import SceneObservation
 from predictor.checkpoint import load_checkpoint
 from predictor.errors import UserError, run_entry_point
-from predictor.provenance import provenance, write_json
+from predictor.files import write_json
+from predictor.provenance import provenance
 from predictor.scene import Scene, SceneSpec
 
 

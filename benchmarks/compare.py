@@ -10,10 +10,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.rows import Compared, Row
+from benchmarks.results import Compared, Row
 from benchmarks.settings import Settings
 from predictor.errors import UserError
-from predictor.provenance import write_json
+from predictor.files import write_json
 
 FORMAT = "dgvae-rl benchmark baseline"
 VERSION = 1

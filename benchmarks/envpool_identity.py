@@ -17,10 +17,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from envs.native import make_pool
-from envs.readers import HighwayReader
-from envs.readers.envpool import HIGHWAY_ENV_OF, PoolIdentity, PoolReader, native_spec
+from envs.readers.envpool import PoolIdentity, PoolReader, native_spec
+from envs.readers.highway import HighwayReader
 from envs.registry import make_env
+from envs.simulators.envpool import HIGHWAY_ENV_OF, make_pool
 from predictor.errors import UserError, run_entry_point
 
 

@@ -19,14 +19,15 @@ from highway_env.vehicle.behavior import IDMVehicle
 from rich.console import Console
 from rich.table import Table
 
-from envs.egos import make_ego, sees_forecasts
-from envs.native import ENV_IDS
+from envs.drivers.ego import make_ego
+from envs.drivers.trained import sees_forecasts
 from envs.readers import reader_for
-from envs.readers.envpool import HIGHWAY_ENV_OF
 from envs.registry import make_env
+from envs.simulators.envpool import ENV_IDS, HIGHWAY_ENV_OF
 from envs.wrappers import ForecastObservation
 from predictor.errors import UserError, run_entry_point
-from predictor.provenance import provenance, write_json
+from predictor.files import write_json
+from predictor.provenance import provenance
 
 _SAME_M = 1e-6
 """Vehicles closer than this are in the same place."""

@@ -19,11 +19,12 @@ import tyro
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from agents.rows import make_rows
 from agents.task import Task
 from agents.training import TrainingPlan, make_model
+from agents.vec_envs import make_rows
 from predictor.errors import UserError, run_entry_point
-from predictor.provenance import provenance, write_json
+from predictor.files import write_json
+from predictor.provenance import provenance
 from predictor.runtime import keep_freed_memory
 
 

@@ -11,7 +11,7 @@ substeps and input changes would come on top.
 
 from dataclasses import dataclass
 
-from predictor.networks import DGVAEConfig
+from predictor.dgvae.networks import DGVAEConfig
 
 STATE = 4
 """Features of a kinematic state."""

@@ -8,7 +8,7 @@ import torch
 
 from benchmarks.flops import Work
 from benchmarks.models import SIZES, forecaster, inference, observed, road, scenes, sized
-from benchmarks.rows import Row
+from benchmarks.results import Row
 from benchmarks.settings import Settings
 from benchmarks.timing import Meter, Timing, rate_row, timed_row
 from predictor.dgvae import DGVAE

@@ -27,14 +27,15 @@ from torch.utils.flop_counter import flop_registry
 
 from predictor.data.springs import SpringsConfig, make
 from predictor.errors import UserError, run_entry_point
-from predictor.feed import Shapes
-from predictor.objective import window_loss
-from predictor.provenance import provenance, write_json
+from predictor.evaluation.paper_tables import SPRINGS, Budget
+from predictor.files import write_json
+from predictor.provenance import provenance
 from predictor.runtime import processor, tune
 from predictor.suite import SuiteConfig, row_config, row_folder, run_row
-from predictor.tables import SPRINGS, Budget
-from predictor.train_config import TrainConfig, TrainPrecision
-from predictor.trainer import Trainer, load_data
+from predictor.training.batches import Shapes
+from predictor.training.config import TrainConfig, TrainPrecision
+from predictor.training.objective import window_loss
+from predictor.training.trainer import Trainer, load_data
 
 SPLITS = ("train", "val", "test", "ood")
 ROW = next(row for row in SPRINGS.rows if row.key == "dgvae")

@@ -16,18 +16,20 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from predictor.accuracy import Tally
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.checkpoint import load_checkpoint
 from predictor.data.store import read_store
 from predictor.data.windows import Windows
-from predictor.dgvae import DGVAE, DGVAEConfig
+from predictor.dgvae import DGVAE
+from predictor.dgvae.networks import DGVAEConfig
 from predictor.errors import UserError, run_entry_point
+from predictor.evaluation.accuracy import Tally
+from predictor.evaluation.measure_row import protocol_indices
+from predictor.evaluation.outcomes import run_windows
+from predictor.files import write_json
 from predictor.forecaster import Forecaster
-from predictor.outcomes import run_windows
-from predictor.provenance import provenance, write_json
+from predictor.provenance import provenance
 from predictor.runtime import tune
-from predictor.suite_measure import protocol_indices
 
 
 @dataclass(frozen=True)

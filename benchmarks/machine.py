@@ -1,6 +1,6 @@
 """What plain matrix products reach here: the rate that other rows are held against."""
 
-from benchmarks.rows import Row
+from benchmarks.results import Row
 from benchmarks.settings import Settings
 from benchmarks.timing import REFERENCE_PRODUCTS, Meter, Product, products, quartiles
 

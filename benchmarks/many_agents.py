@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.child import Child, exact_memory
 from benchmarks.flops import Work
 from benchmarks.models import SIZES, forecaster, inference, road, scenes, sized
-from benchmarks.rows import Compared, Row, skipped
+from benchmarks.results import Compared, Row, skipped
 from benchmarks.settings import Settings
 from benchmarks.timing import Meter, timed_row
-from predictor.dgvae import DGVAE, DGVAEConfig
+from benchmarks.worker_process import Child, exact_memory
+from predictor.dgvae import DGVAE
+from predictor.dgvae.networks import DGVAEConfig
 
 NEIGHBOURS = 8
 HORIZON = 20

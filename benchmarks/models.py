@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from predictor.data.windows import WindowBatch
-from predictor.dgvae import DGVAE, PRESETS, DGVAEConfig
+from predictor.dgvae import DGVAE
+from predictor.dgvae.networks import PRESETS, DGVAEConfig
 from predictor.forecaster import Belief, Memory, WindowOutput
-from predictor.objective import window_loss
 from predictor.runtime import Precision, precision
 from predictor.scene import AxisFrame, SceneSpec
-from predictor.train_config import TrainConfig
+from predictor.training.config import TrainConfig
+from predictor.training.objective import window_loss
 
 SIZES = ("fast", "paper")
 """Presets."""

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.envpool_training import TrainingSpeedConfig, measure
-from benchmarks.needs import missing
-from benchmarks.rows import Row, skipped
+from benchmarks.optional_packages import missing
+from benchmarks.results import Row, skipped
 from benchmarks.settings import Settings
 from benchmarks.timing import ratio_row
 

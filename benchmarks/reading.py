@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.needs import missing
-from benchmarks.rows import Row, skipped
+from benchmarks.optional_packages import missing
+from benchmarks.results import Row, skipped
 from benchmarks.settings import Settings
 from benchmarks.timing import Meter, interpreter, products, rate_row
 from predictor.data.springs import SpringsConfig, make_episodes, spring_spec
@@ -114,8 +114,8 @@ def _highway(settings: Settings) -> Iterator[tuple[Callable[[], float], int]]:
 @contextmanager
 def _pool(settings: Settings) -> Iterator[tuple[Callable[[], float], int]]:
     from benchmarks.wrapper_overhead import blocks_of
-    from envs.native import EnvPoolVecEnv
     from envs.registry import native_task_of
+    from envs.sb3.envpool import EnvPoolVecEnv
 
     with closing(EnvPoolVecEnv(native_task_of(settings.env_id), POOL_ENVS, seed=0, scenes=False)) as venv:
         yield blocks_of(venv, STEPS[settings.mode]), POOL_ENVS

@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 import torch
 
 from benchmarks.models import TrainingStep, box, forecaster, inference
-from benchmarks.rows import Row
+from benchmarks.results import Row
 from benchmarks.settings import Settings
 from benchmarks.timing import Meter, Timing, ratio_row, timed_row
-from predictor.dgvae import DGVAEConfig
+from predictor.dgvae.networks import DGVAEConfig
 from predictor.errors import UserError
 
 EQUAL = DGVAEConfig(
@@ -37,7 +37,6 @@ REFERENCE: dict[str, Any] = {
     "graph_type": "dynamic", "encoder_save_eval_memory": False, "rnn_type": "lstm",
 }  # fmt: skip
 """Its settings, as its own scripts set them for a dynamic graph."""
-
 
 AS_SHIPPED = "the reference with torch's own choice of library"
 """`predictor.runtime.tune` sets who multiplies for the whole process, the reference included; here it is undone."""

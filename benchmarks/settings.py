@@ -10,7 +10,7 @@ SECTIONS: dict[str, str] = {
     "forecast": "benchmarks.forecast",
     "streaming": "benchmarks.streaming",
     "training": "benchmarks.training",
-    "wrappers": "benchmarks.wrappers",
+    "wrappers": "benchmarks.environments",
     "ppo": "benchmarks.ppo",
     "agents": "benchmarks.many_agents",
     "data": "benchmarks.reading",

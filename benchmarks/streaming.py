@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from benchmarks.models import forecaster, inference, road, scenes, sized
-from benchmarks.rows import Row
+from benchmarks.results import Row
 from benchmarks.settings import Settings
 from benchmarks.timing import Meter, ratio_row, timed_row
 from predictor.dgvae import DGVAE

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 
 from benchmarks.compare import Baseline, Comparison, better_of, compare
-from benchmarks.needs import missing
-from benchmarks.rows import Row, skipped
+from benchmarks.optional_packages import missing
+from benchmarks.results import Row, skipped
 from benchmarks.settings import SECTIONS, Settings
 from predictor.provenance import provenance
 from predictor.runtime import processor

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from rich.table import Table
 
-from benchmarks.rows import Row
+from benchmarks.results import Row
 
 HEADINGS = ("section", "measured", "shape", "median", "quartiles", "ratio", "GFLOP/s", "% of matmul", "note")
 _RIGHT = ("median", "quartiles", "GFLOP/s", "% of matmul")

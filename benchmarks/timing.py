@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.rows import TOLERANCE, Compared, Kind, Row
+from benchmarks.results import TOLERANCE, Compared, Kind, Row
 from benchmarks.settings import Settings
 
 Product = tuple[int, int, int]

@@ -7,12 +7,12 @@ process, so the default is timed in another process, which takes turns with this
 from dataclasses import replace
 from typing import NamedTuple
 
-from benchmarks.child import Child, exact_memory
 from benchmarks.flops import STATE, Work
 from benchmarks.models import TrainingStep, sized
-from benchmarks.rows import Row, skipped
+from benchmarks.results import Row, skipped
 from benchmarks.settings import Settings
 from benchmarks.timing import Meter, rate_row, ratio_row
+from benchmarks.worker_process import Child, exact_memory
 from predictor.runtime import keep_freed_memory
 
 

@@ -26,12 +26,14 @@ if not __package__:  # run as a file: the packages are beside this folder
 
 from benchmarks.timing import alternate, quartiles
 from envs.registry import make_env
-from envs.vector import VecForecast
+from envs.sb3.forecast import VecForecast
 from envs.wrappers import SceneObservation
-from predictor.dgvae import DGVAE, PRESETS
+from predictor.dgvae import DGVAE
+from predictor.dgvae.networks import PRESETS
 from predictor.errors import UserError, run_entry_point
+from predictor.files import write_json
 from predictor.forecaster import Forecaster
-from predictor.provenance import provenance, write_json
+from predictor.provenance import provenance
 from predictor.runtime import keep_freed_memory
 from predictor.scene import SceneSpec
 

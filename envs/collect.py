@@ -14,7 +14,7 @@ import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from envs.readers.highway_labels import ATTRIBUTE_NAMES, SceneLabels, with_labels
-from envs.worlds import World, default_drivers, open_world
+from envs.rollouts.world import World, default_drivers, open_world
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.errors import UserError, run_entry_point
 from predictor.provenance import provenance

@@ -10,7 +10,7 @@ import math
 import multiprocessing
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,24 +21,27 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track
 
-from envs import evaluate_report as report
-from envs.live import MODEL, NEIGHBOURS, STRAIGHT, Case, Episode, EpisodeTask, memory_key, play
-from envs.parallel_registry import PARALLEL_CHECKPOINTS, is_parallel_id, parallel_checkpoint_for
-from envs.registry import CHECKPOINTS, checkpoint_for
-from envs.worlds import default_drivers, open_world
-from predictor.accuracy import Accuracy, Outcome, Tally, fitted_std_m
+from envs.registry import CHECKPOINTS, PARALLEL_CHECKPOINTS, checkpoint_for, is_parallel_id, parallel_checkpoint_for
+from envs.rollouts import report
+from envs.rollouts.episode import MODEL, NEIGHBOURS, STRAIGHT, Case, Episode, EpisodeTask, memory_key, play
+from envs.rollouts.report import EnvAccuracy
+from envs.rollouts.world import default_drivers, open_world
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, read_info, resolve
 from predictor.data.store import read_info_of
 from predictor.errors import UserError, run_entry_point
-from predictor.evaluate import ROW_NAMES, accuracy_table
+from predictor.evaluation.accuracy import Accuracy, Tally, fitted_std_m
+from predictor.evaluation.displacement import MISS_THRESHOLD_M, min_ade
+from predictor.evaluation.graph_accuracy import GraphAccuracy, GraphTally
+from predictor.evaluation.outcomes import Outcome
+from predictor.files import write_json
 from predictor.graph import pair_mask
-from predictor.graph_metrics import GraphAccuracy, GraphTally
-from predictor.metrics import MISS_THRESHOLD_M, min_ade
-from predictor.provenance import provenance, write_json
+from predictor.provenance import provenance
+from predictor.reports.tables import ROW_NAMES, accuracy_table
 from predictor.runtime import keep_freed_memory
 from predictor.scene import SceneSpec
 
 PACKAGES = ("highway-env", "mpe2", "pettingzoo", "envpool", "gymnasium", "torch", "numpy")
+
 GALLERY_CASES = 6
 """Worst forecasts that are drawn, at most one per episode."""
 
@@ -93,46 +96,6 @@ class EvaluateConfig:
         names = [Path(checkpoint).name for checkpoint in self.checkpoint]
         if len(set(names)) < len(names):
             raise UserError(f"each checkpoint needs a name of its own, got {', '.join(names)}; rename a folder")
-
-
-@dataclass(frozen=True)
-class EnvAccuracy:
-    """Accuracy of one checkpoint in one environment."""
-
-    env_id: str
-    """The environment."""
-    checkpoint: str
-    """The forecaster's name or folder."""
-    driver: str
-    """Who drove."""
-    dt_s: float
-    """Time step [s]."""
-    model: Accuracy
-    """K = 1, the most likely forecast."""
-    model_samples: Accuracy
-    """Best of K."""
-    constant_velocity: Accuracy
-    """The baseline on the same scenes."""
-    reduction: float
-    """1 − minADE(K = 1) / ADE of constant velocity."""
-    reduction_interval: tuple[float, float]
-    """95 % bootstrap interval of the reduction over episodes."""
-    nearest_neighbours: Accuracy | None = None
-    """The memoryless baseline on the same scenes, where data was given."""
-    histories: dict[int, Accuracy] = field(default_factory=dict)
-    """The model (K = 1) with so many steps of memory."""
-    graph: GraphAccuracy | None = None
-    """Believed against true edges, where the simulator knows them."""
-    latency_median_ms: float = float("nan")
-    """Time to observe one scene and forecast it (K = 1), one thread, all workers busy."""
-    latency_p95_ms: float = float("nan")
-    """The same, 95th percentile."""
-
-    @property
-    def rows(self) -> list[Accuracy]:
-        """All rows of its table."""
-        extra = [] if self.nearest_neighbours is None else [self.nearest_neighbours]
-        return [self.model, self.model_samples, *self.histories.values(), *extra, self.constant_velocity]
 
 
 def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = None) -> tuple[EnvAccuracy, list[Case]]:

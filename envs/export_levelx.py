@@ -20,12 +20,13 @@ import tyro
 from jaxtyping import Float
 from rich.progress import track
 
-from envs.egos import make_ego
+from envs.drivers.ego import make_ego
 from envs.readers.highway import HighwayReader, is_highway_env
 from envs.registry import make_env
 from predictor.data.store import Episode
 from predictor.errors import UserError, run_entry_point
-from predictor.provenance import provenance, replace_folder, write_json
+from predictor.files import replace_folder, write_json
+from predictor.provenance import provenance
 
 FRAMES_PER_S = 25
 """As the datasets."""

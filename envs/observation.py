@@ -19,9 +19,13 @@ from predictor.forecaster import Forecaster
 from predictor.online import OnlineForecaster
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 
+Observations = dict[str, NDArray[Any]]
+
+
 # A forked worker (SubprocVecEnv, start_method="fork") inherits OpenMP's state without its threads and would wait for
 # them forever; with one thread it never asks for them. torch's own DataLoader workers do the same.
 os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
+
 
 SCENE_KEYS = ("scene_states", "scene_ids", "scene_valid", "scene_heading_rad")
 FORECAST_KEYS = ("agents", "forecast", "edge_probs", "edge_features", "valid")
@@ -238,3 +242,54 @@ def into_ego_axes(heading_rad: Float[np.ndarray, " batch"]) -> Float[np.ndarray,
     """Rotations from world axes to axes along each ego's heading; the transpose goes back."""
     cos, sin = np.cos(heading_rad), np.sin(heading_rad)
     return np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], -2)
+
+
+def batch_entries(scenes: SceneBatch) -> dict[str, NDArray[Any]]:
+    """As `envs.observation.scene_entries`, for a batch."""
+    return {
+        "scene_states": scenes.states,
+        "scene_ids": scenes.ids,
+        "scene_valid": scenes.valid.astype(np.int8),
+        "scene_heading_rad": scenes.heading_rad[:, None],
+    }
+
+
+def observe_ended(
+    stream: ForecastStream, observations: Observations, ended: NDArray[np.int64], closing: list[Observations]
+) -> tuple[Observations, list[Observations]]:
+    """Forecast entries for each row, and for each closing observation from the old episode's history."""
+    opening = scenes_from(observations)
+    if not len(ended):
+        return dict(stream.observe(opening)), []
+    scenes = SceneBatch(*(field.copy() for field in (opening.states, opening.ids, opening.valid, opening.heading_rad)))
+    for row, last in zip(ended, closing, strict=True):
+        scenes.states[row], scenes.ids[row] = last["scene_states"], last["scene_ids"]
+        scenes.valid[row], scenes.heading_rad[row] = last["scene_valid"], last["scene_heading_rad"][0]
+    both = stream.observe_boundary(scenes, ended, opening[ended])
+    rows = len(opening)
+    of_closing = {key: value[ended] for key, value in both.items()}
+    for value in both.values():
+        value[ended] = value[rows:]
+    entries = {key: value[:rows] for key, value in both.items()}
+    return entries, [{key: value[i] for key, value in of_closing.items()} for i in range(len(ended))]
+
+
+def with_forecast(observations: Observations, entries: Observations) -> Observations:
+    """Returns the env's own observations with the forecast entries in place of the scene's."""
+    return {"observation": observations["observation"], **entries}
+
+
+def forecast_space(space: gym.spaces.Dict, stream: ForecastStream) -> gym.spaces.Dict:
+    """Returns the space of `with_forecast`."""
+    return gym.spaces.Dict({"observation": space["observation"], **stream.spaces()})
+
+
+def common_value(values: Any, what: str) -> Any:
+    """Returns the value that all environments share.
+
+    Raises:
+        UserError: they differ.
+    """
+    if any(value != values[0] for value in values):
+        raise UserError(f"all environments must have the same {what}, got {sorted({str(v) for v in values})}")
+    return values[0]

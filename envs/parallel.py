@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
+from envs.multiagent_observation import SharedStream, check_shared
 from envs.observation import FORECAST_KEYS, ForecastConfig
-from envs.parallel_registry import MakeSharedReader, parallel_checkpoint_for, parallel_env_id, shared_reader_for
+from envs.readers import MakeSharedReader, parallel_env_id, shared_reader_for
 from envs.readers.base import SharedScene, SharedSceneReader, build_reader
-from envs.shared import SharedStream, check_shared
+from envs.registry import parallel_checkpoint_for
 from predictor.checkpoint import load_forecaster
 from predictor.errors import ProtocolError, UserError
 from predictor.forecaster import Forecaster

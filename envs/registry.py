@@ -1,12 +1,21 @@
 """Which environments are known, how to make them, and which shipped checkpoint serves which id."""
 
+import functools
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
 import highway_env  # noqa: F401  (registers the ids)
+import pettingzoo
+from pettingzoo import ParallelEnv
+from pettingzoo.env_registry.exceptions import PettingZooRegistryError
 
-from envs import scenarios  # noqa: F401  (registers the ids)
-from envs.readers.envpool import HIGHWAY_ENV_OF
+from envs.readers.mpe import MPE_IDS
+from envs.simulators import mixed_traffic  # noqa: F401  (registers the ids)
+from envs.simulators.envpool import HIGHWAY_ENV_OF, register_envpool_ids
+from envs.simulators.highway_multiagent import HIGHWAY_MULTIAGENT_IDS
 from predictor.errors import UserError
 
 CHECKPOINTS: dict[str, str] = {
@@ -27,7 +36,6 @@ CHECKPOINTS: dict[str, str] = {
 }
 """Env id → name of the checkpoint under predictor/pretrained."""
 
-
 ENVPOOL = "envpool/"
 """Namespace of EnvPool's native environments."""
 
@@ -35,8 +43,6 @@ ENVPOOL = "envpool/"
 def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     """`gym.make` with a one-line error for an unknown id."""
     if env_id.startswith(ENVPOOL):
-        from envs.native import register_envpool_ids  # needs what needs this module
-
         register_envpool_ids()
     try:
         return gym.make(env_id, **kwargs)
@@ -75,3 +81,115 @@ def checkpoint_for(env_id: str) -> str:
             f"Shipped ids: {', '.join(CHECKPOINTS)}"
         )
     return CHECKPOINTS[env_id]
+
+
+@dataclass(frozen=True)
+class ParallelEntry:
+    """How to make an environment."""
+
+    factory: str
+    """"module:function" that returns a ParallelEnv."""
+    kwargs: Mapping[str, Any] = field(default_factory=dict)
+    """Arguments that belong to the id."""
+
+
+PARALLEL_IDS: dict[str, ParallelEntry] = {
+    **{env_id: ParallelEntry(f"mpe2.{env_id}:parallel_env") for env_id in MPE_IDS},
+    "pursuit_v5": ParallelEntry("pettingzoo.sisl.pursuit.pursuit:parallel_env"),
+    **{
+        env_id: ParallelEntry("envs.simulators.highway_multiagent:HighwayParallelEnv", {"env_id": env_id})
+        for env_id in HIGHWAY_MULTIAGENT_IDS
+    },
+}
+"""Id → how to make it. simple_crypto is left out: nothing moves in it."""
+
+PARALLEL_CHECKPOINTS: dict[str, str] = {
+    "simple_tag_v3": "simple-tag",
+    "simple_spread_v3": "simple-spread",
+    "intersection-multi-agent-v2": "intersection",
+}
+"""Id → name of the checkpoint under predictor/pretrained."""
+
+
+def is_parallel_id(env_id: str) -> bool:
+    """Whether `make_parallel_env` knows the id: listed here, "module:function", or registered with PettingZoo.
+
+    The module of a "module:function" is imported; gymnasium's "module:EnvId" is none of these.
+    """
+    if ":" not in env_id:
+        return env_id in PARALLEL_IDS or _in_pettingzoo(env_id)
+    try:
+        factory = _load(env_id)
+    except UserError:
+        return False
+    return not isinstance(factory, type) or issubclass(factory, ParallelEnv)
+
+
+def make_parallel_env(env_id: str, **kwargs: Any) -> ParallelEnv:
+    """Make a parallel environment.
+
+    Args:
+        env_id: one of `PARALLEL_IDS`, an id in PettingZoo's own registry ("sisl/pursuit_v5"), or "module:function" of
+            a function (or class) that gives a ParallelEnv.
+        kwargs: for the environment (``max_cycles``, ``continuous_actions``, …).
+
+    Raises:
+        UserError: unknown id, a missing package, or arguments that the environment refuses.
+    """
+    make = _maker(env_id)
+    try:
+        env = make(**kwargs)
+    except (TypeError, ValueError, AssertionError, ImportError, PettingZooRegistryError) as error:
+        arguments = f" with {kwargs}" if kwargs else ""
+        raise UserError(f"cannot make parallel env '{env_id}'{arguments}: {error}") from error
+    if not isinstance(env, ParallelEnv):
+        raise UserError(f"'{env_id}' must give a pettingzoo ParallelEnv, got {type(env).__name__}")
+    return env
+
+
+def parallel_checkpoint_for(env_id: str) -> str:
+    """Name of the shipped checkpoint for a parallel id.
+
+    Raises:
+        UserError: none ships for the id.
+    """
+    if env_id not in PARALLEL_CHECKPOINTS:
+        raise UserError(
+            f"no checkpoint ships for parallel env '{env_id}'; pass one (a name or a path), or 'constant-velocity'. "
+            f"Shipped ids: {', '.join(PARALLEL_CHECKPOINTS)}"
+        )
+    return PARALLEL_CHECKPOINTS[env_id]
+
+
+def _maker(env_id: str) -> Callable[..., Any]:
+    if env_id in PARALLEL_IDS:
+        entry = PARALLEL_IDS[env_id]
+        return functools.partial(_load(entry.factory), **entry.kwargs)
+    if ":" in env_id:
+        return _load(env_id)
+    if _in_pettingzoo(env_id):
+        return functools.partial(pettingzoo.make, "parallel", env_id)
+    raise UserError(
+        f"unknown parallel env '{env_id}'; known: {', '.join(PARALLEL_IDS)}; others as 'module:function' or "
+        "registered with pettingzoo.register('parallel', id, ...)"
+    )
+
+
+def _load(path: str) -> Callable[..., Any]:
+    """What "module:function" names."""
+    module, _, name = path.partition(":")
+    try:
+        factory: Callable[..., Any] | None = getattr(importlib.import_module(module), name, None)
+    except (ImportError, ValueError) as error:
+        raise UserError(f"cannot import '{module}' for '{path}': {error}; is its package installed?") from error
+    if not callable(factory):
+        raise UserError(f"module '{module}' has no function '{name}' that could make an environment")
+    return factory
+
+
+def _in_pettingzoo(env_id: str) -> bool:
+    try:
+        pettingzoo.spec("parallel", env_id)
+    except PettingZooRegistryError:
+        return False
+    return True

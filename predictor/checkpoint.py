@@ -18,9 +18,9 @@ from torch import nn
 
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.errors import UserError
+from predictor.files import replace_folder
 from predictor.forecaster import TrainableForecaster
 from predictor.models import build, config_from_json, name_of
-from predictor.provenance import replace_folder
 from predictor.scene import SceneSpec
 
 FORMAT = "dgvae-rl predictor"

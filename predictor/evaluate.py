@@ -5,7 +5,6 @@ and RMSE and NLL by horizon, for K = 1 and K samples beside constant velocity; w
 in the loop that a policy drives is `python -m envs.evaluate`'s.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,35 +16,21 @@ import tyro
 from matplotlib import pyplot as plt
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
-from predictor.accuracy import Accuracy, Outcome, fitted_std_m, run_window_batch, run_windows, summarise
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint
 from predictor.data.store import EpisodeStore, read_store
 from predictor.data.windows import Windows
 from predictor.errors import UserError, run_entry_point
+from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
+from predictor.evaluation.outcomes import Outcome, run_window_batch, run_windows
+from predictor.files import write_json
 from predictor.forecaster import Forecaster
-from predictor.metrics import COVERAGE_SHARE
-from predictor.plots import plot_error_by_horizon, plot_scene
-from predictor.provenance import provenance, write_json
+from predictor.provenance import provenance
+from predictor.reports.plots import plot_error_by_horizon, plot_scene
+from predictor.reports.tables import ROW_NAMES, accuracy_table, markdown_table
 from predictor.runtime import tune
 from predictor.scene import SceneSpec
-
-SCALARS = (
-    "minADE [m]",
-    "minFDE [m]",
-    "joint ADE [m]",
-    "joint FDE [m]",
-    "RMSE [m]",
-    "missed",
-    "cover",
-)
-"""Columns of both tables between K and the steps."""
-ROW_NAMES = {"dgvae": "dG-VAE", "dnri": "dNRI", "imma": "IMMA", "lstm": "LSTM", "mlp": "MLP"}
-"""What a table calls a model; others go by their own name."""
-MAX_STEPS_SHOWN = 6
-"""Steps of the horizon that fit on a screen, the first and the last among them; accuracy.json has all."""
 
 
 @dataclass(frozen=True)
@@ -146,68 +131,6 @@ def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:
         _write(config, rows, subject.store.info.source, subject.spec.dt_s)
         _plot(config, rows, windows, chosen, subject.model or baseline, horizon)
     return rows
-
-
-def accuracy_table(rows: Sequence[Accuracy], dt_s: float, title: str) -> Table:
-    """One line per row; the columns by horizon hold displacement, RMSE and NLL, for `MAX_STEPS_SHOWN` of its steps."""
-    table = Table(title=title, show_lines=True)
-    table.add_column("forecaster")
-    for heading in ("K", *SCALARS, "forecasts"):
-        table.add_column("\n".join(heading.split()).replace("[", r"\["), justify="right")
-    shown = _steps_shown(rows)
-    for step in shown:
-        table.add_column(f"{dt_s * (step + 1):g} s", justify="right")
-    for row in rows:
-        stacks = [(row.by_step_m[i], row.rmse_m[i], *([row.nll[i]] if row.nll else [])) for i in shown]
-        cells = ["\n".join(_number(value, 2) for value in stack) for stack in stacks]
-        scalars = [cell.replace(" ± ", "\n±") for cell in _scalar_cells(row)]
-        table.add_row(row.name, str(row.num_samples), *scalars, str(row.agents), *cells)
-    table.caption = (
-        r"by time ahead: displacement of the best sample \[m] / RMSE of the mean \[m] / NLL \[nats], top to bottom; "
-        f"± standard error over subsets of the windows; missed: ends more than {rows[0].miss_threshold_m:g} m off; "
-        f"cover: truths within the central {100 * COVERAGE_SHARE:g} % of the samples"
-    )
-    return table
-
-
-def markdown_table(rows: Sequence[Accuracy], dt_s: float) -> str:
-    """The same as Markdown; by time ahead the displacement alone."""
-    shown = _steps_shown(rows)
-    steps = [f"{dt_s * (i + 1):g} s" for i in shown]
-    lines = ["| " + " | ".join(["forecaster", "K", *SCALARS, *steps]) + " |"]
-    lines.append("|" + "---|" * (2 + len(SCALARS) + len(steps)))
-    for row in rows:
-        cells = [row.name, str(row.num_samples), *_scalar_cells(row)]
-        lines.append("| " + " | ".join([*cells, *(_number(row.by_step_m[i], 2) for i in shown)]) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def _steps_shown(rows: Sequence[Accuracy]) -> list[int]:
-    horizon = len(rows[0].by_step_m)
-    return np.linspace(0, horizon - 1, min(horizon, MAX_STEPS_SHOWN)).round().astype(int).tolist()
-
-
-def _number(value: float, places: int) -> str:
-    """Fixed places, or two digits where those would show fewer; springs err by millimetres, traffic by metres."""
-    if math.isnan(value):
-        return "–"
-    return f"{value:.{places}f}" if value == 0 or abs(value) >= 10 ** (1 - places) else f"{value:.2g}"
-
-
-def _scalar_cells(row: Accuracy) -> list[str]:
-    """Cells under `SCALARS`; what was not measured is a dash."""
-
-    def metres(name: str) -> str:
-        value: float = getattr(row, name)
-        error = row.statistics[name].standard_error if name in row.statistics else None
-        return _number(value, 3) + ("" if error is None else f" ± {_number(error, 3)}")
-
-    lengths = [
-        metres(name) for name in ("min_ade_m", "min_fde_m", "min_joint_ade_m", "min_joint_fde_m", "overall_rmse_m")
-    ]
-    miss = "–" if math.isnan(row.miss_rate) else f"{100 * row.miss_rate:.1f} %"
-    covered = f"{100 * row.statistics['coverage'].mean:.0f} %" if "coverage" in row.statistics else "–"
-    return [*lengths, miss, covered]
 
 
 def _write(config: EvaluateConfig, rows: Sequence[Accuracy], source: str, dt_s: float) -> None:

@@ -25,19 +25,16 @@ from rich.console import Console
 from rich.markdown import Markdown
 from rich.progress import track
 
-from predictor import interpret_plots as pictures
 from predictor.checkpoint import CONSTANT_VELOCITY, CheckpointInfo, load_checkpoint
 from predictor.data.store import StoreInfo, read_store
 from predictor.data.windows import Windows
-from predictor.edge_findings import (
-    Findings,
-    measure,
-    watch,
-)
 from predictor.errors import UserError, run_entry_point
-from predictor.interpret_report import scores_markdown
-from predictor.outcomes import run_window_batch
-from predictor.provenance import provenance, write_json
+from predictor.evaluation.edge_findings import Findings, measure, watch
+from predictor.evaluation.outcomes import run_window_batch
+from predictor.files import write_json
+from predictor.provenance import provenance
+from predictor.reports import edge_plots as pictures
+from predictor.reports.tables import scores_markdown
 from predictor.scene import SceneSpec
 
 BATCH_BYTES = 64_000_000

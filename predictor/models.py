@@ -15,7 +15,8 @@ from predictor.baselines.dnri import DNRI, DNRIConfig
 from predictor.baselines.imma import IMMA, IMMAConfig
 from predictor.baselines.lstm import LSTM, LSTMConfig
 from predictor.baselines.mlp import MLP, MLPConfig
-from predictor.dgvae import DGVAE, PRESETS, DGVAEConfig
+from predictor.dgvae import DGVAE
+from predictor.dgvae.networks import PRESETS, DGVAEConfig
 from predictor.errors import UserError
 from predictor.scene import SceneSpec
 

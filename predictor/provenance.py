@@ -2,11 +2,9 @@
 
 import datetime
 import importlib.metadata
-import json
 import os
 import platform
 import shlex
-import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -25,25 +23,6 @@ def provenance(packages: Sequence[str], command: str | None = None) -> dict[str,
         "machine": f"{platform.machine()}, {os.cpu_count()} logical cores",
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON so that a reader finds either the old file or the whole new one."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    partial.write_text(json.dumps(content, indent=2, default=str) + "\n")
-    os.replace(partial, path)
-
-
-def replace_folder(new: Path, target: Path) -> None:
-    """Put `new` in the place of `target`; a crash leaves one of them whole under the target's name or beside it."""
-    if not target.exists():
-        new.rename(target)
-        return
-    old = target.with_name(f".{target.name}.old")
-    shutil.rmtree(old, ignore_errors=True)
-    target.rename(old)
-    os.replace(new, target)
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def _module_or_script() -> list[str]:

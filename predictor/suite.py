@@ -23,14 +23,15 @@ from rich.progress import Progress
 
 from predictor.data.store import read_info_of
 from predictor.errors import UserError, run_entry_point
-from predictor.plots import plot_rows_by_step
-from predictor.provenance import provenance, write_json
+from predictor.evaluation.measure_row import measure_row
+from predictor.evaluation.paper_tables import BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, TABLES, Budget, Row, Sizes
+from predictor.files import write_json
+from predictor.provenance import provenance
+from predictor.reports.plots import plot_rows_by_step
+from predictor.reports.tables import latex_table, markdown_report
 from predictor.runtime import tune
-from predictor.suite_measure import measure_row
-from predictor.suite_report import latex_table, markdown_report
-from predictor.tables import BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, TABLES, Budget, Row, Sizes
 from predictor.train import train
-from predictor.train_config import TrainConfig, TrainPrecision
+from predictor.training.config import TrainConfig, TrainPrecision
 
 TableName = Literal["springs", "recipe", "mocap", "nba", "sdd", "ind"]
 

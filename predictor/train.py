@@ -16,10 +16,11 @@ from torch.utils.tensorboard import SummaryWriter
 
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.errors import UserError, run_entry_point
-from predictor.provenance import provenance, write_json
+from predictor.files import write_json
+from predictor.provenance import provenance
 from predictor.runtime import tune
-from predictor.train_config import TrainConfig
-from predictor.trainer import LOG_EVERY, Trainer, load_data
+from predictor.training.config import TrainConfig
+from predictor.training.trainer import LOG_EVERY, Trainer, load_data
 
 
 def train(config: TrainConfig) -> Path:

@@ -17,12 +17,13 @@ from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 import envs.readers
 from envs.collect import CollectConfig, collect
 from envs.evaluate import EvaluateConfig
-from envs.readers import EntityRowsReader, reader_for
+from envs.readers import reader_for
+from envs.readers.entities import EntityRowsReader
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.data.store import StoreInfo, write_store
 from predictor.scene import SceneSpec
 from predictor.train import train
-from predictor.train_config import TrainConfig
+from predictor.training.config import TrainConfig
 from train_policy import TrainPolicyConfig
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -4,7 +4,8 @@ import gymnasium as gym
 import numpy as np
 from crossing_env import DT_S, CrossingEnv
 
-from envs.readers import FunctionReader, register_reader
+from envs.readers import register_reader
+from envs.readers.function import FunctionReader
 from predictor.scene import Scene, SceneSpec
 
 

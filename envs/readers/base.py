@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from predictor.errors import UserError
-from predictor.scene import PADDING_ID, Scene, SceneSpec
+from predictor.scene import PADDING_ID, Scene, SceneBatch, SceneSpec
 
 
 @runtime_checkable
@@ -205,3 +205,26 @@ def share(
     headings = np.zeros(spec.max_agents)
     headings[:count] = heading_rad
     return SharedScene(padded(everyone, np.arange(count), spec.max_agents), dict(rows), headings)
+
+
+def role_of(agent: str) -> str:
+    """An agent's name without its number."""
+    return agent.rstrip("0123456789").rstrip("_- ") or agent
+
+
+def perceive_batch(everyone: SceneBatch, spec: SceneSpec) -> SceneBatch:
+    """The ego and the nearest agents within perception, nearest first, padded to `max_agents`: `perceive` by row."""
+    rows = len(everyone)
+    offsets = everyone.states[..., :2] - everyone.states[:, :1, :2]
+    distance_m = np.where(everyone.valid, np.linalg.norm(offsets, axis=-1), np.inf)
+    # a stable sort leaves the ego, listed first and at distance 0, in row 0
+    order = np.argsort(distance_m, axis=1, kind="stable")[:, : spec.max_agents]
+    kept = np.take_along_axis(distance_m, order, axis=1) <= spec.perception_m
+    width = order.shape[1]
+    states = np.zeros((rows, spec.max_agents, everyone.states.shape[-1]))
+    ids = np.full((rows, spec.max_agents), PADDING_ID, dtype=np.int64)
+    seen = np.zeros((rows, spec.max_agents), dtype=np.bool_)
+    states[:, :width] = np.where(kept[..., None], np.take_along_axis(everyone.states, order[..., None], axis=1), 0.0)
+    ids[:, :width] = np.where(kept, np.take_along_axis(everyone.ids, order, axis=1), PADDING_ID)
+    seen[:, :width] = kept
+    return SceneBatch(states, ids, seen, everyone.heading_rad)

@@ -12,8 +12,8 @@ import gymnasium as gym
 import numpy as np
 from jaxtyping import Float, Int
 
-from envs.readers.assignment import IdentityTracker
 from envs.readers.base import Reader
+from envs.readers.identity import IdentityTracker
 from predictor.errors import ProtocolError, UserError
 from predictor.scene import Scene, SceneSpec
 
@@ -40,7 +40,7 @@ class EntityRowsReader:
     """What the scenes look like. Features beyond the kinematic ones need a column of that name."""
     gate_m: float = 10.0
     """Without an "id" column: who is found at this distance or more from where its motion led is somebody new [m]; see
-    `envs.readers.assignment`. The default is for cars at 1 s per step; less where agents are closer."""
+    `envs.readers.identity`. The default is for cars at 1 s per step; less where agents are closer."""
     scales: tuple[float, ...] | None = None
     """What 1.0 is in SI units, for each column, where the observation is normalised; None takes SI units."""
     relative: bool = False

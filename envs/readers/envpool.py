@@ -14,29 +14,11 @@ import gymnasium as gym
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from envs.readers.assignment import best_pairs
-from envs.readers.base import Reader
+from envs.readers.base import Reader, perceive_batch
+from envs.readers.identity import best_pairs
+from envs.simulators.envpool import HIGHWAY_ENV_OF
 from predictor.errors import UserError
 from predictor.scene import PADDING_ID, AxisFrame, Scene, SceneBatch, SceneSpec
-
-HIGHWAY_ENV_OF: dict[str, str] = {
-    "Highway-v0": "highway-v0",
-    "HighwayFast-v0": "highway-fast-v0",
-    "Exit-v0": "exit-v0",
-    "Intersection-v0": "intersection-v0",
-    "Intersection-v1": "intersection-v1",
-    "Merge-v0": "merge-v0",
-    "Racetrack-v0": "racetrack-v0",
-    "RacetrackLarge-v0": "racetrack-large-v0",
-    "RacetrackOval-v0": "racetrack-oval-v0",
-    "Roundabout-v0": "roundabout-v0",
-    "TwoWay-v0": "two-way-v0",
-    "UTurn-v0": "u-turn-v0",
-}
-"""EnvPool task → the highway-env id that it re-implements; docs/envpool.md says where the two differ."""
-
-ONE_START = frozenset(HIGHWAY_ENV_OF) - {"Highway-v0", "HighwayFast-v0", "Merge-v0"}
-"""Tasks that begin in the same state whatever the seed (EnvPool 1.2.5): all their variety comes from the ego."""
 
 GATE_M = 12.0
 """A vehicle is not found again beyond this cost [m]; docs/envpool.md has what the motion within a step costs."""
@@ -59,7 +41,7 @@ class NativeEnv(Protocol):
 
 
 def is_envpool_env(env: gym.Env) -> bool:
-    """Whether the environment is one of EnvPool's highway environments behind `envs.native.EnvPoolEnv`."""
+    """Whether the environment is one of EnvPool's highway environments behind `envs.simulators.envpool.EnvPoolEnv`."""
     inner = env.unwrapped
     return getattr(inner, "task_id", None) in HIGHWAY_ENV_OF and hasattr(inner, "debug_states")
 
@@ -202,7 +184,7 @@ class PoolReader:
             states: `debug_states()` of these rows.
             rows: which environments these are.
         """
-        return _perceive(self.read_all(states, rows), self.spec)
+        return perceive_batch(self.read_all(states, rows), self.spec)
 
     def read_all(self, states: Sequence[Any], rows: Int[np.ndarray, " some"]) -> SceneBatch:
         """Everyone, ego first, padded to the fullest row.
@@ -245,26 +227,8 @@ def vehicles_of(
     return kinematics, valid
 
 
-def _perceive(everyone: SceneBatch, spec: SceneSpec) -> SceneBatch:
-    """The ego and the nearest agents within perception, nearest first, padded to `max_agents`: `perceive` by row."""
-    rows = len(everyone)
-    offsets = everyone.states[..., :2] - everyone.states[:, :1, :2]
-    distance_m = np.where(everyone.valid, np.linalg.norm(offsets, axis=-1), np.inf)
-    # a stable sort leaves the ego, listed first and at distance 0, in row 0
-    order = np.argsort(distance_m, axis=1, kind="stable")[:, : spec.max_agents]
-    kept = np.take_along_axis(distance_m, order, axis=1) <= spec.perception_m
-    width = order.shape[1]
-    states = np.zeros((rows, spec.max_agents, everyone.states.shape[-1]))
-    ids = np.full((rows, spec.max_agents), PADDING_ID, dtype=np.int64)
-    seen = np.zeros((rows, spec.max_agents), dtype=np.bool_)
-    states[:, :width] = np.where(kept[..., None], np.take_along_axis(everyone.states, order[..., None], axis=1), 0.0)
-    ids[:, :width] = np.where(kept, np.take_along_axis(everyone.ids, order, axis=1), PADDING_ID)
-    seen[:, :width] = kept
-    return SceneBatch(states, ids, seen, everyone.heading_rad)
-
-
 class EnvPoolReader(Reader):
-    """Scene reader for one of EnvPool's highway environments (`envs.native.EnvPoolEnv`).
+    """Scene reader for one of EnvPool's highway environments (`envs.simulators.envpool.EnvPoolEnv`).
 
     Args:
         env: the environment; its frequencies give `dt_s`, its task the frame.
@@ -278,7 +242,9 @@ class EnvPoolReader(Reader):
     def __init__(self, env: gym.Env, perception_m: float | None = None, max_agents: int | None = None) -> None:
         """Derive the spec from the environment."""
         if not is_envpool_env(env):
-            raise UserError(f"EnvPoolReader needs an EnvPoolEnv (envs.native), got {type(env.unwrapped).__name__}")
+            raise UserError(
+                f"EnvPoolReader needs an EnvPoolEnv (envs.simulators.envpool), got {type(env.unwrapped).__name__}"
+            )
         native: NativeEnv = env.unwrapped  # type: ignore[assignment]
         super().__init__(native_spec(native.task_id, native.native_config, perception_m, max_agents))
         self._rows = np.zeros(1, dtype=np.int64)

@@ -2,8 +2,8 @@
 
 A vehicle driven by the intelligent driver model (IDM) brakes for the vehicle in front of it on its lane, and while it
 changes lane for the one on the lane it changes to as well. Those are its leaders. highway-env's linear drivers, and the
-mixed ones of `envs.scenarios`, look at the same vehicles. A perception system could not know this (nor the driver's
-parameters), so labels never enter an observation; scenes are read in `envs.readers.highway`.
+mixed ones of `envs.simulators.mixed_traffic`, look at the same vehicles. A perception system could not know this (nor
+the driver's parameters), so labels never enter an observation; scenes are read in `envs.readers.highway`.
 
 Only the longitudinal driving is labelled. A lane change also weighs the gaps on the other lane, for one frame.
 """
@@ -18,7 +18,7 @@ from highway_env.vehicle.objects import RoadObject
 from jaxtyping import Float, Int
 
 from envs.readers.highway import vehicles_of
-from envs.scenarios import DRIVER_KINDS, MixedDriver
+from envs.simulators.mixed_traffic import DRIVER_KINDS, MixedDriver
 from predictor.data.store import Episode
 from predictor.scene import Scene
 
@@ -28,7 +28,7 @@ ATTRIBUTE_NAMES = ("time_gap_s", "desired_time_gap_s", "headway_m", "desired_spe
 """Attributes of a leader edge: headway over the receiver's speed; the driver's own TIME_WANTED; from centre to centre
 along the receiver's lane, as its driver measures it (see `leaders_of`); see `desired_speed_mps`; see `driver_kind`."""
 OTHER_KIND = -1
-"""Kind of a driver by a law that is not in `envs.scenarios.DRIVER_KINDS`."""
+"""Kind of a driver by a law that is not in `envs.simulators.mixed_traffic.DRIVER_KINDS`."""
 _LINEAR_KINDS = {
     AggressiveVehicle: DRIVER_KINDS.index("aggressive"),
     DefensiveVehicle: DRIVER_KINDS.index("defensive"),
@@ -93,7 +93,7 @@ def leaders_of(vehicle: IDMVehicle) -> dict[RoadObject, float]:
 
 
 def driver_kind(vehicle: IDMVehicle) -> int:
-    """Place of the driver's law of acceleration in `envs.scenarios.DRIVER_KINDS`, or OTHER_KIND."""
+    """Place of the driver's law of acceleration in `envs.simulators.mixed_traffic.DRIVER_KINDS`, or OTHER_KIND."""
     if isinstance(vehicle, MixedDriver):
         return DRIVER_KINDS.index(vehicle.traits.kind)
     if isinstance(vehicle, LinearVehicle):

@@ -16,8 +16,23 @@ from envs.readers.base import SharedScene, share
 from predictor.errors import ProtocolError, UserError
 from predictor.scene import KINEMATIC_FEATURES, Scene, SceneSpec
 
+MPE_IDS = (
+    "simple_v3",
+    "simple_spread_v3",
+    "simple_tag_v3",
+    "simple_adversary_v3",
+    "simple_push_v3",
+    "simple_world_comm_v3",
+    "simple_formation_v1",
+    "simple_line_v1",
+    "simple_reference_v3",
+    "simple_speaker_listener_v4",
+    "collect_treasure_v1",
+)
+
 MPE_CONSTANTS = ("adversary", "landmark", "radius_m")
 """What a look tells of an entity besides its motion: 1 or 0, 1 or 0, and its size."""
+
 MPE_FEATURES = (*KINEMATIC_FEATURES, *MPE_CONSTANTS)
 _SCALES = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.1)
 _EVERYTHING_M = 1000.0  # the arena is 2 m wide; it has no walls, but nobody gets this far in an episode

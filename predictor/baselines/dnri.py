@@ -2,12 +2,12 @@
 
 Encoder per frame: agent → pair → agent → pair; then a forward LSTM per pair for the learned prior and a reverse one
 that the posterior sees besides (training only). Decoder: messages from its own hidden states along sampled edges, type
-0 silent; gated update; change of state. The loss is `predictor.losses`.
+0 silent; gated update; change of state. The loss is `predictor.training.objective`.
 
 Unlike the public code for a varying number of agents: the forward memory of a pair is carried on and the reverse LSTM
 does run, in training as in prediction; nobody's future presence is known when forecasting; a frame without agents is a
-frame. Batch normalisation is left out (see `predictor.baselines.nri`). While true states are fed, the graph is the
-prior's expectation rather than a draw, as in `predictor.dgvae`, and samples branch off at the first forecast step.
+frame. Batch normalisation is left out (see `predictor.baselines.nri_blocks`). While true states are fed, the graph is
+the prior's expectation rather than a draw, as in `predictor.dgvae`, and samples branch off at the first forecast step.
 """
 
 from dataclasses import dataclass
@@ -17,21 +17,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from predictor.baselines.nri import FrameEncoder, HiddenDecoder, PairLSTM, elu_head
-from predictor.baselines.unroll import (
-    Encoded,
-    GraphRule,
-    Internal,
-    Tensors,
-    UnrolledForecaster,
-    check_sizes,
-    mean_weight,
-)
-from predictor.codec import Residual
+from predictor.baselines.base import Encoded, GraphRule, Internal, Tensors, UnrolledForecaster, check_sizes, mean_weight
+from predictor.baselines.nri_blocks import FrameEncoder, HiddenDecoder, PairLSTM, elu_head
+from predictor.dgvae.networks import concrete_sample, no_edge_where_absent
 from predictor.errors import UserError
 from predictor.forecaster import Belief, WindowOutput
 from predictor.graph import pair_mask
-from predictor.networks import concrete_sample, no_edge_where_absent
+from predictor.layers.state_codec import Residual
 from predictor.scene import SceneSpec
 
 
@@ -56,7 +48,7 @@ class DNRIConfig:
     hard_samples: bool = False
     """Draw one type per pair instead of a mixture, with the gradient of the mixture (straight-through)."""
     residual: Residual = "state"
-    """What the predicted change of position is added to; see `predictor.codec`."""
+    """What the predicted change of position is added to; see `predictor.layers.state_codec`."""
     delta_scales: tuple[float, ...] = ()
     """Typical one-step change of each feature [SI]; empty takes the spec's feature scales."""
 

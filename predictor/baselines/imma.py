@@ -17,11 +17,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from predictor.baselines.nri import FrameEncoder, HiddenDecoder, PairLSTM
-from predictor.baselines.unroll import Encoded, Tensors, UnrolledForecaster, check_sizes
-from predictor.codec import Residual
+from predictor.baselines.base import Encoded, Tensors, UnrolledForecaster, check_sizes
+from predictor.baselines.nri_blocks import FrameEncoder, HiddenDecoder, PairLSTM
 from predictor.errors import UserError
 from predictor.graph import pair_mask
+from predictor.layers.state_codec import Residual
 from predictor.scene import SceneSpec
 
 
@@ -42,7 +42,7 @@ class IMMAConfig:
     dynamic_graph: bool = False
     """Infer attention anew from predicted states, rather than keep the last observed graph (public code)."""
     residual: Residual = "state"
-    """What the predicted change of position is added to; see `predictor.codec`."""
+    """What the predicted change of position is added to; see `predictor.layers.state_codec`."""
     delta_scales: tuple[float, ...] = ()
     """Typical one-step change of each feature [SI]; empty takes the spec's feature scales."""
 

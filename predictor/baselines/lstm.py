@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from predictor.baselines.unroll import Tensors, UnrolledForecaster, check_sizes
-from predictor.codec import Residual
+from predictor.baselines.base import Tensors, UnrolledForecaster, check_sizes
 from predictor.errors import UserError
+from predictor.layers.state_codec import Residual
 from predictor.scene import SceneSpec
 
 
@@ -31,7 +31,7 @@ class LSTMConfig:
     rnn_dim: int = 128
     """Width of the LSTM."""
     residual: Residual = "state"
-    """What the predicted change of position is added to; see `predictor.codec`."""
+    """What the predicted change of position is added to; see `predictor.layers.state_codec`."""
     delta_scales: tuple[float, ...] = ()
     """Typical one-step change of each feature [SI]; empty takes the spec's feature scales."""
 

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from predictor.baselines.unroll import Tensors, UnrolledForecaster, check_sizes
-from predictor.codec import Residual
+from predictor.baselines.base import Tensors, UnrolledForecaster, check_sizes
+from predictor.layers.state_codec import Residual
 from predictor.scene import SceneSpec
 
 
@@ -21,7 +21,7 @@ class MLPConfig:
     hidden_dim: int = 256
     """Width of the hidden layer."""
     residual: Residual = "state"
-    """What the predicted change of position is added to; see `predictor.codec`."""
+    """What the predicted change of position is added to; see `predictor.layers.state_codec`."""
     delta_scales: tuple[float, ...] = ()
     """Typical one-step change of each feature [SI]; empty takes the spec's feature scales."""
 

@@ -20,9 +20,9 @@ from typing import Literal
 
 import tyro
 
-from predictor.data.cards import DatasetNotes, most_present, save_dataset, summary
-from predictor.data.common import NO_LIMIT_M, LoaderConfig, find_files, in_split, progressed, steps_per_frame
+from predictor.data.dataset_card import DatasetNotes, most_present, save_dataset, summary
 from predictor.data.levelx_files import CLASS_FEATURES, Features, Layout, layout_of, open_recording, read_tracks
+from predictor.data.loading import NO_LIMIT_M, LoaderConfig, find_files, in_split, progressed, steps_per_frame
 from predictor.data.store import Episode
 from predictor.data.tracks import cut_episodes
 from predictor.errors import UserError, run_entry_point

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from predictor.data.common import bad_line, finite, read_lines, whole
+from predictor.data.loading import bad_line, finite, read_lines, whole
 from predictor.data.tracks import TrackRows
 from predictor.errors import UserError
 

@@ -2,8 +2,8 @@
 
 Reads one subject's folder (one .asf skeleton, one .amc file per trial, 120 Hz) and gives the 31 joints as agents with
 position and velocity on three axes [m, m/s]; y is up, as in the files. One unit of the files is 0.0254 / 0.45 m (see
-`predictor.data.asf`). Velocity is the backward difference over one step, so the first step of a trial is dropped and
-nothing of the future is in a state.
+`predictor.data.mocap_files`). Velocity is the backward difference over one step, so the first step of a trial is
+dropped and nothing of the future is in a state.
 
 Splits are by trial: the position of SHA-256("12:<trial>") in [0, 1) decides, below 0.1 test, below 0.2 validation, else
 training. Of the 23 walking trials of subject 35 that are usually used (01–16, 28–34), 35_12 and 35_34 are for testing,
@@ -17,10 +17,9 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from predictor.data.amc import joint_positions, read_motion
-from predictor.data.asf import Skeleton, read_skeleton
-from predictor.data.cards import DatasetNotes, save_dataset, summary
-from predictor.data.common import NO_LIMIT_M, LoaderConfig, find_files, in_split, progressed
+from predictor.data.dataset_card import DatasetNotes, save_dataset, summary
+from predictor.data.loading import NO_LIMIT_M, LoaderConfig, find_files, in_split, progressed
+from predictor.data.mocap_files import Skeleton, joint_positions, read_motion, read_skeleton
 from predictor.data.store import Episode
 from predictor.errors import UserError, run_entry_point
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from predictor.data.cards import DatasetNotes, most_present, save_dataset, summary
-from predictor.data.common import (
+from predictor.data.dataset_card import DatasetNotes, most_present, save_dataset, summary
+from predictor.data.loading import (
     NO_LIMIT_M,
     LoaderConfig,
     bad_line,

@@ -18,7 +18,7 @@ import zarr
 from jaxtyping import Bool, Float, Int
 
 from predictor.errors import UserError
-from predictor.provenance import replace_folder
+from predictor.files import replace_folder
 from predictor.scene import PADDING_ID, Scene, SceneSpec
 
 FORMAT = "dgvae-rl episodes"

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from predictor.data.flat import UNKNOWN_TYPE, Casts, Cut, cast, cut, flatten
 from predictor.data.store import Episode
+from predictor.data.window_tensors import UNKNOWN_TYPE, Casts, Cut, cast, cut, flatten
 from predictor.errors import UserError
 from predictor.scene import SceneSpec
 

@@ -8,8 +8,8 @@ import torch
 from pettingzoo import ParallelEnv
 from stable_baselines3 import PPO
 
-from agents.parallel_rows import make_parallel_rows
 from agents.task import Task
+from agents.vec_envs import make_parallel_rows
 
 TOY = f"{__name__}:Meadow"
 LIVES = {"ant_0": 2, "bee_0": 5}

@@ -5,10 +5,9 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from agents.arena import Arena, EgoArena, open_arena
-from agents.parallel_rows import ParallelArena
-from agents.rows import make_rows
+from agents.arena import Arena, EgoArena, ParallelArena, open_arena
 from agents.task import Task
+from agents.vec_envs import make_rows
 from envs.registry import make_env
 
 

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from agents.episodes import EpisodeResult
+from agents.arena import ParallelArena
 from agents.evaluate import (
-    EVALUATION_SEED,
     NUM_POLICIES,
     Evaluation,
     evaluate_policy_on_seeds,
@@ -14,8 +13,8 @@ from agents.evaluate import (
     summarize,
     wilson_interval,
 )
-from agents.parallel_rows import ParallelArena
-from agents.task import Task
+from agents.task import EVALUATION_SEED, Task
+from agents.vec_envs import EpisodeResult
 from predictor.errors import UserError
 from tests.agents.helpers import TOY, policy_for
 

@@ -10,14 +10,12 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from agents.arena import EgoArena
-from agents.episodes import EpisodeResult, SeededEpisodes
-from agents.evaluate import EVALUATION_SEED
 from agents.features import ForecastAttention
 from agents.presets import DQNPreset, PPOPreset, preset_for
-from agents.rows import make_rows
 from agents.runs import read_note, save_model
-from agents.task import Task
-from agents.training import SELECTION_SEED, SaveCheckpoint, SelectBest, TrainingPlan, make_model
+from agents.task import EVALUATION_SEED, SELECTION_SEED, Task
+from agents.training import SaveCheckpoint, SelectBest, TrainingPlan, make_model
+from agents.vec_envs import EpisodeResult, SeededEpisodes, make_rows
 from predictor.errors import UserError
 
 CONSTANT_VELOCITY = Task("highway-fast-v0", "constant-velocity")

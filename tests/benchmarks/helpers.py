@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.compare import Baseline, write_baseline
-from benchmarks.rows import Better, Compared, Kind, Row
+from benchmarks.results import Better, Compared, Kind, Row
 from benchmarks.settings import Settings
 
 QUICK = Settings(quick=True, threads=1)

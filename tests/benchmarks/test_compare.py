@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.compare import OTHER_PROCESSOR, better_of, compare, read_baseline
-from benchmarks.rows import Compared, Row, skipped
+from benchmarks.results import Compared, Row, skipped
 from benchmarks.settings import Settings
 from predictor.errors import UserError
 from tests.benchmarks.helpers import HERE, QUICK, baseline, row, write

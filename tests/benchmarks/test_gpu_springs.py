@@ -13,7 +13,7 @@ import torch
 from benchmarks import gpu_springs as script
 from benchmarks.gpu_springs import Counter, GpuSpringsConfig, Kernel, on_card
 from predictor.errors import UserError, run_entry_point
-from predictor.trainer import Trainer
+from predictor.training.trainer import Trainer
 
 CARD = GpuSpringsConfig(peak_tflops=10.0, bandwidth_gbs=1000.0, share=0.5, kernel_us=2.0, target_minutes=1.0)
 

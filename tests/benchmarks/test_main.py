@@ -8,7 +8,7 @@ import torch
 
 from benchmarks import __main__ as entry
 from benchmarks import forecast, suite
-from benchmarks.rows import Row
+from benchmarks.results import Row
 from benchmarks.timing import Meter
 from predictor.errors import run_entry_point
 from predictor.runtime import processor

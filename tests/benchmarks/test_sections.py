@@ -4,7 +4,8 @@ from typing import Any
 
 import pytest
 
-from benchmarks import forecast, machine, ppo, reading, streaming, suite, training, wrappers
+from benchmarks import environments as wrappers
+from benchmarks import forecast, machine, ppo, reading, streaming, suite, training
 from benchmarks.settings import Settings
 from benchmarks.timing import Meter
 

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.needs import missing
+from benchmarks.optional_packages import missing
 from benchmarks.settings import SECTIONS, Settings
 from predictor.errors import UserError
 

@@ -3,7 +3,7 @@ import io
 import pytest
 from rich.console import Console
 
-from benchmarks.rows import Row, skipped
+from benchmarks.results import Row, skipped
 from benchmarks.table import HEADINGS, cells, number, plain, rich_table
 
 FULL = Row(

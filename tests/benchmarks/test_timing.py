@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.rows import Row
+from benchmarks.results import Row
 from benchmarks.timing import (
     Meter,
     Timing,

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import torch
 
-from envs import live
-from envs.parallel_registry import make_parallel_env, shared_reader_for
+from envs.readers import shared_reader_for
+from envs.registry import make_parallel_env
+from envs.rollouts import episode as live
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE
 from predictor.scene import SceneSpec
@@ -36,6 +37,6 @@ def save_tag(path: Path, has_ego: bool = False) -> str:
 
 
 def forget() -> None:
-    """Drop what `envs.live` keeps from episode to episode: nothing of one test may serve in another."""
+    """Drop what `envs.rollouts.episode` keeps from episode to episode: nothing of one test may serve in another."""
     for kept in (live._kept_world, live._kept_forecaster, live._kept_neighbours):
         kept.cache_clear()

@@ -15,11 +15,12 @@ from highway_env.vehicle.behavior import IDMVehicle
 from stable_baselines3 import PPO
 
 from envs.observation import ForecastConfig, ForecastStream
-from envs.readers import HighwayReader
+from envs.readers.highway import HighwayReader
 from envs.registry import make_env
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
-from predictor.dgvae import DGVAE, DGVAEConfig
+from predictor.dgvae import DGVAE
+from predictor.dgvae.networks import DGVAEConfig
 from predictor.errors import run_entry_point
 from predictor.forecaster import Forecaster
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec

@@ -19,17 +19,18 @@ import pytest
 import torch
 from pettingzoo import ParallelEnv
 
+from envs.multiagent_observation import SharedStream, agent_entries
 from envs.observation import FORECAST_KEYS, ForecastConfig, ForecastStream, ego_entries
 from envs.parallel import ForecastParallelEnv
-from envs.parallel_registry import make_parallel_env, shared_reader_for
-from envs.readers import EntityRowsReader, FunctionReader, Reader, reader_for
-from envs.readers.base import SharedScene, share
-from envs.registry import make_env
-from envs.shared import SharedStream, agent_entries
+from envs.readers import reader_for, shared_reader_for
+from envs.readers.base import Reader, SharedScene, share
+from envs.readers.entities import EntityRowsReader
+from envs.readers.function import FunctionReader
+from envs.registry import make_env, make_parallel_env
 from envs.wrappers import ForecastObservation
-from predictor import dgvae
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE
+from predictor.dgvae import model as dgvae
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 from tests.envs.helpers import HORIZON, SIZES
 

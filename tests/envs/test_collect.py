@@ -7,11 +7,11 @@ from stable_baselines3 import PPO
 
 from envs import collect
 from envs.collect import CollectConfig
-from envs.egos import idle_action
-from envs.parallel_registry import make_parallel_env, shared_reader_for
-from envs.readers import HighwayReader
+from envs.drivers.ego import idle_action
+from envs.readers import shared_reader_for
+from envs.readers.highway import HighwayReader
 from envs.readers.highway_labels import ATTRIBUTE_NAMES, LEADER
-from envs.registry import make_env
+from envs.registry import make_env, make_parallel_env
 from predictor.data.store import Episode, read_store
 from predictor.data.windows import Windows
 from predictor.errors import UserError

@@ -15,14 +15,15 @@ from matplotlib import pyplot as plt
 
 from envs import evaluate
 from envs.collect import CollectConfig, collect
-from envs.evaluate import EnvAccuracy, EvaluateConfig, _finite, _graph, _reduction, _summary, evaluate_env
-from envs.live import MODEL, STRAIGHT, Episode
-from envs.readers import HighwayReader
+from envs.evaluate import EvaluateConfig, _finite, _graph, _reduction, _summary, evaluate_env
+from envs.readers.highway import HighwayReader
 from envs.registry import make_env
-from predictor.accuracy import Outcome
+from envs.rollouts.episode import MODEL, STRAIGHT, Episode
+from envs.rollouts.report import EnvAccuracy
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.data.store import StoreInfo, write_store
 from predictor.errors import UserError
+from predictor.evaluation.outcomes import Outcome
 from predictor.scene import SceneSpec
 from tests.envs.evaluation import TAG, forget, save_tag, tag_spec
 from tests.envs.helpers import HIGHWAY_SPEC, HORIZON, SIZES, run_command, save_forecast_policy, tiny_model

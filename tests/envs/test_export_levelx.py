@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from envs import export_levelx
-from envs.egos import idle_action
+from envs.drivers.ego import idle_action
 from envs.export_levelx import RECORDING_META, TRACKS, TRACKS_META, ExportConfig, export, export_env
-from envs.readers import HighwayReader
+from envs.readers.highway import HighwayReader
 from envs.registry import make_env
 from predictor.data.levelx import LevelxConfig, load
 from tests.envs.helpers import run_command

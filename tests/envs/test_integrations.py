@@ -18,8 +18,11 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 import envs.readers
-from envs.readers import EntityRowsReader, FunctionReader, MakeReader, register_reader
-from envs.vector import VecForecast, VectorForecast
+from envs.readers import MakeReader, register_reader
+from envs.readers.entities import EntityRowsReader
+from envs.readers.function import FunctionReader
+from envs.sb3.forecast import VecForecast
+from envs.vector import VectorForecast
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.scene import Scene, SceneSpec
 from tests.envs.helpers import assert_same, save_tiny
@@ -273,7 +276,7 @@ def test_the_zoo_wraps_all_of_them_at_once(checkpoint: str):
     register_reader(Plaza, ASKED)
     settings = {
         "env_wrapper": "envs.wrappers.SceneObservation",
-        "vec_env_wrapper": {"envs.vector.VecForecast": {"checkpoint": checkpoint}},
+        "vec_env_wrapper": {"envs.sb3.forecast.VecForecast": {"checkpoint": checkpoint}},
     }
     venv = zoo_envs(settings)
     assert isinstance(venv, VecForecast)

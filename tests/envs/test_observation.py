@@ -29,7 +29,8 @@ from envs.readers import reader_for
 from envs.registry import CHECKPOINTS, make_env
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.checkpoint import CheckpointInfo, load_forecaster, resolve, save_checkpoint, shipped
-from predictor.dgvae import DGVAE, DGVAEConfig
+from predictor.dgvae import DGVAE
+from predictor.dgvae.networks import DGVAEConfig
 from predictor.errors import UserError
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 from tests.envs.helpers import (

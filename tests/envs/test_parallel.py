@@ -14,8 +14,9 @@ from pettingzoo.utils import BaseParallelWrapper
 
 from envs.observation import FORECAST_KEYS
 from envs.parallel import ForecastParallelEnv
-from envs.parallel_registry import PARALLEL_CHECKPOINTS, PARALLEL_IDS, make_parallel_env, shared_reader_for
+from envs.readers import shared_reader_for
 from envs.readers.base import SharedScene, share
+from envs.registry import PARALLEL_CHECKPOINTS, PARALLEL_IDS, make_parallel_env
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE
@@ -24,7 +25,7 @@ from predictor.forecaster import Forecaster
 from predictor.online import OnlineForecaster
 from predictor.scene import Scene, SceneBatch, SceneSpec
 from tests.envs.helpers import HORIZON, SIZES, assert_same, largest_difference, save_tiny, tiny_model
-from tests.envs.test_shared import view_by_loops
+from tests.envs.test_multiagent_observation import view_by_loops
 
 WORLD = SceneSpec(dt_s=1.0, has_ego=False, perception_m=25.0, max_agents=8)
 CENTROID = replace(WORLD, frame=("centroid", "centroid"))

@@ -1,8 +1,8 @@
 import gymnasium as gym
 import pytest
 
-from envs.readers.envpool import HIGHWAY_ENV_OF
 from envs.registry import CHECKPOINTS, checkpoint_for, make_env, native_task_of
+from envs.simulators.envpool import HIGHWAY_ENV_OF
 from predictor.errors import UserError
 
 

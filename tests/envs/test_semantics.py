@@ -13,7 +13,7 @@ import torch
 from envs.observation import FORECAST_KEYS
 from envs.readers.base import SharedScene
 from envs.readers.mpe import MPE_FEATURES
-from envs.readers.sisl import PURSUIT_FEATURES
+from envs.readers.pursuit import PURSUIT_FEATURES
 from predictor.scene import KINEMATIC_FEATURES, Scene
 from tests.envs.helpers import assert_same, largest_difference
 from tests.envs.semantics import EGO, SUBJECTS, Bodies, Moment, Session, Views, named

@@ -12,7 +12,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 from envs.observation import FORECAST_KEYS
 from envs.registry import make_env
-from envs.vector import VecForecast, VectorForecast
+from envs.sb3.forecast import VecForecast
+from envs.vector import VectorForecast
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import load_checkpoint
 from predictor.errors import UserError

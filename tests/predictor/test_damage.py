@@ -6,9 +6,9 @@ import torch
 
 from predictor.data.store import read_store
 from predictor.errors import ProtocolError, UserError
-from predictor.losses import nll
 from predictor.online import OnlineForecaster
-from predictor.train_config import TrainConfig
+from predictor.training.config import TrainConfig
+from predictor.training.objective import nll
 from tests.predictor.helpers import batch, model, scene, write_circles
 
 

@@ -12,13 +12,15 @@ import torch
 from rich.console import Console
 
 from predictor import evaluate as evaluation
-from predictor.accuracy import Accuracy, Statistic
 from predictor.baselines.mlp import MLP, MLPConfig
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.dgvae import DGVAE
 from predictor.errors import UserError, run_entry_point
-from predictor.evaluate import EvaluateConfig, accuracy_table, evaluate, markdown_table
+from predictor.evaluate import EvaluateConfig, evaluate
+from predictor.evaluation.accuracy import Accuracy
+from predictor.evaluation.standard_errors import Statistic
+from predictor.reports.tables import accuracy_table, markdown_table
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from tests.predictor.helpers import FAST_LIKE, spec, write_circles
 

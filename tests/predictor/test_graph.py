@@ -8,20 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from predictor.graph import (
-    NOBODY,
-    PairLinear,
-    among_nearest,
-    folded,
-    nearest,
-    off_diagonal,
-    others,
-    pair_mask,
-    sum_over_senders,
-    to_dense,
-    to_pairs,
-    with_diagonal,
-)
+from predictor.graph import NOBODY, among_nearest, nearest, off_diagonal, others, pair_mask, to_dense, with_diagonal
+from predictor.layers.pairs import PairLinear, folded, sum_over_senders, to_pairs
 from tests.predictor.helpers import random_presence, random_states
 
 EXACT = {"rtol": 0.0, "atol": 1e-12}

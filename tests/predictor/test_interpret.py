@@ -16,15 +16,15 @@ from matplotlib.figure import Figure
 from sklearn.metrics import roc_auc_score
 
 from predictor import interpret as interpretation
-from predictor import interpret_plots as pictures
 from predictor.baselines.mlp import MLP, MLPConfig
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.data.springs import Physics, SpringsConfig, make_episodes, spring_spec
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.data.windows import Windows
 from predictor.dgvae import DGVAE
-from predictor.edge_findings import labelled_rows, measure, watch
-from predictor.edge_scores import (
+from predictor.errors import UserError, run_entry_point
+from predictor.evaluation.edge_findings import labelled_rows, measure, watch
+from predictor.evaluation.edge_scores import (
     StillnessTally,
     chance_correlation,
     correlations,
@@ -34,10 +34,10 @@ from predictor.edge_scores import (
     score_factor,
     separation,
 )
-from predictor.errors import UserError, run_entry_point
+from predictor.evaluation.outcomes import run_window_batch
 from predictor.forecaster import Belief, Memory
 from predictor.interpret import InterpretConfig, interpret
-from predictor.outcomes import run_window_batch
+from predictor.reports import edge_plots as pictures
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from tests.predictor.helpers import RICH, circling_episode, model, spec, write_circles
 

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 from torch import Tensor
 
-from predictor import dgvae
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.dgvae import DGVAE
+from predictor.dgvae import model as dgvae
 from predictor.errors import ProtocolError
 from predictor.online import OnlineForecaster
 from predictor.scene import PADDING_ID, Forecast, Scene, SceneBatch

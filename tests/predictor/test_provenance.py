@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from predictor.provenance import provenance, write_json
+from predictor.files import write_json
+from predictor.provenance import provenance
 
 
 def test_provenance_says_how_a_result_was_made(monkeypatch: pytest.MonkeyPatch):

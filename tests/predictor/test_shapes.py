@@ -5,8 +5,8 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
+from predictor.evaluation.displacement import min_ade
 from predictor.graph import pair_mask
-from predictor.metrics import min_ade
 from predictor.scene import Scene
 from tests.predictor.helpers import model, random_presence, random_states
 

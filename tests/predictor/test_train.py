@@ -16,16 +16,18 @@ import torch
 import zarr
 
 from predictor import train as training
-from predictor.accuracy import run_windows, summarise
 from predictor.checkpoint import load_checkpoint
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.data.windows import WindowBatch
-from predictor.dgvae import PRESETS, WindowOutput
+from predictor.dgvae.networks import PRESETS
 from predictor.errors import UserError, run_entry_point
-from predictor.objective import window_loss
+from predictor.evaluation.accuracy import summarise
+from predictor.evaluation.outcomes import run_windows
+from predictor.forecaster import WindowOutput
 from predictor.train import train
-from predictor.train_config import TrainConfig
-from predictor.trainer import Trainer, load_data, typical_change
+from predictor.training.config import TrainConfig
+from predictor.training.objective import window_loss
+from predictor.training.trainer import Trainer, load_data, typical_change
 from tests.predictor.helpers import FAST_LIKE, circling_episode, following_episode, model, spec, write_circles
 
 ROOT = Path(__file__).parents[2]

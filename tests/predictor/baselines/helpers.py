@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from predictor.baselines import dnri
+from predictor.baselines.base import UnrolledForecaster
 from predictor.baselines.dnri import DNRI, DNRIConfig
 from predictor.baselines.imma import IMMA, IMMAConfig
 from predictor.baselines.lstm import LSTM, LSTMConfig
 from predictor.baselines.mlp import MLP, MLPConfig
-from predictor.baselines.unroll import UnrolledForecaster
 from predictor.forecaster import Belief, Memory
 from predictor.scene import SceneSpec
 from tests.predictor.helpers import spec

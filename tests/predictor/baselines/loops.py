@@ -4,8 +4,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from predictor.baselines.nri import FrameEncoder, HiddenDecoder, PairLSTM
-from predictor.graph import PairLinear
+from predictor.baselines.nri_blocks import FrameEncoder, HiddenDecoder, PairLSTM
+from predictor.layers.pairs import PairLinear
 
 Pair = tuple[int, int]
 

@@ -12,8 +12,8 @@ from predictor.baselines import dnri
 from predictor.baselines.dnri import DNRI, DNRIConfig
 from predictor.errors import UserError
 from predictor.graph import pair_mask
-from predictor.losses import kl_categorical
 from predictor.scene import SceneSpec
+from predictor.training.objective import kl_categorical
 from tests.predictor.baselines import loops
 from tests.predictor.baselines.helpers import (
     AGENTS,

@@ -12,7 +12,6 @@ from jaxtyping import TypeCheckError
 from torch import Tensor
 from torch.nn import functional
 
-from predictor.accuracy import summarise
 from predictor.baselines.nearest_neighbour import (
     BLOCK,
     ROLE_WEIGHT,
@@ -26,9 +25,10 @@ from predictor.baselines.nearest_neighbour import (
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.data.windows import Windows
 from predictor.errors import UserError
+from predictor.evaluation.accuracy import summarise
+from predictor.evaluation.outcomes import run_windows
 from predictor.forecaster import Belief, Forecaster, Memory
 from predictor.online import OnlineForecaster
-from predictor.outcomes import run_windows
 from predictor.scene import KINEMATIC_FEATURES, KINEMATIC_FEATURES_3D, SceneSpec
 from tests.predictor.helpers import (
     ROAD,

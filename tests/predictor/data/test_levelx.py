@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from predictor.data import levelx
-from predictor.data.common import split_of
+from predictor.data.loading import split_of
 from tests.predictor.data.helpers import Loader, change_line
 
 CENTRE = (

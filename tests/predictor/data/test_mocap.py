@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from predictor.data import mocap
-from predictor.data.amc import joint_positions, read_motion, rotation
-from predictor.data.asf import Bone, Skeleton, read_skeleton
-from predictor.data.common import split_of
+from predictor.data.loading import split_of
+from predictor.data.mocap_files import Bone, Skeleton, joint_positions, read_motion, read_skeleton, rotation
 from predictor.scene import KINEMATIC_FEATURES_3D
 from tests.predictor.data.helpers import Loader, change_line
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from predictor.data import nba
-from predictor.data.common import split_of
+from predictor.data.loading import split_of
 from tests.predictor.data.helpers import Loader, change_line
 
 PLAYERS = [11, 12, 13, 14, 15, 3, 1004, 1005, 1006, 1007]

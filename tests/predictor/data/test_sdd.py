@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from predictor.data import sdd
-from predictor.data.common import split_of
+from predictor.data.loading import split_of
 from predictor.data.sdd import read_scales
 from predictor.errors import UserError
 from tests.predictor.data.helpers import Loader, change_line

@@ -26,8 +26,8 @@ from predictor.data.springs import (
 )
 from predictor.data.store import read_store
 from predictor.errors import UserError, run_entry_point
-from predictor.train_config import TrainConfig
-from predictor.trainer import Trainer, load_data
+from predictor.training.config import TrainConfig
+from predictor.training.trainer import Trainer, load_data
 
 OPEN = Physics(num_agents=2, box_m=1e6, dt_s=0.1, frames=61, substeps=50)  # no walls
 

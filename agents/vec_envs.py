@@ -1,0 +1,235 @@
+"""Vector environments for training and evaluation.
+
+Environments with one ego run in spawned processes with one torch thread each, or natively in EnvPool; the forecaster
+runs once per step for all of them, in the main process. In PettingZoo tasks every learner is an environment of the
+vector, and agents that do not learn are driven by name (`envs.drivers.all_agents`). What a policy sees is decided by
+the task (`agents.task`), so that training, evaluation and video cannot differ.
+"""
+
+import multiprocessing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from pettingzoo import ParallelEnv
+from pettingzoo.utils import BaseParallelWrapper
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
+
+from agents.task import Task, resolve_device
+from envs.drivers.all_agents import Driver, make_driver
+from envs.drivers.ego import make_ego
+from envs.drivers.trained import Ego
+from envs.parallel import ForecastParallelEnv
+from envs.registry import make_env, make_parallel_env, native_task_of
+from envs.sb3.agents_as_rows import AgentMonitor, ParallelVecEnv
+from envs.sb3.envpool import EnvPoolVecEnv
+from envs.sb3.forecast import VecForecast
+from envs.sb3.padded_spaces import learners_named
+from envs.wrappers import SceneObservation
+from predictor.scene import SceneSpec
+
+EPISODE_INFO = "seeded_episode"
+"""Key under which `SeededEpisodes` leaves the result of an episode in its last info."""
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """What happened in one episode."""
+
+    seed: int
+    """Seed it was reset with."""
+    episode_return: float
+    """Undiscounted sum of rewards; the mean over the learners where there are several."""
+    length: int
+    """Policy steps."""
+    crashed: bool | None
+    """Whether the env reported a crash of the ego at any step; None where there is no ego."""
+    mean_speed_mps: float
+    """Mean over steps of the ego's speed [m/s]; NaN where the env reports none."""
+    returns_by_role: dict[str, float] = field(default_factory=dict)
+    """Mean return of the learners of each role, where there are several roles."""
+
+
+class DrivenEnv(BaseParallelWrapper):
+    """Has a fresh driver in each episode, for the agents that do not learn.
+
+    Args:
+        env: what is driven.
+        driver: its name in `envs.drivers.all_agents`.
+
+    Attributes:
+        episodes: resets so far.
+    """
+
+    def __init__(self, env: ParallelEnv, driver: str) -> None:
+        """Nothing is reset yet."""
+        super().__init__(env)
+        self._name = driver
+        self._rng = np.random.default_rng(0)
+        self._driver: Driver | None = None
+        self.episodes = 0
+
+    @property
+    def driver(self) -> Driver:
+        """Of this episode; made when somebody first needs it, as not every name can drive every environment.
+
+        Raises:
+            UserError: as `envs.drivers.all_agents.make_driver`.
+        """
+        if self._driver is None:
+            self._driver = make_driver(self._name, self.env, self._rng)
+        return self._driver
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], Any]:
+        """Reset; a seed also fixes the drivers of this and the following episodes."""
+        observations, infos = self.env.reset(seed=seed, options=options)
+        if seed is not None:
+            self._rng = np.random.default_rng(seed)
+        self._driver = None
+        self.episodes += 1
+        return observations, infos
+
+
+def drive(env: Any, observations: Mapping[str, Any], generator: np.random.Generator) -> dict[str, Any]:
+    """The partner of `ParallelVecEnv`: the episode's driver acts on the agents' own observations."""
+    return env.driver(own_observations(observations))
+
+
+def own_observations(observations: Mapping[str, Any]) -> dict[str, Any]:
+    """What the environment itself gave each agent, without forecasts."""
+    return {name: seen["observation"] if isinstance(seen, dict) else seen for name, seen in observations.items()}
+
+
+@dataclass(frozen=True)
+class MakeCopy:
+    """Picklable constructor of one copy of a task's environment."""
+
+    task: Task
+    """What to make."""
+    render_mode: str | None = None
+    """Passed on to the environment."""
+
+    def __call__(self) -> ParallelEnv:
+        """The environment in a `DrivenEnv`, with forecasts around it unless the task observes none."""
+        options = {} if self.render_mode is None else {"render_mode": self.render_mode}
+        env = DrivenEnv(make_parallel_env(self.task.env_id, **options), self.task.partner)
+        if self.task.observe == "none":
+            return env
+        return ForecastParallelEnv(env, self.task.forecaster, device=resolve_device(self.task.device))
+
+
+def learners_of(task: Task, env: ParallelEnv) -> list[str]:
+    """The agents that learn."""
+    return learners_named(env.possible_agents, task.learners, task.env_id)
+
+
+def make_parallel_rows(task: Task, copies: int) -> AgentMonitor:
+    """All learners of some copies of a task's environment, with statistics over lives."""
+    make = MakeCopy(task)
+    env = make()
+    learners = learners_of(task, env)
+    env.close()
+    partner = None if len(learners) == len(env.possible_agents) else drive
+    return AgentMonitor(ParallelVecEnv([make] * copies, agents=learners, partner=partner))
+
+
+def make_rows(task: Task, num_rows: int, seeded: bool = False) -> VecEnv:
+    """Parallel rows of a task, with episode statistics and (unless `observe` is none) forecasts.
+
+    Args:
+        task: what to make.
+        num_rows: rows; one runs in this process, more in spawned ones. Copies of a PettingZoo environment, each with
+            a row per learner. Native environments of EnvPool.
+        seeded: wrap each row in `SeededEpisodes`, for evaluation (gymnasium backend only).
+    """
+    if task.is_parallel:
+        return make_parallel_rows(task, num_rows)
+    venv: VecEnv
+    spec = task.scene_spec
+    if task.backend == "envpool":
+        venv = EnvPoolVecEnv(
+            native_task_of(task.env_id),
+            num_rows,
+            scenes=spec is not None,
+            perception_m=None if spec is None else spec.perception_m,
+            max_agents=None if spec is None else spec.max_agents,
+        )
+    else:
+        row = _MakeRow(task.env_id, spec, seeded)
+        venv = DummyVecEnv([row]) if num_rows == 1 else SubprocVecEnv([row] * num_rows, start_method="spawn")
+    if task.observe != "none":
+        venv = VecForecast(venv, task.forecaster, device=resolve_device(task.device))
+    return VecMonitor(venv)
+
+
+@dataclass(frozen=True)
+class _MakeRow:
+    """Picklable constructor of one row."""
+
+    env_id: str
+    scene_spec: SceneSpec | None
+    seeded: bool
+
+    def __call__(self) -> gym.Env:
+        if multiprocessing.parent_process() is not None:
+            torch.set_num_threads(1)  # the rows already fill the cores
+        env = make_env(self.env_id, disable_env_checker=True)
+        if self.scene_spec is not None:
+            env = SceneObservation(env, self.scene_spec.perception_m, self.scene_spec.max_agents)
+        return SeededEpisodes(env) if self.seeded else env
+
+
+class SeededEpisodes(gym.Wrapper):
+    """Plays queued seeds one after another and leaves an `EpisodeResult` in the last info of each episode.
+
+    Episodes beyond the queue go on unseeded and leave no result. An ego from `envs.drivers.ego` may drive in
+    place of the actions that arrive, with its own generator per seed, so its episodes do not depend on the number of
+    rows.
+
+    Args:
+        env: one row.
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        """Nothing is queued yet."""
+        super().__init__(env)
+        self._seeds: list[int] = []
+        self._ego_name: str | None = None
+        self._ego: Ego | None = None
+        self._seed: int | None = None
+
+    def queue(self, seeds: Sequence[int], ego: str | None = None) -> None:
+        """Seeds of the next episodes, from the next reset on; `ego` drives them if given."""
+        self._seeds, self._ego_name = list(seeds), ego
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start the next queued episode."""
+        self._seed = self._seeds.pop(0) if self._seeds else None
+        obs, info = self.env.reset(seed=seed if self._seed is None else self._seed, options=options)
+        self._ego = None
+        if self._ego_name is not None:
+            self._ego = make_ego(self._ego_name, self.env, np.random.default_rng(self._seed))
+        self._rewards: list[float] = []
+        self._speeds_mps: list[float] = []
+        self._crashed = False
+        self._obs = obs
+        return obs, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step, and note what the result needs."""
+        if self._ego is not None:
+            action = self._ego(self._obs)
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        self._obs = obs
+        self._rewards.append(float(reward))
+        self._speeds_mps.append(float(info.get("speed", np.nan)))
+        self._crashed |= bool(info.get("crashed", False))
+        if (terminated or truncated) and self._seed is not None:
+            speed = float(np.mean(self._speeds_mps))
+            info[EPISODE_INFO] = EpisodeResult(
+                self._seed, float(np.sum(self._rewards)), len(self._rewards), self._crashed, speed
+            )
+        return obs, reward, terminated, truncated, info

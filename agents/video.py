@@ -1,0 +1,113 @@
+"""Films one episode of a trained policy, with the forecasts drawn in."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from agents.arena import partner_actions
+from agents.features import EGO_KEY
+from agents.task import EVALUATION_SEED, Task
+from agents.vec_envs import MakeCopy, learners_of, make_parallel_rows, own_observations
+from envs.parallel import ForecastParallelEnv
+from envs.readers import shared_reader_for
+from envs.readers.highway import is_highway_env
+from envs.registry import CHECKPOINTS, PARALLEL_CHECKPOINTS, make_env, make_parallel_env
+from envs.sb3.agents_as_rows import ParallelVecEnv
+from envs.video.highway import record_episode
+from envs.video.multiagent import SharedRecording, record_parallel_episode
+from envs.wrappers import ForecastObservation
+from predictor.checkpoint import CONSTANT_VELOCITY
+from predictor.errors import UserError
+
+MAX_VIDEO_STEPS = 200
+"""Longest video [policy steps]; racetracks go on for 1500."""
+
+
+def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) -> SharedRecording | None:
+    """Play one episode for a film; forecasts are drawn also for a policy that sees none.
+
+    Returns:
+        The recording; None if no reader knows the environment.
+    """
+    filmed = task
+    if task.observe == "none":
+        if not _has_reader(task.env_id):
+            return None
+        shown = None if task.env_id in PARALLEL_CHECKPOINTS else CONSTANT_VELOCITY
+        filmed = replace(task, observe="forecast", checkpoint=shown)
+    env = MakeCopy(filmed)()
+    assert isinstance(env, ForecastParallelEnv)
+    learners = learners_of(task, env)
+    rows = make_parallel_rows(task, 1).venv  # knows how spaces are padded
+    assert isinstance(rows, ParallelVecEnv)
+
+    def act(observations: dict[str, Any]) -> dict[str, Any]:
+        own = own_observations(observations)
+        actions = partner_actions(env, own, learners)
+        for agent in observations:
+            if agent in learners:
+                seen = own[agent] if task.observe == "none" else observations[agent]
+                chosen = policy.predict(rows.row_of(agent, seen), deterministic=True)[0]
+                actions[agent] = rows.own_action(agent, chosen)
+        return actions
+
+    try:
+        return record_parallel_episode(env, act, seed=seed, max_steps=max_steps)
+    finally:
+        env.close()
+        rows.close()
+
+
+def _has_reader(env_id: str) -> bool:
+    env = make_parallel_env(env_id)
+    try:
+        shared_reader_for(env)
+    except UserError:
+        return False
+    finally:
+        env.close()
+    return True
+
+
+def film(task: Task, model: BaseAlgorithm, path: Path) -> Path | None:
+    """Film the first evaluation episode with the forecasts drawn in, also for a policy that sees none.
+
+    Args:
+        task: what is driven.
+        model: the policy.
+        path: of the video.
+
+    Returns:
+        The video; None for an environment that cannot be drawn.
+    """
+    if task.is_parallel:
+        recording = record_task(task, model, EVALUATION_SEED, MAX_VIDEO_STEPS)
+        if recording is None:
+            return None
+        recording.write_video(path)
+        return path
+    checkpoint = task.forecaster
+    if task.observe == "none" and task.env_id not in CHECKPOINTS:
+        checkpoint = "constant-velocity"
+    plain = make_env(task.env_id)
+    drawn = is_highway_env(plain)
+    plain.close()
+    if not drawn:
+        return None
+    env = ForecastObservation(make_env(task.env_id, render_mode="rgb_array"), checkpoint)
+    try:
+        record_episode(env, _act(task, model), seed=EVALUATION_SEED, max_steps=MAX_VIDEO_STEPS).write_video(path)
+    finally:
+        env.close()
+    return path
+
+
+def _act(task: Task, model: BaseAlgorithm) -> Callable[[Any], Any]:
+    def act(obs: dict[str, Any]) -> Any:
+        seen = obs[EGO_KEY] if task.observe == "none" else obs
+        return model.predict(seen, deterministic=True)[0]
+
+    return act

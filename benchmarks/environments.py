@@ -1,0 +1,123 @@
+"""What forecasts cost an environment: plain steps against the same steps under `VecForecast`, highway-env and EnvPool.
+
+The default checkpoint and an untrained network of the paper's size, on the same seeds and actions, in turns
+(`benchmarks.wrapper_overhead` measures one such pair at length).
+"""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple
+
+import torch
+from stable_baselines3.common.vec_env import VecEnv
+
+from benchmarks.optional_packages import missing
+from benchmarks.results import Row, skipped
+from benchmarks.settings import Settings
+from benchmarks.timing import Meter, Timing, interpreter, rate_row, ratio_row
+from benchmarks.wrapper_overhead import blocks_of, make_rows, paper_sized
+from envs.registry import native_task_of
+from envs.sb3.envpool import EnvPoolVecEnv
+from envs.sb3.forecast import VecForecast
+
+
+class Case(NamedTuple):
+    """One kind of vector environment."""
+
+    simulator: Literal["highway-env", "EnvPool"]
+    envs: int
+    vec: Literal["dummy", "subproc", "native"]
+    paper: bool
+    steps: int
+    rounds: int
+
+
+CASES: dict[str, tuple[Case, ...]] = {
+    "quick": (
+        Case("highway-env", 1, "dummy", False, 15, 5),
+        Case("highway-env", 8, "dummy", True, 5, 5),
+        Case("EnvPool", 1, "native", False, 40, 7),
+        Case("EnvPool", 8, "native", False, 40, 7),
+        Case("EnvPool", 64, "native", False, 20, 7),
+    ),
+    "full": (
+        Case("highway-env", 1, "dummy", False, 40, 15),
+        Case("highway-env", 8, "dummy", True, 40, 11),
+        Case("highway-env", 16, "dummy", False, 40, 7),
+        Case("highway-env", 8, "subproc", False, 40, 11),
+        Case("EnvPool", 1, "native", False, 200, 15),
+        Case("EnvPool", 8, "native", True, 200, 15),
+        Case("EnvPool", 64, "native", False, 100, 15),
+    ),
+}
+FEW = 16
+"""Environments up to which the forecaster gets one thread: scenes so few are done before a second one is awake."""
+TOLERANCES = {"highway-env": 1.15, "EnvPool": 1.6}
+"""Of (with forecasts / plain): highway-env itself takes most of the time; EnvPool takes so little that it is noise."""
+
+
+def run(settings: Settings) -> list[Row]:
+    """Every case that has its simulator."""
+    rows = []
+    for case in CASES[settings.mode]:
+        absent = missing("envpool") if case.simulator == "EnvPool" else ""
+        if absent:
+            rows.append(skipped("wrappers", "overhead of forecasts", absent, _what(case, settings)))
+        else:
+            rows += _overhead(case, settings)
+    return rows
+
+
+def _what(case: Case, settings: Settings) -> dict[str, Any]:
+    return {"env": settings.env_id, "simulator": case.simulator, "envs": case.envs, "vec": case.vec}
+
+
+def _overhead(case: Case, settings: Settings) -> list[Row]:
+    meter = Meter(case.rounds)
+    with _environments(case, settings.env_id) as venvs, _threads(settings.threads if case.envs > FEW else 1):
+        blocks = {name: blocks_of(venv, case.steps) for name, venv in venvs.items()}
+        timings = meter.time_blocks(blocks, interpreter())
+    what, count = _what(case, settings), case.steps * case.envs
+    rates = [rate_row("wrappers", name, what, timing, count, "steps/s") for name, timing in timings.items()]
+    # A plain simulator is not ours to compare.
+    rates = [replace(row, compared=None) if row.name == "plain" else row for row in rates]
+    plain = timings.pop("plain")
+    return rates + [_ratio(name, what, timing, plain) for name, timing in timings.items()]
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _ratio(name: str, what: dict[str, Any], timing: Timing, plain: Timing) -> Row:
+    ratios = timing.seconds / plain.seconds
+    tolerance = TOLERANCES[what["simulator"]]
+    return ratio_row("wrappers", f"{name} / plain", what, ratios, "plain, time", tolerance=tolerance)
+
+
+@contextmanager
+def _environments(case: Case, env_id: str) -> Iterator[dict[str, VecEnv]]:
+    """Plain, with the default checkpoint, and where asked for with the paper's size; closed at the end."""
+    with ExitStack() as opened:
+
+        def opening(scenes: bool) -> VecEnv:
+            return opened.enter_context(closing(_rows(case, env_id, scenes)))
+
+        venvs = {"plain": opening(scenes=False), "with forecasts": VecForecast(opening(scenes=True))}
+        if case.paper:
+            rows = opening(scenes=True)
+            venvs["with forecasts, paper size"] = VecForecast(rows, forecaster=paper_sized(rows))
+        yield venvs
+
+
+def _rows(case: Case, env_id: str, scenes: bool) -> VecEnv:
+    if case.vec == "native":
+        return EnvPoolVecEnv(native_task_of(env_id), case.envs, seed=0, scenes=scenes)
+    return make_rows(env_id, case.envs, case.vec, scenes)

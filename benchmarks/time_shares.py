@@ -1,0 +1,102 @@
+"""Where the time of a step goes: `python -m benchmarks.time_shares`.
+
+torch's profiler over three calls: a prediction at the shape that is compared with the published dNRI, a batch of
+forecasts and a training step of the paper's size. Shares are of the processor time that torch's operations report
+themselves; the interpreter between them is not in it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import tyro
+from rich.console import Console
+from rich.table import Table
+from torch.profiler import ProfilerActivity, profile
+
+from benchmarks.models import TrainingStep, box, forecaster, inference, observed, road, scenes, sized
+from benchmarks.reference import EQUAL, PREDICTION
+from predictor.errors import UserError, run_entry_point
+from predictor.runtime import processor, tune
+
+KINDS: dict[str, tuple[str, ...]] = {
+    "products": ("linear_pointwise", "addmm", "aten::mm", "bmm"),
+    "ELU, gates": ("elu", "sigmoid", "tanh", "reciprocal", "clamp", "neg", "lerp"),
+    "lookups, sums over senders": ("index", "embedding_bag", "aten::sum", "gather", "scatter"),
+}
+"""Parts of operations' names; what matches none is the rest."""
+
+
+@dataclass(frozen=True)
+class ProfileConfig:
+    """Say where the time goes."""
+
+    threads: int = 2
+    """Of torch."""
+    calls: int = 10
+    """Of each, after three that do not count; a training step is called a fifth as often."""
+
+    def check(self) -> None:
+        """Check ranges.
+
+        Raises:
+            UserError: a value that makes no sense.
+        """
+        for name in ("threads", "calls"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+
+
+def kind_of(operation: str) -> str:
+    """The kind of an operation by its name."""
+    return next((kind for kind, parts in KINDS.items() if any(part in operation for part in parts)), "rest")
+
+
+def shares(call: Callable[[], Any], calls: int) -> tuple[dict[str, float], float]:
+    """Share of each kind, and operations per call."""
+    for _ in range(3):
+        call()
+    with profile(activities=[ProfilerActivity.CPU]) as seen:
+        for _ in range(calls):
+            call()
+    spent = dict.fromkeys([*KINDS, "rest"], 0.0)
+    events = [e for e in seen.key_averages() if e.self_cpu_time_total > 0]
+    for event in events:
+        spent[kind_of(event.key)] += event.self_cpu_time_total
+    total = sum(spent.values())
+    return {kind: value / total for kind, value in spent.items()}, sum(e.count for e in events) / calls
+
+
+def subjects() -> dict[str, tuple[Callable[[], Any], int]]:
+    """What is profiled, and by how much it is called less often."""
+    shape = PREDICTION
+    equal = forecaster(EQUAL, box(shape.agents), shape.future)
+    _, belief = observed(equal, *scenes(shape.batch, shape.agents))
+    paper = forecaster(sized("paper"), road(12), 5)
+    _, many = observed(paper, *scenes(64, 12))
+    return {
+        f"roll-out of {shape.future} steps, {shape.batch} × {shape.agents} agents, widths of dNRI": (
+            inference(lambda: equal.rollout(belief, shape.future)),
+            1,
+        ),
+        "roll-out of 5 steps, 64 × 12 agents, paper": (inference(lambda: paper.rollout(many, 5)), 1),
+        "training step, 128 × 5 agents × 50 steps, paper": (TrainingStep(sized("paper"), 5, 50, 128), 5),
+    }
+
+
+def main() -> None:
+    """Entry point."""
+    config = tyro.cli(ProfileConfig, description=__doc__)
+    config.check()
+    tune()
+    torch.set_num_threads(config.threads)
+    table = Table("call", *KINDS, "rest", "operations", title=f"{processor()}, {config.threads} threads")
+    for name, (call, less) in subjects().items():
+        spent, operations = shares(call, max(1, config.calls // less))
+        table.add_row(name, *(f"{100 * share:.0f} %" for share in spent.values()), f"{operations:,.0f}")
+    Console(width=150).print(table)
+
+
+if __name__ == "__main__":
+    run_entry_point(main)

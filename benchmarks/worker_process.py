@@ -1,0 +1,160 @@
+"""Another process of this interpreter, for what a process can only be asked once: its allocator and its peak memory.
+
+`Child(...).ask("training", preset="fast", …)` sends one line of JSON and gets one back.
+"""
+
+import contextlib
+import gc
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+_MALLOC = "MALLOC_"
+
+
+def exact_memory() -> dict[str, str]:
+    """Environment in which glibc hands every larger block back at once, so that resident memory is memory in use."""
+    return {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536", "MALLOC_TOP_PAD_": "0"}
+
+
+class Child:
+    """A process that answers requests until it is left; glibc's allocator is at its defaults.
+
+    Args:
+        threads: of torch.
+        environment: what to add to the environment.
+    """
+
+    def __init__(self, threads: int, environment: Mapping[str, str] | None = None) -> None:
+        """Start it."""
+        root = str(Path(__file__).resolve().parents[1])
+        clean = {name: value for name, value in os.environ.items() if not name.startswith(_MALLOC)}
+        path = os.pathsep.join([root, *filter(None, [clean.get("PYTHONPATH")])])
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.worker_process", str(threads)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=clean | {"PYTHONPATH": path} | dict(environment or {}),
+            cwd=root,
+            text=True,
+        )
+
+    def ask(self, task: str, **arguments: Any) -> dict[str, Any]:
+        """Have a task of `TASKS` done.
+
+        Raises:
+            RuntimeError: the process died or could not do it.
+        """
+        streams = self._process
+        assert streams.stdin is not None and streams.stdout is not None
+        with contextlib.suppress(BrokenPipeError):  # then there is no answer either
+            streams.stdin.write(json.dumps({"task": task, "arguments": arguments}) + "\n")
+            streams.stdin.flush()
+        line = streams.stdout.readline()
+        answer: dict[str, Any] = json.loads(line) if line else {"error": f"it died with {streams.wait()}"}
+        if "error" in answer:
+            raise RuntimeError(f"{task} {arguments} in a process of its own: {answer['error']}")
+        return answer
+
+    def __enter__(self) -> "Child":
+        """Itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the process."""
+        if self._process.stdin is not None:
+            with contextlib.suppress(BrokenPipeError):
+                self._process.stdin.close()
+        if error is not None:
+            self._process.terminate()
+        self._process.wait()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+
+def peak_rise(call: Callable[[], Any]) -> int | None:
+    """By how many bytes the resident memory of this process rises at most during a call; None where nobody says."""
+    gc.collect()
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # the high-water mark starts again from here
+        before = _status_bytes("VmRSS")
+        kept = call()  # the result is alive until the mark is read
+        peak = _status_bytes("VmHWM")
+    except OSError:
+        return None
+    del kept
+    return peak - before
+
+
+def _status_bytes(name: str) -> int:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(f"{name}:"):
+            return int(line.split()[1]) * 1024
+    raise OSError(f"no {name} here")
+
+
+@cache
+def _training_step(preset: str, agents: int, steps: int, batch: int, rollout: int) -> Any:
+    from benchmarks.models import TrainingStep, sized
+
+    step = TrainingStep(sized(preset), agents, steps, batch, rollout)
+    step()
+    return step
+
+
+def training(preset: str, agents: int, steps: int, batch: int, rollout: int) -> dict[str, Any]:
+    """Seconds and peak memory of one training step."""
+    step = _training_step(preset, agents, steps, batch, rollout)
+    seconds: list[float] = []
+    peak = peak_rise(lambda: seconds.append(step.timed()))
+    return {"seconds": seconds[-1] if seconds else step.timed(), "peak_bytes": peak}
+
+
+def forecast(preset: str, agents: int, neighbours: int, horizon: int) -> dict[str, Any]:
+    """Peak memory of observing a scene and forecasting it, memory and belief included."""
+    import torch
+
+    from benchmarks.models import forecaster, road, scenes, sized
+
+    config = replace(sized(preset), num_neighbours=neighbours)
+
+    def look(count: int) -> Any:
+        model = forecaster(config, road(count), horizon)
+        states, valid = scenes(1, count)
+        with torch.inference_mode():
+            memory, belief = model.observe(model.empty_memory(1, count), states, valid)
+            return memory, belief, model.rollout(belief, horizon)
+
+    look(4)  # loads kernels and starts threads
+    return {"peak_bytes": peak_rise(lambda: look(agents))}
+
+
+TASKS: dict[str, Callable[..., dict[str, Any]]] = {"training": training, "forecast": forecast}
+"""What a child can be asked."""
+
+
+def main() -> None:
+    """Answer requests until there are no more."""
+    import torch
+
+    torch.set_num_threads(int(sys.argv[1]))
+    for line in sys.stdin:
+        request = json.loads(line)
+        try:
+            answer = TASKS[request["task"]](**request["arguments"])
+        except Exception as error:  # whatever it is, the parent is the one to say it
+            answer = {"error": f"{type(error).__name__}: {error}"}
+        print(json.dumps(answer), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Drivers: they choose the actions while data is collected or accuracy is measured."""

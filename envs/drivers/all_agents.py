@@ -1,0 +1,369 @@
+"""Who drives all agents of a PettingZoo parallel environment while data is collected or accuracy is measured.
+
+Every agent draws its own habits anew in each episode, so that only its history tells who it is. Heuristics look into
+the simulator, as the agents of a study may; what is recorded of them is what a scene reader sees.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from jaxtyping import Float
+
+from envs.drivers.sampled_actions import uniform_action, varied_actions
+from envs.readers import parallel_env_id
+from envs.readers.mpe import mpe_scenario
+from envs.readers.pursuit import is_pursuit_env
+from predictor.errors import UserError
+
+Driver = Callable[[Mapping[str, Any]], dict[str, Any]]
+"""From the observations of a step, of all agents or of some, to the actions of those that live."""
+
+Chooser = Callable[[Any], Any]
+"""From one agent's observation to its action."""
+
+WHO = "drivers"
+DRIVER_NAMES = ("random", "idle", "varied", "heuristic", "mixed")
+
+_PURSUIT_STAY = 4
+_PURSUIT_STEPS = np.array([(-1, 0), (1, 0), (0, 1), (0, -1), (0, 0)])
+_PUSHES = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)], dtype=np.float64)  # mpe2's five discrete actions
+_DEFAULT_ACCEL = 5.0  # mpe2's sensitivity where an agent has no `accel`
+_NEAR_M = 0.1  # this close counts as being there
+_WALL_M = 0.7  # from here on, prey is driven back to the middle; the arena ends at 1
+
+
+def make_driver(name: str, env: Any, rng: np.random.Generator) -> Driver:
+    """A driver of all agents, for one episode.
+
+    Args:
+        name: "random" (uniform actions), "idle" (no action), "varied" (each agent draws its preferences and how long
+            it keeps to a choice), "heuristic" (each agent pursues what its scenario rewards, with its own `Habits`;
+            mpe2 and pursuit only), or "mixed" (each agent is one of random, varied and, where there is one,
+            heuristic).
+        env: the parallel environment that will be driven, wrapped or not; need not be reset yet.
+        rng: source of all randomness of this episode.
+
+    Raises:
+        UserError: unknown name, no heuristic for this environment, or an action space that is neither Discrete nor a
+            bounded Box.
+    """
+    for agent in getattr(env, "possible_agents", ()):
+        uniform_action(env.action_space(agent), np.random.default_rng(0), WHO)
+    draw = _choosers(name, env, rng)
+    choosers: dict[str, Chooser] = {}
+
+    def drive(observations: Mapping[str, Any]) -> dict[str, Any]:
+        living = set(env.agents)
+        for agent in observations:
+            if agent in living and agent not in choosers:
+                choosers[agent] = draw(agent)
+        return {agent: choosers[agent](seen) for agent, seen in observations.items() if agent in living}
+
+    return drive
+
+
+def _choosers(name: str, env: Any, rng: np.random.Generator) -> Callable[[str], Chooser]:
+    """From an agent to how it chooses."""
+    if name == "random":
+        return lambda agent: lambda seen: uniform_action(env.action_space(agent), rng, WHO)
+    if name == "idle":
+        return lambda agent: lambda seen: idle_action(env, agent)
+    if name == "varied":
+        return lambda agent: varied_actions(env.action_space(agent), rng, WHO)
+    if name == "heuristic":
+        return _heuristic(env, rng)
+    if name == "mixed":
+        kinds = ("random", "varied", "heuristic") if _has_heuristic(env) else ("random", "varied")
+        draws = [_choosers(kind, env, rng) for kind in kinds]
+        return lambda agent: draws[rng.integers(len(draws))](agent)
+    raise UserError(f"driver must be one of {', '.join(DRIVER_NAMES)}, got '{name}'")
+
+
+def idle_action(env: Any, agent: str) -> Any:
+    """The action that changes nothing: what the env's own `idle_action(agent)` says, or its family's, or zeros."""
+    own = getattr(env.unwrapped, "idle_action", None)
+    if own is not None:
+        return own(agent)
+    space = env.action_space(agent)
+    if isinstance(space, gym.spaces.Discrete):
+        return int(space.start) + (_PURSUIT_STAY if is_pursuit_env(env) else 0)
+    return np.clip(np.zeros(space.shape, dtype=space.dtype), space.low, space.high)
+
+
+@dataclass(frozen=True)
+class Habits:
+    """How well and in what manner one agent drives in one episode."""
+
+    attention: float
+    """Probability that it looks up at a step; otherwise it repeats its last action."""
+    slip: float
+    """Probability of a random action instead of the intended one."""
+    lead_s: float
+    """How far ahead it thinks of others, whom it expects to keep their velocity [s]."""
+    pace: float
+    """Share of its top speed that it uses."""
+    lean_rad: float
+    """By how much it veers off the straight way."""
+
+    @staticmethod
+    def draw(rng: np.random.Generator) -> "Habits":
+        """Those of a new agent."""
+        return Habits(
+            attention=float(rng.uniform(0.5, 1.0)),
+            slip=float(rng.uniform(0.0, 0.1)),
+            lead_s=float(rng.uniform(0.0, 0.6)),
+            pace=float(rng.uniform(0.5, 1.0)),
+            lean_rad=float(rng.normal(0.0, 0.3)),
+        )
+
+
+def _has_heuristic(env: Any) -> bool:
+    return is_pursuit_env(env) or mpe_scenario(env) in _AIMS
+
+
+def _heuristic(env: Any, rng: np.random.Generator) -> Callable[[str], Chooser]:
+    if not _has_heuristic(env):
+        raise UserError(
+            f"no heuristic drives {parallel_env_id(env)}, only pursuit and mpe2's {', '.join(_AIMS)}; use "
+            + ", ".join(name for name in DRIVER_NAMES if name != "heuristic")
+        )
+    family = _PursuitIntentions(env, rng) if is_pursuit_env(env) else _MpeIntentions(env, rng)
+
+    def draw(agent: str) -> Chooser:
+        habits = Habits.draw(rng)
+        intend = family.of(agent, habits)
+        space = env.action_space(agent)
+        last: list[Any] = []
+
+        def choose(seen: Any) -> Any:
+            if not last or rng.random() < habits.attention:
+                last[:] = [uniform_action(space, rng, WHO) if rng.random() < habits.slip else intend()]
+            return last[0]
+
+        return choose
+
+    return draw
+
+
+class _PursuitIntentions:
+    """Each pursuer heads for its favourite side of the nearest evader, along its favourite axis first."""
+
+    def __init__(self, env: Any, rng: np.random.Generator) -> None:
+        self._env = env.unwrapped
+        self._rng = rng
+
+    def of(self, agent: str, habits: Habits) -> Callable[[], int]:
+        index = self._env.agent_name_mapping[agent]
+        side = _PURSUIT_STEPS[self._rng.integers(4)]
+        axes = self._rng.permutation([1.0, 1.01])  # breaks ties between the two axes
+
+        def intend() -> int:
+            grid = self._env.env
+            if not grid.evader_layer.allies:
+                return _PURSUIT_STAY
+            here = np.array(grid.pursuer_layer.get_position(index))
+            evaders = np.array([evader.current_position() for evader in grid.evader_layer.allies])
+            target = evaders[np.abs(evaders - here).sum(axis=1).argmin()] + side
+            distance = (np.abs(here + _PURSUIT_STEPS - target) * axes).sum(axis=1)
+            free = [self._free(grid, cell) for cell in here + _PURSUIT_STEPS]
+            return int(np.where(free, distance, np.inf).argmin())
+
+        return intend
+
+    @staticmethod
+    def _free(grid: Any, cell: np.ndarray) -> bool:
+        inside = 0 <= cell[0] < grid.x_size and 0 <= cell[1] < grid.y_size
+        return bool(inside and grid.map_matrix[cell[0], cell[1]] != -1)
+
+
+class _MpeIntentions:
+    """Each agent wants a velocity, which its scenario's aim gives; it pushes so that its own comes closest."""
+
+    def __init__(self, env: Any, rng: np.random.Generator) -> None:
+        self.env = env.unwrapped
+        self.world = self.env.world
+        self.rng = rng
+        self._aim = _AIMS[mpe_scenario(env)]
+        self._places: dict[str, Float[np.ndarray, " axes"]] = {}
+        self._new_round_at = 0
+
+    def of(self, agent: str, habits: Habits) -> Callable[[], Any]:
+        body = next(body for body in self.world.agents if body.name == agent)
+        word = 0 if body.silent else int(self.rng.integers(self.world.dim_c))
+        act = self._continuous if self.env.continuous_actions else self._discrete
+
+        def intend() -> Any:
+            velocity = self._aim(self, body, habits) if body.movable else np.zeros(2)
+            return act(body, velocity, word)
+
+        return intend
+
+    def _discrete(self, body: Any, velocity: Float[np.ndarray, " axes"], word: int) -> int:
+        if not body.movable:
+            return word
+        after = self._coasting(body) + _PUSHES * self._push_mps(body)  # of these five velocities, the closest
+        return int(np.linalg.norm(after - velocity, axis=1).argmin()) + len(_PUSHES) * word
+
+    def _continuous(self, body: Any, velocity: Float[np.ndarray, " axes"], word: int) -> Float[np.ndarray, " action"]:
+        push = np.clip((velocity - self._coasting(body)) / self._push_mps(body), -1.0, 1.0)
+        moves = [0.0, max(-push[0], 0), max(push[0], 0), max(-push[1], 0), max(push[1], 0)] if body.movable else []
+        words = [] if body.silent else [float(i == word) for i in range(self.world.dim_c)]
+        return np.array(moves + words, dtype=np.float32)
+
+    def _coasting(self, body: Any) -> Float[np.ndarray, " axes"]:
+        """Its velocity after the next step without a push."""
+        velocity: np.ndarray = body.state.p_vel * (1 - self.world.damping)
+        return velocity
+
+    def _push_mps(self, body: Any) -> float:
+        """By how much a full push changes its velocity in one step."""
+        return float((body.accel or _DEFAULT_ACCEL) / body.mass * self.world.dt)
+
+    def cruise_mps(self, body: Any, habits: Habits) -> float:
+        terminal = self._push_mps(body) / self.world.damping
+        return habits.pace * min(terminal, body.max_speed or np.inf)
+
+    def towards(self, body: Any, target: np.ndarray, habits: Habits, brake: bool = True) -> np.ndarray:
+        """The velocity that leads to a place, slower at its end if the agent is to stop there."""
+        gap = target - body.state.p_pos
+        distance_m = float(np.linalg.norm(gap))
+        cos, sin = np.cos(habits.lean_rad), np.sin(habits.lean_rad)
+        way = np.array([cos * gap[0] - sin * gap[1], sin * gap[0] + cos * gap[1]])
+        speed = self.cruise_mps(body, habits)
+        if brake:  # damping alone stops an agent after v·dt / damping
+            speed = min(speed, distance_m * self.world.damping / self.world.dt)
+        return way * (speed / max(distance_m, 1e-6))
+
+    def place(self, body: Any, bodies: list[Any], places: np.ndarray) -> np.ndarray:
+        """Where the agent is to stand: nearest pairs first; all swap when everyone is there, or after a while."""
+        here = np.array([b.state.p_pos for b in bodies])
+        if not self._places:
+            self._assign(bodies, places, _nearest_pairs(here, places))
+        there = all(np.linalg.norm(b.state.p_pos - self._places[b.name]) < _NEAR_M for b in bodies)
+        if there or self.env.steps >= self._new_round_at:
+            self._assign(bodies, places, self.rng.permutation(len(places)))
+        return self._places[body.name]
+
+    def _assign(self, bodies: list[Any], places: np.ndarray, order: np.ndarray) -> None:
+        self._places = {b.name: places[order[i % len(order)]] for i, b in enumerate(bodies)}
+        self._new_round_at = self.env.steps + int(self.rng.integers(20, 41))
+
+
+def _nearest_pairs(here: Float[np.ndarray, "agents axes"], places: Float[np.ndarray, "places axes"]) -> np.ndarray:
+    """Place of each agent: the nearest pair first, then the nearest of the rest."""
+    distance = np.linalg.norm(here[:, None] - places[None], axis=-1)
+    order = np.arange(len(here)) % len(places)
+    for _ in range(min(distance.shape)):
+        agent, place = np.unravel_index(distance.argmin(), distance.shape)
+        order[agent] = place
+        distance[agent], distance[:, place] = np.inf, np.inf
+    return order
+
+
+def _of_role(world: Any, adversary: bool) -> list[Any]:
+    return [body for body in world.agents if bool(getattr(body, "adversary", False)) == adversary]
+
+
+def _nearest(body: Any, others: list[Any]) -> Any:
+    return min(others, key=lambda other: float(np.linalg.norm(other.state.p_pos - body.state.p_pos)))
+
+
+def _hunt(intentions: _MpeIntentions, body: Any, habits: Habits) -> np.ndarray:
+    """Adversaries make for where the nearest prey will be; prey flees, and looks for food while nobody is near."""
+    world = intentions.world
+    if body.adversary:
+        nearest = _nearest(body, _of_role(world, adversary=False) or [body])
+        target = nearest.state.p_pos + nearest.state.p_vel * habits.lead_s
+        return intentions.towards(body, target, habits, brake=False)
+    hunters = _of_role(world, adversary=True)
+    gaps = [body.state.p_pos - h.state.p_pos - h.state.p_vel * habits.lead_s for h in hunters]
+    food = getattr(world, "food", [])
+    if food and all(np.linalg.norm(gap) > 0.6 for gap in gaps):
+        return intentions.towards(body, _nearest(body, food).state.p_pos, habits)
+    push = sum((gap / max(float(gap @ gap), 1e-3) for gap in gaps), start=np.zeros(2))
+    for landmark in world.landmarks:
+        gap = body.state.p_pos - landmark.state.p_pos
+        clear_m = float(np.linalg.norm(gap)) - landmark.size - body.size
+        if landmark.collide and clear_m < 0.15:
+            push += 3.0 * gap / max(float(np.linalg.norm(gap)), 1e-6)
+    position = body.state.p_pos
+    push -= 20.0 * np.sign(position) * np.maximum(np.abs(position) - _WALL_M, 0.0)
+    return intentions.towards(body, position + push, habits, brake=False)
+
+
+def _stand(places: Callable[[Any], np.ndarray]) -> "Aim":
+    """Everyone (but adversaries) takes one of the places; adversaries guess where somebody is about to be."""
+
+    def aim(intentions: _MpeIntentions, body: Any, habits: Habits) -> np.ndarray:
+        world = intentions.world
+        good = _of_role(world, adversary=False)
+        if getattr(body, "adversary", False):
+            return intentions.towards(body, _likely_goal(good, world.landmarks).state.p_pos, habits)
+        return intentions.towards(body, intentions.place(body, good, places(world)), habits)
+
+    return aim
+
+
+def _likely_goal(bodies: list[Any], landmarks: list[Any]) -> Any:
+    pairs = [(float(np.linalg.norm(b.state.p_pos - m.state.p_pos)), i) for b in bodies for i, m in enumerate(landmarks)]
+    return landmarks[min(pairs)[1]]
+
+
+def _landmarks(world: Any) -> np.ndarray:
+    return np.array([landmark.state.p_pos for landmark in world.landmarks])
+
+
+def _circle(world: Any) -> np.ndarray:
+    angles = 2 * np.pi * np.arange(len(world.agents)) / len(world.agents)
+    return world.landmarks[0].state.p_pos + 0.5 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def _line(world: Any) -> np.ndarray:
+    start, end = (landmark.state.p_pos for landmark in world.landmarks)
+    return start + np.linspace(0, 1, len(world.agents))[:, None] * (end - start)
+
+
+def _push(intentions: _MpeIntentions, body: Any, habits: Habits) -> np.ndarray:
+    """The agent makes for its goal; the adversary for where the agent seems to go."""
+    good = _of_role(intentions.world, adversary=False)
+    goal = _likely_goal(good, intentions.world.landmarks) if body.adversary else body.goal_a
+    return intentions.towards(body, goal.state.p_pos, habits)
+
+
+def _told(intentions: _MpeIntentions, body: Any, habits: Habits) -> np.ndarray:
+    """To the landmark that somebody else is to tell it."""
+    speaker = next(other for other in intentions.world.agents if other is not body)
+    return intentions.towards(body, speaker.goal_b.state.p_pos, habits)
+
+
+def _collect(intentions: _MpeIntentions, body: Any, habits: Habits) -> np.ndarray:
+    """Collectors fetch the nearest treasure and bring it to its deposit; a deposit comes to meet them."""
+    world = intentions.world
+    collectors = [other for other in world.agents if other.collector]
+    if not body.collector:
+        goals = [c for c in collectors if c.holding == body.d_i] or collectors
+    elif body.holding is None:
+        goals = [treasure for treasure in world.landmarks if treasure.alive]
+    else:
+        goals = [other for other in world.agents if not other.collector and other.d_i == body.holding]
+    return intentions.towards(body, _nearest(body, goals or [body]).state.p_pos, habits)
+
+
+Aim = Callable[[_MpeIntentions, Any, Habits], np.ndarray]
+
+_AIMS: dict[str, Aim] = {
+    "simple": _stand(_landmarks),
+    "simple_tag": _hunt,
+    "simple_world_comm": _hunt,
+    "simple_spread": _stand(_landmarks),
+    "simple_adversary": _stand(_landmarks),
+    "simple_formation": _stand(_circle),
+    "simple_line": _stand(_line),
+    "simple_push": _push,
+    "simple_reference": _told,
+    "simple_speaker_listener": _told,
+    "collect_treasure": _collect,
+}

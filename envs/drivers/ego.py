@@ -1,0 +1,75 @@
+"""Ways to drive the ego while data is collected or accuracy is measured."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from highway_env.vehicle.controller import ControlledVehicle
+
+from envs.drivers.sampled_actions import uniform_action, varied_actions
+from envs.drivers.trained import Ego, load_policy
+from predictor.errors import UserError
+
+WHO = "random egos"
+EGO_NAMES = ("random", "idle", "varied", "keep-lane")
+
+
+def make_ego(name: str, env: gym.Env, rng: np.random.Generator) -> Ego:
+    """An ego for one episode.
+
+    Args:
+        name: "random" (uniform actions), "idle" (no action), "varied" (each episode draws its own preferences and how
+            long it keeps to a choice), "keep-lane" (steers along its lane; continuous steering only), or the path of a
+            Stable-Baselines3 ``.zip``.
+        env: the environment that will be driven.
+        rng: source of all randomness of this episode.
+
+    Raises:
+        UserError: unknown name, or an ego that cannot drive this action space.
+    """
+    if name == "random":
+        return lambda obs: uniform_action(env.action_space, rng, WHO)
+    if name == "idle":
+        action = idle_action(env)
+        return lambda obs: np.copy(action) if isinstance(action, np.ndarray) else action
+    if name == "varied":
+        return varied_actions(env.action_space, rng, WHO)
+    if name == "keep-lane":
+        return _keep_lane(env, rng)
+    if name.endswith(".zip"):
+        return _trained(name)
+    raise UserError(f"ego must be one of {', '.join(EGO_NAMES)} or the path of a policy .zip, got '{name}'")
+
+
+def idle_action(env: gym.Env) -> Any:
+    """The action that changes nothing: highway-env's IDLE, or zeros."""
+    space = env.action_space
+    if isinstance(space, gym.spaces.Discrete):
+        indexes = getattr(getattr(env.unwrapped, "action_type", None), "actions_indexes", {})
+        return int(indexes.get("IDLE", 0))
+    if isinstance(space, gym.spaces.Box):
+        return np.zeros(space.shape, dtype=space.dtype)
+    raise UserError(f"no idle action is known for {space}")
+
+
+def _keep_lane(env: gym.Env, rng: np.random.Generator) -> Ego:
+    """Follow the current lane with highway-env's own lane controller, with a little steering noise per episode."""
+    action_type: Any = getattr(env.unwrapped, "action_type", None)
+    if not isinstance(env.action_space, gym.spaces.Box) or not hasattr(action_type, "steering_range"):
+        raise UserError(f"keep-lane needs continuous steering, got {env.action_space}; use random, idle or varied")
+    noise = rng.uniform(0.0, 0.1)
+
+    def act(obs: Any) -> Any:
+        vehicle: Any = env.unwrapped.vehicle  # type: ignore[attr-defined]
+        driver = ControlledVehicle(vehicle.road, vehicle.position, vehicle.heading, vehicle.speed)
+        steering = driver.steering_control(vehicle.lane_index) / action_type.steering_range[1]
+        action = idle_action(env)
+        action[-1] = np.clip(steering + noise * rng.standard_normal(), -1, 1)
+        return action
+
+    return act
+
+
+def _trained(path: str) -> Ego:
+    policy = load_policy(path)
+    return lambda obs: policy.predict(obs, deterministic=True)[0]

@@ -1,0 +1,1 @@
+"""Episodes of running environments, played for collection and evaluation."""

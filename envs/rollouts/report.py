@@ -1,0 +1,226 @@
+"""What `envs.evaluate` shows: tables for a terminal and for a page, a figure by horizon, a gallery of worst cases."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from rich.table import Table
+
+from envs.rollouts.episode import MODEL, NEIGHBOURS, STRAIGHT, Case
+from predictor.evaluation.accuracy import Accuracy
+from predictor.evaluation.graph_accuracy import GraphAccuracy
+from predictor.reports.tables import markdown_table
+
+
+@dataclass(frozen=True)
+class EnvAccuracy:
+    """Accuracy of one checkpoint in one environment."""
+
+    env_id: str
+    """The environment."""
+    checkpoint: str
+    """The forecaster's name or folder."""
+    driver: str
+    """Who drove."""
+    dt_s: float
+    """Time step [s]."""
+    model: Accuracy
+    """K = 1, the most likely forecast."""
+    model_samples: Accuracy
+    """Best of K."""
+    constant_velocity: Accuracy
+    """The baseline on the same scenes."""
+    reduction: float
+    """1 − minADE(K = 1) / ADE of constant velocity."""
+    reduction_interval: tuple[float, float]
+    """95 % bootstrap interval of the reduction over episodes."""
+    nearest_neighbours: Accuracy | None = None
+    """The memoryless baseline on the same scenes, where data was given."""
+    histories: dict[int, Accuracy] = field(default_factory=dict)
+    """The model (K = 1) with so many steps of memory."""
+    graph: GraphAccuracy | None = None
+    """Believed against true edges, where the simulator knows them."""
+    latency_median_ms: float = float("nan")
+    """Time to observe one scene and forecast it (K = 1), one thread, all workers busy."""
+    latency_p95_ms: float = float("nan")
+    """The same, 95th percentile."""
+
+    @property
+    def rows(self) -> list[Accuracy]:
+        """All rows of its table."""
+        extra = [] if self.nearest_neighbours is None else [self.nearest_neighbours]
+        return [self.model, self.model_samples, *self.histories.values(), *extra, self.constant_velocity]
+
+
+HEADS = (
+    "env", "checkpoint", "dt [s]", "steps", "minADE₁ [m]", "minFDE₁ [m]", "minADE_K [m]", "neighbours ADE [m]",
+    "CV ADE / FDE [m]", "ADE below CV", "95 % interval", "forecasts", "latency [ms]",
+)  # fmt: skip
+"""Columns of the overview."""
+
+
+def title(result: "EnvAccuracy") -> str:
+    """Of one environment's table."""
+    return f"{result.env_id}, checkpoint {result.checkpoint}, driven {result.driver}"
+
+
+def remarks(result: "EnvAccuracy") -> str:
+    """What stands under the table: intervals, graph, latency."""
+    low, high = result.model.intervals.get("min_ade_m", (np.nan, np.nan))
+    lines = [f"minADE (K = 1) {result.model.min_ade_m:.3f} m, 95 % over episodes {low:.3f} to {high:.3f}"]
+    for steps, row in result.histories.items():
+        low, high = row.intervals.get("min_ade_m", (np.nan, np.nan))
+        lines.append(f"… with {steps} step(s) of history {row.min_ade_m:.3f} m, {low:.3f} to {high:.3f}")
+    graph = result.graph
+    if graph is not None and graph.accuracy is not None:
+        f1 = "–" if graph.f1 is None else f"{graph.f1:.2f}"
+        always = 100 * max(graph.true_connectivity or 0, 1 - (graph.true_connectivity or 0))
+        lines.append(
+            f"graph accuracy {100 * graph.accuracy:.1f} % of {graph.pairs} pairs (always the commoner answer: "
+            f"{always:.1f} %), F1 of edges {f1}"
+        )
+    lines.append(f"latency {result.latency_median_ms:.1f} ms median, {result.latency_p95_ms:.1f} ms p95 (K = 1)")
+    return "\n".join(lines)
+
+
+def overview(results: Sequence["EnvAccuracy"]) -> Table:
+    """One line per environment."""
+    table = Table(title="in-env accuracy, held-out seeds")
+    for i, heading in enumerate(HEADS):
+        table.add_column(heading.replace("[", r"\["), justify="left" if i < 4 else "right")
+    for row in results:
+        table.add_row(*_cells(row))
+    return table
+
+
+def markdown(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], str]) -> str:
+    """Overview, transfer matrix (with several checkpoints) and each environment's table as Markdown."""
+    lines = ["| " + " | ".join(HEADS) + " |", "|" + "---|" * len(HEADS)]
+    parts = ["\n".join(lines + ["| " + " | ".join(_cells(r)) + " |" for r in results]) + "\n"]
+    if len({r.checkpoint for r in results} | {c for _, c in misfits}) > 1:
+        cells = _matrix(results, misfits)
+        heads = list(next(iter(cells.values())))
+        table = ["| env | " + " | ".join(heads) + " |", "|" + "---|" * (len(heads) + 1)]
+        table += [f"| {env} | " + " | ".join(row.values()) + " |" for env, row in cells.items()]
+        why = [f"* {env} with {name}: {reason}" for (env, name), reason in misfits.items()]
+        parts.append("### Transfer: minADE₁ [m] (below constant velocity)\n\n" + "\n".join([*table, "", *why]) + "\n")
+    for result in results:
+        text = remarks(result).replace("\n", "\n* ")
+        parts.append(f"### {title(result)}\n\n{markdown_table(result.rows, result.dt_s)}\n* {text}\n")
+    return "\n".join(parts)
+
+
+def transfer(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], str]) -> Table:
+    """Checkpoints (columns) measured in environments (rows)."""
+    table = Table(title=r"transfer: minADE₁ \[m] (below constant velocity)", caption="–: does not fit, see accuracy.md")
+    cells = _matrix(results, misfits)
+    table.add_column("env")
+    for name in next(iter(cells.values())):
+        table.add_column(name, justify="right")
+    for env_id, row in cells.items():
+        table.add_row(env_id, *row.values())
+    return table
+
+
+def _matrix(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], str]) -> dict[str, dict[str, str]]:
+    names = list(dict.fromkeys([r.checkpoint for r in results] + [name for _, name in misfits]))
+    envs = list(dict.fromkeys([r.env_id for r in results] + [env for env, _ in misfits]))
+    cells = {env: dict.fromkeys(names, "–") for env in envs}
+    for r in results:
+        cells[r.env_id][r.checkpoint] = f"{_metres(r.model.min_ade_m)} ({100 * r.reduction:.0f} %)"
+    return cells
+
+
+def _cells(row: "EnvAccuracy") -> list[str]:
+    low, high = row.reduction_interval
+    one, many, straight, near = row.model, row.model_samples, row.constant_velocity, row.nearest_neighbours
+    return [
+        row.env_id, row.checkpoint, f"{row.dt_s:g}", str(len(one.by_step_m)),
+        _metres(one.min_ade_m), _metres(one.min_fde_m), _metres(many.min_ade_m),
+        "–" if near is None else _metres(near.min_ade_m),
+        f"{_metres(straight.min_ade_m)} / {_metres(straight.min_fde_m)}",
+        f"{100 * row.reduction:.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %", str(one.agents),
+        f"{row.latency_median_ms:.1f}",
+    ]  # fmt: skip
+
+
+def _metres(value: float) -> str:
+    return f"{value:.2f}" if value >= 1 else f"{value:.3f}"
+
+
+def write_pictures(out: Path, result: "EnvAccuracy", cases: Sequence[Case]) -> None:
+    """`ENV.CHECKPOINT.by_horizon.png` and `….worst.png` under `out`."""
+    matplotlib.use("Agg")
+    out.mkdir(parents=True, exist_ok=True)
+    stem = f"{result.env_id.replace('/', '-')}.{result.checkpoint}"
+    figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
+    threshold_m = result.model.miss_threshold_m
+    for ax, quantity, label in (
+        (axes[0, 0], "by_step_m", "displacement of the best sample [m]"),
+        (axes[0, 1], "rmse_m", "RMSE of the samples' mean [m]"),
+        (axes[1, 0], "nll", "negative log-likelihood [nats]"),
+        (axes[1, 1], "miss_by_step", f"share more than {threshold_m:g} m off"),
+    ):
+        plot_by_horizon(ax, [r for r in result.rows if getattr(r, quantity)], result.dt_s, quantity, label)
+    figure.suptitle(f"{title(result)}; bands are 95 % intervals over episodes")
+    figure.savefig(out / f"{stem}.by_horizon.png", dpi=130)
+    plt.close(figure)
+    if cases:
+        figure, grid = plt.subplots(2, 3, figsize=(13, 8), layout="constrained")
+        for ax, case in zip(grid.flat, cases, strict=False):
+            plot_case(ax, case)
+        for ax in list(grid.flat)[len(cases) :]:
+            ax.axis("off")
+        handles, labels = grid.flat[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+        figure.suptitle(f"{title(result)}: the worst forecast of the {len(cases)} worst episodes")
+        figure.savefig(out / f"{stem}.worst.png", dpi=110)
+        plt.close(figure)
+
+
+def plot_by_horizon(ax: Axes, rows: Sequence[Accuracy], dt_s: float, quantity: str, label: str) -> Axes:
+    """A quantity against time ahead, a line per row with its 95 % band; constant velocity is grey."""
+    for row in rows:
+        values = np.array(getattr(row, quantity))
+        time_s = dt_s * np.arange(1, len(values) + 1)
+        baseline = row.name == STRAIGHT
+        (line,) = ax.plot(
+            time_s, values, color="grey" if baseline else None, marker="o", ms=3,
+            label=row.name if baseline or row.name == NEIGHBOURS else f"{row.name}, K = {row.num_samples}",
+        )  # fmt: skip
+        bounds = [b if b is not None else (np.nan, np.nan) for b in row.step_intervals.get(quantity, [])]
+        if bounds:
+            low, high = np.array(bounds).T
+            ax.fill_between(time_s, low, high, color=line.get_color(), alpha=0.15, lw=0)
+    ax.set_xlabel("time ahead [s]")
+    ax.set_ylabel(label)
+    ax.grid(alpha=0.3)
+    ax.legend(frameon=False, fontsize=8)
+    return ax
+
+
+def plot_case(ax: Axes, case: Case) -> Axes:
+    """One forecast [m]: the agent's history solid, its forecasts dashed, truth thin; the others grey."""
+    for agent in range(case.history.shape[1]):
+        seen = case.history_valid[:, agent]
+        if not seen.any():
+            continue
+        color, label = ("tab:blue", "history") if agent == case.agent else ("0.75", "others")
+        known = label in ax.get_legend_handles_labels()[1]
+        ax.plot(*case.history[seen, agent].T, color=color, lw=2, label=None if known else label)
+        ax.plot(*case.history[seen, agent][-1], marker="s", ms=4, color=color)
+    now = case.history[-1, case.agent][None]
+    styles = {MODEL: ("tab:orange", "model"), STRAIGHT: ("0.4", STRAIGHT), NEIGHBOURS: ("tab:green", NEIGHBOURS)}
+    for key, forecast in case.forecasts.items():
+        if key in styles:
+            color, label = styles[key]
+            ax.plot(*np.concatenate([now, forecast]).T, color=color, ls="--", marker=".", ms=4, lw=1.3, label=label)
+    ax.plot(*np.concatenate([now, case.future]).T, color="black", lw=0.9, marker=".", ms=3, label="what happened")
+    ax.set_title(f"seed {case.seed}, step {case.step}: {case.error_m:.2f} m off", fontsize=9)
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.tick_params(labelsize=7)
+    return ax

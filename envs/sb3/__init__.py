@@ -1,0 +1,1 @@
+"""Vector environments for Stable-Baselines3; nothing outside this package imports it."""

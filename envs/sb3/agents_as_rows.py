@@ -1,0 +1,389 @@
+"""One policy for every agent: a PettingZoo parallel environment as an SB3 VecEnv whose rows are its agents.
+
+Each copy of the environment gives one row per learning agent; unequal spaces are padded to the largest, and agents may
+die and join mid-episode. All copies run in this process. It does not forecast and knows no scenes: wrap the copies.
+
+>>> from mpe2 import simple_tag_v3
+>>> from stable_baselines3 import PPO
+>>> venv = AgentMonitor(ParallelVecEnv([simple_tag_v3.parallel_env] * 4))
+>>> venv.num_envs  # 4 copies of 3 adversaries and 1 prey
+16
+>>> model = PPO("MlpPolicy", venv)
+"""
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+from envs.sb3.padded_spaces import SharedObservation, own_action, roles_of, shared_action
+from predictor.errors import ProtocolError, UserError
+
+Partner = Callable[[ParallelEnv, dict[str, Any], np.random.Generator], Mapping[str, Any]]
+"""Acts for the agents that do not learn: the env, their observations, a generator → an action for each of them."""
+
+
+def random_actions(
+    env: ParallelEnv, observations: dict[str, Any], generator: np.random.Generator
+) -> dict[str, NDArray[Any] | int]:
+    """The partner "random": uniform over each agent's Discrete or bounded Box.
+
+    Raises:
+        UserError: an agent's actions are of another kind.
+    """
+    actions: dict[str, NDArray[Any] | int] = {}
+    for agent in observations:
+        space = env.action_space(agent)
+        if isinstance(space, gym.spaces.Discrete):
+            actions[agent] = int(space.start + generator.integers(space.n))
+        elif isinstance(space, gym.spaces.Box) and space.is_bounded():
+            actions[agent] = generator.uniform(space.low, space.high).astype(space.dtype)
+        else:
+            raise UserError(
+                f"partner 'random' needs Discrete or bounded Box actions, agent '{agent}' has {space}; pass a callable"
+            )
+    return actions
+
+
+PARTNERS: dict[str, Partner] = {"random": random_actions}
+"""Partners by name."""
+
+
+class ParallelVecEnv(VecEnv):
+    """Every agent of every copy is one row of a shared policy.
+
+    Rows are ordered by copy, then by agent. **Spaces** that differ are padded: Box observations (also within a Dict)
+    with zeros at the end of each axis; Discrete actions to the largest n, an action beyond the agent's own n counting
+    as its last; 1-D Box actions to the longest, cut and clipped to the agent's own bounds.
+
+    **Episodes.** A copy is reset at the step that leaves it without living agents, or without a living learner once
+    every learner has lived. When an agent dies, its row reports done=True with its last observation as
+    `terminal_observation`, and `TimeLimit.truncated` if it was truncated (or dropped) and not terminated. Until its
+    next life the row waits: zero observation (a Discrete entry: its first value), reward 0, action ignored,
+    `info["alive"]` False. An agent that is not there at the reset waits likewise until it joins. Each wait is an
+    episode of its own, closed by done=True when the agent joins or the copy resets: so neither advantages nor
+    recurrent states cross between lives, and the value of waiting is a plain 0. SB3 does train on waits: they dilute
+    a batch and its normalisation of advantages, no more.
+
+    **Statistics.** VecMonitor counts each wait as an episode of return 0; `AgentMonitor` counts lives only. To drop
+    waits from own statistics, keep the transitions whose `info["alive"]` is True.
+
+    Args:
+        factories: each makes one copy.
+        agents: who learns; None takes all possible agents.
+        partner: drives the agents that do not learn; a callable or a name of `PARTNERS`.
+        agent_indicator: append the one-hot of the agent's role to the 1-D observation (of a Dict, to its entry
+            "observation"); zero while the row waits. None appends it if spaces are unequal and there is such a vector.
+
+    Attributes:
+        envs: the copies.
+        row_agents: name of each row's agent.
+        row_copies: index of each row's copy.
+        row_roles: role of each row: agents whose names differ in their number only and whose spaces are equal.
+
+    Raises:
+        UserError: no copies, copies that differ, unknown agents, no partner where one is needed, or spaces that
+            cannot be padded.
+    """
+
+    def __init__(
+        self,
+        factories: Sequence[Callable[[], ParallelEnv]],
+        *,
+        agents: Sequence[str] | None = None,
+        partner: Partner | str | None = None,
+        agent_indicator: bool | None = None,
+    ) -> None:
+        """Make the copies and find the spaces that hold every learner's."""
+        self.envs = _make_copies(factories)
+        names = _choose_learners(self.envs[0].possible_agents, agents)
+        drive = _choose_partner(self.envs[0].possible_agents, names, partner)
+        self._copies = [_Copy(env, names, drive) for env in self.envs]
+        observations = {name: self.envs[0].observation_space(name) for name in names}
+        actions = {name: self.envs[0].action_space(name) for name in names}
+        roles = roles_of(observations, actions)
+        self._observation = SharedObservation(observations, roles, agent_indicator)
+        self._own_actions = actions
+        self.row_agents = names * len(self.envs)
+        self.row_copies = [copy for copy in range(len(self.envs)) for _ in names]
+        self.row_roles = [roles[name] for name in self.row_agents]
+        self._actions: NDArray[Any] | None = None
+        super().__init__(len(self.row_agents), self._observation.space, shared_action(actions))
+        self.metadata = {**getattr(self.envs[0], "metadata", {}), **self.metadata}
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seed copy i with seed + i at the next reset; later episodes go on from the copy's own generator."""
+        first = int(np.random.default_rng().integers(2**31)) if seed is None else seed
+        self._seeds = [first + copy for copy in self.row_copies]
+        return self._seeds
+
+    def reset(self) -> VecEnvObs:
+        """Reset all copies."""
+        for i, copy in enumerate(self._copies):
+            row = i * len(copy.learners)
+            self._keep_infos(row, copy, copy.reset(self._seeds[row], self._options[row]))
+        self._reset_seeds()
+        self._reset_options()
+        self._actions = None
+        return self._observe()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Take one action per row, in the padded space."""
+        if any(copy.living is None for copy in self._copies):
+            raise ProtocolError("there is no episode to step; call reset() first")
+        if len(actions) != self.num_envs:
+            raise UserError(f"step needs one action per row ({self.num_envs}), got {len(actions)}")
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step every copy; reset those whose episode ended."""
+        if self._actions is None:
+            raise ProtocolError("step_wait() needs actions; call step_async() first")
+        actions, self._actions = self._actions, None
+        turns: list[_Turn] = []
+        for copy in self._copies:
+            row = len(turns)
+            own = {
+                agent: own_action(actions[row + i], self._own_actions[agent])
+                for i, agent in enumerate(copy.learners)
+                if copy.lives(agent)
+            }
+            turns += copy.step(own)
+            if copy.ended:
+                self._keep_infos(row, copy, copy.reset())
+        rewards = np.array([turn.reward for turn in turns], dtype=np.float32)
+        dones = np.array([turn.done for turn in turns], dtype=np.bool_)
+        return self._observe(), rewards, dones, [self._info(*row) for row in zip(self.row_agents, turns, strict=True)]
+
+    def row_of(self, agent: str, observation: Any) -> Any:
+        """A learner's own observation as its row would show it: padded, with the indicator."""
+        return self._observation.one(agent, observation)
+
+    def own_action(self, agent: str, action: Any) -> Any:
+        """A learner's own action for one of the shared space."""
+        return own_action(action, self._own_actions[agent])
+
+    def close(self) -> None:
+        """Close all copies."""
+        for env in self.envs:
+            env.close()
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """One frame per copy."""
+        return [env.render() for env in self.envs]
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """The attribute of each row's copy; a copy without `render_mode` has None."""
+        default = (None,) if attr_name == "render_mode" else ()
+        return [getattr(self.envs[copy], attr_name, *default) for copy in self._copies_of(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set the attribute on the copies of these rows."""
+        for copy in self._copies_of(indices):
+            setattr(self.envs[copy], attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **kwargs: Any
+    ) -> list[Any]:
+        """Call the method once per copy of these rows; each row gets its copy's result."""
+        copies = self._copies_of(indices)
+        results = {
+            copy: getattr(self.envs[copy], method_name)(*method_args, **kwargs) for copy in dict.fromkeys(copies)
+        }
+        return [results[copy] for copy in copies]
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
+        """Whether each row's copy is wrapped in this class."""
+        return [_is_wrapped(self.envs[copy], wrapper_class) for copy in self._copies_of(indices)]
+
+    def _copies_of(self, indices: VecEnvIndices) -> list[int]:
+        return [self.row_copies[row] for row in self._get_indices(indices)]
+
+    def _keep_infos(self, row: int, copy: "_Copy", infos: Mapping[str, Any]) -> None:
+        """Remember what the reset of a copy, whose first row this is, told its learners."""
+        for i, agent in enumerate(copy.learners):
+            self.reset_infos[row + i] = {**infos.get(agent, {}), "alive": copy.lives(agent)}
+
+    def _observe(self) -> VecEnvObs:
+        """What each row's agent sees now."""
+        seen = [(copy.living or {}).get(agent) for copy in self._copies for agent in copy.learners]
+        return self._observation.stack(list(zip(self.row_agents, seen, strict=True)))
+
+    def _info(self, agent: str, turn: "_Turn") -> dict[str, Any]:
+        info = {**turn.info, "alive": turn.alive, "TimeLimit.truncated": turn.truncated}
+        if turn.done:
+            info["terminal_observation"] = self._observation.one(agent, turn.closing)
+        return info
+
+
+class AgentMonitor(VecMonitor):
+    """VecMonitor that counts lives: a row's wait adds nothing to lengths and is no episode.
+
+    The arguments are VecMonitor's. `evaluate_policy` counts through it as well.
+    """
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step; each life that ended gets `info["episode"]` with its return r, length l and time t [s]."""
+        obs, rewards, dones, step_infos = self.venv.step_wait()
+        infos = list(step_infos)
+        alive = np.array([info.get("alive", True) for info in infos], dtype=np.bool_)
+        self.episode_returns += rewards * alive
+        self.episode_lengths += alive
+        for row in np.flatnonzero(dones & alive):
+            episode = {"r": float(self.episode_returns[row]), "l": int(self.episode_lengths[row])}
+            episode["t"] = round(time.time() - self.t_start, 6)
+            episode.update({key: infos[row][key] for key in self.info_keywords})
+            infos[row] = {**infos[row], "episode": episode}
+            self.episode_count += 1
+            self.episode_returns[row], self.episode_lengths[row] = 0, 0
+            if self.results_writer:
+                self.results_writer.write_row(episode)
+        return obs, rewards, dones, infos
+
+
+@dataclass
+class _Turn:
+    """What one step was for one row."""
+
+    alive: bool = False
+    """The agent was there to act."""
+    reward: float = 0.0
+    """Its reward; 0 while it waits."""
+    done: bool = False
+    """A life or a wait ended."""
+    truncated: bool = False
+    """The life ended, but not by termination."""
+    closing: Any = None
+    """The last observation of the life that ended; None ends a wait."""
+    info: dict[str, Any] = field(default_factory=dict)
+    """What the env told the agent."""
+
+
+class _Copy:
+    """One environment: who lives and what they saw last, and the generator of those who do not learn."""
+
+    def __init__(self, env: ParallelEnv, learners: list[str], partner: Partner | None) -> None:
+        self.env, self.learners, self.partner = env, learners, partner
+        self.living: dict[str, Any] | None = None
+        self._lived: set[str] = set()
+        self._generator = np.random.default_rng()
+
+    @property
+    def ended(self) -> bool:
+        """Nobody is left to wait for."""
+        return not self.living or (self._lived.issuperset(self.learners) and not any(map(self.lives, self.learners)))
+
+    def lives(self, agent: str) -> bool:
+        return agent in (self.living or {})
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Mapping[str, Any]:
+        if seed is not None:
+            self._generator = np.random.default_rng(seed)
+        observations, infos = self.env.reset(seed=seed, options=options or None)
+        self._lived = set()
+        self._enter(self.env.agents, observations)
+        if not self.living:
+            raise UserError("an episode needs agents, but reset() left env.agents empty; check the environment")
+        return infos
+
+    def step(self, actions: dict[str, Any]) -> list[_Turn]:
+        """Act for everyone who lives; one turn per learner."""
+        before = self.living or {}
+        others = {agent: seen for agent, seen in before.items() if agent not in self.learners}
+        observations, rewards, terminated, truncated, infos = self.env.step({**actions, **self._act_for(others)})
+        self._enter([a for a in self.env.agents if not (terminated.get(a) or truncated.get(a))], observations)
+        turns = []
+        for agent in self.learners:
+            lives = self.lives(agent)
+            if agent not in before:
+                turns.append(_Turn(done=lives or self.ended))
+                continue
+            turn = _Turn(True, float(rewards.get(agent, 0.0)), not lives, info=dict(infos.get(agent, {})))
+            if turn.done:
+                turn.truncated = not terminated.get(agent, False)
+                turn.closing = observations.get(agent, before[agent])
+            turns.append(turn)
+        return turns
+
+    def _enter(self, agents: Iterable[str], observations: Mapping[str, Any]) -> None:
+        """These live now."""
+        names = list(agents)
+        unknown = [agent for agent in names if agent not in self.env.possible_agents]
+        if unknown:
+            raise UserError(f"every agent needs a row, but {unknown} are not in possible_agents; add them there")
+        blind = [agent for agent in names if agent not in observations]
+        if blind:
+            raise UserError(f"every living agent needs an observation, the environment gave none for {blind}")
+        self.living = {agent: observations[agent] for agent in names}
+        self._lived.update(names)
+
+    def _act_for(self, others: dict[str, Any]) -> dict[str, Any]:
+        if not others or self.partner is None:
+            return {}
+        chosen = self.partner(self.env, others, self._generator)
+        missing = [agent for agent in others if agent not in chosen]
+        if missing:
+            raise UserError(f"partner must act for {list(others)}, but gave no action for {missing}")
+        return {agent: chosen[agent] for agent in others}
+
+
+def _make_copies(factories: Sequence[Callable[[], ParallelEnv]]) -> list[ParallelEnv]:
+    """Distinct environments with the same agents and spaces."""
+    envs = [factory() for factory in factories]
+    if not envs:
+        raise UserError("at least one factory is needed, got none")
+    for i, env in enumerate(envs):
+        if not isinstance(env, ParallelEnv):
+            raise UserError(
+                f"factory {i} must make a PettingZoo ParallelEnv, it made {type(env).__name__}; "
+                "pettingzoo.utils.aec_to_parallel converts an AECEnv"
+            )
+        if not getattr(env, "possible_agents", None):
+            raise UserError(f"every agent that may appear needs a row, but copy {i} has no possible_agents")
+        if list(env.possible_agents) != list(envs[0].possible_agents):
+            raise UserError(
+                f"copies must have the same possible_agents; copy 0 has {envs[0].possible_agents}, "
+                f"copy {i} has {env.possible_agents}"
+            )
+        for agent in env.possible_agents:
+            for kind in ("observation_space", "action_space"):
+                spaces = [getattr(copy, kind)(agent) for copy in (envs[0], env)]
+                if spaces[0] != spaces[1]:
+                    raise UserError(f"copies must have the same {kind}s; '{agent}' has {spaces[0]} and {spaces[1]}")
+    if len({id(env.unwrapped) for env in envs}) < len(envs):
+        raise UserError("each factory must make an environment of its own, but one was returned twice")
+    return envs
+
+
+def _choose_learners(possible: Sequence[str], agents: Sequence[str] | None) -> list[str]:
+    names = list(possible if agents is None else agents)
+    unknown = [name for name in names if name not in possible]
+    if unknown or not names or len(set(names)) < len(names):
+        raise UserError(f"agents must name some of {list(possible)}, each once; got {names}")
+    return names
+
+
+def _choose_partner(possible: Sequence[str], learners: list[str], partner: Partner | str | None) -> Partner | None:
+    others = [name for name in possible if name not in learners]
+    if others and partner is None:
+        raise UserError(f"{others} do not learn, so somebody must drive them; pass partner= ({', '.join(PARTNERS)})")
+    if partner is not None and not others:
+        raise UserError("a partner drives those who do not learn, but all agents learn; name the learners in agents=")
+    if isinstance(partner, str):
+        if partner not in PARTNERS:
+            raise UserError(f"no partner is called '{partner}'; known: {', '.join(PARTNERS)}, or pass a callable")
+        return PARTNERS[partner]
+    return partner
+
+
+def _is_wrapped(env: Any, wrapper_class: type[Any]) -> bool:
+    while env is not None and not isinstance(env, wrapper_class):
+        env = vars(env).get("env")
+    return env is not None

@@ -1,0 +1,206 @@
+"""EnvPool's native C++ highway environments: one as a gymnasium env, many as an SB3 VecEnv at native speed.
+
+`EnvPoolEnv` is an ordinary environment for every wrapper and command here; `EnvPoolVecEnv` steps a whole pool at once
+and reports scenes as `SceneObservation` does, ready for `VecForecast`. EnvPool is an optional extra and is imported
+when the first environment is made. This module only adapts: what the simulation does is EnvPool's.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from predictor.errors import ProtocolError, UserError
+
+HIGHWAY_ENV_OF: dict[str, str] = {
+    "Highway-v0": "highway-v0",
+    "HighwayFast-v0": "highway-fast-v0",
+    "Exit-v0": "exit-v0",
+    "Intersection-v0": "intersection-v0",
+    "Intersection-v1": "intersection-v1",
+    "Merge-v0": "merge-v0",
+    "Racetrack-v0": "racetrack-v0",
+    "RacetrackLarge-v0": "racetrack-large-v0",
+    "RacetrackOval-v0": "racetrack-oval-v0",
+    "Roundabout-v0": "roundabout-v0",
+    "TwoWay-v0": "two-way-v0",
+    "UTurn-v0": "u-turn-v0",
+}
+"""EnvPool task → the highway-env id that it re-implements; docs/envpool.md says where the two differ."""
+
+ONE_START = frozenset(HIGHWAY_ENV_OF) - {"Highway-v0", "HighwayFast-v0", "Merge-v0"}
+"""Tasks that begin in the same state whatever the seed (EnvPool 1.2.5): all their variety comes from the ego."""
+
+ENV_IDS: dict[str, str] = {f"envpool/{task_id}": task_id for task_id in HIGHWAY_ENV_OF if task_id != "Intersection-v1"}
+"""Gymnasium id → EnvPool task."""
+
+
+# Not a newer version of Intersection-v0, as gymnasium would tell everybody who makes that: its actions are continuous.
+ENV_IDS["envpool/IntersectionContinuous-v1"] = "Intersection-v1"
+MAX_SEED = 2**31 - 1
+_OWN_SETTINGS = ("num_envs", "batch_size", "seed", "env_seed", "max_num_players", "gym_reset_return_info", "base_path")
+
+
+@dataclass(frozen=True)
+class MetaActions:
+    """Names of a task's discrete actions, as highway-env's `action_type` has them."""
+
+    actions_indexes: Mapping[str, int]
+    """Action by name."""
+
+
+_META = MetaActions({"LANE_LEFT": 0, "IDLE": 1, "LANE_RIGHT": 2, "FASTER": 3, "SLOWER": 4})
+_META_LONGITUDINAL = MetaActions({"SLOWER": 0, "IDLE": 1, "FASTER": 2})
+
+
+def register_envpool_ids() -> None:
+    """Declare `ENV_IDS` to gymnasium; may be called again, and does not import EnvPool."""
+    for env_id, task_id in ENV_IDS.items():
+        if env_id not in gym.registry:
+            gym.register(env_id, entry_point="envs.simulators.envpool:EnvPoolEnv", kwargs={"task_id": task_id})
+
+
+def make_pool(task_id: str, seeds: Sequence[int], num_threads: int = 0, **settings: Any) -> Any:
+    """An EnvPool pool of one task, one environment per seed.
+
+    Args:
+        task_id: a key of `HIGHWAY_ENV_OF`.
+        seeds: of each environment; the first `reset` draws from it, later ones carry on.
+        num_threads: of the simulation; 0 leaves it to EnvPool.
+        settings: of the task (`duration`, `policy_frequency`, … ; docs/envpool.md), or `render_mode`.
+
+    Raises:
+        UserError: no EnvPool, an unknown task or setting.
+    """
+    if task_id not in HIGHWAY_ENV_OF:
+        raise UserError(f"no EnvPool task '{task_id}' is known here; known: {', '.join(HIGHWAY_ENV_OF)}")
+    try:
+        import envpool
+    except ImportError as error:
+        raise UserError(
+            f"EnvPool's environments need the envpool package ({error}); pip install 'dgvae-rl[envpool]'"
+        ) from error
+    known = [k for k in envpool.make_spec(task_id).config._fields if k not in _OWN_SETTINGS]
+    if unknown := set(settings) - {*known, "render_mode"}:
+        raise UserError(f"EnvPool's {task_id} has no setting {sorted(unknown)}; it has {', '.join(known)}")
+    pool = envpool.make(
+        task_id,
+        env_type="gymnasium",
+        num_envs=len(seeds),
+        seed=[seed % MAX_SEED for seed in seeds],
+        num_threads=num_threads,
+        **settings,
+    )
+    if not hasattr(pool, "debug_states"):
+        raise UserError(f"EnvPool {envpool.__version__} does not say where the vehicles are; 1.2.5 does")
+    return pool
+
+
+def is_terminated(
+    terminated: NDArray[np.bool_], truncated: NDArray[np.bool_], crashed: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Which environments terminated: EnvPool calls a crash in the very last step a truncation only."""
+    return terminated | (truncated & crashed)
+
+
+class EnvPoolEnv(gym.Env[NDArray[Any], Any]):
+    """One of EnvPool's highway environments as an ordinary gymnasium environment.
+
+        >>> register_envpool_ids()
+        >>> env = gym.make("envpool/HighwayFast-v0", vehicles_count=10)
+
+    EnvPool seeds when it is built, so a seeded reset builds anew (half a millisecond); a reset without a seed draws the
+    next episode from the last one. Row i of an `EnvPoolVecEnv` seeded with s is this environment seeded with s + i.
+
+    Args:
+        task_id: a key of `HIGHWAY_ENV_OF`.
+        render_mode: None or "rgb_array".
+        settings: of the task, see `make_pool`.
+
+    Attributes:
+        task_id: as given.
+        native_config: EnvPool's settings, defaults included.
+        action_type: names of the discrete actions; None where actions are continuous.
+
+    Raises:
+        UserError: no EnvPool, an unknown task or setting.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 5}
+
+    def __init__(self, task_id: str, render_mode: str | None = None, **settings: Any) -> None:
+        """Build the pool, which tells the spaces."""
+        self.task_id, self.render_mode = task_id, render_mode
+        self._settings = settings if render_mode is None else {**settings, "render_mode": render_mode}
+        self._pool = make_pool(task_id, [0], num_threads=1, **self._settings)
+        self.native_config: Mapping[str, Any] = self._pool.config
+        self.observation_space = self._pool.observation_space
+        self.action_space = self._pool.action_space
+        self.action_type = meta_actions_of(self.action_space)
+        self._seeded, self._running = False, False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode.
+
+        Raises:
+            UserError: options, of which EnvPool has none.
+        """
+        super().reset(seed=seed)
+        if options:
+            raise UserError(f"EnvPool takes no options at reset, got {sorted(options)}; pass settings to gym.make")
+        if seed is not None or not self._seeded:
+            first = int(self.np_random.integers(MAX_SEED)) if seed is None else seed
+            self._pool = make_pool(self.task_id, [first], num_threads=1, **self._settings)
+            self._seeded = True
+        observations, info = self._pool.reset()
+        self._running = True
+        return observations[0], info_of(info, 0)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """One policy step.
+
+        Raises:
+            ProtocolError: before a reset or after the episode's end, where EnvPool would silently begin another.
+            UserError: a discrete action that does not exist.
+        """
+        if not self._running:
+            raise ProtocolError("the episode has not begun or is over; call reset() first")
+        space = self.action_space
+        if isinstance(space, gym.spaces.Discrete) and not 0 <= int(action) < space.n:
+            raise UserError(f"action must be in 0…{space.n - 1}, got {action}")
+        observations, rewards, terminated, truncated, info = self._pool.step(
+            np.asarray(action, dtype=space.dtype)[None]
+        )
+        over = bool(is_terminated(terminated, truncated, info["crashed"])[0])
+        self._running = not (over or truncated[0])
+        return observations[0], float(rewards[0]), over, bool(truncated[0]), info_of(info, 0)
+
+    def debug_states(self) -> Sequence[Any]:
+        """EnvPool's own description of the environment, drivers' parameters included: for readers and tests.
+
+        Raises:
+            ProtocolError: before the first reset.
+        """
+        if not self._seeded:
+            raise ProtocolError("the environment has no vehicles yet; call reset() first")
+        states: Sequence[Any] = self._pool.debug_states()
+        return states
+
+    def render(self) -> Any:
+        """The road around the ego as an image; None without a render mode."""
+        return None if self.render_mode is None else self._pool.render()[0]
+
+
+def meta_actions_of(space: gym.Space) -> MetaActions | None:
+    """Returns the names of discrete actions; None where actions are continuous."""
+    if not isinstance(space, gym.spaces.Discrete):
+        return None
+    return _META if space.n == len(_META.actions_indexes) else _META_LONGITUDINAL
+
+
+def info_of(info: Mapping[str, Any], row: int) -> dict[str, Any]:
+    """Returns one environment's info out of the pool's."""
+    return {"speed": float(info["speed"][row]), "crashed": bool(info["crashed"][row])}

@@ -1,0 +1,1 @@
+"""Drawings and films of environments with forecasts."""

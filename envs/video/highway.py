@@ -1,0 +1,254 @@
+"""Film an episode: highway-env's own picture with forecasts, edge weights and what then happened drawn into it.
+
+The episode is played first and drawn afterwards, when the truth is known. Forecasts stay where they were made (anchored
+in the world) until the next policy step replaces them. Pictures come from highway-env's viewer, made larger; its
+agent-display hook is not used, because every env of a process shares it. Knows nothing of policies: `act` is any
+function from an observation to an action.
+"""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from highway_env.envs.common.graphics import EnvViewer
+from jaxtyping import Float, UInt8
+
+from envs.readers.highway import HighwayReader, is_highway_env
+from envs.video.drawing import (
+    AgentOverlay,
+    OverlayStyle,
+    View,
+    decode_png,
+    draw_overlay,
+    encode_png,
+    write_picture,
+    write_video,
+)
+from envs.wrappers import ForecastObservation
+from predictor.errors import UserError
+
+ENLARGE = 2.0
+"""Size of the picture relative to highway-env's."""
+WIDEN = 1.25
+"""How much more road is shown than by highway-env: forecasts reach far ahead."""
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """One picture, and what is needed to draw on it."""
+
+    png: bytes
+    view: View
+    positions_m: dict[int, tuple[float, float]]
+    speed_mps: float
+    step: int
+
+
+@dataclass(frozen=True)
+class _Step:
+    """What was forecast at one policy step."""
+
+    frame: int
+    keys: tuple[int, ...]
+    forecast_m: Float[np.ndarray, "agents samples horizon 2"]
+    edge_probs: Float[np.ndarray, " agents"]
+
+
+@dataclass
+class Recording:
+    """A played episode, ready to be drawn."""
+
+    env_id: str
+    """Gymnasium id."""
+    fps: int
+    """Pictures per second, as highway-env plays them: twice real time."""
+    frames_per_step: int
+    """Pictures per policy step."""
+    dt_s: float
+    """Length of a policy step [s]."""
+    style: OverlayStyle
+    """How it will look."""
+    total_reward: float = 0.0
+    """Return of the episode."""
+    crashed: bool = False
+    """Whether the ego crashed."""
+    _ego: int = -1
+    _frames: list[_Frame] = field(default_factory=list)
+    _steps: list[_Step] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        """Number of pictures."""
+        return len(self._frames)
+
+    @property
+    def num_steps(self) -> int:
+        """Policy steps played."""
+        return len(self._steps) - 1
+
+    def frame_of_step(self, step: int) -> int:
+        """Index of the picture at the moment of a policy step."""
+        if not 0 <= step < len(self._steps):
+            raise UserError(f"step must lie in [0, {len(self._steps)}), got {step}")
+        return self._steps[step].frame
+
+    def draw(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
+        """The annotated picture."""
+        frame = self._frames[index]
+        step = self._steps[frame.step]
+        start = self._frames[step.frame]
+        agents = [
+            AgentOverlay(
+                now_m=frame.positions_m[key],
+                forecast_m=tuple(np.vstack([start.positions_m[key], sample]) for sample in step.forecast_m[row]),
+                truth_m=self._truth(key, step),
+                edge_prob=float(step.edge_probs[row]),
+            )
+            for row, key in enumerate(step.keys)
+            if key in frame.positions_m
+        ]
+        caption = f"{self.env_id}   t = {index / self.frames_per_step * self.dt_s:.1f} s   {frame.speed_mps:.1f} m/s"
+        return draw_overlay(
+            decode_png(frame.png), frame.view, frame.positions_m[self._ego], agents, caption, self.style
+        )
+
+    def write_video(self, path: Path) -> None:
+        """Encode as MP4 (H.264, yuv420p); `path` is always a whole file."""
+        write_video(path, (self.draw(index) for index in range(len(self))), self.fps)
+
+    def write_frame(self, path: Path, index: int) -> None:
+        """Save one annotated picture as PNG."""
+        write_picture(path, self.draw(index))
+
+    def _truth(self, key: int, step: _Step) -> Float[np.ndarray, "points 2"]:
+        """Where an agent went within the horizon of a forecast, picture by picture, while it was on the road."""
+        last = step.frame + step.forecast_m.shape[2] * self.frames_per_step
+        seen = [f.positions_m[key] for f in self._frames[step.frame : last + 1] if key in f.positions_m]
+        return np.array(seen)
+
+
+def record_episode(
+    env: ForecastObservation,
+    act: Callable[[Any], Any],
+    *,
+    seed: int = 0,
+    max_steps: int | None = None,
+    style: OverlayStyle | None = None,
+) -> Recording:
+    """Play one episode and keep what is needed to draw it.
+
+    Args:
+        env: a highway-env environment made with `render_mode="rgb_array"`, wrapped in `ForecastObservation`.
+        act: from its observation to an action.
+        seed: the episode is reset with it.
+        max_steps: stop after so many policy steps.
+        style: how it will look.
+
+    Raises:
+        UserError: not a highway-env environment, or one that cannot be rendered to arrays.
+    """
+    if not is_highway_env(env):
+        raise UserError(f"videos need a highway-env environment, got {env.unwrapped.__class__.__name__}")
+    if env.render_mode != "rgb_array":
+        raise UserError(f"videos need an env made with render_mode='rgb_array', got {env.render_mode!r}")
+    recorder = _Recorder(env, style or OverlayStyle())
+    try:
+        obs, _ = env.reset(seed=seed)
+        recorder.begin()
+        ended = False
+        while not ended and recorder.recording.num_steps != max_steps:
+            obs, reward, terminated, truncated, info = env.step(act(obs))
+            recorder.note_step(float(reward), bool(info.get("crashed", False)))
+            ended = terminated or truncated
+    finally:
+        recorder.end()
+    return recorder.recording
+
+
+class _Recorder:
+    """Follows an episode; stands where highway-env expects a video wrapper, to see the pictures between two steps."""
+
+    frames_per_sec: int = 0  # set by highway-env
+
+    def __init__(self, env: ForecastObservation, style: OverlayStyle) -> None:
+        self._env = env
+        self._base = cast(Any, env.unwrapped)
+        config: dict[str, Any] = self._base.config
+        self.recording = Recording(
+            env_id=env.spec.id if env.spec is not None else type(self._base).__name__,
+            fps=0,
+            frames_per_step=int(config["simulation_frequency"] // config["policy_frequency"]),
+            dt_s=1 / config["policy_frequency"],
+            style=style,
+        )
+        self._reader: HighwayReader = env.get_wrapper_attr("reader")
+
+    def begin(self) -> None:
+        """The first picture, just after the reset."""
+        base = self._base
+        config = dict(base.config)
+        for name in ("screen_width", "screen_height"):
+            config[name] = 2 * round(config[name] * ENLARGE / 2)  # H.264 needs even sizes
+        config["scaling"] = config["scaling"] * ENLARGE / WIDEN
+        base.viewer = _make_viewer(base, config)
+        base.set_record_video_wrapper(self)
+        self.recording.fps = int(self.frames_per_sec)
+        self.recording._ego = int(self._env.scene.ids[0])
+        self._note_forecast()
+        self._capture_frame()
+
+    def note_step(self, reward: float, crashed: bool) -> None:
+        """A policy step is over: its last picture shows the new forecast."""
+        self.recording.total_reward += reward
+        self.recording.crashed |= crashed
+        self._note_forecast()
+        self._capture_frame()
+
+    def end(self) -> None:
+        """Leave the env as it was."""
+        self._base._record_video_wrapper = None
+        if self._base.viewer is not None:
+            self._base.viewer.close()
+            self._base.viewer = None
+
+    def _capture_frame(self) -> None:
+        """Called by highway-env for every picture within a step, and by us for the one at its end."""
+        pixels = np.ascontiguousarray(self._base.render())
+        surface = self._base.viewer.sim_surface
+        everyone = self._reader.read_all(self._env)
+        places = zip(everyone.ids.tolist(), everyone.states[:, :2].tolist(), strict=True)
+        positions = {key: (x, y) for key, (x, y) in places}
+        view = View((float(surface.origin[0]), float(surface.origin[1])), float(surface.scaling))
+        step = len(self.recording._steps) - 1
+        frame = _Frame(encode_png(pixels), view, positions, float(self._base.vehicle.speed), step)
+        self.recording._frames.append(frame)
+
+    def _note_forecast(self) -> None:
+        scene, forecast = self._env.scene, self._env.forecast
+        rows = np.flatnonzero(scene.valid)[1:]  # the ego needs no forecast of itself
+        keys = tuple(scene.ids[rows].tolist())
+        xy_m = forecast.xy[0].double().cpu().numpy() + scene.states[0, :2]
+        probs = 1 - forecast.ego_edges()[0][0, :, 0, 0].double().cpu().numpy()  # who acts on the ego
+        step = _Step(len(self.recording._frames), keys, xy_m[:, rows].swapaxes(0, 1), probs[rows])
+        self.recording._steps.append(step)
+
+
+def _make_viewer(base: Any, config: dict[str, Any]) -> EnvViewer:
+    """A viewer that draws to memory and needs no display.
+
+    SDL would look for a screen, and complain where there is none; its dummy driver does not. highway-env takes that
+    driver for a wish not to draw, so drawing is switched on again.
+    """
+    before = os.environ.get("SDL_VIDEODRIVER")
+    os.environ["SDL_VIDEODRIVER"] = "dummy"
+    try:
+        viewer = EnvViewer(base, config)
+    finally:
+        if before is None:
+            del os.environ["SDL_VIDEODRIVER"]
+        else:
+            os.environ["SDL_VIDEODRIVER"] = before
+    viewer.enabled = True
+    return viewer

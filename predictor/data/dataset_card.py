@@ -1,0 +1,167 @@
+"""Store and data card of a dataset, written together; the card holds only what was measured on the episodes."""
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from predictor.data.loading import LoaderConfig, Split, checksum
+from predictor.data.store import Episode, StoreInfo, write_store
+from predictor.errors import UserError
+from predictor.provenance import provenance
+from predictor.scene import SceneSpec
+
+
+@dataclass(frozen=True)
+class DatasetNotes:
+    """What a loader knows about its dataset and cannot be measured."""
+
+    title: str
+    """Name of the dataset."""
+    about: str
+    """One paragraph."""
+    rights: str
+    """Who may do what."""
+    choices: tuple[str, ...]
+    """What the loader decided: units, axes, what is dropped."""
+    counts: Mapping[str, int] = field(default_factory=dict)
+    """What was read, skipped or dropped, and how often."""
+
+
+def save_dataset(
+    config: LoaderConfig,
+    spec: SceneSpec,
+    episodes: Sequence[Episode],
+    notes: DatasetNotes,
+    files: Iterable[Path],
+    extra: Mapping[str, object] | None = None,
+) -> None:
+    """Write the store and, beside it, its data card; either both are complete or nothing is left.
+
+    Args:
+        config: where to write.
+        spec: layout of the states.
+        episodes: at least one.
+        notes: for the card.
+        files: what was read, for the checksum.
+        extra: more provenance.
+
+    Raises:
+        UserError: no episodes, or the output is in the way.
+    """
+    if not episodes:
+        raise UserError(f"{config.source} gives no episode for split '{config.split}'; {_counted(notes) or 'no data'}")
+    read = list(files)
+    facts = provenance(("numpy", "zarr")) | {
+        "source_sha256": checksum(config.source, read),
+        "source_files": len(read),
+        "split": config.split,
+        "counts": dict(notes.counts),
+        "rights": notes.rights,
+        **(extra or {}),
+    }
+    info = StoreInfo(spec, notes.title, facts)
+    config.card_path.parent.mkdir(parents=True, exist_ok=True)
+    partial = config.card_path.with_name(f".{config.card_path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(card_text(config.split, info, episodes, notes), encoding="utf-8")
+        write_store(config.out, info, episodes, config.overwrite)
+        os.replace(partial, config.card_path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def summary(config: LoaderConfig, episodes: Sequence[Episode]) -> str:
+    """One line for the terminal."""
+    steps = sum(len(e.states) for e in episodes)
+    return f"{config.out}: {len(episodes)} episodes, {steps} steps, split '{config.split}'; card {config.card_path}"
+
+
+def most_present(episodes: Iterable[Episode]) -> int:
+    """Most agents present at once."""
+    return max((int(e.valid.sum(axis=1).max(initial=0)) for e in episodes), default=0)
+
+
+def card_text(split: Split, info: StoreInfo, episodes: Sequence[Episode], notes: DatasetNotes) -> str:
+    """The data card, in Markdown."""
+    facts = info.provenance
+    parts = [
+        f"# {notes.title}",
+        notes.about,
+        "## Facts",
+        _table(("fact", "value"), _facts(split, info, episodes)),
+        "## Columns of a state",
+        f"Frame of the positions for a network: {' × '.join(info.spec.frame)}. The standard deviation is over this "
+        "store, with positions in that frame; the scale is what the network divides by, the same for all splits.",
+        _table(("column", "scale", "standard deviation"), _columns(info.spec, episodes)),
+        "## What the loader did",
+        "\n".join(f"* {choice}" for choice in notes.choices),
+        "## Counts",
+        _table(("what", "count"), [(name, f"{count:,}") for name, count in notes.counts.items()]),
+        "## Rights",
+        notes.rights,
+        "## Made by",
+        f"```\n{facts['command']}\n```",
+        f"Commit {facts['commit']}, {facts['time']}. Source: {facts['source_files']} files, "
+        f"SHA-256 `{facts['source_sha256']}`.",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _facts(split: Split, info: StoreInfo, episodes: Sequence[Episode]) -> list[tuple[str, str]]:
+    lengths = np.array([len(e.states) for e in episodes])
+    present = np.concatenate([e.valid.sum(axis=1) for e in episodes])
+    labels = sorted({e.label for e in episodes})
+    shown = ", ".join(labels) if len(labels) <= 30 else f"{len(labels)} different"
+    return [
+        ("split", split),
+        ("episodes", f"{len(episodes):,}"),
+        ("labels", shown),
+        ("steps", f"{lengths.sum():,} ({lengths.sum() * info.spec.dt_s / 60:.1f} min)"),
+        ("steps per episode (min / median / max)", _spread(lengths)),
+        ("agents per step (min / median / max)", _spread(present)),
+        ("steps without an agent", f"{int((present == 0).sum()):,}"),
+        ("time step", f"{info.spec.dt_s:.6g} s"),
+        ("units", "metres, metres per second"),
+    ]
+
+
+def _columns(spec: SceneSpec, episodes: Sequence[Episode]) -> list[tuple[str, str, str]]:
+    deviations = _deviations(spec, episodes)
+    return [
+        (f"`{name}`", f"{scale:g}", f"{deviation:.3g}")
+        for name, scale, deviation in zip(spec.feature_names, spec.feature_scales, deviations, strict=True)
+    ]
+
+
+def _deviations(spec: SceneSpec, episodes: Sequence[Episode]) -> list[float]:
+    """Standard deviation of each column over all present agents, positions in the spec's frame."""
+    count, total, squares = 0, np.zeros(spec.num_features), np.zeros(spec.num_features)
+    centred = np.array([frame == "centroid" for frame in spec.frame])
+    for episode in episodes:
+        states = episode.states.astype(np.float64)
+        axes = spec.position_dim
+        present = episode.valid[..., None]
+        centre = (states[..., :axes] * present).sum(axis=1, keepdims=True) / np.maximum(
+            present.sum(axis=1, keepdims=True), 1
+        )
+        states[..., :axes] -= centre * centred
+        rows = states[episode.valid]
+        count, total, squares = count + len(rows), total + rows.sum(axis=0), squares + (rows**2).sum(axis=0)
+    mean = total / max(count, 1)
+    return [float(v) for v in np.sqrt(np.maximum(squares / max(count, 1) - mean**2, 0.0))]
+
+
+def _spread(values: np.ndarray) -> str:
+    return f"{values.min():g} / {np.median(values):g} / {values.max():g}"
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def _counted(notes: DatasetNotes) -> str:
+    return ", ".join(f"{name}: {count}" for name, count in notes.counts.items())

@@ -1,0 +1,104 @@
+"""Windows whose episodes live on a device: batches are cut there, in shapes that never vary, and nothing is read back.
+
+A batch holds what `Windows.batch` gives, padded to the longest history and the widest window of all, so that a training
+step on it can be captured once and replayed (`predictor.training.cuda_graph`).
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from predictor.data.window_tensors import cast, cut, join
+from predictor.data.windows import WindowBatch, Windows, window_batch
+from predictor.errors import UserError
+
+_CHUNK = 1 << 22
+"""Entries looked at in one go when the widest window is searched."""
+
+
+class ResidentWindows:
+    """All windows of some stores on one device; rows are numbered store by store.
+
+    Args:
+        windows: one per store, alike in spec, history and horizon.
+        device: where they go.
+        agents: columns of every batch; None takes those of the widest window.
+        budget_bytes: largest size there; None sets no limit.
+
+    Raises:
+        UserError: they do not fit, or an ego is missing at an observed step.
+    """
+
+    def __init__(
+        self,
+        windows: Sequence[Windows],
+        device: torch.device,
+        agents: int | None = None,
+        budget_bytes: int | None = None,
+    ) -> None:
+        """Copy everything to the device."""
+        needed = bytes_needed(windows)
+        if budget_bytes is not None and needed > budget_bytes:
+            raise UserError(
+                f"the windows need {needed / 2**20:,.1f} MiB on {device} and {budget_bytes / 2**20:,.1f} MiB are set "
+                "aside for them; pass --data-device cpu or use fewer episodes (--max-episodes)"
+            )
+        first = windows[0]
+        self.has_ego = first.spec.has_ego
+        self.history_steps = first.history_steps
+        self.horizon_steps = first.horizon_steps
+        self.agents = max(int(window_sizes(w).max()) for w in windows) if agents is None else agents
+        sizes = np.cumsum([0, *(len(w) for w in windows)])
+        self.offsets: tuple[int, ...] = tuple(int(s) for s in sizes[:-1])
+        flat = join([w.flat for w in windows])
+        self._width = int(flat.columns.max())
+        episodes = np.cumsum([0, *(len(w.flat.steps) for w in windows)])
+        index = np.concatenate([w.index + [shift, 0] for w, shift in zip(windows, episodes[:-1], strict=True)])
+        self._episode, self._now = (torch.from_numpy(column).to(device) for column in index.T.copy())
+        self._flat = flat.to(device)
+
+    def __len__(self) -> int:
+        """Number of windows."""
+        return len(self._episode)
+
+    def batch(
+        self, indices: Int[Tensor, " batch"], history_steps: int | None = None, time: int | None = None
+    ) -> WindowBatch:
+        """The given windows as `Windows.batch` cuts them, on the device, padded to a shape that is known beforehand.
+
+        Args:
+            indices: which windows, on the device.
+            history_steps: a shorter history than the longest one.
+            time: steps of the result; None is history and horizon.
+        """
+        history = history_steps or self.history_steps
+        episode, now = self._episode.index_select(0, indices), self._now.index_select(0, indices)
+        casts = cast(self._flat, episode, now, history, self._width, self.has_ego)
+        steps = time or history + self.horizon_steps
+        return window_batch(cut(self._flat, episode, now, casts, history, self.horizon_steps, steps, self.agents))
+
+
+def bytes_needed(windows: Sequence[Windows]) -> int:
+    """What `ResidentWindows` takes on its device, batches aside."""
+    return sum(w.flat.num_bytes + w.index.nbytes for w in windows)
+
+
+def window_sizes(windows: Windows) -> Int[np.ndarray, " windows"]:
+    """Agents of each window, with the longest history.
+
+    Raises:
+        UserError: an ego is missing at an observed step.
+    """
+    flat = windows.flat
+    if not windows.spec.has_ego and flat.visible[:-1].all():  # a fixed cast
+        return flat.columns.numpy()[windows.index[:, 0]]
+    step = max(1, _CHUNK // (windows.history_steps * max(1, int(flat.columns.max()))))
+    sizes = []
+    for begin, end in pairwise([*range(0, len(windows), step), len(windows)]):
+        episode, now = (torch.from_numpy(column) for column in windows.index[begin:end].T.copy())
+        sizes.append(windows.cast(episode, now, windows.history_steps).size.numpy())
+    return np.concatenate(sizes)

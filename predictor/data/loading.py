@@ -1,0 +1,174 @@
+"""What the dataset loaders share: strict reading, splits by name, checksums, progress.
+
+A loader reads a published file format, refuses what it cannot trust with one line that names file and line number, and
+writes one episode store with a data card beside it (`predictor.data.dataset_card`).
+"""
+
+import hashlib
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeVar
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from predictor.errors import UserError
+
+Split = Literal["train", "val", "test", "all"]
+SPLIT_SHARES = {"test": 0.1, "val": 0.1}
+"""What is left after these is for training."""
+NO_LIMIT_M = 1e6
+"""Perception range of scenes that nobody in particular sees [m]."""
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class LoaderConfig:
+    """What every loader is told."""
+
+    source: Path
+    """Where the published files are."""
+    out: Path
+    """Folder of the new store (Zarr); its data card is written beside it as <out>.md."""
+    split: Split = "all"
+    """Which part to write: a fixed function of names (trial, game, video, recording), see docs/datasets."""
+    overwrite: bool = False
+    """Replace an existing store and its card."""
+
+    @property
+    def card_path(self) -> Path:
+        """Where the data card goes."""
+        return self.out.with_name(f"{self.out.name}.md")
+
+    def check(self) -> None:
+        """Refuse before any work is done.
+
+        Raises:
+            UserError: no source, or something is in the way of the output.
+        """
+        if not self.source.exists():
+            raise UserError(f"no source at {self.source}; pass the unpacked dataset")
+        for path in (self.out, self.card_path):
+            if path.exists() and not self.overwrite:
+                raise UserError(f"{path} exists; choose another path or pass --overwrite")
+
+
+def bad_line(path: Path, line: int, problem: str, advice: str = "repair the line or get the file anew") -> UserError:
+    """An error that names file and line."""
+    return UserError(f"{path}, line {line}: {problem}; {advice}")
+
+
+def read_lines(path: Path) -> list[str]:
+    """Lines of a text file, without their ends.
+
+    Raises:
+        UserError: the file is not text or cannot be read.
+    """
+    try:
+        return path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        line = path.read_bytes()[: error.start].count(b"\n") + 1
+        raise bad_line(path, line, "expected text in UTF-8, got other bytes") from error
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror}); check the path") from error
+
+
+def finite(text: str, name: str, path: Path, line: int) -> float:
+    """A finite number from text.
+
+    Raises:
+        UserError: anything else, NaN included.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise bad_line(path, line, f"{name} must be a finite number, got '{text}'")
+    return value
+
+
+def whole(text: str, name: str, path: Path, line: int, least: int | None = None) -> int:
+    """A whole number from text, not below `least`.
+
+    Raises:
+        UserError: anything else.
+    """
+    try:
+        number = int(text)
+    except ValueError:
+        raise bad_line(path, line, f"{name} must be a whole number, got '{text}'") from None
+    if least is not None and number < least:
+        raise bad_line(path, line, f"{name} must be at least {least}, got {number}")
+    return number
+
+
+def steps_per_frame(dt_s: float, frames_per_s: float, source: str) -> int:
+    """How many recorded frames make one step.
+
+    Args:
+        dt_s: wanted time between steps [s].
+        frames_per_s: rate of the recording [Hz].
+        source: what was recorded, for the message.
+
+    Raises:
+        UserError: not a whole number of frames.
+    """
+    frames = dt_s * frames_per_s
+    if not math.isfinite(frames) or round(frames) < 1 or abs(frames - round(frames)) > 1e-6:
+        raise UserError(
+            f"dt_s must be a whole number of frames: {source} has {frames_per_s:g} per second, so dt_s={dt_s:g} would "
+            f"be {frames:g}; pass a multiple of {1 / frames_per_s:g}"
+        )
+    return round(frames)
+
+
+def split_of(name: str, seed: int) -> str:
+    """The split that a name belongs to: a hash of seed and name, so adding files moves nothing."""
+    digest = hashlib.sha256(f"{seed}:{name}".encode()).digest()
+    position = int.from_bytes(digest[:8], "big") / 2**64
+    for split, share in SPLIT_SHARES.items():
+        if position < share:
+            return split
+        position -= share
+    return "train"
+
+
+def in_split(name: str, split: Split, seed: int) -> bool:
+    """Whether a name belongs to the wanted split."""
+    return split == "all" or split_of(name, seed) == split
+
+
+def find_files(source: Path, pattern: str, what: str) -> list[Path]:
+    """Files under a folder, sorted by their path; a file given as source stands for itself.
+
+    Raises:
+        UserError: none.
+    """
+    files = [source] if source.is_file() else sorted(p for p in source.glob(pattern) if p.is_file())
+    if not files:
+        raise UserError(f"{source} holds no {what} ({pattern}); pass the folder of the unpacked dataset")
+    return files
+
+
+def checksum(root: Path, files: Iterable[Path]) -> str:
+    """SHA-256 over the files' paths (relative to `root`, sorted) and contents.
+
+    For each file the digest is fed with the path in UTF-8, a zero byte and the SHA-256 of the content.
+    """
+    root = root.parent if root.is_file() else root
+    total = hashlib.sha256()
+    for name, path in sorted((path.relative_to(root).as_posix(), path) for path in files):
+        with path.open("rb") as file:
+            content = hashlib.file_digest(file, "sha256").digest()
+        total.update(name.encode() + b"\0" + content)
+    return total.hexdigest()
+
+
+def progressed(items: Sequence[Item], label: str) -> Iterator[Item]:
+    """The items, with a progress bar on the terminal."""
+    columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns) as progress:
+        yield from progress.track(items)

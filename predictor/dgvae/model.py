@@ -1,0 +1,400 @@
+"""The dG-VAE (paper Sec. IV): an encoder that infers edges and edge features, a decoder that moves agents along them.
+
+Encoder: linear embedding → EdgeConv → edge embedding → forward LSTM per pair → learned prior and edge features;
+forward ‖ backward LSTM → posterior (training only). Decoder: messages along sampled edges, with edge features → GRU →
+change of state. `observe` and `rollout` make it a `Forecaster`; `window` is what training runs; both use the same
+layers and differ only in how many steps enter at once. Without gradients, single steps go through
+`predictor.dgvae.single_step`, which computes the same with fewer operations.
+
+Two things the paper leaves open are settled here. An agent without edges would not see itself, so the decoder adds a
+linear term of the agent's own state to its messages. And while true states are fed, the graph is the prior's
+expectation, so that a history has one meaning; samples branch off at the first forecast step.
+"""
+
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from predictor.dgvae.networks import (
+    PRESETS,
+    Decoder,
+    DGVAEConfig,
+    Edges,
+    Encoder,
+    concrete_sample,
+    edge_probabilities,
+    no_edge_where_absent,
+)
+from predictor.dgvae.packing import Packed, Padded
+from predictor.dgvae.pair_matching import running_mean, running_mean_step, window_mean
+from predictor.dgvae.single_step import Encoding, Internal, Layers, Modules, Past, Stepper, unpacked
+from predictor.errors import UserError
+from predictor.forecaster import Belief, Memory, WindowOutput
+from predictor.graph import NOBODY, among_nearest, nearest, off_diagonal, others, pair_mask, with_diagonal
+from predictor.layers.rnn import masked_gru
+from predictor.layers.state_codec import StateCodec
+from predictor.scene import SceneSpec
+
+__all__ = ["DGVAE", "PRESETS", "DGVAEConfig", "Decoder", "Edges", "Encoder", "WindowOutput", "concrete_sample"]
+
+
+class DGVAE(nn.Module):
+    """The model, as a `Forecaster` and as a training objective's forward pass.
+
+    Args:
+        spec: layout of the scenes.
+        config: sizes and variants.
+        horizon_steps: steps it is trained to forecast.
+    """
+
+    def __init__(self, spec: SceneSpec, config: DGVAEConfig = PRESETS["paper"], horizon_steps: int = 5) -> None:
+        """Build the network; weights come from torch's generator, so seed it first."""
+        super().__init__()
+        self.spec = spec
+        self.config = config
+        self.horizon_steps = horizon_steps
+        self.codec = StateCodec(spec, config.delta_scales, config.residual, config.input_scales)
+        self.sees_changes = bool(config.change_scales)
+        if self.sees_changes and len(config.change_scales) != spec.num_features:
+            raise UserError(f"change_scales needs {spec.num_features} numbers, got {config.change_scales}")
+        inputs = self.codec.num_inputs
+        self.encoder = Encoder(config, inputs + spec.num_features * self.sees_changes)
+        self.decoder = Decoder(config, inputs, spec.num_features)
+        self._per_change: Tensor
+        per_change = self.codec.scales / torch.tensor(config.change_scales) if self.sees_changes else torch.ones(0)
+        self.register_buffer("_per_change", per_change, persistent=False)
+        self._stepper: Stepper | None = None
+
+    @property
+    def num_edge_types(self) -> int:
+        """Edge types, "no edge" included."""
+        return self.config.num_edge_types
+
+    @property
+    def edge_feature_dim(self) -> int:
+        """Size of an edge's features."""
+        return self.config.edge_feature_dim
+
+    def variant(self, **changes: Any) -> "DGVAE":
+        """The same weights under a changed config: `num_neighbours`, `rollout_graph`, `temperature`, `hard_samples`.
+
+        Raises:
+            UserError: an unknown field, or the weights do not fit the changed config.
+        """
+        unknown = sorted(set(changes) - {f.name for f in fields(self.config)})
+        if unknown:
+            raise UserError(f"DGVAEConfig has no field '{unknown[0]}'")
+        with torch.random.fork_rng(devices=[]):  # the initial weights are not kept
+            other = DGVAE(self.spec, replace(self.config, **changes), self.horizon_steps).to(self.codec.scales)
+        try:
+            other.load_state_dict(self.state_dict())
+        except RuntimeError as error:
+            raise UserError(f"a network with {changes} has other weights; train one instead") from error
+        return other.train(self.training).requires_grad_(next(self.parameters()).requires_grad)
+
+    def train(self, mode: bool = True) -> "DGVAE":
+        """As any module's; what was folded from the weights is forgotten."""
+        self._stepper = None
+        return super().train(mode)
+
+    # --- Forecaster ---------------------------------------------------------------------------------------------
+
+    def empty_memory(self, batch: int, agents: int) -> Memory:
+        """Zeros on the model's device."""
+        near = self.config.num_neighbours
+        nodes, pairs = self._nothing_seen(batch, agents, near or agents)
+        senders = torch.full((batch, agents, near), NOBODY, device=nodes[0].device) if near else None
+        return Memory(nodes, pairs, senders)
+
+    def observe(
+        self, memory: Memory, states: Float[Tensor, "batch agents state"], valid: Bool[Tensor, "batch agents"]
+    ) -> tuple[Memory, Belief]:
+        """One encoder step and one decoder step under the prior's expected graph."""
+        padded = self._graph_now(states, valid)
+        if padded.senders is not None:
+            memory = memory.to_slots(padded.senders, padded.present)
+        layers = self._layers()
+        graph: Padded | Packed = Packed.of(padded, valid) if isinstance(layers, Stepper) else padded
+        (node, seen), pairs = memory.nodes, memory.pairs
+        node_before, (hidden, cell, static) = graph.pack_nodes(node), map(graph.pack_pairs, pairs)
+        past, logits, features = self._encode_step(layers, states, valid, graph, Past(hidden, cell, static, seen))
+        probs = edge_probabilities(logits)
+        node_after, next_states = self._move(layers, states, valid, graph, probs, features, node_before)
+        known = Internal(layers, graph, past, logits, probs, features, node_before, node_after, next_states)
+        remembered = tuple(graph.unpack_pairs(t) for t in (past.hidden, past.cell, past.static))
+        after = Memory((graph.unpack_nodes(node_after), past.seen), remembered, memory.senders)
+        shown = graph.unpack_pairs(probs, no_edge=True), graph.unpack_pairs(features)
+        return after, Belief(states, valid, *shown, known, memory.senders)
+
+    def rollout(
+        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
+    ) -> Float[Tensor, "batch samples agents horizon state"]:
+        """Feed predictions back through the encoder, so that the graph evolves; sample 0 takes expected graphs."""
+        known: Internal = belief.internal
+        if torch.is_grad_enabled():  # the history may have been seen without gradients
+            known = unpacked(known, self._plain())
+        layers, graph, edges = known.layers, known.graph, (known.probs, known.features)
+        future = self._continue(
+            layers, known.next_states, belief.valid, graph, known.past, known.node_after, edges, horizon_steps, None
+        )
+        if num_samples == 1:
+            return future[:, None]
+        draws = num_samples - 1
+        states, valid, seen = (
+            t.repeat_interleave(draws, dim=0) for t in (belief.states, belief.valid, known.past.seen)
+        )
+        hidden, cell, static, features, logits = (
+            graph.repeat_pairs(t, draws)
+            for t in (known.past.hidden, known.past.cell, known.past.static, known.features, known.logits)
+        )
+        node = graph.repeat_nodes(known.node_before, draws)
+        drawn = self._free_run(
+            layers, states, valid, graph.repeat(draws), features, Past(hidden, cell, static, seen), node, logits,
+            horizon_steps, self._sampler(generator),
+        )  # fmt: skip
+        return torch.cat([future[:, None], drawn.unflatten(0, (len(future), draws))], dim=1)
+
+    # --- Training -----------------------------------------------------------------------------------------------
+
+    def window(
+        self,
+        states: Float[Tensor, "batch time agents state"],
+        valid: Bool[Tensor, "batch time agents"],
+        last_observed: Int[Tensor, " batch"],
+        rollout_steps: int,
+        generator: torch.Generator | None = None,
+    ) -> WindowOutput:
+        """Teacher-forced pass under the posterior and free-running roll-out under the prior, from the same encoding."""
+        inputs, graph = self.codec.inputs(states, valid), self._graph_of_window(states, valid)
+        (node, seen), pairs = self._nothing_seen(states.shape[0], states.shape[2], graph.present.shape[-1])
+        edges, features, past = self._encode(inputs, valid, graph, Past(*pairs, seen))
+        posterior = self.encoder.posterior_logits(edges, graph.present)
+        sampled = self._sampler(generator)(posterior)
+        shown = self._match_window(edges.features, features, graph.present)
+        layer = self.decoder.pair_layer(inputs, shown, graph.senders)
+        messages = self.decoder.combine(inputs, layer, graph.present, sampled)
+        nodes = masked_gru(messages, self.decoder.gru, valid, node)
+        change = self.decoder.change(nodes)
+        one_step = self._integrate(self._plain(), states, valid, graph, sampled, shown, change, messages)
+        outputs = self._dense(graph, edges.prior_logits, posterior, shown)
+        if not rollout_steps:
+            nothing = states.new_zeros(len(states), states.shape[2], 0, states.shape[3])
+            return WindowOutput(one_step, nothing, *outputs)
+
+        # the longest history; asking a GPU for it would make it wait
+        steps = states.shape[1] if last_observed.is_cuda else int(last_observed.max())
+        expected = edge_probabilities(edges.prior_logits[:, :steps])
+        if shown is not features:
+            layer = self.decoder.pair_layer(inputs, features, graph.senders)
+        messages = self.decoder.combine(inputs[:, :steps], layer[:, :steps], graph.present[:, :steps], expected)
+        remembered = masked_gru(messages, self.decoder.gru, valid[:, :steps], node)
+        burned_in = torch.cat([node[:, None], remembered], dim=1)
+        now = (torch.arange(len(states), device=states.device), last_observed)
+        future = self._free_run(
+            self._plain(), states[now], valid[now], Padded(graph.present[now], graph.senders), features[now],
+            Past(*(t[now] for t in past)), burned_in[now], edges.prior_logits[now], rollout_steps,
+            self._sampler(generator),
+        )  # fmt: skip
+        return WindowOutput(one_step, future, *outputs)
+
+    def _graph_of_window(self, states: Tensor, valid: Tensor) -> Padded:
+        """Pairs of each step: of everyone with all others, where the encoder does not need the square."""
+        present, near = pair_mask(valid), self.config.num_neighbours
+        if near:
+            present = present & among_nearest(states[..., : self.spec.position_dim], valid, near)
+        agents = valid.shape[-1]
+        if self.config.innovation_rounds or agents == 1:
+            return Padded(present, None)
+        return Padded(off_diagonal(present), others(agents, valid.device))
+
+    def _dense(self, graph: Padded, prior: Tensor, posterior: Tensor, features: Tensor) -> tuple[Tensor, ...]:
+        """What a window says of pairs, with everyone's own entry in it: no edge, and zeros."""
+        if graph.senders is None:
+            return prior, posterior, features
+        nothing = features.new_zeros(features.shape[-1])
+        no_edge = no_edge_where_absent(prior.new_zeros(prior.shape[-1]), graph.present.new_zeros(1))
+        return with_diagonal(prior, no_edge), with_diagonal(posterior, no_edge), with_diagonal(features, nothing)
+
+    # --- Shared -------------------------------------------------------------------------------------------------
+
+    def _graph_now(self, states: Tensor, valid: Tensor) -> Padded:
+        near = self.config.num_neighbours
+        if not near:
+            return Padded(pair_mask(valid), None)
+        senders, present = nearest(states[..., : self.spec.position_dim], valid, near)
+        return Padded(present, senders)
+
+    def _nothing_seen(
+        self, batch: int, agents: int, slots: int
+    ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
+        """Node and pair memory before any observation."""
+        zeros, config = self.codec.scales.new_zeros, self.config
+        pair = zeros(batch, agents, slots, config.rnn_dim)
+        static = zeros(batch, agents, slots, config.static_dim + 1 if config.static_dim else 0)
+        seen = zeros(batch, agents, self.codec.num_inputs + 1 if self.sees_changes else 0)
+        return (zeros(batch, agents, config.decoder_dim), seen), (pair, pair.clone(), static)
+
+    def _sampler(self, generator: torch.Generator | None) -> "_Sampler":
+        return _Sampler(self.config.temperature, self.config.hard_samples, generator)
+
+    def _plain(self) -> Layers:
+        return Modules(self.encoder, self.decoder)
+
+    def _layers(self) -> Layers:
+        """For single steps: with gradients the modules themselves, otherwise the same with its weights folded."""
+        dropout = self.encoder.dropout.training and self.config.dropout > 0
+        if torch.is_grad_enabled() or dropout or self.config.innovation_rounds:
+            return self._plain()
+        if self._stepper is None or not self._stepper.is_current(self.encoder, self.decoder):
+            self._stepper = Stepper(self.encoder, self.decoder)
+        return self._stepper
+
+    def _encode(self, inputs: Tensor, valid: Tensor, graph: Padded, past: Past) -> Encoding:
+        """Encode a stretch of steps after `past`."""
+        inputs, seen = self._with_changes(inputs, valid, past.seen)
+        edges = self.encoder(inputs, graph.present, past.hidden, past.cell, graph.senders)
+        features, static = self._match(edges.features, graph.present, past.static)
+        return Encoding(edges, features, Past(edges.hidden, edges.cell, static, seen))
+
+    def _encode_step(
+        self, layers: Layers, states: Tensor, valid: Tensor, graph: Padded | Packed, past: Past
+    ) -> tuple[Past, Tensor, Tensor]:
+        """The same for one step: memory, prior logits and features after it."""
+        inputs, seen = self.codec.inputs(states, valid), past.seen
+        if self.sees_changes:
+            stretch, after = self._with_changes(inputs[:, None], valid[:, None], seen)
+            inputs, seen = stretch[:, 0], after[:, 0]
+        inputs = graph.pack_nodes(inputs)
+        hidden, cell, logits, features = layers.encode(inputs, graph, past.hidden, past.cell)
+        static = past.static
+        if self.config.static_dim:
+            first = features[..., : self.config.static_dim]
+            static = running_mean_step(first, graph.among_pairs(static), static)
+            features = torch.cat([static[..., :-1], features[..., self.config.static_dim :]], dim=-1)
+        return Past(hidden, cell, static, seen), logits, features
+
+    def _with_changes(self, inputs: Tensor, valid: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+        """What the encoder sees of a stretch of steps, and what it remembers of each for the next one."""
+        if not self.sees_changes:
+            return inputs, inputs.new_zeros(*inputs.shape[:-1], 0)
+        seen = torch.cat([inputs, torch.ones_like(inputs[..., :1])], dim=-1) * valid[..., None]
+        earlier = torch.cat([before[:, None], seen[:, :-1]], dim=1)
+        known = earlier[..., -1:] * valid[..., None]
+        features = self.spec.num_features
+        changes = (inputs[..., :features] - earlier[..., :features]) * self._per_change * known
+        return torch.cat([inputs, changes], dim=-1), seen
+
+    def _match(self, features: Tensor, present: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+        """Pair matching from the past: features whose static dimensions are running means, and these after each step.
+
+        Time axis second.
+        """
+        static = self.config.static_dim
+        if not static:
+            return features, features.new_zeros(*present.shape, 0)
+        mean = running_mean(features[..., :static], present, before)
+        return torch.cat([mean[..., :-1], features[..., static:]], dim=-1), mean
+
+    def _match_window(self, features: Tensor, causal: Tensor, present: Tensor) -> Tensor:
+        """Features for the teacher-forced pass: the static ones from the whole window, if the config asks for that."""
+        static = self.config.static_dim
+        if not static or self.config.pair_matching == "causal":
+            return causal
+        return torch.cat([window_mean(features[..., :static], present), features[..., static:]], dim=-1)
+
+    def _move(
+        self,
+        layers: Layers,
+        states: Tensor,
+        valid: Tensor,
+        graph: Padded | Packed,
+        weights: Tensor,
+        features: Tensor,
+        node: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """One decoder step: GRU states after it, and the next states."""
+        inputs = graph.pack_nodes(self.codec.inputs(states, valid))
+        node, messages = layers.drive(inputs, graph, weights, features, node)
+        node = graph.forget_absent(node, valid)
+        change = graph.unpack_nodes(self.decoder.change(node))
+        return node, self._integrate(layers, states, valid, graph, weights, features, change, messages)
+
+    def _integrate(
+        self,
+        layers: Layers,
+        states: Tensor,
+        valid: Tensor,
+        graph: Padded | Packed,
+        weights: Tensor,
+        features: Tensor,
+        change: Tensor,
+        messages: Tensor | None,
+    ) -> Float[Tensor, "*batch agents state"]:
+        """States one step later; with substeps, messages are evaluated anew as the agents move."""
+        substeps = self.config.substeps
+        if not substeps:
+            return self.codec.advance(states, change)
+        assert messages is not None
+        for substep in range(substeps):
+            if substep:
+                inputs = graph.pack_nodes(self.codec.inputs(states, valid))
+                messages = layers.messages(inputs, graph, weights, features)
+            pushed = graph.unpack_nodes(self.decoder.direct(messages))
+            states = self.codec.advance(states, change + pushed, 1 / substeps)
+        return states
+
+    def _free_run(
+        self,
+        layers: Layers,
+        states: Tensor,
+        valid: Tensor,
+        graph: Padded | Packed,
+        features: Tensor,
+        past: Past,
+        node: Tensor,
+        logits: Tensor,
+        horizon_steps: int,
+        sampler: "_Sampler",
+    ) -> Float[Tensor, "batch agents horizon state"]:
+        """Roll out from an observation whose decoder step is still to be taken."""
+        drawn = graph.per_pair(sampler, logits)
+        node, states = self._move(layers, states, valid, graph, drawn, features, node)
+        return self._continue(layers, states, valid, graph, past, node, (drawn, features), horizon_steps, sampler)
+
+    def _continue(
+        self,
+        layers: Layers,
+        states: Tensor,
+        valid: Tensor,
+        graph: Padded | Packed,
+        past: Past,
+        node: Tensor,
+        edges: tuple[Tensor, Tensor],
+        horizon_steps: int,
+        sampler: "_Sampler | None",
+    ) -> Float[Tensor, "batch agents horizon state"]:
+        """Roll out from predicted states; without a sampler along expected graphs.
+
+        Who may interact with whom stays as it was observed; `edges` are weights and features, kept if frozen.
+        """
+        future, (weights, features) = [states], edges
+        for _ in range(horizon_steps - 1):
+            if self.config.rollout_graph == "evolving":
+                past, logits, features = self._encode_step(layers, states, valid, graph, past)
+                weights = edge_probabilities(logits) if sampler is None else graph.per_pair(sampler, logits)
+            node, states = self._move(layers, states, valid, graph, weights, features, node)
+            future.append(states)
+        return torch.stack(future, dim=2)[:, :, :horizon_steps]
+
+
+@dataclass(frozen=True)
+class _Sampler:
+    temperature: float
+    hard: bool = False
+    generator: torch.Generator | None = field(default=None)
+
+    def __call__(self, logits: Tensor) -> Tensor:
+        return concrete_sample(logits, self.temperature, self.generator, self.hard)

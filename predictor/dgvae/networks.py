@@ -1,0 +1,360 @@
+"""The dG-VAE's two networks (paper Sec. IV): the encoder of edges and the decoder of motion, and their sizes.
+
+Both work on one step or on many at once; `predictor.dgvae` puts them together. Linear layers on a concatenation of two
+agents are computed per agent and added on the pair, and the last layer of an edge MLP is moved behind the sum over
+senders; both are identities.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from torch.nn import functional
+
+from predictor.dgvae.innovation import Innovation
+from predictor.errors import UserError
+from predictor.layers.pairs import PairLinear, folded, sum_over_senders
+from predictor.layers.rnn import Correction, masked_lstm
+from predictor.layers.state_codec import Residual
+
+
+@dataclass(frozen=True)
+class DGVAEConfig:
+    """Sizes and variants of the network; the defaults are the paper's (Sec. V, Implementation)."""
+
+    hidden_dim: int = 128
+    """Width of the encoder's graph layers."""
+    rnn_dim: int = 64
+    """Width of the LSTM of each pair."""
+    head_dim: int = 256
+    """Hidden width of the prior, posterior and feature heads."""
+    message_dim: int = 128
+    """Width of the decoder's messages."""
+    decoder_dim: int = 256
+    """Width of the GRU of each agent."""
+    num_edge_types: int = 2
+    """Edge types; the first one is "no edge" and sends no message."""
+    edge_feature_dim: int = 32
+    """Size of an edge's continuous features (paper: 16 to 64, by dataset); 0 is the ablation without them (dVAE)."""
+    temperature: float = 0.5
+    """Of the concrete distribution."""
+    dropout: float = 0.0
+    """After the LSTM."""
+    residual: Residual = "state"
+    """What the predicted change of position is added to: the state (paper), the state moved on at its own velocity, or
+    at the mean of its own and the predicted velocity (velocity-consistent)."""
+    delta_scales: tuple[float, ...] = ()
+    """Typical one-step change of each feature [SI] beyond the residual; empty takes the spec's feature scales."""
+    input_scales: tuple[float, ...] = ()
+    """Spread of each feature over the map [SI], which divides the network's inputs; empty takes the spec's feature
+    scales. A road of 500 m by 12 m needs it: at 100 m for both axes its lanes lie 0.04 apart."""
+    change_scales: tuple[float, ...] = ()
+    """Typical one-step change of each input [SI]; given, the encoder also sees what changed since the last step."""
+    forget_bias: float = 0.0
+    """Added to the initial bias of the LSTMs' forget gates; 2 starts them with a memory of about eight steps."""
+    innovation_rounds: int = 0
+    """Rounds of predict-compare-correct in the encoder at each step (`predictor.dgvae.innovation`); paper: 0."""
+    innovation_dim: int = 32
+    """Width of such a round."""
+    static_dim: int = 0
+    """Pair matching: so many of the first feature dimensions are averaged over time (paper: 16); 0 is off."""
+    pair_matching: Literal["window", "causal"] = "causal"
+    """Average in training over the whole window (paper), or over the past of each step, as deployed."""
+    substeps: int = 0
+    """Evaluations of the messages within a step, each moving the agents on; 0 is the paper's decoder, in which messages
+    act through the GRU alone."""
+    gated_messages: bool = False
+    """Edge features scale the messages instead of being one more input of theirs."""
+    zero_start: bool = False
+    """Fresh weights predict no change beyond the residual: with many senders, sums are large, and a free run through
+    random weights explodes."""
+    hard_samples: bool = False
+    """Sample one-hot graphs, with the gradient of the soft ones (straight-through)."""
+    num_neighbours: int = 0
+    """An agent hears at most so many others, the nearest; 0 is everyone. The cost then grows with the number of agents,
+    not with its square. A roll-out keeps the neighbours it starts with."""
+    rollout_graph: Literal["evolving", "frozen"] = "evolving"
+    """Whether a roll-out feeds predictions back through the encoder, or keeps the edges and features it starts with:
+    faster, and less accurate unless trained so."""
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        for name in ("hidden_dim", "rnn_dim", "head_dim", "message_dim", "decoder_dim", "innovation_dim"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("edge_feature_dim", "innovation_rounds", "static_dim", "substeps", "num_neighbours"):
+            if getattr(self, name) < 0:
+                raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
+        if self.residual not in ("state", "constant_velocity", "trapezoid"):
+            raise UserError(f"residual must be 'state', 'constant_velocity' or 'trapezoid', got '{self.residual}'")
+        if self.pair_matching not in ("window", "causal"):
+            raise UserError(f"pair_matching must be 'window' or 'causal', got '{self.pair_matching}'")
+        if self.rollout_graph not in ("evolving", "frozen"):
+            raise UserError(f"rollout_graph must be 'evolving' or 'frozen', got '{self.rollout_graph}'")
+        if self.num_neighbours and self.innovation_rounds:
+            raise UserError("innovation_rounds needs every pair and its reverse; set num_neighbours to 0")
+        if self.static_dim > self.edge_feature_dim:
+            raise UserError(
+                f"static_dim must be at most edge_feature_dim ({self.edge_feature_dim}), got {self.static_dim}"
+            )
+        if self.num_edge_types < 2:
+            raise UserError(f"num_edge_types must be at least 2 (the first is 'no edge'), got {self.num_edge_types}")
+        if not 0 < self.temperature or not 0 <= self.dropout < 1:
+            raise UserError(f"need temperature > 0 and 0 <= dropout < 1, got {self.temperature}, {self.dropout}")
+
+
+PRESETS: dict[str, DGVAEConfig] = {
+    "paper": DGVAEConfig(),
+    "fast": DGVAEConfig(
+        hidden_dim=48,
+        rnn_dim=24,
+        head_dim=48,
+        message_dim=64,
+        decoder_dim=96,
+        edge_feature_dim=8,
+        residual="constant_velocity",
+    ),
+}
+"""Named sizes: "paper" for accuracy studies, "fast" for policies on a CPU."""
+
+
+class Edges(NamedTuple):
+    """Encoder outputs for a stretch of time; time axis second; pairs as the encoder got them."""
+
+    hidden: Float[Tensor, "batch time agents slots rnn"]
+    cell: Float[Tensor, "batch time agents slots rnn"]
+    prior_logits: Float[Tensor, "batch time agents slots types"]
+    features: Float[Tensor, "batch time agents slots feature"]
+    hidden_layer: Float[Tensor, "batch time agents slots hidden"]
+    """Of the edge MLP; its second layer is folded into the gates."""
+
+
+def concrete_sample(
+    logits: Float[Tensor, "*batch types"],
+    temperature: float,
+    generator: torch.Generator | None = None,
+    hard: bool = False,
+) -> Float[Tensor, "*batch types"]:
+    """Reparameterised sample of the concrete distribution (paper Sec. IV, Sampling).
+
+    Args:
+        logits: unnormalised log-probabilities.
+        temperature: towards 0 samples become one-hot.
+        generator: source of the Gumbel noise.
+        hard: one-hot samples whose gradient is that of the soft ones (straight-through).
+    """
+    if logits.dtype in (torch.bfloat16, torch.float16):
+        logits = logits.float()  # the tails of the noise are what draws the rare type
+    uniform = torch.rand(logits.shape, generator=generator, device=logits.device, dtype=logits.dtype)
+    tiny = torch.finfo(logits.dtype).tiny
+    gumbel = -torch.log(-torch.log(uniform.clamp(tiny, 1 - torch.finfo(logits.dtype).eps)))
+    soft = edge_probabilities((logits + gumbel) / temperature)
+    if not hard:
+        return soft
+    one_hot = torch.zeros_like(soft).scatter_(-1, soft.argmax(-1, keepdim=True), 1.0)
+    return one_hot + (soft - soft.detach())
+
+
+def _head(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.ELU(), nn.Linear(hidden, outputs))
+
+
+class Encoder(nn.Module):
+    """Edge logits and features from states, step by step or for many steps at once."""
+
+    def __init__(self, config: DGVAEConfig, inputs: int) -> None:
+        """Layers in the order in which data passes."""
+        super().__init__()
+        self.config = config
+        width, rnn = config.hidden_dim, config.rnn_dim
+        self.embed = nn.Linear(inputs, width)
+        self.conv_pair = PairLinear(width, width, relative=True)
+        self.conv_out = nn.Linear(width, width)
+        self.edge_pair = PairLinear(width, width)
+        self.edge_out = nn.Linear(width, width)
+        self.forward_input = nn.Linear(width, 4 * rnn)
+        self.forward_hidden = nn.Linear(rnn, 4 * rnn, bias=False)
+        self.backward_input = nn.Linear(width, 4 * rnn)
+        self.backward_hidden = nn.Linear(rnn, 4 * rnn, bias=False)
+        for gates in (self.forward_input, self.backward_input):
+            gates.bias.data[rnn : 2 * rnn] += config.forget_bias
+        if config.innovation_rounds:
+            self.innovation = Innovation(inputs, rnn, config.innovation_dim, config.innovation_rounds)
+            self.innovation_gates = nn.Linear(rnn, 4 * rnn, bias=False)
+        self.dropout = nn.Dropout(config.dropout)
+        self.prior_head = _head(rnn, config.head_dim, config.num_edge_types)
+        if config.edge_feature_dim:
+            self.feature_head = _head(rnn, config.head_dim, config.edge_feature_dim)
+        self.posterior_head = _head(2 * rnn, config.head_dim, config.num_edge_types)
+
+    def embed_edges(
+        self,
+        inputs: Float[Tensor, "*batch agents inputs"],
+        pairs: Bool[Tensor, "*batch agents slots"],
+        senders: Int[Tensor, "*some agents slots"] | None = None,
+    ) -> Float[Tensor, "*batch agents slots hidden"]:
+        """The graph block up to the hidden layer of the edge MLP; all steps at once."""
+        weight = pairs.to(inputs.dtype)
+        summed = sum_over_senders(self.conv_pair.elu(inputs, senders, self.embed), weight)
+        # Σ_j (W h_ij + b) = W Σ_j h_ij + n b: the second layer of EdgeConv costs agents, not pairs.
+        count = weight.sum(-1, keepdim=True)
+        nodes = functional.elu(functional.linear(summed, self.conv_out.weight) + count * self.conv_out.bias)
+        return self.edge_pair.elu(nodes, senders)
+
+    def _gates(self, layer: nn.Linear, hidden: Tensor) -> Tensor:
+        """Input share of an LSTM's gates."""
+        weight, bias = folded(layer, self.edge_out)
+        return _time_first(lambda x: functional.linear(x, weight, bias), hidden)
+
+    def forward(
+        self,
+        inputs: Float[Tensor, "batch time agents inputs"],
+        pairs: Bool[Tensor, "batch time agents slots"],
+        hidden: Float[Tensor, "batch agents slots rnn"],
+        cell: Float[Tensor, "batch agents slots rnn"],
+        senders: Int[Tensor, "*some agents slots"] | None = None,
+    ) -> Edges:
+        """Run the forward LSTM from a given memory; a pair that is not present has its memory set to zero."""
+        hidden_layer = _time_first(lambda x, mask: self.embed_edges(x, mask, senders), inputs, pairs)
+        correct = self._correction(inputs, pairs) if self.config.innovation_rounds else None
+        gates = self._gates(self.forward_input, hidden_layer)
+        hiddens, cells = masked_lstm(gates, self.forward_hidden, pairs, hidden, cell, correct=correct)
+        past = self.dropout(functional.elu(hiddens))
+        present = pairs[..., None]
+        if self.config.edge_feature_dim:
+            features = _time_first(self.feature_head, past) * present
+        else:
+            features = past.new_zeros(*pairs.shape, 0)
+        logits = no_edge_where_absent(_time_first(self.prior_head, past), present)
+        return Edges(hiddens, cells, logits, features, hidden_layer)
+
+    def _correction(self, inputs: Tensor, pairs: Tensor) -> Correction:
+        regressors, targets = self.innovation.prepare(inputs, pairs)
+        steps = list(zip(regressors.unbind(1), targets.unbind(1), strict=True))
+
+        def gates(t: int, hidden: Tensor) -> Tensor:
+            added: Tensor = self.innovation_gates(self.innovation(hidden, *steps[t]))
+            return added
+
+        return gates
+
+    def posterior_logits(
+        self, edges: Edges, pairs: Bool[Tensor, "batch time agents slots"]
+    ) -> Float[Tensor, "batch time agents slots types"]:
+        """Logits that have seen the future; training only."""
+        zeros = torch.zeros_like(edges.hidden[:, 0])
+        gates = self._gates(self.backward_input, edges.hidden_layer)
+        backward, _ = masked_lstm(gates, self.backward_hidden, pairs, zeros, zeros, reverse=True)
+        both = self.dropout(functional.elu(torch.cat([edges.hidden, backward], dim=-1)))
+        return no_edge_where_absent(_time_first(self.posterior_head, both), pairs[..., None])
+
+
+def _time_first(layer: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
+    """Apply a layer with time before batch, as the LSTMs hold it in memory; no copy is made of what they give."""
+    return layer(*(t.transpose(0, 1) for t in tensors)).transpose(0, 1)
+
+
+def edge_probabilities(logits: Float[Tensor, "*batch types"]) -> Float[Tensor, "*batch types"]:
+    """Softmax over edge types; of two types, a logistic function, which is several times faster on a CPU."""
+    if logits.shape[-1] != 2:
+        return torch.softmax(logits, dim=-1)
+    edge = torch.sigmoid(logits[..., 1] - logits[..., 0])
+    return torch.stack([1 - edge, edge], dim=-1)
+
+
+def no_edge_where_absent(
+    logits: Float[Tensor, "*batch types"], present: Bool[Tensor, "*batch 1"]
+) -> Float[Tensor, "*batch types"]:
+    """The same, with certainty of "no edge" for pairs that are not there."""
+    absent = torch.full_like(logits, -1e4)
+    absent[..., 0] = 0.0
+    return torch.where(present, logits, absent)
+
+
+class Decoder(nn.Module):
+    """Change of state from messages along edges."""
+
+    def __init__(self, config: DGVAEConfig, inputs: int, outputs: int) -> None:
+        """Layers in the order in which data passes."""
+        super().__init__()
+        self.types = config.num_edge_types - 1  # type 0 is silent
+        self.gated = config.gated_messages
+        width = config.message_dim
+        self.message_pair = PairLinear(inputs, self.types * width)
+        if config.edge_feature_dim:
+            self.message_feature = nn.Linear(config.edge_feature_dim, self.types * width, bias=False)
+        self.message_out = nn.Linear(width, self.types * width)  # one block for each type that speaks
+        self.own = nn.Linear(inputs, width)
+        self.gru = nn.GRUCell(width, config.decoder_dim)
+        self.readout = nn.Linear(config.decoder_dim, outputs)
+        if config.substeps:
+            self.direct = nn.Linear(width, outputs, bias=False)
+        self.has_features = config.edge_feature_dim > 0
+        if config.zero_start:
+            for parameter in (*self.readout.parameters(), *(self.direct.parameters() if config.substeps else ())):
+                nn.init.zeros_(parameter)
+
+    def messages(
+        self,
+        inputs: Float[Tensor, "*batch agents inputs"],
+        pairs: Bool[Tensor, "*batch agents slots"],
+        graph: Float[Tensor, "*batch agents slots types"],
+        features: Float[Tensor, "*batch agents slots feature"],
+        senders: Int[Tensor, "*some agents slots"] | None = None,
+    ) -> Float[Tensor, "*batch agents message"]:
+        """Σ_j z_ij · h(x_i ‖ x_j ‖ e_ij) plus the agent's own term; all steps at once."""
+        return self.combine(inputs, self.pair_layer(inputs, features, senders), pairs, graph)
+
+    def pair_layer(
+        self,
+        inputs: Float[Tensor, "*batch agents inputs"],
+        features: Float[Tensor, "*batch agents slots feature"],
+        senders: Int[Tensor, "*some agents slots"] | None = None,
+    ) -> Float[Tensor, "*batch agents slots hidden"]:
+        """The hidden layer of h, one block for each type that speaks; the same whatever the graph."""
+        if not self.has_features:
+            return self.message_pair.elu(inputs, senders)
+        feature = self.message_feature(features)
+        if self.gated:
+            return self.message_pair.elu(inputs, senders) * (1 + feature)
+        return self.message_pair.elu(inputs, senders, extra=feature)
+
+    def combine(
+        self,
+        inputs: Float[Tensor, "*batch agents inputs"],
+        layer: Float[Tensor, "*batch agents slots hidden"],
+        pairs: Bool[Tensor, "*batch agents slots"],
+        graph: Float[Tensor, "*batch agents slots types"],
+    ) -> Float[Tensor, "*batch agents message"]:
+        """Messages from `pair_layer`, weighted by a graph."""
+        total: Tensor = self.own(inputs)
+        blocks = zip(
+            layer.chunk(self.types, dim=-1),
+            self.message_out.weight.chunk(self.types),
+            self.message_out.bias.chunk(self.types),
+            strict=True,
+        )
+        for k, (layer_k, matrix, bias) in enumerate(blocks):
+            weight = graph[..., k + 1] * pairs
+            # Σ_j z_ij (W h_ij + b) = W Σ_j z_ij h_ij + b Σ_j z_ij: the second layer costs agents, not pairs.
+            summed = functional.linear(sum_over_senders(layer_k, weight), matrix)
+            total = total + summed + weight.sum(-1, keepdim=True) * bias
+        return total
+
+    def step(
+        self,
+        messages: Float[Tensor, "batch agents message"],
+        hidden: Float[Tensor, "batch agents decoder"],
+    ) -> Float[Tensor, "batch agents decoder"]:
+        """One GRU step for every agent."""
+        batch, agents, width = hidden.shape
+        after: Tensor = self.gru(messages.reshape(batch * agents, -1), hidden.reshape(batch * agents, width))
+        return after.view(batch, agents, width)
+
+    def change(self, hidden: Float[Tensor, "*batch decoder"]) -> Float[Tensor, "*batch state"]:
+        """Change of state, in units of `delta_scales`."""
+        change: Tensor = self.readout(functional.elu(hidden))
+        return change

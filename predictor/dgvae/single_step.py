@@ -1,0 +1,278 @@
+"""Single steps of the dG-VAE without gradients: what streaming and roll-outs run.
+
+The same function as the modules of `predictor.dgvae.networks`, with fewer operations: only agents and pairs that are
+there are computed (`predictor.dgvae.packing`), linear layers in a row are folded into one, layers on the same input are
+one product, and everything edge-sized is done in place. The folded weights are a snapshot; `is_current` tells whether
+the modules have changed since.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from predictor.dgvae.networks import Decoder, Edges, Encoder, no_edge_where_absent
+from predictor.dgvae.packing import Packed, Padded
+from predictor.layers.pairs import PairLinear, folded
+from predictor.layers.rnn import elu, elu_, gru_step_, lstm_step_
+
+
+class Past(NamedTuple):
+    """What the encoder remembers; tensors with a time axis, or without one."""
+
+    hidden: Tensor
+    cell: Tensor
+    static: Tensor  # pair matching: mean and count (no column if off)
+    seen: Tensor  # the latest inputs and a 1 (no column if changes are not looked at)
+
+
+class Encoding(NamedTuple):
+    """What the encoder makes of a stretch of steps."""
+
+    edges: Edges
+    features: Tensor  # with the static dimensions averaged over the past of each step
+    past: Past  # after each step
+
+
+@runtime_checkable
+class Layers(Protocol):
+    """What single steps need of the networks; `graph` is `Padded` for the modules, `Packed` for the stepper."""
+
+    def encode(self, inputs: Tensor, graph: Any, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Memory of each pair after a step (hidden, cell), prior logits and features."""
+
+    def drive(
+        self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, node: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        """GRU states after a step along a graph; and the messages, unless nobody else needs them."""
+
+    def messages(self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor) -> Tensor:
+        """What reaches each agent along a graph."""
+
+
+class Internal(NamedTuple):
+    """What a belief keeps to roll out from."""
+
+    layers: Layers
+    graph: Padded | Packed  # of all that follows but states
+    past: Past
+    logits: Tensor
+    probs: Tensor
+    features: Tensor
+    node_before: Tensor  # GRU state before the latest observation was decoded
+    node_after: Tensor  # … and after, under the prior's expectation
+    next_states: Tensor
+
+
+@dataclass(frozen=True)
+class Modules:
+    """Single steps through the modules themselves."""
+
+    encoder: Encoder
+    decoder: Decoder
+
+    def encode(self, inputs: Tensor, graph: Any, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """As `Layers.encode`."""
+        edges: Edges = self.encoder(inputs[:, None], graph.present[:, None], hidden, cell, graph.senders)
+        return edges.hidden[:, 0], edges.cell[:, 0], edges.prior_logits[:, 0], edges.features[:, 0]
+
+    def drive(
+        self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, node: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        """As `Layers.drive`."""
+        messages = self.messages(inputs, graph, weights, features)
+        return self.decoder.step(messages, node), messages
+
+    def messages(self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor) -> Tensor:
+        """As `Layers.messages`."""
+        return self.decoder.messages(inputs, graph.present, weights, features, graph.senders)
+
+
+def unpacked(known: Internal, layers: Layers) -> Internal:
+    """The same for other layers, which take padded arrays."""
+    graph = known.graph
+    if isinstance(graph, Padded):
+        return known
+    hidden, cell, static, seen = known.past
+    past = Past(graph.unpack_pairs(hidden), graph.unpack_pairs(cell), graph.unpack_pairs(static), seen)
+    logits = no_edge_where_absent(graph.unpack_pairs(known.logits), graph.padded.present[..., None])
+    probs, features = graph.unpack_pairs(known.probs, no_edge=True), graph.unpack_pairs(known.features)
+    nodes = graph.unpack_nodes(known.node_before), graph.unpack_nodes(known.node_after)
+    return Internal(layers, graph.padded, past, logits, probs, features, *nodes, known.next_states)
+
+
+Layer = tuple[Tensor, Tensor]
+"""Weight (out, in) and bias (out)."""
+
+
+# torch's own compiler takes this path for float32 layers on x86, where it is about twice as fast as the default one.
+_ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
+
+
+# A product of this many multiplications or more is left to oneDNN, which takes longer to start.
+_LARGE = 2**20
+
+
+class Stepper:
+    """The encoder and decoder of one network, ready for single steps.
+
+    Args:
+        encoder: without innovation rounds; its dropout is off.
+        decoder: likewise.
+    """
+
+    def __init__(self, encoder: Encoder, decoder: Decoder) -> None:
+        """Fold the weights."""
+        self._snapshot = _versions(encoder, decoder)
+        with torch.no_grad():
+            self._take_encoder(encoder)
+            self._take_decoder(decoder)
+
+    def is_current(self, encoder: Encoder, decoder: Decoder) -> bool:
+        """Whether these modules still have the weights that were folded.
+
+        What writes into a tensor behind autograd's back is not seen: `.data`, or the replay of a CUDA graph.
+        """
+        return self._snapshot == _versions(encoder, decoder)
+
+    def encode(
+        self,
+        inputs: Float[Tensor, "listed inputs"],
+        graph: Packed,
+        hidden: Float[Tensor, "pairs rnn"],
+        cell: Float[Tensor, "pairs rnn"],
+    ) -> tuple[
+        Float[Tensor, "pairs rnn"],
+        Float[Tensor, "pairs rnn"],
+        Float[Tensor, "pairs types"],
+        Float[Tensor, "pairs feature"],
+    ]:
+        """Memory of each pair after a step (hidden, cell), prior logits and features."""
+        summed = graph.gather(elu_(_spread(inputs, self._conv, graph)))
+        nodes = _product(summed, (self._conv_out[0], None))
+        nodes = elu_(nodes.addcmul_(graph.counts, self._conv_out[1]))
+        edges = elu_(_spread(nodes, self._edge, graph))
+        gates = _product(edges, self._gates, _product(hidden, self._recurrent))
+        hidden, cell = lstm_step_(gates, cell)
+        heads = elu_(_product(elu(hidden), self._heads))
+        if self._features is None:
+            return hidden, cell, _product(heads, self._logits), heads.new_zeros(len(heads), 0)
+        width = heads.shape[1] // 2
+        return hidden, cell, _product(heads[:, :width], self._logits), _product(heads[:, width:], self._features)
+
+    def drive(
+        self,
+        inputs: Float[Tensor, "listed inputs"],
+        graph: Packed,
+        weights: Float[Tensor, "pairs types"],
+        features: Float[Tensor, "pairs feature"],
+        node: Float[Tensor, "listed decoder"],
+    ) -> tuple[Float[Tensor, "listed decoder"], Float[Tensor, "listed message"] | None]:
+        """GRU states after a step along a graph; and the messages, if substeps need them."""
+        if self._driven is None:
+            messages = self.messages(inputs, graph, weights, features)
+            gates = _product(messages, self._gru)
+        else:
+            messages = None
+            gates = self._along(inputs, graph, weights, features, *self._driven)
+        return gru_step_(gates, _product(node, self._remembered), node), messages
+
+    def messages(
+        self,
+        inputs: Float[Tensor, "listed inputs"],
+        graph: Packed,
+        weights: Float[Tensor, "pairs types"],
+        features: Float[Tensor, "pairs feature"],
+    ) -> Float[Tensor, "listed message"]:
+        """What reaches each agent along a graph, its own term included."""
+        return self._along(inputs, graph, weights, features, self._own, self._out)
+
+    def _along(
+        self, inputs: Tensor, graph: Packed, weights: Tensor, features: Tensor, own: Layer, out: list[Layer]
+    ) -> Tensor:
+        layer = _spread(inputs, self._message, graph)
+        if self._feature is None:
+            elu_(layer)
+        elif self._gated:
+            elu_(layer).mul_(_product(features, self._feature).add_(1))
+        else:
+            elu_(layer.addmm_(features, self._feature[0].t()))
+        total = _product(inputs, own)
+        for k, (block, (matrix, bias)) in enumerate(zip(layer.chunk(len(out), -1), out, strict=True)):
+            weight = weights[:, k + 1].contiguous()
+            total = _product(graph.gather(block.contiguous(), weight), (matrix, None), total)
+            total.addcmul_(graph.total(weight), bias)
+        return total
+
+    def _take_encoder(self, encoder: Encoder) -> None:
+        self._conv = _roles(encoder.conv_pair, encoder.embed)
+        self._conv_out = _layer(encoder.conv_out)
+        self._edge = _roles(encoder.edge_pair)
+        self._gates = folded(encoder.forward_input, encoder.edge_out)
+        self._recurrent = (encoder.forward_hidden.weight.detach(), None)
+        heads = [encoder.prior_head, encoder.feature_head] if encoder.config.edge_feature_dim else [encoder.prior_head]
+        layers = [[_layer(part) for part in head if isinstance(part, nn.Linear)] for head in heads]
+        self._heads = _beside(*(hidden for hidden, _ in layers))
+        self._logits = layers[0][1]
+        self._features = layers[1][1] if len(layers) > 1 else None
+
+    def _take_decoder(self, decoder: Decoder) -> None:
+        gru, types = decoder.gru, decoder.types
+        self._message, self._gated = _roles(decoder.message_pair), decoder.gated
+        self._feature = (decoder.message_feature.weight.detach(), None) if decoder.has_features else None
+        self._own = _layer(decoder.own)
+        parts = (t.detach().chunk(types) for t in (decoder.message_out.weight, decoder.message_out.bias))
+        self._out: list[Layer] = list(zip(*parts, strict=True))
+        self._gru = (gru.weight_ih.detach(), gru.bias_ih.detach())
+        self._remembered = (gru.weight_hh.detach(), gru.bias_hh.detach())
+        self._driven: tuple[Layer, list[Layer]] | None = None
+        if not hasattr(decoder, "direct"):  # nothing but the GRU needs the messages
+            weight, bias = self._gru
+            own = (weight @ self._own[0], weight @ self._own[1] + bias)
+            self._driven = (own, [(weight @ matrix, weight @ share) for matrix, share in self._out])
+
+
+def _versions(*modules: nn.Module) -> list[tuple[int, int]]:
+    parameters = (p for part in modules for m in part.modules() for p in m._parameters.values() if p is not None)
+    return [(p.data_ptr(), 0 if p.is_inference() else p._version) for p in parameters]
+
+
+def _product(rows: Tensor, layer: tuple[Tensor, Tensor | None], plus: Tensor | None = None) -> Tensor:
+    """A linear layer, plus what is there already (which may be overwritten)."""
+    weight, bias = layer
+    if _ONEDNN and rows.device.type == "cpu" and rows.dtype is torch.float32:
+        if len(rows) * weight.numel() >= _LARGE:
+            linear = torch.ops.mkldnn._linear_pointwise
+            if plus is None:
+                return linear(rows, weight, bias, "none", [], "")
+            return linear.binary(rows, plus, weight, bias, "add")
+    product = functional.linear(rows, weight, bias)
+    return product if plus is None else product.add_(plus)
+
+
+def _spread(nodes: Tensor, layer: Layer, graph: Packed) -> Tensor:
+    """A `PairLinear` whose two products are one."""
+    return graph.spread(_product(nodes, layer))
+
+
+def _roles(pair: PairLinear, after: nn.Linear | None = None) -> Layer:
+    """Receiver's and sender's share of a `PairLinear`, one above the other."""
+    received, sent = (
+        folded(role, after) if after is not None else _layer(role) for role in (pair.receiver, pair.sender)
+    )
+    if pair.relative:
+        received = (received[0] - sent[0], received[1] - sent[1])
+    return _beside(received, sent)
+
+
+def _layer(linear: nn.Linear) -> Layer:
+    bias = linear.bias if linear.bias is not None else linear.weight.new_zeros(linear.out_features)
+    return linear.weight.detach(), bias.detach()
+
+
+def _beside(*layers: Layer) -> Layer:
+    """Layers on the same input as one."""
+    return torch.cat([weight for weight, _ in layers]), torch.cat([bias for _, bias in layers])

@@ -1,0 +1,1 @@
+"""Metrics and scores of forecasts, graphs and edge features."""

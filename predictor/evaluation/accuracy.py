@@ -1,0 +1,298 @@
+"""From forecasts and truth to an accuracy table; used on windows of a dataset and on live environments alike.
+
+Outcomes are reduced to a few sums per window as they come, so that a test set of any size needs little memory; the
+forecasts themselves are not kept.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from predictor.evaluation import displacement as metrics
+from predictor.evaluation.outcomes import Outcome, run_sequence_batch, run_window_batch, run_windows, sequence_indices
+from predictor.evaluation.standard_errors import (
+    NUM_SUBSETS,
+    Statistic,
+    batch_interval,
+    ratio_statistics,
+    subset_statistics,
+)
+
+__all__ = [
+    "Accuracy",
+    "Outcome",
+    "Statistic",
+    "Tally",
+    "fitted_std_m",
+    "run_sequence_batch",
+    "run_window_batch",
+    "run_windows",
+    "sequence_indices",
+    "subset_statistics",
+    "summarise",
+]
+
+OPTIONAL = ("coverage",)
+"""Left out, rather than NaN, where nothing of it could be measured."""
+SCALAR_NAMES = {"rmse_m": "overall_rmse_m", "coverage": "coverage"}
+"""By-step quantities that also have one number over all steps."""
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Errors of one forecaster at one number of samples; NaN where there was no truth to compare with."""
+
+    name: str
+    """The forecaster."""
+    num_samples: int
+    """K of the best-of-K metrics."""
+    min_ade_m: float
+    """Mean over agents whose truth is known over the whole horizon [m]."""
+    min_fde_m: float
+    """The same at the last step [m]."""
+    by_step_m: list[float]
+    """Displacement at each step of each agent's best sample [m], all agents whose truth is known there."""
+    rmse_m: list[float]
+    """Root mean squared displacement of the samples' mean at each step [m]."""
+    nll: list[float]
+    """Negative log-likelihood at each step [nats], with the spread fitted on validation data; empty without one."""
+    agents: int
+    """Forecasts (agent × instant) behind min_ade_m."""
+    min_joint_ade_m: float = math.nan
+    """Best sample per scene, mean over scenes [m]; the agents of min_ade_m."""
+    min_joint_fde_m: float = math.nan
+    """The same at the last step [m]."""
+    miss_rate: float = math.nan
+    """Share of the agents of min_fde_m whose final displacement, at best, is above the threshold."""
+    overall_rmse_m: float = math.nan
+    """Root mean squared displacement of the samples' mean [m] over all steps and agents whose truth is known. All axes
+    count together, so it is never below the mean displacement; see `rmse_per_axis_m`."""
+    coverage: list[float] = field(default_factory=list)
+    """Share of truths within the central 90 % of the samples at each step; empty with too few samples to say."""
+    miss_by_step: list[float] = field(default_factory=list)
+    """Share of agents whose best sample is further off than the threshold at each step."""
+    miss_threshold_m: float = metrics.MISS_THRESHOLD_M
+    """Of the misses [m]."""
+    scenes: int = 0
+    """Instants behind min_joint_ade_m."""
+    axes: int = 2
+    """Of a position."""
+    statistics: dict[str, Statistic] = field(default_factory=dict)
+    """Mean ± standard error over subsets of the windows, by name of the scalar fields above, and "coverage" over all
+    steps; without those that could not be measured."""
+    step_errors: dict[str, list[float | None]] = field(default_factory=dict)
+    """Standard error over the same subsets at each step, by name of the list fields above."""
+    intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """95 % bootstrap interval over batches (episodes, in a live environment), by name of the scalar fields; where asked
+    for."""
+    step_intervals: dict[str, list[tuple[float, float] | None]] = field(default_factory=dict)
+    """The same at each step, by name of the list fields."""
+
+    @property
+    def rmse_per_axis_m(self) -> float:
+        """Overall RMSE per coordinate [m]: root of the mean over axes too, `overall_rmse_m` / √axes.
+
+        The paper does not define its RMSE, but reports some below the mean displacement of the same deterministic
+        model (springs, "Linear": 0.196 beside an ADE of 0.202); over equal steps only a mean over axes does that.
+        """
+        return self.overall_rmse_m / math.sqrt(self.axes)
+
+
+class Tally:
+    """Collects outcomes batch by batch and keeps a few numbers per window.
+
+    Args:
+        std_m: spread per axis at each step [m] for the likelihood; empty, or shorter than the horizon, leaves it out.
+        miss_threshold_m: of the miss rate [m].
+        partial_agents: count also agents whose truth is known in part: their displacement is the mean over the known
+            steps, and their final one counts if the last step is known. Left out by default, so that every mean is
+            over forecasts of equal length.
+    """
+
+    def __init__(
+        self,
+        std_m: Sequence[float] = (),
+        miss_threshold_m: float = metrics.MISS_THRESHOLD_M,
+        partial_agents: bool = False,
+    ) -> None:
+        """Nothing collected yet."""
+        self._std_m = tuple(std_m)
+        self._threshold_m = miss_threshold_m
+        self._partial = partial_agents
+        self._shape: tuple[int, int, int] | None = None
+        self._sums: dict[str, list[np.ndarray]] = {}
+        self._counts: dict[str, list[np.ndarray]] = {}
+
+    def add(self, outcome: Outcome) -> None:
+        """Take in a batch of windows.
+
+        Raises:
+            ValueError: another number of samples, steps or axes than before.
+        """
+        _, samples, _, horizon, axes = outcome.forecast.shape
+        shape = (samples, horizon, axes)
+        if self._shape not in (None, shape):
+            raise ValueError(f"outcomes of one row need the same samples, horizon and axes {self._shape}, got {shape}")
+        self._shape = shape
+        for name, (value, valid) in self._measure(outcome).items():
+            known, count = torch.where(valid, value, 0.0).double(), valid.double()
+            if valid.ndim > 1:
+                known, count = known.sum(1), count.sum(1)  # over agents
+            self._sums.setdefault(name, []).append(known.cpu().numpy())
+            self._counts.setdefault(name, []).append(count.cpu().numpy())
+
+    def accuracy(
+        self, name: str, num_subsets: int = NUM_SUBSETS, seed: int = 0, batch_intervals: bool = False
+    ) -> Accuracy:
+        """One row of what was collected.
+
+        Args:
+            name: the forecaster's name.
+            num_subsets: subsets of windows behind the standard errors.
+            seed: of the subsets.
+            batch_intervals: also bootstrap over the batches that were added, where each is an independent episode.
+
+        Raises:
+            ValueError: nothing was collected.
+        """
+        if self._shape is None:
+            raise ValueError("an accuracy needs at least one outcome, got none")
+        samples, _, axes = self._shape
+        counts = {key: np.concatenate(parts) for key, parts in self._counts.items()}
+        counts = {key: count for key, count in counts.items() if count.any() or key not in OPTIONAL}
+        sums = {key: np.concatenate(self._sums[key]) for key in counts}
+        whole = {key: _ratio(sums[key].sum(), counts[key].sum()) for key in counts}
+        steps = {
+            key: [_ratio(s, c) for s, c in zip(sums[key].sum(0), counts[key].sum(0), strict=True)]
+            for key in counts
+            if counts[key].ndim == 2
+        }
+        statistics, step_errors = _spread(sums, counts, num_subsets, seed)
+        intervals, step_intervals = self._bootstrap(seed) if batch_intervals else ({}, {})
+        return Accuracy(
+            name=name,
+            num_samples=samples,
+            agents=int(counts["min_ade_m"].sum()),
+            scenes=int(counts["min_joint_ade_m"].sum()),
+            axes=axes,
+            **{
+                key: whole[key] for key in ("min_ade_m", "min_fde_m", "min_joint_ade_m", "min_joint_fde_m", "miss_rate")
+            },
+            overall_rmse_m=math.sqrt(whole["rmse_m"]),
+            by_step_m=steps["by_step_m"],
+            miss_by_step=steps["miss_by_step"],
+            miss_threshold_m=self._threshold_m,
+            rmse_m=[math.sqrt(value) for value in steps["rmse_m"]],
+            nll=steps.get("nll", []),
+            coverage=steps.get("coverage", []),
+            statistics=statistics,
+            step_errors=step_errors,
+            intervals=intervals,
+            step_intervals=step_intervals,
+        )
+
+    def _bootstrap(
+        self, seed: int
+    ) -> tuple[dict[str, tuple[float, float]], dict[str, list[tuple[float, float] | None]]]:
+        """`Accuracy.intervals` and `Accuracy.step_intervals`."""
+        scalars: dict[str, tuple[float, float]] = {}
+        by_step: dict[str, list[tuple[float, float] | None]] = {}
+        for key, parts in self._sums.items():
+            sums = np.stack([part.sum(0) for part in parts])
+            counts = np.stack([part.sum(0) for part in self._counts[key]])
+            root = key == "rmse_m"
+            if sums.ndim == 1:
+                found = batch_interval(sums, counts, seed, root)
+                scalars |= {} if found is None else {key: found}
+                continue
+            if key in SCALAR_NAMES and (found := batch_interval(sums.sum(1), counts.sum(1), seed, root)) is not None:
+                scalars[SCALAR_NAMES[key]] = found
+            by_step[key] = [batch_interval(s, c, seed, root) for s, c in zip(sums.T, counts.T, strict=True)]
+        return scalars, by_step
+
+    def _measure(self, outcome: Outcome) -> dict[str, tuple[Tensor, Tensor]]:
+        """Every metric's values and mask: per agent, per scene, and per agent and step."""
+        forecast, future, valid = outcome.forecast, outcome.future, outcome.valid
+        horizon = forecast.shape[3]
+        counted = valid if self._partial else valid & valid.all(-1, keepdim=True)
+        values = {
+            "min_ade_m": metrics.min_ade(forecast, future, counted),
+            "min_fde_m": metrics.min_fde(forecast, future, counted),
+            "miss_rate": metrics.miss_rate(forecast, future, counted, self._threshold_m),
+            "min_joint_ade_m": metrics.min_joint_ade(forecast, future, counted),
+            "min_joint_fde_m": metrics.min_joint_fde(forecast, future, counted),
+            "by_step_m": metrics.min_displacement(forecast, future, valid),
+            "miss_by_step": self._missed(forecast, future, valid),
+            "rmse_m": metrics.squared_error(forecast, future, valid),
+            "coverage": metrics.coverage(forecast, future, valid),
+        }
+        if len(self._std_m) >= max(1, horizon):
+            std_m = torch.tensor(self._std_m[:horizon], device=forecast.device)
+            values["nll"] = metrics.gaussian_mixture_nll(forecast, future, valid, std_m)
+        return values
+
+    def _missed(self, forecast: Tensor, future: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        distance, known = metrics.min_displacement(forecast, future, valid)
+        return (distance > self._threshold_m).to(distance.dtype), known
+
+
+def summarise(
+    name: str,
+    outcomes: Iterable[Outcome],
+    std_m: Sequence[float] = (),
+    miss_threshold_m: float = metrics.MISS_THRESHOLD_M,
+) -> Accuracy:
+    """Average outcomes into one row.
+
+    Args:
+        name: the forecaster's name.
+        outcomes: at least one, of equal samples and horizon; an iterator is consumed as it goes.
+        std_m: spread per axis at each step [m] for the likelihood; empty leaves it out.
+        miss_threshold_m: of the miss rate [m].
+    """
+    tally = Tally(std_m, miss_threshold_m)
+    for outcome in outcomes:
+        tally.add(outcome)
+    return tally.accuracy(name)
+
+
+def fitted_std_m(outcomes: Iterable[Outcome]) -> tuple[float, ...]:
+    """Standard deviation per axis of the first sample's error at each step [m]: the maximum-likelihood round spread."""
+    totals, counts = [], []
+    for outcome in outcomes:
+        squared = (outcome.forecast[:, 0] - outcome.future).square().sum(-1)
+        totals.append(torch.where(outcome.valid, squared, 0.0).sum((0, 1)).double().cpu())
+        counts.append(outcome.future.shape[-1] * outcome.valid.sum((0, 1)).cpu())
+    if not totals:
+        raise ValueError("a spread needs at least one outcome, got none")
+    variance = torch.stack(totals).sum(0) / torch.stack(counts).sum(0).clamp(min=1)
+    return tuple(variance.sqrt().clamp(min=1e-3).tolist())
+
+
+def _ratio(total: float, count: float) -> float:
+    return float(total / count) if count else math.nan
+
+
+def _spread(
+    sums: dict[str, np.ndarray], counts: dict[str, np.ndarray], num_subsets: int, seed: int
+) -> tuple[dict[str, Statistic], dict[str, list[float | None]]]:
+    """`Accuracy.statistics` and `Accuracy.step_errors` from sums and counts per window (and step)."""
+    scalars: dict[str, Statistic | None] = {}
+    step_errors: dict[str, list[float | None]] = {}
+    for key in sums:
+        root = key == "rmse_m"
+        if sums[key].ndim == 1:
+            scalars[key] = ratio_statistics(sums[key], counts[key], num_subsets, seed)
+            continue
+        if key in SCALAR_NAMES:
+            total, count = sums[key].sum(1), counts[key].sum(1)
+            scalars[SCALAR_NAMES[key]] = ratio_statistics(total, count, num_subsets, seed, root)
+        found = [
+            ratio_statistics(s, c, num_subsets, seed, root) for s, c in zip(sums[key].T, counts[key].T, strict=True)
+        ]
+        step_errors[key] = [None if f is None else f.standard_error for f in found]
+    return {key: value for key, value in scalars.items() if value is not None}, step_errors

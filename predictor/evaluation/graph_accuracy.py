@@ -1,0 +1,254 @@
+"""How right an inferred interaction graph is: accuracy, F1, connectivity, Brier score, with or without naming types.
+
+Everything is per ordered pair (receiver, sender), so graphs may be symmetric or not, and over a whole evaluation set:
+`GraphTally` adds up confusion counts batch by batch. Type 0 is "no edge". A model that never saw a true graph may call
+the types by other names; `matched` then renames its types by the one permutation that is best on the *whole set*, never
+scene by scene, which would flatter. Unmatched is the honest reading where type 0 is "no edge" by construction (its
+messages are skipped).
+
+Edges are unbalanced (70 % in k-springs): always saying "edge" has the accuracy `true_connectivity`, and F1 says more.
+"""
+
+import itertools
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from predictor.evaluation.standard_errors import NUM_SUBSETS, Statistic, ratio_statistics
+
+PairTypes = Int[Tensor, " batch *pairs"]
+"""A type per pair; windows first, then receivers and senders, with a time axis between them or not."""
+
+PairMask = Bool[Tensor, " batch *pairs"]
+"""Which pairs count."""
+
+Predicted = Float[Tensor, "batch *pairs types"] | PairTypes
+"""Probabilities of the types, or types."""
+
+UNKNOWN = -1
+"""True type of a pair of which nothing is known; stores write it."""
+
+MAX_MATCHED_TYPES = 7
+"""Permutations are tried one by one; 7! = 5040."""
+
+
+@dataclass(frozen=True)
+class GraphAccuracy:
+    """What a tally says; None where there is nothing to say (no valid pair, no truth, no edge at all)."""
+
+    pairs: int
+    """Valid ordered pairs."""
+    connectivity: float | None
+    """Share of pairs whose most likely type is an edge (the paper's NBA table)."""
+    accuracy: float | None = None
+    """Share of pairs whose most likely type is the true one."""
+    f1: float | None = None
+    """Of "is an edge": 2 TP / (2 TP + FP + FN)."""
+    precision: float | None = None
+    """Of "is an edge": TP / (TP + FP)."""
+    recall: float | None = None
+    """Of "is an edge": TP / (TP + FN)."""
+    brier: float | None = None
+    """Mean squared difference between the probability of an edge and its presence: 0 is perfect, 0.25 knows nothing.
+    Types given without probabilities count as certain."""
+    true_connectivity: float | None = None
+    """Share of pairs that truly have an edge: the accuracy of always saying "edge" (with two types)."""
+    confusion: list[list[int]] | None = None
+    """Pairs by true type (rows) and most likely type (columns), after renaming."""
+    permutation: tuple[int, ...] | None = None
+    """The true type that each of the model's types stands for; the identity unless matched."""
+    statistics: dict[str, Statistic] = field(default_factory=dict)
+    """Mean ± standard error over subsets of the windows, by the names above; the permutation is the whole set's."""
+
+
+class GraphTally:
+    """Confusion counts per window, batch by batch.
+
+    Example:
+        >>> tally = GraphTally(num_types=2)
+        >>> types = torch.tensor([[[0, 1], [1, 0]]])
+        >>> tally.add(types, types, torch.tensor([[[False, True], [True, False]]]))
+        >>> tally.results().accuracy
+        1.0
+
+    Args:
+        num_types: edge types of the model, "no edge" included; the truth may have fewer.
+    """
+
+    def __init__(self, num_types: int) -> None:
+        """Nothing added yet."""
+        if num_types < 1:
+            raise ValueError(f"num_types must be at least 1, got {num_types}")
+        self.num_types = num_types
+        self._predicted: list[np.ndarray] = []  # windows × types
+        self._confusion: list[np.ndarray] = []  # windows × true × predicted
+        self._brier: list[np.ndarray] = []  # windows × the type taken for "no edge"
+        self._has_truth: bool | None = None
+
+    def add(self, predicted: Predicted, true_types: PairTypes | None, valid: PairMask) -> None:
+        """Take in a batch of windows.
+
+        Args:
+            predicted: probabilities of the types, or types.
+            true_types: looked at where `valid` only; a pair with -1 (unknown) does not count. None where there is no
+                truth at all: only connectivity is reported.
+            valid: which pairs count; leave out the diagonal and absent agents (`predictor.graph.pair_mask`).
+
+        Raises:
+            ValueError: other types than `num_types`, or a truth in some batches only.
+        """
+        if self._has_truth not in (None, true_types is not None):
+            raise ValueError("either all batches of a tally have true types or none; use two tallies")
+        self._has_truth = true_types is not None
+        valid = valid.cpu()
+        if true_types is not None:
+            true_types = true_types.cpu().long()
+            valid = valid & (true_types != UNKNOWN)
+            self._check(true_types[valid], "true")
+        probs, types = self._as_both(predicted.detach().cpu(), valid)
+        self._predicted.append(_count(types, valid, self.num_types))
+        if true_types is None:
+            return
+        pair = torch.where(valid, true_types, 0) * self.num_types + types
+        confusion = _count(pair, valid, self.num_types**2)
+        self._confusion.append(confusion.reshape(-1, self.num_types, self.num_types))
+        no_edge = (true_types == 0)[..., None].double()
+        squared = torch.where(valid[..., None], (probs.double() - no_edge).square(), 0.0)
+        self._brier.append(squared.flatten(1, -2).sum(1).numpy())
+
+    def results(self, matched: bool = False, num_subsets: int = NUM_SUBSETS, seed: int = 0) -> GraphAccuracy:
+        """The whole set's numbers.
+
+        Args:
+            matched: rename the model's types by the permutation with the highest accuracy (ties: the identity).
+            num_subsets: subsets of windows behind the standard errors.
+            seed: of the subsets.
+
+        Raises:
+            ValueError: `matched` without a truth, or with more types than can be tried.
+        """
+        if matched and not self._has_truth:
+            raise ValueError("types can only be matched to true types; add them or pass matched=False")
+        if not self._predicted:
+            return GraphAccuracy(0, None)
+        if not self._has_truth:
+            counts = np.concatenate(self._predicted)
+            ratios = {"connectivity": (counts[:, 1:].sum(1), counts.sum(1))}
+            values, statistics = _summary(ratios, num_subsets, seed)
+            return GraphAccuracy(int(counts.sum()), values["connectivity"], statistics=statistics)
+        confusion = np.concatenate(self._confusion)
+        permutation = _best_permutation(confusion.sum(0)) if matched else tuple(range(self.num_types))
+        confusion = confusion[:, :, np.argsort(permutation)]
+        brier = np.concatenate(self._brier)[:, permutation.index(0)]
+        values, statistics = _summary(_ratios(confusion, brier), num_subsets, seed)
+        total = confusion.sum(0)
+        return GraphAccuracy(
+            int(total.sum()),
+            **values,
+            confusion=total.tolist() if total.any() else None,
+            permutation=permutation,
+            statistics=statistics,
+        )
+
+    def _as_both(self, predicted: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        """Probabilities, and types that are in range everywhere."""
+        if not predicted.is_floating_point():
+            self._check(predicted[valid], "predicted")
+            types = torch.where(valid, predicted, 0).long()
+            return torch.nn.functional.one_hot(types, self.num_types).float(), types
+        if predicted.shape[-1] != self.num_types:
+            raise ValueError(f"probabilities need {self.num_types} types, got {predicted.shape[-1]}")
+        return predicted, predicted.argmax(-1)
+
+    def _check(self, types: Tensor, which: str) -> None:
+        if types.numel() and not 0 <= int(types.min()) <= int(types.max()) < self.num_types:
+            raise ValueError(
+                f"{which} types must be 0 to {self.num_types - 1}, got {int(types.min())} to {int(types.max())}"
+            )
+
+
+def graph_accuracy(
+    predicted: Predicted,
+    true_types: PairTypes,
+    valid: PairMask,
+    matched: bool = False,
+) -> float | None:
+    """Share of valid pairs whose most likely type is the true one; None without a valid pair. As `GraphTally.add`."""
+    return _tallied(predicted, true_types, valid).results(matched, num_subsets=1).accuracy
+
+
+def graph_f1(
+    predicted: Predicted,
+    true_types: PairTypes,
+    valid: PairMask,
+    matched: bool = False,
+) -> float | None:
+    """F1 of "is an edge"; None where neither the truth nor the model has one. As `GraphTally.add`."""
+    return _tallied(predicted, true_types, valid).results(matched, num_subsets=1).f1
+
+
+def connectivity(predicted: Predicted, valid: PairMask) -> float | None:
+    """Share of valid pairs whose most likely type is an edge (any type but 0); None without a valid pair."""
+    return _tallied(predicted, None, valid).results(num_subsets=1).connectivity
+
+
+def _tallied(predicted: Tensor, true_types: Tensor | None, valid: Tensor) -> GraphTally:
+    if predicted.is_floating_point():
+        num_types = predicted.shape[-1]
+    else:
+        known = [types[valid] for types in (predicted, true_types) if types is not None and valid.any()]
+        num_types = 1 + max((int(types.max()) for types in known), default=0)
+    tally = GraphTally(num_types)
+    tally.add(predicted, true_types, valid)
+    return tally
+
+
+def _count(types: Tensor, valid: Tensor, num_types: int) -> Int[np.ndarray, "batch types"]:
+    """How many valid entries of each window have each type."""
+    windows = torch.arange(len(types)).reshape(-1, *[1] * (types.ndim - 1)).expand_as(types)
+    index = (windows * num_types + types)[valid]
+    return torch.bincount(index, minlength=len(types) * num_types).reshape(len(types), num_types).numpy()
+
+
+def _best_permutation(confusion: Int[np.ndarray, "types types"]) -> tuple[int, ...]:
+    """True type for each predicted type, such that the most pairs agree; the first in order among equals."""
+    types = len(confusion)
+    if types > MAX_MATCHED_TYPES:
+        raise ValueError(f"at most {MAX_MATCHED_TYPES} types can be matched, got {types}")
+    return max(itertools.permutations(range(types)), key=lambda p: int(confusion[list(p), range(types)].sum()))
+
+
+def _ratios(confusion: np.ndarray, brier: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Numerator and denominator per window of every measure."""
+    pairs, hits = confusion.sum((1, 2)), confusion[:, 1:, 1:].sum((1, 2))
+    said, are = confusion[:, :, 1:].sum((1, 2)), confusion[:, 1:].sum((1, 2))
+    return {
+        "connectivity": (said, pairs),
+        "accuracy": (np.trace(confusion, axis1=1, axis2=2), pairs),
+        "f1": (2 * hits, said + are),
+        "precision": (hits, said),
+        "recall": (hits, are),
+        "brier": (brier, pairs),
+        "true_connectivity": (are, pairs),
+    }
+
+
+def _summary(
+    ratios: dict[str, tuple[np.ndarray, np.ndarray]], num_subsets: int, seed: int
+) -> tuple[dict[str, float | None], dict[str, Statistic]]:
+    values = {key: float(n.sum() / d.sum()) if d.sum() else None for key, (n, d) in ratios.items()}
+    found = {
+        key: ratio_statistics(n.astype(np.float64), d.astype(np.float64), num_subsets, seed)
+        for key, (n, d) in ratios.items()
+    }
+    return values, {key: statistic for key, statistic in found.items() if statistic is not None}
+
+
+def edge_entropy(
+    edge_probs: Float[Tensor, "*batch types"], valid: Bool[Tensor, "*batch"]
+) -> tuple[Float[Tensor, "*batch"], Bool[Tensor, "*batch"]]:
+    """Entropy of the edge type [nats] per pair: 0 is a decided graph, log(types) an uninformative one."""
+    return -(edge_probs * torch.log(edge_probs.clamp(min=1e-12))).sum(-1), valid

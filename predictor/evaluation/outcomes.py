@@ -1,0 +1,215 @@
+"""Run a forecaster over windows and line up what then happened: forecasts, truths, masks.
+
+Two readings of "the error of a sequence" (docs/protocol.md): *horizon-only* compares the free run after the last
+observed step (`run_window_batch`); *whole-sequence* puts in front of it the one-step predictions that were made from
+true states on the way there (`run_sequence_batch`).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from predictor.data.windows import WindowBatch, Windows
+from predictor.errors import UserError
+from predictor.forecaster import Belief, Forecaster
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Forecasts and what then happened; what was believed of the graph where that was asked for."""
+
+    forecast: Float[Tensor, "batch samples agents horizon axes"]
+    """Predicted positions [m]."""
+    future: Float[Tensor, "batch agents horizon axes"]
+    """True positions [m], same frame."""
+    valid: Bool[Tensor, "batch agents horizon"]
+    """Which truths exist and count."""
+    edge_probs: Float[Tensor, "batch agents agents types"] | None = None
+    """Prior over edge types at the last observed step, receiver first; columns are the window batch's."""
+    edge_features: Float[Tensor, "batch agents agents feature"] | None = None
+    """Edge features at the last observed step."""
+    present: Bool[Tensor, "batch agents"] | None = None
+    """Who is there at the last observed step (the ego too): `pair_mask` of it says which pairs mean something."""
+    edge_types: Int[Tensor, "batch agents agents"] | None = None
+    """True type of each edge at the last observed step where the data knows it, else -1."""
+    edge_attributes: Float[Tensor, "batch agents agents attributes"] | None = None
+    """Known properties of each edge at that step, zeros where unknown or absent."""
+
+    def tail(self, steps: int) -> "Outcome":
+        """The last steps only: the horizon-only view of a whole sequence.
+
+        Raises:
+            ValueError: there are not as many.
+        """
+        if not 1 <= steps <= self.valid.shape[-1]:
+            raise ValueError(f"steps must be between 1 and {self.valid.shape[-1]}, got {steps}")
+        return replace(
+            self,
+            forecast=self.forecast[..., -steps:, :],
+            future=self.future[..., -steps:, :],
+            valid=self.valid[..., -steps:],
+        )
+
+
+@torch.inference_mode()
+def run_window_batch(
+    forecaster: Forecaster,
+    batch: WindowBatch,
+    horizon_steps: int,
+    num_samples: int = 1,
+    generator: torch.Generator | None = None,
+    keep_beliefs: bool = False,
+) -> Outcome:
+    """Stream the history of each window, forecast, and line up the truth; the ego is left out.
+
+    Args:
+        forecaster: forecasts without seeing beyond `last_observed`.
+        batch: windows with at least `horizon_steps` steps (padding included) after `last_observed`.
+        horizon_steps: steps of free run.
+        num_samples: K.
+        generator: of the samples.
+        keep_beliefs: also return the graph at the last observed step, and the true one where the data has it.
+    """
+    belief: Belief | None = None
+    for _, latest in _observed(forecaster, batch):
+        belief = latest
+    assert belief is not None
+    return _free_run(forecaster, batch, belief, horizon_steps, num_samples, generator, keep_beliefs)
+
+
+@torch.inference_mode()
+def run_sequence_batch(
+    forecaster: Forecaster,
+    batch: WindowBatch,
+    horizon_steps: int,
+    num_samples: int = 1,
+    generator: torch.Generator | None = None,
+    keep_beliefs: bool = False,
+) -> Outcome:
+    """Predictions of every step but the first: one step ahead from true states while observing, then the free run.
+
+    The horizon axis has `last_observed` one-step predictions (made from steps 0 … last_observed − 1, of steps 1 …
+    last_observed), then `horizon_steps` free ones; with a burn-in of n steps that is n − 1 + `horizon_steps`. The
+    one-step part is the forecaster's most likely prediction (sample 0), shared by all samples. Rows with a shorter
+    history have no truth at the beginning; an agent counts at a step if it is seen there and one step before. The
+    last `horizon_steps` entries equal `run_window_batch`'s. Arguments as there.
+    """
+    axes = forecaster.spec.position_dim
+    rows = torch.arange(len(batch.states), device=batch.states.device)
+    predicted, truth, valid = [], [], []
+    belief: Belief | None = None
+    for step, belief in _observed(forecaster, batch):
+        predicted.append(forecaster.rollout(belief, 1, 1)[:, 0, :, 0, :axes])
+        ahead = (step + 1).clamp(min=0)
+        truth.append(batch.states[rows, ahead][..., :axes])
+        valid.append(_without_ego(forecaster, batch.valid[rows, ahead] & belief.valid))
+    assert belief is not None
+    free = _free_run(forecaster, batch, belief, horizon_steps, num_samples, generator, keep_beliefs)
+    if len(predicted) == 1:
+        return free
+    # The last entry is the free run's own first step.
+    one_step = torch.stack(predicted[:-1], dim=2)[:, None].expand(-1, num_samples, -1, -1, -1)
+    return replace(
+        free,
+        forecast=torch.cat([one_step, free.forecast], dim=3),
+        future=torch.cat([torch.stack(truth[:-1], dim=2), free.future], dim=2),
+        valid=torch.cat([torch.stack(valid[:-1], dim=2), free.valid], dim=2),
+    )
+
+
+def run_windows(
+    forecaster: Forecaster,
+    windows: Windows,
+    indices: Int[np.ndarray, " some"],
+    horizon_steps: int,
+    num_samples: int = 1,
+    seed: int = 0,
+    batch_size: int = 256,
+    device: str = "cpu",
+    whole_sequence: bool = False,
+    keep_beliefs: bool = False,
+) -> Iterator[Outcome]:
+    """Outcomes of the given windows, in batches; `whole_sequence` runs `run_sequence_batch`.
+
+    Nothing is kept between batches: `predictor.evaluation.accuracy.summarise` takes the iterator itself.
+    """
+    generator = torch.Generator(device=device).manual_seed(seed)
+    run = run_sequence_batch if whole_sequence else run_window_batch
+    for begin in range(0, len(indices), batch_size):
+        batch = windows.batch(indices[begin : begin + batch_size]).to(torch.device(device))
+        yield run(forecaster, batch, horizon_steps, num_samples, generator, keep_beliefs)
+
+
+def sequence_indices(windows: Windows, burn_in_steps: int) -> Int[np.ndarray, " some"]:
+    """The window of each episode that has seen its first `burn_in_steps` steps, for `run_windows`.
+
+    Episodes that end before the horizon does are among them, masked; build `windows` with `min_future_steps` =
+    `horizon_steps` to leave them out.
+
+    Raises:
+        UserError: the windows forget the first steps, or no episode is long enough.
+    """
+    if windows.history_steps < burn_in_steps:
+        raise UserError(f"windows of {windows.history_steps} steps of history cannot hold {burn_in_steps} of burn-in")
+    indices = np.flatnonzero(windows.index[:, 1] == burn_in_steps - 1)
+    if not len(indices):
+        raise UserError(f"no episode has {burn_in_steps} steps of burn-in and a step after them")
+    return indices
+
+
+def _observed(forecaster: Forecaster, batch: WindowBatch) -> Iterator[tuple[Int[Tensor, " batch"], Belief]]:
+    """The step that each row is at, and the belief after it; histories end together.
+
+    Rows with a shorter history see an empty scene until theirs begins (step below 0).
+    """
+    rows = torch.arange(len(batch.states), device=batch.states.device)
+    memory = forecaster.empty_memory(batch.states.shape[0], batch.states.shape[2])
+    for back in range(int(batch.last_observed.max()), -1, -1):
+        step = batch.last_observed - back
+        now = step.clamp(min=0)
+        valid = batch.valid[rows, now] & (step >= 0)[:, None]
+        memory, belief = forecaster.observe(memory, batch.states[rows, now] * valid[..., None], valid)
+        yield step, belief
+
+
+def _free_run(
+    forecaster: Forecaster,
+    batch: WindowBatch,
+    belief: Belief,
+    horizon_steps: int,
+    num_samples: int,
+    generator: torch.Generator | None,
+    keep_beliefs: bool,
+) -> Outcome:
+    axes = forecaster.spec.position_dim
+    rows = torch.arange(len(batch.states), device=batch.states.device)
+    forecast = forecaster.rollout(belief, horizon_steps, num_samples, generator)[..., :axes]
+    steps = batch.last_observed[:, None] + torch.arange(1, horizon_steps + 1, device=rows.device)
+    truth = batch.states[rows[:, None], steps].transpose(1, 2)[..., :axes]
+    valid = batch.valid[rows[:, None], steps].transpose(1, 2) & belief.valid[..., None]
+    outcome = Outcome(forecast, truth, _without_ego(forecaster, valid))
+    if not keep_beliefs:
+        return outcome
+    now, belief = (rows, batch.last_observed), belief.dense()
+    return replace(
+        outcome,
+        edge_probs=belief.edge_probs,
+        edge_features=belief.edge_features,
+        present=belief.valid,
+        edge_types=None if batch.edge_types is None else batch.edge_types[now],
+        edge_attributes=None if batch.edge_attributes is None else batch.edge_attributes[now],
+    )
+
+
+def _without_ego(
+    forecaster: Forecaster, valid: Bool[Tensor, "batch agents *steps"]
+) -> Bool[Tensor, "batch agents *steps"]:
+    """Nobody forecasts the learner itself: row 0 does not count where there is an ego."""
+    if forecaster.spec.has_ego:
+        valid = valid.clone()
+        valid[:, 0] = False
+    return valid

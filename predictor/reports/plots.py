@@ -1,0 +1,89 @@
+"""Plots of forecasts and their accuracy; functions take arrays and an axis and return the axis."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from predictor.evaluation.accuracy import Accuracy
+
+
+def plot_error_by_horizon(ax: Axes, rows: Sequence[Accuracy], dt_s: float) -> Axes:
+    """Displacement against time ahead, one line per row; constant velocity is grey."""
+    for row in rows:
+        time_s = dt_s * np.arange(1, len(row.by_step_m) + 1)
+        baseline = row.name == "constant velocity"
+        label = row.name if baseline else f"{row.name}, K = {row.num_samples}"
+        ax.plot(time_s, row.by_step_m, color="grey" if baseline else None, marker="o", label=label)
+    ax.set_xlabel("time ahead [s]")
+    ax.set_ylabel("displacement of the best sample [m]")
+    ax.set_ylim(bottom=0)
+    ax.grid(alpha=0.3)
+    ax.legend(frameon=False)
+    return ax
+
+
+def plot_rows_by_step(ax: Axes, results: Sequence[dict[str, Any]], kind: str, dt_s: float) -> Axes:
+    """A suite's rows: displacement of the best sample at each step of the free run, with standard errors; log scale.
+
+    Args:
+        ax: where to draw.
+        results: rows of a suite's table.json.
+        kind: test store, "test" or "ood".
+        dt_s: length of a step.
+    """
+    for i, row in enumerate(results):
+        view = row["tests"][kind]["horizon_only"]
+        if row["key"] == "least-squares":  # the limit, orders of magnitude below
+            continue
+        ours = row["key"].startswith(("dgvae", "dvae"))
+        baseline = row["key"] == "constant-velocity"
+        time_s = dt_s * np.arange(1, len(view["by_step_m"]) + 1)
+        errors = [error or 0.0 for error in view["step_errors"]["by_step_m"]]
+        style: dict[str, Any] = {"ls": "-" if ours else "--", "lw": 2.0 if ours else 1.2, "marker": "o", "ms": 3}
+        color = "black" if baseline else colormaps["tab20"](i % 20)
+        ax.errorbar(time_s, view["by_step_m"], yerr=errors, color=color, label=row["name"], **style)
+    ax.set_yscale("log")
+    ax.set_xlabel("time ahead [s]")
+    ax.grid(alpha=0.3, which="both")
+    return ax
+
+
+def plot_scene(
+    ax: Axes,
+    history: NDArray[np.floating],
+    history_valid: NDArray[np.bool_],
+    forecast: NDArray[np.floating],
+    future: NDArray[np.floating],
+    future_valid: NDArray[np.bool_],
+) -> Axes:
+    """One scene in metres: history solid, forecast dashed, truth thin.
+
+    Args:
+        ax: where to draw.
+        history: (time, agents, 2).
+        history_valid: (time, agents).
+        forecast: (samples, agents, horizon, 2).
+        future: (agents, horizon, 2).
+        future_valid: (agents, horizon); agents without a valid step get no forecast drawn.
+    """
+    for agent in range(history.shape[1]):
+        seen = history_valid[:, agent]
+        if not seen.any():
+            continue
+        (line,) = ax.plot(*history[seen, agent].T, lw=2, marker=".", ms=3)
+        color = line.get_color()
+        now = history[seen, agent][-1:]
+        ax.plot(*now.T, marker="s", color=color, ms=5)
+        if not future_valid[agent].any():
+            continue
+        ax.plot(*np.concatenate([now, future[agent, future_valid[agent]]]).T, color="black", lw=0.8)
+        for sample in forecast[:, agent]:
+            ax.plot(*np.concatenate([now, sample]).T, color=color, ls="--", lw=1.3, alpha=max(0.15, 1 / len(forecast)))
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set_xlabel("x [m]")
+    ax.set_ylabel("y [m]")
+    return ax

@@ -1,0 +1,1 @@
+"""Training of a forecaster: settings, batches, objective and the run."""

@@ -1,0 +1,160 @@
+"""What training minimises: likelihoods of one step and of a free run, KL to the prior, labels, the price of edges."""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from predictor.data.windows import WindowBatch
+from predictor.errors import UserError
+from predictor.evaluation.graph_accuracy import edge_entropy
+from predictor.forecaster import TrainableForecaster, WindowOutput
+from predictor.graph import pair_mask
+from predictor.layers.pairs import masked_mean
+from predictor.training.config import Likelihood, TrainConfig
+
+
+def nll(
+    predicted: Float[Tensor, "*batch state"],
+    target: Float[Tensor, "*batch state"],
+    valid: Bool[Tensor, "*batch"],
+    scales: Float[Tensor, " state"],
+    variance: float,
+    likelihood: Likelihood = "gaussian",
+) -> Float[Tensor, ""]:
+    """Negative log-likelihood at fixed variance, up to a constant: summed over features, mean over valid entries.
+
+    Args:
+        predicted: states [SI].
+        target: true states [SI].
+        valid: which entries count.
+        scales: divisors that make features comparable; the variance is in these units.
+        variance: σ of the paper (which uses it as a variance), 5e-5 there.
+        likelihood: "gaussian" (paper) or "laplace" with the same variance, whose gradient does not grow with the error.
+    """
+    # masked before it is squared: the gradient of an infinite error is NaN, also times zero
+    error = torch.where(valid[..., None], (predicted - target) / scales, 0.0)
+    if likelihood == "gaussian":
+        per_entry = error.square().sum(-1) / (2 * variance)
+    else:
+        per_entry = error.abs().sum(-1) / math.sqrt(variance / 2)
+    return masked_mean(per_entry, valid)
+
+
+def kl_categorical(
+    posterior_logits: Float[Tensor, "*batch types"],
+    prior_logits: Float[Tensor, "*batch types"],
+    valid: Bool[Tensor, "*batch"],
+) -> Float[Tensor, ""]:
+    """KL(posterior ‖ prior) over edge types [nats], mean over valid pairs."""
+    log_q = torch.log_softmax(posterior_logits, dim=-1)
+    log_p = torch.log_softmax(prior_logits, dim=-1)
+    return masked_mean((log_q.exp() * (log_q - log_p)).sum(-1), valid)
+
+
+Terms = dict[str, Tensor]
+
+
+def window_loss(
+    model: TrainableForecaster,
+    batch: WindowBatch,
+    output: WindowOutput,
+    config: TrainConfig,
+    kl_scale: float | Float[Tensor, ""] = 1.0,
+    scales: Float[Tensor, " state"] | None = None,
+) -> tuple[Float[Tensor, ""], Terms]:
+    """The objective and its terms for one batch of windows.
+
+    Args:
+        model: only its spec is looked at.
+        batch: the windows.
+        output: what the model made of them.
+        config: weights.
+        kl_scale: share of the KL's full weight (warm-up).
+        scales: the spec's feature scales on the batch's device; None copies them there, which a captured step cannot.
+    """
+    if scales is None:
+        scales = torch.tensor(model.spec.feature_scales, device=batch.states.device)
+    rows = torch.arange(len(batch.states), device=batch.states.device)
+    both = batch.valid[:, 1:] & batch.valid[:, :-1]
+    terms: Terms = {}
+    one_step = nll(output.one_step[:, :-1], batch.states[:, 1:], both, scales, config.variance, config.likelihood)
+    total = config.one_step_weight * one_step
+    terms["nll_one_step"] = one_step
+    horizon = output.rollout.shape[2]
+    if horizon:
+        steps = batch.last_observed[:, None] + torch.arange(1, horizon + 1, device=rows.device)
+        truth = batch.states[rows[:, None], steps].transpose(1, 2)
+        valid = batch.valid[rows[:, None], steps].transpose(1, 2)
+        rollout = nll(output.rollout, truth, valid, scales, config.variance, config.likelihood)
+        total = total + config.rollout_weight * rollout
+        terms["nll_rollout"] = rollout
+    if output.prior_logits is not None:
+        extra, graph_terms = _graph_loss(batch, output, config, kl_scale)
+        total = total + extra
+        terms |= graph_terms
+    return total, {k: v.detach() for k, v in terms.items()}
+
+
+def _graph_loss(
+    batch: WindowBatch, output: WindowOutput, config: TrainConfig, kl_scale: float | Tensor
+) -> tuple[Tensor, Terms]:
+    assert output.prior_logits is not None and output.posterior_logits is not None
+    prior, posterior = output.prior_logits, output.posterior_logits
+    pairs = pair_mask(batch.valid)
+    kl = kl_categorical(posterior, prior, pairs)
+    probs = torch.softmax(prior, dim=-1)
+    terms: Terms = {
+        "kl": kl,
+        "prior_entropy": masked_mean(*edge_entropy(probs.detach(), pairs)),
+        "prior_edge_share": masked_mean(1 - probs.detach()[..., 0], pairs),
+    }
+    total = config.kl_weight * kl_scale * kl
+    if config.edge_cost:
+        edges = masked_mean(1 - probs[..., 0], pairs) + masked_mean(1 - torch.softmax(posterior, -1)[..., 0], pairs)
+        total = total + config.edge_cost * edges
+    if batch.edge_types is not None:
+        known = pairs & (batch.edge_types >= 0)
+        # 0 is "no edge"; everything else counts as an edge where the model has fewer types than the labels
+        truth = batch.edge_types.long().clamp(0, prior.shape[-1] - 1)
+        terms["graph_accuracy"] = masked_mean((prior.detach().argmax(-1) == truth).float(), known)
+        if config.type_label_weight:
+            labelled = _cross_entropy(prior, truth, known) + _cross_entropy(posterior, truth, known)
+            total = total + config.type_label_weight * labelled
+            terms["type_label"] = labelled
+    if config.label_weight and batch.edge_attributes is not None and output.features is not None:
+        missing = batch.edge_attributes.shape[-1] - output.features.shape[-1]
+        if missing > 0:
+            raise UserError(
+                f"restricted labelling of {batch.edge_attributes.shape[-1]} attributes needs as many edge features, "
+                f"got {output.features.shape[-1]}; raise edge_feature_dim or set label_weight to 0"
+            )
+        with_edge = pairs if batch.edge_types is None else pairs & (batch.edge_types > 0)
+        label = restricted_labelling(output.features, batch.edge_attributes, with_edge)
+        total = total + config.label_weight * label
+        terms["label"] = label
+    return total, terms
+
+
+def _cross_entropy(logits: Tensor, truth: Tensor, known: Tensor) -> Tensor:
+    log_probs = functional.log_softmax(logits, dim=-1)
+    return masked_mean(-log_probs.gather(-1, truth[..., None])[..., 0], known)
+
+
+def restricted_labelling(
+    features: Float[Tensor, "batch time agents agents feature"],
+    attributes: Float[Tensor, "batch time agents agents attributes"],
+    labelled: Bool[Tensor, "batch time agents agents"],
+) -> Float[Tensor, ""]:
+    """Mean squared error of the first feature dimensions against known edge attributes.
+
+    Args:
+        features: edge features from the past; as many of the first dimensions are used as there are attributes.
+        attributes: true values; anything where not labelled.
+        labelled: pairs with an edge whose attributes are known.
+    """
+    # masked before it is squared: the gradient of an infinite error is NaN, also times zero
+    error = torch.where(labelled[..., None], features[..., : attributes.shape[-1]] - attributes, 0.0)
+    return masked_mean(error.square().mean(-1), labelled)

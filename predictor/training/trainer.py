@@ -1,0 +1,369 @@
+"""One training run of a forecaster: data, model, optimiser, and where it stands.
+
+Every random draw is a function of (seed, step), so a run that was killed and resumed ends with the same weights as one
+that was not.
+"""
+
+import math
+import os
+import pickle
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.data.store import Episode, EpisodeStore, read_store
+from predictor.data.windows import WindowBatch, Windows, split_episodes
+from predictor.errors import UserError
+from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
+from predictor.evaluation.outcomes import run_windows
+from predictor.forecaster import WindowOutput
+from predictor.layers.state_codec import Residual, StateCodec, drift
+from predictor.models import build, configure
+from predictor.runtime import precision
+from predictor.scene import SceneSpec
+from predictor.training.batches import Plan, open_feed, plan
+from predictor.training.config import TrainConfig
+from predictor.training.cuda_graph import (
+    CapturedStep,
+    CudaRecorder,
+    NotCapturableError,
+    Recorder,
+    default_generator,
+    signature,
+)
+from predictor.training.objective import window_loss
+
+LOG_EVERY = 25
+"""Steps between two points of the training curves; on a CUDA device also between two looks at the numbers."""
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """Windows of all stores, split by episode."""
+
+    spec: SceneSpec
+    """Of the first store; the others are compatible."""
+    sources: tuple[str, ...]
+    """What each store was recorded from."""
+    train: list[Windows]
+    """One per store."""
+    val: list[Windows]
+    """One per store."""
+    train_episodes: list[Episode]
+    """All training episodes."""
+
+
+def load_data(config: TrainConfig) -> TrainingData:
+    """Read and split the stores.
+
+    Raises:
+        UserError: stores of different features or dt, or too few episodes.
+    """
+    stores: list[EpisodeStore] = [read_store(path) for path in (*config.data, *config.val_data)]
+    spec = stores[0].info.spec
+    for path, store in zip((*config.data, *config.val_data), stores, strict=True):
+        spec.check_compatible(store.info.spec, f"store {config.data[0]}", f"store {path}")
+    _check_labels(config, stores)
+    sources = tuple(s.info.source for s in stores[: len(config.data)])
+    if config.val_data:
+        cut = len(config.data)
+        chosen = [s.episodes[: config.max_episodes or None] if i < cut else s.episodes for i, s in enumerate(stores)]
+        train = [_windows(config, e, spec, validation=False) for e in chosen[:cut]]
+        val = [_windows(config, e, spec, validation=True) for e in chosen[cut:]]
+        return TrainingData(spec, sources, train, val, [e for part in chosen[:cut] for e in part])
+    train, val, episodes = [], [], []
+    for path, store in zip(config.data, stores, strict=True):
+        kept, held_out = split_episodes(len(store.episodes), config.val_fraction, config.seed)
+        kept = kept[: config.max_episodes or None]
+        if not kept or not held_out:
+            raise UserError(
+                f"{path}: {len(store.episodes)} episodes split into {len(kept)} for training and {len(held_out)} "
+                "for validation; both need at least one, so collect more"
+            )
+        mine = [store.episodes[i] for i in kept]
+        train.append(_windows(config, mine, spec, validation=False))
+        val.append(_windows(config, [store.episodes[i] for i in held_out], spec, validation=True))
+        episodes += mine
+    return TrainingData(spec, sources, train, val, episodes)
+
+
+def _check_labels(config: TrainConfig, stores: Sequence[EpisodeStore]) -> None:
+    """Weights of labels need labels in every training store; without this they would silently do nothing."""
+    for option, name in (("label_weight", "edge_attributes"), ("type_label_weight", "edge_types")):
+        for path, store in zip(config.data, stores, strict=False):
+            if getattr(config, option) and any(getattr(e, name) is None for e in store.episodes[:1]):
+                raise UserError(f"{option} needs {name}, and store {path} has none; set it to 0 or use labelled data")
+
+
+def _windows(config: TrainConfig, episodes: Sequence[Episode], spec: SceneSpec, validation: bool) -> Windows:
+    if not validation or config.val_history_steps == 1:
+        return Windows(episodes, spec, config.history_steps, config.horizon_steps)
+    # as in the tables: whole burn-in, whole horizon
+    return Windows(
+        episodes,
+        spec,
+        config.history_steps,
+        config.horizon_steps,
+        min_future_steps=config.horizon_steps,
+        min_history_steps=config.val_history_steps,
+    )
+
+
+def typical_change(episodes: Sequence[Episode], spec: SceneSpec, residual: Residual) -> tuple[float, ...]:
+    """Root mean square of what the decoder has to predict in one step, per feature [SI]."""
+    total, count = np.zeros(spec.num_features), 0
+    for episode in episodes:
+        both = episode.valid[1:] & episode.valid[:-1]
+        before, after = (torch.from_numpy(s) for s in (episode.states[:-1], episode.states[1:]))
+        change = (after - before).numpy()
+        change[..., : spec.position_dim] -= drift(spec, residual, before, after).numpy()
+        total += np.square(change[both].astype(np.float64)).sum(axis=0)
+        count += int(both.sum())
+    scale = np.sqrt(total / max(count, 1))
+    return tuple(float(s) for s in np.maximum(scale, 1e-3))
+
+
+def typical_spread(episodes: Sequence[Episode], spec: SceneSpec) -> tuple[float, ...]:
+    """Standard deviation of each input feature over the data [SI], positions as the spec's frame gives them."""
+    states = [_in_frame(episode, spec)[episode.valid] for episode in episodes]
+    spread = np.concatenate(states).astype(np.float64).std(axis=0)
+    least = 1e-2 * np.array(spec.feature_scales)
+    return tuple(float(s) for s in np.maximum(spread, least))
+
+
+def _in_frame(episode: Episode, spec: SceneSpec) -> np.ndarray:
+    codec = StateCodec(spec)
+    inputs = codec.inputs(torch.from_numpy(episode.states), torch.from_numpy(episode.valid))[..., : spec.num_features]
+    framed: np.ndarray = (inputs * codec.scales).numpy()
+    return framed
+
+
+def model_config(config: TrainConfig, data: TrainingData) -> Any:
+    """The network's config, with scales fitted to the training data.
+
+    Raises:
+        UserError: a field of --set that the model does not have, or --input-changes or --fit-inputs for another model.
+    """
+    plain = configure(config.model, config.preset, config.set)
+    fitted = {"delta_scales": typical_change(data.train_episodes, data.spec, plain.residual)}
+    if config.input_changes:
+        if config.model != "dgvae":
+            raise UserError(f"--input-changes belongs to the dG-VAE; leave it out for --model {config.model}")
+        fitted["change_scales"] = typical_change(data.train_episodes, data.spec, "state")
+    if config.fit_inputs:
+        if config.model != "dgvae":
+            raise UserError(f"--fit-inputs belongs to the dG-VAE; leave it out for --model {config.model}")
+        fitted["input_scales"] = typical_spread(data.train_episodes, data.spec)
+    return configure(config.model, config.preset, config.set, **fitted)
+
+
+@contextmanager
+def _tensor_cores(allowed: bool) -> Iterator[None]:
+    """Let products of float32 on CUDA round their inputs to TF32 while it lasts; else leave torch's setting."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if allowed else before)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+class Trainer:
+    """One training run: model, optimiser, data, and where it stands.
+
+    On a CUDA device a step is recorded and replayed (`predictor.training.cuda_graph`), the data lives there if it fits,
+    and nothing is read back between calls of `read`.
+    """
+
+    def __init__(self, config: TrainConfig, data: TrainingData) -> None:
+        """Build everything from the config and the seed."""
+        self.config = config
+        self.data = data
+        self.device = torch.device(config.device)
+        on_cuda = self.device.type == "cuda"
+        if on_cuda and self.device.index is not None:
+            torch.cuda.set_device(self.device)
+        torch.manual_seed(config.seed)
+        self.model: Any = build(config.model, data.spec, model_config(config, data), config.horizon_steps)
+        self.model.to(self.device)
+        self.step = 0
+        self.best = math.inf
+        self.stale = 0
+        self.baseline_m = self._baseline()
+        self.noise = torch.Generator(device=self.device)
+        source = open_feed(config, data.train, self.device)
+        self.feed, self.notes = source.feed, source.notes
+        self.read_every = LOG_EVERY if on_cuda else 1
+        self._looks = not on_cuda
+        self._recorder: Recorder | None = CudaRecorder(self.device, self.noise) if source.capture else None
+        self._recorded: dict[Any, CapturedStep] = {}
+        self.optimizer = self._adam(capturable=source.capture)
+        self._scales = torch.tensor(data.spec.feature_scales, device=self.device)
+        self._kl_scale = torch.ones((), device=self.device)
+        self._finite = torch.ones((), dtype=torch.bool, device=self.device)
+        self._finite_until = 0
+
+    @property
+    def finished(self) -> bool:
+        """All steps done, or no progress for `patience` validations."""
+        return self.step >= self.config.steps or self.stale >= self.config.patience
+
+    def train_step(self) -> Mapping[str, Tensor]:
+        """One optimiser step; the batch and all noise depend on (seed, step) alone.
+
+        Returns:
+            Loss, gradient norm and the objective's terms, on the device; a later step may overwrite them.
+
+        Raises:
+            UserError: the loss is not finite (on a CUDA device, `read` says so).
+        """
+        now = self.plan(self.step)
+        batch = self.feed.batch(now)
+        torch.manual_seed(now.dropout_seed)
+        self.noise.manual_seed(now.noise_seed)
+        for group in self.optimizer.param_groups:
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(now.lr)
+            else:
+                group["lr"] = now.lr
+        self._kl_scale.fill_(now.kl_scale)
+        self.model.train()
+        if self._recorder is not None:
+            terms = self._replayed(self._recorder, batch, now.rollout_steps)
+        else:
+            terms = self._optimise(batch, now.rollout_steps)
+        self.step += 1
+        return terms
+
+    def plan(self, step: int) -> Plan:
+        """Batch, seeds and schedules of a step."""
+        return plan(self.config, [len(w) for w in self.data.train], step)
+
+    def read(self, terms: Mapping[str, Tensor]) -> dict[str, float]:
+        """Numbers of the latest step; waits for the device.
+
+        Raises:
+            UserError: the loss was not finite in a step since the last reading.
+        """
+        first, self._finite_until = self._finite_until, self.step
+        finite, *values = torch.stack([self._finite, *terms.values()]).tolist()
+        if not finite:
+            raise UserError(
+                f"the loss was not finite in some step from {first} to {self.step - 1}; lower --lr or check the data"
+            )
+        return dict(zip(terms, values, strict=True))
+
+    def _optimise(self, batch: WindowBatch, rollout_steps: int) -> Mapping[str, Tensor]:
+        """Forward, loss, backward, clipping, update; on a CUDA device the host never looks at a result."""
+        kind = self.config.precision
+        with _tensor_cores(kind == "tf32"):
+            with precision("bfloat16" if kind == "bfloat16" else "float32", self.device.type):
+                output = self.model.window(batch.states, batch.valid, batch.last_observed, rollout_steps, self.noise)
+            exact = WindowOutput(*(None if t is None else t.float() for t in output))  # type: ignore[arg-type]
+            loss, terms = window_loss(self.model, batch, exact, self.config, self._kl_scale, self._scales)
+            if self._looks and not torch.isfinite(loss):
+                raise UserError(f"the loss is {float(loss.detach())} at step {self.step}; lower --lr or check the data")
+            self.optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.clip_norm)
+        self.optimizer.step()
+        self._finite.logical_and_(torch.isfinite(loss.detach()))
+        return {"loss": loss.detach(), "grad_norm": norm, **terms}
+
+    def _replayed(self, recorder: Recorder, batch: WindowBatch, rollout_steps: int) -> Mapping[str, Tensor]:
+        """The same from a recording, made where there is none for this kind of batch."""
+        key = (rollout_steps, signature(batch))
+        if key not in self._recorded:
+            if any(steps != rollout_steps for steps, _ in self._recorded):  # the free run has grown, and never shrinks
+                self._forget()
+            try:
+                self._recorded[key] = CapturedStep(
+                    partial(self._optimise, rollout_steps=rollout_steps),
+                    batch,
+                    self._state,
+                    (self.noise, default_generator(self.device)),
+                    recorder,
+                )
+            except NotCapturableError as error:
+                self._recorder = None
+                self.notes = (*self.notes, f"steps are not captured: {error}")
+                return self._optimise(batch, rollout_steps)
+        return self._recorded[key](batch)
+
+    def _state(self) -> list[Tensor]:
+        """Everything that a step changes."""
+        moments = (v for values in self.optimizer.state.values() for v in values.values() if isinstance(v, Tensor))
+        return [*self.model.parameters(), *self.model.buffers(), *moments, self._finite]
+
+    def _forget(self) -> None:
+        self._recorded.clear()
+        if self._recorder is not None:
+            self._recorder.forget()
+
+    def _adam(self, capturable: bool) -> torch.optim.Adam:
+        """Adam; captured, its rate is a tensor, and running it uncaptured for a while is no mistake."""
+        rate: Any = torch.tensor(self.config.lr, device=self.device) if capturable else self.config.lr
+        fused = True if self.device.type == "cuda" else None
+        optimizer = torch.optim.Adam(self.model.parameters(), lr=rate, capturable=capturable, fused=fused)
+        optimizer._warned_capturable_if_run_uncaptured = True
+        return optimizer
+
+    def validate(self) -> tuple[Accuracy, tuple[float, ...]]:
+        """Free-running accuracy of the most likely forecast on held-out episodes, and its spread."""
+        self.model.eval()
+        outcomes = [o for w, i in self._val_indices() for o in run_windows(
+            self.model, w, i, self.config.horizon_steps, device=self.config.device)]  # fmt: skip
+        return summarise(self.config.model, outcomes), fitted_std_m(outcomes)
+
+    def save(self, path: Path) -> None:
+        """Write the training state so that a kill leaves the old or the new one."""
+        partial = path.with_name(f".{path.name}.partial")
+        torch.save(
+            {
+                "model": self.model.state_dict(),
+                "optimizer": self.optimizer.state_dict(),
+                "step": self.step,
+                "best": self.best,
+                "stale": self.stale,
+            },
+            partial,
+        )
+        os.replace(partial, path)
+
+    def restore(self, path: Path) -> None:
+        """Continue from a saved training state, of this kind of device or another."""
+        self._forget()  # recordings know tensors that are replaced here
+        try:
+            state = torch.load(path, weights_only=True, map_location=self.device)
+            self.model.load_state_dict(state["model"])
+            # how Adam runs is this run's own; what it remembers is the saved one's
+            groups = zip(self.optimizer.state_dict()["param_groups"], state["optimizer"]["param_groups"], strict=True)
+            state["optimizer"]["param_groups"] = [ours | {"params": theirs["params"]} for ours, theirs in groups]
+            self.optimizer.load_state_dict(state["optimizer"])
+            self.step, self.best, self.stale = int(state["step"]), float(state["best"]), int(state["stale"])
+            self._finite_until = self.step
+        except (RuntimeError, KeyError, TypeError, ValueError, EOFError, pickle.UnpicklingError) as error:
+            reason = " ".join(str(error).split())[:200]
+            raise UserError(f"{path} cannot be read ({reason}); train anew into another --out") from error
+
+    def close(self) -> None:
+        """Stop what prepares batches."""
+        self.feed.close()
+
+    def _baseline(self) -> float:
+        spec, steps = self.data.spec, self.config.horizon_steps
+        outcomes = [o for w, i in self._val_indices() for o in run_windows(ConstantVelocity(spec, steps), w, i, steps)]
+        return summarise("constant velocity", outcomes).min_ade_m
+
+    def _val_indices(self) -> list[tuple[Windows, np.ndarray]]:
+        share = max(1, self.config.val_windows // len(self.data.val))
+        rng = np.random.default_rng([self.config.seed, 2])
+        return [(w, rng.permutation(len(w))[:share]) for w in self.data.val]

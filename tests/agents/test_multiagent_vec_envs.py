@@ -1,0 +1,221 @@
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from agents.arena import ParallelArena
+from agents.task import Task
+from agents.vec_envs import DrivenEnv, EpisodeResult, MakeCopy, drive, make_parallel_rows
+from agents.video import record_task
+from envs.drivers.all_agents import make_driver
+from envs.registry import make_parallel_env
+from predictor.errors import UserError
+from tests.agents.helpers import LIVES, TOY, policy_for
+
+TAG, SPREAD = "simple_tag_v3", "simple_spread_v3"
+
+
+def told(results: list[EpisodeResult]) -> list[tuple]:
+    """Without the speed, whose NaN equals nothing."""
+    return [(r.seed, r.episode_return, r.length, r.crashed, r.returns_by_role) for r in results]
+
+
+# --- Rows -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("learners", "expected"),
+    [
+        ((), ["adversary_0", "adversary_1", "adversary_2", "agent_0"]),
+        (("adversary",), ["adversary_0", "adversary_1", "adversary_2"]),
+        (("agent_0",), ["agent_0"]),
+        (("agent", "adversary_1"), ["adversary_1", "agent_0"]),
+    ],
+    ids=["all", "role", "agent", "both"],
+)
+def test_every_learner_of_every_copy_is_a_row(learners: tuple[str, ...], expected: list[str]):
+    rows = make_parallel_rows(Task(TAG, "none", learners=learners), 2)
+    assert rows.num_envs == 2 * len(expected)
+    assert rows.get_attr("possible_agents")[0] == ["adversary_0", "adversary_1", "adversary_2", "agent_0"]
+    assert rows.venv.row_agents == 2 * expected  # type: ignore[attr-defined]
+    rows.close()
+
+
+def test_unknown_learners_are_named():
+    with pytest.raises(UserError, match=f"'wolf' is neither an agent nor a role of {TAG}; it has adversary_0, "):
+        make_parallel_rows(Task(TAG, learners=("wolf",), observe="none"), 1)
+
+
+def test_rows_observe_what_the_task_says():
+    own = make_parallel_rows(Task(SPREAD, "none"), 1)
+    assert own.observation_space == make_parallel_env(SPREAD).observation_space("agent_0")
+    seeing = make_parallel_rows(Task(SPREAD, "constant-velocity"), 1)
+    assert isinstance(seeing.observation_space, gym.spaces.Dict)
+    assert seeing.observation_space["observation"] == own.observation_space
+    assert {"agents", "forecast", "valid"} <= set(seeing.observation_space)
+
+
+# --- Partners ---------------------------------------------------------------------------------------------------------
+
+
+def prey_actions(env: Any, observations: Any) -> list[int]:
+    """What the partner does with the prey until the end of the episode."""
+    actions = []
+    while env.agents:
+        found = drive(env, {"agent_0": observations["agent_0"]}, np.random.default_rng())
+        assert set(found) == {"agent_0"}
+        actions.append(found["agent_0"])
+        observations, *_ = env.step(found | dict.fromkeys(["adversary_0", "adversary_1", "adversary_2"], 0))
+    return actions
+
+
+@pytest.mark.parametrize("observe", ["none", "constant-velocity"])
+@pytest.mark.parametrize("partner", ["varied", "heuristic"])
+def test_the_prey_is_driven_anew_in_each_episode_by_seed(partner: str, observe: Any):
+    env = MakeCopy(Task(TAG, observe, learners=("adversary",), partner=partner))()
+    played = [prey_actions(env, env.reset(seed=seed)[0]) for seed in (7, None, 7, None, 8)]
+    assert played[:2] == played[2:4]
+    assert played[0] != played[1]
+    assert played[4] not in played[:2]
+    assert {len(actions) for actions in played} == {25}  # mpe2's max_cycles
+
+
+def test_a_driver_serves_one_episode():
+    env = DrivenEnv(make_parallel_env(TAG), "random")
+    env.reset(seed=0)
+    first = env.driver
+    assert env.driver is first
+    env.reset()
+    assert env.driver is not first
+    assert env.episodes == 2
+
+
+def test_drivers_by_name_see_no_forecasts():
+    seen: list[Any] = []
+
+    class Watched(gym.Space[Any]):
+        agents = ["ant"]
+
+        @staticmethod
+        def driver(observations: dict[str, Any]) -> dict[str, Any]:
+            seen.append(observations)
+            return {}
+
+    drive(Watched, {"ant": {"observation": 1, "forecast": 2}, "bee": 3}, np.random.default_rng())
+    assert seen == [{"ant": 1, "bee": 3}]
+
+
+def test_where_all_learn_nobody_needs_to_be_able_to_drive():
+    rows = make_parallel_rows(Task(TOY, "none", partner="heuristic"), 1)
+    rows.reset()
+    assert rows.step(np.array([1, 0]))[1].tolist() == [1.0, 0.0]
+    rows = make_parallel_rows(Task(TOY, "none", learners=("ant",), partner="heuristic"), 1)
+    rows.reset()
+    with pytest.raises(UserError, match="no heuristic drives meadow_v0"):
+        rows.step(np.array([1]))
+
+
+# --- Arena ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("observe", ["none", "constant-velocity"])
+def test_results_depend_on_the_seed_alone(observe: Any):
+    task = Task(TAG, observe, learners=("adversary",), partner="varied")
+    model, arena = policy_for(task), ParallelArena(task)
+    for policy in (model, *arena.baselines):
+        results = arena.play(policy, [3, 4])
+        assert told(arena.play(policy, [4, 3])) == told(results)[::-1]
+        assert [r.seed for r in results] == [3, 4]
+        assert told(results)[0][1:] != told(results)[1][1:] or policy is model
+    assert told(ParallelArena(task).play(model, [4])) == told(arena.play(model, [4]))
+
+
+def test_a_policy_is_played_as_in_a_plain_loop():
+    task = Task(SPREAD, "none")
+    model = policy_for(task)
+    env = make_parallel_env(SPREAD)
+    expected, acted = [], set()
+    for seed in (1, 2):
+        observations, _ = env.reset(seed=seed)
+        total = 0.0
+        while env.agents:
+            actions = {a: int(model.predict(seen, deterministic=True)[0]) for a, seen in observations.items()}
+            acted |= set(actions.values())
+            observations, rewards, *_ = env.step(actions)
+            total += sum(rewards.values()) / 3
+        expected.append(total)
+    results = ParallelArena(task).play(model, [1, 2])
+    assert len(acted) > 1
+    assert [r.episode_return for r in results] == pytest.approx(expected, rel=1e-5)
+    assert [(r.length, r.crashed) for r in results] == [(25, None)] * 2
+
+
+@pytest.mark.parametrize("name", ["random", "heuristic"])
+def test_a_driver_is_played_as_in_a_plain_loop(name: str):
+    env = make_parallel_env(SPREAD)
+    observations, _ = env.reset(seed=6)
+    driver = make_driver(name, env, np.random.default_rng(6))
+    total = 0.0
+    while env.agents:
+        observations, rewards, *_ = env.step(driver(observations))
+        total += sum(rewards.values()) / 3
+    (result,) = ParallelArena(Task(SPREAD, "constant-velocity")).play(name, [6])
+    assert result.episode_return == pytest.approx(total)
+
+
+def test_returns_by_role_where_there_are_several():
+    arena = ParallelArena(Task(TAG, "none"))
+    (result,) = arena.play("heuristic", [0])
+    roles = result.returns_by_role
+    assert set(roles) == {"adversary", "agent"}
+    assert roles["adversary"] > roles["agent"]  # a catch pays the one and costs the other
+    assert result.episode_return == pytest.approx((3 * roles["adversary"] + roles["agent"]) / 4)
+    (alone,) = ParallelArena(Task(TAG, "none", learners=("adversary",))).play("random", [0])
+    assert alone.returns_by_role == {}
+
+
+def test_baselines_can_drive():
+    assert ParallelArena(Task(SPREAD, "none")).baselines == ("random", "heuristic")
+    arena = ParallelArena(Task(TOY, "none"))
+    assert arena.baselines == ("random", "idle")
+    (result,) = arena.play("idle", [0])
+    assert (result.episode_return, result.length) == (0.0, LIVES["bee_0"])
+
+
+@pytest.mark.parametrize("learner", list(LIVES))
+def test_an_episode_ends_with_the_last_learner_whoever_drives(learner: str):
+    task = Task(TOY, "none", learners=(learner,), partner="random")
+    arena = ParallelArena(task)
+    for policy in (policy_for(task), "random"):
+        assert [r.length for r in arena.play(policy, [0, 1])] == [LIVES[learner]] * 2
+
+
+def test_progress_is_reported_per_episode():
+    calls: list[None] = []
+    ParallelArena(Task(TOY, "none")).play("random", range(4), lambda: calls.append(None))
+    assert len(calls) == 4
+
+
+# --- Film -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("env_id", "learners"), [(SPREAD, ()), (TAG, ("adversary",))])
+@pytest.mark.parametrize("observe", ["none", "constant-velocity"])
+def test_the_film_shows_the_episode_that_is_measured(
+    env_id: str, learners: tuple[str, ...], observe: Any, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("agents.vec_envs.PARALLEL_CHECKPOINTS", {})  # as long as none needs to ship
+    task = Task(env_id, observe, learners=learners)
+    model = policy_for(task)
+    (result,) = ParallelArena(task).play(model, [4])
+    recording = record_task(task, model, 4, max_steps=100)
+    assert recording is not None
+    assert recording.num_steps == result.length
+    by_role = recording._moments[-1].returns
+    assert by_role[learners[0] if learners else "agent"] == pytest.approx(result.episode_return, rel=1e-5)
+
+
+def test_what_nobody_can_read_is_not_filmed():
+    task = Task(TOY, "none")
+    assert record_task(task, policy_for(task), 0, max_steps=5) is None

@@ -1,0 +1,125 @@
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
+
+from agents.arena import run_episodes
+from agents.task import Task, resolve_device
+from agents.vec_envs import EpisodeResult, SeededEpisodes, make_rows
+from predictor.errors import UserError
+
+
+class Dice(gym.Env[np.ndarray, np.int64]):
+    """Length, speed and crash are functions of the seed; the reward is the action."""
+
+    observation_space = gym.spaces.Box(0, 1, (1,), np.float32)
+    action_space = gym.spaces.Discrete(3)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._left = int(self.np_random.integers(1, 8))
+        self._crashes = bool(self.np_random.random() < 0.5)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._left -= 1
+        ended = self._left == 0
+        info = {"speed": 10.0 + self._left, "crashed": ended and self._crashes}
+        return np.zeros(1, np.float32), float(action), ended and self._crashes, ended and not self._crashes, info
+
+
+def make_venv(rows: int) -> VecEnv:
+    return VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Dice())] * rows))
+
+
+def always_two(obs: np.ndarray) -> np.ndarray:
+    return np.full(len(obs), 2)
+
+
+def expected(seed: int) -> EpisodeResult:
+    env = Dice()
+    env.reset(seed=seed)
+    length, crashes = env._left, env._crashes
+    speeds = [10.0 + left for left in range(length)]
+    return EpisodeResult(seed, 2.0 * length, length, crashes, float(np.mean(speeds)))
+
+
+@pytest.mark.parametrize("rows", [1, 2, 5, 9])
+def test_every_seed_is_played_once_for_any_number_of_rows(rows: int):
+    seeds = range(100, 107)
+    assert run_episodes(make_venv(rows), always_two, seeds) == [expected(seed) for seed in seeds]
+
+
+def test_second_evaluation_starts_afresh():
+    venv = make_venv(2)
+    first = run_episodes(venv, always_two, range(5))
+    assert run_episodes(venv, "random", range(3)) != first[:3]
+    assert run_episodes(venv, always_two, range(5)) == first
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+def test_random_ego_depends_on_the_seed_alone(rows: int):
+    assert run_episodes(make_venv(rows), "random", range(6)) == run_episodes(make_venv(2), "random", range(6))
+
+
+def test_idle_ego_ignores_the_actions_that_arrive():
+    assert all(e.episode_return == 0 for e in run_episodes(make_venv(2), "idle", range(4)))
+
+
+def test_progress_is_reported_per_episode():
+    calls: list[None] = []
+    run_episodes(make_venv(2), always_two, range(5), lambda: calls.append(None))
+    assert len(calls) == 5
+
+
+def test_unknown_env_is_one_clear_line():
+    with pytest.raises(UserError, match="cannot make env 'highway-fats-v0'"):
+        Task("highway-fats-v0", "none").check()
+
+
+def test_missing_checkpoint_is_one_clear_line():
+    with pytest.raises(UserError, match="no checkpoint 'nowhere'"):
+        Task("highway-fast-v0", "forecast", "nowhere").check()
+
+
+def test_checkpoint_without_forecast_is_refused():
+    with pytest.raises(UserError, match="has no effect with observe=none"):
+        Task("highway-fast-v0", "none", "highway")
+
+
+def test_devices():
+    assert resolve_device("cpu") == "cpu"
+    assert resolve_device("auto") in ("cpu", "cuda")
+    with pytest.raises(UserError, match="got 'tpu9'"):
+        resolve_device("tpu9")
+
+
+def test_rows_observe_what_the_task_says():
+    own = make_rows(Task("highway-fast-v0", "none"), 1)
+    assert isinstance(own.observation_space, gym.spaces.Box)
+    own.close()
+    forecast = make_rows(Task("highway-fast-v0", "constant-velocity"), 1)
+    assert isinstance(forecast.observation_space, gym.spaces.Dict)
+    assert {"observation", "agents", "forecast", "valid"} <= set(forecast.observation_space)
+    forecast.close()
+
+
+def test_native_rows_observe_what_the_others_do():
+    pytest.importorskip("envpool")
+    for observe in ("none", "constant-velocity"):
+        native = make_rows(Task("highway-fast-v0", observe, backend="envpool"), 3)
+        plain = make_rows(Task("highway-fast-v0", observe), 1)
+        assert native.num_envs == 3
+        assert native.get_attr("task_id") == ["HighwayFast-v0"] * 3
+        assert native.observation_space == plain.observation_space
+        assert native.action_space == plain.action_space
+        native.close()
+        plain.close()
+
+
+def test_agents_of_a_parallel_env_are_rows():
+    rows = make_rows(Task("simple_tag_v3", "none", learners=("adversary",)), 2)
+    assert rows.num_envs == 6
+    rows.close()

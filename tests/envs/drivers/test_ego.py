@@ -1,0 +1,205 @@
+import json
+import shutil
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import DQN, PPO
+
+from envs.drivers.ego import EGO_NAMES, idle_action, make_ego
+from envs.drivers.trained import env_for_ego, sees_forecasts
+from envs.registry import CHECKPOINTS, make_env
+from envs.wrappers import ForecastObservation
+from predictor.errors import UserError
+from tests.envs.helpers import assert_same, save_forecast_policy
+
+TRACK_STEPS = 40
+
+
+def actions_of(name: str, env: gym.Env, seed: int, count: int = 200) -> list[Any]:
+    ego = make_ego(name, env, np.random.default_rng(seed))
+    return [ego(None) for _ in range(count)]
+
+
+@pytest.fixture(scope="module")
+def discrete() -> gym.Env:
+    return make_env("two-way-v0")
+
+
+@pytest.fixture(scope="module")
+def continuous() -> gym.Env:
+    return make_env("racetrack-v1")
+
+
+@pytest.fixture(scope="module")
+def policies(tmp_path_factory: pytest.TempPathFactory, discrete: gym.Env) -> Path:
+    folder = tmp_path_factory.mktemp("policies")
+    tiny: dict[str, Any] = {"policy_kwargs": {"net_arch": [4]}, "device": "cpu", "seed": 0}
+    PPO("MlpPolicy", discrete, n_steps=4, batch_size=4, **tiny).save(folder / "ppo.zip")
+    DQN("MlpPolicy", discrete, buffer_size=10, **tiny).save(folder / "dqn.zip")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def forecast_policy(tmp_path_factory: pytest.TempPathFactory, highway_checkpoint: str) -> Path:
+    return save_forecast_policy(tmp_path_factory.mktemp("run"), "two-way-v0", highway_checkpoint)
+
+
+@pytest.mark.parametrize("name", ["random", "varied", "idle"])
+@pytest.mark.parametrize("env_id", ["two-way-v0", "racetrack-v1"])
+def test_actions_lie_in_the_space_and_repeat_with_the_seed(name: str, env_id: str):
+    env = make_env(env_id)
+    actions = actions_of(name, env, seed=3)
+    assert all(action in env.action_space for action in actions)
+    np.testing.assert_array_equal(actions, actions_of(name, env, seed=3))
+    if name != "idle":
+        assert (np.array(actions) != np.array(actions_of(name, env, seed=4))).any()
+
+
+@pytest.mark.parametrize("env_id", CHECKPOINTS)
+def test_idle_is_the_simulators_idle(env_id: str):
+    env = make_env(env_id)
+    action = idle_action(env)
+    assert action in env.action_space
+    if isinstance(env.action_space, gym.spaces.Discrete):
+        assert env.unwrapped.action_type.actions[action] == "IDLE"
+    else:
+        assert not action.any()
+
+
+def test_idle_keeps_speed_and_lane():
+    env = make_env("highway-fast-v0", config={"vehicles_count": 0})
+    env.reset(seed=0)
+    ego: Any = env.unwrapped.vehicle
+    speed, lane = ego.speed, ego.lane_index
+    env.step(idle_action(env))
+    assert (ego.speed, ego.lane_index) == (pytest.approx(speed), lane)
+
+
+def test_random_takes_every_action_equally(discrete: gym.Env):
+    counts = np.bincount(actions_of("random", discrete, seed=0, count=2000), minlength=5)
+    assert counts.min() > 330  # 400 ± 18
+
+
+def test_varied_keeps_to_a_choice_and_differs_between_episodes(discrete: gym.Env):
+    def repeats(name: str, seed: int) -> float:
+        actions = np.array(actions_of(name, discrete, seed, count=400))
+        return float((actions[1:] == actions[:-1]).mean())
+
+    varied = [repeats("varied", seed) for seed in range(12)]
+    assert np.mean(varied) > 0.4 > repeats("random", 0)  # uniform actions repeat every fifth time
+    assert np.ptp(varied) > 0.3
+    favourites = {int(np.bincount(actions_of("varied", discrete, seed)).argmax()) for seed in range(12)}
+    assert len(favourites) > 2
+
+
+def steps_on_road(name: str) -> int:
+    # As envs.collect makes it: gymnasium's checker takes an action that is passed twice for a flaw of the env.
+    env = make_env("racetrack-v1", config={"other_vehicles": 0}, disable_env_checker=True)
+    obs, _ = env.reset(seed=2)
+    ego = make_ego(name, env, np.random.default_rng(2))
+    for step in range(TRACK_STEPS):
+        obs, _, terminated, truncated, _ = env.step(ego(obs))
+        if terminated or truncated or not env.unwrapped.vehicle.on_road:
+            return step
+    return TRACK_STEPS
+
+
+def test_keep_lane_follows_the_track_where_idling_leaves_it():
+    assert steps_on_road("keep-lane") == TRACK_STEPS
+    assert steps_on_road("idle") < TRACK_STEPS
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
+def test_trained_policies_drive(algorithm: str, policies: Path, discrete: gym.Env):
+    ego = make_ego(str(policies / f"{algorithm}.zip"), discrete, np.random.default_rng(0))
+    model = {"ppo": PPO, "dqn": DQN}[algorithm].load(policies / f"{algorithm}.zip", device="cpu")
+    rng = np.random.default_rng(1)
+    observations = [rng.normal(size=discrete.observation_space.shape).astype(np.float32) for _ in range(20)]
+    actions = [int(ego(obs)) for obs in observations]
+    assert actions == [int(model.predict(obs, deterministic=True)[0]) for obs in observations]
+
+
+@pytest.mark.parametrize("name", EGO_NAMES)
+def test_only_policies_change_the_view(name: str, discrete: gym.Env, policies: Path):
+    assert env_for_ego(discrete, name) is discrete
+    assert not sees_forecasts(name)
+    assert env_for_ego(discrete, str(policies / "dqn.zip")) is discrete
+    assert not sees_forecasts(str(policies / "dqn.zip"))
+
+
+def test_policies_trained_on_forecasts_get_those_of_their_run(
+    forecast_policy: Path, discrete: gym.Env, highway_checkpoint: str
+):
+    name = str(forecast_policy)
+    assert sees_forecasts(name)
+    env, expected = env_for_ego(discrete, name), ForecastObservation(make_env("two-way-v0"), highway_checkpoint)
+    ego = make_ego(name, env, np.random.default_rng(0))
+    model = PPO.load(forecast_policy, device="cpu")
+    obs, _ = env.reset(seed=0)
+    own, _ = expected.reset(seed=0)
+    for _ in range(3):
+        assert_same(obs, own, tolerance=0.0)
+        action = int(ego(obs))
+        assert action == int(model.predict(own, deterministic=True)[0])
+        obs, own = env.step(action)[0], expected.step(action)[0]
+
+
+# --- Errors -----------------------------------------------------------------------------------------------------------
+
+
+def test_unknown_names_are_listed(discrete: gym.Env):
+    expected = rf"ego must be one of {', '.join(EGO_NAMES)} or the path of a policy .zip, got 'fast'"
+    with pytest.raises(UserError, match=expected):
+        make_ego("fast", discrete, np.random.default_rng(0))
+
+
+def test_keep_lane_needs_steering(discrete: gym.Env):
+    with pytest.raises(UserError, match=r"keep-lane needs continuous steering, got Discrete\(5\); use random"):
+        make_ego("keep-lane", discrete, np.random.default_rng(0))
+
+
+def test_spaces_without_an_idle_or_random_action_are_named():
+    env = make_env("intersection-multi-agent-v2")
+    with pytest.raises(UserError, match="no idle action is known for Tuple"):
+        idle_action(env)
+    with pytest.raises(UserError, match="random egos need a Discrete or a bounded Box action space, got Tuple"):
+        make_ego("random", env, np.random.default_rng(0))(None)
+
+
+def test_missing_policy_is_named(tmp_path: Path, discrete: gym.Env):
+    with pytest.raises(UserError, match="no policy at .*absent.zip; train one with python train_policy.py"):
+        make_ego(str(tmp_path / "absent.zip"), discrete, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("kind", ["text", "truncated", "foreign"])
+def test_file_that_is_no_policy_is_named(kind: str, tmp_path: Path, policies: Path, discrete: gym.Env):
+    path = tmp_path / f"{kind}.zip"
+    if kind == "text":
+        path.write_text("no zip at all")
+    elif kind == "truncated":
+        whole = (policies / "ppo.zip").read_bytes()
+        path.write_bytes(whole[: len(whole) // 2])
+    else:
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("notes.txt", "a zip, but no policy")
+    with pytest.raises(UserError, match=f"{kind}.zip is neither a PPO nor a DQN policy"):
+        make_ego(str(path), discrete, np.random.default_rng(0))
+
+
+def test_policy_of_another_env_is_named(policies: Path):
+    expected = r"policy .*ppo.zip was trained on Box\(.*\(3, 3, 5\).*, but the env gives Box\(.*\(5, 5\)"
+    with pytest.raises(UserError, match=expected):
+        env_for_ego(make_env("highway-fast-v0"), str(policies / "ppo.zip"))
+
+
+def test_policy_of_other_forecasts_is_named(forecast_policy: Path, tmp_path: Path):
+    """Without its run folder, the forecasts it saw are unknown: those of constant velocity have other edges."""
+    stray = tmp_path / "policy.zip"
+    shutil.copy(forecast_policy, stray)
+    (tmp_path / "config.json").write_text(json.dumps({"config": {"observe": "constant-velocity"}}))
+    with pytest.raises(UserError, match="policy .*policy.zip was trained on Dict.*, but the env gives Dict"):
+        env_for_ego(make_env("two-way-v0"), str(stray))

@@ -1,0 +1,346 @@
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from envs.collect import CollectConfig, collect
+from envs.drivers.ego import idle_action, make_ego
+from envs.observation import ego_entries
+from envs.readers.highway import HighwayReader
+from envs.readers.highway_labels import LEADER, SceneLabels
+from envs.readers.mpe import MPE_FEATURES
+from envs.registry import make_env
+from envs.rollouts.episode import (
+    CASE_HISTORY_STEPS,
+    MODEL,
+    NEIGHBOURS,
+    STRAIGHT,
+    EpisodeTask,
+    _types_of,
+    futures,
+    memory_key,
+    play,
+    world_forecast,
+)
+from envs.rollouts.world import open_world
+from envs.wrappers import SceneObservation
+from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.checkpoint import load_forecaster
+from predictor.data.store import StoreInfo, write_store
+from predictor.evaluation.accuracy import summarise
+from predictor.evaluation.outcomes import Outcome
+from predictor.forecaster import Belief
+from predictor.online import OnlineForecaster
+from predictor.scene import PADDING_ID, Scene, SceneBatch, SceneSpec
+from tests.envs.evaluation import TAG, forget, save_tag, tag_spec
+from tests.envs.helpers import HIGHWAY_SPEC, HORIZON, cruising_env, random_forecast, random_scenes
+from tests.envs.helpers import play as drive
+
+OFFSET_M = torch.tensor([3.0, 4.0])
+"""A displacement of exactly 5 m."""
+
+
+class Drifting(ConstantVelocity):
+    """Constant velocity, off by `OFFSET_M` in the first sample, twice that in the second, and so on."""
+
+    def rollout(
+        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
+    ) -> torch.Tensor:
+        future = super().rollout(belief, horizon_steps, num_samples, generator).clone()
+        future[..., :2] += torch.arange(1.0, num_samples + 1)[:, None, None, None] * OFFSET_M
+        return future
+
+
+@pytest.fixture(autouse=True)
+def clean_slate() -> Iterator[None]:
+    forget()
+    yield
+    forget()
+
+
+@pytest.fixture
+def drifting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every env wrapped from here on is forecast by `Drifting`."""
+
+    def open_drifting(checkpoint: str | None, spec: SceneSpec, source: str, device: str = "cpu") -> Drifting:
+        return Drifting(spec, HORIZON)
+
+    monkeypatch.setattr("envs.wrappers.open_forecaster", open_drifting)
+
+
+def task(env_id: str = "two-way-v0", **changes: Any) -> EpisodeTask:
+    made = EpisodeTask(env_id, "constant-velocity", "idle", seed=3, samples=2, horizon_steps=HORIZON, max_steps=6)
+    return replace(made, **changes)
+
+
+def played(made: EpisodeTask) -> tuple[Outcome, Outcome]:
+    """The measured forecasts and those of constant velocity."""
+    outcomes = play(made).outcomes
+    assert set(outcomes) == {MODEL, STRAIGHT}
+    return outcomes[MODEL], outcomes[STRAIGHT]
+
+
+# --- Truth ------------------------------------------------------------------------------------------------------------
+
+
+def scene(*agents: tuple[float, ...], rows: int = 3, features: int = 4) -> Scene:
+    """Agents as (id, x, y, and the last features); padded to `rows`."""
+    states, ids, valid = np.zeros((rows, features)), np.full(rows, -1), np.zeros(rows, dtype=np.bool_)
+    for row, (number, x, y, *rest) in enumerate(agents):
+        states[row, :2], ids[row], valid[row] = (x, y), int(number), True
+        states[row, 4 : 4 + len(rest)] = rest
+    return Scene(states, ids, valid)
+
+
+def truth(*agents: tuple[float, ...], features: int = 4) -> Scene:
+    return scene(*agents, rows=len(agents), features=features)
+
+
+def test_futures_follow_ids_beyond_perception_until_agents_leave_the_road():
+    """Agent 5 leaves perception after the first step and the road after the third; agent 6 enters late."""
+    scenes = [
+        scene((0, 10, 0), (5, 15, 1)),
+        scene((0, 20, 0), (6, 21, 2)),
+    ]
+    truths = [
+        truth((0, 10, 0), (5, 15, 1), (6, 500, 2)),
+        truth((0, 20, 0), (6, 21, 2), (5, 400, 1)),
+        truth((0, 30, 0), (6, 32, 2), (5, 450, 1)),
+        truth((0, 40, 0), (6, 43, 2)),
+    ]
+    future, valid = futures(scenes, truths, 3, HIGHWAY_SPEC)
+    assert valid.tolist() == [
+        [[False] * 3, [True, True, False], [False] * 3],  # the ego is not counted
+        [[False] * 3, [True, True, False], [False] * 3],  # the episode ends before the third step
+    ]
+    assert future[0, 1].tolist() == [[390, 1], [440, 1], [0, 0]]  # from where the ego is at that step
+    assert future[1, 1].tolist() == [[12, 2], [23, 2], [0, 0]]
+    assert (future[~valid] == 0).all()
+
+
+def test_without_an_ego_everyone_but_landmarks_is_counted_in_world_coordinates():
+    """The agent in row 0 moves and counts; the landmark between the two agents is the same at all times."""
+    prey, rock, hunter = (1.0, 0.0, 0.05), (0.0, 1.0, 0.2), (0.0, 0.0, 0.1)
+    assert MPE_FEATURES[4:] == ("adversary", "landmark", "radius_m")
+    moments = [
+        ((7, 0.5, 0.1 * t, *prey), (8, -0.5, 0.5, *rock), (9, 0.2 * t, -0.5, *hunter)) for t in range(3)
+    ]  # fmt: skip
+    scenes = [scene(*agents, rows=4, features=7) for agents in moments[:1]]
+    future, valid = futures(scenes, [truth(*agents, features=7) for agents in moments], 2, tag_spec())
+    assert valid[0].tolist() == [[True, True], [False, False], [True, True], [False, False]]
+    torch.testing.assert_close(future[0, 0], torch.tensor([[0.5, 0.1], [0.5, 0.2]]))
+    torch.testing.assert_close(future[0, 2], torch.tensor([[0.2, -0.5], [0.4, -0.5]]))
+
+
+def test_an_episode_has_the_truth_of_its_last_step():
+    """The closing scene is no place to forecast from any more, but it is what earlier forecasts are judged by."""
+    env = make_env("u-turn-v1")
+    steps = drive(env, [idle_action(env)] * 50, seed=3)
+    count = len(steps) - 1
+    assert steps[-1][2] or steps[-1][3]
+    model, baseline = played(task("u-turn-v1", seed=3, max_steps=200))
+    assert model.forecast.shape[0] == count
+    assert model.valid[count - 1, 1:].any(0).tolist() == [True, False, False]
+    assert model.valid[count - 2, 1:].any(0).tolist() == [True, True, False]
+    assert torch.equal(model.future, baseline.future)
+    assert torch.equal(model.valid, baseline.valid)
+
+
+def test_an_episode_that_is_cut_keeps_its_last_scene():
+    model, _ = played(task("highway-fast-v0", max_steps=4))
+    assert model.forecast.shape[0] == 5
+    assert model.valid[3, 1:].any(0).tolist() == [True, False, False]
+    assert not model.valid[4].any()
+
+
+def test_out_of_sight_is_not_out_of_truth():
+    """Nobody leaves this road, so whoever is seen has a future up to the episode's end, seen again or not."""
+    steps, seed = 8, 2
+    env = SceneObservation(make_env("highway-fast-v0"))
+    ego = make_ego("random", env, np.random.default_rng(seed))
+    moments = drive(env, [ego(None) for _ in range(steps)], seed)
+    seen = [set(obs["scene_ids"].tolist()) for obs, *_ in moments]
+    assert any(before - after - {PADDING_ID} for before, after in pairwise(seen))  # some are lost from sight
+    model, _ = played(task("highway-fast-v0", seed=seed, driver="random", max_steps=steps))
+    assert len(model.valid) == len(seen) == steps + 1
+    for t in range(steps):
+        known = model.valid[t, :, 0]
+        assert int(known.sum()) == len(seen[t] - {0, PADDING_ID})
+        assert (model.valid[t, known].sum(-1) == min(HORIZON, steps - t)).all()
+
+
+# --- Forecasts, read out of the observation ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_way_back_undoes_the_ego_view(seed: int):
+    """For rows in any order, with gaps, and any heading."""
+    rng = np.random.default_rng(seed)
+    scenes = random_scenes(rng, 1, 6)
+    forecast = random_forecast(rng, scenes, 3, HORIZON, 2, 4)
+    seen = ego_entries(scenes, forecast)["forecast"][0]
+    now = Scene(scenes.states[0], scenes.ids[0], scenes.valid[0], float(scenes.heading_rad[0]))
+    expected = forecast.xy[0] * forecast.valid[0][None, :, None, None]
+    expected[:, 0] = 0  # the ego has no entry
+    torch.testing.assert_close(world_forecast(seen, now), expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("env_id", ["highway-fast-v0", "intersection-v2", "racetrack-v1"])
+def test_forecasts_come_back_into_rows_and_world_axes(env_id: str, drifting: None):
+    """Whatever the ego's heading and the order of agents: what returns is what the forecaster said."""
+    model, straight = played(task(env_id))
+    assert model.forecast.shape[1] == 2
+    seen = model.valid.any(-1)
+    assert seen.any()
+    for sample in range(2):
+        offset = (model.forecast[:, sample] - straight.forecast[:, 0])[seen]
+        expected = ((sample + 1) * OFFSET_M).expand_as(offset)
+        torch.testing.assert_close(offset, expected, rtol=0, atol=1e-3)
+
+
+def test_errors_in_closed_form(drifting: None, monkeypatch: pytest.MonkeyPatch):
+    """Among cars that hold their speed, constant velocity is right and the drifting forecaster 5 m and 10 m off."""
+    monkeypatch.setattr("envs.rollouts.world.make_env", lambda env_id, **kwargs: cruising_env(**kwargs))
+    episode = play(task())
+    assert summarise("straight", [episode.outcomes[STRAIGHT]]).min_ade_m == pytest.approx(0.0, abs=1e-3)
+    both = summarise("drifting", [episode.outcomes[MODEL]])
+    assert both.agents > 5
+    assert both.num_samples == 2
+    assert both.min_ade_m == pytest.approx(5.0, abs=1e-3)
+    assert both.min_fde_m == pytest.approx(5.0, abs=1e-3)
+    assert both.by_step_m == pytest.approx([5.0] * HORIZON, abs=1e-3)
+    assert both.rmse_m == pytest.approx([7.5] * HORIZON, abs=1e-3)  # of the samples' mean
+    case = episode.worst
+    assert case is not None
+    assert (case.error_m, case.seed) == (pytest.approx(5.0, abs=1e-3), 3)
+    np.testing.assert_allclose(case.forecasts[STRAIGHT], case.future, atol=1e-3)
+    np.testing.assert_allclose(case.forecasts[MODEL] - case.future, OFFSET_M.expand(HORIZON, 2), atol=1e-3)
+    # in the world: the agent was at its latest place one step before it is at its first future one
+    step_m = case.future[1] - case.future[0]
+    np.testing.assert_allclose(case.history[-1, case.agent] + step_m, case.future[0], atol=1e-3)
+    assert len(case.history) == min(case.step + 1, CASE_HISTORY_STEPS)
+    assert case.history_valid[-1, case.agent]
+
+
+def test_one_sample_is_the_most_likely_one(drifting: None):
+    model, straight = played(task(samples=1))
+    assert model.forecast.shape[1] == straight.forecast.shape[1] == 1
+    seen = model.valid.any(-1)
+    offset = (model.forecast - straight.forecast)[:, 0][seen]
+    torch.testing.assert_close(offset, OFFSET_M.expand_as(offset), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("env_id", ["two-way-v0", TAG])
+def test_constant_velocity_in_the_deployed_place_is_the_baseline(env_id: str):
+    model, straight = played(task(env_id, driver="varied"))
+    assert model.valid.any()
+    for sample in range(2):
+        difference = (model.forecast[:, sample] - straight.forecast[:, 0])[model.valid.any(-1)]
+        torch.testing.assert_close(difference, torch.zeros_like(difference), rtol=0, atol=1e-3)
+
+
+# --- Memory -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("who", ["road", "tag", "tag-around-an-ego"])
+def test_a_short_memory_forecasts_from_the_last_scenes_alone(who: str, tmp_path: Path, highway_checkpoint: str):
+    """With one step it is a fresh memory at each scene; with as many as the episode has, it is the deployed model."""
+    if who == "road":
+        made = task("highway-fast-v0", checkpoint=highway_checkpoint)
+    else:
+        made = task(TAG, checkpoint=save_tag(tmp_path / "tag", who != "tag"), driver="heuristic")
+    steps = made.max_steps + 1
+    outcomes = play(replace(made, histories=(1, 2, steps))).outcomes
+    everything = outcomes[MODEL].forecast[:, :1]
+    known = outcomes[MODEL].valid.any(-1)
+    assert known.any(-1).sum() > 2
+
+    def same(found: torch.Tensor, expected: torch.Tensor) -> bool:
+        return torch.allclose(found[:, 0][known], expected[:, 0][known], rtol=1e-4, atol=1e-4)
+
+    assert same(outcomes[memory_key(steps)].forecast, everything)
+    for short in (1, 2):
+        found = outcomes[memory_key(short)].forecast
+        assert not same(found, everything)
+        assert same(found, replayed(made, short))
+
+
+def replayed(made: EpisodeTask, history_steps: int) -> torch.Tensor:
+    """The same episode once more; at each scene a new forecaster sees the last ones."""
+    world = open_world(made.env_id, made.driver, made.checkpoint)
+    world.reset(made.seed)
+    model = load_forecaster(made.checkpoint, world.spec, made.env_id)
+    front = int(model.spec.has_ego and not world.spec.has_ego)
+    scenes: list[Scene] = []
+    found = []
+    for _ in range(made.max_steps + 1):
+        scenes.append(world.perceived())
+        online = OnlineForecaster(model, 1, world.spec.max_agents + front)
+        for past in scenes[-history_steps:]:
+            online.observe(SceneBatch.stack([past.behind_absent(front)]))
+        found.append(online.forecast(made.horizon_steps).xy[0, :, front:])
+        if world.step():
+            break
+    return torch.stack(found)
+
+
+# --- Nearest neighbours -----------------------------------------------------------------------------------------------
+
+
+def test_neighbours_that_lived_through_this_very_episode_are_exact(tmp_path: Path):
+    """The store holds it six times, and five neighbours are averaged."""
+    made = task(seed=5)
+    config = CollectConfig(made.env_id, tmp_path, 1, ("idle",), made.seed, made.max_steps, False, 1)
+    (recorded,) = collect(config)
+    store = tmp_path / "store"
+    write_store(store, StoreInfo(HighwayReader(make_env(made.env_id)).spec, made.env_id), [recorded] * 6)
+    outcomes = play(replace(made, neighbours=(str(store),))).outcomes
+    near, straight = (summarise(key, [outcomes[key]]) for key in (NEIGHBOURS, STRAIGHT))
+    assert near.agents == straight.agents > 0
+    assert near.min_ade_m == pytest.approx(0.0, abs=1e-3)
+    assert straight.min_ade_m > 0.1
+
+
+# --- Edges and time ---------------------------------------------------------------------------------------------------
+
+
+def test_true_edges_are_moved_to_the_rows_of_who_is_perceived():
+    everyone = truth((0, 0, 0), (4, 10, 0), (2, 20, 0), (9, 30, 0))
+    types = np.full((4, 4), -1, dtype=np.int8)
+    types[1] = (0, -1, 1, 0)  # 4 follows 2
+    types[2] = (0, 0, -1, 1)  # 2 follows 9
+    labels = SceneLabels(types, np.zeros((4, 4, 5), dtype=np.float32))
+    found = _types_of(scene((0, 0, 0), (9, 30, 0), (2, 20, 0), rows=4), everyone, labels)
+    assert found.tolist() == [[-1, -1, -1, -1], [-1, -1, -1, -1], [0, 1, -1, -1], [-1, -1, -1, -1]]
+
+
+def test_the_graph_is_noted_where_the_simulator_knows_one(highway_checkpoint: str):
+    episode = play(task("highway-fast-v0", checkpoint=highway_checkpoint))
+    assert len(episode.edge_probs) == len(episode.edge_types) == len(episode.latencies_s) == 7
+    agents = HIGHWAY_SPEC.max_agents
+    assert all(probs.shape == (agents, agents, 2) for probs in episode.edge_probs)
+    types = np.stack(episode.edge_types)
+    assert types.shape == (7, agents, agents)
+    assert (types == LEADER).any() and (types[:, 0] == -1).all()  # the ego follows nobody that is known
+
+
+def test_many_learners_have_no_known_graph_and_time_passes(tmp_path: Path):
+    episode = play(task(TAG, checkpoint=save_tag(tmp_path / "tag"), driver="heuristic"))
+    assert episode.edge_types == episode.edge_probs == []
+    assert len(episode.latencies_s) == 7
+    assert min(episode.latencies_s) > 0
+
+
+def test_an_episode_is_a_function_of_its_task(tmp_path: Path):
+    """The world is kept from episode to episode, and nothing of one shows in the next."""
+    made = task(TAG, checkpoint=save_tag(tmp_path / "tag"), driver="mixed")
+    first, other, again = (play(replace(made, seed=seed)).outcomes for seed in (3, 4, 3))
+    for key in first:
+        assert torch.equal(first[key].forecast, again[key].forecast)
+        assert torch.equal(first[key].future, again[key].future)
+    assert not torch.equal(first[MODEL].future, other[MODEL].future)

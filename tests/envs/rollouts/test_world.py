@@ -1,0 +1,125 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envs.readers.highway_labels import LEADER
+from envs.rollouts.world import EgoWorld, SharedWorld, World, default_drivers, open_world
+from envs.wrappers import ForecastObservation, SceneObservation
+from predictor.errors import UserError
+from predictor.scene import Scene
+from tests.envs.evaluation import TAG
+from tests.envs.helpers import save_forecast_policy
+
+ROAD = "two-way-v0"
+
+
+def watched(world: World, seed: int, steps: int = 4) -> list[tuple[Scene, Scene]]:
+    """What is perceived, and everyone, at the start of an episode and after each step."""
+    world.reset(seed)
+    seen = [(world.perceived(), world.everyone())]
+    for _ in range(steps):
+        world.step()
+        seen.append((world.perceived(), world.everyone()))
+    return seen
+
+
+@pytest.fixture(scope="module", params=[ROAD, TAG])
+def world(request: pytest.FixtureRequest) -> World:
+    return open_world(request.param, "varied")
+
+
+def test_who_is_perceived_is_among_everyone(world: World):
+    for perceived, everyone in watched(world, seed=0):
+        perceived.check("perceived", world.spec, rows=world.spec.max_agents)
+        everyone.check("everyone", world.spec)
+        assert everyone.valid.all()
+        truth = dict(zip(everyone.ids.tolist(), everyone.states, strict=True))
+        assert int(perceived.valid.sum()) > 1
+        for row in np.flatnonzero(perceived.valid):
+            np.testing.assert_array_equal(perceived.states[row], truth[int(perceived.ids[row])])
+        if world.spec.has_ego:
+            assert everyone.ids[0] == perceived.ids[0]
+
+
+def test_an_episode_is_a_function_of_its_seed(world: World):
+    first, other, again = (watched(world, seed) for seed in (1, 2, 1))
+    for (_, before), (_, after) in zip(first, again, strict=True):
+        np.testing.assert_array_equal(before.states, after.states)
+        np.testing.assert_array_equal(before.ids, after.ids)
+    assert not np.array_equal(first[0][1].states[:, :2], other[0][1].states[:, :2])
+
+
+def test_a_step_says_when_the_episode_is_over():
+    world = open_world(TAG, "random")
+    world.reset(0)
+    assert [world.step() for _ in range(25)] == [False] * 24 + [True]  # mpe2's max_cycles
+    assert world.everyone().valid.sum() == world.spec.max_agents  # who was there at the end
+    road = open_world("u-turn-v1", "idle")
+    road.reset(3)
+    ends = [road.step() for _ in range(3)]
+    assert ends[0] is False and set(ends) <= {False, True}
+
+
+def test_edges_are_known_on_roads_in_the_rows_of_everyone():
+    world = open_world(ROAD, "idle")
+    world.reset(0)
+    labels = world.labels()
+    assert labels is not None
+    assert labels.edge_types.shape == (len(world.everyone().ids),) * 2
+    assert (labels.edge_types == LEADER).any()
+    shared = open_world(TAG, "idle")
+    shared.reset(0)
+    assert shared.labels() is None
+
+
+def test_one_ego_or_many_learners_with_forecasts_or_without(highway_checkpoint: str):
+    plain, forecast = open_world(ROAD, "idle"), open_world(ROAD, "idle", highway_checkpoint, num_samples=2)
+    assert isinstance(plain, EgoWorld) and isinstance(plain.env, SceneObservation)
+    assert isinstance(forecast, EgoWorld) and isinstance(forecast.env, ForecastObservation)
+    forecast.reset(0)
+    assert forecast.observation["forecast"].ndim == 4
+    shared = open_world(TAG, "idle", "constant-velocity", horizon_steps=7, num_samples=2)
+    assert isinstance(shared, SharedWorld)
+    shared.reset(0)
+    assert shared.env.forecast.xy.shape == (1, 2, shared.spec.max_agents, 7, 2)
+
+
+def test_a_policy_gets_the_most_likely_of_several_forecasts(tmp_path: Path, highway_checkpoint: str):
+    policy = str(save_forecast_policy(tmp_path, ROAD, highway_checkpoint))
+    world = open_world(ROAD, policy, highway_checkpoint, num_samples=3)
+    assert isinstance(world, EgoWorld)
+    world.reset(0)
+    seen: dict[str, Any] = world._seen()
+    assert world.observation["forecast"].shape[1] == 3
+    np.testing.assert_array_equal(seen["forecast"], world.observation["forecast"][:, 0])
+    np.testing.assert_array_equal(seen["agents"], world.observation["agents"])
+
+
+@pytest.mark.parametrize(
+    ("env_id", "driver", "checkpoint", "message"),
+    [
+        ("nope-v0", "idle", None, "cannot make env 'nope-v0'"),
+        (ROAD, "reckless", None, "ego must be one of random"),
+        (ROAD, "keep-lane", "constant-velocity", "keep-lane needs continuous steering"),
+        (ROAD, "absent.zip", None, "no policy at absent.zip"),
+        (ROAD, "idle", "nowhere", "no checkpoint 'nowhere'"),
+        (TAG, "reckless", None, "driver must be one of random"),
+        (TAG, "absent.zip", None, "no policy at absent.zip"),
+        (TAG, "idle", "nowhere", "no checkpoint 'nowhere'"),
+    ],
+)
+def test_what_does_not_go_together_is_named(env_id: str, driver: str, checkpoint: str | None, message: str):
+    with pytest.raises(UserError, match=f"^{message}"):
+        open_world(env_id, driver, checkpoint)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "first"), [(ROAD, "varied"), (TAG, "heuristic"), ("intersection-multi-agent-v2", "varied")]
+)
+def test_default_drivers_can_drive(env_id: str, first: str):
+    names = default_drivers(env_id)
+    assert names[0] == first
+    for name in names:
+        open_world(env_id, name).close()

@@ -1,0 +1,486 @@
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+
+pytest.importorskip("envpool")
+
+from envs.drivers.ego import idle_action  # noqa: E402
+from envs.observation import SCENE_KEYS  # noqa: E402
+from envs.sb3.envpool import EnvPoolVecEnv  # noqa: E402
+from envs.sb3.forecast import VecForecast  # noqa: E402
+from envs.simulators.envpool import (
+    ENV_IDS,
+    HIGHWAY_ENV_OF,  # noqa: E402
+    EnvPoolEnv,
+    make_pool,
+    register_envpool_ids,
+)
+from envs.simulators.envpool import is_terminated as _ends
+from envs.wrappers import ForecastObservation, SceneObservation  # noqa: E402
+from predictor.errors import ProtocolError, UserError  # noqa: E402
+from tests.envs.helpers import MAX_AGENTS, PERCEPTION_M, assert_same, play, random_actions  # noqa: E402
+
+ROOT = Path(__file__).parents[3]
+SEED = 20
+ROWS = 3
+STEPS = 12
+SMALL = {"vehicles_count": 8, "duration": 5}
+"""Short episodes on a road with few vehicles: rows crash or run out of time, at different steps."""
+ACTIONS = np.random.default_rng(3).integers(5, size=(STEPS, ROWS))
+
+CHECKER_WARNINGS = (
+    r"ignore:.*is different from the unwrapped version:UserWarning",
+    r"ignore:.*A Box observation space (minimum|maximum) value is (-?)infinity:UserWarning",
+    r"ignore:It seems that your observation .*is an image:UserWarning",
+    r"ignore:The minimal resolution for an image:UserWarning",
+    r"ignore:Your observation .*has an unconventional shape:UserWarning",
+)
+
+
+def ignore_checker_warnings(test: Any) -> Any:
+    for line in CHECKER_WARNINGS:
+        test = pytest.mark.filterwarnings(line)(test)
+    return test
+
+
+def small_pool(**kwargs: Any) -> EnvPoolVecEnv:
+    usual = {"num_threads": 1, "perception_m": PERCEPTION_M, "max_agents": MAX_AGENTS, **SMALL}
+    return EnvPoolVecEnv("HighwayFast-v0", ROWS, seed=SEED, **(usual | kwargs))
+
+
+def small_env(scenes: bool = True) -> gym.Env:
+    register_envpool_ids()
+    env = gym.make("envpool/HighwayFast-v0", disable_env_checker=True, **SMALL)
+    return SceneObservation(env, PERCEPTION_M, MAX_AGENTS) if scenes else env
+
+
+def row_of(observations: Any, row: int) -> Any:
+    return {key: value[row] for key, value in observations.items()}
+
+
+# --- One environment --------------------------------------------------------------------------------------------------
+
+
+@ignore_checker_warnings
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_gymnasium_accepts(env_id: str):
+    register_envpool_ids()
+    check_env(gym.make(env_id), skip_render_check=True)
+
+
+@ignore_checker_warnings
+@pytest.mark.parametrize("env_id", ["envpool/HighwayFast-v0", "envpool/Intersection-v0", "envpool/Racetrack-v0"])
+def test_sb3_accepts(env_id: str):
+    register_envpool_ids()
+    check_env_for_sb3(SceneObservation(gym.make(env_id)))
+
+
+def test_every_task_has_one_id():
+    assert sorted(ENV_IDS.values()) == sorted(HIGHWAY_ENV_OF)
+
+
+def test_ids_are_declared_without_envpool():
+    """Declaring twice is fine, importing nothing; making one says what to install."""
+    code = """
+import sys
+sys.modules["envpool"] = None  # importing it raises ImportError
+from envs.native import ENV_IDS, register_envpool_ids
+register_envpool_ids()
+register_envpool_ids()
+import gymnasium as gym
+assert set(ENV_IDS) <= set(gym.registry)
+try:
+    gym.make("envpool/HighwayFast-v0")
+except ValueError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "need the envpool package" in done.stdout and "pip install 'dgvae-rl[envpool]'" in done.stdout
+
+
+@pytest.mark.parametrize("env_id", ["envpool/HighwayFast-v0", "envpool/Merge-v0"])
+def test_a_seed_is_an_episode(env_id: str):
+    register_envpool_ids()
+    env = gym.make(env_id)
+    actions = random_actions(env, 4)
+    first, again, other = play(env, actions, 7), play(env, actions, 7), play(env, actions, 8)
+    for (obs, *rest), (expected, *expected_rest) in zip(again, first, strict=True):
+        np.testing.assert_array_equal(obs, expected)
+        assert rest == expected_rest
+    assert (other[0][0] != first[0][0]).any()
+
+
+def test_without_a_seed_the_next_episode_follows():
+    """Reset by reset, two environments of one seed stay together, and no episode is like the last."""
+    first, second = (EnvPoolEnv("HighwayFast-v0") for _ in range(2))
+    episodes = [[env.reset(seed=3)[0], env.reset()[0], env.reset()[0]] for env in (first, second)]
+    np.testing.assert_array_equal(episodes[0], episodes[1])
+    assert (episodes[0][0] != episodes[0][1]).any() and (episodes[0][1] != episodes[0][2]).any()
+
+
+def test_environments_that_nobody_seeds_differ():
+    first, second = (EnvPoolEnv("HighwayFast-v0").reset()[0] for _ in range(2))
+    assert (first != second).any()
+
+
+def test_large_seeds_are_taken():
+    env = EnvPoolEnv("HighwayFast-v0")
+    assert (env.reset(seed=2**32 - 1)[0] != env.reset(seed=2**31 - 2)[0]).any()
+
+
+def test_time_ends_an_episode_by_truncation():
+    env = EnvPoolEnv("HighwayFast-v0", duration=2, vehicles_count=0)
+    env.reset(seed=0)
+    assert env.step(1)[2:4] == (False, False)
+    assert env.step(1)[2:4] == (False, True)
+
+
+def test_a_crash_is_a_termination():
+    """At full speed behind traffic, every row hits somebody before the time is over."""
+    env = EnvPoolEnv("HighwayFast-v0")
+    for seed in range(3):
+        env.reset(seed=seed)
+        for _ in range(30):
+            _, _, terminated, truncated, info = env.step(3)
+            assert terminated == info["crashed"]
+            if terminated or truncated:
+                break
+        assert terminated and not truncated and set(info) == {"speed", "crashed"}
+
+
+def test_a_crash_in_the_last_step_is_both():
+    """EnvPool calls it a truncation only; highway-env, whose flags these are, says both."""
+    terminated, truncated, crashed = (
+        np.array(flags, dtype=np.bool_) for flags in ([1, 0, 0, 0], [0, 1, 1, 0], [1, 1, 0, 0])
+    )
+    assert _ends(terminated, truncated, crashed).tolist() == [True, True, False, False]
+
+
+@pytest.mark.parametrize("task_id", ["HighwayFast-v0", "Intersection-v0"])
+def test_the_idle_ego_idles(task_id: str):
+    """Neither a change of lane (highway's action 0) nor braking (the intersection's)."""
+    env = EnvPoolEnv(task_id)
+    action = idle_action(env)
+    env.reset(seed=0)
+    before = env.debug_states()[0].vehicles[0]
+    env.step(action)
+    after = env.debug_states()[0].vehicles[0]
+    assert after.target_lane_index == before.target_lane_index
+    assert after.target_speed == before.target_speed
+
+
+def test_images_are_drawn_on_request():
+    env = EnvPoolEnv("HighwayFast-v0", render_mode="rgb_array")
+    env.reset(seed=0)
+    image = env.render()
+    assert image.shape == (150, 600, 3) and image.dtype == np.uint8 and image.std() > 0
+    assert EnvPoolEnv("HighwayFast-v0").render() is None
+
+
+def test_forecasts_wrap_it(highway_checkpoint: str):
+    env = ForecastObservation(small_env(), highway_checkpoint)
+    steps = play(env, [1, 1, 1], seed=0)
+    assert all(obs in env.observation_space for obs, *_ in steps)
+    assert (steps[-1][0]["valid"].sum() > 0) and env.scene.ids[0] == 0
+
+
+# --- Many environments ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scenes", [True, False])
+def test_rows_are_single_environments(scenes: bool):
+    """Observations, closing observations, rewards, ends and infos of SB3 over single environments, bit for bit."""
+    pool, single = small_pool(scenes=scenes), DummyVecEnv([partial(small_env, scenes)] * ROWS)
+    single.seed(SEED)
+    assert pool.observation_space == single.observation_space and pool.action_space == single.action_space
+    assert_same(pool.reset(), single.reset(), tolerance=0.0)
+    ended: list[tuple[int, int]] = []
+    for t in range(STEPS):
+        obs, rewards, dones, infos = pool.step(ACTIONS[t])
+        expected, expected_rewards, expected_dones, expected_infos = single.step(ACTIONS[t])
+        assert_same(obs, expected, tolerance=0.0)
+        np.testing.assert_array_equal(rewards, expected_rewards)
+        assert dones.tolist() == expected_dones.tolist()
+        for row in range(ROWS):
+            closing, expected_closing = (i[row].pop("terminal_observation", None) for i in (infos, expected_infos))
+            assert infos[row] == expected_infos[row]
+            assert (closing is None) == (expected_closing is None) == (not dones[row])
+            if closing is not None:
+                assert_same(closing, expected_closing, tolerance=0.0)
+                assert pool.reset_infos[row] == single.reset_infos[row]
+                ended.append((t, row))
+    assert len(ended) > ROWS and len({t for t, _ in ended}) > 2  # rows end at different steps, more than once
+
+
+@pytest.mark.parametrize("task_id", HIGHWAY_ENV_OF)
+def test_observations_lie_in_the_space(task_id: str):
+    pool = EnvPoolVecEnv(task_id, 2, seed=0, num_threads=1)
+    pool.action_space.seed(0)
+    observations: list[Any] = [pool.reset()]
+    for _ in range(12):
+        obs, _, _, infos = pool.step(np.array([pool.action_space.sample() for _ in range(2)]))
+        observations += [
+            obs,
+            *({k: v[None] for k, v in i["terminal_observation"].items()} for i in infos if len(i) > 3),
+        ]
+    assert all(row_of(o, i) in pool.observation_space for o in observations for i in range(len(o["scene_ids"])))
+
+
+def test_an_ended_row_closes_with_the_old_scene_and_opens_with_a_new_one():
+    pool, idle = small_pool(vehicles_count=30, perception_m=1000.0, max_agents=40), np.ones(ROWS, dtype=np.int64)
+    obs: Any = pool.reset()
+    for _ in range(5):
+        last = obs
+        obs, _, dones, infos = pool.step(idle)
+        if dones.any():
+            break
+    assert dones.any()
+    for row in np.flatnonzero(dones):
+        closing, opening = infos[row]["terminal_observation"], row_of(obs, row)
+        assert sorted(opening["scene_ids"][opening["scene_valid"] == 1]) == list(range(31))
+        moved_m = closing["scene_states"][0, 0] - last["scene_states"][row, 0, 0]
+        assert 0 < moved_m < 40  # the ego, one step on
+        assert opening["scene_states"][0, 0] < closing["scene_states"][0, 0] - 20  # back at the start of a road
+        assert set(closing["scene_ids"]) <= set(range(31)) | {-1}
+
+
+def play_alone(row: int, checkpoint: str) -> list[tuple[Any, Any]]:
+    """What each step leads to, and what closes the episode where it ends."""
+    env = ForecastObservation(small_env(), checkpoint)
+    steps: list[tuple[Any, Any]] = [(env.reset(seed=SEED + row)[0], None)]
+    for t in range(STEPS):
+        obs, _, terminated, truncated, _ = env.step(int(ACTIONS[t, row]))
+        steps.append((env.reset()[0], obs) if terminated or truncated else (obs, None))
+    return steps
+
+
+def test_forecasts_are_those_of_single_environments(highway_checkpoint: str):
+    """Over several episodes: memory follows each row's own boundaries, and identities are the same."""
+    venv = VecForecast(VecMonitor(small_pool()), highway_checkpoint)
+    alone = [play_alone(row, highway_checkpoint) for row in range(ROWS)]
+    obs: Any = venv.reset()
+    infos: list[Any] = []
+    closings = 0
+    for t in range(STEPS + 1):
+        for row in range(ROWS):
+            expected, closing = alone[row][t]
+            assert_same(row_of(obs, row), expected)
+            if closing is not None:
+                assert_same(infos[row]["terminal_observation"], closing)
+                closings += 1
+        if t < STEPS:
+            obs, _, _, infos = venv.step(ACTIONS[t])
+    assert closings > ROWS
+
+
+def test_monitored_episodes_add_up():
+    venv = VecMonitor(small_pool())
+    venv.reset()
+    returns, lengths, episodes = np.zeros(ROWS), np.zeros(ROWS), 0
+    for t in range(STEPS):
+        _, rewards, dones, infos = venv.step(ACTIONS[t])
+        returns, lengths = returns + rewards, lengths + 1
+        for row in np.flatnonzero(dones):
+            assert infos[row]["episode"]["r"] == pytest.approx(returns[row], rel=1e-5)
+            assert infos[row]["episode"]["l"] == lengths[row]
+            returns[row] = lengths[row] = 0
+            episodes += 1
+    assert episodes > ROWS
+
+
+@pytest.mark.parametrize("scenes", [True, False])
+def test_ppo_learns_on_it(scenes: bool, highway_checkpoint: str):
+    venv: Any = small_pool(scenes=scenes)
+    if scenes:
+        venv = VecForecast(VecMonitor(venv), highway_checkpoint)
+    policy = "MultiInputPolicy" if scenes else "MlpPolicy"
+    model = PPO(
+        policy, venv, n_steps=8, batch_size=8, n_epochs=1, policy_kwargs={"net_arch": [8]}, device="cpu", seed=0
+    )
+    before = model.policy.action_net.weight.detach().clone()
+    model.learn(24)
+    assert model.num_timesteps == 24
+    assert (model.policy.action_net.weight != before).any()
+
+
+def sequence(venv: EnvPoolVecEnv, seed: int | None = None) -> list[Any]:
+    if seed is not None:
+        venv.seed(seed)
+    return [venv.reset(), *(venv.step(actions)[0] for actions in ACTIONS)]
+
+
+def test_seeding_repeats_the_sequence():
+    first, reseeded, other = sequence(small_pool()), sequence(small_pool(), SEED), sequence(small_pool(), SEED + 1)
+    venv = small_pool()
+    sequence(venv)
+    again = sequence(venv, SEED)
+    for obs, expected, repeated in zip(first, reseeded, again, strict=True):
+        assert_same(obs, expected, tolerance=0.0)
+        assert_same(repeated, expected, tolerance=0.0)
+    assert (other[0]["observation"][:-1] == first[0]["observation"][1:]).all()  # row i of seed s + 1 is row i + 1 of s
+    assert (other[0]["observation"] != first[0]["observation"]).any()
+
+
+def test_a_seed_is_used_once():
+    """As SB3 has it: the next reset carries on."""
+    venv = small_pool()
+    venv.seed(SEED)
+    first: Any = venv.reset()
+    second: Any = venv.reset()
+    assert (first["observation"] != second["observation"]).any()
+
+
+def test_pools_that_nobody_seeds_differ():
+    first, second = (EnvPoolVecEnv("HighwayFast-v0", 2, scenes=False).reset() for _ in range(2))
+    assert (np.asarray(first) != np.asarray(second)).any()
+
+
+def test_threads_change_nothing():
+    for obs, expected in zip(sequence(small_pool()), sequence(small_pool(num_threads=2)), strict=True):
+        assert_same(obs, expected, tolerance=0.0)
+
+
+def test_returned_observations_are_not_written_to_later():
+    venv = small_pool()
+    kept: list[Any] = [venv.reset()]
+    copies = [{key: value.copy() for key, value in kept[0].items()}]
+    for actions in ACTIONS:
+        obs, _, _, infos = venv.step(actions)
+        for held in (obs, *(i["terminal_observation"] for i in infos if "terminal_observation" in i)):
+            kept.append(held)
+            copies.append({key: value.copy() for key, value in held.items()})
+    for obs, copy in zip(kept, copies, strict=True):
+        assert_same(obs, copy, tolerance=0.0)
+
+
+class Frugal:
+    """A pool that hands out the same buffer at each step, as EnvPool may and does not."""
+
+    def __init__(self, pool: Any) -> None:
+        self._pool, self._buffer = pool, np.zeros((ROWS, 5, 5), np.float32)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._pool, name)
+
+    def step(self, actions: Any) -> Any:
+        observations, *rest = self._pool.step(actions)
+        self._buffer[:] = observations
+        return self._buffer, *rest
+
+
+def test_a_buffer_of_the_simulator_is_not_handed_out():
+    venv, frugal = small_pool(), small_pool()
+    frugal._pool = Frugal(frugal._pool)
+    for obs, expected in zip(sequence(frugal), sequence(venv), strict=True):
+        assert_same(obs, expected, tolerance=0.0)
+
+
+def test_attributes_are_shared_by_the_rows():
+    venv = small_pool()
+    assert venv.get_attr("scene_source") == ["envpool/HighwayFast-v0"] * ROWS
+    assert venv.get_attr("scene_spec", [0, 2]) == [venv.scene_spec] * 2
+    assert venv.get_attr("render_mode", 1) == [None]
+    assert venv.has_attr("action_type") and not venv.has_attr("nothing_of_the_kind")
+    assert venv.env_is_wrapped(gym.Wrapper) == [False] * ROWS
+    venv.reset()
+    assert [len(states[0].vehicles) for states in venv.env_method("debug_states", indices=[1])] == [9]
+    with pytest.raises(AttributeError, match="live in C"):
+        venv.set_attr("render_mode", None)
+    with pytest.raises(AttributeError, match="no method 'fly'"):
+        venv.env_method("fly")
+    venv.close()
+
+
+def test_an_id_that_differs_from_its_task_is_its_source():
+    assert EnvPoolVecEnv("Intersection-v1", 1).scene_source == "envpool/IntersectionContinuous-v1"
+
+
+# --- Errors -----------------------------------------------------------------------------------------------------------
+
+
+def test_unknown_names_are_listed():
+    with pytest.raises(UserError, match="no EnvPool task 'Parking-v0' is known here; known: Highway-v0"):
+        make_pool("Parking-v0", [0])
+    with pytest.raises(UserError, match=r"HighwayFast-v0 has no setting \['lanes'\]; it has .*lanes_count"):
+        EnvPoolEnv("HighwayFast-v0", lanes=2)
+    with pytest.raises(UserError, match=r"no setting \['num_envs', 'seed'\]"):
+        EnvPoolEnv("HighwayFast-v0", seed=2, num_envs=3)
+
+
+def test_an_envpool_that_hides_its_vehicles_is_named(monkeypatch: pytest.MonkeyPatch):
+    import envpool
+
+    monkeypatch.setattr(envpool, "make", lambda *args, **kwargs: object())
+    with pytest.raises(UserError, match="does not say where the vehicles are; 1.2.5 does"):
+        make_pool("Merge-v0", [0])
+
+
+@pytest.mark.parametrize("action", [-1, 5])
+def test_actions_that_do_not_exist_are_named(action: int):
+    env = EnvPoolEnv("HighwayFast-v0")
+    env.reset(seed=0)
+    with pytest.raises(UserError, match=f"action must be in 0…4, got {action}"):
+        env.step(action)
+    env.step(4)
+
+
+def test_stepping_past_the_end_is_named():
+    """Where EnvPool would begin another episode and call it a step of this one."""
+    env = EnvPoolEnv("HighwayFast-v0", duration=1)
+    with pytest.raises(ProtocolError, match=r"call reset\(\) first"):
+        env.step(1)
+    env.reset(seed=0)
+    env.step(1)
+    with pytest.raises(ProtocolError, match="the episode has not begun or is over"):
+        env.step(1)
+    env.reset()
+    env.step(1)
+
+
+def test_options_are_refused():
+    env, venv = EnvPoolEnv("HighwayFast-v0"), small_pool()
+    env.reset(options={})
+    with pytest.raises(UserError, match=r"takes no options at reset, got \['config'\]; pass settings to gym.make"):
+        env.reset(options={"config": {}})
+    venv.set_options({"config": {}})
+    with pytest.raises(UserError, match="takes no options at reset; pass settings to EnvPoolVecEnv"):
+        venv.reset()
+
+
+def test_stepping_before_the_first_reset_is_named():
+    venv = small_pool()
+    with pytest.raises(ProtocolError, match=r"call reset\(\) and step_async"):
+        venv.step(ACTIONS[0])
+    venv.reset()
+    with pytest.raises(ProtocolError, match=r"call reset\(\) and step_async"):
+        venv.step_wait()
+
+
+def test_every_row_needs_an_action():
+    venv = small_pool()
+    venv.reset()
+    with pytest.raises(UserError, match="one action for each of 3 rows, got 2"):
+        venv.step(ACTIONS[0, :2])
+
+
+def test_a_pool_needs_rows():
+    with pytest.raises(UserError, match="num_envs must be at least 1, got 0"):
+        EnvPoolVecEnv("Merge-v0", 0)
+
+
+def test_a_pool_without_scenes_has_none():
+    venv = small_pool(scenes=False)
+    assert not set(SCENE_KEYS) & set(getattr(venv.observation_space, "spaces", {}))
+    with pytest.raises(UserError, match="VecForecast needs environments that report scenes"):
+        VecForecast(venv, "constant-velocity")

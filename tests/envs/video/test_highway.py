@@ -1,0 +1,143 @@
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from highway_env.envs.common.graphics import EnvViewer
+from PIL import Image
+
+from envs.drivers.ego import idle_action
+from envs.registry import make_env
+from envs.video.drawing import AgentOverlay, OverlayStyle, View, dashes, draw_overlay
+from envs.video.highway import Recording, record_episode
+from envs.wrappers import ForecastObservation
+from predictor.errors import UserError
+
+STEPS = 4
+PLAIN = OverlayStyle(truth_color=(0, 255, 0), forecast_color=(255, 0, 0), edge_color=(0, 0, 255), edge_alpha=255)
+
+
+@pytest.fixture
+def env() -> Iterator[ForecastObservation]:
+    made = ForecastObservation(make_env("highway-fast-v0", render_mode="rgb_array"), "constant-velocity")
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def recording(env: ForecastObservation) -> Recording:
+    action = idle_action(env)
+    return record_episode(env, lambda obs: action, seed=1, max_steps=STEPS)
+
+
+def decode(path: Path, height: int, width: int) -> np.ndarray:
+    command = [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-v",
+        "error",
+        "-i",
+        str(path),
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-",
+    ]
+    raw = subprocess.run(command, capture_output=True, check=True).stdout
+    return np.frombuffer(raw, np.uint8).reshape(-1, height, width, 3)
+
+
+def test_video_has_every_simulated_picture(recording: Recording, tmp_path: Path):
+    assert recording.num_steps == STEPS
+    assert len(recording) == 1 + STEPS * recording.frames_per_step == 1 + STEPS * 5
+    assert recording.fps == 10  # highway-env plays 5 Hz at twice real time
+    path = tmp_path / "video.mp4"
+    recording.write_video(path)
+    frames = decode(path, 300, 1200)
+    assert len(frames) == len(recording)
+    error = np.abs(frames[7].astype(int) - recording.draw(7).astype(int)).mean()
+    assert error < 3  # the picture that was drawn, up to compression
+    assert [p.name for p in tmp_path.iterdir()] == ["video.mp4"]
+
+
+def test_frame_is_saved_as_drawn(recording: Recording, tmp_path: Path):
+    index = recording.frame_of_step(2)
+    assert index == 2 * recording.frames_per_step
+    recording.write_frame(tmp_path / "frame.png", index)
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "frame.png")), recording.draw(index))
+
+
+def test_forecasts_and_truth_are_in_the_picture(recording: Recording):
+    colors = recording.draw(2).reshape(-1, 3)
+    style = recording.style
+    assert (colors == style.forecast_color).all(-1).sum() > 50
+
+
+def test_forecast_starts_where_the_agent_was_and_stays_there(recording: Recording):
+    """Constant velocity on a straight road: the first forecast point is where the agent is one step later."""
+    step, later = recording._steps[0], recording._frames[recording.frame_of_step(1)]
+    shared = [row for row, key in enumerate(step.keys) if key in later.positions_m]
+    assert shared
+    for row in shared:
+        error_m = np.hypot(*(step.forecast_m[row, 0, 0] - later.positions_m[step.keys[row]]))
+        assert error_m < 3.0  # accelerations are at most 5 m/s²
+
+
+def test_same_seed_same_pictures(env: ForecastObservation, recording: Recording):
+    action = idle_action(env)
+    again = record_episode(env, lambda obs: action, seed=1, max_steps=STEPS)
+    np.testing.assert_array_equal(again.draw(7), recording.draw(7))
+
+
+def test_env_is_left_as_it_was(env: ForecastObservation, recording: Recording):
+    assert env.unwrapped._record_video_wrapper is None  # type: ignore[attr-defined]
+    assert env.unwrapped.viewer is None  # type: ignore[attr-defined]
+    assert env.unwrapped.config["screen_width"] == 600  # type: ignore[attr-defined]
+    assert EnvViewer.agent_display is None
+
+
+def test_env_without_pictures_is_named():
+    env = ForecastObservation(make_env("highway-fast-v0"), "constant-velocity")
+    with pytest.raises(UserError, match="render_mode='rgb_array', got None"):
+        record_episode(env, lambda obs: 0)
+    env.close()
+
+
+@pytest.mark.parametrize("step", [-1, STEPS + 1])
+def test_step_outside_the_episode_is_named(recording: Recording, step: int):
+    assert recording.frame_of_step(STEPS) == len(recording) - 1
+    with pytest.raises(UserError, match=f"got {step}"):
+        recording.frame_of_step(step)
+
+
+def draw(agent: AgentOverlay) -> np.ndarray:
+    picture = Image.new("RGB", (400, 200))
+    return draw_overlay(picture, View((-10.0, -10.0), 10.0), (0.0, 0.0), [agent], "", PLAIN)
+
+
+def count(picture: np.ndarray, color: tuple[int, int, int]) -> int:
+    return int((picture == color).all(-1).sum())
+
+
+def test_world_positions_land_on_their_pixels():
+    agent = AgentOverlay((5.0, 0.0), (np.array([[5.0, -5.0], [15.0, -5.0]]),), np.array([[5.0, 5.0], [15.0, 5.0]]), 1.0)
+    picture = draw(agent)
+    assert tuple(picture[100, 125]) == (0, 0, 255)  # half way from the ego (100, 100) to the agent (150, 100)
+    assert tuple(picture[150, 200]) == (0, 255, 0)
+    assert tuple(picture[50, 250]) == (255, 0, 0)  # the dot at the forecast's end
+
+
+def test_edge_width_follows_its_probability():
+    line = np.array([[5.0, 5.0]])
+    widths = [count(draw(AgentOverlay((5.0, 0.0), (), line, p)), (0, 0, 255)) for p in (0.0, 0.5, 1.0)]
+    legend = widths[0]
+    assert widths[1] > legend
+    assert widths[2] - legend == pytest.approx(2 * (widths[1] - legend), rel=0.2)
+
+
+def test_dashes_alternate_and_keep_corners():
+    pieces = dashes(np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 4.0]]), dash=2.0)
+    assert [p.tolist() for p in pieces] == [[[0, 0], [2, 0]], [[3, 1], [3, 3]]]
+    assert dashes(np.array([[1.0, 1.0], [1.0, 1.0]]), dash=2.0) == []

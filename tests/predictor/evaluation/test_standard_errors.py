@@ -1,0 +1,114 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from predictor.evaluation.standard_errors import (
+    Statistic,
+    batch_interval,
+    ratio_statistics,
+    subset_ratios,
+    subset_statistics,
+)
+
+
+def parts(found: Statistic | None) -> tuple[float, float, int]:
+    assert found is not None and found.standard_error is not None
+    return found.mean, found.standard_error, found.subsets
+
+
+def test_one_window_per_subset_is_the_textbook_standard_error():
+    values = np.array([1.0, 2.0, 3.0, 4.0])
+    found = subset_statistics(values, np.ones(4, dtype=np.bool_), num_subsets=4)
+    assert parts(found) == pytest.approx((2.5, np.sqrt(5 / 3) / 2, 4))
+
+
+def test_each_subset_has_its_own_mean_over_valid_entries():
+    values = np.array([[1.0, 3.0], [np.inf, 10.0], [5.0, 7.0]])
+    valid = np.array([[True, True], [False, True], [True, True]])
+    assert parts(subset_statistics(values, valid, num_subsets=3))[0] == pytest.approx((2 + 10 + 6) / 3)
+    assert subset_statistics(values, valid, num_subsets=1) == Statistic(26 / 5, None, 1)
+
+
+def test_root_is_taken_of_each_subset():
+    found = subset_statistics(np.array([4.0, 16.0]), np.ones(2, dtype=np.bool_), num_subsets=2, root=True)
+    assert parts(found) == pytest.approx((3.0, 1.0, 2))
+
+
+@pytest.mark.parametrize(("windows", "subsets"), [(1, 1), (19, 19), (20, 20), (21, 20), (1000, 20)])
+def test_never_more_subsets_than_windows(windows: int, subsets: int):
+    found = subset_statistics(np.arange(float(windows)), np.ones(windows, dtype=np.bool_))
+    assert found is not None and found.subsets == subsets
+    assert (found.standard_error is None) == (windows == 1)
+
+
+def test_subsets_without_a_valid_entry_are_left_out():
+    valid = np.array([True, False, True, False])
+    assert subset_statistics(np.array([1.0, 9.0, 3.0, 9.0]), valid, num_subsets=4) == Statistic(2.0, 1.0, 2)
+
+
+@pytest.mark.parametrize("windows", [0, 5])
+def test_nothing_valid_is_none(windows: int):
+    assert subset_statistics(np.zeros((windows, 2)), np.zeros((windows, 2), dtype=np.bool_)) is None
+
+
+def test_at_least_one_subset():
+    with pytest.raises(ValueError, match="num_subsets must be at least 1, got 0"):
+        subset_statistics(np.zeros(3), np.ones(3, dtype=np.bool_), num_subsets=0)
+
+
+@given(st.integers(1, 50), st.integers(1, 25), st.integers(0, 5))
+def test_windows_are_dealt_evenly_and_all_of_them(windows: int, num_subsets: int, seed: int):
+    # powers of two: a subset's sum says which windows it holds
+    means = subset_ratios(2.0 ** np.arange(windows), np.ones(windows), num_subsets, seed)
+    assert len(means) == min(windows, num_subsets)
+    sizes = np.array([len(part) for part in np.array_split(np.arange(windows), len(means))])
+    assert (means * sizes).round().sum() == 2.0**windows - 1
+
+
+def test_equal_seeds_deal_equally_and_others_do_not():
+    values, valid = np.random.default_rng(0).normal(size=100), np.ones(100, dtype=np.bool_)
+    first, again, other = (subset_statistics(values, valid, seed=seed) for seed in (0, 0, 1))
+    assert first == again != other
+
+
+def test_standard_error_is_about_right():
+    """Of means of 500 windows with deviation 2: 2 / √500, whatever the subsets."""
+    rng = np.random.default_rng(0)
+    errors = [parts(ratio_statistics(rng.normal(size=500) * 2, np.ones(500), seed=i))[1] for i in range(50)]
+    assert np.mean(errors) == pytest.approx(2 / np.sqrt(500), rel=0.05)
+
+
+# --- Intervals over batches -------------------------------------------------------------------------------------------
+
+
+def test_the_interval_of_two_batches_spans_their_own_ratios():
+    """A quarter of the draws takes one batch twice, and a quarter the other."""
+    assert batch_interval(np.array([3.0, 30.0]), np.array([3.0, 10.0])) == pytest.approx((1.0, 3.0))
+    assert batch_interval(np.array([4.0, 32.0]), np.array([1.0, 2.0]), root=True) == pytest.approx((2.0, 4.0))
+
+
+@given(st.integers(2, 30), st.floats(0.1, 100), st.integers(0, 5))
+def test_equal_batches_leave_no_doubt(batches: int, value: float, seed: int):
+    counts = np.random.default_rng(seed).integers(1, 9, batches).astype(np.float64)
+    assert batch_interval(value * counts, counts, seed) == pytest.approx((value, value))
+
+
+@pytest.mark.parametrize("counts", [[], [4.0], [0.0, 4.0, 0.0], [0.0, 0.0]])
+def test_fewer_than_two_batches_that_count_have_no_interval(counts: list[float]):
+    assert batch_interval(np.ones(len(counts)), np.array(counts)) is None
+
+
+def test_batches_that_count_nothing_say_nothing():
+    """They are drawn like the others; a draw of nothing else has no ratio and is left out."""
+    assert batch_interval(np.array([0.0, 2.0, 6.0]), np.array([0.0, 1.0, 2.0])) == pytest.approx((2.0, 3.0))
+
+
+def test_intervals_depend_on_the_seed_alone_and_are_about_right():
+    """±1.96 × 2 / √400 for means of 400 batches of one with deviation 2."""
+    values, ones = 2 * np.random.default_rng(0).normal(size=400), np.ones(400)
+    first, again, other = (batch_interval(values, ones, seed=seed) for seed in (0, 0, 1))
+    assert first == again != other
+    assert first is not None
+    assert first[0] < values.mean() < first[1]
+    assert first[1] - first[0] == pytest.approx(2 * 1.96 * 2 / 20, rel=0.15)

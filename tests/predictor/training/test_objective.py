@@ -1,0 +1,238 @@
+"""Each term of the training objective in closed form, and what it is a mean over."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from predictor.data.windows import WindowBatch
+from predictor.errors import UserError
+from predictor.forecaster import WindowOutput
+from predictor.training.config import TrainConfig
+from predictor.training.objective import window_loss
+from tests.predictor.helpers import any_model, model, random_states
+
+# Agent 1 is absent at the last of three steps, so there are 2 · 2 ordered pairs, at the first two steps.
+VALID = torch.tensor([[[True, True], [True, True], [True, False]]])
+CONFIG = TrainConfig((), Path(), variance=0.5, likelihood="gaussian", one_step_weight=1.0)
+SILENT = replace(CONFIG, kl_weight=0.0)
+
+
+def batch(types: Any = None, attributes: Tensor | None = None, last_observed: int = 0) -> WindowBatch:
+    """True states are zero."""
+    edge_types = None if types is None else torch.tensor(types, dtype=torch.int8)
+    return WindowBatch(torch.zeros(1, 3, 2, 4), VALID, torch.tensor([last_observed]), edge_types, attributes)
+
+
+def per_pair(first: list[list[float]], second: list[list[float]]) -> Tensor:
+    """Values of the pairs (0, 1) and (1, 0) at the first two steps; everything else is what must not matter."""
+    values = torch.full((1, 3, 2, 2, len(first[0])), 77.0)
+    values[0, :2, 0, 1], values[0, :2, 1, 0] = torch.tensor(first), torch.tensor(second)
+    return values
+
+
+def logits(first: list[float], second: list[float]) -> Tensor:
+    """Two types; probability of an edge for each pair and step."""
+    return per_pair(*([[math.log(1 - p), math.log(p)] for p in pair] for pair in (first, second)))
+
+
+EVEN = logits([0.5, 0.5], [0.5, 0.5])
+
+
+def output(
+    prior: Tensor | None = EVEN,
+    posterior: Tensor | None = EVEN,
+    features: Tensor | None = None,
+    rollout: Tensor | None = None,
+    one_step: Tensor | None = None,
+) -> WindowOutput:
+    """Perfect predictions unless given; two steps of rollout."""
+    one_step = torch.zeros(1, 3, 2, 4) if one_step is None else one_step
+    return WindowOutput(one_step, torch.zeros(1, 2, 2, 4) if rollout is None else rollout, prior, posterior, features)
+
+
+def terms(config: TrainConfig, windows: WindowBatch, out: WindowOutput, kl_scale: float = 1.0) -> dict[str, float]:
+    """The terms, and the objective as "total"."""
+    total, parts = window_loss(model(horizon_steps=2), windows, out, config, kl_scale)
+    return {"total": total.item(), **{name: value.item() for name, value in parts.items()}}
+
+
+def binary_kl(posterior: float, prior: float) -> float:
+    return posterior * math.log(posterior / prior) + (1 - posterior) * math.log((1 - posterior) / (1 - prior))
+
+
+# --- Likelihoods ------------------------------------------------------------------------------------------------------
+
+
+def test_perfect_predictions_without_information_cost_nothing():
+    assert terms(CONFIG, batch(), output())["total"] == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("likelihood", "variance", "expected"),
+    # errors of 10 m and 5 m/s are 1 in scaled units; 3 future states count
+    [("gaussian", 0.5, (1 + 1) / 3), ("gaussian", 0.25, (2 + 2) / 3), ("laplace", 0.5, (2 + 2) / 3)],
+)
+def test_rollout_likelihood(likelihood: Any, variance: float, expected: float):
+    rollout = torch.zeros(1, 2, 2, 4)
+    rollout[0, 0, 0, 0], rollout[0, 1, 0, 3] = 10.0, -5.0
+    rollout[0, 1, 1] = 1e6  # agent 1 is gone by then
+    config = replace(SILENT, likelihood=likelihood, variance=variance, rollout_weight=3.0)
+    ours = terms(config, batch(), output(rollout=rollout))
+    assert ours["nll_rollout"] == pytest.approx(expected)
+    assert ours["total"] == pytest.approx(3.0 * expected)
+
+
+def test_rollout_is_compared_with_what_followed_its_own_last_observation():
+    """Rows are aligned by `last_observed`, not by the beginning of the window."""
+    states = random_states(0, 2, 5, 2, 4)
+    windows = WindowBatch(states, torch.ones(2, 5, 2).bool(), torch.tensor([0, 2]))
+    truth = torch.stack([states[0, 1:3], states[1, 3:5]]).transpose(1, 2)
+    late = torch.stack([states[0, 2:4], states[1, 3:5]]).transpose(1, 2)
+    one_step = torch.cat([states[:, 1:], states[:, :1]], dim=1)  # what it says about after the end does not count
+    forecaster = any_model("mlp")
+    for rollout, right in ((truth, True), (late, False)):
+        total, parts = window_loss(forecaster, windows, WindowOutput(one_step, rollout), SILENT)
+        assert parts["nll_one_step"].item() == 0.0
+        assert (total.item() == 0.0) == right
+
+
+def test_no_rollout_no_term():
+    ours = terms(SILENT, batch(), output(rollout=torch.zeros(1, 2, 0, 4)))
+    assert "nll_rollout" not in ours and ours["total"] == 0.0
+
+
+def test_one_step_counts_transitions_of_who_stays():
+    """3 transitions: agent 0 twice, agent 1 once."""
+    one_step = torch.zeros(1, 3, 2, 4)
+    one_step[0, 1, 0, 0] = 10.0
+    one_step[0, 1, 1] = one_step[0, 2] = 1e6
+    ours = terms(replace(SILENT, one_step_weight=0.25), batch(), output(one_step=one_step))
+    assert ours["nll_one_step"] == pytest.approx(1 / 3)
+    assert ours["total"] == pytest.approx(0.25 / 3)
+
+
+# --- KL ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kl_scale", [0.0, 0.25, 1.0])
+def test_kl_and_its_warm_up(kl_scale: float):
+    out = output(prior=logits([0.5, 0.2], [0.5, 0.5]), posterior=logits([0.5, 0.8], [0.9, 0.5]))
+    expected = (binary_kl(0.8, 0.2) + binary_kl(0.9, 0.5)) / 4
+    ours = terms(replace(CONFIG, kl_weight=2.0), batch(), out, kl_scale)
+    assert ours["kl"] == pytest.approx(expected, rel=1e-5)  # reported in full, whatever it weighs
+    assert ours["total"] == pytest.approx(2.0 * kl_scale * expected, rel=1e-5, abs=1e-6)
+
+
+def test_what_the_prior_believes_is_reported():
+    ours = terms(CONFIG, batch(), output(prior=logits([0.1, 0.2], [0.3, 0.8]), posterior=EVEN))
+    entropy = [-p * math.log(p) - (1 - p) * math.log(1 - p) for p in (0.1, 0.2, 0.3, 0.8)]
+    assert ours["prior_edge_share"] == pytest.approx(0.35)
+    assert ours["prior_entropy"] == pytest.approx(np.mean(entropy), rel=1e-5)
+    assert "graph_accuracy" not in ours and "label" not in ours and "type_label" not in ours
+
+
+# --- Price of edges ---------------------------------------------------------------------------------------------------
+
+
+def test_edges_have_a_price():
+    out = output(prior=logits([0.1, 0.2], [0.3, 0.8]), posterior=logits([0.4, 0.4], [0.4, 0.8]))
+    ours = terms(replace(SILENT, edge_cost=3.0), batch(), out)
+    assert ours["total"] == pytest.approx(3.0 * (0.35 + 0.5), rel=1e-5)
+    assert terms(SILENT, batch(), out)["total"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_every_type_but_the_first_costs():
+    prior = per_pair([[0.0, 0.0, 0.0]] * 2, [[100.0, 0.0, 0.0]] * 2)
+    ours = terms(replace(SILENT, edge_cost=1.0), batch(), output(prior, prior))
+    assert ours["total"] == pytest.approx(2 * (2 / 3 + 0) / 2, rel=1e-5)
+
+
+# --- Labels -----------------------------------------------------------------------------------------------------------
+
+UNKNOWN = [[-1, -1], [-1, -1]]
+# Step 0: (0, 1) is an edge, (1, 0) is none. Step 1: (0, 1) is unknown, (1, 0) an edge. Step 2: labels of who is gone.
+TYPES = [[[[-1, 1], [0, -1]], [[-1, -1], [1, -1]], [[1, 1], [1, 1]]]]
+
+
+def test_type_labels_count_where_they_are_known():
+    prior, posterior = logits([0.2, 0.9], [0.3, 0.4]), logits([0.6, 0.9], [0.3, 0.4])
+    config = replace(SILENT, type_label_weight=2.0)
+    ours = terms(config, batch(TYPES), output(prior, posterior))
+    expected = (
+        -(math.log(0.2) + math.log(0.7) + math.log(0.4)) / 3 - (math.log(0.6) + math.log(0.7) + math.log(0.4)) / 3
+    )
+    assert ours["type_label"] == pytest.approx(expected, rel=1e-5)
+    assert ours["total"] == pytest.approx(2.0 * expected, rel=1e-5)
+    assert ours["graph_accuracy"] == pytest.approx(1 / 3)
+    without = terms(SILENT, batch(TYPES), output(prior, posterior))
+    assert "type_label" not in without and without["total"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_unknown_types_say_nothing():
+    prior = logits([0.2, 0.9], [0.3, 0.4]).requires_grad_()
+    windows = batch([[UNKNOWN] * 3])
+    total, parts = window_loss(model(), windows, output(prior, EVEN), replace(SILENT, type_label_weight=1.0))
+    assert (parts["type_label"].item(), parts["graph_accuracy"].item()) == (0.0, 0.0)
+    total.backward()
+    assert prior.grad is not None and not prior.grad.any()
+
+
+def test_more_types_than_the_model_has_are_edges():
+    types = [[[[-1, 2], [0, -1]], [[-1, 1], [2, -1]], UNKNOWN]]
+    ours = terms(SILENT, batch(types), output(prior=logits([0.9, 0.9], [0.1, 0.9])))
+    assert ours["graph_accuracy"] == 1.0
+
+
+def test_attributes_count_where_there_is_an_edge():
+    """Feature 0 is regressed on the attribute of pairs whose type is an edge: errors 1 and 3; feature 1 is free."""
+    features = per_pair([[2.0, 50.0], [9.0, 50.0]], [[9.0, 50.0], [5.0, 50.0]])
+    attributes = per_pair([[1.0], [5.0]], [[0.0], [2.0]])
+    config = replace(SILENT, label_weight=0.5)
+    ours = terms(config, batch(TYPES, attributes), output(features=features))
+    assert ours["label"] == pytest.approx((1 + 9) / 2)
+    assert ours["total"] == pytest.approx(0.5 * 5.0, rel=1e-5)
+    assert "label" not in terms(SILENT, batch(TYPES, attributes), output(features=features))
+
+
+def test_attributes_without_types_count_for_every_pair():
+    features, attributes = per_pair([[1.0], [1.0]], [[1.0], [3.0]]), per_pair([[1.0], [1.0]], [[1.0], [1.0]])
+    ours = terms(replace(SILENT, label_weight=1.0), batch(None, attributes), output(features=features))
+    assert ours["label"] == pytest.approx(4 / 4)
+
+
+def test_labels_of_a_model_without_features_have_no_term():
+    attributes = per_pair([[1.0], [1.0]], [[1.0], [1.0]])
+    assert "label" not in terms(replace(SILENT, label_weight=1.0), batch(TYPES, attributes), output(features=None))
+
+
+# --- Models without a graph -------------------------------------------------------------------------------------------
+
+
+def test_without_a_graph_only_the_likelihoods_count():
+    rollout = torch.zeros(1, 2, 2, 4)
+    rollout[0, 0, 0, 0] = 10.0
+    config = replace(CONFIG, kl_weight=5.0, edge_cost=5.0, label_weight=5.0, type_label_weight=5.0)
+    windows = batch(TYPES, per_pair([[1.0], [1.0]], [[1.0], [1.0]]))
+    ours = terms(config, windows, output(prior=None, posterior=None, rollout=rollout))
+    assert ours.keys() == {"total", "nll_one_step", "nll_rollout"}
+    assert ours["total"] == pytest.approx(1 / 3)
+
+
+def test_terms_are_for_reading_only():
+    """The objective carries the gradient, its terms do not."""
+    prior = logits([0.2, 0.9], [0.3, 0.4]).requires_grad_()
+    config = replace(CONFIG, edge_cost=1.0, type_label_weight=1.0)
+    total, parts = window_loss(model(), batch(TYPES), output(prior, EVEN), config)
+    assert total.requires_grad and not any(part.requires_grad for part in parts.values())
+
+
+def test_more_attributes_than_features_are_refused():
+    attributes = torch.zeros(1, 3, 2, 2, 3)
+    with pytest.raises(UserError, match="restricted labelling of 3 attributes needs as many edge features, got 1"):
+        terms(replace(SILENT, label_weight=1.0), batch(None, attributes), output(features=torch.zeros(1, 3, 2, 2, 1)))

@@ -1,0 +1,322 @@
+"""What a training run is made of: its data, its config, its schedules, and every kind of model through all of it."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from predictor.checkpoint import load_checkpoint
+from predictor.data.store import Episode, StoreInfo, write_store
+from predictor.errors import UserError
+from predictor.models import name_of
+from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
+from predictor.train import train
+from predictor.training import trainer as trainer_module
+from predictor.training.config import TrainConfig
+from predictor.training.objective import window_loss
+from predictor.training.trainer import Trainer, load_data, model_config, typical_change, typical_spread
+from tests.predictor.helpers import FAST_LIKE, circling_episode, random_states, spec, write_circles
+
+SMALL = {"steps": 2, "batch_size": 4, "history_steps": 3, "horizon_steps": 2, "val_fraction": 0.34, "eval_every": 2}
+# Every kind of model at a size that trains in milliseconds, as a user would ask for it.
+MODELS: dict[str, dict[str, Any]] = {
+    "dgvae": {"set": ("hidden_dim=5", "rnn_dim=4")},
+    "dgvae-rich": {
+        "input_changes": True,
+        "set": ("static_dim=2", "innovation_rounds=1", "substeps=2", "gated_messages=true", "residual=trapezoid"),
+    },
+    "dnri": {"set": ("hidden_dim=5", "rnn_dim=4", "decoder_dim=6", "message_dim=7")},
+    "imma": {"set": ("hidden_dim=5", "rnn_dim=4", "decoder_dim=6", "message_dim=7", "num_layers=3")},
+    "lstm": {"set": ("embed_dim=5", "rnn_dim=4")},
+    "lstm-joint": {"set": ("embed_dim=5", "rnn_dim=4", "joint=true")},
+    "mlp": {"set": ("hidden_dim=5",)},
+}
+pytestmark = pytest.mark.usefixtures("tiny")
+
+
+def config(data: Path, out: Path, **changes: Any) -> TrainConfig:
+    return TrainConfig(data=(data,), out=out, **(SMALL | changes))
+
+
+def made(settings: TrainConfig) -> Trainer:
+    settings.check()
+    return Trainer(settings, load_data(settings))
+
+
+# --- Every kind of model ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_every_model_trains_and_comes_back(circles: Path, tmp_path: Path, kind: str):
+    name = kind.partition("-")[0]
+    settings = config(circles, tmp_path / "run", model=name, **MODELS[kind])
+    loaded, info = load_checkpoint(train(settings))
+    assert (name_of(loaded), info.model, info.config) == (name, name, loaded.config)
+    assert info.provenance["train_config"]["model"] == name
+    assert info.provenance["result"]["step"] == 2
+    assert loaded.config.delta_scales and math.isfinite(info.provenance["result"]["val_min_ade_m"])
+    for override in settings.set:
+        what, _, value = override.partition("=")
+        assert str(getattr(loaded.config, what)).lower() == value
+    trained = Trainer(settings, load_data(settings))
+    trained.restore(tmp_path / "run" / "train_state.pt")
+    for name_, value in trained.model.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name_], value), name_
+    states, valid = random_states(0, 1, 2, 4), torch.ones(1, 2).bool()
+    trained.model.eval()
+    forecasts = []
+    for forecaster in (trained.model, loaded):
+        belief = forecaster.observe(forecaster.empty_memory(1, 2), states, valid)[1]
+        forecasts.append(forecaster.rollout(belief, 2))
+    assert torch.equal(*forecasts)
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_every_model_moves_all_of_its_weights(tmp_path: Path, kind: str):
+    crowd = write_circles(tmp_path / "crowd", agents=3)  # attention over a single other agent has nothing to learn
+    settings = config(crowd, tmp_path / "run", model=kind.partition("-")[0], **MODELS[kind])
+    trainer = made(settings)
+    before = {name: p.detach().clone() for name, p in trainer.model.named_parameters()}
+    terms = trainer.train_step()
+    assert all(map(math.isfinite, terms.values()))
+    assert ("kl" in terms) == (kind.startswith(("dgvae", "dnri")))
+    still = {name for name, p in trainer.model.named_parameters() if torch.equal(p, before[name])}
+    assert not still
+
+
+@pytest.mark.parametrize("model", ["dnri", "mlp"])
+def test_teacher_forced_training_takes_no_free_run(circles: Path, tmp_path: Path, model: str):
+    """As the NRI family is trained; validation is a free run all the same."""
+    trainer = made(config(circles, tmp_path, model=model, rollout_weight=0.0, set=("hidden_dim=4",)))
+    terms = trainer.train_step()
+    assert "nll_rollout" not in terms and "nll_one_step" in terms
+    assert math.isfinite(trainer.validate()[0].min_ade_m)
+
+
+# --- Config of the network --------------------------------------------------------------------------------------------
+
+
+def test_scales_are_fitted_to_the_training_episodes(circles: Path, tmp_path: Path):
+    settings = config(circles, tmp_path, input_changes=True, set=("residual=trapezoid",))
+    data = load_data(settings)
+    fitted = model_config(settings, data)
+    assert fitted.delta_scales == typical_change(data.train_episodes, spec(), "trapezoid")
+    assert fitted.change_scales == typical_change(data.train_episodes, spec(), "state")
+    assert fitted.delta_scales[:2] != fitted.change_scales[:2]
+    assert fitted.delta_scales[2:] == fitted.change_scales[2:]
+    assert replace(fitted, delta_scales=(), change_scales=()) == replace(FAST_LIKE, residual="trapezoid")
+    assert model_config(replace(settings, input_changes=False), data).change_scales == ()
+
+
+def test_given_scales_win_over_fitted_ones(circles: Path, tmp_path: Path):
+    settings = config(circles, tmp_path, model="mlp", set=("delta_scales=1,2,3,4",))
+    assert model_config(settings, load_data(settings)).delta_scales == (1.0, 2.0, 3.0, 4.0)
+
+
+@pytest.mark.parametrize("model", ["dnri", "imma", "lstm", "mlp"])
+def test_changes_are_an_input_of_the_dgvae_only(circles: Path, tmp_path: Path, model: Any):
+    settings = config(circles, tmp_path, model=model, input_changes=True)
+    message = f"--input-changes belongs to the dG-VAE; leave it out for --model {model}"
+    with pytest.raises(UserError) as error:
+        model_config(settings, load_data(settings))
+    assert str(error.value) == message
+
+
+@pytest.mark.parametrize(
+    ("residual", "position"),
+    # 3 m at 2 m/s, then 4 m at 3 m/s, ending at 5 m/s, along the third axis
+    [
+        ("state", math.sqrt((9 + 16) / 2)),
+        ("constant_velocity", math.sqrt((1 + 1) / 2)),
+        ("trapezoid", math.sqrt((0.5**2 + 0) / 2)),
+    ],
+)
+def test_typical_change_in_space(residual: Any, position: float):
+    states = np.zeros((3, 1, 6), dtype=np.float32)
+    states[:, 0, 2], states[:, 0, 5] = (0.0, 3.0, 7.0), (2.0, 3.0, 5.0)
+    layout = SceneSpec(1.0, ("world",) * 3, KINEMATIC_FEATURES_3D, (1.0,) * 6, has_ego=False)
+    episode = replace(circling_episode(0, 3, 1), states=states)
+    expected = [1e-3, 1e-3, position, 1e-3, 1e-3, math.sqrt((1 + 4) / 2)]
+    assert typical_change([episode], layout, residual) == pytest.approx(expected)
+
+
+# --- Data -------------------------------------------------------------------------------------------------------------
+
+
+def test_validation_stores_are_used_as_they_are(circles: Path, tmp_path: Path):
+    """All episodes of `data` train, all of `val_data` validate, and only `data` is what the model was made from."""
+    write_store(tmp_path / "val", StoreInfo(spec(), "held out"), [circling_episode(100 + i, steps=7) for i in range(3)])
+    settings = config(circles, tmp_path, val_data=(tmp_path / "val",), val_fraction=0.9)
+    data = load_data(settings)
+    assert ([len(w) for w in data.train], [len(w) for w in data.val]) == ([6 * 9], [3 * 6])
+    assert (data.sources, data.spec) == (("circles",), spec())
+    assert [e.seed for e in data.train_episodes] == list(range(6))
+    assert data.val[0].batch(np.array([0])).states[0, 0, 0].tolist() == pytest.approx(
+        circling_episode(100).states[0, 0].tolist()
+    )
+
+
+def test_validation_stores_must_fit(circles: Path, tmp_path: Path):
+    write_store(tmp_path / "val", StoreInfo(spec(dt_s=0.2), "quick"), [circling_episode(0)])
+    with pytest.raises(UserError, match=r"store .*circles was trained at dt_s=1 but store .*val steps at dt_s=0\.2"):
+        load_data(config(circles, tmp_path, val_data=(tmp_path / "val",)))
+
+
+@pytest.mark.parametrize("given", [False, True], ids=["held_out", "given"])
+def test_training_episodes_can_be_limited(circles: Path, tmp_path: Path, given: bool):
+    """The first ones of each training store; validation is what it was."""
+    write_circles(tmp_path / "val", episodes=3)
+    changes = {"val_data": (tmp_path / "val",)} if given else {}
+    everything, few = (load_data(config(circles, tmp_path, max_episodes=n, **changes)) for n in (0, 2))
+    assert [e.seed for e in few.train_episodes] == [e.seed for e in everything.train_episodes][:2]
+    assert [len(w) for w in few.train] == [2 * 9]
+    assert [len(w) for w in few.val] == [len(w) for w in everything.val]
+
+
+def test_validation_may_ask_for_whole_histories_and_horizons(circles: Path, tmp_path: Path):
+    """As in the tables: `history_steps` of burn-in and the whole horizon; training windows stay as they were."""
+    loose, strict = (load_data(config(circles, tmp_path, val_history_steps=n)) for n in (1, 3))
+    assert strict.val[0].index[:, 1].min() == 2 and strict.val[0].index[:, 1].max() == 10 - 2 - 1
+    assert loose.val[0].index[:, 1].min() == 0 and loose.val[0].index[:, 1].max() == 10 - 1 - 1
+    assert np.array_equal(strict.train[0].index, loose.train[0].index)
+    batch = strict.val[0].batch(np.arange(len(strict.val[0])))
+    assert (batch.last_observed == 2).all() and batch.valid[..., 0].all()
+
+
+@pytest.mark.parametrize(
+    ("option", "needed"), [("label_weight", "edge_attributes"), ("type_label_weight", "edge_types")]
+)
+def test_weights_of_labels_need_labels(circles: Path, tmp_path: Path, option: str, needed: str):
+    """In every training store; validation does without."""
+    labels = {
+        "edge_types": np.zeros((1, 2, 2), dtype=np.int8),
+        "edge_attributes": np.zeros((1, 2, 2, 1), dtype=np.float32),
+    }
+    episodes = [replace(circling_episode(i), **{needed: labels[needed]}) for i in range(3)]
+    write_store(tmp_path / "labelled", StoreInfo(spec(), "labelled"), episodes)
+    fine = config(tmp_path / "labelled", tmp_path / "run", val_data=(circles,), **{option: 1.0})
+    assert len(load_data(fine).train_episodes) == 3
+    with pytest.raises(UserError, match=f"{option} needs {needed}, and store .*circles has none; set it to 0 or use"):
+        load_data(replace(fine, data=(tmp_path / "labelled", circles)))
+
+
+# --- Schedules --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What one training step was like."""
+
+    history_steps: int
+    rollout_steps: int
+    kl_scale: float
+    states: Tensor = field(compare=False)
+
+
+@pytest.fixture
+def watched(monkeypatch: pytest.MonkeyPatch) -> list[Seen]:
+    """Filled by every training step."""
+    seen: list[Seen] = []
+
+    def watching(model: Any, batch: Any, output: Any, settings: Any, kl_scale: Tensor, scales: Tensor) -> Any:
+        longest = int(batch.last_observed.max()) + 1
+        seen.append(Seen(longest, output.rollout.shape[2], float(kl_scale), batch.states.clone()))
+        return window_loss(model, batch, output, settings, kl_scale, scales)
+
+    monkeypatch.setattr(trainer_module, "window_loss", watching)
+    return seen
+
+
+def run(settings: TrainConfig, steps: int, restore: Path | None = None) -> Trainer:
+    trainer = made(settings)
+    if restore:
+        trainer.restore(restore)
+    for _ in range(steps):
+        trainer.train_step()
+    return trainer
+
+
+@pytest.mark.parametrize(
+    ("changes", "what", "expected"),
+    [
+        ({}, "rollout_steps", [3] * 8),
+        ({"curriculum_steps": 6}, "rollout_steps", [1, 1, 1, 2, 2, 2, 3, 3]),
+        ({"curriculum_steps": 2}, "rollout_steps", [1, 2, 3, 3, 3, 3, 3, 3]),
+        ({"curriculum_steps": 6, "rollout_weight": 0.0}, "rollout_steps", [0] * 8),
+        ({}, "kl_scale", [1.0] * 8),
+        ({"kl_warmup_steps": 4}, "kl_scale", [0.25, 0.5, 0.75, 1.0, 1.0, 1.0, 1.0, 1.0]),
+        ({"kl_warmup_steps": 1}, "kl_scale", [1.0] * 8),
+        ({}, "history_steps", [5] * 8),
+        ({"min_history_steps": 5}, "history_steps", [5] * 8),
+    ],
+)
+def test_schedules(circles: Path, tmp_path: Path, watched: list[Seen], changes: Any, what: str, expected: list[Any]):
+    run(config(circles, tmp_path, history_steps=5, horizon_steps=3, batch_size=32, **changes), 8)
+    assert [getattr(seen, what) for seen in watched] == expected
+
+
+def test_histories_are_drawn_between_the_shortest_and_the_longest(circles: Path, tmp_path: Path, watched: list[Seen]):
+    run(config(circles, tmp_path, model="mlp", min_history_steps=2, history_steps=4, batch_size=32), 40)
+    drawn = [seen.history_steps for seen in watched]
+    assert set(drawn) == {2, 3, 4}
+    assert min(drawn.count(n) for n in (2, 3, 4)) > 5
+
+
+def test_schedules_are_functions_of_seed_and_step(circles: Path, tmp_path: Path, watched: list[Seen]):
+    """A run that is resumed sees the very batches that it would have seen."""
+    settings = config(
+        circles, tmp_path, min_history_steps=1, history_steps=5, horizon_steps=3, curriculum_steps=5, kl_warmup_steps=5
+    )
+    run(settings, 6)
+    whole = list(watched)
+    run(settings, 2).save(tmp_path / "state")
+    watched.clear()
+    np.random.default_rng().random(), torch.manual_seed(123)
+    run(settings, 4, restore=tmp_path / "state")
+    assert len(watched) == 4
+    for ours, expected in zip(watched, whole[2:], strict=True):
+        assert ours == expected and torch.equal(ours.states, expected.states)
+    watched.clear()
+    run(replace(settings, seed=1), 6)
+    assert [s.history_steps for s in watched] != [s.history_steps for s in whole]
+    assert [(s.rollout_steps, s.kl_scale) for s in watched] == [(s.rollout_steps, s.kl_scale) for s in whole]
+
+
+@pytest.mark.parametrize(
+    ("changes", "check"),
+    [
+        ({"edge_cost": 50.0}, lambda terms: terms["prior_edge_share"]),
+        ({"kl_weight": 50.0}, lambda terms: terms["kl"]),
+    ],
+    ids=["edge_cost", "kl"],
+)
+def test_weights_of_the_objective_are_felt(
+    circles: Path, tmp_path: Path, changes: dict[str, float], check: Callable[[dict[str, float]], float]
+):
+    def after(**weights: float) -> float:
+        trainer = made(config(circles, tmp_path, lr=0.2, batch_size=16, variance=1.0, **weights))
+        for _ in range(20):
+            terms = trainer.train_step()
+        return check(trainer.read(terms))
+
+    assert after(**changes) < 0.5 * after(**dict.fromkeys(changes, 0.0))
+
+
+def test_inputs_are_divided_by_their_spread_in_the_frame_of_the_spec():
+    """A road of 500 m by 12 m: the lane gets a scale of metres; relative to the ego, 10 km do not count."""
+    rng = np.random.default_rng(0)
+    states = np.zeros((40, 2, 4), dtype=np.float32)
+    states[..., 0] = 10_000 + rng.uniform(0, 500, (40, 2))
+    states[..., 1] = rng.uniform(0, 12, (40, 2))
+    states[..., 2] = 25 + rng.normal(size=(40, 2))
+    episode = Episode(states, np.ones((40, 2), dtype=np.bool_), np.arange(2))
+    world = typical_spread([episode], SceneSpec(dt_s=1.0))
+    assert world == pytest.approx([*states.reshape(-1, 4).std(axis=0)[:3], 0.3], rel=1e-3)  # a spread of 0 has a floor
+    relative = typical_spread([episode], SceneSpec(dt_s=1.0, frame=("ego", "world")))
+    assert relative[0] == pytest.approx((states[..., 0] - states[:, :1, 0]).std(), rel=1e-3)
