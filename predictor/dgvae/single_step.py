@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.autograd import forward_ad
 from torch.nn import functional
 
 from predictor.dgvae.networks import Decoder, Edges, Encoder, no_edge_where_absent
@@ -89,6 +90,12 @@ class Modules:
     def messages(self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor) -> Tensor:
         """As `Layers.messages`."""
         return self.decoder.messages(inputs, graph.present, weights, features, graph.senders)
+
+
+def differentiable() -> bool:
+    """Returns whether derivatives may be asked for: autograd, forward mode or a transform of `torch.func` is on."""
+    functional_transform: bool = torch._C._are_functorch_transforms_active()
+    return torch.is_grad_enabled() or functional_transform or forward_ad._current_level >= 0
 
 
 def unpacked(known: Internal, layers: Layers) -> Internal:

@@ -1,11 +1,8 @@
 """Layers on ordered pairs of agents: linear maps of receiver and sender, and sums of messages over senders."""
 
-from typing import Any
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 
@@ -53,8 +50,8 @@ class PairLinear(nn.Module):
         extra: Float[Tensor, "*batch agents slots out"] | None = None,
     ) -> Float[Tensor, "*batch agents slots out"]:
         """ELU of `forward`, and of what else is to be added to it; only the result is kept for the gradient."""
-        result: Tensor = _PairELU.apply(*self._roles(nodes, after), extra, senders)
-        return result
+        pairs = self(nodes, senders, after)
+        return functional.elu_(pairs if extra is None else pairs + extra)
 
     def _roles(self, nodes: Tensor, after: nn.Linear | None) -> tuple[Tensor, Tensor]:
         sent = self._product(self.sender, nodes, after)
@@ -76,43 +73,6 @@ def to_pairs(
         return nodes.index_select(-2, senders.flatten()).unflatten(-2, (agents, slots))
     rows = senders + agents * torch.arange(len(senders), device=senders.device)[:, None, None]
     return nodes.flatten(-3, -2).index_select(-2, rows.flatten()).unflatten(-2, tuple(senders.shape))
-
-
-class _PairELU(torch.autograd.Function):
-    """received and sent (…, A, W), extra (…, A, S, W) or None → elu(received_i + sent_j + extra_ij) (…, A, S, W)."""
-
-    @staticmethod
-    def forward(ctx: Any, received: Tensor, sent: Tensor, extra: Tensor | None, senders: Tensor | None) -> Tensor:
-        if senders is None:
-            pairs = received[..., :, None, :] + sent[..., None, :, :]
-        else:
-            pairs = to_pairs(sent, senders).add_(received[..., :, None, :])
-        if extra is not None:
-            pairs.add_(extra)
-        functional.elu_(pairs)
-        ctx.save_for_backward(pairs)
-        ctx.senders, ctx.has_extra = senders, extra is not None
-        return pairs
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        (pairs,) = ctx.saved_tensors
-        grad = torch.ops.aten.elu_backward(grad, 1.0, 1.0, 1.0, True, pairs)
-        received = grad.sum(-2)
-        sent = grad.sum(-3) if ctx.senders is None else _from_pairs(grad, ctx.senders)
-        return received, sent, grad if ctx.has_extra else None, None
-
-
-def _from_pairs(pairs: Tensor, senders: Tensor) -> Tensor:
-    """What `to_pairs` gave, summed back to its senders."""
-    agents, slots = senders.shape[-2:]
-    if senders.ndim == 2:
-        total = pairs.new_zeros(*pairs.shape[:-3], agents, pairs.shape[-1])
-        return total.index_add_(-2, senders.flatten(), pairs.flatten(-3, -2))
-    rows = senders + agents * torch.arange(len(senders), device=senders.device)[:, None, None]
-    total = pairs.new_zeros(*pairs.shape[:-4], len(senders) * agents, pairs.shape[-1])
-    return total.index_add_(-2, rows.flatten(), pairs.flatten(-4, -2)).unflatten(-2, (len(senders), agents))
 
 
 def folded(outer: nn.Linear, inner: nn.Linear) -> tuple[Float[Tensor, "out in"], Float[Tensor, " out"]]:
