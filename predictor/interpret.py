@@ -29,6 +29,7 @@ from predictor.checkpoint import CONSTANT_VELOCITY, CheckpointInfo, load_checkpo
 from predictor.data.store import StoreInfo, read_store
 from predictor.data.windows import Windows
 from predictor.errors import UserError, run_entry_point
+from predictor.evaluation.disentanglement import sklearn
 from predictor.evaluation.edge_findings import Findings, measure, watch
 from predictor.evaluation.outcomes import run_window_batch
 from predictor.files import write_json
@@ -91,6 +92,8 @@ def interpret(config: InterpretConfig) -> Findings:
     model, info = _load_model(config.checkpoint, config.device)
     store = read_store(config.data)
     info.spec.check_compatible(store.info.spec, f"checkpoint '{config.checkpoint}'", f"store {config.data}")
+    if any(e.edge_types is not None or e.edge_attributes is not None for e in store.episodes):
+        sklearn("metrics")  # known to be missing now, not after everything was measured
     try:
         lengths = (config.history_steps, config.horizon_steps)
         windows = Windows(

@@ -23,6 +23,7 @@ from rich.progress import Progress
 
 from predictor.data.store import read_info_of
 from predictor.errors import UserError, run_entry_point
+from predictor.evaluation.disentanglement import sklearn
 from predictor.evaluation.measure_row import measure_row
 from predictor.evaluation.paper_tables import BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, TABLES, Budget, Row, Sizes
 from predictor.files import write_json
@@ -154,6 +155,8 @@ def row_folder(config: SuiteConfig, row: Row) -> Path:
 
 def run_row(config: SuiteConfig, row: Row) -> dict[str, Any]:
     """Train (or resume) and measure one row; writes and returns its result."""
+    if read_info_of(config.data / TABLES[config.table].train).edge_attribute_names:
+        sklearn("linear_model")  # known to be missing now, not after training
     folder = row_folder(config, row)
     folder.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()

@@ -6,9 +6,10 @@ the mean alone. Where a number cannot be had (nothing valid, a constant target) 
 
 Sources: DCI, Eastwood & Williams, "A Framework for the Quantitative Evaluation of Disentangled Representations", ICLR
 2018; MIG, Chen et al., "Isolating Sources of Disentanglement in VAEs", NeurIPS 2018 (histograms as in Locatello et al.,
-ICML 2019). `dci` needs scikit-learn (the `scores` extra).
+ICML 2019). All but `direct_r2` needs scikit-learn (the `scores` extra).
 """
 
+import importlib
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -19,6 +20,18 @@ from predictor.errors import UserError
 
 MIN_R2 = 0.01
 """Held-out R² from which on `dci` believes that a factor can be read."""
+
+
+def sklearn(module: str) -> Any:
+    """Returns a module of scikit-learn, which is loaded only where it is needed.
+
+    Raises:
+        UserError: scikit-learn is not installed.
+    """
+    try:
+        return importlib.import_module(f"sklearn.{module}")
+    except ImportError as error:
+        raise UserError("scores of edge features need scikit-learn: pip install 'dgvae-rl[scores]'") from error
 
 
 def direct_r2(
@@ -68,14 +81,9 @@ def linear_r2(
     known, answers = features[fit][valid[fit]].astype(np.float64), target[fit][valid[fit]].astype(np.float64)
     if len(answers) < 2:
         return None
-    mean, std = known.mean(0), known.std(0)
-    scale = np.where(std > 0, std, 1.0)
-    known = (known - mean) / scale
-    weights = np.linalg.solve(
-        known.T @ known + ridge * len(known) * np.eye(known.shape[1]), known.T @ (answers - answers.mean())
-    )
-    asked = (features[score][valid[score]] - mean) / scale
-    prediction, truth = asked @ weights + answers.mean(), target[score][valid[score]]
+    scaler, penalty = sklearn("preprocessing").StandardScaler(), ridge * len(known)
+    model = sklearn("pipeline").make_pipeline(scaler, sklearn("linear_model").Ridge(penalty)).fit(known, answers)
+    prediction, truth = model.predict(features[score][valid[score]]), target[score][valid[score]]
     return direct_r2(prediction, truth, np.ones(len(truth), dtype=np.bool_))
 
 
@@ -121,7 +129,8 @@ def dci(
         raise ValueError(f"dci needs at least 4 rows, got {len(features)}")
     order = np.random.default_rng(seed).permutation(len(features))
     fit, score = order[: len(order) // 2], order[len(order) // 2 :]
-    inputs, outputs = _standardised(features, fit), _standardised(factors, fit)
+    scale = sklearn("preprocessing").StandardScaler
+    inputs, outputs = (scale().fit(values[fit]).transform(values) for values in (features, factors))
     importance = np.zeros((features.shape[1], factors.shape[1]))
     everything = np.ones(len(score), dtype=np.bool_)
     scores = []
@@ -171,19 +180,9 @@ def mutual_information(
 
 
 def _regressor(kind: Literal["lasso", "forest"], alpha: float, seed: int) -> Any:
-    try:
-        from sklearn.ensemble import RandomForestRegressor
-        from sklearn.linear_model import Lasso
-    except ImportError as error:
-        raise UserError("dci needs scikit-learn: pip install 'dgvae-rl[scores]'") from error
     if kind == "lasso":
-        return Lasso(alpha=alpha)
-    return RandomForestRegressor(n_estimators=50, min_samples_leaf=5, random_state=seed)
-
-
-def _standardised(values: np.ndarray, fit: np.ndarray) -> np.ndarray:
-    std = values[fit].std(0)
-    return (values - values[fit].mean(0)) / np.where(std > 0, std, 1.0)
+        return sklearn("linear_model").Lasso(alpha=alpha)
+    return sklearn("ensemble").RandomForestRegressor(n_estimators=50, min_samples_leaf=5, random_state=seed)
 
 
 def _decided(importance: Float[np.ndarray, "rows columns"]) -> float:
@@ -209,11 +208,7 @@ def _labels(values: Float[np.ndarray, "rows columns"], bins: int) -> Int[np.ndar
 
 def _information(first: Int[np.ndarray, " rows"], second: Int[np.ndarray, " rows"]) -> float:
     """Mutual information of two labels [nats]; of a label with itself its entropy."""
-    joint = np.zeros((first.max() + 1, second.max() + 1))
-    np.add.at(joint, (first, second), 1.0)
-    row, column = joint.sum(1), joint.sum(0)
-    filled = joint > 0
-    expected = np.outer(row, column)[filled] / len(first)
-    plain = float((joint[filled] * np.log(joint[filled] / expected)).sum()) / len(first)
-    excess = filled.sum() - (row > 0).sum() - (column > 0).sum() + 1
-    return max(0.0, plain - float(excess) / (2 * len(first)))
+    cluster = sklearn("metrics.cluster")
+    joint = cluster.contingency_matrix(first, second, sparse=True)
+    excess = joint.nnz - joint.shape[0] - joint.shape[1] + 1
+    return max(0.0, float(cluster.mutual_info_score(None, None, contingency=joint)) - excess / (2 * len(first)))

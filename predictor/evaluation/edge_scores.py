@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from predictor.errors import UserError
-from predictor.evaluation.disentanglement import DCI, dci, direct_r2, linear_r2, mig
+from predictor.evaluation.disentanglement import DCI, dci, direct_r2, linear_r2, mig, sklearn
 
 SHUFFLES = 100
 CHANCE_QUANTILE = 0.95
@@ -169,7 +168,7 @@ def score_factor(
 
 
 def rank_statistic(values: Float[np.ndarray, "rows dims"], exists: Bool[np.ndarray, " rows"]) -> list[float]:
-    """Share of (edge, no edge) couples in which the edge has the larger value, ties half; 0.5 knows nothing.
+    """Area under the ROC curve (AUC) of each dimension: chance that an edge has a larger value than a pair without one.
 
     Raises:
         ValueError: all rows are edges, or none.
@@ -177,12 +176,8 @@ def rank_statistic(values: Float[np.ndarray, "rows dims"], exists: Bool[np.ndarr
     with_edge, without = int(exists.sum()), int((~exists).sum())
     if not with_edge or not without:
         raise ValueError(f"rows with and without an edge are needed, got {with_edge} with and {without} without")
-    found = []
-    for column in values.T:
-        _, kind, count = np.unique(column, return_inverse=True, return_counts=True)
-        ranks = (np.cumsum(count) - (count - 1) / 2)[kind]
-        found.append(float((ranks[exists].sum() - with_edge * (with_edge + 1) / 2) / (with_edge * without)))
-    return found
+    area = sklearn("metrics").roc_auc_score
+    return [float(area(exists, column)) for column in values.T]
 
 
 def separation(
@@ -199,18 +194,13 @@ def separation(
 def disentanglement(
     features: Float[np.ndarray, "rows dims"], factors: Float[np.ndarray, "rows factors"], seed: int = 0
 ) -> Disentanglement:
-    """DCI (where scikit-learn is installed) and MIG of the factors that vary."""
+    """DCI and MIG of the factors that vary."""
     if len(features) < 4:
         return Disentanglement(len(features), None, None, f"needs at least 4 edges, got {len(features)}")
     factors = factors[:, _standardised(factors).any(axis=0)]
     if not factors.shape[1]:
         return Disentanglement(len(features), None, None, "no attribute varies")
-    found, note = None, ""
-    try:
-        found = dci(features, factors, seed=seed)
-    except UserError as error:
-        note = str(error)
-    return Disentanglement(len(features), mig(features, factors), found, note)
+    return Disentanglement(len(features), mig(features, factors), dci(features, factors, seed=seed))
 
 
 class StillnessTally:

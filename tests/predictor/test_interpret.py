@@ -1,4 +1,3 @@
-import builtins
 import json
 import sys
 from collections.abc import Iterator
@@ -13,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from sklearn.metrics import roc_auc_score
 
 from predictor import interpret as interpretation
 from predictor.baselines.mlp import MLP, MLPConfig
@@ -149,11 +147,13 @@ def test_rank_statistic_closed_form(values: list[float], share: float):
 
 
 @given(st.integers(0, 10**6))
-def test_rank_statistic_against_scikit_learn(seed: int):
+def test_rank_statistic_is_that_of_all_couples(seed: int):
     rng = np.random.default_rng(seed)
     values, exists = rng.integers(5, size=(40, 2)).astype(float), rng.random(40) < 0.4
     exists[:2] = False, True
-    assert rank_statistic(values, exists) == pytest.approx([roc_auc_score(exists, c) for c in values.T])
+    difference = values[exists][:, None] - values[~exists][None]
+    share = ((difference > 0) + 0.5 * (difference == 0)).mean(axis=(0, 1))
+    assert rank_statistic(values, exists) == pytest.approx(share.tolist(), abs=1e-12)
 
 
 def test_rank_statistic_needs_both_kinds():
@@ -185,20 +185,6 @@ def test_attributes_that_do_not_vary_are_left_out():
     assert found.dci is not None and found.dci.disentanglement is None  # one factor is left
     assert disentanglement(drawn(1, ROWS, 2), np.ones((ROWS, 1))).note == "no attribute varies"
     assert disentanglement(drawn(1, 3, 2), drawn(2, 3, 1)).note == "needs at least 4 edges, got 3"
-
-
-def test_without_scikit_learn_a_note_stands_in_for_dci(monkeypatch: pytest.MonkeyPatch):
-    genuine = builtins.__import__
-
-    def without(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.startswith("sklearn"):
-            raise ImportError(name)
-        return genuine(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    found = disentanglement(drawn(0, 200, 2), drawn(1, 200, 1))
-    assert found.dci is None and found.mig is not None
-    assert found.note == "dci needs scikit-learn: pip install 'dgvae-rl[scores]'"
 
 
 # --- Stillness --------------------------------------------------------------------------------------------------------
@@ -289,7 +275,7 @@ def test_watching_ends_with_what_the_forecaster_believes():
     np.testing.assert_array_equal(watched.edge_probs[:, -1], outcome.edge_probs)
     static = slice(0, forecaster.config.static_dim)
     first = watch(forecaster, windows.batch(np.array([0]), history_steps=4)).features[:, 0]
-    np.testing.assert_allclose(watched.features[:1, 0, ..., static], first[..., static])
+    np.testing.assert_allclose(watched.features[:1, 0, ..., static], first[..., static], rtol=1e-5, atol=1e-6)
 
 
 def test_known_pairs_are_read_at_the_last_observed_step():
@@ -458,6 +444,18 @@ def test_smoke_with_labels(
     text = (out / "scores.md").read_text()
     assert "| property | pairs | best | r |" in text and "* DCI: disentanglement – (not defined for one" in text
     assert "| 2 | static |" in text and "| 3 | dynamic |" in text and "nan" not in text
+
+
+def test_without_scikit_learn_labels_are_refused_before_anything_is_measured(
+    monkeypatch: pytest.MonkeyPatch, springs: Path, tmp_path: Path
+):
+    checkpoint, out = saved(tmp_path / "toy", spring_spec(Physics(num_agents=4))), tmp_path / "out"
+    for name in [name for name in sys.modules if name.split(".")[0] == "sklearn"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setattr(interpretation, "measure", lambda *_: pytest.fail("measured"))
+    with pytest.raises(UserError, match=r"need scikit-learn: pip install 'dgvae-rl\[scores\]'"):
+        interpret(InterpretConfig(str(checkpoint), springs, out, 5, 4, 3, 2))
+    assert not out.exists()
 
 
 def test_smoke_without_labels_and_with_an_ego(springs: Path, tmp_path: Path):

@@ -1,6 +1,7 @@
 """The suite: rows are trained and measured once, failures say why, and the table says what was run."""
 
 import json
+import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -64,6 +65,16 @@ def test_every_kind_of_row_is_trained_and_measured(data: Path, tmp_path: Path, k
     assert (measured["features"] is None) == (key != "dgvae-rl")
     saved = json.loads((row_folder(config(data, tmp_path), row(key)) / "result.json").read_text())
     assert saved["tests"]["test"]["horizon_only"]["min_ade_m"] == horizon["min_ade_m"]
+
+
+def test_a_row_on_labelled_data_needs_scikit_learn_before_it_is_trained(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    for name in [name for name in sys.modules if name.split(".")[0] == "sklearn"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setattr(suite, "train", lambda _: pytest.fail("trained"))
+    with pytest.raises(UserError, match=r"need scikit-learn: pip install 'dgvae-rl\[scores\]'"):
+        run_row(config(data, tmp_path), row("dgvae-rl"))
 
 
 def test_all_rows_of_a_table_share_data_steps_and_protocol(data: Path, tmp_path: Path):

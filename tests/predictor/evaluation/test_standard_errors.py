@@ -112,3 +112,21 @@ def test_intervals_depend_on_the_seed_alone_and_are_about_right():
     assert first is not None
     assert first[0] < values.mean() < first[1]
     assert first[1] - first[0] == pytest.approx(2 * 1.96 * 2 / 20, rel=0.15)
+
+
+@pytest.mark.parametrize("root", [False, True])
+def test_intervals_are_those_of_scipy_up_to_the_draws(root: bool):
+    """SciPy draws indices, one set per call; here equal seeds draw equal episodes for every line of a table."""
+    stats = pytest.importorskip("scipy.stats")
+    rng = np.random.default_rng(0)
+    counts = rng.integers(1, 9, 60).astype(np.float64)
+    sums = counts * rng.gamma(2.0, size=60)
+
+    def ratio(sums: np.ndarray, counts: np.ndarray, axis: int) -> np.ndarray:
+        return (sums.sum(axis) / counts.sum(axis)) ** (0.5 if root else 1.0)
+
+    library = stats.bootstrap(
+        (sums, counts), ratio, paired=True, method="percentile", n_resamples=20_000, rng=np.random.default_rng(1)
+    ).confidence_interval
+    ours = batch_interval(sums, counts, root=root)
+    assert ours == pytest.approx((library.low, library.high), abs=0.05 * (library.high - library.low))

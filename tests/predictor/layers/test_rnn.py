@@ -135,3 +135,23 @@ def test_memory_layout_changes_nothing(layout: Callable[[Tensor], Tensor]):
     gates, hidden, cell = inputs
     ours = masked_lstm(layout(gates), recurrent, layout(pairs), hidden, cell)
     torch.testing.assert_close(ours, masked_lstm(gates, recurrent, pairs, hidden, cell), **EXACT)
+
+
+@pytest.mark.parametrize(
+    "correct", [None, lambda _, h: torch.zeros(*h.shape[:-1], 4 * RNN)], ids=["plain", "corrected"]
+)
+def test_recurrences_are_not_rounded_under_autocast(correct: Any):
+    inputs, recurrent, pairs = lstm_case(0, 0.8)
+    gates, hidden, cell = (x.detach().float() for x in inputs)
+    recurrent, rnn = recurrent.float(), nn.GRUCell(WIDTH, RNN)
+    sequence, valid, state = draw(3, BATCH, TIME, AGENTS, WIDTH).detach().float(), pairs.any(-1), hidden[:, :, 0]
+    expected = *masked_lstm(gates, recurrent, pairs, hidden, cell), masked_gru(sequence, rnn, valid, state)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = (
+            *masked_lstm(gates, recurrent, pairs, hidden, cell, correct=correct),
+            masked_gru(sequence, rnn, valid, state),
+        )
+        rounded = masked_lstm(gates.bfloat16(), recurrent, pairs, hidden, cell)[0]
+    for ours, exact in zip(found, expected, strict=True):
+        assert torch.equal(ours, exact)
+    assert rounded.dtype is torch.float32 and not torch.equal(rounded, expected[0])  # inputs may be rounded before
