@@ -24,6 +24,7 @@ from agents.arena import open_arena
 from agents.runs import POLICY_FILE, load_model, read_config
 from agents.task import EVALUATION_SEED, Task
 from agents.vec_envs import EpisodeResult
+from predictor import markdown
 from predictor.errors import UserError, run_entry_point
 from predictor.files import write_json, write_text
 from predictor.provenance import provenance
@@ -96,9 +97,7 @@ class Evaluation:
     def markdown(self) -> str:
         """The table for a README."""
         header, rows = self._cells()
-        lines = ["| " + " | ".join(header) + " |", "|---" * len(header) + "|"]
-        lines += ["| " + " | ".join(row) + " |" for row in rows]
-        return "\n".join(lines) + f"\n\n{self.env_id}: {self._caption()}\n"
+        return f"{markdown.table(header, rows)}\n\n{self.env_id}: {self._caption()}\n"
 
     def table(self) -> Table:
         """The table for a terminal."""

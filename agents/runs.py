@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.presets import Algorithm
 from predictor.errors import UserError
-from predictor.files import partial_path, publish, write_json
+from predictor.files import delete_leftovers, new_file, write_json
 
 CONFIG_FILE = "config.json"
 CHECKPOINT_FILE = "checkpoint.zip"
@@ -56,8 +56,7 @@ def open_run(
             raise UserError(f"{run_dir} exists; choose another --run-dir, or continue it with --resume")
         starts = _check_same(file, config, free)
     run_dir.mkdir(parents=True, exist_ok=True)
-    for leftover in run_dir.glob(".*.partial"):
-        leftover.unlink()
+    delete_leftovers(run_dir)
     write_json(file, {"config": config, "provenance": [*starts, provenance]})
 
 
@@ -79,15 +78,14 @@ def save_model(model: BaseAlgorithm, path: Path, note: dict[str, Any] | None = N
         note: small JSON content that travels inside.
         buffer: put the replay buffer inside as well, if the algorithm has one.
     """
-    partial = partial_path(path)
-    with partial.open("wb") as file:
-        model.save(file)
-    with zipfile.ZipFile(partial, "a") as archive:
-        archive.writestr(_NOTE_ENTRY, json.dumps(note or {}))
-        if buffer and isinstance(model, OffPolicyAlgorithm):
-            with archive.open(_BUFFER_ENTRY, "w", force_zip64=True) as entry:
-                pickle.dump(model.replay_buffer, entry, protocol=pickle.HIGHEST_PROTOCOL)
-    publish(partial, path)
+    with new_file(path) as partial:
+        with partial.open("wb") as file:
+            model.save(file)
+        with zipfile.ZipFile(partial, "a") as archive:
+            archive.writestr(_NOTE_ENTRY, json.dumps(note or {}))
+            if buffer and isinstance(model, OffPolicyAlgorithm):
+                with archive.open(_BUFFER_ENTRY, "w", force_zip64=True) as entry:
+                    pickle.dump(model.replay_buffer, entry, protocol=pickle.HIGHEST_PROTOCOL)
 
 
 def load_model(path: Path, algorithm: Algorithm, venv: VecEnv | None = None, device: str = "cpu") -> BaseAlgorithm:

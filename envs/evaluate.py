@@ -33,7 +33,7 @@ from predictor.evaluation.accuracy import Accuracy, Tally, fitted_std_m
 from predictor.evaluation.displacement import MISS_THRESHOLD_M, min_ade
 from predictor.evaluation.graph_accuracy import GraphAccuracy, GraphTally
 from predictor.evaluation.outcomes import Outcome
-from predictor.files import write_json
+from predictor.files import write_json, write_text
 from predictor.graph import pair_mask
 from predictor.provenance import provenance
 from predictor.reports.tables import ROW_NAMES, accuracy_table
@@ -290,7 +290,7 @@ def main() -> None:
         content: dict[str, Any] = {"config": asdict(config), "results": [asdict(r) for r in results]}
         misfit = [{"env_id": e, "checkpoint": c, "why": why} for (e, c), why in misfits.items()]
         write_json(config.out / "accuracy.json", _finite(content | {"misfits": misfit, "provenance": made}))
-        (config.out / "accuracy.md").write_text(report.markdown(results, misfits))
+        write_text(config.out / "accuracy.md", report.markdown(results, misfits))
 
 
 if __name__ == "__main__":

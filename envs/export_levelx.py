@@ -7,8 +7,6 @@ simulator's own. Accelerations are backward differences of the velocity, zero in
 """
 
 import csv
-import shutil
-import uuid
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +23,7 @@ from envs.readers.highway import HighwayReader, is_highway_env
 from envs.registry import make_env
 from predictor.data.store import Episode
 from predictor.errors import UserError, run_entry_point
-from predictor.files import replace_folder, write_json
+from predictor.files import new_folder, write_json
 from predictor.provenance import provenance
 
 FRAMES_PER_S = 25
@@ -196,10 +194,8 @@ def export(config: ExportConfig) -> int:
     """
     env = export_env(config.env_id)
     make_ego(config.ego, env, np.random.default_rng(0))
-    partial = config.out.with_name(f".{config.out.name}.{uuid.uuid4().hex[:8]}.partial")
     frames = 0
-    try:
-        partial.mkdir(parents=True)
+    with new_folder(config.out) as partial:
         for i in track(range(config.episodes), f"export {config.env_id}"):
             episode, heading_rad = roll_out(env, config.ego, config.seed + i, config.max_steps)
             ego: Any = env.unwrapped.vehicle  # type: ignore[attr-defined]
@@ -207,9 +203,6 @@ def export(config: ExportConfig) -> int:
             frames += len(episode.states)
         made = provenance(("highway-env", "gymnasium", "numpy"))
         write_json(partial / "export.json", {"env_id": config.env_id, "seed": config.seed, "provenance": made})
-        replace_folder(partial, config.out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return frames
 
 

@@ -14,6 +14,8 @@ import tyro
 from predictor.checkpoint import CheckpointInfo, load_checkpoint
 from predictor.data.store import EpisodeStore, read_store
 from predictor.errors import UserError, run_entry_point
+from predictor.files import write_text
+from predictor.markdown import table
 
 
 @dataclass(frozen=True)
@@ -73,27 +75,30 @@ def write_card(config: CardConfig) -> Path:
         ]
     )
     path = config.checkpoint / "README.md"
-    path.write_text(text + "\n")
+    write_text(path, text + "\n")
     return path
 
 
 def _accuracy(rows: Sequence[dict[str, Any]]) -> str:
-    lines = [
-        "| env | minADE₁ [m] | minFDE₁ [m] | minADE_K [m] | neighbours ADE [m] | CV ADE / FDE [m] | below CV "
-        "| 95 % interval |",
-        "|" + "---|" * 8,
-    ]
+    headings = ["env", "minADE₁ [m]", "minFDE₁ [m]", "minADE_K [m]", "neighbours ADE [m]", "CV ADE / FDE [m]"]
+    lines = []
     for row in rows:
         one, straight = row["model"], row["constant_velocity"]
         low, high = row["reduction_interval"]
         near = row.get("nearest_neighbours")
         lines.append(
-            f"| {row['env_id']} | {_metres(one['min_ade_m'])} | {_metres(one['min_fde_m'])} | "
-            f"{_metres(row['model_samples']['min_ade_m'])} | {'–' if near is None else _metres(near['min_ade_m'])} | "
-            f"{_metres(straight['min_ade_m'])} / {_metres(straight['min_fde_m'])} | "
-            f"{100 * row['reduction']:.0f} % | {100 * low:.0f} to {100 * high:.0f} % |"
+            [
+                row["env_id"],
+                _metres(one["min_ade_m"]),
+                _metres(one["min_fde_m"]),
+                _metres(row["model_samples"]["min_ade_m"]),
+                "–" if near is None else _metres(near["min_ade_m"]),
+                f"{_metres(straight['min_ade_m'])} / {_metres(straight['min_fde_m'])}",
+                f"{100 * row['reduction']:.0f} %",
+                f"{100 * low:.0f} to {100 * high:.0f} %",
+            ]
         )
-    return "\n".join(lines)
+    return table([*headings, "below CV", "95 % interval"], lines)
 
 
 def _metres(value: float) -> str:

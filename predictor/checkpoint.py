@@ -5,8 +5,6 @@ A checkpoint carries everything needed to run it (spec, sizes, horizon, residual
 
 import dataclasses
 import json
-import shutil
-import uuid
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,7 @@ from torch import nn
 
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.errors import UserError
-from predictor.files import replace_folder
+from predictor.files import new_folder, write_json
 from predictor.forecaster import TrainableForecaster
 from predictor.models import build, config_from_json, name_of
 from predictor.scene import SceneSpec
@@ -53,18 +51,10 @@ def save_checkpoint(path: Path, model: nn.Module, info: CheckpointInfo) -> None:
     """Write a checkpoint folder; an existing one is replaced only when the new one is complete."""
     if name_of(model) != info.model:
         raise UserError(f"the checkpoint says model '{info.model}' but the network is '{name_of(model)}'")
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.partial")
-    partial.mkdir()
-    try:
+    with new_folder(Path(path)) as partial:
         tensors = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
         save_file(tensors, partial / "model.safetensors")
-        content = {"format": FORMAT, "version": VERSION, **asdict(info)}
-        (partial / "config.json").write_text(json.dumps(content, indent=2, default=str) + "\n")
-        replace_folder(partial, path)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        write_json(partial / "config.json", {"format": FORMAT, "version": VERSION, **asdict(info)})
 
 
 def resolve(name: str | Path) -> Path:

@@ -24,7 +24,7 @@ from predictor.data.windows import Windows
 from predictor.errors import UserError, run_entry_point
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import Outcome, run_window_batch, run_windows
-from predictor.files import write_json
+from predictor.files import write_json, write_text
 from predictor.forecaster import Forecaster
 from predictor.provenance import provenance
 from predictor.reports.plots import plot_error_by_horizon, plot_scene
@@ -139,7 +139,7 @@ def _write(config: EvaluateConfig, rows: Sequence[Accuracy], source: str, dt_s: 
     made = provenance(("torch", "numpy"))
     content = {"source": source, "dt_s": dt_s, "config": asdict(config), "rows": [asdict(r) for r in rows]}
     write_json(config.out / "accuracy.json", content | {"provenance": made})
-    (config.out / "accuracy.md").write_text(markdown_table(rows, dt_s))
+    write_text(config.out / "accuracy.md", markdown_table(rows, dt_s))
 
 
 def _plot(

@@ -10,8 +10,6 @@ that the decoder uses it (docs/interpretability.md).
 """
 
 import os
-import shutil
-import uuid
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -31,7 +29,7 @@ from predictor.data.windows import Windows
 from predictor.errors import UserError, run_entry_point
 from predictor.evaluation.edge_findings import Findings, measure, watch
 from predictor.evaluation.outcomes import run_window_batch
-from predictor.files import write_json
+from predictor.files import scratch_folder, write_json, write_text
 from predictor.provenance import provenance
 from predictor.reports import edge_plots as pictures
 from predictor.reports.tables import scores_markdown
@@ -110,22 +108,18 @@ def interpret(config: InterpretConfig) -> Findings:
     )
     content = _content(config, info, store.info, findings)
     out = config.out.resolve()
-    partial = out.with_name(f".{out.name}.{uuid.uuid4().hex[:8]}.partial")
-    partial.mkdir(parents=True)
-    try:
+    with scratch_folder(out) as partial:
         shown = _shown(config, model, windows, first, store.info)
         graphs = _shown(config, model, windows, _by_accuracy(np.sort(drawn), accuracies), store.info)
         _draw(partial, config, content, findings, shown, graphs, info.spec)
         write_json(partial / "scores.json", content)
-        (partial / "scores.md").write_text(scores_markdown(content), encoding="utf-8")
+        write_text(partial / "scores.md", scores_markdown(content))
         out.mkdir(exist_ok=True)
         for name in FILES:
             if (partial / name).exists():
                 os.replace(partial / name, out / name)
             else:  # of an earlier run; it would mislead beside the new ones
                 (out / name).unlink(missing_ok=True)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return findings
 
 

@@ -25,7 +25,7 @@ from predictor.data.store import read_info_of
 from predictor.errors import UserError, run_entry_point
 from predictor.evaluation.measure_row import measure_row
 from predictor.evaluation.paper_tables import BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, TABLES, Budget, Row, Sizes
-from predictor.files import write_json
+from predictor.files import write_json, write_text
 from predictor.provenance import provenance
 from predictor.reports.plots import plot_rows_by_step
 from predictor.reports.tables import latex_table, markdown_report
@@ -200,9 +200,7 @@ def run_suite(config: SuiteConfig) -> dict[str, Any]:
     config.folder.mkdir(parents=True, exist_ok=True)
     write_json(config.folder / "table.json", content)
     for name, text in (("table.md", markdown_report(content)), ("table.tex", latex_table(content))):
-        partial = config.folder / f".{name}.partial"
-        partial.write_text(text)
-        os.replace(partial, config.folder / name)
+        write_text(config.folder / name, text)
     if content["rows"]:
         _plot(config, content["rows"], content["title"])
     return content

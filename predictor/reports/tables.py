@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from predictor import markdown
 from predictor.evaluation.accuracy import Accuracy
 from predictor.evaluation.displacement import COVERAGE_SHARE
 
@@ -89,13 +90,13 @@ def _accuracy_table(content: dict[str, Any], view: str) -> str:
     headings.append(
         "paper's " + " / ".join(name for name, _ in METRICS.values()) + (" / OOD" if "ood" in kinds else "")
     )
-    lines = ["| " + " | ".join(headings) + " |", "|---|" + "---:|" * (len(headings) - 2) + "---|"]
+    lines = []
     for row in content["rows"]:
         cells = [_cell(row, view, kind, metric) for kind in kinds for metric in METRICS]
         figures = content["paper"].get(row["key"], {})
         beside = " / ".join(f"{figures[key]:.3f}" for key in paper_keys if key in figures)
-        lines.append("| " + " | ".join([row["name"], *cells, beside or "–"]) + " |")
-    return "\n".join(lines)
+        lines.append([row["name"], *cells, beside or "–"])
+    return markdown.table(headings, lines, "-" + "r" * (len(headings) - 2) + "-")
 
 
 def _cell(row: dict[str, Any], view: str, kind: str, metric: str) -> str:
@@ -122,7 +123,7 @@ def _graph_table(content: dict[str, Any]) -> str:
             numbers += [scores.get("direct_r2"), scores.get("linear_r2"), coverage and coverage["mean"]]
             cells += [_number(x) for x in numbers]
         if any(c != "–" for c in cells):
-            lines.append("| " + " | ".join([row["name"], *cells]) + " |")
+            lines.append([row["name"], *cells])
     if not lines:
         return ""
     names = [
@@ -135,7 +136,7 @@ def _graph_table(content: dict[str, Any]) -> str:
         "coverage of 90 %",
     ]
     headings = ["model", *(n if kind == "test" else f"{kind} {n}" for kind in kinds for n in names)]
-    return "\n".join(["| " + " | ".join(headings) + " |", "|---|" + "---:|" * (len(headings) - 1), *lines])
+    return markdown.table(headings, lines, "-r")
 
 
 def _number(value: Any) -> str:
@@ -215,7 +216,7 @@ def _factor_table(scores: Sequence[dict[str, Any]]) -> str:
         for s in scores
     ]
     header = ["property", "pairs", "best", "r", "r²", "chance", "distance", "linear R²", "direct R²"]
-    return _table(header, rows)
+    return markdown.table(header, rows)
 
 
 def _graph_lines(content: dict[str, Any]) -> str:
@@ -261,7 +262,7 @@ def _dimension_table(content: dict[str, Any], scores: Sequence[dict[str, Any]]) 
         row = [str(d), kind, f"{spread:.3g}", plain(whole["within"][d], 2), plain(late["within"][d], 2)]
         rows.append(row + [_signed(s["correlations"][d]) for s in scored])
     header = ["feature", "kind", "spread", "changing", "changing, 2nd half", *(f"r: {s['name']}" for s in scored)]
-    return _table(header, rows)
+    return markdown.table(header, rows)
 
 
 def _stillness_note(content: dict[str, Any]) -> str:
@@ -273,10 +274,6 @@ def _stillness_note(content: dict[str, Any]) -> str:
         f"second half ({late['edges']}). static: averaged over the past (pair matching), so stiller by construction. "
         f"spread: standard deviation in the second half; a dash beside it is a dimension that never changes at all."
     )
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in [header, ["---"] * len(header), *rows])
 
 
 def plain(value: float | None, places: int = 3) -> str:
@@ -314,12 +311,11 @@ def markdown_table(rows: Sequence[Accuracy], dt_s: float) -> str:
     """The same as Markdown; by time ahead the displacement alone."""
     shown = _steps_shown(rows)
     steps = [f"{dt_s * (i + 1):g} s" for i in shown]
-    lines = ["| " + " | ".join(["forecaster", "K", *SCALARS, *steps]) + " |"]
-    lines.append("|" + "---|" * (2 + len(SCALARS) + len(steps)))
-    for row in rows:
-        cells = [row.name, str(row.num_samples), *_scalar_cells(row)]
-        lines.append("| " + " | ".join([*cells, *(_rounded_number(row.by_step_m[i], 2) for i in shown)]) + " |")
-    return "\n".join(lines) + "\n"
+    lines = [
+        [row.name, str(row.num_samples), *_scalar_cells(row), *(_rounded_number(row.by_step_m[i], 2) for i in shown)]
+        for row in rows
+    ]
+    return markdown.table(["forecaster", "K", *SCALARS, *steps], lines) + "\n"
 
 
 def _steps_shown(rows: Sequence[Accuracy]) -> list[int]:

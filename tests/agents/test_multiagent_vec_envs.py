@@ -205,7 +205,7 @@ def test_progress_is_reported_per_episode():
 def test_the_film_shows_the_episode_that_is_measured(
     env_id: str, learners: tuple[str, ...], observe: Any, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("agents.vec_envs.PARALLEL_CHECKPOINTS", {})  # as long as none needs to ship
+    monkeypatch.setattr("agents.video.PARALLEL_CHECKPOINTS", {})  # as long as none needs to ship
     task = Task(env_id, observe, learners=learners)
     model = policy_for(task)
     (result,) = ParallelArena(task).play(model, [4])

@@ -11,7 +11,6 @@ import pytest
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
-from envs import registry as parallel_registry
 from envs.readers import parallel_env_id, register_shared_reader, shared_reader_for
 from envs.readers.base import SharedSceneReader
 from envs.readers.mpe import MpeReader
@@ -81,7 +80,7 @@ HERE.number = 3  # type: ignore[attr-defined]
 def walks(monkeypatch: pytest.MonkeyPatch) -> None:
     """An importable module of a third party, and nothing registered."""
     monkeypatch.setitem(sys.modules, "walks", HERE)
-    monkeypatch.setattr(parallel_registry, "_REGISTERED", {})
+    monkeypatch.setattr("envs.readers._SHARED_REGISTERED", {})
 
 
 # --- Making -----------------------------------------------------------------------------------------------------------
