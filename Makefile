@@ -16,7 +16,7 @@ help: ## list the targets
 	touch $@
 
 train: .venv/.installed ## train a policy on highway-fast-v0 into RUN_DIR (continues a run that was stopped), evaluate and film it
-	.venv/bin/python train_policy.py --resume --run-dir $(RUN_DIR)
+	.venv/bin/python train_policy.py --resume --out $(RUN_DIR)
 
 test: .venv/.installed ## run the tests, TEST_JOBS at a time
 	.venv/bin/python -m pytest -n $(TEST_JOBS)

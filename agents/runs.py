@@ -46,14 +46,14 @@ def open_run(
         UserError: the folder is in use, or holds a run with another config.
     """
     if run_dir.exists() and not run_dir.is_dir():
-        raise UserError(f"{run_dir} is a file; choose another --run-dir")
+        raise UserError(f"{run_dir} is a file; choose another --out")
     config = json.loads(json.dumps(config, default=str))
     file = run_dir / CONFIG_FILE
     started = run_dir.exists() and any(not entry.name.startswith(".") for entry in run_dir.iterdir())
     starts: list[Any] = []
     if started:
         if not resume:
-            raise UserError(f"{run_dir} exists; choose another --run-dir, or continue it with --resume")
+            raise UserError(f"{run_dir} exists; choose another --out, or continue it with --resume")
         starts = _check_same(file, config, free)
     run_dir.mkdir(parents=True, exist_ok=True)
     delete_leftovers(run_dir)
@@ -132,6 +132,6 @@ def _check_same(file: Path, config: dict[str, Any], free: Sequence[str]) -> list
         if name not in free and before.get(name) != config[name]:
             raise UserError(
                 f"cannot resume {file.parent}: {name} was {before.get(name)!r}, now {config[name]!r}; "
-                "pass the old value or choose another --run-dir"
+                "pass the old value or choose another --out"
             )
     return list(stored.get("provenance", []))

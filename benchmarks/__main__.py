@@ -9,13 +9,13 @@ import sys
 import time
 
 import torch
-import tyro
 from rich.console import Console
 
 from benchmarks.compare import Comparison, read_baseline, write_baseline
 from benchmarks.settings import Settings
 from benchmarks.suite import measure, report, settle
 from benchmarks.table import plain, rich_table
+from predictor.command_line import parse
 from predictor.errors import run_entry_point
 from predictor.files import write_json
 from predictor.runtime import keep_freed_memory, processor, tune
@@ -23,8 +23,8 @@ from predictor.runtime import keep_freed_memory, processor, tune
 
 def main() -> None:
     """Entry point."""
-    settings = tyro.cli(Settings, description=__doc__)
-    settings.check()
+    settings = parse(Settings, __doc__)
+    settings.check_files()
     if settings.reference is not None:
         from benchmarks.reference import load
 

@@ -11,7 +11,7 @@ from benchmarks.settings import Settings
 from benchmarks.timing import ratio_row
 
 SHAPES: dict[str, dict[str, Any]] = {
-    "quick": {"native_envs": 64, "plain_envs": 2, "blocks": 2, "plain_steps": 256, "native_steps": 4096},
+    "quick": {"num_envpool_envs": 64, "num_plain_envs": 2, "blocks": 2, "plain_steps": 256, "envpool_steps": 4096},
     "full": {"blocks": 5},
 }
 """Fields of `TrainingSpeedConfig`."""
@@ -28,8 +28,8 @@ def run(settings: Settings) -> list[Row]:
     config = TrainingSpeedConfig(settings.env_id, threads=settings.threads, **SHAPES[settings.mode])
     result = measure(config, lambda _: None)
     what = {"env": settings.env_id}
-    plain, native = what | {"processes": config.plain_envs}, what | {"envs": config.native_envs}
-    both = native | {"processes": config.plain_envs}
+    plain, native = what | {"processes": config.num_plain_envs}, what | {"envs": config.num_envpool_envs}
+    both = native | {"processes": config.num_plain_envs}
     rows = [
         Row("ppo", "plain PPO on highway-env", plain, result["plain_steps_per_s"], "steps/s"),
         Row("ppo", "PPO with forecasts on EnvPool", native, result["native_forecast_steps_per_s"], "steps/s"),

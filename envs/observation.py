@@ -14,9 +14,11 @@ from torch import Tensor
 
 from envs.registry import checkpoint_for
 from predictor.checkpoint import load_forecaster
+from predictor.config_checks import check_at_least
 from predictor.errors import UserError
 from predictor.forecaster import Forecaster
 from predictor.online import OnlineForecaster
+from predictor.runtime import resolve_device
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 
 Observations = dict[str, NDArray[Any]]
@@ -40,16 +42,14 @@ class ForecastConfig:
     num_samples: int = 1
     """Sampled futures per agent; 1 gives the most likely one and drops the axis."""
     device: str = "cpu"
-    """Where the forecaster runs."""
+    """Where the forecaster runs: cpu, cuda or auto."""
     seed: int = 0
-    """Of the samples, until reset(seed=…) gives another."""
+    """Random seed for drawing samples, until reset(seed=…) gives another."""
 
     def __post_init__(self) -> None:
-        """Check ranges."""
-        if self.num_samples < 1:
-            raise UserError(f"num_samples must be at least 1, got {self.num_samples}")
-        if self.horizon_steps is not None and self.horizon_steps < 1:
-            raise UserError(f"horizon_steps must be at least 1, got {self.horizon_steps}")
+        """Check ranges; `device="auto"` becomes the device that is taken."""
+        check_at_least(self, 1, "num_samples", "horizon_steps")
+        object.__setattr__(self, "device", resolve_device(self.device))
 
 
 def scene_spaces(spec: SceneSpec) -> dict[str, gym.Space]:

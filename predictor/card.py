@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import tyro
-
-from predictor.checkpoint import CheckpointInfo, load_checkpoint
+from predictor.checkpoint import WEIGHTS, CheckpointInfo, load_checkpoint, name_of_folder, resolve
+from predictor.command_line import parse
 from predictor.data.store import EpisodeStore, read_store
 from predictor.errors import UserError, run_entry_point
 from predictor.files import write_text
@@ -23,11 +22,11 @@ class CardConfig:
     """Write README.md into a checkpoint's folder."""
 
     checkpoint: Path
-    """Checkpoint folder."""
+    """Checkpoint whose card is written: a folder or a run folder."""
     data: tuple[Path, ...]
-    """Episode stores it was trained on."""
+    """Episode stores that the checkpoint was trained on."""
     accuracy: Path
-    """accuracy.json of python -m envs.evaluate; the rows of this checkpoint are used."""
+    """File accuracy.json of `python -m envs.evaluate` with the results of this checkpoint."""
 
 
 def write_card(config: CardConfig) -> Path:
@@ -37,23 +36,22 @@ def write_card(config: CardConfig) -> Path:
         UserError: unreadable input, or no accuracy row for this checkpoint.
     """
     model, info = load_checkpoint(config.checkpoint)
+    folder, name = resolve(config.checkpoint), name_of_folder(config.checkpoint)
     try:
         results = json.loads(config.accuracy.read_text())
-        rows = [r for r in results["results"] if r["checkpoint"] == config.checkpoint.name]
+        rows = [r for r in results["results"] if r["checkpoint"] in (name, folder.name)]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{config.accuracy} is not an accuracy.json of envs.evaluate ({error})") from error
     if not rows:
-        raise UserError(
-            f"{config.accuracy} has no row for checkpoint '{config.checkpoint.name}'; run envs.evaluate on it"
-        )
+        raise UserError(f"{config.accuracy} has no row for checkpoint '{name}'; run envs.evaluate on it")
     who = "the ego included" if info.spec.has_ego else "nobody is the ego"
     drivers = ", ".join(sorted({f"`{r.get('driver') or results['config']['ego']}`" for r in rows}))
     left_out = "the ego itself is not counted" if info.spec.has_ego else "what never moves is not counted"
     parameters = sum(p.numel() for p in model.parameters())
-    size_kb = (config.checkpoint / "model.safetensors").stat().st_size / 1000
+    size_kb = (folder / WEIGHTS).stat().st_size / 1000
     text = "\n\n".join(
         [
-            f"# Predictor checkpoint `{config.checkpoint.name}`",
+            f"# Predictor checkpoint `{name}`",
             f"dG-VAE, {parameters:,} parameters, {size_kb:.0f} kB of safetensors. Trained on recorded "
             f"{', '.join(info.sources)}; forecasts {info.horizon_steps} steps of {info.spec.dt_s:g} s. Sees at most "
             f"{info.spec.max_agents} agents ({who}) within {info.spec.perception_m:g} m.",
@@ -74,7 +72,7 @@ def write_card(config: CardConfig) -> Path:
             "forecast lies between the routes. It was trained without a view of the ego's plan.",
         ]
     )
-    path = config.checkpoint / "README.md"
+    path = folder / "README.md"
     write_text(path, text + "\n")
     return path
 
@@ -123,7 +121,7 @@ def _training(info: CheckpointInfo) -> str:
 
 def main() -> None:
     """Entry point."""
-    print(write_card(tyro.cli(CardConfig, description=__doc__)))
+    print(write_card(parse(CardConfig, __doc__)))
 
 
 if __name__ == "__main__":

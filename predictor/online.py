@@ -13,6 +13,7 @@ from torch.nn import functional
 from predictor.errors import ProtocolError
 from predictor.forecaster import Belief, Forecaster, Memory
 from predictor.graph import NOBODY
+from predictor.runtime import resolve_device
 from predictor.scene import PADDING_ID, Forecast, SceneBatch
 
 
@@ -23,13 +24,13 @@ class OnlineForecaster:
         forecaster: any `Forecaster`.
         rows: parallel scenes (environments).
         agents: rows of each scene, padding included.
-        device: where the forecaster lives.
+        device: where the forecaster lives: cpu, cuda or auto.
     """
 
     def __init__(self, forecaster: Forecaster, rows: int, agents: int, device: str = "cpu") -> None:
         """Start with empty memory in every row."""
         self.forecaster = forecaster
-        self.device = torch.device(device)
+        self.device = torch.device(resolve_device(device))
         self._memory = forecaster.empty_memory(rows, agents)
         self._fresh = forecaster.empty_memory(1, agents)
         self._ids: Int[np.ndarray, "rows agents"] = np.full((rows, agents), PADDING_ID, dtype=np.int64)

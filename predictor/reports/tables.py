@@ -162,7 +162,7 @@ def scores_markdown(content: dict[str, Any]) -> str:
     parts = [
         f"# What the edges of `{content['config']['checkpoint']}` say about {content['source']}",
         f"{content['windows']} windows of {content['episodes']} episodes; features are read at the last of "
-        f"{content['config']['history_steps']} observed steps.",
+        f"{content['config']['burn_in_steps']} observed steps.",
     ]
     relation = content["edges"]
     if content["has_ego"] and relation is not None:

@@ -73,7 +73,7 @@ def prey_actions(env: Any, observations: Any) -> list[int]:
 @pytest.mark.parametrize("observe", ["none", "constant-velocity"])
 @pytest.mark.parametrize("partner", ["varied", "heuristic"])
 def test_the_prey_is_driven_anew_in_each_episode_by_seed(partner: str, observe: Any):
-    env = MakeCopy(Task(TAG, observe, learners=("adversary",), partner=partner))()
+    env = MakeCopy(Task(TAG, observe, learners=("adversary",), driver=partner))()
     played = [prey_actions(env, env.reset(seed=seed)[0]) for seed in (7, None, 7, None, 8)]
     assert played[:2] == played[2:4]
     assert played[0] != played[1]
@@ -107,10 +107,10 @@ def test_drivers_by_name_see_no_forecasts():
 
 
 def test_where_all_learn_nobody_needs_to_be_able_to_drive():
-    rows = make_parallel_rows(Task(TOY, "none", partner="heuristic"), 1)
+    rows = make_parallel_rows(Task(TOY, "none", driver="heuristic"), 1)
     rows.reset()
     assert rows.step(np.array([1, 0]))[1].tolist() == [1.0, 0.0]
-    rows = make_parallel_rows(Task(TOY, "none", learners=("ant",), partner="heuristic"), 1)
+    rows = make_parallel_rows(Task(TOY, "none", learners=("ant",), driver="heuristic"), 1)
     rows.reset()
     with pytest.raises(UserError, match="no heuristic drives meadow_v0"):
         rows.step(np.array([1]))
@@ -121,7 +121,7 @@ def test_where_all_learn_nobody_needs_to_be_able_to_drive():
 
 @pytest.mark.parametrize("observe", ["none", "constant-velocity"])
 def test_results_depend_on_the_seed_alone(observe: Any):
-    task = Task(TAG, observe, learners=("adversary",), partner="varied")
+    task = Task(TAG, observe, learners=("adversary",), driver="varied")
     model, arena = policy_for(task), ParallelArena(task)
     for policy in (model, *arena.baselines):
         results = arena.play(policy, [3, 4])
@@ -185,7 +185,7 @@ def test_baselines_can_drive():
 
 @pytest.mark.parametrize("learner", list(LIVES))
 def test_an_episode_ends_with_the_last_learner_whoever_drives(learner: str):
-    task = Task(TOY, "none", learners=(learner,), partner="random")
+    task = Task(TOY, "none", learners=(learner,), driver="random")
     arena = ParallelArena(task)
     for policy in (policy_for(task), "random"):
         assert [r.length for r in arena.play(policy, [0, 1])] == [LIVES[learner]] * 2

@@ -51,7 +51,7 @@ def test_new_run_holds_its_config(tmp_path: Path):
 def test_existing_run_is_not_touched_without_resume(tmp_path: Path):
     open_run(tmp_path / "run", CONFIG, MADE, resume=False)
     before = (tmp_path / "run" / "config.json").read_bytes()
-    with pytest.raises(UserError, match="exists; choose another --run-dir, or continue it with --resume"):
+    with pytest.raises(UserError, match="exists; choose another --out, or continue it with --resume"):
         open_run(tmp_path / "run", CONFIG | {"steps": 7}, MADE, resume=False)
     assert (tmp_path / "run" / "config.json").read_bytes() == before
 

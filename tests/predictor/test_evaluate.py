@@ -56,7 +56,7 @@ def test_smoke(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], data: Path, checkpoint: Path, tmp_path: Path
 ):
     out = tmp_path / "out"
-    run(monkeypatch, "--checkpoint", checkpoint, "--data", data, "--samples", 3, "--out", out)
+    run(monkeypatch, "--checkpoint", checkpoint, "--data", data, "--num-samples", 3, "--out", out)
     printed = capsys.readouterr().out
     assert "minADE" in printed and "constant velocity" in printed
     assert "displacement of the best sample [m] / RMSE of the mean [m] / NLL [nats]" in " ".join(printed.split())
@@ -84,7 +84,7 @@ def test_smoke(
 
 
 def test_known_model_scores_what_it_must(data: Path, checkpoint: Path):
-    one, many, straight = evaluate(EvaluateConfig(str(checkpoint), data, samples=4))
+    one, many, straight = evaluate(EvaluateConfig(str(checkpoint), data, num_samples=4))
     for row in (one, many):
         assert row.min_ade_m == pytest.approx(straight.min_ade_m, rel=1e-5)
         assert row.min_fde_m == pytest.approx(straight.min_fde_m, rel=1e-5)
@@ -107,7 +107,7 @@ def test_horizon_and_number_of_windows_can_be_chosen(data: Path, checkpoint: Pat
 
 
 def test_one_sample_gives_one_row(data: Path, checkpoint: Path):
-    assert [r.name for r in evaluate(EvaluateConfig(str(checkpoint), data, samples=1))] == [
+    assert [r.name for r in evaluate(EvaluateConfig(str(checkpoint), data, num_samples=1))] == [
         "dG-VAE",
         "constant velocity",
     ]
@@ -116,12 +116,12 @@ def test_one_sample_gives_one_row(data: Path, checkpoint: Path):
 def test_rows_bear_the_name_of_the_model(data: Path, tmp_path: Path):
     torch.manual_seed(0)
     save_checkpoint(tmp_path / "mlp", MLP(spec(), MLPConfig(), 2), CheckpointInfo(spec(), MLPConfig(), 2, model="mlp"))
-    rows = evaluate(EvaluateConfig(str(tmp_path / "mlp"), data, samples=2))
+    rows = evaluate(EvaluateConfig(str(tmp_path / "mlp"), data, num_samples=2))
     assert [r.name for r in rows] == ["MLP", "MLP", "constant velocity"]
 
 
 def test_equal_seeds_give_equal_rows(data: Path, checkpoint: Path):
-    settings = EvaluateConfig(str(checkpoint), data, samples=3, max_windows=6)
+    settings = EvaluateConfig(str(checkpoint), data, num_samples=3, max_windows=6)
     assert evaluate(settings) == evaluate(settings)
 
 
@@ -166,7 +166,7 @@ def test_constant_velocity_is_a_checkpoint_of_every_store(
 ):
     settings = EvaluateConfig("constant-velocity", data, horizon_steps=2)
     (row,) = evaluate(settings)
-    assert row == evaluate(EvaluateConfig(str(checkpoint), data, samples=1))[-1]
+    assert row == evaluate(EvaluateConfig(str(checkpoint), data, num_samples=1))[-1]
     assert len(evaluate(EvaluateConfig("constant-velocity", data))[0].by_step_m) == 5
     out = tmp_path / "out"
     run(monkeypatch, "--checkpoint", "constant-velocity", "--data", data, "--horizon-steps", 2, "--out", out)
@@ -229,7 +229,7 @@ def truncated_checkpoint(data: Path, checkpoint: Path) -> list[Any]:
 
 
 def negative_samples(data: Path, checkpoint: Path) -> list[Any]:
-    return ["--checkpoint", checkpoint, "--data", data, "--samples", -1]
+    return ["--checkpoint", checkpoint, "--data", data, "--num-samples", -1]
 
 
 def no_horizon(data: Path, checkpoint: Path) -> list[Any]:
@@ -286,5 +286,5 @@ def test_windows_without_a_future_are_refused(data: Path, checkpoint: Path, tmp_
 
 
 def test_longest_horizon_that_fits_is_measured(data: Path, checkpoint: Path):
-    rows = evaluate(EvaluateConfig(str(checkpoint), data, horizon_steps=5, samples=2))
+    rows = evaluate(EvaluateConfig(str(checkpoint), data, horizon_steps=5, num_samples=2))
     assert all(len(r.by_step_m) == 5 and r.agents == 3 and math.isfinite(r.min_ade_m) for r in rows)

@@ -19,7 +19,7 @@ from tests.predictor.helpers import any_model, model, random_states
 
 # Agent 1 is absent at the last of three steps, so there are 2 · 2 ordered pairs, at the first two steps.
 VALID = torch.tensor([[[True, True], [True, True], [True, False]]])
-CONFIG = TrainConfig((), Path(), variance=0.5, likelihood="gaussian", one_step_weight=1.0)
+CONFIG = TrainConfig((Path(),), Path(), variance=0.5, likelihood="gaussian", one_step_weight=1.0)
 SILENT = replace(CONFIG, kl_weight=0.0)
 
 
