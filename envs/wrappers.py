@@ -71,10 +71,6 @@ class SceneObservation(gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstru
                 "apply gymnasium.wrappers.FlattenObservation first"
             )
         self.reader = _reader_of(env, reader, perception_m, max_agents)
-        if not self.reader.spec.has_ego:
-            raise UserError(
-                f"{type(self.reader).__name__}: an environment with one ego needs a reader whose spec has has_ego=True"
-            )
         self._scene: Scene | None = None
         self.observation_space = gym.spaces.Dict({"observation": own, **scene_spaces(self.reader.spec)})
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.readers.base import SharedScene, share
+from envs.readers.base import MultiagentScene, pad_multiagent_scene
 from predictor.errors import ProtocolError, UserError
 from predictor.scene import KINEMATIC_FEATURES, Scene, SceneSpec
 
@@ -124,7 +124,7 @@ class MpeReader:
         self._known: weakref.WeakKeyDictionary[Any, _Known] = weakref.WeakKeyDictionary()
         self._next_id = 0
 
-    def read(self, env: Any) -> SharedScene:
+    def read(self, env: Any) -> MultiagentScene:
         """Everyone who is there now, at rest or not.
 
         Raises:
@@ -139,7 +139,7 @@ class MpeReader:
         ids = np.array([self._identify(entity) for entity in entities], dtype=np.int64)
         rows = {entity.name: row for row, entity in enumerate(entities) if entity.name in names}
         scene = Scene(states, ids, np.ones(len(entities), dtype=np.bool_))
-        return share(scene, rows, np.zeros(len(entities)), self._spec, type(self).__name__)
+        return pad_multiagent_scene(scene, rows, np.zeros(len(entities)), self._spec, type(self).__name__)
 
     def _listed(self, world: Any) -> list[Any]:
         return list(world.entities if self.landmarks else world.agents)

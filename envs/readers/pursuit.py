@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from envs.readers.base import SharedScene, share
+from envs.readers.base import MultiagentScene, pad_multiagent_scene
 from envs.readers.mpe import agents_in_sight
 from predictor.errors import UserError
 from predictor.scene import KINEMATIC_FEATURES, Scene, SceneSpec
@@ -78,7 +78,7 @@ class PursuitReader:
         self._tracks: weakref.WeakKeyDictionary[Any, _Track] = weakref.WeakKeyDictionary()
         self._next_id = 0
 
-    def read(self, env: Any) -> SharedScene:
+    def read(self, env: Any) -> MultiagentScene:
         """Everyone on the grid now; reading twice at a step gives the same scene.
 
         Velocities [cells/step] are zero when a body is first seen, and mean ones after a step that was not read.
@@ -98,7 +98,7 @@ class PursuitReader:
         ids = np.array([track.number for track in tracks], dtype=np.int64)
         rows = {name: row for name, row in unwrapped.agent_name_mapping.items() if name in names}
         scene = Scene(states, ids, np.ones(len(bodies), dtype=np.bool_))
-        return share(scene, rows, np.zeros(len(bodies)), self._spec, type(self).__name__)
+        return pad_multiagent_scene(scene, rows, np.zeros(len(bodies)), self._spec, type(self).__name__)
 
     def _follow(self, body: Any, frame: int) -> _Track:
         position = np.array(body.current_position(), dtype=np.float64)  # a copy: the grid moves bodies in place
