@@ -25,6 +25,7 @@ from envs.observation import FORECAST_KEYS, ForecastConfig
 from envs.readers import MakeReader, multiagent_env_id, multiagent_reader_for
 from envs.readers.base import MultiagentReader, MultiagentScene, build_multiagent_reader
 from envs.registry import checkpoint_for
+from envs.simulators.copies import RunningCopy
 from predictor.checkpoint import load_forecaster
 from predictor.errors import ProtocolError, UserError
 from predictor.forecaster import Forecaster
@@ -33,7 +34,7 @@ from predictor.scene import Forecast, SceneSpec
 _COMPOSED = (gym.spaces.Dict, gym.spaces.Tuple, gym.spaces.Graph, gym.spaces.Sequence, gym.spaces.OneOf)
 
 
-class ForecastParallelEnv(BaseParallelWrapper):
+class ForecastParallelEnv(RunningCopy, BaseParallelWrapper):
     """Shows every agent what the others are about to do.
 
     Observation of an agent: Dict with `observation` (its own, untouched) and, for the other agents sorted by distance

@@ -5,7 +5,6 @@ simulator's own object, never its place in a list. Goals, messages and what an a
 looks at the arena sees them.
 """
 
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from envs.readers.base import MultiagentScene, pad_multiagent_scene
+from envs.readers.identity import IdentityDict
 from predictor.errors import ProtocolError, UserError
 from predictor.scene import KINEMATIC_FEATURES, Scene, SceneSpec
 
@@ -120,8 +120,7 @@ class MpeReader:
 
     def reset(self) -> None:
         """Forget all identities; numbers start anew in the order of `world.entities`."""
-        # Keyed by the living object: id() is reused after garbage collection and would join two entities.
-        self._known: weakref.WeakKeyDictionary[Any, _Known] = weakref.WeakKeyDictionary()
+        self._known: IdentityDict[_Known] = IdentityDict()
         self._next_id = 0
 
     def read(self, env: Any) -> MultiagentScene:

@@ -4,7 +4,6 @@ A cell is one metre and a step one second: the grid has no other units. Velociti
 agents on a grid have none. The other SISL environment, multiwalker, is not read.
 """
 
-import weakref
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from envs.readers.base import MultiagentScene, pad_multiagent_scene
+from envs.readers.identity import IdentityDict
 from envs.readers.mpe import agents_in_sight
 from predictor.errors import UserError
 from predictor.scene import KINEMATIC_FEATURES, Scene, SceneSpec
@@ -74,8 +74,7 @@ class PursuitReader:
 
     def reset(self) -> None:
         """Forget all identities and where they were."""
-        # Keyed by the living object: id() is reused after garbage collection and would join two bodies.
-        self._tracks: weakref.WeakKeyDictionary[Any, _Track] = weakref.WeakKeyDictionary()
+        self._tracks: IdentityDict[_Track] = IdentityDict()
         self._next_id = 0
 
     def read(self, env: Any) -> MultiagentScene:
