@@ -19,7 +19,7 @@ from envs.readers.base import MultiagentScene
 from predictor.errors import UserError
 from predictor.forecaster import Forecaster
 from predictor.online import OnlineForecaster
-from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
+from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec, perceived_agents
 
 
 class SharedStream:
@@ -166,11 +166,8 @@ def _views(
     scene: Scene, egos: Int[np.ndarray, " egos"], view: SceneSpec
 ) -> tuple[Int[np.ndarray, "egos seen"], Bool[np.ndarray, "egos seen"]]:
     """For each ego the rows it sees, itself first and the nearest next, and which of them are not padding."""
-    positions = scene.states[:, : view.position_dim]
-    distance_m = np.linalg.norm(positions[None] - positions[egos, None], axis=-1)
-    distance_m = np.where(scene.valid, distance_m, np.inf)
-    distance_m[np.arange(len(egos)), egos] = -1.0  # first, also when another agent lies on top of it
-    order = np.argsort(distance_m, axis=1, kind="stable")[:, : view.max_agents]
-    seen = scene.valid[order] & (np.take_along_axis(distance_m, order, axis=1) <= view.perception_m)
+    states = np.broadcast_to(scene.states, (len(egos), *scene.states.shape))
+    valid = np.broadcast_to(scene.valid, (len(egos), *scene.valid.shape))
+    order, seen = perceived_agents(states, valid, egos, view)
     padding = ((0, 0), (0, view.max_agents - order.shape[1]))
     return np.pad(order, padding), np.pad(seen, padding)

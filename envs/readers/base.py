@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from predictor.errors import UserError
-from predictor.scene import PADDING_ID, Scene, SceneBatch, SceneSpec
+from predictor.scene import PADDING_ID, Scene, SceneBatch, SceneSpec, perceived_agents
 
 
 @runtime_checkable
@@ -208,12 +208,8 @@ def perceive(everyone: Scene, spec: SceneSpec, source: str = "reader") -> Scene:
         UserError: `everyone` breaks the contract of a scene.
     """
     everyone.check(source, spec)
-    offsets = everyone.states[:, : spec.position_dim] - everyone.states[0, : spec.position_dim]
-    distance_m = np.where(everyone.valid, np.sqrt(np.square(offsets).sum(axis=1)), np.inf)
-    distance_m[0] = -1.0  # the ego stays in row 0, also when another agent lies on top of it
-    order = np.argsort(distance_m, kind="stable")[: spec.max_agents]
-    order = order[everyone.valid[order] & (distance_m[order] <= spec.perception_m)]
-    return padded(everyone, order, spec.max_agents)
+    order, seen = perceived_agents(everyone.states, everyone.valid, 0, spec)
+    return padded(everyone, order[seen], spec.max_agents)
 
 
 def padded(scene: Scene, rows: np.ndarray, agents: int) -> Scene:
@@ -257,18 +253,13 @@ def role_of(agent: str) -> str:
 
 
 def perceive_batch(everyone: SceneBatch, spec: SceneSpec) -> SceneBatch:
-    """The ego and the nearest agents within perception, nearest first, padded to `max_agents`: `perceive` by row."""
-    rows = len(everyone)
-    offsets = everyone.states[..., :2] - everyone.states[:, :1, :2]
-    distance_m = np.where(everyone.valid, np.linalg.norm(offsets, axis=-1), np.inf)
-    # a stable sort leaves the ego, listed first and at distance 0, in row 0
-    order = np.argsort(distance_m, axis=1, kind="stable")[:, : spec.max_agents]
-    kept = np.take_along_axis(distance_m, order, axis=1) <= spec.perception_m
-    width = order.shape[1]
-    states = np.zeros((rows, spec.max_agents, everyone.states.shape[-1]))
-    ids = np.full((rows, spec.max_agents), PADDING_ID, dtype=np.int64)
-    seen = np.zeros((rows, spec.max_agents), dtype=np.bool_)
-    states[:, :width] = np.where(kept[..., None], np.take_along_axis(everyone.states, order[..., None], axis=1), 0.0)
-    ids[:, :width] = np.where(kept, np.take_along_axis(everyone.ids, order, axis=1), PADDING_ID)
-    seen[:, :width] = kept
-    return SceneBatch(states, ids, seen, everyone.heading_rad)
+    """Returns what each ego of a batch perceives: `perceive` for many scenes at once."""
+    order, seen = perceived_agents(everyone.states, everyone.valid, 0, spec)
+    batch, nearest = order.shape
+    states = np.zeros((batch, spec.max_agents, everyone.states.shape[-1]))
+    ids = np.full((batch, spec.max_agents), PADDING_ID, dtype=np.int64)
+    valid = np.zeros((batch, spec.max_agents), dtype=np.bool_)
+    states[:, :nearest] = np.where(seen[..., None], np.take_along_axis(everyone.states, order[..., None], axis=1), 0.0)
+    ids[:, :nearest] = np.where(seen, np.take_along_axis(everyone.ids, order, axis=1), PADDING_ID)
+    valid[:, :nearest] = seen
+    return SceneBatch(states, ids, valid, everyone.heading_rad)
