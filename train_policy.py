@@ -20,7 +20,7 @@ from agents.runs import load_model, open_run
 from agents.task import Backend, Observe, Task
 from agents.training import TrainingPlan, train
 from agents.video import film
-from envs.registry import native_task_of
+from envs.registry import entry_for, native_task_of
 from envs.simulators.envpool import ONE_START
 from predictor.command_line import Renamed, parse
 from predictor.config_checks import check_at_least, check_choices
@@ -30,9 +30,6 @@ from predictor.runtime import keep_freed_memory
 
 ENVS = {"gymnasium": 6, "envpool": 64}
 """Number of parallel environments by default."""
-
-LEARNERS: dict[str, tuple[str, ...]] = {"simple_tag_v3": ("adversary",), "simple_world_comm_v3": ("adversary",)}
-"""Who learns by default where the sides are opponents: pursuers, against a prey that flees by rule."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +94,7 @@ class TrainPolicyConfig:
     @property
     def plan(self) -> TrainingPlan:
         """The training."""
-        learners = LEARNERS.get(self.env_id, ()) if self.learners is None else self.learners
+        learners = entry_for(self.env_id).learners if self.learners is None else self.learners
         task = Task(self.env_id, self.observe, self.checkpoint, self.device, self.backend, tuple(learners), self.driver)
         return TrainingPlan(
             task,

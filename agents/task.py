@@ -9,7 +9,7 @@ import numpy as np
 
 from envs.drivers.all_agents import DRIVER_NAMES, make_driver
 from envs.parallel import ForecastParallelEnv
-from envs.registry import is_parallel_id, make_env, make_parallel_env, native_task_of
+from envs.registry import is_multiagent_id, make_env, make_multiagent_env, native_task_of
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.sb3.padded_spaces import learners_named
 from envs.wrappers import ForecastObservation
@@ -66,7 +66,7 @@ class Task:
     @property
     def is_parallel(self) -> bool:
         """Whether it is a PettingZoo environment with many learners."""
-        return is_parallel_id(self.env_id)
+        return is_multiagent_id(self.env_id)
 
     @property
     def forecaster(self) -> str | None:
@@ -101,7 +101,7 @@ class Task:
         return env.action_space
 
     def _check_parallel(self) -> gym.Space:
-        env = make_parallel_env(self.env_id)
+        env = make_multiagent_env(self.env_id)
         if self.observe != "none":
             env = ForecastParallelEnv(env, self.forecaster, device=self.device)
         learners = learners_named(env.possible_agents, self.learners, self.env_id)

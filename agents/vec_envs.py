@@ -23,7 +23,7 @@ from envs.drivers.all_agents import Driver, make_driver
 from envs.drivers.ego import make_ego
 from envs.drivers.trained import Ego
 from envs.parallel import ForecastParallelEnv
-from envs.registry import make_env, make_parallel_env, native_task_of
+from envs.registry import make_env, make_multiagent_env, native_task_of
 from envs.sb3.agents_as_rows import AgentMonitor, ParallelVecEnv
 from envs.sb3.envpool import EnvPoolVecEnv
 from envs.sb3.forecast import VecForecast
@@ -115,7 +115,7 @@ class MakeCopy:
     def __call__(self) -> ParallelEnv:
         """The environment in a `DrivenEnv`, with forecasts around it unless the task observes none."""
         options = {} if self.render_mode is None else {"render_mode": self.render_mode}
-        env = DrivenEnv(make_parallel_env(self.task.env_id, **options), self.task.driver)
+        env = DrivenEnv(make_multiagent_env(self.task.env_id, **options), self.task.driver)
         if self.task.observe == "none":
             return env
         return ForecastParallelEnv(env, self.task.forecaster, device=self.task.device)

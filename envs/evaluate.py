@@ -20,7 +20,7 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track
 
-from envs.registry import CHECKPOINTS, PARALLEL_CHECKPOINTS, checkpoint_for, is_parallel_id, parallel_checkpoint_for
+from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, checkpoint_for
 from envs.rollouts import report
 from envs.rollouts.episode import MODEL, NEIGHBOURS, STRAIGHT, Case, Episode, EpisodeTask, memory_key, play
 from envs.rollouts.report import EnvAccuracy
@@ -51,7 +51,7 @@ GALLERY_CASES = 6
 class EvaluateConfig:
     """Measure forecasts inside live environments, through the deployed wrapper, beside constant velocity."""
 
-    env_ids: tuple[str, ...] = (*CHECKPOINTS, *PARALLEL_CHECKPOINTS)
+    env_ids: tuple[str, ...] = (*CHECKPOINTS, *MULTIAGENT_CHECKPOINTS)
     """Environments to measure in, gymnasium or PettingZoo parallel; by default all ids with a shipped checkpoint."""
     checkpoint: tuple[str, ...] = ()
     """Checkpoints to measure: shipped names, folders or run folders; none given, the one that ships for each id.
@@ -110,8 +110,7 @@ def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = N
     Raises:
         UserError: unknown env or checkpoint, or episodes too short to compare anything.
     """
-    shipped = parallel_checkpoint_for if is_parallel_id(env_id) else checkpoint_for
-    checkpoint = checkpoint if checkpoint is not None else shipped(env_id)
+    checkpoint = checkpoint if checkpoint is not None else checkpoint_for(env_id)
     if checkpoint != CONSTANT_VELOCITY:
         checkpoint = str(resolve(checkpoint))
     driver = config.driver or default_drivers(env_id)[0]

@@ -15,11 +15,11 @@ from jaxtyping import Bool, Int
 from numpy.typing import NDArray
 
 from envs.observation import ForecastConfig, ForecastStream, ego_entries
-from envs.readers.base import SharedScene
+from envs.readers.base import MultiagentScene
 from predictor.errors import UserError
 from predictor.forecaster import Forecaster
 from predictor.online import OnlineForecaster
-from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
+from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec, perceived_agents
 
 
 class SharedStream:
@@ -88,7 +88,7 @@ class SharedStream:
         """Forget the history."""
         self._online.reset()
 
-    def observe(self, shared: SharedScene) -> dict[str, dict[str, NDArray[np.float32]]]:
+    def observe(self, shared: MultiagentScene) -> dict[str, dict[str, NDArray[np.float32]]]:
         """Take in the scene; the entries of each agent in its `rows`, by name."""
         self._online.observe(SceneBatch.stack([shared.scene.behind_absent(self._front)]))
         forecast = self._online.forecast(self.horizon_steps, self.config.num_samples, self._generator).dense()
@@ -103,7 +103,7 @@ class SharedStream:
 
 
 def agent_entries(
-    shared: SharedScene, forecast: Forecast, view: SceneSpec
+    shared: MultiagentScene, forecast: Forecast, view: SceneSpec
 ) -> dict[str, dict[str, NDArray[np.float32]]]:
     """Each agent's forecast entries, cut from one forecast; `envs.observation.ego_entries` gives the shapes.
 
@@ -134,19 +134,19 @@ def agent_entries(
     return {name: {key: value[i] for key, value in entries.items()} for i, name in enumerate(names)}
 
 
-def check_shared(shared: Any, spec: SceneSpec, source: str = "reader") -> SharedScene:
-    """What a reader gave, which must keep the contract of `envs.readers.base.SharedScene`.
+def check_multiagent_scene(shared: Any, spec: SceneSpec, source: str = "reader") -> MultiagentScene:
+    """What a reader gave, which must keep the contract of `envs.readers.base.MultiagentScene`.
 
     Args:
-        shared: a `SharedScene`, one hopes.
+        shared: a `MultiagentScene`, one hopes.
         spec: the reader's.
         source: who read it, for messages.
 
     Raises:
         UserError: something else, as `Scene.check`, or the rows or headings of the agents do not fit the scene.
     """
-    if not isinstance(shared, SharedScene):
-        raise UserError(f"{source}: reading must give a SharedScene (envs.readers), got {type(shared).__name__}")
+    if not isinstance(shared, MultiagentScene):
+        raise UserError(f"{source}: reading must give a MultiagentScene (envs.readers), got {type(shared).__name__}")
     shared.scene.check(source, spec, rows=spec.max_agents)
     heading = shared.heading_rad
     if heading.shape != (spec.max_agents,) or not np.isfinite(heading).all():
@@ -166,11 +166,8 @@ def _views(
     scene: Scene, egos: Int[np.ndarray, " egos"], view: SceneSpec
 ) -> tuple[Int[np.ndarray, "egos seen"], Bool[np.ndarray, "egos seen"]]:
     """For each ego the rows it sees, itself first and the nearest next, and which of them are not padding."""
-    positions = scene.states[:, : view.position_dim]
-    distance_m = np.linalg.norm(positions[None] - positions[egos, None], axis=-1)
-    distance_m = np.where(scene.valid, distance_m, np.inf)
-    distance_m[np.arange(len(egos)), egos] = -1.0  # first, also when another agent lies on top of it
-    order = np.argsort(distance_m, axis=1, kind="stable")[:, : view.max_agents]
-    seen = scene.valid[order] & (np.take_along_axis(distance_m, order, axis=1) <= view.perception_m)
+    states = np.broadcast_to(scene.states, (len(egos), *scene.states.shape))
+    valid = np.broadcast_to(scene.valid, (len(egos), *scene.valid.shape))
+    order, seen = perceived_agents(states, valid, egos, view)
     padding = ((0, 0), (0, view.max_agents - order.shape[1]))
     return np.pad(order, padding), np.pad(seen, padding)

@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
-from envs.multiagent_observation import SharedStream, check_shared
+from envs.multiagent_observation import SharedStream, check_multiagent_scene
 from envs.observation import FORECAST_KEYS, ForecastConfig
-from envs.readers import MakeSharedReader, parallel_env_id, shared_reader_for
-from envs.readers.base import SharedScene, SharedSceneReader, build_reader
-from envs.registry import parallel_checkpoint_for
+from envs.readers import MakeReader, multiagent_env_id, multiagent_reader_for
+from envs.readers.base import MultiagentReader, MultiagentScene, build_multiagent_reader
+from envs.registry import checkpoint_for
+from envs.simulators.copies import RunningCopy
 from predictor.checkpoint import load_forecaster
 from predictor.errors import ProtocolError, UserError
 from predictor.forecaster import Forecaster
@@ -33,7 +34,7 @@ from predictor.scene import Forecast, SceneSpec
 _COMPOSED = (gym.spaces.Dict, gym.spaces.Tuple, gym.spaces.Graph, gym.spaces.Sequence, gym.spaces.OneOf)
 
 
-class ForecastParallelEnv(BaseParallelWrapper):
+class ForecastParallelEnv(RunningCopy, BaseParallelWrapper):
     """Shows every agent what the others are about to do.
 
     Observation of an agent: Dict with `observation` (its own, untouched) and, for the other agents sorted by distance
@@ -71,7 +72,7 @@ class ForecastParallelEnv(BaseParallelWrapper):
         perception_m: float | None = None,
         max_agents: int | None = None,
         device: str = "cpu",
-        reader: MakeSharedReader | None = None,
+        reader: MakeReader | None = None,
         forecaster: Forecaster | None = None,
     ) -> None:
         """Load the forecaster and extend the observation spaces."""
@@ -81,13 +82,13 @@ class ForecastParallelEnv(BaseParallelWrapper):
                 "parallel_env(), or convert an AEC env with pettingzoo.utils.conversions.aec_to_parallel"
             )
         super().__init__(env)
-        self._source = f"env '{parallel_env_id(env)}'"
-        self._reader: SharedSceneReader = (
-            build_reader(reader, env) if reader is not None else shared_reader_for(env, perception_m)
+        self._source = f"env '{multiagent_env_id(env)}'"
+        self._reader: MultiagentReader = (
+            build_multiagent_reader(reader, env) if reader is not None else multiagent_reader_for(env, perception_m)
         )
         spec = self._reader.spec
         if forecaster is None:
-            name = checkpoint if checkpoint is not None else parallel_checkpoint_for(parallel_env_id(env))
+            name = checkpoint if checkpoint is not None else checkpoint_for(multiagent_env_id(env))
             forecaster = load_forecaster(name, spec, self._source, device)
         elif checkpoint is not None:
             raise UserError(f"give a checkpoint or a forecaster, not both (checkpoint '{checkpoint}')")
@@ -97,12 +98,12 @@ class ForecastParallelEnv(BaseParallelWrapper):
         config = ForecastConfig(horizon_steps, num_samples, device)
         self._stream = SharedStream(forecaster, spec, config, perception_m, max_agents)
         self._spaces: dict[str, gym.spaces.Dict] = {}
-        self._scene: SharedScene | None = None
+        self._scene: MultiagentScene | None = None
         for agent in getattr(env, "possible_agents", ()):
             self.observation_space(agent)
 
     @property
-    def reader(self) -> SharedSceneReader:
+    def reader(self) -> MultiagentReader:
         """Who reads the scenes."""
         return self._reader
 
@@ -112,7 +113,7 @@ class ForecastParallelEnv(BaseParallelWrapper):
         return self._reader.spec
 
     @property
-    def scene(self) -> SharedScene:
+    def scene(self) -> MultiagentScene:
         """The latest scene, world frame."""
         if self._scene is None:
             raise ProtocolError("there is no scene yet; call reset() first")
@@ -161,7 +162,7 @@ class ForecastParallelEnv(BaseParallelWrapper):
 
     def _observe(self, observations: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         scene = self._reader.read(self.env)
-        self._scene = check_shared(scene, self._reader.spec, f"scene reader of {self._source}")
+        self._scene = check_multiagent_scene(scene, self._reader.spec, f"scene reader of {self._source}")
         entries = self._stream.observe(self._scene)
         return {
             agent: {"observation": own, **(entries[agent] if agent in entries else self._nothing_seen(agent))}

@@ -23,6 +23,7 @@ from envs.observation import (
 )
 from envs.readers import MakeReader, reader_for
 from envs.readers.base import build_reader, require_scene, show
+from envs.simulators.copies import RunningCopy
 from predictor.errors import ProtocolError, UserError
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 
@@ -37,7 +38,7 @@ def _reader_of(env: gym.Env, make_reader: MakeReader | None, perception_m: float
     return reader_for(env, perception_m, max_agents) if make_reader is None else build_reader(make_reader, env)
 
 
-class SceneObservation(gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstructorArgs):
+class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstructorArgs):
     """Adds the scene around the ego to the observation.
 
     Observation: Dict with `observation` (the env's own, untouched), `scene_states` (max_agents, F) in the world frame,
@@ -71,10 +72,6 @@ class SceneObservation(gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstru
                 "apply gymnasium.wrappers.FlattenObservation first"
             )
         self.reader = _reader_of(env, reader, perception_m, max_agents)
-        if not self.reader.spec.has_ego:
-            raise UserError(
-                f"{type(self.reader).__name__}: an environment with one ego needs a reader whose spec has has_ego=True"
-            )
         self._scene: Scene | None = None
         self.observation_space = gym.spaces.Dict({"observation": own, **scene_spaces(self.reader.spec)})
 
@@ -116,7 +113,7 @@ class SceneObservation(gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstru
         return {"observation": obs, **scene_entries(scene)}
 
 
-class ForecastObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+class ForecastObservation(RunningCopy, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Shows the policy what the others are about to do.
 
     Observation: Dict with `observation` (the env's own, untouched) and, for the other agents sorted by distance,

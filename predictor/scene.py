@@ -152,8 +152,10 @@ class Scene:
         number = isinstance(self.heading_rad, int | float | np.integer | np.floating)
         if not number or not np.isfinite(self.heading_rad):
             raise UserError(f"{source}: heading_rad must be one finite number, got {self.heading_rad}")
-        if not np.isfinite(self.states[self.valid]).all():
-            raise UserError(f"{source}: states must be finite, got {self.states[self.valid].tolist()}")
+        if not np.isfinite(self.states).all():
+            raise UserError(
+                f"{source}: states must be finite, those of padded agents too (zeros), got {self.states.tolist()}"
+            )
 
     def _check_arrays(self, source: str, spec: SceneSpec | None, rows: int | None) -> None:
         for name, array, kind, wanted, axes in (
@@ -217,6 +219,40 @@ class SceneBatch:
             np.concatenate([first.valid, second.valid]),
             np.concatenate([first.heading_rad, second.heading_rad]),
         )
+
+
+def perceived_agents(
+    states: Float[np.ndarray, "*batch agents state"],
+    valid: Bool[np.ndarray, "*batch agents"],
+    ego: int | Int[np.ndarray, "*batch"],
+    spec: SceneSpec,
+) -> tuple[Int[np.ndarray, "*batch nearest"], Bool[np.ndarray, "*batch nearest"]]:
+    """Finds what an ego perceives: itself, then the nearest agents, at most `max_agents`, within `perception_m`.
+
+    Agents at equal distances keep their order; the ego comes first also when another agent is at the same position.
+
+    Args:
+        states: world frame; entries of agents that are not valid are ignored.
+        valid: which entries hold an agent.
+        ego: index of the ego: one for all scenes, or one for each.
+        spec: its `perception_m`, `max_agents` and `position_dim` decide.
+
+    Returns:
+        Indices of agents in this order, as many as there are, at most `max_agents`; and which of them are perceived:
+        the others are too far away or not valid.
+    """
+    positions = states[..., : spec.position_dim]
+    if isinstance(ego, int):
+        offsets = positions - positions[..., ego : ego + 1, :]
+    else:
+        offsets = positions - np.take_along_axis(positions, ego[..., None, None], axis=-2)
+    distance_m = np.where(valid, np.sqrt(np.square(offsets).sum(axis=-1)), np.inf)
+    if isinstance(ego, int):
+        distance_m[..., ego] = -1.0
+    else:
+        np.put_along_axis(distance_m, ego[..., None], -1.0, axis=-1)
+    order = np.argsort(distance_m, axis=-1, kind="stable")[..., : spec.max_agents]
+    return order, np.take_along_axis(valid & (distance_m <= spec.perception_m), order, axis=-1)
 
 
 @dataclass(frozen=True)

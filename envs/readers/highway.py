@@ -5,7 +5,6 @@ Sees what a perception system could: vehicles within `perception_m`, the nearest
 parameters.
 """
 
-import weakref
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -16,6 +15,7 @@ from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.vehicle.kinematics import Vehicle
 
 from envs.readers.base import Reader
+from envs.readers.identity import IdentityDict
 from predictor.errors import ProtocolError, UserError
 from predictor.scene import KINEMATIC_FEATURES, AxisFrame, Scene, SceneSpec
 
@@ -78,8 +78,7 @@ class HighwayReader(Reader):
 
     def reset(self) -> None:
         """Forget all identities; numbering starts anew, so equal seeds give equal ids."""
-        # Keyed by the living object: id() is reused after garbage collection and would join two vehicles.
-        self._ids: weakref.WeakKeyDictionary[Vehicle, int] = weakref.WeakKeyDictionary()
+        self._ids: IdentityDict[int] = IdentityDict()
         self._next_id = 0
 
     def read_all(self, env: gym.Env) -> Scene:

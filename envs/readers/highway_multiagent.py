@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from pettingzoo import ParallelEnv
 
-from envs.readers.base import SharedScene, share
+from envs.readers.base import MultiagentScene, pad_multiagent_scene
 from envs.readers.highway import HighwayReader
 from envs.simulators.highway_multiagent import HighwayParallelEnv
 from predictor.errors import UserError
 from predictor.scene import SceneSpec
 
 
-class HighwaySharedReader:
+class HighwayMultiagentReader:
     """Reads every vehicle on the road of a `HighwayParallelEnv`, learners and traffic; nobody is the ego.
 
     An agent has a row as long as it is observed, its last observation included; its vehicle stays in the scene.
@@ -32,7 +32,7 @@ class HighwaySharedReader:
     def __init__(self, env: ParallelEnv, perception_m: float | None = None, max_agents: int | None = None) -> None:
         """Derive the spec from the environment."""
         if not isinstance(env.unwrapped, HighwayParallelEnv):
-            raise UserError(f"HighwaySharedReader needs a HighwayParallelEnv, got {type(env.unwrapped).__name__}")
+            raise UserError(f"HighwayMultiagentReader needs a HighwayParallelEnv, got {type(env.unwrapped).__name__}")
         highway = env.unwrapped.highway
         rows = most_vehicles(highway.config) if max_agents is None else max_agents
         self._reader = HighwayReader(highway, perception_m, rows)
@@ -47,7 +47,7 @@ class HighwaySharedReader:
         """Forget all identities; numbering starts anew, so equal seeds give equal ids."""
         self._reader.reset()
 
-    def read(self, env: ParallelEnv) -> SharedScene:
+    def read(self, env: ParallelEnv) -> MultiagentScene:
         """Everyone on the road now."""
         inner: HighwayParallelEnv = env.unwrapped
         vehicles = inner.highway.road.vehicles
@@ -55,7 +55,7 @@ class HighwaySharedReader:
         rows = {agent: row[vehicle] for agent, vehicle in inner.vehicles.items()}
         headings = np.array([float(vehicle.heading) for vehicle in vehicles])
         everyone = self._reader.read_vehicles(inner.highway, vehicles)
-        return share(everyone, rows, headings, self._spec, type(self).__name__)
+        return pad_multiagent_scene(everyone, rows, headings, self._spec, type(self).__name__)
 
 
 def most_vehicles(config: Mapping[str, Any]) -> int:

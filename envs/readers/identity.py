@@ -7,6 +7,10 @@ those.
 """
 
 import math
+import weakref
+from collections.abc import Iterator
+from copy import deepcopy
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -15,6 +19,28 @@ from predictor.errors import UserError
 from predictor.scene import PADDING_ID
 
 _CHANGE_WEIGHT = 0.1
+
+Known = TypeVar("Known")
+
+
+class IdentityDict(weakref.WeakKeyDictionary[Any, Known]):
+    """What is known of the simulator's own objects; an entry ends with its object.
+
+    Keyed by the living object, since `id()` is reused after garbage collection and would join two agents. Unlike its
+    base, it follows its objects: in a copy (`copy.deepcopy`, `pickle`) of reader and environment together, the entries
+    belong to the copied objects.
+    """
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "IdentityDict[Known]":
+        """Returns a dictionary of the copied objects."""
+        copied: IdentityDict[Known] = IdentityDict()
+        for key, value in list(self.items()):
+            copied[deepcopy(key, memo)] = deepcopy(value, memo)
+        return copied
+
+    def __reduce__(self) -> tuple[type, tuple[()], None, None, Iterator[tuple[Any, Known]]]:
+        """Pickles the objects with their entries."""
+        return type(self), (), None, None, iter(list(self.items()))
 
 
 class IdentityTracker:

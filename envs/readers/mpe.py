@@ -5,14 +5,14 @@ simulator's own object, never its place in a list. Goals, messages and what an a
 looks at the arena sees them.
 """
 
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from envs.readers.base import SharedScene, share
+from envs.readers.base import MultiagentScene, pad_multiagent_scene
+from envs.readers.identity import IdentityDict
 from predictor.errors import ProtocolError, UserError
 from predictor.scene import KINEMATIC_FEATURES, Scene, SceneSpec
 
@@ -120,11 +120,10 @@ class MpeReader:
 
     def reset(self) -> None:
         """Forget all identities; numbers start anew in the order of `world.entities`."""
-        # Keyed by the living object: id() is reused after garbage collection and would join two entities.
-        self._known: weakref.WeakKeyDictionary[Any, _Known] = weakref.WeakKeyDictionary()
+        self._known: IdentityDict[_Known] = IdentityDict()
         self._next_id = 0
 
-    def read(self, env: Any) -> SharedScene:
+    def read(self, env: Any) -> MultiagentScene:
         """Everyone who is there now, at rest or not.
 
         Raises:
@@ -139,7 +138,7 @@ class MpeReader:
         ids = np.array([self._identify(entity) for entity in entities], dtype=np.int64)
         rows = {entity.name: row for row, entity in enumerate(entities) if entity.name in names}
         scene = Scene(states, ids, np.ones(len(entities), dtype=np.bool_))
-        return share(scene, rows, np.zeros(len(entities)), self._spec, type(self).__name__)
+        return pad_multiagent_scene(scene, rows, np.zeros(len(entities)), self._spec, type(self).__name__)
 
     def _listed(self, world: Any) -> list[Any]:
         return list(world.entities if self.landmarks else world.agents)

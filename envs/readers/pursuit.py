@@ -4,14 +4,14 @@ A cell is one metre and a step one second: the grid has no other units. Velociti
 agents on a grid have none. The other SISL environment, multiwalker, is not read.
 """
 
-import weakref
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from envs.readers.base import SharedScene, share
+from envs.readers.base import MultiagentScene, pad_multiagent_scene
+from envs.readers.identity import IdentityDict
 from envs.readers.mpe import agents_in_sight
 from predictor.errors import UserError
 from predictor.scene import KINEMATIC_FEATURES, Scene, SceneSpec
@@ -74,11 +74,10 @@ class PursuitReader:
 
     def reset(self) -> None:
         """Forget all identities and where they were."""
-        # Keyed by the living object: id() is reused after garbage collection and would join two bodies.
-        self._tracks: weakref.WeakKeyDictionary[Any, _Track] = weakref.WeakKeyDictionary()
+        self._tracks: IdentityDict[_Track] = IdentityDict()
         self._next_id = 0
 
-    def read(self, env: Any) -> SharedScene:
+    def read(self, env: Any) -> MultiagentScene:
         """Everyone on the grid now; reading twice at a step gives the same scene.
 
         Velocities [cells/step] are zero when a body is first seen, and mean ones after a step that was not read.
@@ -98,7 +97,7 @@ class PursuitReader:
         ids = np.array([track.number for track in tracks], dtype=np.int64)
         rows = {name: row for name, row in unwrapped.agent_name_mapping.items() if name in names}
         scene = Scene(states, ids, np.ones(len(bodies), dtype=np.bool_))
-        return share(scene, rows, np.zeros(len(bodies)), self._spec, type(self).__name__)
+        return pad_multiagent_scene(scene, rows, np.zeros(len(bodies)), self._spec, type(self).__name__)
 
     def _follow(self, body: Any, frame: int) -> _Track:
         position = np.array(body.current_position(), dtype=np.float64)  # a copy: the grid moves bodies in place

@@ -5,6 +5,7 @@ and reports scenes as `SceneObservation` does, ready for `VecForecast`. EnvPool 
 when the first environment is made. This module only adapts: what the simulation does is EnvPool's.
 """
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -177,6 +178,19 @@ class EnvPoolEnv(gym.Env[NDArray[Any], Any]):
         over = bool(is_terminated(terminated, truncated, info["crashed"])[0])
         self._running = not (over or truncated[0])
         return observations[0], float(rewards[0]), over, bool(truncated[0]), info_of(info, 0)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickles and copies an environment that was not reset yet, as the arguments of its constructor.
+
+        Raises:
+            UserError: it is running, and EnvPool's C++ state cannot be copied.
+        """
+        if self._seeded:
+            raise UserError(
+                f"a running EnvPool environment cannot be copied or pickled (its state is in C++), got {self.task_id}; "
+                "copy it before the first reset, or use highway-env's own environment"
+            )
+        return functools.partial(EnvPoolEnv, self.task_id, **self._settings), (), {"spec": self.spec}
 
     def debug_states(self) -> Sequence[Any]:
         """EnvPool's own description of the environment, drivers' parameters included: for readers and tests.

@@ -23,9 +23,7 @@ from pettingzoo import ParallelEnv
 
 from predictor.errors import ProtocolError, UserError
 
-HIGHWAY_MULTIAGENT_IDS = ("intersection-multi-agent-v2", "intersection-multi-agent-v1", "intersection-multi-agent-v0")
-
-INTERSECTION = HIGHWAY_MULTIAGENT_IDS[0]
+INTERSECTION = "intersection-multi-agent-v2"
 """Its drivers notice who drives on connected lanes, as on intersection-v2."""
 
 
@@ -175,7 +173,7 @@ def _make(env_id: str, **kwargs: Any) -> gym.Env:
         return gym.make(env_id, disable_env_checker=True, **kwargs).unwrapped
     except (gym.error.Error, ModuleNotFoundError) as error:
         raise UserError(
-            f"cannot make env '{env_id}': {error}; known here: {', '.join(HIGHWAY_MULTIAGENT_IDS)}"
+            f"cannot make env '{env_id}': {error}; pass an intersection with several agents, such as '{INTERSECTION}'"
         ) from error
 
 

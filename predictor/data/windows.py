@@ -16,7 +16,7 @@ from torch import Tensor
 from predictor.data.store import Episode
 from predictor.data.window_tensors import UNKNOWN_TYPE, Casts, Cut, cast, cut, flatten
 from predictor.errors import UserError
-from predictor.scene import SceneSpec
+from predictor.scene import SceneSpec, perceived_agents
 
 
 @dataclass(frozen=True)
@@ -49,16 +49,13 @@ class WindowBatch:
 
 
 def visible(episode: Episode, spec: SceneSpec) -> Bool[np.ndarray, "time agents"]:
-    """Who the ego (column 0) perceives: the nearest `max_agents` within `perception_m`; everyone without an ego."""
+    """Returns which agents the ego (column 0) perceives at each step; all that are present, without an ego."""
     if not spec.has_ego:
         return episode.valid
-    axes = spec.position_dim
-    offsets = episode.states[..., :axes] - episode.states[:, :1, :axes]
-    distance_m = np.where(episode.valid, np.linalg.norm(offsets, axis=-1), np.inf)
-    distance_m[:, 0] = -1.0
-    rank = np.argsort(np.argsort(distance_m, axis=1, kind="stable"), axis=1, kind="stable")
-    seen: np.ndarray = episode.valid & (distance_m <= spec.perception_m) & (rank < spec.max_agents)
-    return seen
+    order, seen = perceived_agents(episode.states, episode.valid, 0, spec)
+    perceived = np.zeros_like(episode.valid)
+    np.put_along_axis(perceived, order, seen, axis=1)
+    return perceived
 
 
 class Windows:

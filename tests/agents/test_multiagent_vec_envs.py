@@ -9,7 +9,7 @@ from agents.task import Task
 from agents.vec_envs import DrivenEnv, EpisodeResult, MakeCopy, drive, make_parallel_rows
 from agents.video import record_task
 from envs.drivers.all_agents import make_driver
-from envs.registry import make_parallel_env
+from envs.registry import make_multiagent_env
 from predictor.errors import UserError
 from tests.agents.helpers import LIVES, TOY, policy_for
 
@@ -49,7 +49,7 @@ def test_unknown_learners_are_named():
 
 def test_rows_observe_what_the_task_says():
     own = make_parallel_rows(Task(SPREAD, "none"), 1)
-    assert own.observation_space == make_parallel_env(SPREAD).observation_space("agent_0")
+    assert own.observation_space == make_multiagent_env(SPREAD).observation_space("agent_0")
     seeing = make_parallel_rows(Task(SPREAD, "constant-velocity"), 1)
     assert isinstance(seeing.observation_space, gym.spaces.Dict)
     assert seeing.observation_space["observation"] == own.observation_space
@@ -82,7 +82,7 @@ def test_the_prey_is_driven_anew_in_each_episode_by_seed(partner: str, observe: 
 
 
 def test_a_driver_serves_one_episode():
-    env = DrivenEnv(make_parallel_env(TAG), "random")
+    env = DrivenEnv(make_multiagent_env(TAG), "random")
     env.reset(seed=0)
     first = env.driver
     assert env.driver is first
@@ -134,7 +134,7 @@ def test_results_depend_on_the_seed_alone(observe: Any):
 def test_a_policy_is_played_as_in_a_plain_loop():
     task = Task(SPREAD, "none")
     model = policy_for(task)
-    env = make_parallel_env(SPREAD)
+    env = make_multiagent_env(SPREAD)
     expected, acted = [], set()
     for seed in (1, 2):
         observations, _ = env.reset(seed=seed)
@@ -153,7 +153,7 @@ def test_a_policy_is_played_as_in_a_plain_loop():
 
 @pytest.mark.parametrize("name", ["random", "heuristic"])
 def test_a_driver_is_played_as_in_a_plain_loop(name: str):
-    env = make_parallel_env(SPREAD)
+    env = make_multiagent_env(SPREAD)
     observations, _ = env.reset(seed=6)
     driver = make_driver(name, env, np.random.default_rng(6))
     total = 0.0
@@ -205,7 +205,7 @@ def test_progress_is_reported_per_episode():
 def test_the_film_shows_the_episode_that_is_measured(
     env_id: str, learners: tuple[str, ...], observe: Any, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("agents.video.PARALLEL_CHECKPOINTS", {})  # as long as none needs to ship
+    monkeypatch.setattr("agents.video.MULTIAGENT_CHECKPOINTS", {})  # as long as none needs to ship
     task = Task(env_id, observe, learners=learners)
     model = policy_for(task)
     (result,) = ParallelArena(task).play(model, [4])

@@ -8,10 +8,10 @@ from stable_baselines3 import PPO
 from envs import collect
 from envs.collect import CollectConfig
 from envs.drivers.ego import idle_action
-from envs.readers import shared_reader_for
+from envs.readers import multiagent_reader_for
 from envs.readers.highway import HighwayReader
 from envs.readers.highway_labels import ATTRIBUTE_NAMES, LEADER
-from envs.registry import make_env, make_parallel_env
+from envs.registry import make_env, make_multiagent_env
 from predictor.data.store import Episode, read_store
 from predictor.data.windows import Windows
 from predictor.errors import UserError
@@ -130,9 +130,9 @@ def test_labels_can_be_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 
 def test_an_episode_of_many_learners_is_what_the_simulator_did():
     (episode,) = collect.collect(config(episodes=1, env_id=TAG, driver=("idle",), seed=11))
-    env = make_parallel_env(TAG)
+    env = make_multiagent_env(TAG)
     env.reset(seed=11)
-    reader = shared_reader_for(env)
+    reader = multiagent_reader_for(env)
     assert (episode.label, episode.seed, len(episode.states)) == ("idle", 11, STEPS + 1)
     assert (episode.edge_types, episode.edge_attributes) == (None, None)
     assert episode.valid.all()
@@ -158,7 +158,7 @@ def test_many_learners_are_recorded_without_labels(
     assert (code, errors) == (0, [])
     assert "4 episodes, 24 scenes, seeds 30–33" in output
     store = read_store(tmp_path / "s")
-    assert store.info.spec == shared_reader_for(make_parallel_env(TAG)).spec
+    assert store.info.spec == multiagent_reader_for(make_multiagent_env(TAG)).spec
     assert (store.info.spec.has_ego, store.info.source) == (False, TAG)
     assert store.info.edge_attribute_names == ()
     assert all(e.edge_types is None for e in store.episodes)

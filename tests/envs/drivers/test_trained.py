@@ -11,7 +11,7 @@ from agents.arena import ParallelArena
 from agents.task import Task
 from envs.drivers.trained import trained_driver
 from envs.parallel import ForecastParallelEnv
-from envs.registry import make_parallel_env
+from envs.registry import make_multiagent_env
 from envs.rollouts.world import SharedWorld
 from predictor.errors import UserError
 from tests.agents.helpers import policy_for
@@ -31,7 +31,7 @@ def save_run(folder: Path, task: Task, config: bool = True) -> tuple[str, PPO]:
 
 
 def forecast_env(env_id: str = SPREAD, **settings: Any) -> ForecastParallelEnv:
-    return ForecastParallelEnv(make_parallel_env(env_id), "constant-velocity", **settings)
+    return ForecastParallelEnv(make_multiagent_env(env_id), "constant-velocity", **settings)
 
 
 def played(env: ForecastParallelEnv, path: str) -> tuple[dict[str, float], list[dict[str, Any]]]:
