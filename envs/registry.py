@@ -4,19 +4,21 @@ import functools
 import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import highway_env  # noqa: F401  (registers the ids)
-import pettingzoo
-from pettingzoo import ParallelEnv
-from pettingzoo.env_registry.exceptions import PettingZooRegistryError
 
 from envs.readers.mpe import MPE_IDS
-from envs.simulators import mixed_traffic  # noqa: F401  (registers the ids)
+from envs.simulators import (
+    HIGHWAY_MULTIAGENT_IDS,
+    mixed_traffic,  # noqa: F401  (registers the ids)
+)
 from envs.simulators.envpool import HIGHWAY_ENV_OF, register_envpool_ids
-from envs.simulators.highway_multiagent import HIGHWAY_MULTIAGENT_IDS
 from predictor.errors import UserError
+
+if TYPE_CHECKING:
+    import pettingzoo  # at run time only where such an environment is made: gymnasium users need not have it
 
 CHECKPOINTS: dict[str, str] = {
     "highway-v0": "highway",
@@ -122,10 +124,12 @@ def is_parallel_id(env_id: str) -> bool:
         factory = _load(env_id)
     except UserError:
         return False
+    from pettingzoo import ParallelEnv
+
     return not isinstance(factory, type) or issubclass(factory, ParallelEnv)
 
 
-def make_parallel_env(env_id: str, **kwargs: Any) -> ParallelEnv:
+def make_parallel_env(env_id: str, **kwargs: Any) -> "pettingzoo.ParallelEnv":
     """Make a parallel environment.
 
     Args:
@@ -136,6 +140,9 @@ def make_parallel_env(env_id: str, **kwargs: Any) -> ParallelEnv:
     Raises:
         UserError: unknown id, a missing package, or arguments that the environment refuses.
     """
+    from pettingzoo import ParallelEnv
+    from pettingzoo.env_registry.exceptions import PettingZooRegistryError
+
     make = _maker(env_id)
     try:
         env = make(**kwargs)
@@ -168,6 +175,8 @@ def _maker(env_id: str) -> Callable[..., Any]:
     if ":" in env_id:
         return _load(env_id)
     if _in_pettingzoo(env_id):
+        import pettingzoo
+
         return functools.partial(pettingzoo.make, "parallel", env_id)
     raise UserError(
         f"unknown parallel env '{env_id}'; known: {', '.join(PARALLEL_IDS)}; others as 'module:function' or "
@@ -188,6 +197,9 @@ def _load(path: str) -> Callable[..., Any]:
 
 
 def _in_pettingzoo(env_id: str) -> bool:
+    import pettingzoo
+    from pettingzoo.env_registry.exceptions import PettingZooRegistryError
+
     try:
         pettingzoo.spec("parallel", env_id)
     except PettingZooRegistryError:

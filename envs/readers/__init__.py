@@ -10,10 +10,8 @@ from envs.readers.entities import EntityRowsReader
 from envs.readers.envpool import EnvPoolReader, is_envpool_env
 from envs.readers.function import FunctionReader
 from envs.readers.highway import HighwayReader, is_highway_env
-from envs.readers.highway_multiagent import HighwaySharedReader
 from envs.readers.mpe import MPE_IDS, MpeReader, is_mpe_env, mpe_scenario
 from envs.readers.pursuit import PursuitReader, is_pursuit_env
-from envs.simulators.highway_multiagent import HighwayParallelEnv
 from predictor.errors import UserError
 
 MakeSharedReader = Callable[[Any], SharedSceneReader]
@@ -112,6 +110,11 @@ def shared_reader_for(env: Any, perception_m: float | None = None, max_agents: i
     for env_class in type(env.unwrapped).__mro__:
         if env_class in _SHARED_REGISTERED:
             return _SHARED_REGISTERED[env_class](env)
+    from envs.readers.highway_multiagent import (
+        HighwaySharedReader,
+    )  # brings PettingZoo, which other readers do not need
+    from envs.simulators.highway_multiagent import HighwayParallelEnv
+
     if isinstance(env.unwrapped, HighwayParallelEnv):
         return HighwaySharedReader(env, perception_m, max_agents)
     own = getattr(env, "make_scene_reader", None)

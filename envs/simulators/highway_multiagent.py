@@ -21,9 +21,8 @@ from highway_env.envs.intersection_env import MultiAgentIntersectionEnv
 from highway_env.vehicle.kinematics import Vehicle
 from pettingzoo import ParallelEnv
 
+from envs.simulators import HIGHWAY_MULTIAGENT_IDS
 from predictor.errors import ProtocolError, UserError
-
-HIGHWAY_MULTIAGENT_IDS = ("intersection-multi-agent-v2", "intersection-multi-agent-v1", "intersection-multi-agent-v0")
 
 INTERSECTION = HIGHWAY_MULTIAGENT_IDS[0]
 """Its drivers notice who drives on connected lanes, as on intersection-v2."""
