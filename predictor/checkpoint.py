@@ -13,7 +13,7 @@ from typing import Any
 
 import safetensors
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import nn
 
 from predictor.baselines.constant_velocity import ConstantVelocity
@@ -59,7 +59,7 @@ def save_checkpoint(path: Path, model: nn.Module, info: CheckpointInfo) -> None:
     partial.mkdir()
     try:
         tensors = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
-        save_file(tensors, partial / "model.safetensors")
+        (partial / "model.safetensors").write_bytes(save(tensors))  # `save_file` would not follow the umask
         content = {"format": FORMAT, "version": VERSION, **asdict(info)}
         (partial / "config.json").write_text(json.dumps(content, indent=2, default=str) + "\n")
         replace_folder(partial, path)
