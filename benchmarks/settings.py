@@ -34,7 +34,7 @@ class Settings:
     env_id: str = "highway-fast-v0"
     """Environment of the wrappers and of PPO; needs a shipped checkpoint and a copy in EnvPool."""
     out: Path = Path("runs/benchmarks.json")
-    """JSON file for machine, versions and all rows."""
+    """JSON file for machine, versions and all lines."""
     baseline: Path | None = None
     """Compare with this file and exit with status 1 if anything got slower."""
     write_baseline: Path | None = None

@@ -7,7 +7,6 @@ the median ratio. Absolute numbers depend on the machine; the ratio is the resul
 import json
 import platform
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
