@@ -39,24 +39,24 @@ def main() -> None:
     def say(section: str) -> None:
         progress.print(f"[{time.perf_counter() - began:5.0f} s] {section} …", markup=False, highlight=False)
 
-    rows = measure(settings, settings.sections, say)
+    lines = measure(settings, settings.sections, say)
     comparison: Comparison | None = None
     if baseline is not None:
-        rows, comparison = settle(settings, baseline, rows, say)
-    result = report(settings, rows, keeps_memory, began)
+        lines, comparison = settle(settings, baseline, lines, say)
+    result = report(settings, lines, keeps_memory, began)
     kept = "kept" if keeps_memory else "handed back"
     versions = ", ".join(f"{name} {version}" for name, version in result["provenance"]["versions"].items())
     print(f"{result['machine']}; {settings.threads} torch threads; freed memory is {kept}; {settings.mode} run")
     print(f"commit {result['provenance']['commit']}; {versions}")
-    console.print(rich_table(rows)) if console.is_terminal else print(plain(rows))
+    console.print(rich_table(lines)) if console.is_terminal else print(plain(lines))
     settings.out.parent.mkdir(parents=True, exist_ok=True)
     write_json(settings.out, result)
     if settings.write_baseline is not None:
-        write_baseline(settings.write_baseline, settings, rows, processor(), result["provenance"])
+        write_baseline(settings.write_baseline, settings, lines, processor(), result["provenance"])
     if comparison is not None and baseline is not None:
         if baseline.processor != processor():
             print(f"the baseline is of another processor ({baseline.processor}): wider tolerances for equivalents")
-        print("\n".join(comparison.lines()))
+        print("\n".join(comparison.report()))
         if comparison.slower:
             sys.exit(1)
 

@@ -1,6 +1,6 @@
 """Does `VecForecast` leak? Agents come and go at every step; resident memory, slots and values are watched.
 
-`python benchmarks/churn.py` steps a synthetic traffic of which a share is replaced at each step, with episodes that end
+`python -m benchmarks.churn` steps a synthetic traffic of which a share is replaced at each step, with episodes that end
 at different times, and reports the slope of the resident memory [bytes per vector step], measured after a warm-up.
 """
 

@@ -1,6 +1,6 @@
 """How often EnvPool's vehicles keep their identity from step to step, when only their motion tells who is who.
 
-`python benchmarks/envpool_identity.py` drives each task with random actions, hides the order of the vehicles from the
+`python -m benchmarks.envpool_identity` drives each task with random actions, hides the order of the vehicles from the
 reader by shuffling it anew at each step, and compares the identities with the true ones: EnvPool 1.2.5 never reorders
 or removes a vehicle, which is checked in the same run where each driver has an exponent of its own. `--replay` does the
 same to scenes of highway-env, where vehicles also come and go and the simulator names them.

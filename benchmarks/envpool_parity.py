@@ -1,6 +1,6 @@
 """How far EnvPool's highway environments are from highway-env's: the same state in both, and episodes of each.
 
-`python benchmarks/envpool_parity.py` copies the states that EnvPool's episodes begin in (positions, speeds, lanes,
+`python -m benchmarks.envpool_parity` copies the states that EnvPool's episodes begin in (positions, speeds, lanes,
 routes, target speeds, drivers' exponents and timers) into the mirrored highway-env id, steps both with the same random
 actions, and reports by how much vehicles differ in position. Then it compares what episodes of each are like on their
 own terms, and with `--policy` how one trained policy fares in both.

@@ -1,6 +1,6 @@
 """PPO with forecasts on EnvPool against plain PPO on highway-env: steps/s of whole training loops, in one run.
 
-`python benchmarks/envpool_training.py` trains both in turn, block by block (rollouts and updates, no evaluation), each
+`python -m benchmarks.envpool_training` trains both in turn, block by block (rollouts and updates, no evaluation), each
 with the preset that `train_policy.py` uses for it, and prints the median ratio and where the time of the first goes.
 Absolute numbers depend on the machine; the ratio is the result.
 """

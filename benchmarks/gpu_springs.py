@@ -1,4 +1,4 @@
-"""Paper-size training of 5-Spring on one GPU, as one command: `python benchmarks/gpu_springs.py --data data`.
+"""Paper-size training of 5-Spring on one GPU, as one command: `python -m benchmarks.gpu_springs --data data`.
 
 Makes the data where it is missing, trains the dG-VAE for 150 epochs of 50,000 sequences at batch 128, measures it as
 the table does (`python -m predictor.suite --table springs --budget paper --rows dgvae`, whose row this is) and writes

@@ -36,7 +36,7 @@ class Settings:
     env_id: str = "highway-fast-v0"
     """Environment of the wrappers and of PPO; needs a shipped checkpoint and a copy in EnvPool."""
     out: Path = Path("runs/benchmarks.json")
-    """JSON file for machine, versions and all rows."""
+    """JSON file for machine, versions and all lines."""
     baseline: Path | None = None
     """Baseline file to compare with; the exit status is 1 if anything got slower."""
     write_baseline: Path | None = None

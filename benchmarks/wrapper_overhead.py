@@ -1,13 +1,12 @@
 """What foresight costs: steps/s of plain environments against the same ones under `VecForecast`, in one run.
 
-`python benchmarks/wrapper_overhead.py` times both in turn, block by block, on the same seeds and actions, and prints
+`python -m benchmarks.wrapper_overhead` times both in turn, block by block, on the same seeds and actions, and prints
 the median ratio. Absolute numbers depend on the machine; the ratio is the result.
 """
 
 import json
 import platform
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,9 +18,6 @@ import numpy as np
 import torch
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
-
-if not __package__:  # run as a file: the packages are beside this folder
-    sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 from benchmarks.timing import alternate, quartiles
 from envs.registry import make_env

@@ -4,7 +4,8 @@ Each row keeps its own history and forgets it when, and only when, its own episo
 episode carries the forecast made from that episode's history; the one that opens the next starts from one step.
 """
 
-from typing import Any
+import importlib
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -24,6 +25,16 @@ from envs.observation import (
     with_forecast,
 )
 from predictor.scene import SceneSpec
+
+if TYPE_CHECKING:
+    from envs.sb3.forecast import VecForecast  # noqa: F401  (an alias at run time)
+
+
+def __getattr__(name: str) -> Any:
+    """Finds `VecForecast`, which stood here before it moved to `envs.sb3.forecast`; only then SB3 is imported."""
+    if name == "VecForecast":
+        return importlib.import_module("envs.sb3.forecast").VecForecast
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
 
 
 class VectorForecast(gym.vector.VectorWrapper):

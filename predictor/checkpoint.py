@@ -11,7 +11,7 @@ from typing import Any
 
 import safetensors
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import nn
 
 from predictor.baselines.constant_velocity import ConstantVelocity
@@ -57,7 +57,7 @@ def save_checkpoint(path: Path, model: nn.Module, info: CheckpointInfo) -> None:
         raise UserError(f"the checkpoint says model '{info.model}' but the network is '{name_of(model)}'")
     with new_folder(Path(path)) as partial:
         tensors = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
-        save_file(tensors, partial / WEIGHTS)
+        (partial / WEIGHTS).write_bytes(save(tensors))  # `save_file` would not follow the umask
         write_json(partial / "config.json", {"format": FORMAT, "version": VERSION, **asdict(info)})
 
 

@@ -25,9 +25,12 @@ _HEADINGS = ("heading", "cos_h", "sin_h")
 class EntityRowsReader:
     """Makes readers of the env's own observation, a Box of entities × columns (or the same as one row of numbers).
 
+        >>> from envs import ForecastObservation, make_env
         >>> columns = ("presence", "x", "y", "vx", "vy")
-        >>> reader = EntityRowsReader(columns, SceneSpec(dt_s=0.1), gate_m=1.0)
-        >>> ForecastObservation(env, checkpoint, reader=reader)
+        >>> observation = {"type": "Kinematics", "features": [*columns], "absolute": True, "normalize": False}
+        >>> env = make_env("highway-fast-v0", config={"observation": observation})
+        >>> reader = EntityRowsReader(columns, SceneSpec(dt_s=1.0))
+        >>> env = ForecastObservation(env, "highway", reader=reader)
 
     An observation that is clipped cannot be undone: take it without, or with bounds that are never met.
     """

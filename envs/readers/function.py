@@ -13,12 +13,16 @@ from predictor.scene import Scene, SceneSpec
 class FunctionReader:
     """Makes readers of a function that says who is there; what the ego perceives of it is decided as everywhere.
 
-        >>> def read_walkers(env) -> Scene:
-        ...     world = env.unwrapped
-        ...     return Scene(world.states, world.ids, np.ones(len(world.ids), dtype=bool))
-        >>> reader = FunctionReader(read_walkers, SceneSpec(dt_s=0.1))
-        >>> ForecastObservation(env, checkpoint, reader=reader)
-        >>> register_reader(MyEnv, reader)  # from then on, no wrapper and no command needs to be told
+        >>> import numpy as np
+        >>> from envs import ForecastObservation, make_env
+        >>> def read_cars(env) -> Scene:
+        ...     cars = env.unwrapped.road.vehicles  # the ego is the first
+        ...     states = np.array([[*car.position, *car.velocity] for car in cars])
+        ...     return Scene(states, np.array([id(car) for car in cars]), np.ones(len(cars), dtype=bool))
+        >>> reader = FunctionReader(read_cars, SceneSpec(dt_s=1.0))
+        >>> env = ForecastObservation(make_env("highway-fast-v0"), "highway", reader=reader)
+
+    After `register_reader(MyEnv, reader)` no wrapper and no command needs `reader=` for environments of that class.
 
     It can be pickled, for environments in processes of their own, if the function can: one at the top of a module.
     """

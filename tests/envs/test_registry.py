@@ -1,3 +1,7 @@
+import subprocess
+import sys
+from pathlib import Path
+
 import gymnasium as gym
 import pytest
 
@@ -11,6 +15,27 @@ def test_an_unknown_id_is_one_clear_line(env_id: str):
     with pytest.raises(UserError, match=f"cannot make env '{env_id}'.*known here: highway-v0, ") as error:
         make_env(env_id)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("absent", ["envpool", "envpool stable_baselines3"])
+def test_an_env_of_envpool_without_envpool_says_what_to_install(absent: str):
+    code = f"""
+import sys
+for name in {absent.split()!r}:
+    sys.modules[name] = None  # importing it raises ImportError
+from envs.registry import make_env
+from predictor.errors import UserError
+try:
+    make_env("envpool/HighwayFast-v0")
+except UserError as error:
+    print(error)
+"""
+    root = Path(__file__).resolve().parents[2]
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    (line,) = done.stdout.splitlines()
+    assert "need the envpool package" in line and "pip install 'dgvae-rl[envpool]'" in line
 
 
 def test_native_environments_are_made_by_id():

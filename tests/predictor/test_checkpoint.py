@@ -60,6 +60,18 @@ def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
 # --- Round trip -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("mask", "file_mode", "folder_mode"), [(0o022, 0o644, 0o755), (0o077, 0o600, 0o700)])
+def test_modes_follow_the_umask(tmp_path: Path, mask: int, file_mode: int, folder_mode: int):
+    before = os.umask(mask)
+    try:
+        save_checkpoint(tmp_path / "toy", made(), INFO)
+    finally:
+        os.umask(before)
+    modes = {file.name: file.stat().st_mode & 0o777 for file in (tmp_path / "toy").iterdir()}
+    assert modes == {"config.json": file_mode, "model.safetensors": file_mode}
+    assert (tmp_path / "toy").stat().st_mode & 0o777 == folder_mode
+
+
 def test_round_trip_is_exact(path: Path):
     assert_holds(path, made())
     loaded, info = load_checkpoint(path)
@@ -106,7 +118,7 @@ def test_failed_save_leaves_the_old_checkpoint_whole(
     before = {p.name: p.read_bytes() for p in path.iterdir()} if existing else {}
     match point:
         case "weights":
-            monkeypatch.setattr(checkpoint, "save_file", crash)
+            monkeypatch.setattr(checkpoint, "save", crash)
         case "config":
             monkeypatch.setattr(checkpoint, "asdict", crash)
         case "replace":
