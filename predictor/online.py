@@ -13,6 +13,7 @@ from torch.nn import functional
 from predictor.errors import ProtocolError
 from predictor.forecaster import Belief, Forecaster, Memory
 from predictor.graph import NOBODY
+from predictor.layers.pair_noise import Noise
 from predictor.scene import PADDING_ID, Forecast, SceneBatch
 
 
@@ -84,7 +85,7 @@ class OnlineForecaster:
         self,
         horizon_steps: int | None = None,
         num_samples: int = 1,
-        generator: torch.Generator | None = None,
+        generator: Noise | None = None,
     ) -> Forecast:
         """Forecast from the latest observation; sample 0 is the most likely graph's.
 
