@@ -20,21 +20,21 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
-from envs.multiagent_observation import SharedStream, check_multiagent_scene
-from envs.observation import FORECAST_KEYS, ForecastConfig
+from envs.forecast_wrapper import ForecastWrapper, ObservationLayout
+from envs.multiagent_observation import MultiagentStream, check_multiagent_scene
+from envs.observation import FORECAST_KEYS, open_forecaster
 from envs.readers import MakeReader, multiagent_env_id, multiagent_reader_for
 from envs.readers.base import MultiagentReader, MultiagentScene, build_multiagent_reader
-from envs.registry import checkpoint_for
+from envs.scene_stream import ForecastConfig
 from envs.simulators.copies import RunningCopy
-from predictor.checkpoint import load_forecaster
 from predictor.errors import ProtocolError, UserError
 from predictor.forecaster import Forecaster
-from predictor.scene import Forecast, SceneSpec
+from predictor.scene import SceneSpec
 
 _COMPOSED = (gym.spaces.Dict, gym.spaces.Tuple, gym.spaces.Graph, gym.spaces.Sequence, gym.spaces.OneOf)
 
 
-class ForecastParallelEnv(RunningCopy, BaseParallelWrapper):
+class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     """Shows every agent what the others are about to do.
 
     Observation of an agent: Dict with `observation` (its own, untouched) and, for the other agents sorted by distance
@@ -42,7 +42,7 @@ class ForecastParallelEnv(RunningCopy, BaseParallelWrapper):
     num_samples > 1), `edge_probs` and `edge_features` (other → agent, then agent → other), `valid`.
     `envs.observation.ego_entries` gives the shapes. Agents may differ in their own spaces, die and join at any step. An
     agent gets its last observation like any other; if the reader no longer sees it, all its entries are zero, `valid`
-    too.
+    too. With `flatten=True` an observation is one Box, in the Dict's key order.
 
     The history is forgotten at reset only. After each step, `scene` and `forecast` hold the same in the world frame.
 
@@ -51,11 +51,13 @@ class ForecastParallelEnv(RunningCopy, BaseParallelWrapper):
         checkpoint: shipped name, folder, or "constant-velocity"; None takes the one that ships for the env's id.
         horizon_steps: steps to forecast; None takes the checkpoint's.
         num_samples: sampled futures per agent.
+        flatten: one Box for each agent instead of a Dict.
         perception_m: how far an agent sees [m]; None takes what the checkpoint was trained with.
         max_agents: rows of an agent's view, itself included, the nearest are kept; None takes everyone.
         device: where the forecaster runs.
-        reader: makes a reader for the env; None picks one by env family.
         forecaster: instead of a checkpoint; lives on `device`.
+        seed: of the samples' noise, until `reset(seed=…)` gives another.
+        reader: makes a reader for the env; None picks one by env family.
 
     Raises:
         UserError: not a parallel env, no reader, no checkpoint, one of another spec (features, dt) or relative to an
@@ -69,11 +71,13 @@ class ForecastParallelEnv(RunningCopy, BaseParallelWrapper):
         *,
         horizon_steps: int | None = None,
         num_samples: int = 1,
+        flatten: bool = False,
         perception_m: float | None = None,
         max_agents: int | None = None,
         device: str = "cpu",
-        reader: MakeReader | None = None,
         forecaster: Forecaster | None = None,
+        seed: int = 0,
+        reader: MakeReader | None = None,
     ) -> None:
         """Load the forecaster and extend the observation spaces."""
         if not isinstance(env, ParallelEnv):
@@ -81,23 +85,18 @@ class ForecastParallelEnv(RunningCopy, BaseParallelWrapper):
                 f"ForecastParallelEnv needs a PettingZoo parallel env, got {type(env).__name__}; make it with "
                 "parallel_env(), or convert an AEC env with pettingzoo.utils.conversions.aec_to_parallel"
             )
-        super().__init__(env)
+        BaseParallelWrapper.__init__(self, env)
         self._source = f"env '{multiagent_env_id(env)}'"
         self._reader: MultiagentReader = (
             build_multiagent_reader(reader, env) if reader is not None else multiagent_reader_for(env, perception_m)
         )
         spec = self._reader.spec
-        if forecaster is None:
-            name = checkpoint if checkpoint is not None else checkpoint_for(multiagent_env_id(env))
-            forecaster = load_forecaster(name, spec, self._source, device)
-        elif checkpoint is not None:
-            raise UserError(f"give a checkpoint or a forecaster, not both (checkpoint '{checkpoint}')")
-        else:
-            forecaster.spec.check_compatible(spec, "the forecaster", self._source)
+        env_id = multiagent_env_id(env)
+        forecaster = open_forecaster(checkpoint, spec, env_id, device, forecaster)
         perception_m = forecaster.spec.perception_m if perception_m is None else perception_m
-        config = ForecastConfig(horizon_steps, num_samples, device)
-        self._stream = SharedStream(forecaster, spec, config, perception_m, max_agents)
-        self._spaces: dict[str, gym.spaces.Dict] = {}
+        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten)
+        self.stream: MultiagentStream = MultiagentStream(forecaster, spec, config, perception_m, max_agents)
+        self._layouts: dict[str, ObservationLayout] = {}
         self._scene: MultiagentScene | None = None
         for agent in getattr(env, "possible_agents", ()):
             self.observation_space(agent)
@@ -119,28 +118,24 @@ class ForecastParallelEnv(RunningCopy, BaseParallelWrapper):
             raise ProtocolError("there is no scene yet; call reset() first")
         return self._scene
 
-    @property
-    def forecast(self) -> Forecast:
-        """The latest forecast, a batch of one, rows as in `scene.scene`, world coordinates."""
-        if self._stream.forecast is None:
-            raise ProtocolError("there is no forecast yet; call reset() first")
-        return self._stream.forecast
-
-    def observation_space(self, agent: str) -> gym.spaces.Dict:
-        """Its own observation and the forecast entries; the same object at each call.
+    def observation_space(self, agent: str) -> gym.Space:
+        """Returns the space of its own observation and the forecast entries, always one object.
 
         Raises:
             UserError: the agent's own observation is a Dict or Tuple.
         """
-        if agent not in self._spaces:
+        return self._layout(agent).space
+
+    def _layout(self, agent: str) -> ObservationLayout:
+        if agent not in self._layouts:
             own = self.env.observation_space(agent)
             if isinstance(own, _COMPOSED):
                 raise UserError(
                     f"an agent's own observation must be one array, but '{agent}' of {self._source} gives a "
                     f"{type(own).__name__}; pass on the array alone, and an action mask in the agent's info"
                 )
-            self._spaces[agent] = gym.spaces.Dict({"observation": own, **self._stream.spaces()})
-        return self._spaces[agent]
+            self._layouts[agent] = ObservationLayout(own, self.stream.spaces(), self.stream.config.flatten)
+        return self._layouts[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -148,9 +143,9 @@ class ForecastParallelEnv(RunningCopy, BaseParallelWrapper):
         """Reset the env and forget the history; a seed also restarts the samples' noise."""
         observations, infos = self.env.reset(seed=seed, options=options)
         self._reader.reset()
-        self._stream.reset()
+        self.stream.reset()
         if seed is not None:
-            self._stream.seed(seed)
+            self.stream.seed(seed)
         return self._observe(observations), infos
 
     def step(
@@ -160,15 +155,15 @@ class ForecastParallelEnv(RunningCopy, BaseParallelWrapper):
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
         return self._observe(observations), rewards, terminations, truncations, infos
 
-    def _observe(self, observations: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    def _observe(self, observations: Mapping[str, Any]) -> dict[str, Any]:
         scene = self._reader.read(self.env)
         self._scene = check_multiagent_scene(scene, self._reader.spec, f"scene reader of {self._source}")
-        entries = self._stream.observe(self._scene)
+        entries = self.stream.observe(self._scene)
         return {
-            agent: {"observation": own, **(entries[agent] if agent in entries else self._nothing_seen(agent))}
+            agent: self._layout(agent).one(own, entries[agent] if agent in entries else self._nothing_seen())
             for agent, own in observations.items()
         }
 
-    def _nothing_seen(self, agent: str) -> dict[str, NDArray[np.float32]]:
-        spaces = self.observation_space(agent).spaces
+    def _nothing_seen(self) -> dict[str, NDArray[np.float32]]:
+        spaces = self.stream.spaces()
         return {key: np.zeros(spaces[key].shape or (), dtype=np.float32) for key in FORECAST_KEYS}

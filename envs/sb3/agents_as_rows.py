@@ -23,7 +23,7 @@ from pettingzoo import ParallelEnv
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from envs.sb3.padded_spaces import SharedObservation, own_action, roles_of, shared_action
+from envs.sb3.padded_spaces import PaddedObservation, own_action, roles_of, shared_action
 from predictor.errors import ProtocolError, UserError
 
 Partner = Callable[[ParallelEnv, dict[str, Any], np.random.Generator], Mapping[str, Any]]
@@ -109,7 +109,7 @@ class ParallelVecEnv(VecEnv):
         observations = {name: self.envs[0].observation_space(name) for name in names}
         actions = {name: self.envs[0].action_space(name) for name in names}
         roles = roles_of(observations, actions)
-        self._observation = SharedObservation(observations, roles, agent_indicator)
+        self._observation = PaddedObservation(observations, roles, agent_indicator)
         self._own_actions = actions
         self.row_agents = names * len(self.envs)
         self.row_copies = [copy for copy in range(len(self.envs)) for _ in names]

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from predictor.config_checks import check_at_least, check_choices
 from predictor.forecaster import Belief, Memory, WindowOutput
 from predictor.graph import pair_mask
+from predictor.layers.pair_noise import Noise
 from predictor.layers.state_codec import Residual, StateCodec
 from predictor.scene import SceneSpec
 
@@ -149,7 +150,7 @@ class UnrolledForecaster(nn.Module, ABC):
         return Memory(nodes, pairs), Belief(states, valid, self.edge_probs(graph, valid), features, internal)
 
     def rollout(
-        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
+        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
         """Feed predictions back; all samples are the same."""
         now: Internal = belief.internal

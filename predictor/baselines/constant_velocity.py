@@ -5,6 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from predictor.forecaster import Belief, Memory, edgeless_belief
+from predictor.layers.pair_noise import Noise
 from predictor.scene import SceneSpec
 
 
@@ -31,7 +32,7 @@ class ConstantVelocity:
         return memory, edgeless_belief(states, valid, self.num_edge_types, self.edge_feature_dim)
 
     def rollout(
-        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
+        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
         """X + v·t; all samples are the same."""
         states = belief.states

@@ -11,7 +11,8 @@ linear term of the agent's own state to its messages. And while true states are 
 expectation, so that a history has one meaning; samples branch off at the first forecast step.
 """
 
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable
+from dataclasses import fields, replace
 from typing import Any
 
 import torch
@@ -34,6 +35,7 @@ from predictor.dgvae.single_step import Encoding, Internal, Layers, Modules, Pas
 from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory, WindowOutput
 from predictor.graph import NOBODY, among_nearest, nearest, off_diagonal, others, pair_mask, with_diagonal
+from predictor.layers.pair_noise import Noise, PairNoise, noise_of_pairs
 from predictor.layers.rnn import masked_gru
 from predictor.layers.state_codec import StateCodec
 from predictor.scene import SceneSpec
@@ -130,7 +132,7 @@ class DGVAE(nn.Module):
         return after, Belief(states, valid, *shown, known, memory.senders)
 
     def rollout(
-        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
+        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
         """Feed predictions back through the encoder, so that the graph evolves; sample 0 takes expected graphs."""
         known: Internal = belief.internal
@@ -143,6 +145,8 @@ class DGVAE(nn.Module):
         if num_samples == 1:
             return future[:, None]
         draws = num_samples - 1
+        steps = horizon_steps if self.config.rollout_graph == "evolving" else 1
+        noise = noise_of_pairs(generator, graph.pairs_there, draws, steps, self.num_edge_types)
         states, valid, seen = (
             t.repeat_interleave(draws, dim=0) for t in (belief.states, belief.valid, known.past.seen)
         )
@@ -153,7 +157,7 @@ class DGVAE(nn.Module):
         node = graph.repeat_nodes(known.node_before, draws)
         drawn = self._free_run(
             layers, states, valid, graph.repeat(draws), features, Past(hidden, cell, static, seen), node, logits,
-            horizon_steps, self._sampler(generator),
+            horizon_steps, self._sampler(noise),
         )  # fmt: skip
         return torch.cat([future[:, None], drawn.unflatten(0, (len(future), draws))], dim=1)
 
@@ -237,8 +241,9 @@ class DGVAE(nn.Module):
         seen = zeros(batch, agents, self.codec.num_inputs + 1 if self.sees_changes else 0)
         return (zeros(batch, agents, config.decoder_dim), seen), (pair, pair.clone(), static)
 
-    def _sampler(self, generator: torch.Generator | None) -> "_Sampler":
-        return _Sampler(self.config.temperature, self.config.hard_samples, generator)
+    def _sampler(self, noise: torch.Generator | PairNoise | None) -> Callable[[Tensor], Tensor]:
+        temperature, hard = self.config.temperature, self.config.hard_samples
+        return lambda logits: concrete_sample(logits, temperature, noise, hard)
 
     def _plain(self) -> Layers:
         return Modules(self.encoder, self.decoder)
@@ -357,7 +362,7 @@ class DGVAE(nn.Module):
         node: Tensor,
         logits: Tensor,
         horizon_steps: int,
-        sampler: "_Sampler",
+        sampler: Callable[[Tensor], Tensor],
     ) -> Float[Tensor, "batch agents horizon state"]:
         """Roll out from an observation whose decoder step is still to be taken."""
         drawn = graph.per_pair(sampler, logits)
@@ -374,7 +379,7 @@ class DGVAE(nn.Module):
         node: Tensor,
         edges: tuple[Tensor, Tensor],
         horizon_steps: int,
-        sampler: "_Sampler | None",
+        sampler: Callable[[Tensor], Tensor] | None,
     ) -> Float[Tensor, "batch agents horizon state"]:
         """Roll out from predicted states; without a sampler along expected graphs.
 
@@ -388,13 +393,3 @@ class DGVAE(nn.Module):
             node, states = self._move(layers, states, valid, graph, weights, features, node)
             future.append(states)
         return torch.stack(future, dim=2)[:, :, :horizon_steps]
-
-
-@dataclass(frozen=True)
-class _Sampler:
-    temperature: float
-    hard: bool = False
-    generator: torch.Generator | None = field(default=None)
-
-    def __call__(self, logits: Tensor) -> Tensor:
-        return concrete_sample(logits, self.temperature, self.generator, self.hard)

@@ -17,6 +17,7 @@ from torch.nn import functional
 from predictor.config_checks import check_at_least, check_choices
 from predictor.dgvae.innovation import Innovation
 from predictor.errors import UserError
+from predictor.layers.pair_noise import PairNoise
 from predictor.layers.pairs import PairLinear, folded, sum_over_senders
 from predictor.layers.rnn import Correction, masked_lstm
 from predictor.layers.state_codec import Residual
@@ -127,7 +128,7 @@ class Edges(NamedTuple):
 def concrete_sample(
     logits: Float[Tensor, "*batch types"],
     temperature: float,
-    generator: torch.Generator | None = None,
+    generator: torch.Generator | PairNoise | None = None,
     hard: bool = False,
 ) -> Float[Tensor, "*batch types"]:
     """Reparameterised sample of the concrete distribution (paper Sec. IV, Sampling).
@@ -135,12 +136,15 @@ def concrete_sample(
     Args:
         logits: unnormalised log-probabilities.
         temperature: towards 0 samples become one-hot.
-        generator: source of the Gumbel noise.
+        generator: source of the Gumbel noise; the one of each scene's own pairs, or one for all.
         hard: one-hot samples whose gradient is that of the soft ones (straight-through).
     """
     if logits.dtype in (torch.bfloat16, torch.float16):
         logits = logits.float()  # the tails of the noise are what draws the rare type
-    uniform = torch.rand(logits.shape, generator=generator, device=logits.device, dtype=logits.dtype)
+    if isinstance(generator, PairNoise):
+        uniform = generator.like(logits)
+    else:
+        uniform = torch.rand(logits.shape, generator=generator, device=logits.device, dtype=logits.dtype)
     tiny = torch.finfo(logits.dtype).tiny
     gumbel = -torch.log(-torch.log(uniform.clamp(tiny, 1 - torch.finfo(logits.dtype).eps)))
     soft = edge_probabilities((logits + gumbel) / temperature)

@@ -19,7 +19,7 @@ import pytest
 import torch
 from pettingzoo import ParallelEnv
 
-from envs.multiagent_observation import SharedStream, agent_entries
+from envs.multiagent_observation import MultiagentStream, agent_entries
 from envs.observation import FORECAST_KEYS, ForecastConfig, ForecastStream, ego_entries
 from envs.parallel import ForecastParallelEnv
 from envs.readers import multiagent_reader_for, reader_for
@@ -494,7 +494,7 @@ class Stream:
         self._shared, view = session.subject.shared, session.view
         config = ForecastConfig()
         self._stream: Any = (
-            SharedStream(session.model, session.spec, config, view.perception_m, view.max_agents)
+            MultiagentStream(session.model, session.spec, config, view.perception_m, view.max_agents)
             if self._shared
             else ForecastStream(session.model, session.spec, 1, config)
         )

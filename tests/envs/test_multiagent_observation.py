@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.multiagent_observation import SharedStream, agent_entries, check_multiagent_scene
+from envs.multiagent_observation import MultiagentStream, agent_entries, check_multiagent_scene
 from envs.observation import FORECAST_KEYS, ForecastConfig
 from envs.readers.base import MultiagentScene
 from predictor.baselines.constant_velocity import ConstantVelocity
@@ -127,11 +127,11 @@ def reordered(shared: MultiagentScene, order: np.ndarray) -> MultiagentScene:
 
 def stream(spec: SceneSpec, perception_m: float | None = None, max_agents: int | None = None, **config: Any):
     model = tiny_model(spec)
-    return SharedStream(model, replace(spec, has_ego=False), ForecastConfig(**config), perception_m, max_agents)
+    return MultiagentStream(model, replace(spec, has_ego=False), ForecastConfig(**config), perception_m, max_agents)
 
 
 def straight(shared: MultiagentScene, spec: SceneSpec = WORLD, horizon: int = 2) -> dict[str, dict[str, np.ndarray]]:
-    return SharedStream(ConstantVelocity(spec, horizon), spec, ForecastConfig()).observe(shared)
+    return MultiagentStream(ConstantVelocity(spec, horizon), spec, ForecastConfig()).observe(shared)
 
 
 # --- agent_entries: one forecast, everyone's own view -----------------------------------------------------------------
@@ -230,13 +230,13 @@ def test_nobody_who_learns_gets_nothing():
     assert agent_entries(shared, random_world_forecast(rng, 6, 1, 2, 2, 1), WORLD) == {}
 
 
-# --- SharedStream -----------------------------------------------------------------------------------------------------
+# --- MultiagentStream ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("spec", FRAMES, ids=FRAME_NAMES)
 def test_forecast_is_in_world_coordinates(spec: SceneSpec):
     shared = shared_scene((100, 200, 4, 0), (-50, 30, 0, -8))
-    made = SharedStream(ConstantVelocity(spec, 2), replace(spec, has_ego=False), ForecastConfig())
+    made = MultiagentStream(ConstantVelocity(spec, 2), replace(spec, has_ego=False), ForecastConfig())
     made.observe(shared)
     assert made.forecast is not None
     expected = [[[102, 200], [104, 200]], [[-50, 26], [-50, 22]]]
@@ -382,7 +382,7 @@ def test_a_view_is_what_was_asked_for():
 def test_a_forecaster_that_needs_an_ego_is_refused():
     model = tiny_model(replace(AROUND_EGO, frame=("ego", "world")))
     with pytest.raises(UserError, match="relative to one ego, but these scenes have many learners"):
-        SharedStream(model, WORLD, ForecastConfig())
+        MultiagentStream(model, WORLD, ForecastConfig())
 
 
 def test_scenes_with_an_ego_or_a_height_are_refused():
@@ -391,7 +391,7 @@ def test_scenes_with_an_ego_or_a_height_are_refused():
     )
     for spec, found in ((AROUND_EGO, "has_ego=True and 2 axes"), (high, "has_ego=False and 3 axes")):
         with pytest.raises(UserError, match=f"need has_ego=False and positions on two axes, got {found}"):
-            SharedStream(ConstantVelocity(spec), spec, ForecastConfig())
+            MultiagentStream(ConstantVelocity(spec), spec, ForecastConfig())
 
 
 @pytest.mark.parametrize(("perception_m", "max_agents"), [(0.0, None), (-1.0, None), (None, 0)])

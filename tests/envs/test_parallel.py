@@ -310,7 +310,7 @@ def test_reset_forgets_and_nothing_else_does():
     amnesiac = wrap(Toy(), shuffle=False)
     amnesiac.reset(seed=0)
     while amnesiac.agents:
-        amnesiac._stream.reset()
+        amnesiac.stream.reset()
         last, *_ = amnesiac.step(act(amnesiac))
     assert set(last) == set(first[-1]) == {"stays", "joins", "takes over"}
     for name in last:
@@ -347,7 +347,7 @@ def test_who_takes_a_leavers_row_gets_none_of_its_memory(learns: bool):
     for _ in range(4):
         observations, *_ = env.step(act(env))
         rows.append({int(i): row for row, i in enumerate(env.scene.scene.ids) if i >= 0})
-        fresh._stream.reset()
+        fresh.stream.reset()
         first_sight, *_ = fresh.step(act(fresh))
     assert rows[2][101] == rows[3][102] == 1
     assert observations["stays"]["valid"].sum() == 1
