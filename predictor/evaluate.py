@@ -1,8 +1,8 @@
 """Measure a checkpoint on recorded data: `python -m predictor.evaluate --checkpoint NAME --data STORE`.
 
 Prints minADE and minFDE (per agent and joint, with standard errors over subsets of the windows), miss rate, coverage,
-and RMSE and NLL by horizon, for K = 1 and K samples beside constant velocity; writes JSON, Markdown and plots. Accuracy
-in the loop that a policy drives is `python -m envs.evaluate`'s.
+and RMSE and NLL by horizon, for K = 1 and K samples beside constant velocity (K = 1) and constant velocity with noise
+(K samples); writes JSON, Markdown and plots. Accuracy in the loop that a policy drives is `python -m envs.evaluate`'s.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from matplotlib import pyplot as plt
 from rich.console import Console
 from rich.progress import track
 
-from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
 from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint
 from predictor.data.store import EpisodeStore, read_store
 from predictor.data.windows import Windows
@@ -82,7 +82,7 @@ class _Subject:
 
 
 def evaluate(config: EvaluateConfig) -> list[Accuracy]:
-    """Rows for the model at K = 1 and K = `samples`, and for constant velocity.
+    """Returns the model at K = 1 and at K = `samples`, constant velocity, and at K = `samples` the same with noise.
 
     Raises:
         UserError: checkpoint or store unreadable or of different specs, or no episode as long as the horizon.
@@ -112,7 +112,7 @@ def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:
         )
     windows = Windows(subject.store.episodes, subject.spec, config.history_steps, horizon)
     chosen = np.random.default_rng(config.seed).permutation(len(windows))[: config.max_windows]
-    # Constant velocity has no training data of its own; its spread is fitted on these very errors, in its favour.
+    # No training data is given here: the spread of both baselines is fitted to these very errors, in their favour.
     std_m = fitted_std_m(run_windows(baseline, windows, chosen, horizon))
     straight = summarise("constant velocity", run_windows(baseline, windows, chosen, horizon), std_m)
     if not straight.agents:
@@ -127,6 +127,10 @@ def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:
             made = run_windows(subject.model, windows, chosen, horizon, samples, config.seed, device=config.device)
             rows.append(summarise(subject.name, made, subject.std_m))
     rows.append(straight)
+    if config.samples > 1:
+        noisy = NoisyConstantVelocity.fit(subject.spec, std_m)
+        made = run_windows(noisy, windows, chosen, horizon, config.samples, config.seed)
+        rows.append(summarise("constant velocity + noise", made, std_m))
     if config.out is not None:
         _write(config, rows, subject.store.info.source, subject.spec.dt_s)
         _plot(config, rows, windows, chosen, subject.model or baseline, horizon)

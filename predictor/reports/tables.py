@@ -29,7 +29,7 @@ MAX_STEPS_SHOWN = 6
 
 VIEWS = {"horizon_only": "Horizon-only", "whole_sequence": "Whole sequence"}
 EXPLAINED = {
-    "horizon_only": "Errors on the 10 future steps after a burn-in of 40, best of K = 20 samples",
+    "horizon_only": "Errors on the 10 future steps after a burn-in of 40, best of K samples",
     "whole_sequence": "Errors over all predicted steps of the sequence, one-step errors of the burn-in included",
 }
 METRICS = {"overall_rmse_m": ("RMSE", "rmse"), "min_ade_m": ("minADE", "ade"), "min_fde_m": ("minFDE", "fde")}
@@ -64,14 +64,14 @@ def latex_table(content: dict[str, Any]) -> str:
     columns = [(view, kind, metric) for view in VIEWS for kind in kinds for metric in METRICS]
     lines = [
         f"% {content['provenance']['command']}, commit {content['provenance']['commit']}",
-        r"\begin{tabular}{l" + "r" * len(columns) + "}",
+        r"\begin{tabular}{l" + "r" * (1 + len(columns)) + "}",
         r"\toprule",
-        " & ".join(["Model", *(f"{VIEWS[v]}, {k}: {METRICS[m][0]} [m]" for v, k, m in columns)]) + r" \\",
+        " & ".join(["Model", "$K$", *(f"{VIEWS[v]}, {k}: {METRICS[m][0]} [m]" for v, k, m in columns)]) + r" \\",
         r"\midrule",
     ]
     for row in content["rows"]:
         cells = [_cell(row, v, k, m).replace("±", r"$\pm$") for v, k, m in columns]
-        lines.append(" & ".join([row["name"], *cells]) + r" \\")
+        lines.append(" & ".join([row["name"], _samples_of(row), *cells]) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
@@ -81,7 +81,7 @@ def _kinds(content: dict[str, Any]) -> list[str]:
 
 def _accuracy_table(content: dict[str, Any], view: str) -> str:
     kinds = _kinds(content)
-    headings, paper_keys = ["model"], []
+    headings, paper_keys = ["model", "K"], []
     for kind in kinds:
         for name, key in METRICS.values():
             headings.append(name if kind == "test" else f"{kind} {name}")
@@ -94,8 +94,13 @@ def _accuracy_table(content: dict[str, Any], view: str) -> str:
         cells = [_cell(row, view, kind, metric) for kind in kinds for metric in METRICS]
         figures = content["paper"].get(row["key"], {})
         beside = " / ".join(f"{figures[key]:.3f}" for key in paper_keys if key in figures)
-        lines.append("| " + " | ".join([row["name"], *cells, beside or "–"]) + " |")
+        lines.append("| " + " | ".join([row["name"], _samples_of(row), *cells, beside or "–"]) + " |")
     return "\n".join(lines)
+
+
+def _samples_of(row: dict[str, Any]) -> str:
+    """Returns K, the number of forecasts per window that the best-of-K errors choose from."""
+    return str(next(iter(row["tests"].values()))["horizon_only"]["num_samples"])
 
 
 def _cell(row: dict[str, Any], view: str, kind: str, metric: str) -> str:
@@ -122,7 +127,7 @@ def _graph_table(content: dict[str, Any]) -> str:
             numbers += [scores.get("direct_r2"), scores.get("linear_r2"), coverage and coverage["mean"]]
             cells += [_number(x) for x in numbers]
         if any(c != "–" for c in cells):
-            lines.append("| " + " | ".join([row["name"], *cells]) + " |")
+            lines.append("| " + " | ".join([row["name"], _samples_of(row), *cells]) + " |")
     if not lines:
         return ""
     names = [
@@ -134,7 +139,7 @@ def _graph_table(content: dict[str, Any]) -> str:
         "R² (linear)",
         "coverage of 90 %",
     ]
-    headings = ["model", *(n if kind == "test" else f"{kind} {n}" for kind in kinds for n in names)]
+    headings = ["model", "K", *(n if kind == "test" else f"{kind} {n}" for kind in kinds for n in names)]
     return "\n".join(["| " + " | ".join(headings) + " |", "|---|" + "---:|" * (len(headings) - 1), *lines])
 
 
