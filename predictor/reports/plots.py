@@ -48,14 +48,7 @@ def plot_rows_by_step(ax: Axes, results: Sequence[dict[str, Any]], kind: str, dt
         dashes = "-" if ours else ":" if row["key"] == "constant-velocity-noise" else "--"
         style: dict[str, Any] = {"ls": dashes, "lw": 2.0 if ours else 1.2, "marker": "o", "ms": 3}
         color = "black" if baseline else colormaps["tab20"](i % 20)
-        ax.errorbar(
-            time_s,
-            view["by_step_m"],
-            yerr=errors,
-            color=color,
-            label=f"{row['name']}, K = {view['num_samples']}",
-            **style,
-        )
+        ax.errorbar(time_s, view["by_step_m"], yerr=errors, color=color, label=label, **style)
     ax.set_yscale("log")
     ax.set_xlabel("time ahead [s]")
     ax.grid(alpha=0.3, which="both")
