@@ -114,7 +114,8 @@ def update_record(folder: Path, found: Sequence[Measurement]) -> list[Measuremen
 def _measurement(row: dict[str, Any], config: dict[str, Any], made: dict[str, Any]) -> Measurement:
     one, straight = row["model"], row["constant_velocity"]
     short = (row.get("histories") or {}).get("1") or {}
-    near, latency = row.get("nearest_neighbours") or {}, (row.get("latency_median_ms"), row.get("latency_p95_ms"))
+    near = row.get("nearest_neighbours") or {}
+    median_ms, p95_ms = row.get("latency_median_ms"), row.get("latency_p95_ms")
     return Measurement(
         env_id=row["env_id"],
         driver=row.get("driver") or config["ego"],
@@ -133,7 +134,7 @@ def _measurement(row: dict[str, Any], config: dict[str, Any], made: dict[str, An
         neighbours_m=near.get("min_ade_m"),
         below_cv=row["reduction"],
         below_cv_interval=_frozen(row["reduction_interval"]),
-        latency_ms=None if None in latency else latency,
+        latency_ms=None if median_ms is None or p95_ms is None else (median_ms, p95_ms),
         forecasts=one.get("agents"),
         horizon_steps=len(one["by_step_m"]) if one.get("by_step_m") else None,
         dt_s=row.get("dt_s"),
