@@ -48,7 +48,7 @@ def write_card(config: CardConfig) -> Path:
             f"{config.accuracy} has no row for checkpoint '{config.checkpoint.name}'; run envs.evaluate on it"
         )
     measured = [m for m in update_record(config.checkpoint, found) if m.samples == found[0].samples]
-    who = "the ego included" if info.spec.has_ego else "nobody is the ego"
+    who = "the ego included" if info.spec.has_ego else "no ego"
     left_out = "the ego itself is not counted" if info.spec.has_ego else "what never moves is not counted"
     parameters = sum(p.numel() for p in model.parameters())
     size_kb = (config.checkpoint / "model.safetensors").stat().st_size / 1000
@@ -67,8 +67,8 @@ def write_card(config: CardConfig) -> Path:
             "## Training",
             _training(info),
             "## Limits",
-            "Knows the traffic of the simulator named above and nothing else: fixed maps are learned by heart, drivers "
-            "are the simulator's own. The spread of its samples is not calibrated; where a driver's route is free, the "
+            "It knows the traffic of the simulator named above and nothing else: fixed maps are memorised, drivers are "
+            "those of the simulator. The spread of its samples is not calibrated; where a driver's route is free, the "
             "forecast lies between the routes. It was trained without a view of the ego's plan.",
         ]
     )

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory, edgeless_belief
 from predictor.scene import SceneSpec
 
@@ -87,18 +88,46 @@ class NoisyConstantVelocity(ConstantVelocity):
         return cls(spec, float(np.exp(offset)), float(growth), len(std_m))
 
     def rollout(
-        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
+        self,
+        belief: Belief,
+        horizon_steps: int,
+        num_samples: int = 1,
+        generator: torch.Generator | Sequence[np.random.Generator] | None = None,
     ) -> Float[Tensor, "batch samples agents horizon state"]:
-        """Returns constant velocity as sample 0, and samples with noise; each one's velocity follows its positions."""
-        future = super().rollout(belief, horizon_steps, num_samples, generator).clone()
-        batch, agents = belief.valid.shape
+        """Returns constant velocity as sample 0, and samples with noise; each one's velocity follows its positions.
+
+        With one generator per scene of the batch, a scene's samples depend on no other scene.
+
+        Raises:
+            UserError: a sequence of generators that has not one for each scene.
+        """
+        future = super().rollout(belief, horizon_steps, num_samples).clone()
         axes = self.spec.position_dim
-        drawn = torch.randn(
-            batch, num_samples - 1, agents, 1, axes, dtype=future.dtype, device=future.device, generator=generator
-        )
+        drawn = _normal(belief.valid, num_samples - 1, axes, generator).to(future)[..., None, :]
         time_s = self.spec.dt_s * torch.arange(1, horizon_steps + 1, dtype=future.dtype, device=future.device)
         spread_m = self.noise_m * time_s**self.growth
         added_m = spread_m.diff(prepend=spread_m.new_zeros(1))
         future[:, 1:, ..., :axes] += drawn * spread_m[:, None]
         future[:, 1:, ..., axes : 2 * axes] += drawn * added_m[:, None] / self.spec.dt_s
         return future
+
+
+def _normal(
+    valid: Bool[Tensor, "batch agents"],
+    samples: int,
+    axes: int,
+    generator: torch.Generator | Sequence[np.random.Generator] | None,
+) -> Float[Tensor, "batch samples agents axes"]:
+    """Draws standard normal numbers; a scene with a generator of its own draws for its present agents only."""
+    shape = (len(valid), samples, valid.shape[1], axes)
+    if generator is None or isinstance(generator, torch.Generator):
+        return torch.randn(shape, device=valid.device, generator=generator)
+    if len(generator) != len(valid):
+        raise UserError(
+            f"noise needs one generator per scene, got {len(generator)} for {len(valid)}; pass one for each"
+        )
+    drawn = torch.zeros(shape)
+    for scene, (own, present) in enumerate(zip(generator, valid.cpu(), strict=True)):
+        numbers = own.standard_normal((samples, int(present.sum()), axes), dtype=np.float32)
+        drawn[scene, :, present] = torch.from_numpy(numbers)
+    return drawn

@@ -120,7 +120,7 @@ def _measurement(row: dict[str, Any], config: dict[str, Any], made: dict[str, An
         env_id=row["env_id"],
         driver=row.get("driver") or config["ego"],
         episodes=config["episodes"],
-        samples=config["samples"],
+        samples=config["num_samples"] if "num_samples" in config else config["samples"],  # its name until version 0.1
         command=made["command"],
         commit=made.get("commit") or "",
         constant_velocity_ade_m=straight["min_ade_m"],

@@ -232,7 +232,7 @@ def _graph_lines(content: dict[str, Any]) -> str:
     ]
     if apart is not None:
         lines.append(
-            f"* chance that an edge has the larger value than a non-edge (AUC; 0.5 knows nothing, near 0 is as good as "
+            f"* chance that an edge has the larger value than a non-edge (AUC; 0.5 is chance, near 0 is as good as "
             f"near 1): feature {apart['dimension']} {plain(apart['auc'])}, the model's own probability "
             f"{plain(apart['edge_prob_auc'])}"
         )

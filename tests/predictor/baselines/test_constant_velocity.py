@@ -1,7 +1,9 @@
+import numpy as np
 import pytest
 import torch
 
 from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
+from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from tests.predictor.helpers import random_presence, random_states, spec
@@ -112,3 +114,18 @@ def test_equal_generators_give_equal_noise_and_the_batch_is_left_alone():
     first, second = (noisy.rollout(belief, 3, 5, torch.Generator().manual_seed(7)) for _ in range(2))
     assert torch.equal(first, second) and not torch.equal(first[:, 1], first[:, 2])
     assert torch.equal(belief.states, states)
+
+
+def test_a_scene_with_its_own_generator_draws_the_same_in_any_batch_and_with_any_padding():
+    noisy, states = NoisyConstantVelocity(spec(), 0.3, 1.0), random_states(0, 2, 3, 4)
+    both = noisy.rollout(observe(noisy, states), 3, 5, [np.random.default_rng(7), np.random.default_rng(8)])
+    padded = torch.cat([states[1:], torch.zeros(1, 2, 4)], dim=1)
+    belief = noisy.observe(noisy.empty_memory(1, 5), padded, torch.tensor([[True] * 3 + [False] * 2]))[1]
+    alone = noisy.rollout(belief, 3, 5, [np.random.default_rng(8)])
+    assert torch.equal(alone[0, :, :3], both[1]) and not torch.equal(both[0, 1], both[1, 1])
+
+
+def test_generators_must_be_as_many_as_scenes():
+    noisy, states = NoisyConstantVelocity(spec(), 0.3, 1.0), random_states(0, 2, 3, 4)
+    with pytest.raises(UserError, match="noise needs one generator per scene, got 1 for 2"):
+        noisy.rollout(observe(noisy, states), 3, 5, [np.random.default_rng(7)])
