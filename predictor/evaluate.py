@@ -1,8 +1,8 @@
 """Measure a checkpoint on recorded data: `python -m predictor.evaluate --checkpoint NAME --data STORE`.
 
 Prints minADE and minFDE (per agent and joint, with standard errors over subsets of the windows), miss rate, coverage,
-and RMSE and NLL by horizon, for K = 1 and K samples beside constant velocity; writes JSON, Markdown and plots. Accuracy
-in the loop that a policy drives is `python -m envs.evaluate`'s.
+and RMSE and NLL by horizon, for K = 1 and K samples beside constant velocity (K = 1) and constant velocity with noise
+(K samples); writes JSON, Markdown and plots. Accuracy in the loop that a policy drives is `python -m envs.evaluate`'s.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from matplotlib import pyplot as plt
 from rich.console import Console
 from rich.progress import track
 
-from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
 from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint
 from predictor.command_line import Renamed, parse
 from predictor.config_checks import check_at_least
@@ -80,7 +80,7 @@ class _Subject:
 
 
 def evaluate(config: EvaluateConfig) -> list[Accuracy]:
-    """Rows for the model at K = 1 and K = `num_samples`, and for constant velocity.
+    """Returns the model at K = 1 and K = `num_samples`, constant velocity, and that with noise at K = `num_samples`.
 
     Raises:
         UserError: checkpoint or store unreadable or of different specs, or no episode as long as the horizon.
@@ -110,7 +110,7 @@ def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:
         )
     windows = Windows(subject.store.episodes, subject.spec, config.history_steps, horizon)
     chosen = np.random.default_rng(config.seed).permutation(len(windows))[: config.max_windows]
-    # Constant velocity has no training data of its own; its spread is fitted on these very errors, in its favour.
+    # No training data is given here: the spread of both baselines is fitted to these very errors, in their favour.
     std_m = fitted_std_m(run_windows(baseline, windows, chosen, horizon))
     straight = summarise("constant velocity", run_windows(baseline, windows, chosen, horizon), std_m)
     if not straight.agents:
@@ -125,6 +125,10 @@ def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:
             made = run_windows(subject.model, windows, chosen, horizon, samples, config.seed, device=config.device)
             rows.append(summarise(subject.name, made, subject.std_m))
     rows.append(straight)
+    if config.num_samples > 1:
+        noisy = NoisyConstantVelocity.fit(subject.spec, std_m)
+        made = run_windows(noisy, windows, chosen, horizon, config.num_samples, config.seed)
+        rows.append(summarise("constant velocity + noise", made, std_m))
     if config.out is not None:
         _write(config, rows, subject.store.info.source, subject.spec.dt_s)
         _plot(config, rows, windows, chosen, subject.model or baseline, horizon)

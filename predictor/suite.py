@@ -146,7 +146,7 @@ def row_folder(config: SuiteConfig, row: Row) -> Path:
         "protocol": [BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, table.test_stride, sizes.test_windows, config.seed],
         "stores": [_fingerprint(config.data / s) for s in (table.train, table.val, *table.tests.values()) if s],
     }
-    if row.model not in ("constant-velocity", "least-squares"):
+    if row.is_trained:
         values = asdict(row_config(config, row, Path()))
         for name in ("data", "val_data", "out", "threads", "device", "data_device", "capture", "resume"):
             del values[name]
@@ -163,7 +163,7 @@ def run_row(config: SuiteConfig, row: Row) -> dict[str, Any]:
     folder.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()
     checkpoint = None
-    if row.model not in ("constant-velocity", "least-squares"):
+    if row.is_trained:
         checkpoint = train(row_config(config, row, folder / "run"))
     trained = time.perf_counter()
     result = {

@@ -76,7 +76,11 @@ def test_the_guides_python_runs(title: str):
 
 
 def test_the_guide_has_python_where_it_says():
-    assert set(sections()) - set(WITH_PYTHON) == {"rl-baselines3-zoo", "Collect, train, wrap", "What a reader owes"}
+    assert set(sections()) - set(WITH_PYTHON) == {
+        "rl-baselines3-zoo",
+        "Collect, train, wrap",
+        "What a reader must return",
+    }
     assert sum(len(blocks(text, "python")) for text in sections().values()) == GUIDE.read_text().count("```python")
 
 

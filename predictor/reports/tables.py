@@ -30,7 +30,7 @@ MAX_STEPS_SHOWN = 6
 
 VIEWS = {"horizon_only": "Horizon-only", "whole_sequence": "Whole sequence"}
 EXPLAINED = {
-    "horizon_only": "Errors on the 10 future steps after a burn-in of 40, best of K = 20 samples",
+    "horizon_only": "Errors on the 10 future steps after a burn-in of 40, best of K samples",
     "whole_sequence": "Errors over all predicted steps of the sequence, one-step errors of the burn-in included",
 }
 METRICS = {"overall_rmse_m": ("RMSE", "rmse"), "min_ade_m": ("minADE", "ade"), "min_fde_m": ("minFDE", "fde")}
@@ -65,14 +65,14 @@ def latex_table(content: dict[str, Any]) -> str:
     columns = [(view, kind, metric) for view in VIEWS for kind in kinds for metric in METRICS]
     lines = [
         f"% {content['provenance']['command']}, commit {content['provenance']['commit']}",
-        r"\begin{tabular}{l" + "r" * len(columns) + "}",
+        r"\begin{tabular}{l" + "r" * (1 + len(columns)) + "}",
         r"\toprule",
-        " & ".join(["Model", *(f"{VIEWS[v]}, {k}: {METRICS[m][0]} [m]" for v, k, m in columns)]) + r" \\",
+        " & ".join(["Model", "$K$", *(f"{VIEWS[v]}, {k}: {METRICS[m][0]} [m]" for v, k, m in columns)]) + r" \\",
         r"\midrule",
     ]
     for row in content["rows"]:
         cells = [_cell(row, v, k, m).replace("±", r"$\pm$") for v, k, m in columns]
-        lines.append(" & ".join([row["name"], *cells]) + r" \\")
+        lines.append(" & ".join([row["name"], _samples_of(row), *cells]) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
@@ -82,7 +82,7 @@ def _kinds(content: dict[str, Any]) -> list[str]:
 
 def _accuracy_table(content: dict[str, Any], view: str) -> str:
     kinds = _kinds(content)
-    headings, paper_keys = ["model"], []
+    headings, paper_keys = ["model", "K"], []
     for kind in kinds:
         for name, key in METRICS.values():
             headings.append(name if kind == "test" else f"{kind} {name}")
@@ -95,8 +95,13 @@ def _accuracy_table(content: dict[str, Any], view: str) -> str:
         cells = [_cell(row, view, kind, metric) for kind in kinds for metric in METRICS]
         figures = content["paper"].get(row["key"], {})
         beside = " / ".join(f"{figures[key]:.3f}" for key in paper_keys if key in figures)
-        lines.append([row["name"], *cells, beside or "–"])
+        lines.append([row["name"], _samples_of(row), *cells, beside or "–"])
     return markdown.table(headings, lines, "-" + "r" * (len(headings) - 2) + "-")
+
+
+def _samples_of(row: dict[str, Any]) -> str:
+    """Returns K, the number of forecasts per window that the best-of-K errors choose from."""
+    return str(next(iter(row["tests"].values()))["horizon_only"]["num_samples"])
 
 
 def _cell(row: dict[str, Any], view: str, kind: str, metric: str) -> str:
@@ -123,7 +128,7 @@ def _graph_table(content: dict[str, Any]) -> str:
             numbers += [scores.get("direct_r2"), scores.get("linear_r2"), coverage and coverage["mean"]]
             cells += [_number(x) for x in numbers]
         if any(c != "–" for c in cells):
-            lines.append([row["name"], *cells])
+            lines.append([row["name"], _samples_of(row), *cells])
     if not lines:
         return ""
     names = [
@@ -135,7 +140,7 @@ def _graph_table(content: dict[str, Any]) -> str:
         "R² (linear)",
         "coverage of 90 %",
     ]
-    headings = ["model", *(n if kind == "test" else f"{kind} {n}" for kind in kinds for n in names)]
+    headings = ["model", "K", *(n if kind == "test" else f"{kind} {n}" for kind in kinds for n in names)]
     return markdown.table(headings, lines, "-r")
 
 
@@ -228,7 +233,7 @@ def _graph_lines(content: dict[str, Any]) -> str:
     ]
     if apart is not None:
         lines.append(
-            f"* chance that an edge has the larger value than a non-edge (AUC; 0.5 knows nothing, near 0 is as good as "
+            f"* chance that an edge has the larger value than a non-edge (AUC; 0.5 is chance, near 0 is as good as "
             f"near 1): feature {apart['dimension']} {plain(apart['auc'])}, the model's own probability "
             f"{plain(apart['edge_prob_auc'])}"
         )

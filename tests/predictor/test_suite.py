@@ -16,7 +16,7 @@ from predictor.data.windows import Windows
 from predictor.errors import UserError
 from predictor.evaluation import paper_tables as tables
 from predictor.evaluation.measure_row import protocol_indices
-from predictor.evaluation.paper_tables import TABLES, Row
+from predictor.evaluation.paper_tables import NUM_SAMPLES, TABLES, Row
 from predictor.models import configure
 from predictor.reports.tables import latex_table, markdown_report
 from predictor.suite import SuiteConfig, row_config, row_folder, run_row, run_suite
@@ -67,7 +67,7 @@ def test_every_kind_of_row_is_trained_and_measured(data: Path, tmp_path: Path, k
 
 
 def test_all_rows_of_a_table_share_data_steps_and_protocol(data: Path, tmp_path: Path):
-    trained = [r for r in TABLES["springs"].rows if r.model not in ("constant-velocity", "least-squares")]
+    trained = [r for r in TABLES["springs"].rows if r.is_trained]
     configs = [row_config(config(data, tmp_path), r, tmp_path / r.key) for r in trained]
     shared = ("data", "val_data", "steps", "batch_size", "max_episodes", "history_steps", "horizon_steps", "lr", "seed")
     for name in shared:
@@ -123,7 +123,26 @@ def test_reports_have_a_line_for_each_row_and_the_papers_figures(data: Path, tmp
     text, latex = markdown_report(content), latex_table(content)
     assert text.count("| least squares (limit) |") == 3  # two views and the graph
     assert "0.125 / 0.250 / 0.500" in text
-    assert latex.count(r"\\") == 3 and latex.count("&") == 3 * 12
+    assert latex.count(r"\\") == 3 and latex.count("&") == 3 * 13
+
+
+def test_the_stochastic_control_has_as_many_samples_as_the_models_and_says_so(data: Path, tmp_path: Path):
+    content = run_suite(config(data, tmp_path, rows=("constant-velocity", "constant-velocity-noise"), jobs=2))
+    straight, noisy = (r["tests"]["test"]["horizon_only"] for r in content["rows"])
+    assert (straight["num_samples"], noisy["num_samples"]) == (1, 20)
+    assert noisy["min_ade_m"] < 0.8 * straight["min_ade_m"]
+    lines = markdown_report(content).splitlines()
+    for name, samples in (("constant velocity", "1"), ("constant velocity + noise", "20")):
+        found = [line.split("|")[2].strip() for line in lines if line.startswith(f"| {name} |")]
+        assert len(found) >= 2 and set(found) == {samples}  # in every table that names it
+    assert 0.7 < noisy["statistics"]["coverage"]["mean"] <= 1
+
+
+@pytest.mark.parametrize("name", ["springs", "mocap", "nba", "sdd", "ind"])
+def test_every_table_of_the_paper_has_the_stochastic_control(name: str):
+    rows = {r.key: r for r in TABLES[name].rows}
+    assert rows["constant-velocity-noise"].num_samples == rows["dgvae"].num_samples == NUM_SAMPLES
+    assert not rows["constant-velocity-noise"].is_trained
 
 
 @pytest.mark.parametrize("name", list(TABLES))
@@ -133,7 +152,7 @@ def test_every_row_of_every_table_is_a_valid_config(name: Any, budget: Any, tmp_
     keys = [r.key for r in TABLES[name].rows]
     assert len(set(keys)) == len(keys)
     for each in TABLES[name].rows:
-        if each.model not in ("constant-velocity", "least-squares"):
+        if each.is_trained:
             made = row_config(settings, each, tmp_path)
             configure(made.model, made.preset, made.set)
 
@@ -153,7 +172,10 @@ def test_windows_end_their_burn_in_at_every_stride():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rows": ("dgvea",)}, "table 'springs' has no row 'dgvea'; there are constant-velocity, mlp"),
+        (
+            {"rows": ("dgvea",)},
+            "table 'springs' has no row 'dgvea'; there are constant-velocity, constant-velocity-noise",
+        ),
         ({"steps": -1}, "steps must not be negative, got -1"),
         ({"device": "cuda:7"}, "device 'cuda:7' was asked for but torch finds no CUDA device"),
     ],
