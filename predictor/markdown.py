@@ -18,7 +18,7 @@ def table(headings: Sequence[str], lines: Iterable[Sequence[str]], align: str = 
         ValueError: a line has more or fewer cells than there are headings.
     """
     letters = (align or "-").ljust(len(headings), (align or "-")[-1])[: len(headings)]
-    written = [_line(headings), _line([_RULES[letter] for letter in letters])]
+    written = [_line(headings), f"|{'|'.join(_RULES[letter] for letter in letters)}|"]
     for cells in lines:
         if len(cells) != len(headings):
             raise ValueError(f"a line needs {len(headings)} cells, got {len(cells)}: {list(cells)}")

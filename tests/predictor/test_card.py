@@ -68,7 +68,7 @@ def test_card_says_what_the_files_say(config: CardConfig):
     [
         ("{", "is not an accuracy.json of envs.evaluate"),
         ('{"rows": []}', r"is not an accuracy.json of envs.evaluate \('results'\)"),
-        (json.dumps(RESULTS | {"results": [ROW | {"checkpoint": "other"}]}), "has no row for checkpoint 'toy'"),
+        (json.dumps(RESULTS | {"results": [ROW | {"checkpoint": "other"}]}), "has no result of checkpoint 'toy'"),
     ],
     ids=["broken", "foreign", "another_checkpoint"],
 )

@@ -4,12 +4,12 @@ from predictor.markdown import table
 
 
 def test_a_line_for_headings_rules_and_cells():
-    assert table(["a", "b"], [["1", "2"], ["3", "4"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |\n| 3 | 4 |"
+    assert table(["a", "b"], [["1", "2"], ["3", "4"]]) == "| a | b |\n|---|---|\n| 1 | 2 |\n| 3 | 4 |"
 
 
 def test_the_last_letter_of_align_holds_for_the_columns_that_follow():
-    assert table(["a", "b", "c"], [], "-r").splitlines()[1] == "| --- | ---: | ---: |"
-    assert table(["a", "b"], [], "lr-").splitlines()[1] == "| :--- | ---: |"
+    assert table(["a", "b", "c"], [], "-r").splitlines()[1] == "|---|---:|---:|"
+    assert table(["a", "b"], [], "lr-").splitlines()[1] == "|:---|---:|"
 
 
 def test_bars_in_cells_do_not_end_them():
