@@ -103,6 +103,12 @@ def _sentence_in(box: str) -> str:
     lines = re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines()
     if not lines or lines[0].strip("╭─╮+- ") not in _SAID_IN_A_SENTENCE:
         return ""
-    inside = (line[1:-1].strip() for line in lines[1:-1])  # frames are of lines, or of | and - where there are none
-    sentence = itertools.takewhile(lambda line: line.strip("─-"), inside)
+    inside = [line.strip("│ ") for line in lines[1:]]
+    after_title = itertools.dropwhile(_is_rule, inside)
+    sentence = itertools.takewhile(lambda line: not _is_rule(line), after_title)
     return " ".join(sentence).removeprefix("Error parsing ")
+
+
+def _is_rule(line: str) -> bool:
+    """Returns whether a line of a box is empty or a rule; tyro draws with ASCII where stdout has nothing else."""
+    return not line.strip("╰╯─-")

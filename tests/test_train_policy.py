@@ -191,9 +191,10 @@ def test_who_learns(env_id: str, asked: tuple[str, ...] | None, learners: tuple[
 
 def test_what_cannot_be_drawn_gives_no_video_and_no_error(tmp_path: Path):
     config = train_policy.TrainPolicyConfig("CartPole-v1", observe="none", out=tmp_path)
-    assert train_policy.film(config, SB3PPO("MlpPolicy", "CartPole-v1", device="cpu")) is None
+    model = SB3PPO("MlpPolicy", "CartPole-v1", device="cpu")
+    assert train_policy.film(config.plan.task, model, tmp_path / "video.mp4") is None
     config = train_policy.TrainPolicyConfig(TOY, observe="none", out=tmp_path)
-    assert train_policy.film(config, policy_for(config.plan.task)) is None
+    assert train_policy.film(config.plan.task, policy_for(config.plan.task), tmp_path / "video.mp4") is None
     assert not list(tmp_path.iterdir())
 
 
