@@ -1,8 +1,9 @@
-"""What every scene reader is: who is there, where, and who they are; the same rules of perception for all families.
+"""Interfaces of scene readers, and what they have in common: how they are made, and what an ego perceives.
 
-A reader reports everyone (`read_all`); what the ego perceives of it (`read`) is decided here, once: agents within
-`perception_m`, the nearest `max_agents`, the ego in row 0, padded rows of zeros. A PettingZoo environment has many
-learners and no single ego: its reader gives a `MultiagentScene`, from which every agent's own view is cut.
+A reader reports all agents (`read_all`): which they are, where, and how they move. What the ego perceives of them
+(`read`) is decided by `predictor.scene.perceived_agents`: itself first, then the nearest within `perception_m`, at most
+`max_agents`, padded with zeros. A PettingZoo environment has many learners and no single ego: its reader returns a
+`MultiagentScene`, from which every agent's own view is cut.
 """
 
 from abc import ABC, abstractmethod
@@ -19,47 +20,48 @@ from predictor.scene import PADDING_ID, Scene, SceneBatch, SceneSpec, perceived_
 
 @runtime_checkable
 class SceneReader(Protocol):
-    """Sees the agents of one environment; keeps their identities from step to step."""
+    """Reads the agents of one environment with an ego; keeps their identities from step to step."""
 
     @property
     def spec(self) -> SceneSpec:
-        """What the scenes of this reader look like."""
+        """Returns the layout of the scenes."""
 
     def reset(self) -> None:
-        """Forget all identities: a new episode has begun."""
+        """Forgets all identities: a new episode has begun."""
 
     def read(self, env: Any) -> Scene:
-        """The scene as a perception system would have it: within `perception_m`, at most `max_agents`."""
+        """Returns what the ego perceives: agents within `perception_m`, at most `max_agents`, padded."""
 
     def read_all(self, env: Any) -> Scene:
-        """Everyone, ego first, unpadded: ground truth for collection and evaluation."""
+        """Returns all agents, ego first, unpadded: ground truth for collection and evaluation."""
 
 
 @dataclass(frozen=True)
 class MultiagentScene:
-    """Everyone in an environment with many learners; nobody is the ego."""
+    """All agents of an environment with many learners, none of which is the ego."""
 
     scene: Scene
-    """Everyone, padded to `max_agents` rows; a row need not stay an agent's, its id does."""
+    """All agents, padded to `max_agents`; an agent's index may change from step to step, its id does not."""
     rows: Mapping[str, int]
-    """Row of each agent that is observed now, by its name: the living, and those whose last observation this is."""
+    """Index in `scene` of each agent that is observed now, by its name: those that live, and those that see their last
+    observation."""
     heading_rad: Float[np.ndarray, " agents"]
-    """Heading of each row, which turns world axes into the agent's; 0 where agents have none."""
+    """Heading of each agent, which turns world axes into its own; 0 where agents have none."""
 
 
 @runtime_checkable
 class MultiagentReader(Protocol):
-    """Sees everyone in one PettingZoo parallel environment."""
+    """Reads all agents of one PettingZoo environment; keeps their identities from step to step."""
 
     @property
     def spec(self) -> SceneSpec:
-        """What the scenes look like: `has_ego` is False; `max_agents` holds everyone."""
+        """Returns the layout of the scenes: `has_ego` is False, and all agents fit into `max_agents`."""
 
     def reset(self) -> None:
-        """Forget all identities: a new episode has begun."""
+        """Forgets all identities: a new episode has begun."""
 
     def read(self, env: Any) -> MultiagentScene:
-        """Everyone who is there now."""
+        """Returns all agents that are present now."""
 
 
 MakeReader = Callable[[Any], Any]
@@ -67,36 +69,36 @@ MakeReader = Callable[[Any], Any]
 
 
 class Reader(ABC):
-    """A `SceneReader` that only has to say who is there; derive from it for a new family.
+    """Base of `SceneReader`s that only have to report all agents; derive from it for a new family.
 
     Args:
-        spec: what the scenes look like.
+        spec: layout of the scenes.
     """
 
     def __init__(self, spec: SceneSpec) -> None:
-        """Keep the spec."""
+        """Keeps the spec."""
         self._spec = spec
 
     @property
     def spec(self) -> SceneSpec:
-        """What the scenes of this reader look like."""
+        """Returns the layout of the scenes."""
         return self._spec
 
     def reset(self) -> None:  # noqa: B027 (a default, not a duty)
-        """Forget all identities; a reader whose environment names its agents has none to forget."""
+        """Forgets all identities; does nothing for a reader whose environment numbers its agents."""
 
     def see(self, observation: Any) -> None:  # noqa: B027
-        """Take in the env's own observation, once after each reset and step, before anything is read.
+        """Takes in the env's own observation, once after each reset and step, before anything is read.
 
-        For a reader that lives on observations; one that looks into the environment has no use for them.
+        For readers of observations; a reader that looks into the environment ignores them.
         """
 
     @abstractmethod
     def read_all(self, env: Any) -> Scene:
-        """Everyone, ego first, unpadded. The same at each call until the environment steps."""
+        """Returns all agents, ego first, unpadded; equal at each call until the environment steps."""
 
     def read(self, env: Any) -> Scene:
-        """What the ego perceives of everyone, padded to `max_agents` rows."""
+        """Returns what the ego perceives, padded to `max_agents`."""
         name = type(self).__name__
         return perceive(require_scene(self.read_all(env), name), self._spec, name)
 
@@ -177,14 +179,14 @@ def _build(make_reader: Any, env: Any, advice: str) -> Any:
 
 
 def show(reader: Any, observation: Any) -> None:
-    """Hand the env's own observation to a reader that wants to `see` it; once after each reset and step."""
+    """Passes the env's own observation to a reader that has `see`; once after each reset and step."""
     see = getattr(reader, "see", None)
     if see is not None:
         see(observation)
 
 
 def require_scene(scene: Any, source: str) -> Scene:
-    """What a reader gave, which must be a `Scene`.
+    """Returns what a reader returned, which must be a `Scene`.
 
     Raises:
         UserError: it is something else.
@@ -195,12 +197,12 @@ def require_scene(scene: Any, source: str) -> Scene:
 
 
 def perceive(everyone: Scene, spec: SceneSpec, source: str = "reader") -> Scene:
-    """The ego and the nearest agents within perception, nearest first, padded to `max_agents` rows.
+    """Returns the ego and the nearest agents that it perceives, nearest first, padded to `max_agents`.
 
-    Agents beyond the nearest `max_agents` are out of perception, not an error. Rows that are not valid are dropped.
+    Agents beyond the nearest `max_agents` are not perceived, which is no error. Entries that are not valid are dropped.
 
     Args:
-        everyone: ego first, any number of rows.
+        everyone: ego first, any number of agents.
         spec: its `perception_m` and `max_agents` decide.
         source: who read the scene, for messages.
 
@@ -212,27 +214,27 @@ def perceive(everyone: Scene, spec: SceneSpec, source: str = "reader") -> Scene:
     return padded(everyone, order[seen], spec.max_agents)
 
 
-def padded(scene: Scene, rows: np.ndarray, agents: int) -> Scene:
-    """The given rows of a scene, in this order, and rows of padding up to `agents`."""
-    states = np.zeros((agents, scene.states.shape[1]))
-    ids = np.full(agents, PADDING_ID, dtype=np.int64)
-    valid = np.zeros(agents, dtype=np.bool_)
-    states[: len(rows)] = scene.states[rows]
-    ids[: len(rows)] = scene.ids[rows]
-    valid[: len(rows)] = True
+def padded(scene: Scene, indices: np.ndarray, max_agents: int) -> Scene:
+    """Returns the agents at these indices of a scene, in this order, padded to `max_agents`."""
+    states = np.zeros((max_agents, scene.states.shape[1]))
+    ids = np.full(max_agents, PADDING_ID, dtype=np.int64)
+    valid = np.zeros(max_agents, dtype=np.bool_)
+    states[: len(indices)] = scene.states[indices]
+    ids[: len(indices)] = scene.ids[indices]
+    valid[: len(indices)] = True
     return Scene(states, ids, valid, scene.heading_rad)
 
 
 def pad_multiagent_scene(
     everyone: Scene, rows: Mapping[str, int], heading_rad: np.ndarray, spec: SceneSpec, source: str = "reader"
 ) -> MultiagentScene:
-    """A `MultiagentScene` of an unpadded scene.
+    """Returns the `MultiagentScene` of an unpadded scene.
 
     Args:
-        everyone: all rows valid, any order.
-        rows: row of each living agent.
-        heading_rad: of each row.
-        spec: `max_agents` is the number of rows to pad to.
+        everyone: all agents, all valid, in any order.
+        rows: index of each observed agent, by its name.
+        heading_rad: heading of each agent [rad].
+        spec: its `max_agents` is the size to pad to.
         source: who read the scene, for messages.
 
     Raises:
@@ -248,7 +250,7 @@ def pad_multiagent_scene(
 
 
 def role_of(agent: str) -> str:
-    """An agent's name without its number."""
+    """Returns an agent's name without its number."""
     return agent.rstrip("0123456789").rstrip("_- ") or agent
 
 

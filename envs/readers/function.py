@@ -1,4 +1,4 @@
-"""A plain function as a reader: `FunctionReader(read, spec)`, for environments that name their agents themselves."""
+"""Makes a reader of a plain function, `FunctionReader(read, spec)`: for environments that number their agents."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from predictor.scene import Scene, SceneSpec
 
 @dataclass(frozen=True)
 class FunctionReader:
-    """Makes readers of a function that says who is there; what the ego perceives of it is decided as everywhere.
+    """Makes readers of a function that reports all agents; what the ego perceives is decided as for every reader.
 
         >>> import numpy as np
         >>> from envs import ForecastObservation, make_env
@@ -28,13 +28,13 @@ class FunctionReader:
     """
 
     read: Callable[[Any], Scene]
-    """From the environment (as it was wrapped; `env.unwrapped` is the innermost) to everyone in it: ego first, any
-    number of rows, an id that stays with its agent."""
+    """Function of the environment (as it was wrapped; `env.unwrapped` is innermost) that returns all its agents: ego
+    first, any number of them, each with an id that stays with it."""
     spec: SceneSpec
-    """What the scenes look like; `dt_s` has no default."""
+    """Layout of the scenes; `dt_s` has no default."""
 
     def __post_init__(self) -> None:
-        """Check that a function and a spec are what was given."""
+        """Checks that a function and a spec were given."""
         if not callable(self.read) or not isinstance(self.spec, SceneSpec):
             raise UserError(
                 "FunctionReader needs a function read(env) -> Scene and a SceneSpec, got "
@@ -42,7 +42,7 @@ class FunctionReader:
             )
 
     def __call__(self, env: Any) -> Reader:
-        """A reader for this environment."""
+        """Returns a reader for this environment."""
         return _Reading(self)
 
 

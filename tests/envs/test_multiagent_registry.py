@@ -12,8 +12,9 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
 from envs import readers
-from envs.readers import multiagent_env_id, multiagent_reader_for, register_reader
-from envs.readers.base import MultiagentReader
+from envs.parallel import ForecastParallelEnv
+from envs.readers import multiagent_env_id, multiagent_reader_for, reader_for, register_reader
+from envs.readers.base import MultiagentReader, Reader
 from envs.readers.mpe import MpeReader
 from envs.readers.pursuit import PursuitReader
 from envs.registry import MULTIAGENT_CHECKPOINTS, MULTIAGENT_IDS, checkpoint_for, is_multiagent_id, make_multiagent_env
@@ -247,6 +248,67 @@ def test_an_environment_may_bring_its_own_reader():
         assert multiagent_reader_for(env).asked == {}
         assert multiagent_reader_for(env, perception_m=5.0).asked == {"perception_m": 5.0}
         assert multiagent_reader_for(env, 5.0, 4).asked == {"perception_m": 5.0, "max_agents": 4}
+
+
+class OneEgo(gym.Env):
+    """Has one ego, and a reader for it."""
+
+
+class OneEgoReader(Reader):
+    """Reads nothing, for an environment with one ego."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(SceneSpec(dt_s=1.0))
+
+    def read_all(self, env: Any) -> Any:
+        return None
+
+
+def test_one_registry_serves_both_kinds_of_environments():
+    register_reader(OneEgo, OneEgoReader)
+    register_reader(Walk, lambda env: WalkReader())
+    assert isinstance(reader_for(OneEgo()), OneEgoReader)
+    assert isinstance(multiagent_reader_for(Walk()), WalkReader)
+
+
+@pytest.mark.parametrize("ways", [(Walk, multiagent_reader_for), (OneEgo, reader_for)])
+@pytest.mark.parametrize(
+    ("make_reader", "message"),
+    [
+        (lambda env: None, "reader= takes what makes a reader, but <lambda> gives NoneType without spec, reset, read"),
+        (lambda env: env.bogus, "reader= takes what makes a reader .*but <lambda> failed with AttributeError"),
+        (lambda env: types.SimpleNamespace(spec=1, reset=1, read=1), "must be a SceneSpec, got int"),
+    ],
+    ids=["nothing", "fails", "spec"],
+)
+def test_what_is_no_reader_is_refused_for_both_kinds_alike(
+    ways: tuple[type, Any], make_reader: Any, message: str, monkeypatch: pytest.MonkeyPatch
+):
+    env_class, find_reader = ways
+    monkeypatch.setitem(readers._REGISTERED, env_class, make_reader)
+    with pytest.raises(UserError, match=message):
+        find_reader(env_class())
+
+
+def test_a_registered_reader_of_the_other_kind_is_named():
+    register_reader(Walk, OneEgoReader)
+    needed = "OneEgoReader: a multiagent .* needs a reader whose spec has has_ego=False, got a OneEgoReader"
+    with pytest.raises(UserError, match=needed + ".*read\\(env\\) -> MultiagentScene"):
+        multiagent_reader_for(Walk())
+    with pytest.raises(UserError, match=needed):
+        ForecastParallelEnv(Walk(), "constant-velocity")
+    register_reader(OneEgo, lambda env: WalkReader())
+    with pytest.raises(UserError, match="one ego needs a reader .*has_ego=True, got a WalkReader with .*multiagent"):
+        reader_for(OneEgo())
+
+
+def test_an_environments_own_reader_is_checked_too():
+    class Unreadable(Walk):
+        def make_scene_reader(self) -> None:
+            return None
+
+    with pytest.raises(UserError, match="make_scene_reader gives NoneType without spec, reset, read"):
+        multiagent_reader_for(Unreadable())
 
 
 def test_ways_to_a_reader_are_named():

@@ -127,7 +127,7 @@ def test_reports_have_a_line_for_each_row_and_the_papers_figures(data: Path, tmp
 
 
 def test_the_stochastic_control_has_as_many_samples_as_the_models_and_says_so(data: Path, tmp_path: Path):
-    content = run_suite(config(data, tmp_path, rows=("constant-velocity", "constant-velocity-noise"), jobs=2))
+    content = run_suite(config(data, tmp_path, rows=("constant-velocity", "constant-velocity-noise"), workers=2))
     straight, noisy = (r["tests"]["test"]["horizon_only"] for r in content["rows"])
     assert (straight["num_samples"], noisy["num_samples"]) == (1, 20)
     assert noisy["min_ade_m"] < 0.8 * straight["min_ade_m"]
