@@ -43,8 +43,12 @@ class ForecastWrapper:
         memo[id(self.forecaster)] = self.forecaster
         twin = object.__new__(type(self))
         memo[id(self)] = twin
-        twin.__dict__.update({name: deepcopy(value, memo) for name, value in self.__dict__.items()})
+        twin.__setstate__({name: deepcopy(value, memo) for name, value in self.__getstate__().items()})
         return twin
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns what a copy or a pickle keeps."""
+        return dict(self.__dict__)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a pickle; wrappers that look attributes up in what they wrap would look for this there."""
