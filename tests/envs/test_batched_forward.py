@@ -130,6 +130,22 @@ def test_a_copy_that_is_stepped_by_itself_lacks_nothing_once_it_is_filled():
             assert_same(seen[agent], expected[agent], 1e-3)
 
 
+def test_a_seeded_reset_leaves_the_noise_of_what_came_before_alone():
+    first, second, reference = (make() for make in copies((6, 6, 6), num_samples=4))
+    forward = batch_forwards([first, second])
+    assert forward is not None
+    found, expected = [], []
+    for env, seen in ((first, found), (reference, expected)):
+        seen.append(env.reset(seed=0)[0])
+        for seed in (7, 8):  # nothing is filled before the next seed arrives
+            seen.append(env.step(act(env))[0])
+            seen.append(env.reset(seed=seed)[0])
+    forward.fill()
+    for one, other in zip(found, expected, strict=True):
+        for agent in other:
+            assert_same(one[agent], other[agent], 1e-3)
+
+
 def streams(*envs: Any) -> list[Any]:
     return [env.stream for env in envs]
 
