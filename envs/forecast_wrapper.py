@@ -47,6 +47,11 @@ class ForecastWrapper:
         twin.__setstate__(deepcopy(state, memo))
         return twin
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns what a copy or a pickle keeps."""
+        state: Any = super().__getstate__()
+        return dict(state)
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy or a pickle; wrappers that look attributes up in what they wrap would look for this there."""
         restore = getattr(super(), "__setstate__", self.__dict__.update)

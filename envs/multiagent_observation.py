@@ -82,6 +82,10 @@ class MultiagentStream(SceneStream):
         """Returns the spaces of one agent's entries; new objects at each call, since a space carries its own seed."""
         return entry_spaces(self.forecaster, self.view_spec, self.config)
 
+    def nothing_seen(self) -> dict[str, NDArray[np.float32]]:
+        """Returns the entries of an agent that the reader does not see: zeros."""
+        return {key: np.zeros(space.shape or (), dtype=np.float32) for key, space in self.spaces().items()}
+
     def observe(self, shared: MultiagentScene) -> AgentEntries:
         """Take in the scene of the only environment; returns the entries of each of its learners, by name."""
         [entries] = self.observe_each([shared])

@@ -11,25 +11,24 @@ with one ego there is `envs.wrappers.ForecastObservation`.
 (5, 2)
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
-from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
+from envs.batched_forward import BatchedForward, can_share
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout
 from envs.multiagent_observation import MultiagentStream, check_multiagent_scene
-from envs.observation import FORECAST_KEYS, open_forecaster
+from envs.observation import open_forecaster
 from envs.readers import MakeReader, multiagent_env_id, multiagent_reader_for
 from envs.readers.base import MultiagentReader, MultiagentScene, build_multiagent_reader
 from envs.scene_stream import ForecastConfig
 from envs.simulators.copies import RunningCopy
 from predictor.errors import ProtocolError, UserError
 from predictor.forecaster import Forecaster
-from predictor.scene import SceneSpec
+from predictor.scene import Forecast, SceneSpec
 
 _COMPOSED = (gym.spaces.Dict, gym.spaces.Tuple, gym.spaces.Graph, gym.spaces.Sequence, gym.spaces.OneOf)
 
@@ -97,6 +96,8 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten)
         self.stream: MultiagentStream = MultiagentStream(forecaster, spec, config, perception_m, max_agents)
         self._layouts: dict[str, ObservationLayout] = {}
+        self._forward: BatchedForward | None = None
+        self._place = 0
         self._scene: MultiagentScene | None = None
         for agent in getattr(env, "possible_agents", ()):
             self.observation_space(agent)
@@ -117,6 +118,16 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         if self._scene is None:
             raise ProtocolError("there is no scene yet; call reset() first")
         return self._scene
+
+    @property
+    def forecast(self) -> Forecast:
+        """The forecast behind the latest observations: a batch of one, agents as in `scene.scene`, world axes."""
+        if self._forward is None:
+            return super().forecast
+        forecast = self._forward.forecast_of(self._place)
+        if forecast is None or self._scene is None:
+            raise ProtocolError("there is no forecast yet; call reset() first")
+        return forecast
 
     def observation_space(self, agent: str) -> gym.Space:
         """Returns the space of its own observation and the forecast entries, always one object.
@@ -143,27 +154,58 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         """Reset the env and forget the history; a seed also restarts the samples' noise."""
         observations, infos = self.env.reset(seed=seed, options=options)
         self._reader.reset()
+        scene, shown = self._read(), self._own(observations)
+        if self._forward is not None:
+            self._forward.begin(self._place, scene, shown, seed)
+            return shown, infos
         self.stream.reset()
         if seed is not None:
             self.stream.seed(seed)
-        return self._observe(observations), infos
+        return self._with_views(scene, shown), infos
 
     def step(
         self, actions: dict[str, Any]
     ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any]]:
         """Step the env, take in the scene, forecast."""
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
-        return self._observe(observations), rewards, terminations, truncations, infos
+        scene, shown = self._read(), self._own(observations)
+        if self._forward is not None:
+            self._forward.go_on(self._place, scene, shown)
+        else:
+            shown = self._with_views(scene, shown)
+        return shown, rewards, terminations, truncations, infos
 
-    def _observe(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+    def _read(self) -> MultiagentScene:
         scene = self._reader.read(self.env)
         self._scene = check_multiagent_scene(scene, self._reader.spec, f"scene reader of {self._source}")
-        entries = self.stream.observe(self._scene)
+        return self._scene
+
+    def _own(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        return {agent: {"observation": own} for agent, own in observations.items()}
+
+    def _with_views(self, scene: MultiagentScene, shown: dict[str, Any]) -> dict[str, Any]:
+        entries = self.stream.observe(scene)
         return {
-            agent: self._layout(agent).one(own, entries[agent] if agent in entries else self._nothing_seen())
-            for agent, own in observations.items()
+            agent: self._layout(agent).one(seen["observation"], entries.get(agent) or self.stream.nothing_seen())
+            for agent, seen in shown.items()
         }
 
-    def _nothing_seen(self) -> dict[str, NDArray[np.float32]]:
-        spaces = self.stream.spaces()
-        return {key: np.zeros(spaces[key].shape or (), dtype=np.float32) for key in FORECAST_KEYS}
+
+def batch_forwards(envs: Sequence[ParallelEnv]) -> BatchedForward | None:
+    """Let copies of one environment share their forecasts' forward, if they can and are more than one.
+
+    Their observations then lack forecasts until `BatchedForward.fill` is called. Histories start anew: reset them.
+
+    Args:
+        envs: copies with equal wrappers.
+
+    Returns:
+        What to `fill` after the last copy's step or reset; None if each copy forecasts by itself.
+    """
+    copies = [env for env in envs if type(env) is ForecastParallelEnv and not env.stream.config.flatten]
+    if len(copies) < len(envs) or len(copies) < 2 or not can_share([copy.stream for copy in copies]):
+        return None
+    forward = BatchedForward([copy.stream for copy in copies])
+    for place, copy in enumerate(copies):
+        copy._forward, copy._place = forward, place
+    return forward

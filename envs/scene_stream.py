@@ -74,6 +74,19 @@ class SceneStream:
         """The network, or what stands in for it."""
         return self._online.forecaster
 
+    @property
+    def num_envs(self) -> int:
+        """Number of parallel environments."""
+        return len(self._noise)
+
+    def forecast_of(self, env: int) -> Forecast | None:
+        """Returns the latest forecast of one environment, a batch of one; None before the first."""
+        return None if self.forecast is None else _changed(lambda field: field[env : env + 1], self.forecast)
+
+    def continue_noise(self, streams: "Sequence[SceneStream]") -> None:
+        """Let each environment draw on from where the stream that had it alone stands."""
+        self._noise = [stream._noise[0] for stream in streams]
+
     def seed(self, seed: int | Sequence[int | None]) -> None:
         """Restart the samples' noise: of environment i from seed + i, or from its entry unless that is None."""
         seeds = [seed + env for env in range(len(self._noise))] if isinstance(seed, int | np.integer) else seed

@@ -16,7 +16,7 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from envs.parallel import ForecastParallelEnv
-from envs.registry import make_env, make_parallel_env
+from envs.registry import make_env, make_multiagent_env
 from envs.sb3.forecast import VecForecast
 from envs.vector import VectorForecast
 from envs.wrappers import ForecastObservation, SceneObservation
@@ -369,7 +369,7 @@ def test_a_command_runs_on_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 WRAPPED: dict[str, Callable[[str], Any]] = {
     "ForecastObservation": lambda device: ForecastObservation(make_env("highway-fast-v0"), "highway", device=device),
     "ForecastParallelEnv": lambda device: ForecastParallelEnv(
-        make_parallel_env("simple_tag_v3"), "simple-tag", device=device
+        make_multiagent_env("simple_tag_v3"), "simple-tag", device=device
     ),
     "VecForecast": lambda device: VecForecast(
         DummyVecEnv([lambda: SceneObservation(make_env("highway-fast-v0"))]), "highway", device=device

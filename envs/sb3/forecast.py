@@ -5,6 +5,7 @@ observation that closes an episode carries the forecast made from that episode's
 starts from one step. `envs.vector` has the same for gymnasium's vector environments.
 """
 
+import inspect
 from collections.abc import Sequence
 from typing import Any
 
@@ -25,6 +26,8 @@ from envs.readers import MakeReader
 from envs.scene_stream import ForecastConfig
 from predictor.forecaster import Forecaster
 from predictor.scene import SceneBatch
+
+_CLASS_NOTES = "class_attributes"
 
 
 class VecForecast(ForecastWrapper, VecEnvWrapper):
@@ -75,6 +78,14 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         self.stream: ForecastStream = ForecastStream(forecaster, spec, venv.num_envs, config)
         self._layout = ObservationLayout(space["observation"], self.stream.spaces(), flatten)
         VecEnvWrapper.__init__(self, venv, observation_space=self._layout.space)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns what a copy or a pickle keeps; VecEnvWrapper's notes on its own class do not pickle."""
+        return {name: value for name, value in super().__getstate__().items() if name != _CLASS_NOTES}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copy or a pickle."""
+        super().__setstate__({**state, _CLASS_NOTES: dict(inspect.getmembers(type(self)))})
 
     @property
     def scene(self) -> SceneBatch:
