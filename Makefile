@@ -1,12 +1,13 @@
 PYTHON ?= python3
 TEST_JOBS ?= 2
+EXTRAS ?= core scores envs rl envpool
 RUN_DIR ?= runs/highway-fast-ppo
 
 .DEFAULT_GOAL := help
-.PHONY: help .venv train test check bench bench-check clean
+.PHONY: help .venv train test check docs-check install-check bench bench-check clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[.a-z-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[.a-z-]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 .venv: .venv/.installed ## install the package and its tools, at the versions of constraints.txt, into .venv
 
@@ -16,16 +17,24 @@ help: ## list the targets
 	touch $@
 
 train: .venv/.installed ## train a policy on highway-fast-v0 into RUN_DIR (continues a run that was stopped), evaluate and film it
-	.venv/bin/python train_policy.py --resume --run-dir $(RUN_DIR)
+	.venv/bin/python train_policy.py --resume --out $(RUN_DIR)
 
 test: .venv/.installed ## run the tests, TEST_JOBS at a time
 	.venv/bin/python -m pytest -n $(TEST_JOBS)
 
-check: .venv/.installed ## lint, formatting, types, who may import whom
+check: .venv/.installed ## lint, formatting, types, who may import whom, the shape of the tree, the examples in docstrings
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 	.venv/bin/lint-imports
+	.venv/bin/python -m pytest -q -o addopts=--import-mode=importlib --doctest-modules \
+		predictor envs agents benchmarks train_policy.py tests/test_structure.py
+
+docs-check: .venv/.installed ## run every command and every block of README.md and docs/ as written, in a copy of the tree
+	.venv/bin/python .ci/docs_check.py
+
+install-check: ## build the wheel and try EXTRAS, each in a fresh environment: five minutes and 2 GB each
+	$(PYTHON) .ci/install_check.py --only $(EXTRAS)
 
 bench: .venv/.installed ## measure the speed of everything: one table, and runs/benchmarks.json
 	.venv/bin/python -m benchmarks

@@ -1,4 +1,4 @@
-"""Train a policy that sees what the others are about to do: `python train_policy.py --run-dir runs/highway`.
+"""Train a policy that sees what the others are about to do: `python train_policy.py --out runs/highway`.
 
 Ends with a table over held-out seeds (trained, random and idle egos on the same seeds) and a video with the forecasts
 drawn in. The run folder holds config.json, tb/ (TensorBoard), checkpoint.zip (the latest), best_model.zip (best on the
@@ -8,100 +8,99 @@ selection seeds), policy.zip (the final policy: the best), summary.json, summary
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
-import tyro
 from rich.console import Console
 
 from agents.evaluate import PACKAGES, evaluate_with_progress
 from agents.features import AttentionConfig
+from agents.presets import Algorithm
 from agents.runs import load_model, open_run
-from agents.task import Task
+from agents.task import Backend, Observe, Task
 from agents.training import TrainingPlan, train
 from agents.video import film
-from envs.registry import native_task_of
+from envs.registry import entry_for, native_task_of
 from envs.simulators.envpool import ONE_START
-from predictor.errors import UserError, run_entry_point
+from predictor.command_line import Renamed, parse
+from predictor.config_checks import check_at_least, check_choices
+from predictor.errors import run_entry_point
 from predictor.provenance import provenance
 from predictor.runtime import keep_freed_memory
 
 ENVS = {"gymnasium": 6, "envpool": 64}
-"""Parallel environments by default."""
-
-LEARNERS: dict[str, tuple[str, ...]] = {"simple_tag_v3": ("adversary",), "simple_world_comm_v3": ("adversary",)}
-"""Who learns by default where the sides are opponents: pursuers, against a prey that flees by rule."""
+"""Number of parallel environments by default."""
 
 
 @dataclass(frozen=True)
 class TrainPolicyConfig:
     """Train a policy on forecasts, evaluate it and film it."""
 
-    env_id: Annotated[str, tyro.conf.arg(aliases=["--env"])] = "highway-fast-v0"
-    """Gymnasium id (highway-fast-v0) or PettingZoo parallel id (simple_tag_v3)."""
-    algorithm: Literal["ppo", "dqn"] = "ppo"
+    env_id: Annotated[str, Renamed("env")] = "highway-fast-v0"
+    """Environment to train on: gymnasium id (highway-fast-v0) or PettingZoo parallel id (simple_tag_v3)."""
+    algorithm: Algorithm = "ppo"
     """Learning algorithm; its hyperparameters are in agents/presets.py."""
-    observe: Literal["forecast", "none", "constant-velocity"] = "forecast"
+    observe: Observe = "forecast"
     """What the policy sees: learned forecasts, the env's own observation alone, or constant-velocity forecasts."""
     checkpoint: str | None = None
-    """Forecaster: name of a shipped checkpoint or a path; None takes the one that ships for the env id."""
+    """Forecaster: shipped name, folder or run folder; None takes the checkpoint that ships for the env id."""
     steps: int = 20_000
-    """Environment steps to train for, over all environments."""
-    envs: int | None = None
-    """Parallel environments: processes, native ones with EnvPool, copies of a PettingZoo environment. None takes 6,
-    with EnvPool 64."""
-    backend: Literal["gymnasium", "envpool"] = "gymnasium"
-    """Who simulates in training; measured and filmed on the gymnasium environment in any case."""
+    """Number of environment steps to train for, over all environments."""
+    num_envs: Annotated[int | None, Renamed("envs")] = None
+    """Number of parallel environments: processes, native ones with EnvPool, copies of a PettingZoo environment. None
+    takes 6, with EnvPool 64."""
+    backend: Backend = "gymnasium"
+    """Simulator in training; the policy is measured and filmed on the gymnasium environment in any case."""
     learners: tuple[str, ...] | None = None
     """PettingZoo: agents or roles that learn, for example adversary; None takes all, in simple_tag the adversaries."""
-    partner: str = "heuristic"
+    driver: Annotated[str, Renamed("partner")] = "heuristic"
     """PettingZoo: who drives the agents that do not learn: random, idle, varied, heuristic or mixed."""
     seed: int = 0
-    """Drives torch, NumPy and the environments; evaluation seeds do not depend on it."""
-    run_dir: Path | None = None
-    """Run folder; None takes runs/ENV_ID-ALGORITHM-OBSERVE-SEED."""
+    """Random seed for torch, NumPy and the environments; evaluation seeds do not depend on it."""
+    out: Annotated[Path | None, Renamed("run_dir")] = None
+    """Run folder to write; None takes runs/ENV_ID-ALGORITHM-OBSERVE-SEED."""
     resume: bool = False
-    """Continue the run in run_dir (or start it, if nothing is there yet)."""
+    """Continue the run in `out` (or start it, if nothing is there yet)."""
     selections: int = 8
-    """How often, evenly spread, the policy is measured to find the best one."""
+    """Number of times, evenly spread, that the policy is measured to find the best one."""
     selection_episodes: int = 20
-    """Episodes per such measurement, on seeds that neither training nor the final table uses."""
+    """Number of episodes per such measurement, on seeds that neither training nor the final table uses."""
     checkpoint_every: int = 2_000
-    """Environment steps between checkpoints."""
+    """Number of environment steps between checkpoints."""
     eval_episodes: int = 50
-    """Episodes per policy in the final table."""
+    """Number of episodes per policy in the final table."""
     video: bool = True
     """Film one episode at the end."""
     device: str = "cpu"
-    """Where forecaster and policy run: cpu, cuda or auto."""
+    """Device that runs forecaster and policy: cpu, cuda or auto (cuda where there is one)."""
 
-    def check(self) -> None:
-        """Check ranges; what belongs together is checked by the parts.
+    def __post_init__(self) -> None:
+        """Check choices and ranges; the parts check what belongs together.
 
         Raises:
-            UserError: a number that makes no sense. (In `__post_init__`, tyro would turn it into a box of lines.)
+            UserError: a value that makes no sense.
         """
-        for name in ("steps", "num_envs", "selections", "selection_episodes", "checkpoint_every", "eval_episodes"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_choices(self)
+        check_at_least(
+            self, 1, "steps", "num_envs", "selections", "selection_episodes", "checkpoint_every", "eval_episodes"
+        )
+        object.__setattr__(self, "device", self.plan.device)
 
     @property
     def folder(self) -> Path:
         """The run folder."""
-        return self.run_dir or Path("runs") / f"{self.env_id}-{self.algorithm}-{self.observe}-{self.seed}"
+        return self.out or Path("runs") / f"{self.env_id}-{self.algorithm}-{self.observe}-{self.seed}"
 
     @property
     def plan(self) -> TrainingPlan:
         """The training."""
-        learners = LEARNERS.get(self.env_id, ()) if self.learners is None else self.learners
-        task = Task(
-            self.env_id, self.observe, self.checkpoint, self.device, self.backend, tuple(learners), self.partner
-        )
+        learners = entry_for(self.env_id).learners if self.learners is None else self.learners
+        task = Task(self.env_id, self.observe, self.checkpoint, self.device, self.backend, tuple(learners), self.driver)
         return TrainingPlan(
             task,
             self.algorithm,
             self.steps,
-            self.num_envs,
+            self.parallel_envs,
             self.seed,
             self.device,
             self.selections,
@@ -111,24 +110,24 @@ class TrainPolicyConfig:
         )
 
     @property
-    def num_envs(self) -> int:
-        """Parallel environments."""
-        return self.envs if self.envs is not None else ENVS[self.backend]
+    def parallel_envs(self) -> int:
+        """Number of parallel environments."""
+        return self.num_envs if self.num_envs is not None else ENVS[self.backend]
 
     @property
     def measuring_rows(self) -> int:
-        """Parallel environments that measure a policy; results do not depend on it."""
-        return min(self.num_envs, os.cpu_count() or 1)
+        """Number of parallel environments that measure a policy; results do not depend on it."""
+        return min(self.parallel_envs, os.cpu_count() or 1)
 
 
 def run(config: TrainPolicyConfig, console: Console) -> None:
     """Train, evaluate, film. Nothing is written before the input has been checked."""
-    config.check()
     plan = config.plan
     plan.check_action_space(plan.task.check())
     settings = asdict(config) | {"preset": asdict(plan.preset), "attention": asdict(AttentionConfig())}
-    settings |= {"learners": plan.task.learners, "envs": config.num_envs}
-    for name in ("run_dir", "resume"):
+    # config.json keeps the names that runs had when their options were called so: they can be read and resumed
+    settings |= {"learners": plan.task.learners, "envs": config.parallel_envs, "partner": config.driver}
+    for name in ("out", "resume", "num_envs", "driver"):
         settings.pop(name)
     free = ("checkpoint_every", "eval_episodes", "video", "device")
     open_run(config.folder, settings, provenance(PACKAGES) | {"seed": config.seed}, config.resume, free)
@@ -150,7 +149,7 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
 def main() -> None:
     """Entry point."""
     keep_freed_memory()
-    config = tyro.cli(TrainPolicyConfig, description=__doc__)
+    config = parse(TrainPolicyConfig, __doc__)
     if config.backend != "envpool":  # its environments wait while networks compute
         torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
     run(config, Console())

@@ -1,1 +1,30 @@
-"""Policies that learn from forecasts: features, training, evaluation, studies (Stable-Baselines3)."""
+"""Policies that learn from forecasts, with Stable-Baselines3: features, training, evaluation.
+
+    >>> from agents import ForecastAttention, Task, TrainingPlan, train
+
+The names below are imported when they are used.
+"""
+
+from typing import TYPE_CHECKING
+
+from predictor.lazy_exports import lazy_exports
+
+if TYPE_CHECKING:
+    from agents.evaluate import Evaluation, PolicySummary, evaluate_policy_on_seeds
+    from agents.features import AttentionConfig, ForecastAttention
+    from agents.presets import DQNPreset, PPOPreset, preset_for
+    from agents.runs import load_model, save_model
+    from agents.task import Task
+    from agents.training import TrainingPlan, train
+
+__getattr__, __all__ = lazy_exports(
+    __name__,
+    {
+        "agents.evaluate": ("Evaluation", "PolicySummary", "evaluate_policy_on_seeds"),
+        "agents.features": ("AttentionConfig", "ForecastAttention"),
+        "agents.presets": ("DQNPreset", "PPOPreset", "preset_for"),
+        "agents.runs": ("load_model", "save_model"),
+        "agents.task": ("Task",),
+        "agents.training": ("TrainingPlan", "train"),
+    },
+)

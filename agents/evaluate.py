@@ -9,11 +9,10 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
-import tyro
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -24,10 +23,13 @@ from agents.arena import open_arena
 from agents.runs import POLICY_FILE, load_model, read_config
 from agents.task import EVALUATION_SEED, Task
 from agents.vec_envs import EpisodeResult
+from predictor import markdown
+from predictor.command_line import Renamed, parse
+from predictor.config_checks import check_at_least
 from predictor.errors import UserError, run_entry_point
 from predictor.files import write_json, write_text
 from predictor.provenance import provenance
-from predictor.runtime import keep_freed_memory
+from predictor.runtime import keep_freed_memory, resolve_device
 
 NUM_POLICIES = 3
 """The trained one and an arena's two baselines."""
@@ -96,9 +98,7 @@ class Evaluation:
     def markdown(self) -> str:
         """The table for a README."""
         header, rows = self._cells()
-        lines = ["| " + " | ".join(header) + " |", "|---" * len(header) + "|"]
-        lines += ["| " + " | ".join(row) + " |" for row in rows]
-        return "\n".join(lines) + f"\n\n{self.env_id}: {self._caption()}\n"
+        return f"{markdown.table(header, rows)}\n\n{self.env_id}: {self._caption()}\n"
 
     def table(self) -> Table:
         """The table for a terminal."""
@@ -251,37 +251,34 @@ class EvaluateConfig:
     """Evaluate the policy of a training run on held-out seeds, beside random and idle."""
 
     run_dir: Path
-    """Folder that train_policy.py made."""
+    """Folder of the training run, as train_policy.py wrote it."""
     episodes: int = 50
-    """Episodes per policy."""
+    """Number of episodes per policy."""
     seed: int = EVALUATION_SEED
-    """Episode i is reset with seed + i; the default is apart from all training seeds."""
+    """Random seed: episode i is reset with seed + i; the default is apart from all training seeds."""
     out: Path | None = None
     """Folder for summary.json and summary.md; None takes RUN_DIR/evaluation."""
-    workers: int = os.cpu_count() or 1
-    """Parallel environments; the results do not depend on it."""
+    num_envs: Annotated[int, Renamed("workers")] = os.cpu_count() or 1
+    """Number of parallel environments; the results do not depend on it."""
     device: str = "cpu"
-    """Where forecaster and policy run: cpu, cuda or auto."""
+    """Device that runs forecaster and policy: cpu, cuda or auto (cuda where there is one)."""
 
-    def check(self) -> None:
-        """Check ranges.
+    def __post_init__(self) -> None:
+        """Check ranges; `device="auto"` becomes the device that is taken.
 
         Raises:
-            UserError: a number that makes no sense. (In `__post_init__`, tyro would turn it into a box of lines.)
+            UserError: a value that makes no sense, or a device that is not there.
         """
-        for name in ("episodes", "workers"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.seed < 0:
-            raise UserError(f"seed must not be negative, got {self.seed}")
+        check_at_least(self, 1, "episodes", "num_envs")
+        check_at_least(self, 0, "seed")
+        object.__setattr__(self, "device", resolve_device(self.device))
 
 
 def main() -> None:
     """Entry point."""
     keep_freed_memory()
     torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
-    config = tyro.cli(EvaluateConfig, description=__doc__)
-    config.check()
+    config = parse(EvaluateConfig, __doc__)
     run = read_config(config.run_dir)
     task = Task(
         run["env_id"],
@@ -289,12 +286,12 @@ def main() -> None:
         run["checkpoint"],
         config.device,
         learners=tuple(run.get("learners", ())),
-        partner=run.get("partner", "heuristic"),
+        driver=run.get("partner", "heuristic"),
     )
     task.check()
     model = load_model(config.run_dir / POLICY_FILE, run["algorithm"])
     name = f"{run['algorithm']} ({run['observe']})"
-    evaluation = evaluate_with_progress(task, model, name, config.episodes, config.workers, config.seed)
+    evaluation = evaluate_with_progress(task, model, name, config.episodes, config.num_envs, config.seed)
     out = config.out or config.run_dir / "evaluation"
     out.mkdir(parents=True, exist_ok=True)
     evaluation.write(out, algorithm=run["algorithm"], observe=run["observe"])

@@ -53,7 +53,10 @@ class ForecastAttention(BaseFeaturesExtractor):
     """SB3 features extractor for forecast observations; works with any subset of the token keys.
 
     Example:
-        >>> PPO("MultiInputPolicy", venv, policy_kwargs={"features_extractor_class": ForecastAttention})
+        >>> from stable_baselines3 import PPO
+        >>> from envs import ForecastObservation, make_env
+        >>> env = ForecastObservation(make_env("highway-fast-v0"))
+        >>> model = PPO("MultiInputPolicy", env, policy_kwargs={"features_extractor_class": ForecastAttention})
 
     Args:
         observation_space: Dict space with `observation` and some of `agents`, `forecast`, `edge_probs`,

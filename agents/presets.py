@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from agents.task import Backend
-from envs.registry import is_parallel_id
+from envs.registry import is_multiagent_id
 
 Algorithm = Literal["ppo", "dqn"]
 
@@ -85,7 +85,7 @@ _PARTICLES = PPOPreset(n_steps=100, batch_size=300, n_epochs=8, learning_rate=7e
 
 def preset_for(env_id: str, algorithm: Algorithm, backend: Backend = "gymnasium") -> Preset:
     """The tuned preset of an env id, or the nearest published one."""
-    if algorithm == "ppo" and is_parallel_id(env_id):
+    if algorithm == "ppo" and is_multiagent_id(env_id):
         return _PARTICLES
     if algorithm == "ppo" and backend == "envpool":
         gamma = _FIVE_HZ_GAMMA if env_id.startswith("racetrack") else _ENVPOOL_PPO.gamma

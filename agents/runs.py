@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.presets import Algorithm
 from predictor.errors import UserError
-from predictor.files import partial_path, publish, write_json
+from predictor.files import delete_leftovers, new_file, write_json
 
 CONFIG_FILE = "config.json"
 CHECKPOINT_FILE = "checkpoint.zip"
@@ -46,18 +46,17 @@ def open_run(
         UserError: the folder is in use, or holds a run with another config.
     """
     if run_dir.exists() and not run_dir.is_dir():
-        raise UserError(f"{run_dir} is a file; choose another --run-dir")
+        raise UserError(f"{run_dir} is a file; choose another --out")
     config = json.loads(json.dumps(config, default=str))
     file = run_dir / CONFIG_FILE
     started = run_dir.exists() and any(not entry.name.startswith(".") for entry in run_dir.iterdir())
     starts: list[Any] = []
     if started:
         if not resume:
-            raise UserError(f"{run_dir} exists; choose another --run-dir, or continue it with --resume")
+            raise UserError(f"{run_dir} exists; choose another --out, or continue it with --resume")
         starts = _check_same(file, config, free)
     run_dir.mkdir(parents=True, exist_ok=True)
-    for leftover in run_dir.glob(".*.partial"):
-        leftover.unlink()
+    delete_leftovers(run_dir)
     write_json(file, {"config": config, "provenance": [*starts, provenance]})
 
 
@@ -79,15 +78,14 @@ def save_model(model: BaseAlgorithm, path: Path, note: dict[str, Any] | None = N
         note: small JSON content that travels inside.
         buffer: put the replay buffer inside as well, if the algorithm has one.
     """
-    partial = partial_path(path)
-    with partial.open("wb") as file:
-        model.save(file)
-    with zipfile.ZipFile(partial, "a") as archive:
-        archive.writestr(_NOTE_ENTRY, json.dumps(note or {}))
-        if buffer and isinstance(model, OffPolicyAlgorithm):
-            with archive.open(_BUFFER_ENTRY, "w", force_zip64=True) as entry:
-                pickle.dump(model.replay_buffer, entry, protocol=pickle.HIGHEST_PROTOCOL)
-    publish(partial, path)
+    with new_file(path) as partial:
+        with partial.open("wb") as file:
+            model.save(file)
+        with zipfile.ZipFile(partial, "a") as archive:
+            archive.writestr(_NOTE_ENTRY, json.dumps(note or {}))
+            if buffer and isinstance(model, OffPolicyAlgorithm):
+                with archive.open(_BUFFER_ENTRY, "w", force_zip64=True) as entry:
+                    pickle.dump(model.replay_buffer, entry, protocol=pickle.HIGHEST_PROTOCOL)
 
 
 def load_model(path: Path, algorithm: Algorithm, venv: VecEnv | None = None, device: str = "cpu") -> BaseAlgorithm:
@@ -134,6 +132,6 @@ def _check_same(file: Path, config: dict[str, Any], free: Sequence[str]) -> list
         if name not in free and before.get(name) != config[name]:
             raise UserError(
                 f"cannot resume {file.parent}: {name} was {before.get(name)!r}, now {config[name]!r}; "
-                "pass the old value or choose another --run-dir"
+                "pass the old value or choose another --out"
             )
     return list(stored.get("provenance", []))

@@ -6,15 +6,16 @@ from typing import Literal
 
 import gymnasium as gym
 import numpy as np
-import torch
 
 from envs.drivers.all_agents import DRIVER_NAMES, make_driver
 from envs.parallel import ForecastParallelEnv
-from envs.registry import is_parallel_id, make_env, make_parallel_env, native_task_of
+from envs.registry import is_multiagent_id, make_env, make_multiagent_env, native_task_of
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.sb3.padded_spaces import learners_named
 from envs.wrappers import ForecastObservation
+from predictor.config_checks import check_choice, check_choices
 from predictor.errors import UserError
+from predictor.runtime import resolve_device
 from predictor.scene import SceneSpec
 
 EVALUATION_SEED = 2_000_000_000
@@ -43,29 +44,29 @@ class Task:
     """Who simulates in training: the gymnasium environment itself, or EnvPool's native copy of it."""
     learners: tuple[str, ...] = ()
     """PettingZoo: agents or roles ("adversary") that learn; none named are all."""
-    partner: str = "heuristic"
+    driver: str = "heuristic"
     """PettingZoo: who drives the agents that do not learn (`envs.drivers.all_agents`)."""
 
     def __post_init__(self) -> None:
-        """Check that the fields fit together."""
+        """Check choices, and that the fields fit together; `device="auto"` becomes the device that is taken."""
+        check_choices(self)
         if self.is_parallel and self.backend != "gymnasium":
             raise UserError(f"backend {self.backend} has no {self.env_id}; leave it out")
         if self.learners and not self.is_parallel:
             raise UserError(f"learners are for PettingZoo environments, {self.env_id} has one ego; leave them out")
-        if self.partner not in DRIVER_NAMES:
-            raise UserError(f"partner must be one of {', '.join(DRIVER_NAMES)}, got '{self.partner}'")
+        check_choice("driver", self.driver, DRIVER_NAMES)
         if self.backend == "envpool":
             native_task_of(self.env_id)
             if importlib.util.find_spec("envpool") is None:
                 raise UserError("backend envpool needs the envpool package; pip install 'dgvae-rl[envpool]'")
         if self.checkpoint is not None and self.observe != "forecast":
             raise UserError(f"checkpoint '{self.checkpoint}' has no effect with observe={self.observe}; leave one out")
-        resolve_device(self.device)
+        object.__setattr__(self, "device", resolve_device(self.device))
 
     @property
     def is_parallel(self) -> bool:
         """Whether it is a PettingZoo environment with many learners."""
-        return is_parallel_id(self.env_id)
+        return is_multiagent_id(self.env_id)
 
     @property
     def forecaster(self) -> str | None:
@@ -81,7 +82,7 @@ class Task:
         """
         if self.observe == "none":
             return None
-        env = ForecastObservation(make_env(self.env_id), self.forecaster, device=resolve_device(self.device))
+        env = ForecastObservation(make_env(self.env_id), self.forecaster, device=self.device)
         spec: SceneSpec = env.get_wrapper_attr("scene_spec")
         env.close()
         return spec
@@ -90,7 +91,7 @@ class Task:
         """Make the environment, with its forecaster, and return its action space.
 
         Raises:
-            UserError: as `scene_spec`; unknown learners, or a partner that cannot drive the others.
+            UserError: as `scene_spec`; unknown learners, or a driver that cannot drive the others.
         """
         if self.is_parallel:
             return self._check_parallel()
@@ -100,30 +101,13 @@ class Task:
         return env.action_space
 
     def _check_parallel(self) -> gym.Space:
-        env = make_parallel_env(self.env_id)
+        env = make_multiagent_env(self.env_id)
         if self.observe != "none":
-            env = ForecastParallelEnv(env, self.forecaster, device=resolve_device(self.device))
+            env = ForecastParallelEnv(env, self.forecaster, device=self.device)
         learners = learners_named(env.possible_agents, self.learners, self.env_id)
         partnered = len(learners) < len(env.possible_agents)
         if partnered:
-            make_driver(self.partner, env, np.random.default_rng(0))
+            make_driver(self.driver, env, np.random.default_rng(0))
         space = ParallelVecEnv([lambda: env], agents=learners, partner="random" if partnered else None).action_space
         env.close()
         return space
-
-
-def resolve_device(device: str) -> str:
-    """The torch device of a name; auto takes cuda where there is one.
-
-    Raises:
-        UserError: no such device here.
-    """
-    if device == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        usable = torch.device(device).type != "cuda" or torch.cuda.is_available()
-    except RuntimeError as error:
-        raise UserError(f"device must be cpu, cuda or auto, got '{device}'") from error
-    if not usable:
-        raise UserError(f"device '{device}' was asked for but torch finds no CUDA device; use --device cpu")
-    return device

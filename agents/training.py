@@ -20,10 +20,12 @@ from agents.arena import Arena, open_arena
 from agents.features import AttentionConfig, ForecastAttention
 from agents.presets import Algorithm, PPOPreset, Preset, preset_for
 from agents.runs import BEST_FILE, CHECKPOINT_FILE, POLICY_FILE, load_model, read_note, save_model
-from agents.task import SELECTION_SEED, Task, resolve_device
+from agents.task import SELECTION_SEED, Task
 from agents.vec_envs import make_rows
+from predictor.config_checks import check_at_least, check_choices
 from predictor.errors import UserError
 from predictor.files import copy_file
+from predictor.runtime import resolve_device
 
 
 @dataclass(frozen=True)
@@ -52,12 +54,14 @@ class TrainingPlan:
     """Environment steps between checkpoints."""
 
     def __post_init__(self) -> None:
-        """Check ranges."""
-        for name in ("steps", "num_rows", "selections", "selection_episodes", "selection_rows", "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        """Check choices and ranges; `device="auto"` becomes the device that is taken."""
+        check_choices(self)
+        check_at_least(
+            self, 1, "steps", "num_rows", "selections", "selection_episodes", "selection_rows", "checkpoint_every"
+        )
         if not 0 <= self.seed < SELECTION_SEED:
             raise UserError(f"seed must lie in [0, {SELECTION_SEED}), got {self.seed}")
+        object.__setattr__(self, "device", resolve_device(self.device))
 
     @property
     def preset(self) -> Preset:
@@ -136,7 +140,7 @@ def make_model(plan: TrainingPlan, venv: VecEnv, tensorboard_log: str | None = N
         policy_kwargs=policy_kwargs,
         tensorboard_log=tensorboard_log,
         seed=plan.seed,
-        device=resolve_device(plan.device),
+        device=plan.device,
         **options,
     )
 
@@ -146,7 +150,7 @@ def _resume_or_make(plan: TrainingPlan, venv: VecEnv, run_dir: Path) -> BaseAlgo
     checkpoint = run_dir / CHECKPOINT_FILE
     if not checkpoint.exists():
         return make_model(plan, venv, logs)
-    model = load_model(checkpoint, plan.algorithm, venv, resolve_device(plan.device))
+    model = load_model(checkpoint, plan.algorithm, venv, plan.device)
     model.tensorboard_log = logs  # the folder may have moved
     # The episodes after a resume are new ones, still a function of the seed.
     fresh = np.random.SeedSequence([plan.seed, model.num_timesteps]).generate_state(1)[0]

@@ -18,12 +18,12 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
-from agents.task import Task, resolve_device
+from agents.task import Task
 from envs.drivers.all_agents import Driver, make_driver
 from envs.drivers.ego import make_ego
 from envs.drivers.trained import Ego
 from envs.parallel import ForecastParallelEnv
-from envs.registry import make_env, make_parallel_env, native_task_of
+from envs.registry import make_env, make_multiagent_env, native_task_of
 from envs.sb3.agents_as_rows import AgentMonitor, ParallelVecEnv
 from envs.sb3.envpool import EnvPoolVecEnv
 from envs.sb3.forecast import VecForecast
@@ -115,10 +115,10 @@ class MakeCopy:
     def __call__(self) -> ParallelEnv:
         """The environment in a `DrivenEnv`, with forecasts around it unless the task observes none."""
         options = {} if self.render_mode is None else {"render_mode": self.render_mode}
-        env = DrivenEnv(make_parallel_env(self.task.env_id, **options), self.task.partner)
+        env = DrivenEnv(make_multiagent_env(self.task.env_id, **options), self.task.driver)
         if self.task.observe == "none":
             return env
-        return ForecastParallelEnv(env, self.task.forecaster, device=resolve_device(self.task.device))
+        return ForecastParallelEnv(env, self.task.forecaster, device=self.task.device)
 
 
 def learners_of(task: Task, env: ParallelEnv) -> list[str]:
@@ -161,7 +161,7 @@ def make_rows(task: Task, num_rows: int, seeded: bool = False) -> VecEnv:
         row = _MakeRow(task.env_id, spec, seeded)
         venv = DummyVecEnv([row]) if num_rows == 1 else SubprocVecEnv([row] * num_rows, start_method="spawn")
     if task.observe != "none":
-        venv = VecForecast(venv, task.forecaster, device=resolve_device(task.device))
+        venv = VecForecast(venv, task.forecaster, device=task.device)
     return VecMonitor(venv)
 
 

@@ -12,9 +12,9 @@ from agents.features import EGO_KEY
 from agents.task import EVALUATION_SEED, Task
 from agents.vec_envs import MakeCopy, learners_of, make_parallel_rows, own_observations
 from envs.parallel import ForecastParallelEnv
-from envs.readers import shared_reader_for
+from envs.readers import multiagent_reader_for
 from envs.readers.highway import is_highway_env
-from envs.registry import CHECKPOINTS, PARALLEL_CHECKPOINTS, make_env, make_parallel_env
+from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, make_env, make_multiagent_env
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.video.highway import record_episode
 from envs.video.multiagent import SharedRecording, record_parallel_episode
@@ -36,7 +36,7 @@ def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) ->
     if task.observe == "none":
         if not _has_reader(task.env_id):
             return None
-        shown = None if task.env_id in PARALLEL_CHECKPOINTS else CONSTANT_VELOCITY
+        shown = None if task.env_id in MULTIAGENT_CHECKPOINTS else CONSTANT_VELOCITY
         filmed = replace(task, observe="forecast", checkpoint=shown)
     env = MakeCopy(filmed)()
     assert isinstance(env, ForecastParallelEnv)
@@ -62,9 +62,9 @@ def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) ->
 
 
 def _has_reader(env_id: str) -> bool:
-    env = make_parallel_env(env_id)
+    env = make_multiagent_env(env_id)
     try:
-        shared_reader_for(env)
+        multiagent_reader_for(env)
     except UserError:
         return False
     finally:

@@ -9,13 +9,13 @@ import sys
 import time
 
 import torch
-import tyro
 from rich.console import Console
 
 from benchmarks.compare import Comparison, read_baseline, write_baseline
 from benchmarks.settings import Settings
 from benchmarks.suite import measure, report, settle
 from benchmarks.table import plain, rich_table
+from predictor.command_line import parse
 from predictor.errors import run_entry_point
 from predictor.files import write_json
 from predictor.runtime import keep_freed_memory, processor, tune
@@ -23,8 +23,8 @@ from predictor.runtime import keep_freed_memory, processor, tune
 
 def main() -> None:
     """Entry point."""
-    settings = tyro.cli(Settings, description=__doc__)
-    settings.check()
+    settings = parse(Settings, __doc__)
+    settings.check_files()
     if settings.reference is not None:
         from benchmarks.reference import load
 
@@ -39,24 +39,24 @@ def main() -> None:
     def say(section: str) -> None:
         progress.print(f"[{time.perf_counter() - began:5.0f} s] {section} …", markup=False, highlight=False)
 
-    rows = measure(settings, settings.sections, say)
+    lines = measure(settings, settings.sections, say)
     comparison: Comparison | None = None
     if baseline is not None:
-        rows, comparison = settle(settings, baseline, rows, say)
-    result = report(settings, rows, keeps_memory, began)
+        lines, comparison = settle(settings, baseline, lines, say)
+    result = report(settings, lines, keeps_memory, began)
     kept = "kept" if keeps_memory else "handed back"
     versions = ", ".join(f"{name} {version}" for name, version in result["provenance"]["versions"].items())
     print(f"{result['machine']}; {settings.threads} torch threads; freed memory is {kept}; {settings.mode} run")
     print(f"commit {result['provenance']['commit']}; {versions}")
-    console.print(rich_table(rows)) if console.is_terminal else print(plain(rows))
+    console.print(rich_table(lines)) if console.is_terminal else print(plain(lines))
     settings.out.parent.mkdir(parents=True, exist_ok=True)
     write_json(settings.out, result)
     if settings.write_baseline is not None:
-        write_baseline(settings.write_baseline, settings, rows, processor(), result["provenance"])
+        write_baseline(settings.write_baseline, settings, lines, processor(), result["provenance"])
     if comparison is not None and baseline is not None:
         if baseline.processor != processor():
             print(f"the baseline is of another processor ({baseline.processor}): wider tolerances for equivalents")
-        print("\n".join(comparison.lines()))
+        print("\n".join(comparison.report()))
         if comparison.slower:
             sys.exit(1)
 

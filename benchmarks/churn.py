@@ -1,6 +1,6 @@
 """Does `VecForecast` leak? Agents come and go at every step; resident memory, slots and values are watched.
 
-`python benchmarks/churn.py` steps a synthetic traffic of which a share is replaced at each step, with episodes that end
+`python -m benchmarks.churn` steps a synthetic traffic of which a share is replaced at each step, with episodes that end
 at different times, and reports the slope of the resident memory [bytes per vector step], measured after a warm-up.
 """
 
@@ -8,12 +8,11 @@ import gc
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium as gym
 import numpy as np
 import torch
-import tyro
 from rich.progress import track
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -21,6 +20,8 @@ from envs.readers.function import FunctionReader
 from envs.sb3.forecast import VecForecast
 from envs.wrappers import SceneObservation
 from predictor.checkpoint import load_checkpoint
+from predictor.command_line import Renamed, parse
+from predictor.config_checks import check_at_least
 from predictor.errors import UserError, run_entry_point
 from predictor.files import write_json
 from predictor.provenance import provenance
@@ -32,34 +33,34 @@ class ChurnConfig:
     """Step `VecForecast` under constant coming and going."""
 
     steps: int = 200_000
-    """Environment steps, over all rows."""
-    rows: int = 8
-    """Environments."""
-    agents: int = 6
-    """Agents around the ego, on average."""
+    """Number of environment steps, over all environments."""
+    num_envs: Annotated[int, Renamed("rows")] = 8
+    """Number of parallel environments."""
+    num_agents: Annotated[int, Renamed("agents")] = 6
+    """Number of agents around the ego, on average."""
     replaced: float = 0.2
     """Share of the agents that is replaced at each step."""
     checkpoint: str = "highway"
-    """Whose forecasts."""
+    """Forecaster: shipped name, folder or run folder."""
     horizon_steps: int = 2
-    """Steps to forecast; memory is kept by observing, and short forecasts leave more steps for that."""
-    samples: int = 200
-    """Measurements of memory over the run."""
+    """Number of steps to forecast; memory is kept by observing, and short forecasts leave more steps for that."""
+    measurements: Annotated[int, Renamed("samples")] = 200
+    """Number of measurements of memory over the run."""
     out: Path | None = None
-    """JSON file for the result."""
+    """JSON file to write the result to."""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check ranges.
 
         Raises:
             UserError: a value that makes no sense.
         """
-        for name in ("steps", "rows", "agents", "horizon_steps", "samples"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.steps < 2 * self.samples * self.rows:
-            least = 2 * self.samples * self.rows
-            raise UserError(f"steps must be at least {least} (2 · samples · rows), got {self.steps}")
+        check_at_least(self, 1, "steps", "num_envs", "num_agents", "horizon_steps", "measurements")
+        if not 0 <= self.replaced <= 1:
+            raise UserError(f"replaced must lie between 0 and 1, got {self.replaced}")
+        least = 2 * self.measurements * self.num_envs
+        if self.steps < least:
+            raise UserError(f"steps must be at least {least} (2 · measurements · num_envs), got {self.steps}")
 
 
 class Churning(gym.Env):
@@ -110,29 +111,30 @@ def resident_bytes() -> int:
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(ChurnConfig, description=__doc__)
-    config.check()
+    config = parse(ChurnConfig, __doc__)
     torch.set_num_threads(1)
     _, info = load_checkpoint(config.checkpoint)
     spec: SceneSpec = info.spec
     reader = FunctionReader(read, spec)
     venv = VecForecast(
-        DummyVecEnv([lambda: SceneObservation(Churning(config.agents, config.replaced), reader=reader)] * config.rows),
+        DummyVecEnv(
+            [lambda: SceneObservation(Churning(config.num_agents, config.replaced), reader=reader)] * config.num_envs
+        ),
         config.checkpoint,
         horizon_steps=config.horizon_steps,
     )
     venv.seed(0)
     venv.reset()
-    actions = np.zeros(config.rows, dtype=np.int64)
+    actions = np.zeros(config.num_envs, dtype=np.int64)
     measured: list[tuple[int, int]] = []
     tensors: list[int] = []
     began = time.perf_counter()
-    vector_steps = config.steps // config.rows
+    vector_steps = config.steps // config.num_envs
     for step in track(range(vector_steps), "churn"):
         observations: Any = venv.step(actions)[0]
         if not all(np.isfinite(value).all() for value in observations.values()):
             raise UserError(f"step {step}: an observation is not finite")
-        if (step + 1) % (vector_steps // config.samples) == 0:
+        if (step + 1) % (vector_steps // config.measurements) == 0:
             gc.collect()
             measured.append((step + 1, resident_bytes()))
             tensors.append(sum(type(thing) is torch.Tensor for thing in gc.get_objects()))
@@ -142,7 +144,7 @@ def main() -> None:
     online = venv.stream._online
     seen = sum(env.unwrapped._next for env in venv.unwrapped.envs)  # type: ignore[attr-defined]
     print(
-        f"{config.steps} steps in {config.rows} rows, {seen} agents, "
+        f"{config.steps} steps in {config.num_envs} rows, {seen} agents, "
         f"{config.steps / (time.perf_counter() - began):.0f} steps/s: resident memory {late[0][1] / 2**20:.1f} to "
         f"{late[-1][1] / 2**20:.1f} MiB after a quarter of the run, slope {slope:.3f} bytes per vector step; "
         f"tensors alive {tensors[0]} then {tensors[-1]}; slots {online._ids.shape}, all observations finite"

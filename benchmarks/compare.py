@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.results import Compared, Row
+from benchmarks.results import Compared, Line
 from benchmarks.settings import Settings
 from predictor.errors import UserError
 from predictor.files import write_json
@@ -31,16 +31,16 @@ class Baseline:
     """torch threads."""
     processor: str
     """Where it was measured."""
-    rows: Mapping[str, Compared]
+    lines: Mapping[str, Compared]
     """By key."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """One row, then and now."""
+    """One line, then and now."""
 
     key: str
-    """Of the row."""
+    """Of the line."""
     before: Compared
     """In the baseline."""
     now: float
@@ -63,7 +63,7 @@ class Change:
         """Beyond the tolerance."""
         return self.slowdown < 1 / self.tolerance
 
-    def line(self) -> str:
+    def text(self) -> str:
         """For people."""
         factor = f"{self.slowdown:.2f}× slower" if self.slowdown >= 1 else f"{1 / self.slowdown:.2f}× faster"
         unit = {"ratio": "", "matmul": " matmul-equivalents", "interpreter": " interpreter-equivalents"}
@@ -76,7 +76,7 @@ class Comparison:
     """A run against a baseline."""
 
     changes: tuple[Change, ...]
-    """Rows that both have."""
+    """Lines that both have."""
     missing: tuple[str, ...]
     """Keys of the baseline that were not measured although their section ran."""
     new: tuple[str, ...]
@@ -92,21 +92,23 @@ class Comparison:
         """Best first."""
         return sorted((c for c in self.changes if c.faster), key=lambda change: change.slowdown)
 
-    def lines(self) -> list[str]:
+    def report(self) -> list[str]:
         """For people."""
-        lines = [f"SLOWER  {change.line()}" for change in self.slower]
-        lines += [f"faster  {change.line()}" for change in self.faster]
-        lines += [f"missing {key}" for key in self.missing] + [f"new     {key}" for key in self.new]
-        counts = f"{len(self.changes)} rows compared: {len(self.slower)} slower, {len(self.faster)} faster"
-        return [*lines, f"{counts}, {len(self.missing)} missing, {len(self.new)} new"]
+        parts = [f"SLOWER  {change.text()}" for change in self.slower]
+        parts += [f"faster  {change.text()}" for change in self.faster]
+        parts += [f"missing {key}" for key in self.missing] + [f"new     {key}" for key in self.new]
+        counts = f"{len(self.changes)} lines compared: {len(self.slower)} slower, {len(self.faster)} faster"
+        return [*parts, f"{counts}, {len(self.missing)} missing, {len(self.new)} new"]
 
 
-def write_baseline(path: Path, settings: Settings, rows: Sequence[Row], machine: str, made: Mapping[str, Any]) -> None:
+def write_baseline(
+    path: Path, settings: Settings, lines: Sequence[Line], machine: str, made: Mapping[str, Any]
+) -> None:
     """Write the comparable numbers of a run; a reader finds the old file or the new one."""
-    compared = {row.key: asdict(row.compared) for row in rows if row.compared is not None}
+    compared = {line.key: asdict(line.compared) for line in lines if line.compared is not None}
     path.parent.mkdir(parents=True, exist_ok=True)
     head = {"format": FORMAT, "version": VERSION, "mode": settings.mode, "threads": settings.threads}
-    write_json(path, head | {"processor": machine, "provenance": made, "rows": compared})
+    write_json(path, head | {"processor": machine, "provenance": made, "lines": compared})
 
 
 def read_baseline(path: Path, settings: Settings) -> Baseline:
@@ -122,8 +124,8 @@ def read_baseline(path: Path, settings: Settings) -> Baseline:
         content = json.loads(path.read_text(encoding="utf-8"))
         if (content["format"], content["version"]) != (FORMAT, VERSION):
             raise KeyError(f"format {content['format']!r}, version {content['version']}")
-        rows = {key: Compared(**values) for key, values in content["rows"].items()}
-        baseline = Baseline(content["mode"], int(content["threads"]), str(content["processor"]), rows)
+        lines = {key: Compared(**values) for key, values in content["lines"].items()}
+        baseline = Baseline(content["mode"], int(content["threads"]), str(content["processor"]), lines)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise UserError(f"{path} is not a readable baseline ({error}); {again}") from error
     if baseline.mode != settings.mode:
@@ -133,38 +135,38 @@ def read_baseline(path: Path, settings: Settings) -> Baseline:
     return baseline
 
 
-def compare(baseline: Baseline, rows: Iterable[Row], sections: Sequence[str], machine: str) -> Comparison:
-    """Hold a run's rows against the baseline's.
+def compare(baseline: Baseline, lines: Iterable[Line], sections: Sequence[str], machine: str) -> Comparison:
+    """Hold a run's lines against the baseline's.
 
     Args:
         baseline: what to compare with.
-        rows: what was measured.
-        sections: which sections ran; rows of others are not missing.
+        lines: what was measured.
+        sections: which sections ran; lines of others are not missing.
         machine: the processor's name.
     """
-    now = {row.key: row.compared for row in rows if row.compared is not None}
+    now = {line.key: line.compared for line in lines if line.compared is not None}
     widened = 1.0 if machine == baseline.processor else OTHER_PROCESSOR
     changes = []
-    for key, before in baseline.rows.items():
+    for key, before in baseline.lines.items():
         measured = now.get(key)
         if measured is not None:
             tolerance = before.tolerance * (1.0 if before.kind == "ratio" else widened)
             changes.append(Change(key, before, measured.value, tolerance))
-    expected = [key for key in baseline.rows if key.split(" | ")[0] in sections]
+    expected = [key for key in baseline.lines if key.split(" | ")[0] in sections]
     missing = tuple(key for key in expected if key not in now)
-    return Comparison(tuple(changes), missing, tuple(key for key in now if key not in baseline.rows))
+    return Comparison(tuple(changes), missing, tuple(key for key in now if key not in baseline.lines))
 
 
-def better_of(rows: Sequence[Row], again: Iterable[Row], keys: Iterable[str]) -> list[Row]:
-    """The rows, with those of these keys replaced where the second measurement was better."""
+def better_of(lines: Sequence[Line], again: Iterable[Line], keys: Iterable[str]) -> list[Line]:
+    """The lines, with those of these keys replaced where the second measurement was better."""
     wanted = set(keys)
-    second = {row.key: row for row in again if row.key in wanted and row.compared is not None}
+    second = {line.key: line for line in again if line.key in wanted and line.compared is not None}
 
-    def choose(row: Row) -> Row:
-        other = second.get(row.key)
-        if other is None or other.compared is None or row.compared is None:
-            return row
-        improved = row.compared.slowdown(other.compared.value) < 1
-        return replace(other, note=", ".join(filter(None, [other.note, "measured twice"]))) if improved else row
+    def choose(line: Line) -> Line:
+        other = second.get(line.key)
+        if other is None or other.compared is None or line.compared is None:
+            return line
+        improved = line.compared.slowdown(other.compared.value) < 1
+        return replace(other, note=", ".join(filter(None, [other.note, "measured twice"]))) if improved else line
 
-    return [choose(row) for row in rows]
+    return [choose(line) for line in lines]

@@ -13,9 +13,9 @@ import torch
 from stable_baselines3.common.vec_env import VecEnv
 
 from benchmarks.optional_packages import missing
-from benchmarks.results import Row, skipped
+from benchmarks.results import Line, skipped
 from benchmarks.settings import Settings
-from benchmarks.timing import Meter, Timing, interpreter, rate_row, ratio_row
+from benchmarks.timing import Meter, Timing, interpreter, rate_line, ratio_line
 from benchmarks.wrapper_overhead import blocks_of, make_rows, paper_sized
 from envs.registry import native_task_of
 from envs.sb3.envpool import EnvPoolVecEnv
@@ -57,31 +57,31 @@ TOLERANCES = {"highway-env": 1.15, "EnvPool": 1.6}
 """Of (with forecasts / plain): highway-env itself takes most of the time; EnvPool takes so little that it is noise."""
 
 
-def run(settings: Settings) -> list[Row]:
+def run(settings: Settings) -> list[Line]:
     """Every case that has its simulator."""
-    rows = []
+    lines = []
     for case in CASES[settings.mode]:
         absent = missing("envpool") if case.simulator == "EnvPool" else ""
         if absent:
-            rows.append(skipped("wrappers", "overhead of forecasts", absent, _what(case, settings)))
+            lines.append(skipped("wrappers", "overhead of forecasts", absent, _what(case, settings)))
         else:
-            rows += _overhead(case, settings)
-    return rows
+            lines += _overhead(case, settings)
+    return lines
 
 
 def _what(case: Case, settings: Settings) -> dict[str, Any]:
     return {"env": settings.env_id, "simulator": case.simulator, "envs": case.envs, "vec": case.vec}
 
 
-def _overhead(case: Case, settings: Settings) -> list[Row]:
+def _overhead(case: Case, settings: Settings) -> list[Line]:
     meter = Meter(case.rounds)
     with _environments(case, settings.env_id) as venvs, _threads(settings.threads if case.envs > FEW else 1):
         blocks = {name: blocks_of(venv, case.steps) for name, venv in venvs.items()}
         timings = meter.time_blocks(blocks, interpreter())
     what, count = _what(case, settings), case.steps * case.envs
-    rates = [rate_row("wrappers", name, what, timing, count, "steps/s") for name, timing in timings.items()]
+    rates = [rate_line("wrappers", name, what, timing, count, "steps/s") for name, timing in timings.items()]
     # A plain simulator is not ours to compare.
-    rates = [replace(row, compared=None) if row.name == "plain" else row for row in rates]
+    rates = [replace(line, compared=None) if line.name == "plain" else line for line in rates]
     plain = timings.pop("plain")
     return rates + [_ratio(name, what, timing, plain) for name, timing in timings.items()]
 
@@ -96,10 +96,10 @@ def _threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _ratio(name: str, what: dict[str, Any], timing: Timing, plain: Timing) -> Row:
+def _ratio(name: str, what: dict[str, Any], timing: Timing, plain: Timing) -> Line:
     ratios = timing.seconds / plain.seconds
     tolerance = TOLERANCES[what["simulator"]]
-    return ratio_row("wrappers", f"{name} / plain", what, ratios, "plain, time", tolerance=tolerance)
+    return ratio_line("wrappers", f"{name} / plain", what, ratios, "plain, time", tolerance=tolerance)
 
 
 @contextmanager
@@ -108,16 +108,16 @@ def _environments(case: Case, env_id: str) -> Iterator[dict[str, VecEnv]]:
     with ExitStack() as opened:
 
         def opening(scenes: bool) -> VecEnv:
-            return opened.enter_context(closing(_rows(case, env_id, scenes)))
+            return opened.enter_context(closing(_venv(case, env_id, scenes)))
 
         venvs = {"plain": opening(scenes=False), "with forecasts": VecForecast(opening(scenes=True))}
         if case.paper:
-            rows = opening(scenes=True)
-            venvs["with forecasts, paper size"] = VecForecast(rows, forecaster=paper_sized(rows))
+            scenes = opening(scenes=True)
+            venvs["with forecasts, paper size"] = VecForecast(scenes, forecaster=paper_sized(scenes))
         yield venvs
 
 
-def _rows(case: Case, env_id: str, scenes: bool) -> VecEnv:
+def _venv(case: Case, env_id: str, scenes: bool) -> VecEnv:
     if case.vec == "native":
         return EnvPoolVecEnv(native_task_of(env_id), case.envs, seed=0, scenes=scenes)
     return make_rows(env_id, case.envs, case.vec, scenes)

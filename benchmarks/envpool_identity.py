@@ -1,19 +1,18 @@
 """How often EnvPool's vehicles keep their identity from step to step, when only their motion tells who is who.
 
-`python benchmarks/envpool_identity.py` drives each task with random actions, hides the order of the vehicles from the
+`python -m benchmarks.envpool_identity` drives each task with random actions, hides the order of the vehicles from the
 reader by shuffling it anew at each step, and compares the identities with the true ones: EnvPool 1.2.5 never reorders
 or removes a vehicle, which is checked in the same run where each driver has an exponent of its own. `--replay` does the
 same to scenes of highway-env, where vehicles also come and go and the simulator names them.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium as gym
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -21,6 +20,8 @@ from envs.readers.envpool import PoolIdentity, PoolReader, native_spec
 from envs.readers.highway import HighwayReader
 from envs.registry import make_env
 from envs.simulators.envpool import HIGHWAY_ENV_OF, make_pool
+from predictor.command_line import Renamed, parse
+from predictor.config_checks import check_at_least
 from predictor.errors import UserError, run_entry_point
 
 
@@ -29,27 +30,26 @@ class IdentityConfig:
     """Count kept and lost identities of EnvPool's vehicles."""
 
     task_ids: tuple[str, ...] = tuple(HIGHWAY_ENV_OF)
-    """EnvPool tasks."""
+    """EnvPool tasks to drive."""
     vehicle_steps: int = 100_000
-    """Pairs of a vehicle and a step to count per task, the ego not among them."""
-    envs: int = 32
-    """Parallel environments."""
+    """Number of pairs of a vehicle and a step to count per task, the ego not among them."""
+    num_envs: Annotated[int, Renamed("envs")] = 32
+    """Number of parallel environments."""
     seed: int = 0
-    """Of environments, actions and shuffles."""
+    """Random seed for environments, actions and shuffles."""
     replay: tuple[str, ...] = ()
-    """highway-env ids whose scenes are tracked as well, for example intersection-v2."""
+    """Ids of highway-env whose scenes are tracked as well, for example intersection-v2."""
     replay_vehicle_steps: int = 10_000
-    """Pairs per replayed id; highway-env makes about a thousand per second."""
+    """Number of such pairs per replayed id; highway-env makes about a thousand per second."""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check ranges.
 
         Raises:
             UserError: a value that makes no sense.
         """
-        for field in fields(self):
-            if field.type is int and getattr(self, field.name) < (field.name != "seed"):
-                raise UserError(f"{field.name} is too small: {getattr(self, field.name)}")
+        check_at_least(self, 1, "vehicle_steps", "num_envs", "replay_vehicle_steps")
+        check_at_least(self, 0, "seed")
 
 
 @dataclass
@@ -83,17 +83,17 @@ class Count:
 def count_envpool(task_id: str, config: IdentityConfig) -> Count:
     """Drive a task until enough vehicle steps are counted; no count where nobody but the ego drives."""
     rng = np.random.default_rng(config.seed)
-    pool = make_pool(task_id, [config.seed + i for i in range(config.envs)])
+    pool = make_pool(task_id, [config.seed + i for i in range(config.num_envs)])
     pool.reset()
-    reader = PoolReader(native_spec(task_id, pool.config), config.envs)
-    rows = np.arange(config.envs)
+    reader = PoolReader(native_spec(task_id, pool.config), config.num_envs)
+    rows = np.arange(config.num_envs)
     states = pool.debug_states()
     agents = len(states[0].vehicles)
     count = Count()
     before, drivers = _numbers(reader, states, rows, rng), _drivers(states)
     while agents > 1 and count.pairs < config.vehicle_steps:
         clock = [state.elapsed_step for state in states]
-        pool.step(_actions(pool.action_space, config.envs, rng))
+        pool.step(_actions(pool.action_space, config.num_envs, rng))
         states = pool.debug_states()
         now, after = _numbers(reader, states, rows, rng), _drivers(states)
         for i in rows:
@@ -163,8 +163,7 @@ def count_replay(env_id: str, config: IdentityConfig) -> Count:
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(IdentityConfig, description=__doc__)
-    config.check()
+    config = parse(IdentityConfig, __doc__)
     table = Table(title=f"identity from motion, random ego, seed {config.seed}")
     for heading in ("env", "vehicle steps", "correct", "id switches", "split", "wrong", "episodes"):
         table.add_column(heading, justify="left" if heading == "env" else "right")

@@ -1,6 +1,6 @@
 """How far EnvPool's highway environments are from highway-env's: the same state in both, and episodes of each.
 
-`python benchmarks/envpool_parity.py` copies the states that EnvPool's episodes begin in (positions, speeds, lanes,
+`python -m benchmarks.envpool_parity` copies the states that EnvPool's episodes begin in (positions, speeds, lanes,
 routes, target speeds, drivers' exponents and timers) into the mirrored highway-env id, steps both with the same random
 actions, and reports by how much vehicles differ in position. Then it compares what episodes of each are like on their
 own terms, and with `--policy` how one trained policy fares in both.
@@ -10,11 +10,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium as gym
 import numpy as np
-import tyro
 from highway_env.vehicle.behavior import IDMVehicle
 from rich.console import Console
 from rich.table import Table
@@ -25,6 +24,8 @@ from envs.readers import reader_for
 from envs.registry import make_env
 from envs.simulators.envpool import ENV_IDS, HIGHWAY_ENV_OF
 from envs.wrappers import ForecastObservation
+from predictor.command_line import Renamed, parse
+from predictor.config_checks import check_at_least
 from predictor.errors import UserError, run_entry_point
 from predictor.files import write_json
 from predictor.provenance import provenance
@@ -39,33 +40,32 @@ class ParityConfig:
     """Compare EnvPool's highway environments with highway-env's."""
 
     task_ids: tuple[str, ...] = ("HighwayFast-v0", "Intersection-v0")
-    """EnvPool tasks with discrete actions."""
+    """EnvPool tasks to compare; they have discrete actions."""
     starts: int = 20
-    """Copied initial states per task."""
+    """Number of copied initial states per task."""
     steps: int = 10
-    """Steps from each [policy steps]."""
+    """Number of steps from each of them [policy steps]."""
     episodes: int = 30
-    """Episodes per task, simulator and ego; 0 leaves these tables out."""
-    egos: tuple[str, ...] = ("random", "idle")
+    """Number of episodes per task, simulator and driver; 0 leaves these tables out."""
+    driver: Annotated[tuple[str, ...], Renamed("egos")] = ("random", "idle")
     """Who drives: random, idle or varied."""
     policy: Path | None = None
-    """A Stable-Baselines3 policy .zip that drives as well, in both."""
+    """Policy .zip of Stable-Baselines3 that drives as well, in both simulators."""
     checkpoint: str | None = None
-    """Whose forecasts the policy sees; None takes the one that ships for the id."""
+    """Forecaster whose forecasts the policy sees; None takes the checkpoint that ships for the id."""
     seed: int = 0
-    """Of environments and actions."""
+    """Random seed for environments and actions."""
     out: Path | None = None
-    """JSON file for the results."""
+    """JSON file to write the results to."""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check ranges.
 
         Raises:
             UserError: a value that makes no sense.
         """
-        for name, least in (("starts", 1), ("steps", 1), ("episodes", 0), ("seed", 0)):
-            if getattr(self, name) < least:
-                raise UserError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        check_at_least(self, 1, "starts", "steps")
+        check_at_least(self, 0, "episodes", "seed")
         unknown = [t for t in self.task_ids if t not in HIGHWAY_ENV_OF or t.startswith("Racetrack")]
         if unknown:
             raise UserError(f"cannot compare {', '.join(unknown)}: unknown, or without other vehicles")
@@ -277,8 +277,7 @@ def episodes_table(task_id: str, ego: str, both: Sequence[tuple[str, Episodes]])
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(ParityConfig, description=__doc__)
-    config.check()
+    config = parse(ParityConfig, __doc__)
     console = Console(width=140)
     results: dict[str, Any] = {}
     for task_id in config.task_ids:
@@ -286,7 +285,7 @@ def main() -> None:
             apart = step_both(task_id, config)
         console.print(distances_table(task_id, apart))
         results[task_id] = {"apart": asdict(apart)}
-        egos = [*config.egos, *([str(config.policy)] if config.policy else [])] if config.episodes else []
+        egos = [*config.driver, *([str(config.policy)] if config.policy else [])] if config.episodes else []
         for ego in egos:
             with untouched_drivers():
                 made = [("envpool", _env_id(task_id)), ("highway-env", HIGHWAY_ENV_OF[task_id])]

@@ -1,6 +1,6 @@
 """PPO with forecasts on EnvPool against plain PPO on highway-env: steps/s of whole training loops, in one run.
 
-`python benchmarks/envpool_training.py` trains both in turn, block by block (rollouts and updates, no evaluation), each
+`python -m benchmarks.envpool_training` trains both in turn, block by block (rollouts and updates, no evaluation), each
 with the preset that `train_policy.py` uses for it, and prints the median ratio and where the time of the first goes.
 Absolute numbers depend on the machine; the ratio is the result.
 """
@@ -12,17 +12,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
-import tyro
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from agents.task import Task
 from agents.training import TrainingPlan, make_model
 from agents.vec_envs import make_rows
-from predictor.errors import UserError, run_entry_point
+from predictor.command_line import Renamed, parse
+from predictor.config_checks import check_at_least
+from predictor.errors import run_entry_point
 from predictor.files import write_json
 from predictor.provenance import provenance
 from predictor.runtime import keep_freed_memory
@@ -33,31 +34,31 @@ class TrainingSpeedConfig:
     """Compare steps/s of two PPO trainings."""
 
     env_id: str = "highway-fast-v0"
-    """highway-env's id; EnvPool trains on its native copy."""
-    native_envs: int = 64
-    """Environments in EnvPool."""
-    plain_envs: int = 6
-    """Processes of highway-env, as many as train_policy.py takes."""
+    """Environment by highway-env's id; EnvPool trains on its native copy."""
+    num_envpool_envs: Annotated[int, Renamed("native_envs")] = 64
+    """Number of parallel environments in EnvPool."""
+    num_plain_envs: Annotated[int, Renamed("plain_envs")] = 6
+    """Number of parallel environments of highway-env, as many as train_policy.py takes."""
     blocks: int = 5
-    """Pairs of blocks; the median of their ratios is reported."""
+    """Number of pairs of blocks; the median of their ratios is reported."""
     plain_steps: int = 768
-    """Environment steps in a plain block (one rollout of 128 steps and its update)."""
-    native_steps: int = 8192
-    """Environment steps in a block with forecasts."""
+    """Number of environment steps in a plain block (one rollout of 128 steps and its update)."""
+    envpool_steps: Annotated[int, Renamed("native_steps")] = 8192
+    """Number of environment steps in a block with forecasts."""
     threads: int = 2
-    """torch threads of the forecaster and of both policies."""
+    """Number of torch threads of the forecaster and of both policies."""
     out: Path | None = None
-    """JSON file for the result."""
+    """JSON file to write the result to."""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check ranges.
 
         Raises:
             UserError: a value that makes no sense.
         """
-        for name in ("native_envs", "plain_envs", "blocks", "plain_steps", "native_steps", "threads"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_at_least(
+            self, 1, "num_envpool_envs", "num_plain_envs", "blocks", "plain_steps", "envpool_steps", "threads"
+        )
 
 
 class Timed:
@@ -122,16 +123,16 @@ def measure(config: TrainingSpeedConfig, report: Callable[[str], None]) -> dict[
         config: shapes and repetitions.
         report: is told what each pair of blocks gave.
     """
-    plain = make(Task(config.env_id, "none"), config.plain_envs, 0)
-    native = make(Task(config.env_id, "forecast", backend="envpool"), config.native_envs, 0)
+    plain = make(Task(config.env_id, "none"), config.num_plain_envs, 0)
+    native = make(Task(config.env_id, "forecast", backend="envpool"), config.num_envpool_envs, 0)
     try:
         run_block(plain, config.plain_steps)
-        run_block(native, config.native_steps)
+        run_block(native, config.envpool_steps)
         pairs = []
         for _ in range(config.blocks):
-            pairs.append((run_block(plain, config.plain_steps), run_block(native, config.native_steps)))
+            pairs.append((run_block(plain, config.plain_steps), run_block(native, config.envpool_steps)))
             report(f"plain {pairs[-1][0]:.0f} steps/s, EnvPool with forecasts {pairs[-1][1]:.0f}")
-        shares = profile(native, config.native_steps)
+        shares = profile(native, config.envpool_steps)
     finally:
         for model in (plain, native):
             model.env.close()  # type: ignore[union-attr]
@@ -148,17 +149,16 @@ def measure(config: TrainingSpeedConfig, report: Callable[[str], None]) -> dict[
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(TrainingSpeedConfig, description=__doc__)
-    config.check()
+    config = parse(TrainingSpeedConfig, __doc__)
     keep_freed_memory()
     torch.set_num_threads(config.threads)
     result = measure(config, partial(print, flush=True))
     ratios = result["ratios"]
     print(
-        f"{config.env_id}: plain PPO on highway-env ({config.plain_envs} processes) "
-        f"{result['plain_steps_per_s']:.0f} steps/s, PPO with forecasts on EnvPool ({config.native_envs} environments) "
-        f"{result['native_forecast_steps_per_s']:.0f} steps/s, ratio {result['ratio']:.1f} "
-        f"({min(ratios):.1f} to {max(ratios):.1f})"
+        f"{config.env_id}: plain PPO on highway-env ({config.num_plain_envs} processes) "
+        f"{result['plain_steps_per_s']:.0f} steps/s, PPO with forecasts on EnvPool "
+        f"({config.num_envpool_envs} environments) {result['native_forecast_steps_per_s']:.0f} steps/s, "
+        f"ratio {result['ratio']:.1f} ({min(ratios):.1f} to {max(ratios):.1f})"
     )
     shares = result["shares"].items()
     print("where its time goes: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares))

@@ -8,9 +8,9 @@ import torch
 
 from benchmarks.flops import Work
 from benchmarks.models import SIZES, forecaster, inference, observed, road, scenes, sized
-from benchmarks.results import Row
+from benchmarks.results import Line
 from benchmarks.settings import Settings
-from benchmarks.timing import Meter, Timing, rate_row, timed_row
+from benchmarks.timing import Meter, Timing, rate_line, timed_line
 from predictor.dgvae import DGVAE
 
 
@@ -40,13 +40,13 @@ CASES: dict[str, tuple[Case, ...]] = {
 EVOLVING = "evolving graph, float32"
 
 
-def run(settings: Settings) -> list[Row]:
+def run(settings: Settings) -> list[Line]:
     """Both presets at every shape."""
     meter = Meter.of(settings)
-    return [row for preset in SIZES for case in CASES[settings.mode] for row in _case(preset, case, meter)]
+    return [line for preset in SIZES for case in CASES[settings.mode] for line in _case(preset, case, meter)]
 
 
-def _case(preset: str, case: Case, meter: Meter) -> list[Row]:
+def _case(preset: str, case: Case, meter: Meter) -> list[Line]:
     model = forecaster(sized(preset), road(case.agents), case.horizon)
     timings = meter.measure(_calls(model, case))
     work = Work(model.config, case.agents)
@@ -55,16 +55,18 @@ def _case(preset: str, case: Case, meter: Meter) -> list[Row]:
     frozen = work.rollout(case.horizon, case.samples, case.batch, frozen=True)
     seen, rolled = timings["observe"], timings["roll-out"]
 
-    def row(name: str, flop: float, base: Timing | None = None) -> Row:
-        return timed_row("forecast", name, what, timings[name], flop=flop, base=base, ratio_to=EVOLVING if base else "")
+    def line(name: str, flop: float, base: Timing | None = None) -> Line:
+        return timed_line(
+            "forecast", name, what, timings[name], flop=flop, base=base, ratio_to=EVOLVING if base else ""
+        )
 
     forecasts = case.batch * case.agents * case.samples
     return [
-        row("observe", look),
-        row("roll-out", run_on),
-        row("roll-out, frozen graph", frozen, rolled),
-        row("observe and roll-out, half of the agents there", 0.0),
-        rate_row(
+        line("observe", look),
+        line("roll-out", run_on),
+        line("roll-out, frozen graph", frozen, rolled),
+        line("observe and roll-out, half of the agents there", 0.0),
+        rate_line(
             "forecast", "observe + roll-out", what, seen.plus(rolled), forecasts, "agent-forecasts/s",
             flop=look + run_on,
         ),

@@ -1,4 +1,4 @@
-"""Paper-size training of 5-Spring on one GPU, as one command: `python benchmarks/gpu_springs.py --data data`.
+"""Paper-size training of 5-Spring on one GPU, as one command: `python -m benchmarks.gpu_springs --data data`.
 
 Makes the data where it is missing, trains the dG-VAE for 150 epochs of 50,000 sequences at batch 128, measures it as
 the table does (`python -m predictor.suite --table springs --budget paper --rows dgvae`, whose row this is) and writes
@@ -19,18 +19,19 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
 from torch import Tensor
 from torch.utils import _pytree as pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
+from predictor.command_line import parse
+from predictor.config_checks import check_at_least, check_choices, check_positive
 from predictor.data.springs import SpringsConfig, make
 from predictor.errors import UserError, run_entry_point
 from predictor.evaluation.paper_tables import SPRINGS, Budget
 from predictor.files import write_json
 from predictor.provenance import provenance
-from predictor.runtime import processor, tune
+from predictor.runtime import processor, resolve_device, tune
 from predictor.suite import SuiteConfig, row_config, row_folder, run_row
 from predictor.training.batches import Shapes
 from predictor.training.config import TrainConfig, TrainPrecision
@@ -63,68 +64,67 @@ class GpuSpringsConfig:
     """Train the paper-size dG-VAE on 5-Spring, measure it, and write down how long it took."""
 
     data: Path = Path("data")
-    """Folder of the stores; springs/ below it is made where it is missing (a few minutes)."""
+    """Folder of the episode stores; springs/ below it is made where it is missing (a few minutes)."""
     out: Path = Path("runs/gpu_springs")
-    """Run folder: the suite's row, and summary.json (or projection.json)."""
+    """Folder to write: the suite's row, and summary.json (or projection.json)."""
     device: str = "cuda"
-    """"cpu" or "cuda"; `--project` takes the CPU."""
+    """Device that trains and measures: cpu, cuda or auto; `--project` takes the CPU."""
     precision: TrainPrecision = "float32"
-    """Of matrix products in training, see `python -m predictor.train --help`."""
+    """Precision of matrix products in training, see `python -m predictor.train --help`."""
     budget: Budget = "paper"
-    """Of the table; "paper" is 150 epochs at batch 128, "smoke" a minute on a CPU."""
+    """Sizes of network and training: "paper" is 150 epochs at batch 128, "smoke" a minute on a CPU."""
     steps: int = 0
-    """Optimiser steps in place of the budget's; 0 keeps them."""
+    """Number of optimiser steps; 0 takes the budget's."""
     seed: int = 0
-    """Of data, training and samples."""
+    """Random seed for data, training and forecasts."""
     sequences: int = 50_000
-    """Training sequences to make where there are none (paper: 50,000)."""
+    """Number of training sequences to make where there are none (paper: 50,000)."""
     held_out: int = 10_000
-    """Sequences of each of the other splits (paper: 10,000)."""
+    """Number of sequences of each of the other splits (paper: 10,000)."""
     project: bool = False
     """Time and count a step here, and project it onto a card."""
     timed_steps: int = 3
-    """Steps to time for the projection, after one to warm up."""
+    """Number of steps to time for the projection, after one to warm up."""
     batch_size: int = 0
-    """Of the projection, in place of the budget's; 0 keeps it."""
+    """Number of windows in a step of the projection; 0 takes the budget's."""
     peak_tflops: float = 0.0
-    """Of the card's products at this precision; 0 takes an H200's (67 in float32, 494 in TF32, 989 in bfloat16)."""
+    """Peak rate of the card's products at this precision; 0 takes an H200's (67 in float32, 494 in TF32, 989 in
+    bfloat16)."""
     bandwidth_gbs: float = 4800.0
-    """Of the card's memory (H200: 4,800)."""
+    """Bandwidth of the card's memory (H200: 4,800)."""
     share: float = 0.0
     """Share of the peak that products of these shapes reach; 0 takes the share of this machine's own rate."""
     kernel_us: float = 2.0
-    """What a kernel in a replayed graph takes at least, start included: the assumption that matters most."""
+    """Least time of a kernel in a replayed graph, start included: the assumption that matters most."""
     target_minutes: float = 30.0
-    """What the run is to stay below."""
+    """Time that the run is to stay below."""
 
-    def check(self) -> None:
-        """Check ranges.
+    def __post_init__(self) -> None:
+        """Check choices and ranges; `device="auto"` becomes the device that is taken.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value that makes no sense, or, without `project`, a device that is not there.
         """
-        for name in ("sequences", "held_out", "timed_steps"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("steps", "seed", "batch_size", "peak_tflops"):
-            if getattr(self, name) < 0:
-                raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
-        for name in ("bandwidth_gbs", "kernel_us", "target_minutes"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise UserError(f"{name} must be positive, got {getattr(self, name)}")
+        check_choices(self)
+        check_at_least(self, 1, "sequences", "held_out", "timed_steps")
+        check_at_least(self, 0, "steps", "seed", "batch_size", "peak_tflops")
+        check_positive(self, "bandwidth_gbs", "kernel_us", "target_minutes")
         if not 0 <= self.share <= 1:
             raise UserError(f"share must lie between 0 and 1, got {self.share}")
-        if not self.project and self.device.startswith("cuda") and not torch.cuda.is_available():
-            raise UserError(
-                f"device '{self.device}' asked for but torch sees no CUDA device; pass --project for an estimate"
-            )
+        if self.project:
+            return
+        try:
+            object.__setattr__(self, "device", resolve_device(self.device))
+        except UserError as error:
+            raise UserError(f"{error}, or pass --project for an estimate") from None
 
     @property
     def suite(self) -> SuiteConfig:
-        """The table's row that is run."""
+        """The table's row that is run; a projection computes on the CPU, which has no TF32."""
         device = "cpu" if self.project else self.device
+        precision: TrainPrecision = "float32" if self.project and self.precision == "tf32" else self.precision
         return SuiteConfig(
-            "springs", self.data, self.out, self.budget, (ROW.key,), self.steps, 1, self.seed, device, self.precision
+            "springs", self.data, self.out, self.budget, (ROW.key,), self.steps, 1, self.seed, device, precision
         )
 
 
@@ -142,7 +142,7 @@ def make_missing(config: GpuSpringsConfig) -> dict[str, float]:
 def run(config: GpuSpringsConfig) -> dict[str, Any]:
     """Data, training, measuring, summary; what is there already is not done again."""
     made = make_missing(config)
-    config.suite.check()
+    config.suite.check_stores()
     folder = row_folder(config.suite, ROW)
     before, result = _steps_done(folder / "run"), folder / "result.json"
     measured = json.loads(result.read_text()) if result.exists() else run_row(config.suite, ROW)
@@ -216,14 +216,12 @@ def projected_config(config: GpuSpringsConfig, data: Path) -> TrainConfig:
     lengths = range(settings.min_history_steps, settings.history_steps + 1)
     mean = statistics.mean(shapes.time(n) for n in lengths) - settings.horizon_steps
     batch = config.batch_size or settings.batch_size
-    precision = "float32" if settings.precision == "tf32" else settings.precision  # as exact as a CPU can
     return replace(
         settings,
         batch_size=batch,
         history_steps=round(mean),
         min_history_steps=0,
         val_history_steps=1,
-        precision=precision,
     )
 
 
@@ -364,8 +362,7 @@ def describe(content: dict[str, Any]) -> str:
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(GpuSpringsConfig, description=__doc__)
-    config.check()
+    config = parse(GpuSpringsConfig, __doc__)
     if config.project:
         print(describe(project(config)))
         print(f"written to {config.out / 'projection.json'}")

@@ -1,4 +1,4 @@
-"""What cheaper graphs cost in accuracy: `python -m benchmarks.graph_accuracy --checkpoints A B --stores C D`.
+"""What cheaper graphs cost in accuracy: `python -m benchmarks.graph_accuracy --checkpoint A B --data C D`.
 
 Each checkpoint is measured on the same windows of each store with all pairs, with the nearest k, and with a graph that
 stays as it is when the roll-out begins, whatever it was trained with. minADE of the most likely forecast, beside
@@ -8,16 +8,17 @@ constant velocity; the time is of streaming the histories and forecasting, one w
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
-import tyro
 from rich.console import Console
 from rich.table import Table
 
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.checkpoint import load_checkpoint
+from predictor.command_line import Renamed, parse
+from predictor.config_checks import check_at_least
 from predictor.data.store import read_store
 from predictor.data.windows import Windows
 from predictor.dgvae import DGVAE
@@ -36,43 +37,39 @@ from predictor.runtime import tune
 class GraphConfig:
     """Measure checkpoints with several graphs."""
 
-    checkpoints: tuple[Path, ...]
-    """dG-VAE checkpoints."""
-    stores: tuple[Path, ...]
+    checkpoint: Annotated[tuple[Path, ...], Renamed("checkpoints")]
+    """Checkpoints of dG-VAEs to measure: shipped names, folders or run folders."""
+    data: Annotated[tuple[Path, ...], Renamed("stores")]
     """Episode stores to measure on."""
     neighbours: tuple[int, ...] = (2, 4, 8, 16)
-    """Numbers of neighbours; all pairs, evolving and frozen, are always measured."""
-    history_steps: int = 40
-    """Steps observed."""
+    """Numbers of neighbours to measure with; all pairs, evolving and frozen, are always measured."""
+    burn_in_steps: Annotated[int, Renamed("history_steps")] = 40
+    """Number of steps observed in every window before the forecast begins."""
     horizon_steps: int = 10
-    """Steps forecast."""
-    windows: int = 100
-    """Windows of each store, drawn evenly."""
+    """Number of steps to forecast."""
+    max_windows: Annotated[int, Renamed("windows")] = 100
+    """Number of windows measured at most in each store, drawn evenly."""
     stride: int = 5
-    """Steps between two windows of an episode."""
+    """Number of steps between two windows of an episode."""
     threads: int = 2
-    """Of torch."""
+    """Number of CPU threads of torch."""
     out: Path | None = None
-    """JSON file for the result."""
+    """JSON file to write the result to."""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check ranges.
 
         Raises:
             UserError: a value that makes no sense.
         """
-        if not self.checkpoints or not self.stores:
-            raise UserError("give at least one of --checkpoints and one of --stores")
-        for name in ("history_steps", "horizon_steps", "windows", "stride", "threads"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if min(self.neighbours, default=1) < 1:
-            raise UserError(f"neighbours must be at least 1, got {self.neighbours}")
+        if not self.checkpoint or not self.data:
+            raise UserError("give at least one of --checkpoint and one of --data")
+        check_at_least(self, 1, "burn_in_steps", "horizon_steps", "max_windows", "stride", "threads", "neighbours")
 
 
 def measure(forecaster: Forecaster, windows: Windows, config: GraphConfig) -> dict[str, float]:
     """Errors [m] over the windows, and seconds for all of them."""
-    chosen = protocol_indices(windows, config.stride, config.windows, seed=0)
+    chosen = protocol_indices(windows, config.stride, config.max_windows, seed=0)
     tally, began = Tally(), time.perf_counter()
     for outcome in run_windows(forecaster, windows, chosen, config.horizon_steps, batch_size=1):
         tally.add(outcome)
@@ -100,19 +97,18 @@ def variants(checkpoint: Path, config: GraphConfig) -> list[DGVAE]:
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(GraphConfig, description=__doc__)
-    config.check()
+    config = parse(GraphConfig, __doc__)
     tune()
     torch.set_num_threads(config.threads)
     table = Table("store", "agents", "trained on", "graph", "minADE [m]", "minFDE [m]", "s per window")
     rows: list[dict[str, Any]] = []
-    for path in config.stores:
+    for path in config.data:
         store = read_store(path)
-        spec, history, horizon = store.info.spec, config.history_steps, config.horizon_steps
+        spec, history, horizon = store.info.spec, config.burn_in_steps, config.horizon_steps
         windows = Windows(store.episodes, spec, history, horizon, horizon, history)
         agents = float(np.mean([e.valid.sum(axis=1).mean() for e in store.episodes]))
         cases: list[tuple[str, str, Forecaster]] = [("", "constant velocity", ConstantVelocity(spec, horizon))]
-        for checkpoint in config.checkpoints:
+        for checkpoint in config.checkpoint:
             trained = load_checkpoint(checkpoint)[1].config
             cases += [(_graph(trained), _graph(other.config), other) for other in variants(checkpoint, config)]
         for trained_on, graph, forecaster in cases:

@@ -1,6 +1,6 @@
-"""What plain matrix products reach here: the rate that other rows are held against."""
+"""What plain matrix products reach here: the rate that other lines are held against."""
 
-from benchmarks.results import Row
+from benchmarks.results import Line
 from benchmarks.settings import Settings
 from benchmarks.timing import REFERENCE_PRODUCTS, Meter, Product, products, quartiles
 
@@ -8,21 +8,21 @@ SQUARE: Product = (1024, 1024, 1024)
 """Large and square: the most a product reaches, which thin ones do not."""
 
 
-def run(settings: Settings) -> list[Row]:
+def run(settings: Settings) -> list[Line]:
     """GFLOP/s of each reference product, of all of them together, and of a large square one."""
     shapes = [*((shape,) for shape in REFERENCE_PRODUCTS), (SQUARE,), REFERENCE_PRODUCTS]
     yards = {_name(s): products(tuple(s)) for s in shapes}
     timings = Meter.of(settings).measure({name: yard.call for name, yard in yards.items()})
-    rows = []
+    lines = []
     for name, yard in yards.items():
         rates = yard.flop / timings[name].seconds / 1e9
         median = yard.flop / timings[name].median
         share = timings[name].matmul_share(yard.flop)
-        rows.append(
-            Row("machine", "float32 product", {"m×k×n": name}, median / 1e9, "GFLOP/s", quartiles(rates),
+        lines.append(
+            Line("machine", "float32 product", {"m×k×n": name}, median / 1e9, "GFLOP/s", quartiles(rates),
                 flop=yard.flop, flops_per_s=median, matmul_share=share)
         )  # fmt: skip
-    return rows
+    return lines
 
 
 def _name(shapes: tuple[Product, ...]) -> str:

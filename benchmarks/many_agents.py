@@ -14,10 +14,10 @@ import torch
 
 from benchmarks.flops import Work
 from benchmarks.models import SIZES, forecaster, inference, road, scenes, sized
-from benchmarks.results import Compared, Row, skipped
+from benchmarks.results import Compared, Line, skipped
 from benchmarks.settings import Settings
-from benchmarks.timing import Meter, timed_row
-from benchmarks.worker_process import Child, exact_memory
+from benchmarks.timing import Meter, timed_line
+from benchmarks.worker_process import WorkerProcess, exact_memory
 from predictor.dgvae import DGVAE
 from predictor.dgvae.networks import DGVAEConfig
 
@@ -46,17 +46,17 @@ def dense_bytes(config: DGVAEConfig, agents: int) -> float:
     return 4.0 * agents**2 * width
 
 
-def run(settings: Settings) -> list[Row]:
+def run(settings: Settings) -> list[Line]:
     """Both presets, both graphs."""
-    rows = []
-    with Child(settings.threads, exact_memory()) as child:
+    lines = []
+    with WorkerProcess(settings.threads, exact_memory()) as worker:
         for preset in SIZES:
             for neighbours in (0, NEIGHBOURS):
                 times, timed = _times(preset, neighbours, settings)
-                peaks, measured = _memory(preset, neighbours, settings, child)
-                rows += timed + measured
-                rows += _exponents(preset, neighbours, times, peaks)
-    return rows
+                peaks, measured = _memory(preset, neighbours, settings, worker)
+                lines += timed + measured
+                lines += _exponents(preset, neighbours, times, peaks)
+    return lines
 
 
 def _what(preset: str, neighbours: int) -> dict[str, Any]:
@@ -64,8 +64,8 @@ def _what(preset: str, neighbours: int) -> dict[str, Any]:
     return {"preset": preset, "graph": graph, "horizon": HORIZON}
 
 
-def _counts(counts: Sequence[int], preset: str, neighbours: int, settings: Settings) -> tuple[list[int], list[Row]]:
-    """Which numbers of agents to measure, and rows for those that do not fit."""
+def _counts(counts: Sequence[int], preset: str, neighbours: int, settings: Settings) -> tuple[list[int], list[Line]]:
+    """Which numbers of agents to measure, and lines for those that do not fit."""
     if neighbours:
         return list(counts), []
     chosen = [count for count in counts if count <= MOST_DENSE[settings.mode]]
@@ -75,20 +75,22 @@ def _counts(counts: Sequence[int], preset: str, neighbours: int, settings: Setti
     return small, [skipped("agents", "forecast", why, what | {"agents": c}) for c in chosen if c not in small]
 
 
-def _times(preset: str, neighbours: int, settings: Settings) -> tuple[Costs, list[Row]]:
+def _times(preset: str, neighbours: int, settings: Settings) -> tuple[Costs, list[Line]]:
     meter = Meter.of(settings)
     counts, absent = _counts(COUNTS[settings.mode], preset, neighbours, settings)
     times: Costs = {}
-    rows = []
+    lines = []
     for agents in counts:
         config = replace(sized(preset), num_neighbours=neighbours)
         model = forecaster(config, road(agents), HORIZON)
         timing = meter.measure({"forecast": inference(partial(_forecast, model, *scenes(1, agents)))})["forecast"]
         work = Work(config, agents, neighbours=neighbours)
         flop = work.observe() + work.rollout(HORIZON)
-        rows.append(timed_row("agents", "forecast", _what(preset, neighbours) | {"agents": agents}, timing, flop=flop))
+        lines.append(
+            timed_line("agents", "forecast", _what(preset, neighbours) | {"agents": agents}, timing, flop=flop)
+        )
         times[agents] = timing.equivalents  # the machine may drift between two counts
-    return times, rows + absent
+    return times, lines + absent
 
 
 def _forecast(model: DGVAE, states: torch.Tensor, valid: torch.Tensor) -> None:
@@ -96,23 +98,23 @@ def _forecast(model: DGVAE, states: torch.Tensor, valid: torch.Tensor) -> None:
     model.rollout(belief, HORIZON)
 
 
-def _memory(preset: str, neighbours: int, settings: Settings, child: Child) -> tuple[Costs, list[Row]]:
+def _memory(preset: str, neighbours: int, settings: Settings, worker: WorkerProcess) -> tuple[Costs, list[Line]]:
     counts, _ = _counts(MEMORY_COUNTS[settings.mode], preset, neighbours, settings)
     peaks: Costs = {}
-    rows = []
+    lines = []
     for agents in counts:
         what = _what(preset, neighbours) | {"agents": agents}
         arguments = {"preset": preset, "agents": agents, "neighbours": neighbours, "horizon": HORIZON}
-        peak = child.ask("forecast", **arguments)["peak_bytes"]
+        peak = worker.ask("forecast", **arguments)["peak_bytes"]
         if peak is None:
             return {}, [skipped("agents", "peak memory", "needs /proc/self/clear_refs (Linux)", what)]
-        rows.append(Row("agents", "peak memory", what, peak / 2**20, "MiB"))
+        lines.append(Line("agents", "peak memory", what, peak / 2**20, "MiB"))
         peaks[agents] = max(1.0, peak)
-    return peaks, rows
+    return peaks, lines
 
 
-def _exponents(preset: str, neighbours: int, times: Costs, peaks: Costs) -> list[Row]:
-    rows = []
+def _exponents(preset: str, neighbours: int, times: Costs, peaks: Costs) -> list[Line]:
+    lines = []
     for name, costs in (("time", times), ("memory", peaks)):
         fitted = {agents: cost for agents, cost in costs.items() if agents >= FIT_FROM}
         if len(fitted) < 2:
@@ -121,5 +123,5 @@ def _exponents(preset: str, neighbours: int, times: Costs, peaks: Costs) -> list
         what = _what(preset, neighbours) | {"agents": f"{min(fitted)} to {max(fitted)}"}
         compared = Compared(slope, "ratio", "lower", EXPONENT_TOLERANCE)
         note = f"{name} grows with agents to this power"
-        rows.append(Row("agents", f"exponent of {name}", what, slope, "", compared=compared, note=note))
-    return rows
+        lines.append(Line("agents", f"exponent of {name}", what, slope, "", compared=compared, note=note))
+    return lines

@@ -6,12 +6,12 @@ import numpy as np
 
 from benchmarks.envpool_training import TrainingSpeedConfig, measure
 from benchmarks.optional_packages import missing
-from benchmarks.results import Row, skipped
+from benchmarks.results import Line, skipped
 from benchmarks.settings import Settings
-from benchmarks.timing import ratio_row
+from benchmarks.timing import ratio_line
 
 SHAPES: dict[str, dict[str, Any]] = {
-    "quick": {"native_envs": 64, "plain_envs": 2, "blocks": 2, "plain_steps": 256, "native_steps": 4096},
+    "quick": {"num_envpool_envs": 64, "num_plain_envs": 2, "blocks": 2, "plain_steps": 256, "envpool_steps": 4096},
     "full": {"blocks": 5},
 }
 """Fields of `TrainingSpeedConfig`."""
@@ -20,7 +20,7 @@ TOLERANCE = 1.6
 """Few blocks, and processes that share the cores."""
 
 
-def run(settings: Settings) -> list[Row]:
+def run(settings: Settings) -> list[Line]:
     """Steps/s of both, their ratio, and where the time goes."""
     absent = missing("envpool")
     if absent:
@@ -28,14 +28,14 @@ def run(settings: Settings) -> list[Row]:
     config = TrainingSpeedConfig(settings.env_id, threads=settings.threads, **SHAPES[settings.mode])
     result = measure(config, lambda _: None)
     what = {"env": settings.env_id}
-    plain, native = what | {"processes": config.plain_envs}, what | {"envs": config.native_envs}
-    both = native | {"processes": config.plain_envs}
-    rows = [
-        Row("ppo", "plain PPO on highway-env", plain, result["plain_steps_per_s"], "steps/s"),
-        Row("ppo", "PPO with forecasts on EnvPool", native, result["native_forecast_steps_per_s"], "steps/s"),
-        ratio_row(
+    plain, native = what | {"processes": config.num_plain_envs}, what | {"envs": config.num_envpool_envs}
+    both = native | {"processes": config.num_plain_envs}
+    lines = [
+        Line("ppo", "plain PPO on highway-env", plain, result["plain_steps_per_s"], "steps/s"),
+        Line("ppo", "PPO with forecasts on EnvPool", native, result["native_forecast_steps_per_s"], "steps/s"),
+        ratio_line(
             "ppo", NAME, both, np.array(result["ratios"]), "plain, steps/s", better="higher", tolerance=TOLERANCE
         ),
     ]
     shares = result["shares"].items()
-    return rows + [Row("ppo", f"share of time: {name}", native, 100 * share, "%") for name, share in shares]
+    return lines + [Line("ppo", f"share of time: {name}", native, 100 * share, "%") for name, share in shares]

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.optional_packages import missing
-from benchmarks.results import Row, skipped
+from benchmarks.results import Line, skipped
 from benchmarks.settings import Settings
-from benchmarks.timing import Meter, interpreter, products, rate_row
+from benchmarks.timing import Meter, interpreter, products, rate_line
 from predictor.data.springs import SpringsConfig, make_episodes, spring_spec
 from predictor.data.store import Episode, EpisodeStore, StoreInfo, read_store, write_store
 from predictor.data.windows import Windows
@@ -26,7 +26,7 @@ STEPS: dict[str, int] = {"quick": 10, "full": 60}
 """Simulator steps in a block."""
 
 
-def run(settings: Settings) -> list[Row]:
+def run(settings: Settings) -> list[Line]:
     """Stores and windows, then simulators."""
     meter = Meter.of(settings)
     count = EPISODES[settings.mode]
@@ -35,12 +35,12 @@ def run(settings: Settings) -> list[Row]:
         config = SpringsConfig(Path(folder))
         write_store(springs, StoreInfo(spring_spec(config.physics), "springs"), make_episodes(config, "train", count))
         write_store(traffic, StoreInfo(SceneSpec(1.0), "traffic"), _traffic(count // 4))
-        rows = _store(springs, "springs", meter, 40, 10) + _store(traffic, "ego, varying cast", meter, 10, 5)
-    rows.append(_springs(config, count, meter))
-    return rows + _simulators(settings)
+        lines = _store(springs, "springs", meter, 40, 10) + _store(traffic, "ego, varying cast", meter, 10, 5)
+    lines.append(_springs(config, count, meter))
+    return lines + _simulators(settings)
 
 
-def _store(path: Path, name: str, meter: Meter, history: int, horizon: int) -> list[Row]:
+def _store(path: Path, name: str, meter: Meter, history: int, horizon: int) -> list[Line]:
     store = read_store(path)
     windows = Windows(store.episodes, store.info.spec, history, horizon)
     indices = np.random.default_rng(0).integers(len(windows), size=BATCH)
@@ -51,10 +51,10 @@ def _store(path: Path, name: str, meter: Meter, history: int, horizon: int) -> l
     timings = meter.measure(calls, interpreter())
     what = {"data": name, "episodes": len(store.episodes)}
     shape = {"data": name, "batch": BATCH, "history": history, "horizon": horizon}
-    read = rate_row("data", "read_store", what, timings["read"], _bytes(store) / 1e6, "MB/s")
+    read = rate_line("data", "read_store", what, timings["read"], _bytes(store) / 1e6, "MB/s")
     return [
         read.noted("of arrays in memory; files are in the page cache"),
-        rate_row("data", "Windows.batch", shape, timings["cut"], BATCH, "windows/s"),
+        rate_line("data", "Windows.batch", shape, timings["cut"], BATCH, "windows/s"),
     ]
 
 
@@ -81,26 +81,26 @@ def _traffic(count: int, steps: int = 40, agents: int = 24) -> list[Episode]:
     return episodes
 
 
-def _springs(config: SpringsConfig, count: int, meter: Meter) -> Row:
+def _springs(config: SpringsConfig, count: int, meter: Meter) -> Line:
     timing = meter.measure({"springs": partial(make_episodes, config, "train", count)}, products())["springs"]
-    return rate_row("data", "springs simulator", {"rollouts at once": count}, timing, count, "rollouts/s")
+    return rate_line("data", "springs simulator", {"rollouts at once": count}, timing, count, "rollouts/s")
 
 
-def _simulators(settings: Settings) -> list[Row]:
-    rows = []
+def _simulators(settings: Settings) -> list[Line]:
+    lines = []
     for name, made, absent in (
         ("highway-env, plain", _highway, missing("highway_env", "stable_baselines3")),
         ("EnvPool, plain", _pool, missing("envpool", "stable_baselines3")),
     ):
         if absent:
-            rows.append(skipped("data", name, absent, {"env": settings.env_id}))
+            lines.append(skipped("data", name, absent, {"env": settings.env_id}))
             continue
         with made(settings) as (block, envs):
             timing = Meter.of(settings).time_blocks({name: block}, interpreter())[name]
         what = {"env": settings.env_id, "envs": envs}
-        row = rate_row("data", name, what, timing, STEPS[settings.mode] * envs, "steps/s")
-        rows.append(replace(row, compared=None))  # not ours
-    return rows
+        line = rate_line("data", name, what, timing, STEPS[settings.mode] * envs, "steps/s")
+        lines.append(replace(line, compared=None))  # not ours
+    return lines
 
 
 @contextmanager

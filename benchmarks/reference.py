@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 import torch
 
 from benchmarks.models import TrainingStep, box, forecaster, inference
-from benchmarks.results import Row
+from benchmarks.results import Line
 from benchmarks.settings import Settings
-from benchmarks.timing import Meter, Timing, ratio_row, timed_row
+from benchmarks.timing import Meter, Timing, ratio_line, timed_line
 from predictor.dgvae.networks import DGVAEConfig
 from predictor.errors import UserError
 
@@ -95,7 +95,7 @@ def parameters(model: torch.nn.Module) -> int:
     return sum(p.numel() for p in model.parameters() if p.requires_grad)
 
 
-def run(settings: Settings) -> list[Row]:
+def run(settings: Settings) -> list[Line]:
     """Training, three views of prediction, and both models' sizes."""
     assert settings.reference is not None  # `Settings.sections`
     model_class = load(settings.reference)
@@ -104,7 +104,7 @@ def run(settings: Settings) -> list[Row]:
         return _training(model_class, meter) + _prediction(model_class, meter)
 
 
-def _training(model_class: Any, meter: Meter) -> list[Row]:
+def _training(model_class: Any, meter: Meter) -> list[Line]:
     shape = TRAINING
     theirs = build(model_class, shape.agents).train()
     optimizer = torch.optim.Adam([p for p in theirs.parameters() if p.requires_grad], lr=5e-4)
@@ -120,7 +120,7 @@ def _training(model_class: Any, meter: Meter) -> list[Row]:
     timings = meter.measure({"reference": step, AS_SHIPPED: as_shipped(step), "ours": ours})
     what = shape._asdict()
     sizes = [
-        Row("reference", f"parameters, {name}", {}, float(parameters(model)), "")
+        Line("reference", f"parameters, {name}", {}, float(parameters(model)), "")
         for name, model in (("reference", theirs), ("ours at equal sizes", ours.model))
     ]
     return [
@@ -130,18 +130,18 @@ def _training(model_class: Any, meter: Meter) -> list[Row]:
     ]
 
 
-def _pair(name: str, what: dict[str, Any], theirs: Timing, ours: Timing) -> list[Row]:
-    row = ratio_row(
+def _pair(name: str, what: dict[str, Any], theirs: Timing, ours: Timing) -> list[Line]:
+    line = ratio_line(
         "reference", f"{name}: reference / ours", what, theirs.seconds / ours.seconds, "ours", better="higher"
     )
     return [
-        timed_row("reference", f"{name}, reference", what, theirs),
-        timed_row("reference", f"{name}, ours", what, ours),
-        row,
+        timed_line("reference", f"{name}, reference", what, theirs),
+        timed_line("reference", f"{name}, ours", what, ours),
+        line,
     ]
 
 
-def _prediction(model_class: Any, meter: Meter) -> list[Row]:
+def _prediction(model_class: Any, meter: Meter) -> list[Line]:
     shape = PREDICTION
     states = 0.3 * torch.randn(shape.batch, shape.history, shape.agents, 4)
     theirs = build(model_class, shape.agents).eval()

@@ -1,4 +1,4 @@
-"""One measured number (`Row`), and the number of it that means the same in another run (`Compared`)."""
+"""One measured number (`Line`), and the number of it that means the same in another run (`Compared`)."""
 
 import math
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ Kind = Literal["ratio", "matmul", "interpreter"]
 Better = Literal["lower", "higher"]
 
 TOLERANCE = 1.35
-"""By which factor a row may get worse before it counts as slower, where the row says nothing else."""
+"""By which factor a line may get worse before it counts as slower, where the line says nothing else."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Compared:
 
 
 @dataclass(frozen=True)
-class Row:
+class Line:
     """One line of the table."""
 
     section: str
@@ -51,13 +51,13 @@ class Row:
     ratio: float | None = None
     """Median over blocks of this time divided by another one's."""
     ratio_to: str = ""
-    """Whose; for a row whose value is a ratio, what it is a ratio of."""
+    """Whose; for a line whose value is a ratio, what it is a ratio of."""
     flop: float | None = None
     """Products that one call mathematically needs (`benchmarks.flops`)."""
     flops_per_s: float | None = None
     """The same divided by the time."""
     matmul_share: float | None = None
-    """The same divided by the rate of plain float32 matrix products, measured around this row."""
+    """The same divided by the rate of plain float32 matrix products, measured around this line."""
     compared: Compared | None = None
     """What a later run is compared with; None if nothing is."""
     note: str = ""
@@ -65,7 +65,7 @@ class Row:
 
     @property
     def key(self) -> str:
-        """Names the row across runs."""
+        """Names the line across runs."""
         return " | ".join([self.section, self.name, self.shape])
 
     @property
@@ -73,7 +73,7 @@ class Row:
         """Shape and settings as text."""
         return ", ".join(f"{name} {value}" for name, value in self.what.items())
 
-    def noted(self, note: str) -> "Row":
+    def noted(self, note: str) -> "Line":
         """The same with a note."""
         return replace(self, note=note)
 
@@ -82,6 +82,6 @@ class Row:
         return {"key": self.key} | asdict(self)
 
 
-def skipped(section: str, name: str, why: str, what: Mapping[str, Any] | None = None) -> Row:
-    """A row that says why nothing was measured."""
-    return Row(section, name, what or {}, note=f"skipped: {why}")
+def skipped(section: str, name: str, why: str, what: Mapping[str, Any] | None = None) -> Line:
+    """A line that says why nothing was measured."""
+    return Line(section, name, what or {}, note=f"skipped: {why}")

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from predictor.config_checks import check_at_least
 from predictor.errors import UserError
 
 SECTIONS: dict[str, str] = {
@@ -24,21 +25,22 @@ class Settings:
     """Measure the speed of everything, print one table, write it as JSON; compare it with a baseline if asked to."""
 
     only: tuple[str, ...] = ()
-    """Run these sections only (machine, forecast, streaming, training, wrappers, ppo, agents, data, reference)."""
+    """Sections to run; none given runs all of them (machine, forecast, streaming, training, wrappers, ppo, agents,
+    data, reference)."""
     quick: bool = False
-    """Fewer shapes and repetitions: a minute or two instead of half an hour."""
+    """Measure fewer shapes and repetitions: a minute or two instead of half an hour."""
     threads: int = 2
-    """torch threads."""
+    """Number of CPU threads of torch."""
     reference: Path | None = None
-    """A checkout of github.com/cgraber/cvpr_dNRI, whose model is timed beside ours."""
+    """Checkout of github.com/cgraber/cvpr_dNRI, whose model is timed beside ours."""
     env_id: str = "highway-fast-v0"
     """Environment of the wrappers and of PPO; needs a shipped checkpoint and a copy in EnvPool."""
     out: Path = Path("runs/benchmarks.json")
-    """JSON file for machine, versions and all rows."""
+    """JSON file for machine, versions and all lines."""
     baseline: Path | None = None
-    """Compare with this file and exit with status 1 if anything got slower."""
+    """Baseline file to compare with; the exit status is 1 if anything got slower."""
     write_baseline: Path | None = None
-    """Write what later runs are compared with."""
+    """Baseline file to write, with which later runs are compared."""
 
     @property
     def mode(self) -> str:
@@ -51,21 +53,27 @@ class Settings:
         chosen = self.only or tuple(SECTIONS)
         return tuple(s for s in SECTIONS if s in chosen and (s != "reference" or self.reference is not None))
 
-    def check(self) -> None:
-        """Check ranges.
+    def __post_init__(self) -> None:
+        """Check names of sections and ranges.
 
         Raises:
             UserError: a value that makes no sense.
         """
+        check_at_least(self, 1, "threads")
         unknown = [name for name in self.only if name not in SECTIONS]
         if unknown:
             raise UserError(f"there is no section {', '.join(unknown)}; there are {', '.join(SECTIONS)}")
-        if self.threads < 1:
-            raise UserError(f"threads must be at least 1, got {self.threads}")
         if "reference" in self.only and self.reference is None:
             raise UserError("section reference needs --reference PATH, a checkout of github.com/cgraber/cvpr_dNRI")
         if self.only and self.write_baseline is not None:
             raise UserError("a baseline holds every section; leave --only out")
-        for folder in (self.out, self.write_baseline):
-            if folder is not None and folder.is_dir():
-                raise UserError(f"{folder} is a folder; name a file")
+
+    def check_files(self) -> None:
+        """Check that what is written can be files.
+
+        Raises:
+            UserError: a folder has the name.
+        """
+        for path in (self.out, self.write_baseline):
+            if path is not None and path.is_dir():
+                raise UserError(f"{path} is a folder; name a file")

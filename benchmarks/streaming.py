@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from benchmarks.models import forecaster, inference, road, scenes, sized
-from benchmarks.results import Row
+from benchmarks.results import Line
 from benchmarks.settings import Settings
-from benchmarks.timing import Meter, ratio_row, timed_row
+from benchmarks.timing import Meter, ratio_line, timed_line
 from predictor.dgvae import DGVAE
 from predictor.online import OnlineForecaster
 from predictor.scene import SceneBatch
@@ -71,32 +71,32 @@ class Streamed:
         self._online.forecast()
 
 
-def run(settings: Settings) -> list[Row]:
+def run(settings: Settings) -> list[Line]:
     """Cost of a step by history, its ratio, and what encoding anew would cost."""
     presets = ("fast",) if settings.quick else ("fast", "paper")
-    return [row for preset in presets for row in _measure(preset, settings)]
+    return [line for preset in presets for line in _measure(preset, settings)]
 
 
-def _measure(preset: str, settings: Settings) -> list[Row]:
+def _measure(preset: str, settings: Settings) -> list[Line]:
     model = forecaster(sized(preset), road(AGENTS), HORIZON)
     stream = _stream()
     meter = Meter(ROUNDS[settings.mode], budget_s=60.0)
     streamed = {str(h): Streamed(model, h, stream) for h in HISTORIES}
     timings = meter.time_blocks({name: s.block for name, s in streamed.items()})
     what = {"preset": preset, "batch": BATCH, "agents": AGENTS, "horizon": HORIZON}
-    rows = [
-        timed_row("streaming", "observe + forecast", what | {"history": int(name)}, timing)
+    lines = [
+        timed_line("streaming", "observe + forecast", what | {"history": int(name)}, timing)
         for name, timing in timings.items()
     ]
     short, long = (str(h) for h in (min(HISTORIES), max(HISTORIES)))
     ratios = timings[long].seconds / timings[short].seconds
     base = f"history {short} in the same run"
     name = f"a step after {long} steps / after {short}"
-    rows.append(ratio_row("streaming", name, what, ratios, base, tolerance=TOLERANCE))
-    return rows + _encoding_anew(model, what, Meter.of(settings))
+    lines.append(ratio_line("streaming", name, what, ratios, base, tolerance=TOLERANCE))
+    return lines + _encoding_anew(model, what, Meter.of(settings))
 
 
-def _encoding_anew(model: DGVAE, what: dict[str, Any], meter: Meter) -> list[Row]:
+def _encoding_anew(model: DGVAE, what: dict[str, Any], meter: Meter) -> list[Line]:
     calls = {}
     for steps in ANEW:
         states, valid = scenes(BATCH, AGENTS)
@@ -107,7 +107,7 @@ def _encoding_anew(model: DGVAE, what: dict[str, Any], meter: Meter) -> list[Row
     timings = meter.measure({str(steps): call for steps, call in calls.items()})
     note = "training's window path, posterior included"
     return [
-        timed_row("streaming", "whole history anew + forecast", what | {"history": int(s)}, timing).noted(note)
+        timed_line("streaming", "whole history anew + forecast", what | {"history": int(s)}, timing).noted(note)
         for s, timing in timings.items()
     ]
 

@@ -1,4 +1,4 @@
-"""Runs sections, and what a run leaves behind: rows, machine, versions."""
+"""Runs sections, and what a run leaves behind: lines, machine, versions."""
 
 import importlib
 import time
@@ -9,7 +9,7 @@ import torch
 
 from benchmarks.compare import Baseline, Comparison, better_of, compare
 from benchmarks.optional_packages import missing
-from benchmarks.results import Row, skipped
+from benchmarks.results import Line, skipped
 from benchmarks.settings import SECTIONS, Settings
 from predictor.provenance import provenance
 from predictor.runtime import processor
@@ -22,7 +22,7 @@ NEEDED: dict[str, tuple[str, ...]] = {
 PACKAGES = ("torch", "numpy", "zarr", "gymnasium", "highway-env", "envpool", "stable-baselines3")
 
 
-def measure(settings: Settings, sections: Sequence[str], began: Callable[[str], None]) -> list[Row]:
+def measure(settings: Settings, sections: Sequence[str], began: Callable[[str], None]) -> list[Line]:
     """Run sections one after the other.
 
     Args:
@@ -30,52 +30,52 @@ def measure(settings: Settings, sections: Sequence[str], began: Callable[[str], 
         sections: which.
         began: is told the name of each section as it begins.
     """
-    rows: list[Row] = []
+    lines: list[Line] = []
     for section in sections:
         began(section)
         absent = missing(*NEEDED.get(section, ()))
-        rows += [skipped(section, section, absent)] if absent else _run(section, settings)
-    return rows
+        lines += [skipped(section, section, absent)] if absent else _run(section, settings)
+    return lines
 
 
 WITH_POLICIES = {"wrappers", "ppo"}
 """Sections that leave products to torch's own library, as `train_policy.py` does."""
 
 
-def _run(section: str, settings: Settings) -> list[Row]:
+def _run(section: str, settings: Settings) -> list[Line]:
     module: Any = importlib.import_module(SECTIONS[section])
     if section not in WITH_POLICIES:
-        rows: list[Row] = module.run(settings)
-        return rows
+        lines: list[Line] = module.run(settings)
+        return lines
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("highest")
     try:
-        rows = module.run(settings)
+        lines = module.run(settings)
     finally:
         torch.set_float32_matmul_precision(before)
-    return rows
+    return lines
 
 
 def settle(
-    settings: Settings, baseline: Baseline, rows: list[Row], began: Callable[[str], None]
-) -> tuple[list[Row], Comparison]:
+    settings: Settings, baseline: Baseline, lines: list[Line], began: Callable[[str], None]
+) -> tuple[list[Line], Comparison]:
     """Compare with a baseline; what looks slower is measured once more and the better of both counts."""
-    comparison = compare(baseline, rows, settings.sections, processor())
+    comparison = compare(baseline, lines, settings.sections, processor())
     failing = [change.key for change in comparison.slower]
     if failing:
         sections = [s for s in settings.sections if any(key.startswith(f"{s} | ") for key in failing)]
         again = measure(settings, sections, lambda name: began(f"{name}, once more"))
-        rows = better_of(rows, again, failing)
-        comparison = compare(baseline, rows, settings.sections, processor())
-    return rows, comparison
+        lines = better_of(lines, again, failing)
+        comparison = compare(baseline, lines, settings.sections, processor())
+    return lines, comparison
 
 
-def report(settings: Settings, rows: Sequence[Row], keeps_memory: bool, began: float) -> dict[str, Any]:
+def report(settings: Settings, lines: Sequence[Line], keeps_memory: bool, began: float) -> dict[str, Any]:
     """Everything about a run, as JSON values.
 
     Args:
         settings: of the run.
-        rows: what was measured.
+        lines: what was measured.
         keeps_memory: whether glibc keeps freed memory.
         began: when, by `time.perf_counter`.
     """
@@ -86,5 +86,5 @@ def report(settings: Settings, rows: Sequence[Row], keeps_memory: bool, began: f
         "keeps_freed_memory": keeps_memory,
         "seconds": round(time.perf_counter() - began, 1),
         "provenance": provenance(PACKAGES),
-        "rows": [row.json() for row in rows],
+        "lines": [line.json() for line in lines],
     }

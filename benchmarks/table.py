@@ -4,25 +4,25 @@ from collections.abc import Sequence
 
 from rich.table import Table
 
-from benchmarks.results import Row
+from benchmarks.results import Line
 
 HEADINGS = ("section", "measured", "shape", "median", "quartiles", "ratio", "GFLOP/s", "% of matmul", "note")
 _RIGHT = ("median", "quartiles", "GFLOP/s", "% of matmul")
 
 
-def cells(row: Row) -> tuple[str, ...]:
+def cells(line: Line) -> tuple[str, ...]:
     """One line of the table."""
-    ratio = "" if row.ratio is None else f"{row.ratio:.2f} "
+    ratio = "" if line.ratio is None else f"{line.ratio:.2f} "
     return (
-        row.section,
-        row.name,
-        row.shape,
-        "–" if row.value is None else f"{number(row.value)} {row.unit}".strip(),
-        "" if row.quartiles is None else "–".join(number(q) for q in row.quartiles),
-        f"{ratio}of {row.ratio_to}" if row.ratio_to else "",
-        "" if row.flops_per_s is None else number(row.flops_per_s / 1e9),
-        "" if row.matmul_share is None else f"{100 * row.matmul_share:.0f} %",
-        row.note,
+        line.section,
+        line.name,
+        line.shape,
+        "–" if line.value is None else f"{number(line.value)} {line.unit}".strip(),
+        "" if line.quartiles is None else "–".join(number(q) for q in line.quartiles),
+        f"{ratio}of {line.ratio_to}" if line.ratio_to else "",
+        "" if line.flops_per_s is None else number(line.flops_per_s / 1e9),
+        "" if line.matmul_share is None else f"{100 * line.matmul_share:.0f} %",
+        line.note,
     )
 
 
@@ -31,27 +31,27 @@ def number(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 999.5 else f"{value:.3g}"
 
 
-def plain(rows: Sequence[Row]) -> str:
+def plain(lines: Sequence[Line]) -> str:
     """Aligned text without lines."""
-    lines = [HEADINGS, *(cells(row) for row in rows)]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(HEADINGS))]
+    table = [HEADINGS, *(cells(line) for line in lines)]
+    widths = [max(len(texts[column]) for texts in table) for column in range(len(HEADINGS))]
 
     def align(text: str, column: int) -> str:
         return text.rjust(widths[column]) if HEADINGS[column] in _RIGHT else text.ljust(widths[column])
 
-    return "\n".join("  ".join(align(text, i) for i, text in enumerate(line)).rstrip() for line in lines)
+    return "\n".join("  ".join(align(text, i) for i, text in enumerate(texts)).rstrip() for texts in table)
 
 
-def rich_table(rows: Sequence[Row]) -> Table:
+def rich_table(lines: Sequence[Line]) -> Table:
     """For a terminal."""
     table = Table(*HEADINGS, title="benchmarks")
     for column in table.columns:
         if column.header in _RIGHT:
             column.justify = "right"
     before = ""
-    for row in rows:
-        if row.section != before:
+    for line in lines:
+        if line.section != before:
             table.add_section()
-        before = row.section
-        table.add_row(*cells(row))
+        before = line.section
+        table.add_row(*cells(line))
     return table

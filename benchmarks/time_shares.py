@@ -10,14 +10,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-import tyro
 from rich.console import Console
 from rich.table import Table
 from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.models import TrainingStep, box, forecaster, inference, observed, road, scenes, sized
 from benchmarks.reference import EQUAL, PREDICTION
-from predictor.errors import UserError, run_entry_point
+from predictor.command_line import parse
+from predictor.config_checks import check_at_least
+from predictor.errors import run_entry_point
 from predictor.runtime import processor, tune
 
 KINDS: dict[str, tuple[str, ...]] = {
@@ -33,19 +34,17 @@ class ProfileConfig:
     """Say where the time goes."""
 
     threads: int = 2
-    """Of torch."""
+    """Number of CPU threads of torch."""
     calls: int = 10
-    """Of each, after three that do not count; a training step is called a fifth as often."""
+    """Number of profiled calls of each subject, after three that do not count; a training step has a fifth."""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check ranges.
 
         Raises:
             UserError: a value that makes no sense.
         """
-        for name in ("threads", "calls"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_at_least(self, 1, "threads", "calls")
 
 
 def kind_of(operation: str) -> str:
@@ -87,8 +86,7 @@ def subjects() -> dict[str, tuple[Callable[[], Any], int]]:
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(ProfileConfig, description=__doc__)
-    config.check()
+    config = parse(ProfileConfig, __doc__)
     tune()
     torch.set_num_threads(config.threads)
     table = Table("call", *KINDS, "rest", "operations", title=f"{processor()}, {config.threads} threads")

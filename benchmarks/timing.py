@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.results import TOLERANCE, Compared, Kind, Row
+from benchmarks.results import TOLERANCE, Compared, Kind, Line
 from benchmarks.settings import Settings
 
 Product = tuple[int, int, int]
@@ -173,7 +173,7 @@ def quartiles(values: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def timed_row(
+def timed_line(
     section: str,
     name: str,
     what: Mapping[str, Any],
@@ -183,10 +183,10 @@ def timed_row(
     base: Timing | None = None,
     ratio_to: str = "",
     tolerance: float = TOLERANCE,
-) -> Row:
+) -> Line:
     """Milliseconds of a call."""
     ms = 1e3 * timing.seconds
-    return Row(
+    return Line(
         section,
         name,
         what,
@@ -202,7 +202,7 @@ def timed_row(
     )
 
 
-def rate_row(
+def rate_line(
     section: str,
     name: str,
     what: Mapping[str, Any],
@@ -212,17 +212,17 @@ def rate_row(
     *,
     flop: float | None = None,
     tolerance: float = TOLERANCE,
-) -> Row:
+) -> Line:
     """So many things per second, `count` of them in one call."""
     rates = count / timing.seconds
-    row = timed_row(section, name, what, timing, flop=flop, tolerance=tolerance)
-    return Row(
-        section, name, what, float(np.median(rates)), unit, quartiles(rates), flop=flop, flops_per_s=row.flops_per_s,
-        matmul_share=row.matmul_share, compared=row.compared,
+    line = timed_line(section, name, what, timing, flop=flop, tolerance=tolerance)
+    return Line(
+        section, name, what, float(np.median(rates)), unit, quartiles(rates), flop=flop, flops_per_s=line.flops_per_s,
+        matmul_share=line.matmul_share, compared=line.compared,
     )  # fmt: skip
 
 
-def ratio_row(
+def ratio_line(
     section: str,
     name: str,
     what: Mapping[str, Any],
@@ -231,9 +231,9 @@ def ratio_row(
     *,
     better: str = "lower",
     tolerance: float = TOLERANCE,
-) -> Row:
+) -> Line:
     """A ratio of two things of the same run, block by block."""
     median = float(np.median(ratios))
     direction: Any = better
     compared = Compared(median, "ratio", direction, tolerance)
-    return Row(section, name, what, median, "×", quartiles(ratios), ratio_to=ratio_to, compared=compared)
+    return Line(section, name, what, median, "×", quartiles(ratios), ratio_to=ratio_to, compared=compared)

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 from benchmarks.flops import STATE, Work
 from benchmarks.models import TrainingStep, sized
-from benchmarks.results import Row, skipped
+from benchmarks.results import Line, skipped
 from benchmarks.settings import Settings
-from benchmarks.timing import Meter, rate_row, ratio_row
-from benchmarks.worker_process import Child, exact_memory
+from benchmarks.timing import Meter, rate_line, ratio_line
+from benchmarks.worker_process import WorkerProcess, exact_memory
 from predictor.runtime import keep_freed_memory
 
 
@@ -46,13 +46,13 @@ ALLOCATOR_CASE = Case("fast", **_SPRINGS, rollout=0)
 ALLOCATOR_ROUNDS = {"quick": 5, "full": 15}
 
 
-def run(settings: Settings) -> list[Row]:
+def run(settings: Settings) -> list[Line]:
     """Every shape; then memory, then the allocator."""
     cases = CASES[settings.mode]
-    rows = [row for case in cases for row in _speed(case, Meter.of(settings))]
-    rows.append(_bfloat16(cases[-1], Meter.of(settings)))
-    rows += _memory(cases if not settings.quick else cases[:1], settings.threads)
-    return [*rows, _allocator(settings)]
+    lines = [line for case in cases for line in _speed(case, Meter.of(settings))]
+    lines.append(_bfloat16(cases[-1], Meter.of(settings)))
+    lines += _memory(cases if not settings.quick else cases[:1], settings.threads)
+    return [*lines, _allocator(settings)]
 
 
 def _step(case: Case) -> TrainingStep:
@@ -63,54 +63,54 @@ def _name(case: Case) -> str:
     return "teacher-forced + roll-out" if case.rollout else "teacher-forced"
 
 
-def _speed(case: Case, meter: Meter) -> list[Row]:
+def _speed(case: Case, meter: Meter) -> list[Line]:
     step = _step(case)
     work = Work(step.model.config, case.agents, inputs=STATE)
     flop = work.training(case.batch, case.steps, case.rollout, step.last)
     timing = meter.measure({"step": step})["step"]
     what = case._asdict()
-    steps = rate_row("training", _name(case), what, timing, 1, "steps/s", flop=flop)
-    windows = rate_row("training", f"{_name(case)}, windows", what, timing, case.batch, "windows/s")
+    steps = rate_line("training", _name(case), what, timing, 1, "steps/s", flop=flop)
+    windows = rate_line("training", f"{_name(case)}, windows", what, timing, case.batch, "windows/s")
     return [steps, replace(windows, compared=None)]  # the same number twice
 
 
-def _bfloat16(case: Case, meter: Meter) -> Row:
+def _bfloat16(case: Case, meter: Meter) -> Line:
     shape = (case.agents, case.steps, case.batch, case.rollout)
     steps = {kind: TrainingStep(sized(case.preset), *shape, kind) for kind in ("float32", "bfloat16")}
     timings = meter.measure(steps)
     ratios = timings["float32"].seconds / timings["bfloat16"].seconds
-    row = ratio_row("training", f"{_name(case)}, float32 / bfloat16", case._asdict(), ratios, "--precision bfloat16")
-    return replace(row, compared=None)  # says something about the processor
+    line = ratio_line("training", f"{_name(case)}, float32 / bfloat16", case._asdict(), ratios, "--precision bfloat16")
+    return replace(line, compared=None)  # says something about the processor
 
 
-def _memory(cases: tuple[Case, ...], threads: int) -> list[Row]:
-    rows = []
-    with Child(threads, exact_memory()) as child:
+def _memory(cases: tuple[Case, ...], threads: int) -> list[Line]:
+    lines = []
+    with WorkerProcess(threads, exact_memory()) as worker:
         for case in cases:
             name, what = f"peak memory, {_name(case)}", case._asdict()
-            peak = child.ask("training", **what)["peak_bytes"]
+            peak = worker.ask("training", **what)["peak_bytes"]
             if peak is None:
-                rows.append(skipped("training", name, "needs /proc/self/clear_refs (Linux)", what))
+                lines.append(skipped("training", name, "needs /proc/self/clear_refs (Linux)", what))
                 continue
             note = "rise of the resident size in a process of its own"
-            rows.append(Row("training", name, what, peak / 2**20, "MiB", note=note))
-    return rows
+            lines.append(Line("training", name, what, peak / 2**20, "MiB", note=note))
+    return lines
 
 
-def _allocator(settings: Settings) -> Row:
+def _allocator(settings: Settings) -> Line:
     name, case = "step, glibc's default / freed memory kept", ALLOCATOR_CASE
     if not keep_freed_memory():
         return skipped("training", name, "needs glibc", case._asdict())
     step = _step(case)
     step()
-    with Child(settings.threads) as child:
+    with WorkerProcess(settings.threads) as worker:
 
         def default() -> float:
-            return float(child.ask("training", **case._asdict())["seconds"])
+            return float(worker.ask("training", **case._asdict())["seconds"])
 
         default()
         meter = Meter(ALLOCATOR_ROUNDS[settings.mode])
         timings = meter.time_blocks({"default": default, "kept": step.timed})
     ratios = timings["default"].seconds / timings["kept"].seconds
-    row = ratio_row("training", name, case._asdict(), ratios, "predictor.runtime.keep_freed_memory()")
-    return replace(row, compared=None)  # says something about glibc, not about us
+    line = ratio_line("training", name, case._asdict(), ratios, "predictor.runtime.keep_freed_memory()")
+    return replace(line, compared=None)  # says something about glibc, not about us

@@ -1,6 +1,6 @@
 """Another process of this interpreter, for what a process can only be asked once: its allocator and its peak memory.
 
-`Child(...).ask("training", preset="fast", …)` sends one line of JSON and gets one back.
+`WorkerProcess(...).ask("training", preset="fast", …)` sends one line of JSON and gets one back.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ def exact_memory() -> dict[str, str]:
     return {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536", "MALLOC_TOP_PAD_": "0"}
 
 
-class Child:
+class WorkerProcess:
     """A process that answers requests until it is left; glibc's allocator is at its defaults.
 
     Args:
@@ -63,7 +63,7 @@ class Child:
             raise RuntimeError(f"{task} {arguments} in a process of its own: {answer['error']}")
         return answer
 
-    def __enter__(self) -> "Child":
+    def __enter__(self) -> "WorkerProcess":
         """Itself."""
         return self
 
@@ -139,7 +139,7 @@ def forecast(preset: str, agents: int, neighbours: int, horizon: int) -> dict[st
 
 
 TASKS: dict[str, Callable[..., dict[str, Any]]] = {"training": training, "forecast": forecast}
-"""What a child can be asked."""
+"""Tasks that a worker can be asked for."""
 
 
 def main() -> None:

@@ -1,33 +1,30 @@
 """What foresight costs: steps/s of plain environments against the same ones under `VecForecast`, in one run.
 
-`python benchmarks/wrapper_overhead.py` times both in turn, block by block, on the same seeds and actions, and prints
+`python -m benchmarks.wrapper_overhead` times both in turn, block by block, on the same seeds and actions, and prints
 the median ratio. Absolute numbers depend on the machine; the ratio is the result.
 """
 
 import json
 import platform
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
-import tyro
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
-
-if not __package__:  # run as a file: the packages are beside this folder
-    sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 from benchmarks.timing import alternate, quartiles
 from envs.registry import make_env
 from envs.sb3.forecast import VecForecast
 from envs.wrappers import SceneObservation
+from predictor.command_line import Renamed, parse
+from predictor.config_checks import check_at_least, check_choices
 from predictor.dgvae import DGVAE
 from predictor.dgvae.networks import PRESETS
 from predictor.errors import UserError, run_entry_point
@@ -43,33 +40,32 @@ class OverheadConfig:
     """Compare steps/s without and with forecasts."""
 
     env_id: str = "highway-fast-v0"
-    """Environment."""
+    """Environment to time."""
     checkpoint: str | None = None
-    """Shipped name or folder; None takes the one that ships for the id."""
+    """Forecaster: shipped name, folder or run folder; None takes the checkpoint that ships for the id."""
     paper_size: bool = False
     """Forecast with an untrained network of the paper's size instead of a checkpoint."""
-    envs: int = 8
-    """Parallel environments."""
+    num_envs: Annotated[int, Renamed("envs")] = 8
+    """Number of parallel environments."""
     vec: Literal["dummy", "subproc"] = "dummy"
-    """One process, or one process per environment."""
+    """Processes of the environments: dummy (one for all) or subproc (one for each)."""
     steps: int = 40
-    """Vector steps in a block."""
+    """Number of vector steps in a block."""
     blocks: int = 15
-    """Pairs of blocks; the median of their ratios is reported."""
+    """Number of pairs of blocks; the median of their ratios is reported."""
     threads: int = 1
-    """torch threads of the forecaster; more do not pay for scenes this small."""
+    """Number of torch threads of the forecaster; more do not pay for scenes this small."""
     out: Path | None = None
-    """JSON file for the result."""
+    """JSON file to write the result to."""
 
-    def check(self) -> None:
-        """Check ranges.
+    def __post_init__(self) -> None:
+        """Check choices and ranges.
 
         Raises:
-            UserError: a value that makes no sense. (In `__post_init__`, tyro would turn it into a box of lines.)
+            UserError: a value that makes no sense.
         """
-        for name in ("envs", "steps", "blocks", "threads"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_choices(self)
+        check_at_least(self, 1, "num_envs", "steps", "blocks", "threads")
         if self.paper_size and self.checkpoint is not None:
             raise UserError(f"checkpoint '{self.checkpoint}' and --paper-size exclude each other; leave one out")
 
@@ -111,22 +107,21 @@ def paper_sized(scenes: VecEnv, horizon_steps: int = 5) -> Forecaster:
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(OverheadConfig, description=__doc__)
-    config.check()
+    config = parse(OverheadConfig, __doc__)
     keep_freed_memory()
     torch.set_num_threads(config.threads)
-    plain, scenes = (make_rows(config.env_id, config.envs, config.vec, scenes) for scenes in (False, True))
+    plain, scenes = (make_rows(config.env_id, config.num_envs, config.vec, scenes) for scenes in (False, True))
     paper = paper_sized(scenes) if config.paper_size else None
     forecast = VecForecast(scenes, config.checkpoint, forecaster=paper)
     made = {name: blocks_of(venv, config.steps) for name, venv in (("plain", plain), ("forecast", forecast))}
     seconds = alternate(made, config.blocks)  # a drifting machine favours neither
     plain.close()
     forecast.close()
-    steps = config.steps * config.envs
+    steps = config.steps * config.num_envs
     ratios = seconds["forecast"] / seconds["plain"]
     result = {
         "env_id": config.env_id,
-        "envs": config.envs,
+        "envs": config.num_envs,
         "vec": config.vec,
         "paper_size": config.paper_size,
         "agents": forecast.stream.scene_spec.max_agents,
@@ -141,7 +136,7 @@ def main() -> None:
     print(json.dumps(result, indent=2))
     low, high = result["overhead_quartiles"]
     print(
-        f"{config.env_id}, {config.envs} envs ({config.vec}): plain {result['plain_steps_per_s']:.0f} steps/s, "
+        f"{config.env_id}, {config.num_envs} envs ({config.vec}): plain {result['plain_steps_per_s']:.0f} steps/s, "
         f"with forecasts {result['forecast_steps_per_s']:.0f}; overhead {100 * result['overhead_median']:.1f} % "
         f"(quartiles {100 * low:.1f} to {100 * high:.1f} %)"
     )

@@ -8,13 +8,14 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
-import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from envs.readers.highway_labels import ATTRIBUTE_NAMES, SceneLabels, with_labels
 from envs.rollouts.world import World, default_drivers, open_world
+from predictor.command_line import Renamed, parse
+from predictor.config_checks import check_at_least
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.errors import UserError, run_entry_point
 from predictor.provenance import provenance
@@ -28,42 +29,41 @@ class CollectConfig:
     """Record episodes of an environment into an episode store."""
 
     env_id: str
-    """Gymnasium id (highway-fast-v0, envpool/HighwayFast-v0) or PettingZoo parallel id (simple_tag_v3)."""
+    """Environment to record: gymnasium id (highway-fast-v0, envpool/HighwayFast-v0) or PettingZoo parallel id
+    (simple_tag_v3)."""
     out: Path
     """Folder of the new store (Zarr)."""
     episodes: int = 400
-    """Episodes to record."""
-    ego: tuple[str, ...] = ()
-    """Who drives; episodes take turns. One ego: random, idle, varied, keep-lane, or the path of a policy .zip. Many
-    learners: random, idle, varied, heuristic, mixed. Left out: varied random idle, or heuristic mixed varied."""
+    """Number of episodes to record."""
+    driver: Annotated[tuple[str, ...], Renamed("ego")] = ()
+    """Who drives; episodes take several in turn. One ego: random, idle, varied, keep-lane, or the path of a policy
+    .zip. Many learners: random, idle, varied, heuristic, mixed. None given: varied random idle, or heuristic mixed
+    varied."""
     seed: int = 0
-    """Episode i is seeded with seed + i; keep test seeds apart from training seeds."""
+    """Random seed: episode i is reset with seed + i; keep test seeds apart from training seeds."""
     max_steps: int = 200
-    """Cut longer episodes here [policy steps]."""
+    """Largest length of an episode; longer ones are cut there [policy steps]."""
     labels: bool = True
     """Record who follows whom at each step, and with what gap: for training on known edges and for scores, never seen
     by a policy. The recorded states are the same without; docs/datasets/env.md has the price in time and bytes."""
     workers: int = os.cpu_count() or 1
-    """Parallel processes."""
+    """Number of parallel processes; the store does not depend on it."""
     overwrite: bool = False
     """Replace an existing store."""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check ranges.
 
         Raises:
-            UserError: a value that makes no sense. (In `__post_init__`, tyro would turn it into a box of lines.)
+            UserError: a value that makes no sense.
         """
-        for name in ("episodes", "max_steps", "workers"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.seed < 0:
-            raise UserError(f"seed must not be negative, got {self.seed}")
+        check_at_least(self, 1, "episodes", "max_steps", "workers")
+        check_at_least(self, 0, "seed")
 
     @property
     def drivers(self) -> tuple[str, ...]:
         """Who takes turns."""
-        return self.ego or default_drivers(self.env_id)
+        return self.driver or default_drivers(self.env_id)
 
 
 def collect(config: CollectConfig) -> Iterator[Episode]:
@@ -122,8 +122,7 @@ def _record(task: _Task) -> Episode:
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(CollectConfig, description=__doc__)
-    config.check()
+    config = parse(CollectConfig, __doc__)
     if config.out.exists() and not config.overwrite:
         raise UserError(f"{config.out} exists; choose another path or pass --overwrite")
     worlds = [open_world(config.env_id, name) for name in config.drivers]

@@ -12,28 +12,29 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
-import tyro
 from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track
 
-from envs.registry import CHECKPOINTS, PARALLEL_CHECKPOINTS, checkpoint_for, is_parallel_id, parallel_checkpoint_for
+from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, checkpoint_for
 from envs.rollouts import report
 from envs.rollouts.episode import MODEL, NEIGHBOURS, STRAIGHT, Case, Episode, EpisodeTask, memory_key, play
 from envs.rollouts.report import EnvAccuracy
 from envs.rollouts.world import default_drivers, open_world
-from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, read_info, resolve
+from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, name_of_folder, read_info, resolve
+from predictor.command_line import Renamed, parse
+from predictor.config_checks import check_at_least, check_positive
 from predictor.data.store import read_info_of
 from predictor.errors import UserError, run_entry_point
 from predictor.evaluation.accuracy import Accuracy, Tally, fitted_std_m
 from predictor.evaluation.displacement import MISS_THRESHOLD_M, min_ade
 from predictor.evaluation.graph_accuracy import GraphAccuracy, GraphTally
 from predictor.evaluation.outcomes import Outcome
-from predictor.files import write_json
+from predictor.files import write_json, write_text
 from predictor.graph import pair_mask
 from predictor.provenance import provenance
 from predictor.reports.tables import ROW_NAMES, accuracy_table
@@ -50,50 +51,47 @@ GALLERY_CASES = 6
 class EvaluateConfig:
     """Measure forecasts inside live environments, through the deployed wrapper, beside constant velocity."""
 
-    env_ids: tuple[str, ...] = (*CHECKPOINTS, *PARALLEL_CHECKPOINTS)
-    """Environments, gymnasium or PettingZoo parallel; all ids with a shipped checkpoint by default."""
+    env_ids: tuple[str, ...] = (*CHECKPOINTS, *MULTIAGENT_CHECKPOINTS)
+    """Environments to measure in, gymnasium or PettingZoo parallel; by default all ids with a shipped checkpoint."""
     checkpoint: tuple[str, ...] = ()
-    """Shipped name or folder; left out, the one that ships for each id. Several make a transfer matrix."""
+    """Checkpoints to measure: shipped names, folders or run folders; none given, the one that ships for each id.
+    Several make a transfer matrix."""
     episodes: int = 50
-    """Episodes per environment."""
-    ego: str | None = None
+    """Number of episodes in each environment."""
+    driver: Annotated[str | None, Renamed("ego")] = None
     """Who drives. One ego: random, idle, varied (default), keep-lane, or the path of a policy .zip (which gets the
     measured forecasts). Many learners: random, idle, varied, heuristic (default), mixed."""
     seed: int = 900_000
-    """Episode i is seeded with seed + i; the shipped checkpoints were trained on seeds from 100,000 on."""
-    samples: int = 20
-    """K of the second row; the first is K = 1, the most likely forecast."""
+    """Random seed: episode i is reset with seed + i; the shipped checkpoints were trained on seeds from 100,000
+    on."""
+    num_samples: Annotated[int, Renamed("samples")] = 20
+    """Number of forecasts drawn (K) for the second line; the first is K = 1, the most likely forecast."""
     horizon_steps: int | None = None
-    """Steps to forecast; None takes each checkpoint's."""
-    history_steps: tuple[int, ...] = ()
-    """Also measure the model with a memory of so many steps only: what its memory is worth."""
+    """Number of steps to forecast; None takes each checkpoint's."""
+    memory_steps: Annotated[tuple[int, ...], Renamed("history_steps")] = ()
+    """Numbers of steps to which the model's memory is limited, each measured as well: what its memory is worth."""
     neighbours: tuple[Path, ...] = ()
-    """Recorded data for the nearest-neighbour row: stores, or folders of stores named by env id; others' are left."""
+    """Recorded data for the nearest-neighbour forecaster: stores, or folders of stores named by env id; stores of other
+    environments are left out."""
     miss_m: float | None = None
     """Final displacement above which a forecast misses [m]; None: 2 m on roads, a tenth of a small arena's scale."""
     max_steps: int = 200
-    """Cut longer episodes here [policy steps]."""
+    """Largest length of an episode; longer ones are cut there [policy steps]."""
     workers: int = os.cpu_count() or 1
-    """Parallel processes."""
+    """Number of parallel processes; the results do not depend on it."""
     out: Path | None = None
     """Folder for accuracy.json, accuracy.md, and per environment a figure by horizon and a gallery of worst cases."""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check ranges.
 
         Raises:
-            UserError: a value that makes no sense. (In `__post_init__`, tyro would turn it into a box of lines.)
+            UserError: a value that makes no sense, or two checkpoints of one name.
         """
-        for name in ("episodes", "samples", "max_steps", "workers"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.seed < 0:
-            raise UserError(f"seed must not be negative, got {self.seed}")
-        if min(self.history_steps, default=1) < 1:
-            raise UserError(f"history_steps must be at least 1, got {self.history_steps}")
-        if self.miss_m is not None and self.miss_m <= 0:
-            raise UserError(f"miss_m must be positive, got {self.miss_m}")
-        names = [Path(checkpoint).name for checkpoint in self.checkpoint]
+        check_at_least(self, 1, "episodes", "num_samples", "max_steps", "workers", "horizon_steps", "memory_steps")
+        check_at_least(self, 0, "seed")
+        check_positive(self, "miss_m")
+        names = [name_of_folder(checkpoint) for checkpoint in self.checkpoint]
         if len(set(names)) < len(names):
             raise UserError(f"each checkpoint needs a name of its own, got {', '.join(names)}; rename a folder")
 
@@ -112,11 +110,10 @@ def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = N
     Raises:
         UserError: unknown env or checkpoint, or episodes too short to compare anything.
     """
-    shipped = parallel_checkpoint_for if is_parallel_id(env_id) else checkpoint_for
-    checkpoint = checkpoint if checkpoint is not None else shipped(env_id)
+    checkpoint = checkpoint if checkpoint is not None else checkpoint_for(env_id)
     if checkpoint != CONSTANT_VELOCITY:
         checkpoint = str(resolve(checkpoint))
-    driver = config.ego or default_drivers(env_id)[0]
+    driver = config.driver or default_drivers(env_id)[0]
     world = open_world(env_id, driver, checkpoint, horizon_steps=config.horizon_steps)
     spec = world.spec
     world.close()
@@ -133,8 +130,8 @@ def _play_all(config: EvaluateConfig, env_id: str, checkpoint: str, driver: str,
     neighbours = _neighbour_stores(config.neighbours, env_id)
     tasks = [
         EpisodeTask(
-            env_id, checkpoint, driver, config.seed + i, config.samples, horizon, config.max_steps,
-            neighbours, config.history_steps,
+            env_id, checkpoint, driver, config.seed + i, config.num_samples, horizon, config.max_steps,
+            neighbours, config.memory_steps,
         )
         for i in range(config.episodes)
     ]  # fmt: skip
@@ -182,7 +179,7 @@ def _summary(
     latencies_ms = 1e3 * np.concatenate([e.latencies_s[1:] or e.latencies_s for e in episodes])  # the first warms up
     return EnvAccuracy(
         env_id,
-        Path(checkpoint).name if learned else checkpoint,
+        name_of_folder(checkpoint) if learned else checkpoint,
         driver,
         spec.dt_s,
         row(name, first, std_m),
@@ -193,7 +190,7 @@ def _summary(
         None if near is None else row(NEIGHBOURS, near, fitted_std_m(near)),
         {
             n: row(f"{name}, {n} step{'s' * (n > 1)} of history", outcomes[memory_key(n)], std_m)
-            for n in config.history_steps
+            for n in config.memory_steps
         },
         _graph(episodes) if learned else None,
         float(np.median(latencies_ms)),
@@ -248,7 +245,7 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
             except UserError as error:
                 if len(config.checkpoint) < 2 or checkpoint is None:
                     raise
-                misfits[env_id, Path(checkpoint).name] = str(error)
+                misfits[env_id, name_of_folder(checkpoint)] = str(error)
                 continue
             results.append(result)
             console.print(accuracy_table(result.rows, result.dt_s, report.title(result)))
@@ -270,12 +267,11 @@ def _finite(content: Any) -> Any:
 def main() -> None:
     """Entry point."""
     keep_freed_memory()
-    config = tyro.cli(EvaluateConfig, description=__doc__)
-    config.check()
+    config = parse(EvaluateConfig, __doc__)
     console = Console(width=170)
     for env_id in config.env_ids:  # complain about any unknown id or driver before hours of work
-        policy = config.ego is not None and config.ego.endswith(".zip")
-        open_world(env_id, "idle" if policy else config.ego or default_drivers(env_id)[0]).close()
+        policy = config.driver is not None and config.driver.endswith(".zip")
+        open_world(env_id, "idle" if policy else config.driver or default_drivers(env_id)[0]).close()
     for checkpoint in config.checkpoint:
         if checkpoint != CONSTANT_VELOCITY:
             resolve(checkpoint)
@@ -290,7 +286,7 @@ def main() -> None:
         content: dict[str, Any] = {"config": asdict(config), "results": [asdict(r) for r in results]}
         misfit = [{"env_id": e, "checkpoint": c, "why": why} for (e, c), why in misfits.items()]
         write_json(config.out / "accuracy.json", _finite(content | {"misfits": misfit, "provenance": made}))
-        (config.out / "accuracy.md").write_text(report.markdown(results, misfits))
+        write_text(config.out / "accuracy.md", report.markdown(results, misfits))
 
 
 if __name__ == "__main__":

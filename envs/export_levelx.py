@@ -7,25 +7,24 @@ simulator's own. Accelerations are backward differences of the velocity, zero in
 """
 
 import csv
-import shutil
-import uuid
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium as gym
 import numpy as np
-import tyro
 from jaxtyping import Float
 from rich.progress import track
 
 from envs.drivers.ego import make_ego
 from envs.readers.highway import HighwayReader, is_highway_env
 from envs.registry import make_env
+from predictor.command_line import Renamed, parse
+from predictor.config_checks import check_at_least
 from predictor.data.store import Episode
 from predictor.errors import UserError, run_entry_point
-from predictor.files import replace_folder, write_json
+from predictor.files import new_folder, write_json
 from predictor.provenance import provenance
 
 FRAMES_PER_S = 25
@@ -46,31 +45,35 @@ class ExportConfig:
     """Write highway-env rollouts in levelXData's CSV layout."""
 
     env_id: str
-    """Gymnasium id of a highway-env environment, for example roundabout-v1."""
+    """Environment to record: gymnasium id of a highway-env environment, for example roundabout-v1."""
     out: Path
     """Folder of the new recordings."""
     episodes: int = 10
-    """Episodes, one recording each."""
-    ego: str = "varied"
+    """Number of episodes; each becomes a recording."""
+    driver: Annotated[str, Renamed("ego")] = "varied"
     """Who drives the ego: random, idle, varied, keep-lane."""
     seed: int = 0
-    """Episode i is seeded with seed + i."""
+    """Random seed: episode i is reset with seed + i."""
     max_steps: int = 200
-    """Cut longer episodes here [policy steps]."""
+    """Largest length of an episode; longer ones are cut there [policy steps]."""
     overwrite: bool = False
     """Replace an existing export."""
 
-    def check(self) -> None:
-        """Check ranges, and that nothing is in the way.
+    def __post_init__(self) -> None:
+        """Check ranges.
 
         Raises:
             UserError: a value that makes no sense.
         """
-        for name in ("episodes", "max_steps"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.seed < 0:
-            raise UserError(f"seed must not be negative, got {self.seed}")
+        check_at_least(self, 1, "episodes", "max_steps")
+        check_at_least(self, 0, "seed")
+
+    def check_out(self) -> None:
+        """Check that `out` is free, or an export that may be replaced.
+
+        Raises:
+            UserError: it is neither.
+        """
         if self.out.exists() and not self.overwrite:
             raise UserError(f"{self.out} exists; choose another path or pass --overwrite")
         if self.out.exists() and not (self.out / "export.json").exists():
@@ -192,31 +195,26 @@ def export(config: ExportConfig) -> int:
         Number of frames.
 
     Raises:
-        UserError: the environment or the ego does not fit.
+        UserError: the environment or the driver does not fit, or `out` is taken.
     """
+    config.check_out()
     env = export_env(config.env_id)
-    make_ego(config.ego, env, np.random.default_rng(0))
-    partial = config.out.with_name(f".{config.out.name}.{uuid.uuid4().hex[:8]}.partial")
+    make_ego(config.driver, env, np.random.default_rng(0))
     frames = 0
-    try:
-        partial.mkdir(parents=True)
+    with new_folder(config.out) as partial:
         for i in track(range(config.episodes), f"export {config.env_id}"):
-            episode, heading_rad = roll_out(env, config.ego, config.seed + i, config.max_steps)
+            episode, heading_rad = roll_out(env, config.driver, config.seed + i, config.max_steps)
             ego: Any = env.unwrapped.vehicle  # type: ignore[attr-defined]
             write_recording(partial, i, episode, heading_rad, (ego.LENGTH, ego.WIDTH))
             frames += len(episode.states)
         made = provenance(("highway-env", "gymnasium", "numpy"))
         write_json(partial / "export.json", {"env_id": config.env_id, "seed": config.seed, "provenance": made})
-        replace_folder(partial, config.out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return frames
 
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(ExportConfig, description=__doc__)
-    config.check()
+    config = parse(ExportConfig, __doc__)
     frames = export(config)
     print(f"{config.out}: {config.episodes} recordings, {frames} frames at {FRAMES_PER_S} Hz")
 

@@ -1,11 +1,13 @@
-"""One forecast for everyone, and every agent's own view of it: for environments with many learners.
+"""One forecast of a scene, and each agent's own view of it: for environments with many learners.
 
-The forecaster runs once per step on the shared scene. Each agent then gets what a single ego would get
+The forecaster runs once per step for the scenes of all environments. Each agent then gets what a single ego would get
 (`envs.observation.ego_entries`): itself as origin, its heading as x axis, its own edges, the others by distance.
 An agent's view is cut to its perception; the forecast behind it is everyone's.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import reduce
 from typing import Any
 
 import gymnasium as gym
@@ -14,29 +16,33 @@ import torch
 from jaxtyping import Bool, Int
 from numpy.typing import NDArray
 
-from envs.observation import ForecastConfig, ForecastStream, ego_entries
-from envs.readers.base import SharedScene
+from envs.observation import ego_entries, entry_spaces
+from envs.readers.base import MultiagentScene
+from envs.scene_stream import ForecastConfig, SceneStream
 from predictor.errors import UserError
 from predictor.forecaster import Forecaster
-from predictor.online import OnlineForecaster
-from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
+from predictor.scene import PADDING_ID, Forecast, Scene, SceneBatch, SceneSpec, perceived_agents
+
+AgentEntries = dict[str, dict[str, NDArray[np.float32]]]
+"""Forecast entries by agent."""
 
 
-class SharedStream:
-    """Streams one environment's shared scenes and cuts each agent's entries from the one forecast.
+class MultiagentStream(SceneStream):
+    """Streams scenes with many learners and cuts each agent's entries from the one forecast of its scene.
 
-    A forecaster trained around an ego serves too, if its frame has no ego axis: nobody carries the ego's mark.
+    A forecaster trained around an ego serves too, if its frame has no ego axis: no agent carries the ego's mark.
 
     Args:
-        forecaster: who forecasts; lives on `config.device`.
-        scene_spec: layout of the shared scenes.
+        forecaster: lives on `config.device`.
+        scene_spec: layout of the scenes.
         config: how the forecast enters the observations.
         perception_m: how far an agent sees [m]; None takes the spec's.
-        max_agents: rows of a view, the agent itself included; None takes the spec's, which is everyone. More than the
+        max_agents: agents of a view, the viewer included; None takes the spec's, which is all of them. More than the
             scene has are padding, so that a policy can move between environments.
+        envs: number of parallel environments, forecast in one batch.
 
     Attributes:
-        forecast: the latest forecast, a batch of one, rows as in the shared scene, world coordinates.
+        forecast: the latest forecast, one entry per environment, agents as in its scene, world coordinates.
 
     Raises:
         UserError: the forecaster needs an ego, the scenes have one or are not flat, or a bound is out of range.
@@ -49,6 +55,7 @@ class SharedStream:
         config: ForecastConfig,
         perception_m: float | None = None,
         max_agents: int | None = None,
+        envs: int = 1,
     ) -> None:
         """Start with empty memory."""
         if "ego" in forecaster.spec.frame:
@@ -61,92 +68,124 @@ class SharedStream:
                 "shared scenes need has_ego=False and positions on two axes, got "
                 f"has_ego={scene_spec.has_ego} and {scene_spec.position_dim} axes; change the reader's spec"
             )
-        self.forecaster = forecaster
         self.scene_spec = scene_spec
         self.view_spec = replace(
             scene_spec,
             perception_m=scene_spec.perception_m if perception_m is None else perception_m,
             max_agents=scene_spec.max_agents if max_agents is None else max_agents,
         )
-        self.config = config
-        self.horizon_steps = config.horizon_steps or forecaster.horizon_steps
-        self.forecast: Forecast | None = None
-        # A forecaster with an ego finds an absent one in row 0.
+        # A forecaster with an ego finds an absent one in front.
         self._front = int(forecaster.spec.has_ego)
-        self._online = OnlineForecaster(forecaster, 1, scene_spec.max_agents + self._front, config.device)
-        self._generator = torch.Generator(device=config.device).manual_seed(config.seed)
-
-    def seed(self, seed: int) -> None:
-        """Restart the samples' noise."""
-        self._generator.manual_seed(seed)
+        super().__init__(forecaster, envs, scene_spec.max_agents + self._front, config)
 
     def spaces(self) -> dict[str, gym.Space]:
-        """Spaces of one agent's entries; new objects at each call, since a space carries its own seed."""
-        return ForecastStream(self.forecaster, self.view_spec, 1, self.config).spaces()
+        """Returns the spaces of one agent's entries; new objects at each call, since a space carries its own seed."""
+        return entry_spaces(self.forecaster, self.view_spec, self.config)
 
-    def reset(self) -> None:
-        """Forget the history."""
-        self._online.reset()
+    def nothing_seen(self) -> dict[str, NDArray[np.float32]]:
+        """Returns the entries of an agent that the reader does not see: zeros."""
+        return {key: np.zeros(space.shape or (), dtype=np.float32) for key, space in self.spaces().items()}
 
-    def observe(self, shared: SharedScene) -> dict[str, dict[str, NDArray[np.float32]]]:
-        """Take in the scene; the entries of each agent in its `rows`, by name."""
-        self._online.observe(SceneBatch.stack([shared.scene.behind_absent(self._front)]))
-        forecast = self._online.forecast(self.horizon_steps, self.config.num_samples, self._generator).dense()
-        front = self._front
-        self.forecast = Forecast(
-            forecast.xy[:, :, front:],
-            forecast.edge_probs[:, front:, front:],
-            forecast.edge_features[:, front:, front:],
-            forecast.valid[:, front:],
+    def observe(self, shared: MultiagentScene) -> AgentEntries:
+        """Take in the scene of the only environment; returns the entries of each of its learners, by name."""
+        [entries] = self.observe_each([shared])
+        return entries
+
+    def observe_each(
+        self, shared: Sequence[MultiagentScene], envs: Int[np.ndarray, " some"] | None = None
+    ) -> list[AgentEntries]:
+        """Take in one scene for each environment (of `envs`, if given); returns the learners' entries for each."""
+        return view_entries(shared, self.take(_batch(shared), envs), self.view_spec)
+
+    def observe_boundary(
+        self, shared: Sequence[MultiagentScene], ended: Int[np.ndarray, " ended"], successors: Sequence[MultiagentScene]
+    ) -> list[AgentEntries]:
+        """As `observe_each`, with the last scenes of ended episodes; entries of their successors follow at the end."""
+        forecast = self.take_boundary(_batch(shared), ended, _batch(successors))
+        return view_entries([*shared, *successors], forecast, self.view_spec)
+
+    def _given(self, scenes: SceneBatch) -> SceneBatch:
+        front = (0, 0), (self._front, 0)
+        return SceneBatch(
+            np.pad(scenes.states, (*front, (0, 0))),
+            np.pad(scenes.ids, front, constant_values=PADDING_ID),
+            np.pad(scenes.valid, front),
+            scenes.heading_rad,
         )
-        return agent_entries(shared, self.forecast, self.view_spec)
+
+    def _shown(self, forecast: Forecast) -> Forecast:
+        dense, front = forecast.dense(), self._front
+        return Forecast(
+            dense.xy[:, :, front:],
+            dense.edge_probs[:, front:, front:],
+            dense.edge_features[:, front:, front:],
+            dense.valid[:, front:],
+        )
 
 
-def agent_entries(
-    shared: SharedScene, forecast: Forecast, view: SceneSpec
-) -> dict[str, dict[str, NDArray[np.float32]]]:
-    """Each agent's forecast entries, cut from one forecast; `envs.observation.ego_entries` gives the shapes.
+def _batch(shared: Sequence[MultiagentScene]) -> SceneBatch:
+    return SceneBatch.stack([one.scene for one in shared])
+
+
+def agent_entries(shared: MultiagentScene, forecast: Forecast, view: SceneSpec) -> AgentEntries:
+    """Returns each agent's forecast entries, cut from one forecast; `envs.observation.ego_entries` gives the shapes.
 
     Args:
         shared: the scene that was forecast.
-        forecast: a batch of one, rows as in the scene, world coordinates.
+        forecast: a batch of one, agents as in the scene, world coordinates.
         view: its `perception_m` and `max_agents` bound what an agent sees.
 
     Returns:
         The entries of each agent in `shared.rows`, by name.
     """
-    names = list(shared.rows)
-    if not names:
-        return {}
-    scene, axes = shared.scene, view.position_dim
-    egos = np.array([shared.rows[name] for name in names])
-    order, seen = _views(scene, egos, view)
-    rows = torch.from_numpy(order).to(forecast.xy.device)
-    origin = torch.from_numpy(scene.states[egos, :axes]).to(forecast.xy)
-    views = Forecast(
-        forecast.xy[0].transpose(0, 1)[rows].transpose(1, 2) - origin[:, None, None, None],
-        forecast.edge_probs[0][rows[:, :, None], rows[:, None, :]],
-        forecast.edge_features[0][rows[:, :, None], rows[:, None, :]],
-        torch.from_numpy(seen).to(forecast.valid.device),
+    [entries] = view_entries([shared], forecast, view)
+    return entries
+
+
+def view_entries(shared: Sequence[MultiagentScene], forecast: Forecast, view: SceneSpec) -> list[AgentEntries]:
+    """Returns `agent_entries` for each of several scenes, whose forecasts are one batch."""
+    named = [(env, name) for env, one in enumerate(shared) for name in one.rows]
+    entries: list[AgentEntries] = [{} for _ in shared]
+    if not named:
+        return entries
+    origins, scenes, orders = [], [], []
+    for one in shared:
+        egos = np.array(list(one.rows.values()), dtype=np.int64)
+        order, seen = _views(one.scene, egos, view)
+        orders.append(order)
+        origins.append(one.scene.states[egos, : view.position_dim])
+        scenes.append(SceneBatch(one.scene.states[order], one.scene.ids[order], seen, one.heading_rad[egos]))
+    views = reduce(SceneBatch.concatenate, scenes)
+    device = forecast.xy.device
+    env = torch.tensor([env for env, _ in named], device=device)
+    agents = torch.from_numpy(np.concatenate(orders)).to(device)
+    origin = torch.from_numpy(np.concatenate(origins)).to(forecast.xy)
+    pairs = env[:, None, None], agents[:, :, None], agents[:, None, :]
+    seen_by_each = Forecast(
+        forecast.xy.transpose(1, 2)[env[:, None], agents].transpose(1, 2) - origin[:, None, None, None],
+        forecast.edge_probs[pairs],
+        forecast.edge_features[pairs],
+        torch.from_numpy(views.valid).to(device),
     )
-    scenes = SceneBatch(scene.states[order], scene.ids[order], seen, shared.heading_rad[egos])
-    entries = ego_entries(scenes, views)
-    return {name: {key: value[i] for key, value in entries.items()} for i, name in enumerate(names)}
+    for key, values in ego_entries(views, seen_by_each).items():
+        for (place, name), value in zip(named, values, strict=True):
+            entries[place].setdefault(name, {})[key] = value
+    return entries
 
 
-def check_shared(shared: Any, spec: SceneSpec, source: str = "reader") -> SharedScene:
-    """What a reader gave, which must keep the contract of `envs.readers.base.SharedScene`.
+def check_multiagent_scene(shared: Any, spec: SceneSpec, source: str = "reader") -> MultiagentScene:
+    """What a reader gave, which must keep the contract of `envs.readers.base.MultiagentScene`.
 
     Args:
-        shared: a `SharedScene`, one hopes.
+        shared: a `MultiagentScene`, one hopes.
         spec: the reader's.
         source: who read it, for messages.
 
     Raises:
         UserError: something else, as `Scene.check`, or the rows or headings of the agents do not fit the scene.
     """
-    if not isinstance(shared, SharedScene):
-        raise UserError(f"{source}: reading must give a SharedScene (envs.readers), got {type(shared).__name__}")
+    if not isinstance(shared, MultiagentScene):
+        raise UserError(f"{source}: reading must give a MultiagentScene (envs.readers), got {type(shared).__name__}")
     shared.scene.check(source, spec, rows=spec.max_agents)
     heading = shared.heading_rad
     if heading.shape != (spec.max_agents,) or not np.isfinite(heading).all():
@@ -166,11 +205,8 @@ def _views(
     scene: Scene, egos: Int[np.ndarray, " egos"], view: SceneSpec
 ) -> tuple[Int[np.ndarray, "egos seen"], Bool[np.ndarray, "egos seen"]]:
     """For each ego the rows it sees, itself first and the nearest next, and which of them are not padding."""
-    positions = scene.states[:, : view.position_dim]
-    distance_m = np.linalg.norm(positions[None] - positions[egos, None], axis=-1)
-    distance_m = np.where(scene.valid, distance_m, np.inf)
-    distance_m[np.arange(len(egos)), egos] = -1.0  # first, also when another agent lies on top of it
-    order = np.argsort(distance_m, axis=1, kind="stable")[:, : view.max_agents]
-    seen = scene.valid[order] & (np.take_along_axis(distance_m, order, axis=1) <= view.perception_m)
+    states = np.broadcast_to(scene.states, (len(egos), *scene.states.shape))
+    valid = np.broadcast_to(scene.valid, (len(egos), *scene.valid.shape))
+    order, seen = perceived_agents(states, valid, egos, view)
     padding = ((0, 0), (0, view.max_agents - order.shape[1]))
     return np.pad(order, padding), np.pad(seen, padding)

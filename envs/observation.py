@@ -1,55 +1,27 @@
 """From scenes and a forecaster to what the policy sees; the same for one env, SB3 and gymnasium vector envs."""
 
-import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
 from envs.registry import checkpoint_for
+from envs.scene_stream import ForecastConfig, SceneStream
 from predictor.checkpoint import load_forecaster
 from predictor.errors import UserError
 from predictor.forecaster import Forecaster
-from predictor.online import OnlineForecaster
+from predictor.online import use_one_thread_after_fork
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 
 Observations = dict[str, NDArray[Any]]
 
 
-# A forked worker (SubprocVecEnv, start_method="fork") inherits OpenMP's state without its threads and would wait for
-# them forever; with one thread it never asks for them. torch's own DataLoader workers do the same.
-os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
-
-
 SCENE_KEYS = ("scene_states", "scene_ids", "scene_valid", "scene_heading_rad")
 FORECAST_KEYS = ("agents", "forecast", "edge_probs", "edge_features", "valid")
-
-
-@dataclass(frozen=True)
-class ForecastConfig:
-    """How a forecast enters the observation."""
-
-    horizon_steps: int | None = None
-    """Steps to forecast; None takes what the checkpoint was trained for."""
-    num_samples: int = 1
-    """Sampled futures per agent; 1 gives the most likely one and drops the axis."""
-    device: str = "cpu"
-    """Where the forecaster runs."""
-    seed: int = 0
-    """Of the samples, until reset(seed=…) gives another."""
-
-    def __post_init__(self) -> None:
-        """Check ranges."""
-        if self.num_samples < 1:
-            raise UserError(f"num_samples must be at least 1, got {self.num_samples}")
-        if self.horizon_steps is not None and self.horizon_steps < 1:
-            raise UserError(f"horizon_steps must be at least 1, got {self.horizon_steps}")
 
 
 def scene_spaces(spec: SceneSpec) -> dict[str, gym.Space]:
@@ -102,82 +74,94 @@ def require_scenes(space: gym.Space, wrapper: str) -> gym.spaces.Dict:
     return space
 
 
-def open_forecaster(checkpoint: str | None, scene_spec: SceneSpec, source: str, device: str = "cpu") -> Forecaster:
-    """The forecaster of a shipped name, a folder, or "constant-velocity"; None takes the one that ships for `source`.
-
-    Raises:
-        UserError: there is none, or it is of another spec (features, dt).
-    """
-    name = checkpoint if checkpoint is not None else checkpoint_for(source)
-    return load_forecaster(name, scene_spec, f"env '{source}'", device)
-
-
-class ForecastStream:
-    """Forecasts for `rows` parallel environments, and the observations made of them.
+def open_forecaster(
+    checkpoint: str | None,
+    scene_spec: SceneSpec,
+    source: str,
+    device: str = "cpu",
+    forecaster: Forecaster | None = None,
+) -> Forecaster:
+    """Returns the forecaster of a shipped name, a folder, or "constant-velocity"; or the given one, once it fits.
 
     Args:
-        forecaster: who forecasts; lives on `config.device`.
+        checkpoint: None takes the one that ships for `source`.
+        scene_spec: layout of the scenes that it has to take.
+        source: id of the environment.
+        device: where to put it.
+        forecaster: instead of a checkpoint; lives on `device` already.
+
+    Raises:
+        UserError: there is none, two are given, or it is of another spec (features, dt).
+    """
+    use_one_thread_after_fork()
+    if forecaster is None:
+        name = checkpoint if checkpoint is not None else checkpoint_for(source)
+        return load_forecaster(name, scene_spec, f"env '{source}'", device)
+    if checkpoint is not None:
+        raise UserError(f"give a checkpoint or a forecaster, not both (checkpoint '{checkpoint}')")
+    forecaster.spec.check_compatible(scene_spec, "the forecaster", f"env '{source}'")
+    return forecaster
+
+
+class ForecastStream(SceneStream):
+    """Forecasts for parallel environments with one ego each, and the observations made of them.
+
+    Args:
+        forecaster: lives on `config.device`.
         scene_spec: layout of the scenes that will arrive.
-        rows: parallel environments.
+        envs: number of parallel environments.
         config: how the forecast enters the observation.
 
-    Attributes:
-        forecast: the latest forecast (all rows).
+    Raises:
+        UserError: scenes that do not lie in a plane.
     """
 
-    def __init__(self, forecaster: Forecaster, scene_spec: SceneSpec, rows: int, config: ForecastConfig) -> None:
+    def __init__(self, forecaster: Forecaster, scene_spec: SceneSpec, envs: int, config: ForecastConfig) -> None:
         """Start with empty memory."""
         if scene_spec.position_dim != 2:
             raise UserError(f"observations are of positions in a plane, got {scene_spec.position_dim} axes")
-        self.forecaster = forecaster
-        self.config = config
+        super().__init__(forecaster, envs, scene_spec.max_agents, config)
         self.scene_spec = scene_spec
-        self.horizon_steps = config.horizon_steps or forecaster.horizon_steps
-        self.forecast: Forecast | None = None
-        self._online = OnlineForecaster(forecaster, rows, scene_spec.max_agents, config.device)
-        self._generator = torch.Generator(device=config.device).manual_seed(config.seed)
-
-    def seed(self, seed: int) -> None:
-        """Restart the samples' noise."""
-        self._generator.manual_seed(seed)
 
     def spaces(self) -> dict[str, gym.Space]:
-        """Spaces of the forecast entries; metres and m/s have no honest bound, probabilities do."""
-        others = self.scene_spec.max_agents - 1
-        samples = (self.config.num_samples,) if self.config.num_samples > 1 else ()
-
-        def unbounded(*shape: int) -> gym.Space:
-            return gym.spaces.Box(-np.inf, np.inf, shape, np.float32)
-
-        return {
-            "agents": unbounded(others, self.scene_spec.num_features),
-            "forecast": unbounded(others, *samples, self.horizon_steps, 2),
-            "edge_probs": gym.spaces.Box(0, 1, (others, 2 * (self.forecaster.num_edge_types - 1)), np.float32),
-            "edge_features": unbounded(others, 2 * self.forecaster.edge_feature_dim),
-            "valid": gym.spaces.Box(0, 1, (others,), np.float32),
-        }
-
-    def reset(self, rows: Int[np.ndarray, " some"] | None = None) -> None:
-        """Forget the history of some rows (all, if None)."""
-        self._online.reset(rows)
+        """Returns the spaces of the forecast entries."""
+        return entry_spaces(self.forecaster, self.scene_spec, self.config)
 
     def observe(
-        self, scenes: SceneBatch, rows: Int[np.ndarray, " some"] | None = None
+        self, scenes: SceneBatch, envs: Int[np.ndarray, " some"] | None = None
     ) -> dict[str, NDArray[np.float32]]:
-        """Take in one scene for each row (of `rows`, if given); the forecast entries for each."""
-        self._online.observe(scenes, rows)
-        return self._entries(scenes)
+        """Take in one scene for each environment (of `envs`, if given); returns the forecast entries for each."""
+        return ego_entries(scenes, self.take(scenes, envs))
 
     def observe_boundary(
         self, scenes: SceneBatch, ended: Int[np.ndarray, " ended"], successors: SceneBatch
     ) -> dict[str, NDArray[np.float32]]:
-        """As `observe`, with the last scenes of ended episodes; their successors' first scenes are extra rows."""
-        self._online.observe_boundary(scenes, ended, successors)
-        return self._entries(SceneBatch.concatenate(scenes, successors))
+        """As `observe`, with the last scenes of ended episodes; entries of their successors follow at the end."""
+        forecast = self.take_boundary(scenes, ended, successors)
+        return ego_entries(SceneBatch.concatenate(scenes, successors), forecast)
 
-    def _entries(self, scenes: SceneBatch) -> dict[str, NDArray[np.float32]]:
-        self.forecast = self._online.forecast(self.horizon_steps, self.config.num_samples, self._generator)
-        return ego_entries(scenes, self.forecast)
+
+def entry_spaces(forecaster: Forecaster, view: SceneSpec, config: ForecastConfig) -> dict[str, gym.Space]:
+    """Returns spaces of the forecast entries, new at each call; m and m/s have no honest bound, probabilities do.
+
+    Args:
+        forecaster: decides the sizes of edges and, unless `config` does, the horizon.
+        view: layout of what one policy sees.
+        config: how the forecast enters the observation.
+    """
+    others = view.max_agents - 1
+    samples = (config.num_samples,) if config.num_samples > 1 else ()
+
+    def unbounded(*shape: int) -> gym.Space:
+        return gym.spaces.Box(-np.inf, np.inf, shape, np.float32)
+
+    return {
+        "agents": unbounded(others, view.num_features),
+        "forecast": unbounded(others, *samples, config.horizon_steps or forecaster.horizon_steps, 2),
+        "edge_probs": gym.spaces.Box(0, 1, (others, 2 * (forecaster.num_edge_types - 1)), np.float32),
+        "edge_features": unbounded(others, 2 * forecaster.edge_feature_dim),
+        "valid": gym.spaces.Box(0, 1, (others,), np.float32),
+    }
 
 
 def ego_entries(scenes: SceneBatch, forecast: Forecast) -> dict[str, NDArray[np.float32]]:
@@ -257,31 +241,21 @@ def batch_entries(scenes: SceneBatch) -> dict[str, NDArray[Any]]:
 def observe_ended(
     stream: ForecastStream, observations: Observations, ended: NDArray[np.int64], closing: list[Observations]
 ) -> tuple[Observations, list[Observations]]:
-    """Forecast entries for each row, and for each closing observation from the old episode's history."""
+    """Returns forecast entries for each environment, and for each closing observation, from its episode's history."""
     opening = scenes_from(observations)
     if not len(ended):
         return dict(stream.observe(opening)), []
     scenes = SceneBatch(*(field.copy() for field in (opening.states, opening.ids, opening.valid, opening.heading_rad)))
-    for row, last in zip(ended, closing, strict=True):
-        scenes.states[row], scenes.ids[row] = last["scene_states"], last["scene_ids"]
-        scenes.valid[row], scenes.heading_rad[row] = last["scene_valid"], last["scene_heading_rad"][0]
+    for env, last in zip(ended, closing, strict=True):
+        scenes.states[env], scenes.ids[env] = last["scene_states"], last["scene_ids"]
+        scenes.valid[env], scenes.heading_rad[env] = last["scene_valid"], last["scene_heading_rad"][0]
     both = stream.observe_boundary(scenes, ended, opening[ended])
-    rows = len(opening)
+    envs = len(opening)
     of_closing = {key: value[ended] for key, value in both.items()}
     for value in both.values():
-        value[ended] = value[rows:]
-    entries = {key: value[:rows] for key, value in both.items()}
+        value[ended] = value[envs:]
+    entries = {key: value[:envs] for key, value in both.items()}
     return entries, [{key: value[i] for key, value in of_closing.items()} for i in range(len(ended))]
-
-
-def with_forecast(observations: Observations, entries: Observations) -> Observations:
-    """Returns the env's own observations with the forecast entries in place of the scene's."""
-    return {"observation": observations["observation"], **entries}
-
-
-def forecast_space(space: gym.spaces.Dict, stream: ForecastStream) -> gym.spaces.Dict:
-    """Returns the space of `with_forecast`."""
-    return gym.spaces.Dict({"observation": space["observation"], **stream.spaces()})
 
 
 def common_value(values: Any, what: str) -> Any:

@@ -11,21 +11,21 @@ with one ego there is `envs.wrappers.ForecastObservation`.
 (5, 2)
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
-from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
-from envs.multiagent_observation import SharedStream, check_shared
-from envs.observation import FORECAST_KEYS, ForecastConfig
-from envs.readers import MakeSharedReader, parallel_env_id, shared_reader_for
-from envs.readers.base import SharedScene, SharedSceneReader, build_reader
-from envs.registry import parallel_checkpoint_for
-from predictor.checkpoint import load_forecaster
+from envs.batched_forward import BatchedForward, can_share
+from envs.forecast_wrapper import ForecastWrapper, ObservationLayout
+from envs.multiagent_observation import MultiagentStream, check_multiagent_scene
+from envs.observation import open_forecaster
+from envs.readers import MakeReader, multiagent_env_id, multiagent_reader_for
+from envs.readers.base import MultiagentReader, MultiagentScene, build_multiagent_reader
+from envs.scene_stream import ForecastConfig
+from envs.simulators.copies import RunningCopy
 from predictor.errors import ProtocolError, UserError
 from predictor.forecaster import Forecaster
 from predictor.scene import Forecast, SceneSpec
@@ -33,7 +33,7 @@ from predictor.scene import Forecast, SceneSpec
 _COMPOSED = (gym.spaces.Dict, gym.spaces.Tuple, gym.spaces.Graph, gym.spaces.Sequence, gym.spaces.OneOf)
 
 
-class ForecastParallelEnv(BaseParallelWrapper):
+class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     """Shows every agent what the others are about to do.
 
     Observation of an agent: Dict with `observation` (its own, untouched) and, for the other agents sorted by distance
@@ -41,7 +41,7 @@ class ForecastParallelEnv(BaseParallelWrapper):
     num_samples > 1), `edge_probs` and `edge_features` (other → agent, then agent → other), `valid`.
     `envs.observation.ego_entries` gives the shapes. Agents may differ in their own spaces, die and join at any step. An
     agent gets its last observation like any other; if the reader no longer sees it, all its entries are zero, `valid`
-    too.
+    too. With `flatten=True` an observation is one Box, in the Dict's key order.
 
     The history is forgotten at reset only. After each step, `scene` and `forecast` hold the same in the world frame.
 
@@ -50,11 +50,13 @@ class ForecastParallelEnv(BaseParallelWrapper):
         checkpoint: shipped name, folder, or "constant-velocity"; None takes the one that ships for the env's id.
         horizon_steps: steps to forecast; None takes the checkpoint's.
         num_samples: sampled futures per agent.
+        flatten: one Box for each agent instead of a Dict.
         perception_m: how far an agent sees [m]; None takes what the checkpoint was trained with.
         max_agents: rows of an agent's view, itself included, the nearest are kept; None takes everyone.
         device: where the forecaster runs.
-        reader: makes a reader for the env; None picks one by env family.
         forecaster: instead of a checkpoint; lives on `device`.
+        seed: of the samples' noise, until `reset(seed=…)` gives another.
+        reader: makes a reader for the env; None picks one by env family.
 
     Raises:
         UserError: not a parallel env, no reader, no checkpoint, one of another spec (features, dt) or relative to an
@@ -68,11 +70,13 @@ class ForecastParallelEnv(BaseParallelWrapper):
         *,
         horizon_steps: int | None = None,
         num_samples: int = 1,
+        flatten: bool = False,
         perception_m: float | None = None,
         max_agents: int | None = None,
         device: str = "cpu",
-        reader: MakeSharedReader | None = None,
         forecaster: Forecaster | None = None,
+        seed: int = 0,
+        reader: MakeReader | None = None,
     ) -> None:
         """Load the forecaster and extend the observation spaces."""
         if not isinstance(env, ParallelEnv):
@@ -80,29 +84,26 @@ class ForecastParallelEnv(BaseParallelWrapper):
                 f"ForecastParallelEnv needs a PettingZoo parallel env, got {type(env).__name__}; make it with "
                 "parallel_env(), or convert an AEC env with pettingzoo.utils.conversions.aec_to_parallel"
             )
-        super().__init__(env)
-        self._source = f"env '{parallel_env_id(env)}'"
-        self._reader: SharedSceneReader = (
-            build_reader(reader, env) if reader is not None else shared_reader_for(env, perception_m)
+        BaseParallelWrapper.__init__(self, env)
+        self._source = f"env '{multiagent_env_id(env)}'"
+        self._reader: MultiagentReader = (
+            build_multiagent_reader(reader, env) if reader is not None else multiagent_reader_for(env, perception_m)
         )
         spec = self._reader.spec
-        if forecaster is None:
-            name = checkpoint if checkpoint is not None else parallel_checkpoint_for(parallel_env_id(env))
-            forecaster = load_forecaster(name, spec, self._source, device)
-        elif checkpoint is not None:
-            raise UserError(f"give a checkpoint or a forecaster, not both (checkpoint '{checkpoint}')")
-        else:
-            forecaster.spec.check_compatible(spec, "the forecaster", self._source)
+        env_id = multiagent_env_id(env)
+        forecaster = open_forecaster(checkpoint, spec, env_id, device, forecaster)
         perception_m = forecaster.spec.perception_m if perception_m is None else perception_m
-        config = ForecastConfig(horizon_steps, num_samples, device)
-        self._stream = SharedStream(forecaster, spec, config, perception_m, max_agents)
-        self._spaces: dict[str, gym.spaces.Dict] = {}
-        self._scene: SharedScene | None = None
+        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten)
+        self.stream: MultiagentStream = MultiagentStream(forecaster, spec, config, perception_m, max_agents)
+        self._layouts: dict[str, ObservationLayout] = {}
+        self._forward: BatchedForward | None = None
+        self._place = 0
+        self._scene: MultiagentScene | None = None
         for agent in getattr(env, "possible_agents", ()):
             self.observation_space(agent)
 
     @property
-    def reader(self) -> SharedSceneReader:
+    def reader(self) -> MultiagentReader:
         """Who reads the scenes."""
         return self._reader
 
@@ -112,7 +113,7 @@ class ForecastParallelEnv(BaseParallelWrapper):
         return self._reader.spec
 
     @property
-    def scene(self) -> SharedScene:
+    def scene(self) -> MultiagentScene:
         """The latest scene, world frame."""
         if self._scene is None:
             raise ProtocolError("there is no scene yet; call reset() first")
@@ -120,26 +121,32 @@ class ForecastParallelEnv(BaseParallelWrapper):
 
     @property
     def forecast(self) -> Forecast:
-        """The latest forecast, a batch of one, rows as in `scene.scene`, world coordinates."""
-        if self._stream.forecast is None:
+        """The forecast behind the latest observations: a batch of one, agents as in `scene.scene`, world axes."""
+        if self._forward is None:
+            return super().forecast
+        forecast = self._forward.forecast_of(self._place)
+        if forecast is None or self._scene is None:
             raise ProtocolError("there is no forecast yet; call reset() first")
-        return self._stream.forecast
+        return forecast
 
-    def observation_space(self, agent: str) -> gym.spaces.Dict:
-        """Its own observation and the forecast entries; the same object at each call.
+    def observation_space(self, agent: str) -> gym.Space:
+        """Returns the space of its own observation and the forecast entries, always one object.
 
         Raises:
             UserError: the agent's own observation is a Dict or Tuple.
         """
-        if agent not in self._spaces:
+        return self._layout(agent).space
+
+    def _layout(self, agent: str) -> ObservationLayout:
+        if agent not in self._layouts:
             own = self.env.observation_space(agent)
             if isinstance(own, _COMPOSED):
                 raise UserError(
                     f"an agent's own observation must be one array, but '{agent}' of {self._source} gives a "
                     f"{type(own).__name__}; pass on the array alone, and an action mask in the agent's info"
                 )
-            self._spaces[agent] = gym.spaces.Dict({"observation": own, **self._stream.spaces()})
-        return self._spaces[agent]
+            self._layouts[agent] = ObservationLayout(own, self.stream.spaces(), self.stream.config.flatten)
+        return self._layouts[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -147,27 +154,58 @@ class ForecastParallelEnv(BaseParallelWrapper):
         """Reset the env and forget the history; a seed also restarts the samples' noise."""
         observations, infos = self.env.reset(seed=seed, options=options)
         self._reader.reset()
-        self._stream.reset()
+        scene, shown = self._read(), self._own(observations)
+        if self._forward is not None:
+            self._forward.begin(self._place, scene, shown, seed)
+            return shown, infos
+        self.stream.reset()
         if seed is not None:
-            self._stream.seed(seed)
-        return self._observe(observations), infos
+            self.stream.seed(seed)
+        return self._with_views(scene, shown), infos
 
     def step(
         self, actions: dict[str, Any]
     ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any]]:
         """Step the env, take in the scene, forecast."""
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
-        return self._observe(observations), rewards, terminations, truncations, infos
+        scene, shown = self._read(), self._own(observations)
+        if self._forward is not None:
+            self._forward.go_on(self._place, scene, shown)
+        else:
+            shown = self._with_views(scene, shown)
+        return shown, rewards, terminations, truncations, infos
 
-    def _observe(self, observations: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    def _read(self) -> MultiagentScene:
         scene = self._reader.read(self.env)
-        self._scene = check_shared(scene, self._reader.spec, f"scene reader of {self._source}")
-        entries = self._stream.observe(self._scene)
+        self._scene = check_multiagent_scene(scene, self._reader.spec, f"scene reader of {self._source}")
+        return self._scene
+
+    def _own(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        return {agent: {"observation": own} for agent, own in observations.items()}
+
+    def _with_views(self, scene: MultiagentScene, shown: dict[str, Any]) -> dict[str, Any]:
+        entries = self.stream.observe(scene)
         return {
-            agent: {"observation": own, **(entries[agent] if agent in entries else self._nothing_seen(agent))}
-            for agent, own in observations.items()
+            agent: self._layout(agent).one(seen["observation"], entries.get(agent) or self.stream.nothing_seen())
+            for agent, seen in shown.items()
         }
 
-    def _nothing_seen(self, agent: str) -> dict[str, NDArray[np.float32]]:
-        spaces = self.observation_space(agent).spaces
-        return {key: np.zeros(spaces[key].shape or (), dtype=np.float32) for key in FORECAST_KEYS}
+
+def batch_forwards(envs: Sequence[ParallelEnv]) -> BatchedForward | None:
+    """Let copies of one environment share their forecasts' forward, if they can and are more than one.
+
+    Their observations then lack forecasts until `BatchedForward.fill` is called. Histories start anew: reset them.
+
+    Args:
+        envs: copies with equal wrappers.
+
+    Returns:
+        What to `fill` after the last copy's step or reset; None if each copy forecasts by itself.
+    """
+    copies = [env for env in envs if type(env) is ForecastParallelEnv and not env.stream.config.flatten]
+    if len(copies) < len(envs) or len(copies) < 2 or not can_share([copy.stream for copy in copies]):
+        return None
+    forward = BatchedForward([copy.stream for copy in copies])
+    for place, copy in enumerate(copies):
+        copy._forward, copy._place = forward, place
+    return forward

@@ -1,57 +1,199 @@
-"""Which environments are known, how to make them, and which shipped checkpoint serves which id."""
+"""Environments that are known by id: how each is made, its shipped checkpoint, its drivers and its learners.
+
+An id that is not listed works too, where Gymnasium or PettingZoo knows it; it has no checkpoint then.
+"""
 
 import functools
 import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
-import highway_env  # noqa: F401  (registers the ids)
-import pettingzoo
-from pettingzoo import ParallelEnv
-from pettingzoo.env_registry.exceptions import PettingZooRegistryError
 
 from envs.readers.mpe import MPE_IDS
-from envs.simulators import mixed_traffic  # noqa: F401  (registers the ids)
+from envs.simulators.envpool import ENV_IDS as ENVPOOL_IDS
 from envs.simulators.envpool import HIGHWAY_ENV_OF, register_envpool_ids
-from envs.simulators.highway_multiagent import HIGHWAY_MULTIAGENT_IDS
 from predictor.errors import UserError
 
-CHECKPOINTS: dict[str, str] = {
-    "highway-v0": "highway",
-    "highway-fast-v0": "highway",
-    "two-way-v0": "two-way",
-    "merge-v1": "merge",
-    "merge-generic-v1": "merge-generic",
-    "roundabout-v1": "roundabout",
-    "roundabout-generic-v1": "roundabout-generic",
-    "intersection-v2": "intersection",
-    "exit-v1": "exit",
-    "racetrack-v1": "racetrack",
-    "racetrack-large-v1": "racetrack-large",
-    "racetrack-oval-v1": "racetrack-oval",
-    "u-turn-v1": "u-turn",
-    "highway-mixed-v0": "highway-mixed",
-}
-"""Env id → name of the checkpoint under predictor/pretrained."""
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
 
-ENVPOOL = "envpool/"
-"""Namespace of EnvPool's native environments."""
+HEURISTIC_DRIVERS = ("heuristic", "mixed", "varied")
+"""Drivers of the multiagent environments that `envs.drivers.all_agents` has a heuristic for."""
+
+
+@dataclass(frozen=True)
+class EnvEntry:
+    """What belongs to one environment id."""
+
+    factory: str | None = None
+    """"module:function" that returns a PettingZoo ParallelEnv; None makes it with `gymnasium.make`."""
+    kwargs: Mapping[str, Any] = field(default_factory=dict)
+    """Arguments of the factory that belong to the id."""
+    checkpoint: str | None = None
+    """Name of the checkpoint under predictor/pretrained; None where none ships."""
+    drivers: tuple[str, ...] = ("varied", "random", "idle")
+    """Names of the drivers that take turns in data collection; the first one drives where accuracy is measured."""
+    learners: tuple[str, ...] = ()
+    """Roles that learn by default (`agents.task.Task`); empty where all agents do. Set where the sides are opponents:
+    pursuers learn, against a prey that flees by rule."""
+
+    @property
+    def multiagent(self) -> bool:
+        """Whether the id makes a PettingZoo environment."""
+        return self.factory is not None
+
+
+_HIGHWAY: dict[str, EnvEntry] = {
+    "highway-v0": EnvEntry(checkpoint="highway"),
+    "highway-fast-v0": EnvEntry(checkpoint="highway"),
+    "two-way-v0": EnvEntry(checkpoint="two-way"),
+    "merge-v1": EnvEntry(checkpoint="merge"),
+    "merge-generic-v1": EnvEntry(checkpoint="merge-generic"),
+    "roundabout-v1": EnvEntry(checkpoint="roundabout"),
+    "roundabout-generic-v1": EnvEntry(checkpoint="roundabout-generic"),
+    "intersection-v2": EnvEntry(checkpoint="intersection"),
+    "exit-v1": EnvEntry(checkpoint="exit"),
+    "racetrack-v1": EnvEntry(checkpoint="racetrack"),
+    "racetrack-large-v1": EnvEntry(checkpoint="racetrack-large"),
+    "racetrack-oval-v1": EnvEntry(checkpoint="racetrack-oval"),
+    "u-turn-v1": EnvEntry(checkpoint="u-turn"),
+    "highway-mixed-v0": EnvEntry(checkpoint="highway-mixed"),
+    "merge-mixed-v0": EnvEntry(),
+    "roundabout-mixed-v0": EnvEntry(),
+    "intersection-mixed-v0": EnvEntry(),
+}
+"""highway-env's ids, and those of `envs.simulators.mixed_traffic`."""
+
+
+def _original_of(env_id: str) -> EnvEntry:
+    """Returns the entry of the highway-env id, of any version, that an EnvPool id copies."""
+    name = HIGHWAY_ENV_OF[ENVPOOL_IDS[env_id]].rpartition("-v")[0]
+    return next((entry for known, entry in _HIGHWAY.items() if known.rpartition("-v")[0] == name), EnvEntry())
+
+
+def _mpe(env_id: str, checkpoint: str | None = None, learners: tuple[str, ...] = ()) -> EnvEntry:
+    return EnvEntry(f"mpe2.{env_id}:parallel_env", {}, checkpoint, HEURISTIC_DRIVERS, learners)
+
+
+def _intersection(env_id: str, checkpoint: str | None = None) -> EnvEntry:
+    return EnvEntry("envs.simulators.highway_multiagent:HighwayParallelEnv", {"env_id": env_id}, checkpoint)
+
+
+ENVS: dict[str, EnvEntry] = {
+    **_HIGHWAY,
+    **{env_id: EnvEntry(checkpoint=_original_of(env_id).checkpoint) for env_id in ENVPOOL_IDS},
+    **{env_id: _mpe(env_id) for env_id in MPE_IDS},
+    "simple_tag_v3": _mpe("simple_tag_v3", "simple-tag", learners=("adversary",)),
+    "simple_spread_v3": _mpe("simple_spread_v3", "simple-spread"),
+    "simple_world_comm_v3": _mpe("simple_world_comm_v3", learners=("adversary",)),
+    "pursuit_v5": EnvEntry("pettingzoo.sisl.pursuit.pursuit:parallel_env", drivers=HEURISTIC_DRIVERS),
+    "intersection-multi-agent-v2": _intersection("intersection-multi-agent-v2", "intersection"),
+    "intersection-multi-agent-v1": _intersection("intersection-multi-agent-v1"),
+    "intersection-multi-agent-v0": _intersection("intersection-multi-agent-v0"),
+}
+"""Id → its entry. mpe2's simple_crypto is left out: nothing moves in it."""
+
+MULTIAGENT_IDS = tuple(env_id for env_id, entry in ENVS.items() if entry.multiagent)
+"""Ids of `ENVS` that make PettingZoo environments."""
+CHECKPOINTS: dict[str, str] = {
+    env_id: entry.checkpoint for env_id, entry in ENVS.items() if entry.checkpoint and env_id in _HIGHWAY
+}
+"""Gymnasium id → name of its checkpoint; EnvPool's copies have those of their originals."""
+MULTIAGENT_CHECKPOINTS: dict[str, str] = {
+    env_id: entry.checkpoint for env_id, entry in ENVS.items() if entry.checkpoint and entry.multiagent
+}
+"""PettingZoo id → name of its checkpoint."""
+
+
+def entry_for(env_id: str) -> EnvEntry:
+    """Returns the entry of an id; of one that is not listed, an entry without a checkpoint."""
+    return ENVS.get(env_id, EnvEntry())
 
 
 def make_env(env_id: str, **kwargs: Any) -> gym.Env:
-    """`gym.make` with a one-line error for an unknown id."""
-    if env_id.startswith(ENVPOOL):
-        register_envpool_ids()
+    """Makes a Gymnasium environment.
+
+    Args:
+        env_id: id of highway-env, of `envs.simulators.mixed_traffic`, of EnvPool ("envpool/Highway-v0"), or any other
+            that Gymnasium knows.
+        kwargs: for `gymnasium.make`.
+
+    Raises:
+        UserError: unknown id, or a missing package.
+    """
+    import highway_env  # noqa: F401  (registers its ids)
+
+    from envs.simulators import mixed_traffic  # noqa: F401  (registers its ids)
+
+    register_envpool_ids()
     try:
         return gym.make(env_id, **kwargs)
-    except (gym.error.UnregisteredEnv, gym.error.Error, ModuleNotFoundError) as error:
-        raise UserError(f"cannot make env '{env_id}': {error}; known here: {', '.join(CHECKPOINTS)}") from error
+    except (gym.error.Error, ModuleNotFoundError) as error:
+        raise UserError(f"cannot make env '{env_id}': {error}; known here: {', '.join(_HIGHWAY)}") from error
+
+
+def make_multiagent_env(env_id: str, **kwargs: Any) -> "ParallelEnv":
+    """Makes a PettingZoo environment.
+
+    Args:
+        env_id: one of `MULTIAGENT_IDS`, an id in PettingZoo's own registry ("sisl/pursuit_v5"), or "module:function" of
+            a function (or class) that returns a ParallelEnv.
+        kwargs: for the environment (``max_cycles``, ``continuous_actions``, …).
+
+    Raises:
+        UserError: unknown id, a missing package, or arguments that the environment refuses.
+    """
+    from pettingzoo import ParallelEnv
+    from pettingzoo.env_registry.exceptions import PettingZooRegistryError
+
+    make = _maker(env_id)
+    try:
+        env = make(**kwargs)
+    except (TypeError, ValueError, AssertionError, ImportError, PettingZooRegistryError) as error:
+        arguments = f" with {kwargs}" if kwargs else ""
+        raise UserError(f"cannot make multiagent env '{env_id}'{arguments}: {error}") from error
+    if not isinstance(env, ParallelEnv):
+        raise UserError(f"'{env_id}' must give a pettingzoo ParallelEnv, got {type(env).__name__}")
+    return env
+
+
+def is_multiagent_id(env_id: str) -> bool:
+    """Returns whether `make_multiagent_env` knows the id: listed here, "module:function", or PettingZoo's.
+
+    The module of a "module:function" is imported; gymnasium's "module:EnvId" is none of these.
+    """
+    if env_id in ENVS:
+        return ENVS[env_id].multiagent
+    if ":" not in env_id:
+        return _in_pettingzoo(env_id)
+    from pettingzoo import ParallelEnv
+
+    try:
+        factory = _load(env_id)
+    except UserError:
+        return False
+    return not isinstance(factory, type) or issubclass(factory, ParallelEnv)
+
+
+def checkpoint_for(env_id: str) -> str:
+    """Returns the name of the checkpoint that ships for an id, of Gymnasium or PettingZoo.
+
+    Raises:
+        UserError: none ships for the id.
+    """
+    checkpoint = entry_for(env_id).checkpoint
+    if checkpoint is None:
+        raise UserError(
+            f"no checkpoint ships for env '{env_id}'; pass one (a name or a path), or 'constant-velocity'. "
+            f"Shipped ids: {', '.join((*CHECKPOINTS, *MULTIAGENT_CHECKPOINTS))}"
+        )
+    return checkpoint
 
 
 def native_task_of(env_id: str) -> str:
-    """EnvPool's task that re-implements a highway-env id: its own version, else the first one it has.
+    """Returns the EnvPool task that copies a highway-env id: its own version, else the first one it has.
 
     Raises:
         UserError: it has none.
@@ -66,117 +208,24 @@ def native_task_of(env_id: str) -> str:
     return (exact + near)[0]
 
 
-def checkpoint_for(env_id: str) -> str:
-    """Name of the shipped checkpoint for an env id.
-
-    Raises:
-        UserError: none ships for the id.
-    """
-    if env_id.startswith(ENVPOOL):
-        copied = HIGHWAY_ENV_OF.get(env_id.removeprefix(ENVPOOL), "").rpartition("-v")[0]
-        env_id = next((known for known in CHECKPOINTS if copied and known.rpartition("-v")[0] == copied), env_id)
-    if env_id not in CHECKPOINTS:
-        raise UserError(
-            f"no checkpoint ships for env '{env_id}'; pass one (a name or a path), or 'constant-velocity'. "
-            f"Shipped ids: {', '.join(CHECKPOINTS)}"
-        )
-    return CHECKPOINTS[env_id]
-
-
-@dataclass(frozen=True)
-class ParallelEntry:
-    """How to make an environment."""
-
-    factory: str
-    """"module:function" that returns a ParallelEnv."""
-    kwargs: Mapping[str, Any] = field(default_factory=dict)
-    """Arguments that belong to the id."""
-
-
-PARALLEL_IDS: dict[str, ParallelEntry] = {
-    **{env_id: ParallelEntry(f"mpe2.{env_id}:parallel_env") for env_id in MPE_IDS},
-    "pursuit_v5": ParallelEntry("pettingzoo.sisl.pursuit.pursuit:parallel_env"),
-    **{
-        env_id: ParallelEntry("envs.simulators.highway_multiagent:HighwayParallelEnv", {"env_id": env_id})
-        for env_id in HIGHWAY_MULTIAGENT_IDS
-    },
-}
-"""Id → how to make it. simple_crypto is left out: nothing moves in it."""
-
-PARALLEL_CHECKPOINTS: dict[str, str] = {
-    "simple_tag_v3": "simple-tag",
-    "simple_spread_v3": "simple-spread",
-    "intersection-multi-agent-v2": "intersection",
-}
-"""Id → name of the checkpoint under predictor/pretrained."""
-
-
-def is_parallel_id(env_id: str) -> bool:
-    """Whether `make_parallel_env` knows the id: listed here, "module:function", or registered with PettingZoo.
-
-    The module of a "module:function" is imported; gymnasium's "module:EnvId" is none of these.
-    """
-    if ":" not in env_id:
-        return env_id in PARALLEL_IDS or _in_pettingzoo(env_id)
-    try:
-        factory = _load(env_id)
-    except UserError:
-        return False
-    return not isinstance(factory, type) or issubclass(factory, ParallelEnv)
-
-
-def make_parallel_env(env_id: str, **kwargs: Any) -> ParallelEnv:
-    """Make a parallel environment.
-
-    Args:
-        env_id: one of `PARALLEL_IDS`, an id in PettingZoo's own registry ("sisl/pursuit_v5"), or "module:function" of
-            a function (or class) that gives a ParallelEnv.
-        kwargs: for the environment (``max_cycles``, ``continuous_actions``, …).
-
-    Raises:
-        UserError: unknown id, a missing package, or arguments that the environment refuses.
-    """
-    make = _maker(env_id)
-    try:
-        env = make(**kwargs)
-    except (TypeError, ValueError, AssertionError, ImportError, PettingZooRegistryError) as error:
-        arguments = f" with {kwargs}" if kwargs else ""
-        raise UserError(f"cannot make parallel env '{env_id}'{arguments}: {error}") from error
-    if not isinstance(env, ParallelEnv):
-        raise UserError(f"'{env_id}' must give a pettingzoo ParallelEnv, got {type(env).__name__}")
-    return env
-
-
-def parallel_checkpoint_for(env_id: str) -> str:
-    """Name of the shipped checkpoint for a parallel id.
-
-    Raises:
-        UserError: none ships for the id.
-    """
-    if env_id not in PARALLEL_CHECKPOINTS:
-        raise UserError(
-            f"no checkpoint ships for parallel env '{env_id}'; pass one (a name or a path), or 'constant-velocity'. "
-            f"Shipped ids: {', '.join(PARALLEL_CHECKPOINTS)}"
-        )
-    return PARALLEL_CHECKPOINTS[env_id]
-
-
 def _maker(env_id: str) -> Callable[..., Any]:
-    if env_id in PARALLEL_IDS:
-        entry = PARALLEL_IDS[env_id]
+    entry = entry_for(env_id)
+    if entry.factory is not None:
         return functools.partial(_load(entry.factory), **entry.kwargs)
     if ":" in env_id:
         return _load(env_id)
     if _in_pettingzoo(env_id):
+        import pettingzoo
+
         return functools.partial(pettingzoo.make, "parallel", env_id)
     raise UserError(
-        f"unknown parallel env '{env_id}'; known: {', '.join(PARALLEL_IDS)}; others as 'module:function' or "
+        f"unknown multiagent env '{env_id}'; known: {', '.join(MULTIAGENT_IDS)}; others as 'module:function' or "
         "registered with pettingzoo.register('parallel', id, ...)"
     )
 
 
 def _load(path: str) -> Callable[..., Any]:
-    """What "module:function" names."""
+    """Returns what "module:function" names."""
     module, _, name = path.partition(":")
     try:
         factory: Callable[..., Any] | None = getattr(importlib.import_module(module), name, None)
@@ -188,6 +237,9 @@ def _load(path: str) -> Callable[..., Any]:
 
 
 def _in_pettingzoo(env_id: str) -> bool:
+    import pettingzoo
+    from pettingzoo.env_registry.exceptions import PettingZooRegistryError
+
     try:
         pettingzoo.spec("parallel", env_id)
     except PettingZooRegistryError:

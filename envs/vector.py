@@ -1,9 +1,11 @@
-"""Forecasts for many environments, one batched forward per step: `VecForecast` (SB3), `VectorForecast` (gymnasium).
+"""Forecasts for many environments of a Gymnasium vector environment, with one batched forward per step.
 
-Each row keeps its own history and forgets it when, and only when, its own episode ends. The observation that closes an
-episode carries the forecast made from that episode's history; the one that opens the next starts from one step.
+Each environment keeps its own history; it is cleared when, and only when, its own episode ends. The observation that
+closes an episode carries the forecast made from that episode's history; the one that opens the next starts from one
+step. `envs.sb3.forecast` has the same for Stable-Baselines3, and needs it: this module does not.
 """
 
+from importlib import import_module
 from typing import Any
 
 import gymnasium as gym
@@ -11,37 +13,51 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
 from envs.observation import (
-    ForecastConfig,
     ForecastStream,
     Observations,
     common_value,
-    forecast_space,
     observe_ended,
     open_forecaster,
     require_scenes,
     scenes_from,
-    with_forecast,
 )
-from predictor.scene import SceneSpec
+from envs.readers import MakeReader
+from envs.scene_stream import ForecastConfig
+from predictor.errors import UserError
+from predictor.forecaster import Forecaster
+from predictor.scene import SceneBatch, SceneSpec
 
 
-class VectorForecast(gym.vector.VectorWrapper):
+def __getattr__(name: str) -> Any:
+    """Returns `VecForecast` of `envs.sb3.forecast`, which is imported, with Stable-Baselines3, when it is asked for."""
+    if name == "VecForecast":
+        return import_module("envs.sb3.forecast").VecForecast
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+
+
+class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
     """`ForecastObservation` for a gymnasium vector env whose environments are wrapped in `SceneObservation`.
 
     Knows both autoreset modes and no autoreset: with NEXT_STEP the closing observation is the step's own and the next
-    step opens the new episode; with SAME_STEP the closing observation is `infos["final_obs"]`; with DISABLED, rows
-    are forgotten when `reset(options={"reset_mask": …})` names them.
+    step opens the new episode; with SAME_STEP the closing observation is `infos["final_obs"]`; with DISABLED,
+    histories are forgotten when `reset(options={"reset_mask": …})` names their environments. After each step, `scene`
+    and `forecast` hold, in the world frame, what `observations[i]` shows of environment i.
 
     Args:
-        env: gymnasium vector environment.
+        env: Gymnasium vector environment, wrapped or not.
         checkpoint: shipped name, folder, or "constant-velocity"; None takes the one that ships for the env's id.
         horizon_steps: steps to forecast; None takes the checkpoint's.
         num_samples: sampled futures per agent.
+        flatten: one Box instead of a Dict.
         device: where the forecaster runs.
+        forecaster: instead of a checkpoint; lives on `device`.
+        seed: of the samples' noise, environment i gets seed + i, until `reset(seed=…)` gives others.
+        reader: refused, because the environments report their scenes; give it to `SceneObservation`.
 
     Raises:
-        UserError: the envs report no scenes, differ from each other, or do not fit the checkpoint.
+        UserError: the envs report no scenes, differ from each other, or do not fit the forecaster.
     """
 
     def __init__(
@@ -51,53 +67,82 @@ class VectorForecast(gym.vector.VectorWrapper):
         *,
         horizon_steps: int | None = None,
         num_samples: int = 1,
+        flatten: bool = False,
         device: str = "cpu",
+        forecaster: Forecaster | None = None,
+        seed: int = 0,
+        reader: MakeReader | None = None,
     ) -> None:
         """Load the forecaster and extend the observation space."""
-        super().__init__(env)
+        gym.vector.VectorWrapper.__init__(self, env)
+        refuse_reader(reader, "VectorForecast")
         space = require_scenes(env.single_observation_space, "VectorForecast")
-        spec: SceneSpec = common_value(env.get_attr("scene_spec"), "scene spec")  # type: ignore[attr-defined]
-        source: str = common_value(env.get_attr("scene_source"), "env id")  # type: ignore[attr-defined]
-        config = ForecastConfig(horizon_steps, num_samples, device)
-        self.stream = ForecastStream(open_forecaster(checkpoint, spec, source, device), spec, env.num_envs, config)
-        self.single_observation_space = forecast_space(space, self.stream)
+        spec: SceneSpec = common_value(_attribute_of_each(env, "scene_spec"), "scene spec")
+        source: str = common_value(_attribute_of_each(env, "scene_source"), "env id")
+        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten)
+        forecaster = open_forecaster(checkpoint, spec, source, device, forecaster)
+        self.stream: ForecastStream = ForecastStream(forecaster, spec, env.num_envs, config)
+        self._layout = ObservationLayout(space["observation"], self.stream.spaces(), flatten)
+        self.single_observation_space = self._layout.space
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
         self._ended = np.zeros(env.num_envs, dtype=np.bool_)
         self._entries: Observations = {}
 
+    @property
+    def scene(self) -> SceneBatch:
+        """The latest scene of each environment, world frame, ego first."""
+        return self._scenes()
+
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Reset all environments, or those of `options["reset_mask"]`, and forget their histories."""
-        mask = (options or {}).get("reset_mask")
+        chosen = (options or {}).get("reset_mask")  # wrappers below may take it out of the options
         observations, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
-        rows = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
-        self.stream.reset(rows)
-        seeds = [s for s in (seed if isinstance(seed, list) else [seed]) if s is not None]
-        if mask is None and seeds:
-            self.stream.seed(seeds[0])
-        self._ended[rows] = False
-        # A partial reset repeats the other rows' observations, which were taken in already and must not count twice.
-        entries = self.stream.observe(scenes_from(observations)[rows], rows)
+        envs = np.arange(self.num_envs) if chosen is None else np.flatnonzero(chosen)
+        self.stream.reset(envs)
+        if seed is not None:
+            seeds = seed if isinstance(seed, list) else [seed + env for env in range(self.num_envs)]
+            self.stream.seed([own if env in envs else None for env, own in enumerate(seeds)])
+        self._ended[envs] = False
+        # A partial reset repeats the others' observations, which were taken in already and must not count twice.
+        entries = self.stream.observe(scenes_from(observations)[envs], envs)
         for key, value in entries.items():
-            self._entries.setdefault(key, np.zeros((self.num_envs, *value.shape[1:]), value.dtype))[rows] = value
-        return with_forecast(observations, {key: value.copy() for key, value in self._entries.items()}), infos
+            self._entries.setdefault(key, np.zeros((self.num_envs, *value.shape[1:]), value.dtype))[envs] = value
+        shown = {key: value.copy() for key, value in self._entries.items()}
+        return self._layout.batch(observations["observation"], shown), infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step; one batched forward for all rows."""
+        """Step; one batched forward for all environments."""
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
         ended = np.asarray(terminations | truncations)
         if self._mode is AutoresetMode.SAME_STEP:
-            rows = np.flatnonzero(ended)
-            closing = [infos["final_obs"][i] for i in rows]
-            entries, closing_entries = observe_ended(self.stream, observations, rows, closing)
-            for i, own, extra in zip(rows, closing, closing_entries, strict=True):
-                infos["final_obs"][i] = with_forecast(own, extra)
+            over = np.flatnonzero(ended)
+            closing = [infos["final_obs"][i] for i in over]
+            entries, closing_entries = observe_ended(self.stream, observations, over, closing)
+            for i, last, extra in zip(over, closing, closing_entries, strict=True):
+                infos["final_obs"][i] = self._layout.one(last["observation"], extra)
         else:
             if self._mode is AutoresetMode.NEXT_STEP:
                 self.stream.reset(np.flatnonzero(self._ended))
             entries = self.stream.observe(scenes_from(observations))
-        # copies: a later reset writes into the rows that it opens
+        # copies: a later reset writes into the entries of the environments that it opens
         self._ended, self._entries = ended, {key: value.copy() for key, value in entries.items()}
-        return with_forecast(observations, entries), rewards, terminations, truncations, infos
+        shown = self._layout.batch(observations["observation"], entries)
+        return shown, rewards, terminations, truncations, infos
+
+
+def _attribute_of_each(env: gym.vector.VectorEnv, name: str) -> Any:
+    """An attribute of each environment of a vector environment; its wrappers have no way to ask for it.
+
+    Raises:
+        UserError: the vector environment has none either.
+    """
+    base = env.unwrapped
+    if not hasattr(base, "get_attr"):
+        raise UserError(
+            f"VectorForecast asks each environment for its {name}, but {type(base).__name__} has no get_attr; use "
+            "SyncVectorEnv or AsyncVectorEnv"
+        )
+    return base.get_attr(name)

@@ -13,18 +13,15 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 
-from envs.observation import (
-    ForecastConfig,
-    ForecastStream,
-    carries_scenes,
-    open_forecaster,
-    scene_entries,
-    scene_spaces,
-)
+from envs.forecast_wrapper import ForecastWrapper, ObservationLayout
+from envs.observation import ForecastStream, carries_scenes, open_forecaster, scene_entries, scene_spaces
 from envs.readers import MakeReader, reader_for
 from envs.readers.base import build_reader, require_scene, show
+from envs.scene_stream import ForecastConfig
+from envs.simulators.copies import RunningCopy
 from predictor.errors import ProtocolError, UserError
-from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
+from predictor.forecaster import Forecaster
+from predictor.scene import Scene, SceneBatch, SceneSpec
 
 
 def scene_source(env: gym.Env) -> str:
@@ -37,7 +34,7 @@ def _reader_of(env: gym.Env, make_reader: MakeReader | None, perception_m: float
     return reader_for(env, perception_m, max_agents) if make_reader is None else build_reader(make_reader, env)
 
 
-class SceneObservation(gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstructorArgs):
+class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstructorArgs):
     """Adds the scene around the ego to the observation.
 
     Observation: Dict with `observation` (the env's own, untouched), `scene_states` (max_agents, F) in the world frame,
@@ -71,10 +68,6 @@ class SceneObservation(gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstru
                 "apply gymnasium.wrappers.FlattenObservation first"
             )
         self.reader = _reader_of(env, reader, perception_m, max_agents)
-        if not self.reader.spec.has_ego:
-            raise UserError(
-                f"{type(self.reader).__name__}: an environment with one ego needs a reader whose spec has has_ego=True"
-            )
         self._scene: Scene | None = None
         self.observation_space = gym.spaces.Dict({"observation": own, **scene_spaces(self.reader.spec)})
 
@@ -116,7 +109,7 @@ class SceneObservation(gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstru
         return {"observation": obs, **scene_entries(scene)}
 
 
-class ForecastObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Shows the policy what the others are about to do.
 
     Observation: Dict with `observation` (the env's own, untouched) and, for the other agents sorted by distance,
@@ -135,10 +128,12 @@ class ForecastObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         perception_m: how far the ego sees [m]; None takes what the checkpoint was trained with.
         max_agents: rows of a scene, the ego included; None takes what the checkpoint was trained with.
         device: where the forecaster runs.
+        forecaster: instead of a checkpoint; lives on `device`.
+        seed: of the samples' noise, until `reset(seed=…)` gives another.
         reader: makes a reader for the env; None picks one by env family.
 
     Raises:
-        UserError: no reader, no checkpoint, or a checkpoint of another spec (features, dt).
+        UserError: no reader, no checkpoint, or a forecaster of another spec (features, dt).
     """
 
     def __init__(
@@ -152,14 +147,17 @@ class ForecastObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         perception_m: float | None = None,
         max_agents: int | None = None,
         device: str = "cpu",
+        forecaster: Forecaster | None = None,
+        seed: int = 0,
         reader: MakeReader | None = None,
     ) -> None:
         """Load the forecaster and extend the observation space."""
         RecordConstructorArgs.__init__(
             self, checkpoint=checkpoint, horizon_steps=horizon_steps, num_samples=num_samples, flatten=flatten,
-            perception_m=perception_m, max_agents=max_agents, device=device, reader=reader,
+            perception_m=perception_m, max_agents=max_agents, device=device, forecaster=forecaster, seed=seed,
+            reader=reader, _disable_deepcopy=True,
         )  # fmt: skip
-        config = ForecastConfig(horizon_steps, num_samples, device)
+        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten)
         ready = carries_scenes(env.observation_space)
         source = scene_source(env)
         if ready:
@@ -171,17 +169,16 @@ class ForecastObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
                 )
         else:
             spec = _reader_of(env, reader, perception_m, max_agents).spec
-        forecaster = open_forecaster(checkpoint, spec, source, device)
+        forecaster = open_forecaster(checkpoint, spec, source, device, forecaster)
         if not ready:
             trained = forecaster.spec
             env = SceneObservation(env, perception_m or trained.perception_m, max_agents or trained.max_agents, reader)
             spec = env.scene_spec
         gym.Wrapper.__init__(self, env)
-        self._stream = ForecastStream(forecaster, spec, rows=1, config=config)
+        self.stream: ForecastStream = ForecastStream(forecaster, spec, envs=1, config=config)
         own = env.observation_space["observation"]  # type: ignore[index]
-        self._dict_space = gym.spaces.Dict({"observation": own, **self._stream.spaces()})
-        self._flatten = flatten
-        self.observation_space = gym.spaces.flatten_space(self._dict_space) if flatten else self._dict_space
+        self._layout = ObservationLayout(own, self.stream.spaces(), flatten)
+        self.observation_space = self._layout.space
 
     @property
     def scene(self) -> Scene:
@@ -189,19 +186,12 @@ class ForecastObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         scene: Scene = self.env.get_wrapper_attr("scene")
         return scene
 
-    @property
-    def forecast(self) -> Forecast:
-        """The latest forecast, a batch of one, rows as in `scene`, world axes relative to the ego."""
-        if self._stream.forecast is None:
-            raise ProtocolError("there is no forecast yet; call reset() first")
-        return self._stream.forecast
-
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the env and forget the history; a seed also restarts the samples' noise."""
         obs, info = self.env.reset(seed=seed, options=options)
-        self._stream.reset()
+        self.stream.reset()
         if seed is not None:
-            self._stream.seed(seed)
+            self.stream.seed(seed)
         return self._observe(obs), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -210,6 +200,5 @@ class ForecastObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return self._observe(obs), reward, terminated, truncated, info
 
     def _observe(self, obs: dict[str, Any]) -> Any:
-        entries = self._stream.observe(SceneBatch.stack([self.scene]))
-        full = {"observation": obs["observation"], **{key: value[0] for key, value in entries.items()}}
-        return gym.spaces.flatten(self._dict_space, full) if self._flatten else full
+        entries = self.stream.observe(SceneBatch.stack([self.scene]))
+        return self._layout.one(obs["observation"], {key: value[0] for key, value in entries.items()})

@@ -5,27 +5,29 @@ A checkpoint carries everything needed to run it (spec, sizes, horizon, residual
 
 import dataclasses
 import json
-import shutil
-import uuid
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import safetensors
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import nn
 
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.errors import UserError
-from predictor.files import replace_folder
+from predictor.files import new_folder, write_json
 from predictor.forecaster import TrainableForecaster
 from predictor.models import build, config_from_json, name_of
+from predictor.runtime import resolve_device
 from predictor.scene import SceneSpec
 
 FORMAT = "dgvae-rl predictor"
 VERSION = 1
 CONSTANT_VELOCITY = "constant-velocity"
+WEIGHTS = "model.safetensors"
+BEST_OF_RUN = "checkpoint"
+"""Folder of the best checkpoint, in the run folder that `python -m predictor.train` writes."""
 PRETRAINED = Path(__file__).resolve().parent / "pretrained"
 
 
@@ -53,34 +55,34 @@ def save_checkpoint(path: Path, model: nn.Module, info: CheckpointInfo) -> None:
     """Write a checkpoint folder; an existing one is replaced only when the new one is complete."""
     if name_of(model) != info.model:
         raise UserError(f"the checkpoint says model '{info.model}' but the network is '{name_of(model)}'")
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.partial")
-    partial.mkdir()
-    try:
+    with new_folder(Path(path)) as partial:
         tensors = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
-        save_file(tensors, partial / "model.safetensors")
-        content = {"format": FORMAT, "version": VERSION, **asdict(info)}
-        (partial / "config.json").write_text(json.dumps(content, indent=2, default=str) + "\n")
-        replace_folder(partial, path)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        (partial / WEIGHTS).write_bytes(save(tensors))  # `save_file` would not follow the umask
+        write_json(partial / "config.json", {"format": FORMAT, "version": VERSION, **asdict(info)})
 
 
 def resolve(name: str | Path) -> Path:
-    """The folder of a shipped name or of a path.
+    """Returns the folder of a checkpoint: a shipped one by its name, a folder itself, or the best one of a run folder.
 
     Raises:
         UserError: neither exists.
     """
     path = Path(name)
     if path.is_dir():
-        return path
+        best = path / BEST_OF_RUN
+        return best if (best / WEIGHTS).is_file() and not (path / WEIGHTS).is_file() else path
     if str(name) in shipped():
         return PRETRAINED / str(name)
     raise UserError(
         f"no checkpoint '{name}': neither a folder nor a shipped name ({', '.join([*shipped(), CONSTANT_VELOCITY])})"
     )
+
+
+def name_of_folder(path: str | Path) -> str:
+    """Returns what to call a checkpoint in a table: its folder's name, or the run folder's for its best checkpoint."""
+    path = Path(path)
+    named = path.resolve() if path.name in ("", ".", "..") else path
+    return named.resolve().parent.name if named.name == BEST_OF_RUN else named.name
 
 
 def shipped() -> list[str]:
@@ -98,7 +100,7 @@ def load_checkpoint(name: str | Path, device: str = "cpu") -> tuple[Any, Checkpo
     info = read_info(path)
     model = build(info.model, info.spec, info.config, info.horizon_steps)
     try:
-        tensors = load_file(path / "model.safetensors")
+        tensors = load_file(path / WEIGHTS)
     except (safetensors.SafetensorError, OSError) as error:
         raise UserError(f"{path / 'model.safetensors'} cannot be read ({error}); copy or train it again") from error
     expected = {k: tuple(v.shape) for k, v in model.state_dict().items()}
@@ -112,7 +114,7 @@ def load_checkpoint(name: str | Path, device: str = "cpu") -> tuple[Any, Checkpo
     if not all(bool(torch.isfinite(t).all()) for t in tensors.values()):
         raise UserError(f"{path}: the weights are not finite; train it again")
     model.load_state_dict(tensors)
-    return model.to(device).eval(), info
+    return model.to(resolve_device(device)).eval(), info
 
 
 def read_info(path: Path) -> CheckpointInfo:

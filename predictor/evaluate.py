@@ -1,35 +1,37 @@
 """Measure a checkpoint on recorded data: `python -m predictor.evaluate --checkpoint NAME --data STORE`.
 
 Prints minADE and minFDE (per agent and joint, with standard errors over subsets of the windows), miss rate, coverage,
-and RMSE and NLL by horizon, for K = 1 and K samples beside constant velocity; writes JSON, Markdown and plots. Accuracy
-in the loop that a policy drives is `python -m envs.evaluate`'s.
+and RMSE and NLL by horizon, for K = 1 and K samples beside constant velocity (K = 1) and constant velocity with noise
+(K samples); writes JSON, Markdown and plots. Accuracy in the loop that a policy drives is `python -m envs.evaluate`'s.
 """
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
 import matplotlib
 import numpy as np
 import torch
-import tyro
 from matplotlib import pyplot as plt
 from rich.console import Console
 from rich.progress import track
 
-from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
 from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint
+from predictor.command_line import Renamed, parse
+from predictor.config_checks import check_at_least
 from predictor.data.store import EpisodeStore, read_store
 from predictor.data.windows import Windows
 from predictor.errors import UserError, run_entry_point
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import Outcome, run_window_batch, run_windows
-from predictor.files import write_json
+from predictor.files import write_json, write_text
 from predictor.forecaster import Forecaster
 from predictor.provenance import provenance
 from predictor.reports.plots import plot_error_by_horizon, plot_scene
 from predictor.reports.tables import ROW_NAMES, accuracy_table, markdown_table
-from predictor.runtime import tune
+from predictor.runtime import resolve_device, tune
 from predictor.scene import SceneSpec
 
 
@@ -38,37 +40,33 @@ class EvaluateConfig:
     """Measure a predictor's accuracy on recorded episodes, beside constant velocity."""
 
     checkpoint: str
-    """Shipped name, folder, or "constant-velocity"."""
+    """Checkpoint to measure: shipped name, folder, run folder, or "constant-velocity"."""
     data: Path
     """Episode store that was not trained on."""
     out: Path | None = None
     """Folder for accuracy.json, accuracy.md and plots; none are written if left out."""
-    samples: int = 20
-    """K of the second row; the first is always K = 1, the most likely forecast."""
+    num_samples: Annotated[int, Renamed("samples")] = 20
+    """Number of forecasts drawn (K) for the second line; the first is always K = 1, the most likely forecast."""
     history_steps: int = 10
-    """Steps streamed before each forecast (fewer where the episode has just begun)."""
+    """Number of observed steps fed to the model before each forecast (fewer where the episode has just begun)."""
     horizon_steps: int | None = None
-    """Steps to forecast; None takes the checkpoint's (5 for constant velocity)."""
+    """Number of steps to forecast; None takes the checkpoint's (5 for constant velocity)."""
     max_windows: int = 4000
-    """Forecasts to make, drawn evenly from the store."""
+    """Number of windows measured at most, drawn evenly from the store."""
     seed: int = 0
-    """Of the drawn windows and samples."""
+    """Random seed for window sampling and forecasts."""
     device: str = "cpu"
-    """"cpu" or "cuda"."""
+    """Device that runs the model: cpu, cuda or auto (cuda where there is one)."""
 
-    def check(self) -> None:
-        """Check ranges.
+    def __post_init__(self) -> None:
+        """Check ranges; `device="auto"` becomes the device that is taken.
 
         Raises:
-            UserError: a value that makes no sense. (In `__post_init__`, tyro would turn it into a box of lines.)
+            UserError: a value that makes no sense, or a device that is not there.
         """
-        if self.device.startswith("cuda") and not torch.cuda.is_available():
-            raise UserError(f"device '{self.device}' asked for but torch sees no CUDA device; use --device cpu")
-        for name in ("samples", "history_steps", "max_windows"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.horizon_steps is not None and self.horizon_steps < 1:
-            raise UserError(f"horizon_steps must be at least 1, got {self.horizon_steps}")
+        check_at_least(self, 1, "num_samples", "history_steps", "horizon_steps", "max_windows")
+        check_at_least(self, 0, "seed")
+        object.__setattr__(self, "device", resolve_device(self.device))
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,7 @@ class _Subject:
 
 
 def evaluate(config: EvaluateConfig) -> list[Accuracy]:
-    """Rows for the model at K = 1 and K = `samples`, and for constant velocity.
+    """Returns the model at K = 1 and K = `num_samples`, constant velocity, and that with noise at K = `num_samples`.
 
     Raises:
         UserError: checkpoint or store unreadable or of different specs, or no episode as long as the horizon.
@@ -112,7 +110,7 @@ def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:
         )
     windows = Windows(subject.store.episodes, subject.spec, config.history_steps, horizon)
     chosen = np.random.default_rng(config.seed).permutation(len(windows))[: config.max_windows]
-    # Constant velocity has no training data of its own; its spread is fitted on these very errors, in its favour.
+    # No training data is given here: the spread of both baselines is fitted to these very errors, in their favour.
     std_m = fitted_std_m(run_windows(baseline, windows, chosen, horizon))
     straight = summarise("constant velocity", run_windows(baseline, windows, chosen, horizon), std_m)
     if not straight.agents:
@@ -123,10 +121,14 @@ def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:
         )
     rows = []
     if subject.model is not None:
-        for samples in track(sorted({1, config.samples}), description="evaluate"):
+        for samples in track(sorted({1, config.num_samples}), description="evaluate"):
             made = run_windows(subject.model, windows, chosen, horizon, samples, config.seed, device=config.device)
             rows.append(summarise(subject.name, made, subject.std_m))
     rows.append(straight)
+    if config.num_samples > 1:
+        noisy = NoisyConstantVelocity.fit(subject.spec, std_m)
+        made = run_windows(noisy, windows, chosen, horizon, config.num_samples, config.seed)
+        rows.append(summarise("constant velocity + noise", made, std_m))
     if config.out is not None:
         _write(config, rows, subject.store.info.source, subject.spec.dt_s)
         _plot(config, rows, windows, chosen, subject.model or baseline, horizon)
@@ -139,7 +141,7 @@ def _write(config: EvaluateConfig, rows: Sequence[Accuracy], source: str, dt_s: 
     made = provenance(("torch", "numpy"))
     content = {"source": source, "dt_s": dt_s, "config": asdict(config), "rows": [asdict(r) for r in rows]}
     write_json(config.out / "accuracy.json", content | {"provenance": made})
-    (config.out / "accuracy.md").write_text(markdown_table(rows, dt_s))
+    write_text(config.out / "accuracy.md", markdown_table(rows, dt_s))
 
 
 def _plot(
@@ -159,7 +161,7 @@ def _plot(
     batch = windows.batch(chosen[:200])
     device = torch.device("cpu" if isinstance(model, ConstantVelocity) else config.device)
     outcome: Outcome = run_window_batch(
-        model, batch.to(device), horizon, min(config.samples, 10), torch.Generator(device)
+        model, batch.to(device), horizon, min(config.num_samples, 10), torch.Generator(device)
     )
     busiest = torch.argsort(outcome.valid.cpu().all(-1).sum(-1), descending=True)[:4].tolist()
     figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
@@ -180,8 +182,7 @@ def _plot(
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(EvaluateConfig, description=__doc__)
-    config.check()
+    config = parse(EvaluateConfig, __doc__)
     tune(config.device)
     subject = _load(config)
     rows = _evaluate(config, subject)

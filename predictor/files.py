@@ -1,52 +1,95 @@
-"""Writes files and folders so that a reader finds the old version or the whole new one, never a part."""
+"""Writes files and folders so that a reader finds the old version or the whole new one, never a part.
+
+What is not complete yet stands beside its target under a hidden name that ends in ``.partial``.
+"""
 
 import json
 import os
 import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Gives a temporary name to write to; renames it to `path` at the end, or deletes it if the body raises.
+
+    The content is flushed to disk before it is renamed, so that also a power cut leaves the old file or the new one.
+    The temporary name keeps the suffix of `path`, by which encoders choose their format.
+    """
+    partial = _beside(path, path.suffix)
+    try:
+        yield partial
+        _flush(partial)
+        os.replace(partial, path)
+        _flush(path.parent)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Gives an empty temporary folder to fill; puts it in the place of `path` at the end, or deletes it on an error."""
+    with scratch_folder(path) as partial:
+        yield partial
+        _replace_folder(partial, path)
+
+
+@contextmanager
+def scratch_folder(path: Path) -> Iterator[Path]:
+    """Gives an empty temporary folder beside `path`, on the same disk; deletes it at the end."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = _beside(path)
+    partial.mkdir()
+    try:
+        yield partial
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
 def copy_file(source: Path, target: Path) -> None:
-    """Copy so that `target` is always a whole file."""
-    partial = partial_path(target)
-    shutil.copyfile(source, partial)
-    publish(partial, target)
+    """Copies a file."""
+    with new_file(target) as partial:
+        shutil.copyfile(source, partial)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write so that `path` is always a whole file."""
-    partial = partial_path(path)
-    partial.write_text(text)
-    publish(partial, path)
-
-
-def partial_path(path: Path) -> Path:
-    """Returns the temporary name beside `path` under which this process writes."""
-    return path.with_name(f".{path.name}.{os.getpid()}.partial")
-
-
-def publish(partial: Path, path: Path) -> None:
-    """Flush to disk, then rename: a reader finds the old file or the whole new one, also after a power cut."""
-    for target in (partial, partial.parent):
-        descriptor = os.open(target, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-        if target is partial:
-            os.replace(partial, path)
+    """Writes text as UTF-8."""
+    with new_file(path) as partial:
+        partial.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON so that a reader finds either the old file or the whole new one."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    partial.write_text(json.dumps(content, indent=2, default=str) + "\n")
-    os.replace(partial, path)
+    """Writes JSON; what JSON has no type for is written as its string."""
+    write_text(path, json.dumps(content, indent=2, default=str) + "\n")
 
 
-def replace_folder(new: Path, target: Path) -> None:
-    """Put `new` in the place of `target`; a crash leaves one of them whole under the target's name or beside it."""
+def delete_leftovers(folder: Path) -> None:
+    """Deletes what a killed process left unfinished in a folder."""
+    for leftover in folder.glob(".*.partial*"):
+        if leftover.is_dir():
+            shutil.rmtree(leftover, ignore_errors=True)
+        else:
+            leftover.unlink(missing_ok=True)
+
+
+def _beside(path: Path, suffix: str = "") -> Path:
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.partial{suffix}")
+
+
+def _flush(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _replace_folder(new: Path, target: Path) -> None:
+    """Puts `new` in the place of `target`; a crash leaves one of them whole under the target's name or beside it."""
     if not target.exists():
         new.rename(target)
         return

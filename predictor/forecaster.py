@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from predictor.graph import NOBODY
+from predictor.layers.pair_noise import Noise
 from predictor.scene import SceneSpec, dense_edges
 
 
@@ -178,9 +179,12 @@ class Forecaster(Protocol):
         """Take in one instant [SI units]; cost does not depend on how much was seen before."""
 
     def rollout(
-        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
+        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
-        """Future states [SI units]: sample 0 follows the most likely graph, the others draw theirs."""
+        """Future states [SI units]: sample 0 follows the most likely graph, the others draw theirs.
+
+        With one generator per scene of the batch, a scene's samples depend on no other scene.
+        """
 
 
 class WindowOutput(NamedTuple):

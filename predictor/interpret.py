@@ -10,32 +10,32 @@ that the decoder uses it (docs/interpretability.md).
 """
 
 import os
-import shutil
-import uuid
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
-import tyro
 from jaxtyping import Float, Int
 from rich.console import Console
 from rich.markdown import Markdown
 from rich.progress import track
 
 from predictor.checkpoint import CONSTANT_VELOCITY, CheckpointInfo, load_checkpoint
+from predictor.command_line import Renamed, parse
+from predictor.config_checks import check_at_least
 from predictor.data.store import StoreInfo, read_store
 from predictor.data.windows import Windows
 from predictor.errors import UserError, run_entry_point
 from predictor.evaluation.disentanglement import sklearn
 from predictor.evaluation.edge_findings import Findings, measure, watch
 from predictor.evaluation.outcomes import run_window_batch
-from predictor.files import write_json
+from predictor.files import scratch_folder, write_json, write_text
 from predictor.provenance import provenance
 from predictor.reports import edge_plots as pictures
 from predictor.reports.tables import scores_markdown
+from predictor.runtime import resolve_device
 from predictor.scene import SceneSpec
 
 BATCH_BYTES = 64_000_000
@@ -50,85 +50,80 @@ class InterpretConfig:
     """Draw and measure what a checkpoint's edges and edge features say."""
 
     checkpoint: str
-    """A dG-VAE: shipped name or folder."""
+    """Checkpoint of a dG-VAE: shipped name, folder or run folder."""
     data: Path
     """Episode store that was not trained on; edge labels are used where it has them."""
     out: Path
     """Folder for the three pictures, scores.json and scores.md."""
-    windows: int = 300
-    """Windows to measure on, drawn evenly from the store (fewer if it has fewer)."""
-    history_steps: int = 40
-    """Steps observed before features are read and the forecast begins."""
+    max_windows: Annotated[int, Renamed("windows")] = 300
+    """Number of windows measured at most, drawn evenly from the store."""
+    burn_in_steps: Annotated[int, Renamed("history_steps")] = 40
+    """Number of steps observed in every window before features are read and the forecast begins."""
     horizon_steps: int = 10
-    """Steps that are forecast in trajectories.png; a window has so many after its history."""
-    samples: int = 20
-    """Forecasts drawn per agent."""
+    """Number of steps forecast in trajectories.png; a window has so many after its burn-in."""
+    num_samples: Annotated[int, Renamed("samples")] = 20
+    """Number of forecasts drawn for each agent."""
     seed: int = 0
-    """Of the drawn windows, samples and shuffles."""
+    """Random seed for window sampling, forecasts and shuffles."""
     device: str = "cpu"
-    """"cpu" or "cuda"."""
+    """Device that runs the model: cpu, cuda or auto (cuda where there is one)."""
 
-    def check(self) -> None:
-        """Check ranges.
+    def __post_init__(self) -> None:
+        """Check ranges; `device="auto"` becomes the device that is taken.
 
         Raises:
-            UserError: a value that makes no sense. (In `__post_init__`, tyro would turn it into a box of lines.)
+            UserError: a value that makes no sense, or a device that is not there.
         """
-        if self.device.startswith("cuda") and not torch.cuda.is_available():
-            raise UserError(f"device '{self.device}' asked for but torch sees no CUDA device; use --device cpu")
-        for name in ("windows", "history_steps", "horizon_steps", "samples"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.out.exists() and not self.out.is_dir():
-            raise UserError(f"out must be a folder, but {self.out} is a file; choose another path")
+        check_at_least(self, 1, "max_windows", "burn_in_steps", "horizon_steps", "num_samples")
+        check_at_least(self, 0, "seed")
+        object.__setattr__(self, "device", resolve_device(self.device))
 
 
 def interpret(config: InterpretConfig) -> Findings:
     """Measure, draw and write everything under `config.out`; nothing is written if anything is refused.
 
     Raises:
-        UserError: a model without edge features, a store that does not fit it, or no window that is long enough.
+        UserError: a file in the place of `out`, a model without edge features, a store that does not fit it, or no
+            window that is long enough.
     """
+    if config.out.exists() and not config.out.is_dir():
+        raise UserError(f"out must be a folder, but {config.out} is a file; choose another path")
     model, info = _load_model(config.checkpoint, config.device)
     store = read_store(config.data)
     info.spec.check_compatible(store.info.spec, f"checkpoint '{config.checkpoint}'", f"store {config.data}")
     if any(e.edge_types is not None or e.edge_attributes is not None for e in store.episodes):
         sklearn("metrics")  # known to be missing now, not after everything was measured
     try:
-        lengths = (config.history_steps, config.horizon_steps)
+        lengths = (config.burn_in_steps, config.horizon_steps)
         windows = Windows(
             store.episodes, info.spec, *lengths, min_future_steps=lengths[1], min_history_steps=lengths[0]
         )
     except UserError as error:
-        raise UserError(f"store {config.data}: {error}; lower --history-steps or --horizon-steps") from error
-    drawn = np.random.default_rng(config.seed).permutation(len(windows))[: config.windows]
+        raise UserError(f"store {config.data}: {error}; lower --burn-in-steps or --horizon-steps") from error
+    drawn = np.random.default_rng(config.seed).permutation(len(windows))[: config.max_windows]
     first = _with_pairs(windows, drawn)
     if not first:
         raise UserError(f"store {config.data}: in {len(drawn)} windows there are never two agents at once, so no edges")
     columns = max(e.states.shape[1] for e in store.episodes)
-    size = max(1, BATCH_BYTES // (4 * config.history_steps * columns**2 * model.edge_feature_dim))
+    size = max(1, BATCH_BYTES // (4 * config.burn_in_steps * columns**2 * model.edge_feature_dim))
     parts = np.array_split(np.sort(drawn), -(-len(drawn) // size))
     findings, accuracies = measure(
         model, windows, track(parts, description="watch"), store.info.edge_attribute_names, config.seed, config.device
     )
     content = _content(config, info, store.info, findings)
     out = config.out.resolve()
-    partial = out.with_name(f".{out.name}.{uuid.uuid4().hex[:8]}.partial")
-    partial.mkdir(parents=True)
-    try:
+    with scratch_folder(out) as partial:
         shown = _shown(config, model, windows, first, store.info)
         graphs = _shown(config, model, windows, _by_accuracy(np.sort(drawn), accuracies), store.info)
         _draw(partial, config, content, findings, shown, graphs, info.spec)
         write_json(partial / "scores.json", content)
-        (partial / "scores.md").write_text(scores_markdown(content), encoding="utf-8")
+        write_text(partial / "scores.md", scores_markdown(content))
         out.mkdir(exist_ok=True)
         for name in FILES:
             if (partial / name).exists():
                 os.replace(partial / name, out / name)
             else:  # of an earlier run; it would mislead beside the new ones
                 (out / name).unlink(missing_ok=True)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return findings
 
 
@@ -186,7 +181,7 @@ def _shown(
         batch = windows.batch(np.array([index]))
         watched = watch(model, batch.to(device))
         generator = torch.Generator(device).manual_seed(config.seed)
-        outcome = run_window_batch(model, batch.to(device), config.horizon_steps, config.samples, generator)
+        outcome = run_window_batch(model, batch.to(device), config.horizon_steps, config.num_samples, generator)
         episode, last = windows.index[index].tolist()
         now = int(batch.last_observed[0])
         made.append(
@@ -242,8 +237,7 @@ def _draw(
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(InterpretConfig, description=__doc__)
-    config.check()
+    config = parse(InterpretConfig, __doc__)
     interpret(config)
     Console(width=160).print(Markdown((config.out / "scores.md").read_text(encoding="utf-8")))
 

@@ -1,9 +1,13 @@
-"""Streaming: one forecaster, many parallel rows, memory that follows agents by id and is forgotten row by row.
+"""Streaming: one forecaster for many parallel environments, whose memory follows agents by id.
 
-Between two observations rows may be re-sorted and agents may come and go: memory is moved to where an agent's id now
+Between two observations agents may be re-sorted and may come and go: memory is moved to where an agent's id now
 stands, newcomers start from zero, and the memory of leavers is dropped with the old arrangement. The cost of a step
 does not depend on how much was seen before.
 """
+
+import copy
+import os
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,32 +17,60 @@ from torch.nn import functional
 from predictor.errors import ProtocolError
 from predictor.forecaster import Belief, Forecaster, Memory
 from predictor.graph import NOBODY
+from predictor.layers.pair_noise import Noise
+from predictor.runtime import resolve_device
 from predictor.scene import PADDING_ID, Forecast, SceneBatch
+
+_process = os.getpid()
+
+
+def use_one_thread_after_fork() -> None:
+    """Limits torch to one thread in a process that was forked from the one that imported this module.
+
+    A forked worker (SubprocVecEnv or AsyncVectorEnv with "fork") inherits OpenMP's state without its threads and would
+    wait for them forever; with one thread it never asks for them. torch's DataLoader workers do likewise. Call it
+    before a worker's first operation on tensors; from the second call on it changes nothing.
+    """
+    global _process
+    if os.getpid() != _process:
+        _process = os.getpid()
+        torch.set_num_threads(1)
 
 
 class OnlineForecaster:
-    """Keeps the memory of a forecaster for `rows` parallel scenes.
+    """Keeps the memory of a forecaster for `envs` parallel scenes.
+
+    A deep copy continues on its own and shares the forecaster, which no step changes.
 
     Args:
         forecaster: any `Forecaster`.
-        rows: parallel scenes (environments).
-        agents: rows of each scene, padding included.
-        device: where the forecaster lives.
+        envs: parallel scenes, one for each environment.
+        agents: agents of each scene, padding included.
+        device: where the forecaster lives: cpu, cuda or auto.
     """
 
-    def __init__(self, forecaster: Forecaster, rows: int, agents: int, device: str = "cpu") -> None:
-        """Start with empty memory in every row."""
+    def __init__(self, forecaster: Forecaster, envs: int, agents: int, device: str = "cpu") -> None:
+        """Start with empty memory for every environment."""
+        use_one_thread_after_fork()
         self.forecaster = forecaster
-        self.device = torch.device(device)
-        self._memory = forecaster.empty_memory(rows, agents)
+        self.device = torch.device(resolve_device(device))
+        self._memory = forecaster.empty_memory(envs, agents)
         self._fresh = forecaster.empty_memory(1, agents)
-        self._ids: Int[np.ndarray, "rows agents"] = np.full((rows, agents), PADDING_ID, dtype=np.int64)
+        self._ids: Int[np.ndarray, "envs agents"] = np.full((envs, agents), PADDING_ID, dtype=np.int64)
         self._ego_axes = np.array([f == "ego" for f in forecaster.spec.frame], dtype=np.float64)
         self._belief: Belief | None = None
 
-    def reset(self, rows: Int[np.ndarray, " some"] | None = None) -> None:
-        """Forget the history of some rows (all, if None); the others keep theirs."""
-        chosen = np.arange(len(self._ids)) if rows is None else np.asarray(rows, dtype=np.int64)
+    def __deepcopy__(self, memo: dict[int, Any]) -> "OnlineForecaster":
+        """Returns an independent copy; memory and belief are replaced at each step, never written to."""
+        twin = copy.copy(self)
+        memo[id(self)] = twin
+        twin._ids = self._ids.copy()
+        return twin
+
+    def reset(self, envs: Int[np.ndarray, " some"] | None = None) -> None:
+        """Forget the history of some environments (all, if None); the others keep theirs."""
+        use_one_thread_after_fork()
+        chosen = np.arange(len(self._ids)) if envs is None else np.asarray(envs, dtype=np.int64)
         if not len(chosen):
             return
         self._belief = None  # a forecast of what is forgotten would have no meaning
@@ -48,25 +80,27 @@ class OnlineForecaster:
         self._memory = self._memory.replace_rows(index, fresh)
 
     @torch.inference_mode()
-    def observe(self, scenes: SceneBatch, rows: Int[np.ndarray, " some"] | None = None) -> None:
-        """Take in one scene per row, or one for each of `rows`; a `forecast` that follows has the same rows."""
-        if rows is None:
+    def observe(self, scenes: SceneBatch, envs: Int[np.ndarray, " some"] | None = None) -> None:
+        """Take in one scene per environment, or one for each of `envs`; a `forecast` that follows has as many."""
+        use_one_thread_after_fork()
+        if envs is None:
             self._memory, self._ids = self._take(scenes, self._ids, self._memory)
             return
-        index = torch.from_numpy(np.asarray(rows, dtype=np.int64)).to(self.device)
-        memory, self._ids[rows] = self._take(scenes, self._ids[rows], self._memory.select(index))
+        index = torch.from_numpy(np.asarray(envs, dtype=np.int64)).to(self.device)
+        memory, self._ids[envs] = self._take(scenes, self._ids[envs], self._memory.select(index))
         self._memory = self._memory.replace_rows(index, memory)
 
     @torch.inference_mode()
     def observe_boundary(self, scenes: SceneBatch, ended: Int[np.ndarray, " ended"], successors: SceneBatch) -> None:
-        """Take in one scene per row, of which some are the last of their episode, together with their successors.
+        """Take in one scene per environment, some the last of their episode, together with their successors.
 
-        One batched step serves both: rows of `scenes` continue their histories; for each row in `ended`, the first
+        One batched step serves both: `scenes` continue their histories; for each environment in `ended`, the first
         scene of its next episode enters with an empty history and is what stays in memory. A `forecast` that follows
-        has `len(scenes) + len(ended)` rows, the successors last.
+        has `len(scenes) + len(ended)` entries, the successors last.
         """
+        use_one_thread_after_fork()
         ended = np.asarray(ended, dtype=np.int64)
-        rows = len(self._ids)
+        envs = len(self._ids)
         fresh = self._fresh.select(torch.zeros(len(ended), dtype=torch.long, device=self.device))
         no_ids = np.full((len(ended), self._ids.shape[1]), PADDING_ID, dtype=np.int64)
         memory, ids = self._take(
@@ -74,8 +108,8 @@ class OnlineForecaster:
             np.concatenate([self._ids, no_ids]),
             Memory.concatenate(self._memory, fresh),
         )
-        kept = np.arange(rows)
-        kept[ended] = rows + np.arange(len(ended))
+        kept = np.arange(envs)
+        kept[ended] = envs + np.arange(len(ended))
         self._memory = memory.select(torch.from_numpy(kept).to(self.device))
         self._ids = ids[kept]
 
@@ -84,13 +118,19 @@ class OnlineForecaster:
         self,
         horizon_steps: int | None = None,
         num_samples: int = 1,
-        generator: torch.Generator | None = None,
+        generator: Noise | None = None,
     ) -> Forecast:
         """Forecast from the latest observation; sample 0 is the most likely graph's.
+
+        Args:
+            horizon_steps: None takes the forecaster's.
+            num_samples: futures per agent.
+            generator: of the samples; one for all scenes of the latest observation, or one for each of them.
 
         Raises:
             ProtocolError: nothing was observed yet.
         """
+        use_one_thread_after_fork()
         if self._belief is None:
             raise ProtocolError("forecast() needs an observation; call observe() first")
         belief = self._belief
@@ -99,7 +139,7 @@ class OnlineForecaster:
         # float32 relative to the ego: the origin that observe() removed is the ego's own position on "ego" axes
         axes = self.forecaster.spec.position_dim
         ego_now = belief.states[:, None, :1, None, :axes] * float(self.forecaster.spec.has_ego)
-        xy = (states[..., :axes] - ego_now) * belief.valid[:, None, :, None, None]
+        xy = (states[..., :axes] - ego_now).masked_fill(~belief.valid[:, None, :, None, None], 0.0)
         missing = self._ids.shape[1] - belief.valid.shape[1]
         senders = belief.senders
         pairs = (0, 0, 0, missing if senders is None else 0, 0, missing)
@@ -115,9 +155,9 @@ class OnlineForecaster:
         )
 
     def _take(
-        self, scenes: SceneBatch, old_ids: Int[np.ndarray, "rows agents"], memory: Memory
-    ) -> tuple[Memory, Int[np.ndarray, "rows agents"]]:
-        # Columns beyond the last agent of any row cost nothing: pairs grow with the square of the columns.
+        self, scenes: SceneBatch, old_ids: Int[np.ndarray, "envs agents"], memory: Memory
+    ) -> tuple[Memory, Int[np.ndarray, "envs agents"]]:
+        # Columns beyond the last agent of any scene cost nothing: pairs grow with the square of the columns.
         agents = 1 + int(np.flatnonzero(scenes.valid.any(axis=0)).max(initial=0))
         valid = scenes.valid[:, :agents]
         ids = np.where(scenes.valid, scenes.ids, PADDING_ID)
@@ -125,17 +165,18 @@ class OnlineForecaster:
             source, known = _match(old_ids, ids[:, :agents])
             memory = memory.reorder(torch.from_numpy(source).to(self.device), torch.from_numpy(known).to(self.device))
         # float64 until the ego's position is off: a scene 10 km down the road loses no precision
-        local = scenes.states[:, :agents].copy()
+        # what stands in padding, not-a-number for example, must not reach any agent
+        local = np.where(valid[..., None], scenes.states[:, :agents], 0.0)
         axes = len(self._ego_axes)
         local[..., :axes] -= local[:, :1, :axes] * self._ego_axes
-        states = torch.from_numpy((local * valid[..., None]).astype(np.float32)).to(self.device)
+        states = torch.from_numpy(np.where(valid[..., None], local, 0.0).astype(np.float32)).to(self.device)
         memory, self._belief = self.forecaster.observe(memory, states, torch.from_numpy(valid).to(self.device))
         return memory.padded(ids.shape[1]), ids
 
 
 def _match(
-    old_ids: Int[np.ndarray, "rows before"], new_ids: Int[np.ndarray, "rows agents"]
-) -> tuple[Int[np.ndarray, "rows agents"], Bool[np.ndarray, "rows agents"]]:
-    """For each new row of each scene, where its id stood before, and whether it did."""
+    old_ids: Int[np.ndarray, "envs before"], new_ids: Int[np.ndarray, "envs agents"]
+) -> tuple[Int[np.ndarray, "envs agents"], Bool[np.ndarray, "envs agents"]]:
+    """Returns, for each place of each new scene, where its id stood before, and whether it did."""
     same = (new_ids[:, :, None] == old_ids[:, None, :]) & (new_ids[:, :, None] != PADDING_ID)
     return same.argmax(axis=2), same.any(axis=2)

@@ -14,12 +14,33 @@ from typing import Literal
 
 import torch
 
+from predictor.errors import UserError
+
 Precision = Literal["float32", "bfloat16"]
 """Of products and convolutions: "bfloat16" rounds their inputs and results; weights, states and losses stay float32."""
 
 # glibc's <malloc.h>
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4
 _LARGEST = 2**31 - 1
+
+
+def resolve_device(device: str) -> str:
+    """Returns the torch device of a name: cpu, cuda, cuda:N, or auto, which is cuda where torch finds such a device.
+
+    Raises:
+        UserError: another name, or no such device in this machine.
+    """
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        kind = torch.device(device)
+    except RuntimeError:
+        kind = None
+    if kind is None or kind.type not in ("cpu", "cuda"):
+        raise UserError(f"device must be cpu, cuda or auto, got '{device}'")
+    if kind.type == "cuda" and not torch.cuda.is_available():
+        raise UserError(f"device '{device}' was asked for but torch finds no CUDA device; use --device cpu")
+    return device
 
 
 def tune(device: str = "cpu") -> None:

@@ -1,6 +1,6 @@
-"""What everything speaks in: a scene's layout (`SceneSpec`), one instant (`Scene`), many (`SceneBatch`), `Forecast`.
+"""Types that all modules exchange: layout of a scene (`SceneSpec`), `Scene`, `SceneBatch` and `Forecast`.
 
-States are in the world frame and SI units. Where a scene has an ego, it is row 0, always. Padded rows are
+States are in the world frame and SI units. Where a scene has an ego, it is agent 0, always. Padded agents are
 `valid=False`, hold zeros and id -1. The first features are always position and velocity, on two axes or three.
 """
 
@@ -25,28 +25,28 @@ AxisFrame = Literal["ego", "world", "centroid"]
 
 @dataclass(frozen=True)
 class SceneSpec:
-    """The contract between whoever reads scenes and whoever forecasts them; travels inside every checkpoint."""
+    """Layout of scenes, on which readers and forecasters must agree; kept in every checkpoint."""
 
     dt_s: float
     """Time between two scenes [s]."""
     frame: tuple[AxisFrame, ...] = ("world", "world")
     """Per axis, what is subtracted from positions at each step: "ego" the ego's (unbounded roads), "centroid" the mean
-    of everyone present (nobody is special, the place does not matter), "world" nothing (fixed maps)."""
+    of all agents that are present (no agent is special, the place does not matter), "world" nothing (fixed maps)."""
     feature_names: tuple[str, ...] = KINEMATIC_FEATURES
     """Columns of a state; position and velocity come first, on two or three axes."""
     feature_scales: tuple[float, ...] = (100.0, 100.0, 30.0, 30.0)
     """Divisors that bring each feature to order one for the network."""
     has_ego: bool = True
-    """Whether row 0 is the learner; tells the network which agent does not drive like the others."""
+    """Whether agent 0 is the learner; tells the network which agent does not drive like the others."""
     perception_m: float = 100.0
-    """How far the ego sees [m]; agents beyond are not in the scene."""
+    """Distance to which the ego sees [m]; agents beyond are not in the scene."""
     max_agents: int = 12
-    """Rows of a scene, the ego included; the nearest are kept."""
+    """Largest number of agents in a scene, the ego included; the nearest are kept."""
     constant_features: tuple[str, ...] = ()
     """Features that never change while an agent is there (a role, a size): given to the network, never predicted."""
 
     def __post_init__(self) -> None:
-        """Check that the fields fit together."""
+        """Checks that the fields fit together."""
         if not 0 < self.dt_s < float("inf"):
             raise UserError(f"dt_s must be positive, got {self.dt_s}")
         if self.feature_names[:4] != KINEMATIC_FEATURES and self.feature_names[:6] != KINEMATIC_FEATURES_3D:
@@ -77,16 +77,16 @@ class SceneSpec:
 
     @property
     def position_dim(self) -> int:
-        """Axes of a position, which is the first columns of a state; as many columns of velocity follow."""
+        """Number of axes of a position, which is the first columns of a state; as many columns of velocity follow."""
         return 3 if self.feature_names[:6] == KINEMATIC_FEATURES_3D else 2
 
     @property
     def num_features(self) -> int:
-        """Columns of a state."""
+        """Number of features of a state."""
         return len(self.feature_names)
 
     def check_compatible(self, other: "SceneSpec", name: str, source: str) -> None:
-        """Raise unless scenes of `other` can be fed to a forecaster of this spec.
+        """Raises unless scenes of `other` can be fed to a forecaster of this spec.
 
         Args:
             other: the spec of the scenes that arrive.
@@ -110,19 +110,19 @@ class SceneSpec:
 
 @dataclass(frozen=True)
 class Scene:
-    """All agents at one instant, padded to a fixed number of rows."""
+    """All agents at one instant, padded to a fixed number."""
 
     states: Float[np.ndarray, "agents state"]
-    """World frame, SI units, float64; row 0 is the ego."""
+    """World frame, SI units, float64; agent 0 is the ego. Finite, padded agents included."""
     ids: Int[np.ndarray, " agents"]
-    """Identity that stays with an agent from step to step; -1 in padded rows."""
+    """Identity that stays with an agent from step to step; -1 for padded agents."""
     valid: Bool[np.ndarray, " agents"]
-    """Which rows hold an agent."""
+    """Which entries hold an agent."""
     heading_rad: float = 0.0
-    """The ego's heading, which turns world axes into ego axes; 0 where agents have none."""
+    """Heading of the ego, which turns world axes into ego axes; 0 where agents have none."""
 
     def behind_absent(self, rows: int) -> "Scene":
-        """The same with `rows` absent rows in front: what a forecaster with an ego gets where nobody is the ego."""
+        """Returns the scene behind `rows` absent agents, for a forecaster with an ego where no agent is the ego."""
         return Scene(
             np.pad(self.states, ((rows, 0), (0, 0))),
             np.pad(self.ids, (rows, 0), constant_values=PADDING_ID),
@@ -131,12 +131,12 @@ class Scene:
         )
 
     def check(self, source: str = "reader", spec: SceneSpec | None = None, rows: int | None = None) -> None:
-        """Raise unless the scene keeps the contract.
+        """Raises unless the scene keeps the contract.
 
         Args:
             source: who read it, for messages.
             spec: features and ego are checked against it; None expects an ego and any features.
-            rows: required number of rows, padding included; None takes any.
+            rows: required number of agents, padding included; None takes any.
 
         Raises:
             UserError: wrong types or shapes, no ego, duplicate or negative ids, non-finite values.
@@ -152,8 +152,10 @@ class Scene:
         number = isinstance(self.heading_rad, int | float | np.integer | np.floating)
         if not number or not np.isfinite(self.heading_rad):
             raise UserError(f"{source}: heading_rad must be one finite number, got {self.heading_rad}")
-        if not np.isfinite(self.states[self.valid]).all():
-            raise UserError(f"{source}: states must be finite, got {self.states[self.valid].tolist()}")
+        if not np.isfinite(self.states).all():
+            raise UserError(
+                f"{source}: states must be finite, those of padded agents too (zeros), got {self.states.tolist()}"
+            )
 
     def _check_arrays(self, source: str, spec: SceneSpec | None, rows: int | None) -> None:
         for name, array, kind, wanted, axes in (
@@ -179,7 +181,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class SceneBatch:
-    """Scenes of many rows (parallel environments) at one instant."""
+    """Scenes of many environments at one instant."""
 
     states: Float[np.ndarray, "batch agents state"]
     """World frame, SI units, float64."""
@@ -192,7 +194,7 @@ class SceneBatch:
 
     @staticmethod
     def stack(scenes: Sequence[Scene]) -> "SceneBatch":
-        """Stack scenes of equal size."""
+        """Stacks scenes of equal size."""
         return SceneBatch(
             np.stack([s.states for s in scenes]),
             np.stack([s.ids for s in scenes]),
@@ -201,16 +203,16 @@ class SceneBatch:
         )
 
     def __len__(self) -> int:
-        """Rows of the batch."""
+        """Number of scenes in the batch."""
         return len(self.states)
 
     def __getitem__(self, rows: Int[np.ndarray, " rows"]) -> "SceneBatch":
-        """The given rows, as a batch."""
+        """Returns the scenes of the given environments, as a batch."""
         return SceneBatch(self.states[rows], self.ids[rows], self.valid[rows], self.heading_rad[rows])
 
     @staticmethod
     def concatenate(first: "SceneBatch", second: "SceneBatch") -> "SceneBatch":
-        """The rows of `first`, then those of `second`."""
+        """Returns the scenes of `first`, then those of `second`."""
         return SceneBatch(
             np.concatenate([first.states, second.states]),
             np.concatenate([first.ids, second.ids]),
@@ -219,13 +221,47 @@ class SceneBatch:
         )
 
 
+def perceived_agents(
+    states: Float[np.ndarray, "*batch agents state"],
+    valid: Bool[np.ndarray, "*batch agents"],
+    ego: int | Int[np.ndarray, "*batch"],
+    spec: SceneSpec,
+) -> tuple[Int[np.ndarray, "*batch nearest"], Bool[np.ndarray, "*batch nearest"]]:
+    """Finds what an ego perceives: itself, then the nearest agents, at most `max_agents`, within `perception_m`.
+
+    Agents at equal distances keep their order; the ego comes first also when another agent is at the same position.
+
+    Args:
+        states: world frame; entries of agents that are not valid are ignored.
+        valid: which entries hold an agent.
+        ego: index of the ego: one for all scenes, or one for each.
+        spec: its `perception_m`, `max_agents` and `position_dim` decide.
+
+    Returns:
+        Indices of agents in this order, as many as there are, at most `max_agents`; and which of them are perceived:
+        the others are too far away or not valid.
+    """
+    positions = states[..., : spec.position_dim]
+    if isinstance(ego, int):
+        offsets = positions - positions[..., ego : ego + 1, :]
+    else:
+        offsets = positions - np.take_along_axis(positions, ego[..., None, None], axis=-2)
+    distance_m = np.where(valid, np.sqrt(np.square(offsets).sum(axis=-1)), np.inf)
+    if isinstance(ego, int):
+        distance_m[..., ego] = -1.0
+    else:
+        np.put_along_axis(distance_m, ego[..., None], -1.0, axis=-1)
+    order = np.argsort(distance_m, axis=-1, kind="stable")[..., : spec.max_agents]
+    return order, np.take_along_axis(valid & (distance_m <= spec.perception_m), order, axis=-1)
+
+
 @dataclass(frozen=True)
 class Forecast:
-    """What a forecaster says at one instant about the steps that follow it."""
+    """Forecast at one instant of the steps that follow it."""
 
     xy: Float[Tensor, "batch samples agents horizon axes"]
     """Predicted positions [m], world axes; relative to the ego's position now, or to the world's origin where there is
-    no ego (a spec without one, or an absent row 0). Zeros where `valid` is not."""
+    no ego (a spec without one, or an absent agent 0). Zeros where `valid` is not."""
     edge_probs: Float[Tensor, "batch agents slots types"]
     """Prior over edge types now, receiver first; type 0 is "no edge"."""
     edge_features: Float[Tensor, "batch agents slots feature"]
@@ -233,16 +269,16 @@ class Forecast:
     valid: Bool[Tensor, "batch agents"]
     """Which agents are forecast."""
     senders: Int[Tensor, "batch agents slots"] | None = None
-    """Whose each slot of an edge is (`predictor.graph.NOBODY` where empty); None if slot j is agent j's."""
+    """Index of the sender in each slot (`predictor.graph.NOBODY` where empty); None if slot j is agent j's."""
 
     def dense(self) -> "Forecast":
-        """The same with slot j for agent j; of use where scenes are small."""
+        """Returns the forecast with slot j for agent j; of use where scenes are small."""
         if self.senders is None:
             return self
         return Forecast(self.xy, *dense_edges(self.edge_probs, self.edge_features, self.senders), self.valid)
 
     def ego_edges(self) -> tuple[Float[Tensor, "batch agents 2 types"], Float[Tensor, "batch agents 2 feature"]]:
-        """Probabilities and features of the edges from each agent to agent 0, and from agent 0 to each agent."""
+        """Returns probabilities and features of the edges from each agent to agent 0, and of those back."""
         if self.senders is None:
             probs, features = self.edge_probs, self.edge_features
             return torch.stack([probs[:, 0], probs[:, :, 0]], 2), torch.stack([features[:, 0], features[:, :, 0]], 2)
@@ -252,7 +288,7 @@ class Forecast:
         heard = torch.stack([to_ego, from_ego], 2).to(self.xy.dtype)
         slots = [torch.stack([t[:, :1].expand_as(t), t], 2) for t in (self.edge_probs, self.edge_features)]
         probs, features = (torch.matmul(heard[..., None, :], t)[..., 0, :] for t in slots)
-        probs[..., 0] = 1 - probs[..., 1:].sum(-1)  # who is not heard has no edge
+        probs[..., 0] = 1 - probs[..., 1:].sum(-1)  # an agent without a slot has no edge
         return probs, features
 
 
@@ -261,7 +297,7 @@ def dense_edges(
     features: Float[Tensor, "batch agents slots feature"],
     senders: Int[Tensor, "batch agents slots"],
 ) -> tuple[Float[Tensor, "batch agents agents types"], Float[Tensor, "batch agents agents feature"]]:
-    """Edge probabilities and features with slot j for agent j: "no edge", and zeros, where there is no slot."""
+    """Returns edge probabilities and features with slot j for agent j: "no edge", and zeros, where there is no slot."""
     no_edge = probs.new_zeros(probs.shape[-1])
     no_edge[0] = 1.0
     return to_dense(probs, senders, no_edge), to_dense(features, senders, features.new_zeros(features.shape[-1]))

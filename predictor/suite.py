@@ -13,26 +13,26 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import matplotlib
-import torch
-import tyro
 from matplotlib import pyplot as plt
 from rich.progress import Progress
 
+from predictor.command_line import Renamed, parse
+from predictor.config_checks import check_at_least, check_choices
 from predictor.data.store import read_info_of
 from predictor.errors import UserError, run_entry_point
 from predictor.evaluation.disentanglement import sklearn
 from predictor.evaluation.measure_row import measure_row
 from predictor.evaluation.paper_tables import BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, TABLES, Budget, Row, Sizes
-from predictor.files import write_json
+from predictor.files import write_json, write_text
 from predictor.provenance import provenance
 from predictor.reports.plots import plot_rows_by_step
 from predictor.reports.tables import latex_table, markdown_report
-from predictor.runtime import tune
+from predictor.runtime import resolve_device, tune
 from predictor.train import train
-from predictor.training.config import TrainConfig, TrainPrecision
+from predictor.training.config import TrainConfig, TrainPrecision, check_precision
 
 TableName = Literal["springs", "recipe", "mocap", "nba", "sdd", "ind"]
 
@@ -42,46 +42,51 @@ class SuiteConfig:
     """Train and measure every row of one of the paper's tables."""
 
     table: TableName
-    """Which table."""
+    """Table of the paper to rerun."""
     data: Path = Path("data")
-    """Folder of the stores; what is missing is named with the command that makes it."""
+    """Folder of the episode stores; a missing one is named with the command that makes it."""
     out: Path = Path("runs/suite")
-    """Runs, results and tables go to a folder for each table and budget below this one."""
+    """Folder for runs, results and tables, with a folder below it for each table and budget."""
     budget: Budget = "cpu"
-    """"smoke" takes minutes, "cpu" hours on two cores with smaller networks, "paper" the paper's sizes on a GPU."""
+    """Sizes of networks and training: "smoke" takes minutes, "cpu" hours on two cores with smaller networks,
+    "paper" needs a GPU for the paper's sizes."""
     rows: tuple[str, ...] = ()
-    """Only these rows, by key; none means all."""
+    """Keys of the rows to run; none runs all."""
     steps: int = 0
-    """Optimiser steps in place of the budget's, for every row alike; 0 keeps them."""
-    jobs: int = 0
-    """Rows at a time; 0 is one per core (one in all on a GPU)."""
+    """Number of optimiser steps of every row; 0 takes the budget's."""
+    workers: Annotated[int, Renamed("jobs")] = 0
+    """Number of parallel processes, a row in each; 0 is one per core (one in all on a GPU)."""
     seed: int = 0
-    """Of training and of the samples."""
+    """Random seed for training and forecasts."""
     device: str = "cpu"
-    """"cpu" or "cuda"."""
+    """Device that trains and measures: cpu, cuda or auto (cuda where there is one)."""
     precision: TrainPrecision = "float32"
-    """Of matrix products in training (see `python -m predictor.train --help`); measuring is done in float32."""
+    """Precision of matrix products in training (see `python -m predictor.train --help`); measuring is in float32."""
     only_row: str = ""
-    """Run this row in this very process; what the suite itself calls."""
+    """Key of a row to run in this process; the suite starts its processes with it."""
 
-    def check(self) -> None:
-        """Check what can be checked before anything runs.
+    def __post_init__(self) -> None:
+        """Check choices and ranges; `device="auto"` becomes the device that is taken.
 
         Raises:
-            UserError: an unknown row, a missing store, a device that is not there.
+            UserError: an unknown table or row, a number that makes no sense, or a device that is not there.
         """
-        table = TABLES[self.table]
-        keys = [row.key for row in table.rows]
+        check_choices(self)
+        check_at_least(self, 0, "steps", "workers", "seed")
+        keys = [row.key for row in TABLES[self.table].rows]
         for key in (*self.rows, *filter(None, [self.only_row])):
             if key not in keys:
                 raise UserError(f"table '{self.table}' has no row '{key}'; there are {', '.join(keys)}")
-        for name in ("steps", "jobs", "seed"):
-            if getattr(self, name) < 0:
-                raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
-        if self.device.startswith("cuda") and not torch.cuda.is_available():
-            raise UserError(f"device '{self.device}' asked for but torch sees no CUDA device; use --device cpu")
-        if self.precision == "tf32" and not self.device.startswith("cuda"):
-            raise UserError("precision 'tf32' needs a CUDA device; use --precision float32 or --device cuda")
+        object.__setattr__(self, "device", resolve_device(self.device))
+        check_precision(self.precision, self.device)
+
+    def check_stores(self) -> None:
+        """Check that the stores of the table are there.
+
+        Raises:
+            UserError: one is missing; the message has the commands that make them.
+        """
+        table = TABLES[self.table]
         missing = [s for s in (table.train, table.val, *table.tests.values()) if s and not (self.data / s).exists()]
         if missing:
             commands = "; ".join(c.format(data=self.data) for c in table.commands)
@@ -95,13 +100,13 @@ class SuiteConfig:
 
     @property
     def folder(self) -> Path:
-        """Of this table at this budget."""
+        """Folder for this table at this budget."""
         return self.out / f"{self.table}-{self.budget}"
 
     @property
-    def workers(self) -> int:
-        """Rows at a time."""
-        return self.jobs or (1 if self.device.startswith("cuda") else os.cpu_count() or 1)
+    def num_processes(self) -> int:
+        """Number of parallel processes, a row in each."""
+        return self.workers or (1 if self.device.startswith("cuda") else os.cpu_count() or 1)
 
 
 def row_config(config: SuiteConfig, row: Row, out: Path) -> TrainConfig:
@@ -128,7 +133,7 @@ def row_config(config: SuiteConfig, row: Row, out: Path) -> TrainConfig:
         seed=config.seed,
         device=config.device,
         precision=config.precision,
-        threads=0 if config.device != "cpu" else max(1, (os.cpu_count() or 1) // config.workers),
+        threads=0 if config.device != "cpu" else max(1, (os.cpu_count() or 1) // config.num_processes),
         resume=True,
     )
     return replace(base, **row.train)
@@ -142,7 +147,7 @@ def row_folder(config: SuiteConfig, row: Row) -> Path:
         "protocol": [BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, table.test_stride, sizes.test_windows, config.seed],
         "stores": [_fingerprint(config.data / s) for s in (table.train, table.val, *table.tests.values()) if s],
     }
-    if row.model not in ("constant-velocity", "least-squares"):
+    if row.is_trained:
         values = asdict(row_config(config, row, Path()))
         for name in ("data", "val_data", "out", "threads", "device", "data_device", "capture", "resume"):
             del values[name]
@@ -161,7 +166,7 @@ def run_row(config: SuiteConfig, row: Row) -> dict[str, Any]:
     folder.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()
     checkpoint = None
-    if row.model not in ("constant-velocity", "least-squares"):
+    if row.is_trained:
         checkpoint = train(row_config(config, row, folder / "run"))
     trained = time.perf_counter()
     result = {
@@ -177,7 +182,12 @@ def run_row(config: SuiteConfig, row: Row) -> dict[str, Any]:
 
 
 def run_suite(config: SuiteConfig) -> dict[str, Any]:
-    """Run every row that has no result yet, then write the table; returns its content."""
+    """Run every row that has no result yet, then write the table; returns its content.
+
+    Raises:
+        UserError: a missing store.
+    """
+    config.check_stores()
     table = TABLES[config.table]
     chosen = [r for r in table.rows if not config.rows or r.key in config.rows]
     pending = [r for r in chosen if not (row_folder(config, r) / "result.json").exists()]
@@ -203,9 +213,7 @@ def run_suite(config: SuiteConfig) -> dict[str, Any]:
     config.folder.mkdir(parents=True, exist_ok=True)
     write_json(config.folder / "table.json", content)
     for name, text in (("table.md", markdown_report(content)), ("table.tex", latex_table(content))):
-        partial = config.folder / f".{name}.partial"
-        partial.write_text(text)
-        os.replace(partial, config.folder / name)
+        write_text(config.folder / name, text)
     if content["rows"]:
         _plot(config, content["rows"], content["title"])
     return content
@@ -238,7 +246,7 @@ def _run_in_processes(config: SuiteConfig, pending: Sequence[Row]) -> dict[str, 
         task = progress.add_task(f"{config.table}: {len(pending)} rows to run", total=len(pending))
         try:
             while waiting or running:
-                while waiting and len(running) < config.workers:
+                while waiting and len(running) < config.num_processes:
                     row = waiting.pop(0)
                     running[row.key] = _start(config, row)
                 time.sleep(0.5)
@@ -262,8 +270,8 @@ def _start(config: SuiteConfig, row: Row) -> "tuple[subprocess.Popen[bytes], Pat
     log = folder / "log.txt"
     command = [
         sys.executable, "-m", "predictor.suite", "--table", config.table, "--data", str(config.data),
-        "--out", str(config.out), "--budget", config.budget, "--steps", str(config.steps), "--jobs",
-        str(config.workers), "--seed", str(config.seed), "--device", config.device,
+        "--out", str(config.out), "--budget", config.budget, "--steps", str(config.steps), "--workers",
+        str(config.num_processes), "--seed", str(config.seed), "--device", config.device,
         "--precision", config.precision, "--only-row", row.key,
     ]  # fmt: skip
     with log.open("wb") as stream:
@@ -280,10 +288,10 @@ def _fingerprint(path: Path) -> str:
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(SuiteConfig, description=__doc__)
-    config.check()
+    config = parse(SuiteConfig, __doc__)
     tune(config.device)
     if config.only_row:
+        config.check_stores()
         run_row(config, next(r for r in TABLES[config.table].rows if r.key == config.only_row))
         return
     content = run_suite(config)

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch.utils.tensorboard import SummaryWriter
 
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
+from predictor.command_line import parse
 from predictor.errors import UserError, run_entry_point
 from predictor.files import write_json
 from predictor.provenance import provenance
@@ -141,8 +141,7 @@ def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(TrainConfig, description=__doc__)
-    config.check()
+    config = parse(TrainConfig, __doc__)
     checkpoint = train(config)
     print(f"best checkpoint: {checkpoint}")
 

@@ -1,9 +1,11 @@
 """How the tree hangs together: who imports whom, and what no file may hold."""
 
 import ast
+import graphlib
+import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,8 @@ LAYERS = ("predictor", "envs", "agents", "train_policy")
 """From the bottom up; each may import those before it."""
 FOREIGN_TO_PREDICTOR = ("gymnasium", "pettingzoo", "stable_baselines3", "highway_env", "tqdm", "pygame")
 ROOMS = ("predictor", "envs", "agents", "tests", "benchmarks", "docs", ".ci")
+MAX_LINES = 400
+"""Of a module; longer ones are cut in two."""
 TEXT_SUFFIXES = {".py", ".md", ".toml", ".json", ".txt", ".yml", ".yaml", ".cfg", ""}
 
 
@@ -66,6 +70,86 @@ def test_import_contracts_hold(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     monkeypatch.syspath_prepend(ROOT)
     status = lint_imports(config_filename="pyproject.toml", no_cache=True, no_logo=True)
     assert status == 0, capsys.readouterr().out
+
+
+def module_name(path: Path, root: Path = ROOT) -> str:
+    parts = path.relative_to(root).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports_within(path: Path, known: Mapping[str, Path]) -> Iterator[str]:
+    """Modules among `known` that a file imports: at its top, in functions, under TYPE_CHECKING, or by import_module."""
+    for node in ast.walk(ast.parse(path.read_text(), str(path))):
+        if isinstance(node, ast.Import):
+            named = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            inner = [f"{node.module}.{alias.name}" for alias in node.names]
+            named = [name if name in known else str(node.module) for name in inner]
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            named = [node.args[0].value] if isinstance(node.args[0], ast.Constant) else []
+        else:
+            continue
+        yield from (name for name in named if name in known)
+
+
+def import_cycle(paths: Sequence[Path], root: Path = ROOT) -> list[str]:
+    """Returns modules that import each other in a circle, the first one repeated at the end; empty if none do."""
+    known = {module_name(path, root): path for path in paths}
+    arrows = {name: set(imports_within(path, known)) - {name} for name, path in known.items()}
+    try:
+        graphlib.TopologicalSorter(arrows).prepare()
+    except graphlib.CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    """Lazy imports included: a function that imports its importer cannot be read, moved or copied without it."""
+    own = [path for path in sources() if relative(path).split("/")[0] != "tests"]
+    assert len(own) > 100
+    assert import_cycle(own) == []
+
+
+@pytest.mark.parametrize(
+    "back",
+    [
+        "import room.first",
+        "from room import first",
+        "def later():\n    from room.first import NAME",
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from room.first import NAME",
+        "import importlib\nname = importlib.import_module('room.first')",
+    ],
+    ids=["import", "from-package", "in-a-function", "type-checking", "import-module"],
+)
+def test_a_circle_is_found_however_it_is_closed(tmp_path: Path, back: str):
+    (tmp_path / "room").mkdir()
+    files = {name: tmp_path / "room" / f"{name}.py" for name in ("__init__", "first", "second")}
+    files["__init__"].write_text("")
+    files["first"].write_text("from room.second import other\nNAME = 1\n")
+    files["second"].write_text("other = 2\n")
+    assert import_cycle(list(files.values()), tmp_path) == []
+    files["second"].write_text(f"other = 2\n{back}\n")
+    assert set(import_cycle(list(files.values()), tmp_path)) == {"room.first", "room.second"}
+
+
+def test_no_module_is_longer_than_four_hundred_lines():
+    own = [path for path in sources() if relative(path).split("/")[0] != "tests"]
+    lines = {relative(path): len(path.read_text().splitlines()) for path in own}
+    assert max(lines.values()) > 100
+    assert {name: count for name, count in lines.items() if count > MAX_LINES} == {}
+
+
+def test_no_file_hides_a_module_of_the_standard_library():
+    """`python folder/file.py` puts the folder first on the path: its `profile.py` is imported instead of Python's."""
+    files = [*sources(), *(ROOT / "docs").rglob("*.py"), *(ROOT / ".ci").rglob("*.py")]
+    assert [relative(path) for path in files if path.stem in sys.stdlib_module_names] == []
+
+
+def test_no_module_edits_the_search_path():
+    """Commands are run as `python -m package.module` from the root, which needs no other path."""
+    own = [path for path in sources() if relative(path).split("/")[0] not in ("tests", "benchmarks")]
+    own += [path for path in (ROOT / "benchmarks").glob("*.py") if path.name != "reference.py"]  # imports a checkout
+    assert [relative(path) for path in own if re.search(r"\bsys\.path\b", path.read_text())] == []
 
 
 def test_predictor_runs_where_there_is_no_simulator():

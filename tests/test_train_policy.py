@@ -27,12 +27,12 @@ from tests.agents.helpers import TOY, policy_for
 pytestmark = pytest.mark.filterwarnings("ignore:rich is experimental")
 
 TINY = (
-    "--observe", "constant-velocity", "--envs", "1", "--selections", "1", "--selection-episodes", "1",
+    "--observe", "constant-velocity", "--num-envs", "1", "--selections", "1", "--selection-episodes", "1",
     "--eval-episodes", "1", "--checkpoint-every", "1",
 )  # fmt: skip
 PPO = (*TINY, "--steps", "256")  # two rollouts of 128
 DQN = (*TINY, "--algorithm", "dqn", "--steps", "230")  # learns from step 200 on
-TAG = (*TINY[2:], "--env", "simple_tag_v3", "--checkpoint", "constant-velocity", "--steps", "600")
+TAG = (*TINY[2:], "--env-id", "simple_tag_v3", "--checkpoint", "constant-velocity", "--steps", "600")
 """Two rollouts of 100 steps of three pursuers."""
 
 
@@ -49,7 +49,7 @@ def trained(run: Path, *arguments: str) -> tuple[Path, str]:
     """A run and what it printed."""
     printed = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
-        patch.setattr(sys, "argv", ["train_policy.py", *arguments, "--run-dir", str(run)])
+        patch.setattr(sys, "argv", ["train_policy.py", *arguments, "--out", str(run)])
         run_entry_point(train_policy.main)
     return run, printed.getvalue()
 
@@ -112,7 +112,7 @@ def test_best_model_carries_its_result(finished: tuple[Path, str]):
 
 def test_a_finished_policy_is_evaluated_again(finished: tuple[Path, str], monkeypatch: pytest.MonkeyPatch):
     run, _ = finished
-    arguments = ["evaluate.py", "--run-dir", str(run), "--episodes", "1", "--workers", "1"]
+    arguments = ["evaluate.py", "--run-dir", str(run), "--episodes", "1", "--num-envs", "1"]
     monkeypatch.setattr(sys, "argv", arguments)
     run_entry_point(evaluate.main)
     again = json.loads((run / "evaluation" / "summary.json").read_text())
@@ -144,7 +144,7 @@ def test_pursuers_are_evaluated_again(chased: tuple[Path, str], monkeypatch: pyt
 
 
 def test_agents_without_forecasts_learn_and_are_filmed(tmp_path: Path):
-    arguments = [*TINY[2:], "--env", "simple_spread_v3", "--observe", "none", "--steps", "300"]
+    arguments = [*TINY[2:], "--env-id", "simple_spread_v3", "--observe", "none", "--steps", "300"]
     run, printed = trained(tmp_path / "run", *arguments)
     assert json.loads((run / "config.json").read_text())["config"]["learners"] == []
     assert load_model(run / "policy.zip", "ppo").observation_space.shape == (18,)
@@ -156,7 +156,7 @@ def test_agents_without_forecasts_learn_and_are_filmed(tmp_path: Path):
 
 def test_native_environments_train_what_is_measured_on_the_original(tmp_path: Path):
     pytest.importorskip("envpool")
-    arguments = ["--envs", "16", *TINY[4:], "--backend", "envpool", "--checkpoint", "constant-velocity"]
+    arguments = ["--num-envs", "16", *TINY[4:], "--backend", "envpool", "--checkpoint", "constant-velocity"]
     run, _ = trained(tmp_path / "run", *arguments, "--steps", "512", "--no-video")
     config = json.loads((run / "config.json").read_text())["config"]
     assert (config["backend"], config["preset"]["n_steps"]) == ("envpool", 32)
@@ -170,8 +170,8 @@ def test_native_environments_train_what_is_measured_on_the_original(tmp_path: Pa
 
 @pytest.mark.parametrize(("backend", "envs"), [("gymnasium", 6), ("envpool", 64)])
 def test_environments_by_default(backend: Literal["gymnasium", "envpool"], envs: int):
-    assert train_policy.TrainPolicyConfig(backend=backend).num_envs == envs
-    assert train_policy.TrainPolicyConfig(backend=backend, envs=3).num_envs == 3
+    assert train_policy.TrainPolicyConfig(backend=backend).parallel_envs == envs
+    assert train_policy.TrainPolicyConfig(backend=backend, num_envs=3).parallel_envs == 3
 
 
 @pytest.mark.parametrize(
@@ -190,10 +190,11 @@ def test_who_learns(env_id: str, asked: tuple[str, ...] | None, learners: tuple[
 
 
 def test_what_cannot_be_drawn_gives_no_video_and_no_error(tmp_path: Path):
-    config = train_policy.TrainPolicyConfig("CartPole-v1", observe="none", run_dir=tmp_path)
-    assert train_policy.film(config, SB3PPO("MlpPolicy", "CartPole-v1", device="cpu")) is None
-    config = train_policy.TrainPolicyConfig(TOY, observe="none", run_dir=tmp_path)
-    assert train_policy.film(config, policy_for(config.plan.task)) is None
+    config = train_policy.TrainPolicyConfig("CartPole-v1", observe="none", out=tmp_path)
+    model = SB3PPO("MlpPolicy", "CartPole-v1", device="cpu")
+    assert train_policy.film(config.plan.task, model, tmp_path / "video.mp4") is None
+    config = train_policy.TrainPolicyConfig(TOY, observe="none", out=tmp_path)
+    assert train_policy.film(config.plan.task, policy_for(config.plan.task), tmp_path / "video.mp4") is None
     assert not list(tmp_path.iterdir())
 
 
@@ -219,7 +220,7 @@ def test_interrupted_run_goes_on_where_it_was(
     with monkeypatch.context() as patch:
         patch.setattr(SaveCheckpoint, "_on_rollout_start", save_then_die)
         with pytest.raises(SystemExit) as exit_:
-            command(*arguments, "--run-dir", str(run))
+            command(*arguments, "--out", str(run))
     assert exit_.value.code == 130
     interrupted = load_model(run / "checkpoint.zip", algorithm)
     assert interrupted.num_timesteps == interrupted_at
@@ -233,7 +234,7 @@ def test_interrupted_run_goes_on_where_it_was(
         start(self)
 
     monkeypatch.setattr(SaveCheckpoint, "_on_training_start", note_start)
-    command(*arguments, "--run-dir", str(run), "--no-video", "--resume")
+    command(*arguments, "--out", str(run), "--no-video", "--resume")
     assert started_at == [interrupted_at]
     finished = load_model(run / "checkpoint.zip", algorithm)
     assert finished.num_timesteps == int(arguments[-1])
@@ -246,7 +247,7 @@ def test_interrupted_run_goes_on_where_it_was(
 @pytest.mark.slow
 def test_kill_nine_then_resume(command: Callable[..., None], tmp_path: Path):
     run = tmp_path / "run"
-    arguments = [*DQN[:-1], "600", "--run-dir", str(run), "--no-video"]
+    arguments = [*DQN[:-1], "600", "--out", str(run), "--no-video"]
     root = Path(train_policy.__file__).parent
     process = subprocess.Popen([sys.executable, "train_policy.py", *arguments], cwd=root, stderr=subprocess.DEVNULL)
     while not (run / "checkpoint.zip").exists():
@@ -266,17 +267,17 @@ def test_resume_with_another_config_names_the_field(
     run = tmp_path / "run"
     monkeypatch.setattr(train_policy, "train", lambda *arguments: sys.exit(0))
     with pytest.raises(SystemExit):
-        command(*PPO, "--run-dir", str(run))
+        command(*PPO, "--out", str(run))
     before = (run / "config.json").read_bytes()
     capsys.readouterr()
     with pytest.raises(SystemExit) as exit_:
-        command(*PPO, "--run-dir", str(run), "--resume", "--seed", "3")
+        command(*PPO, "--out", str(run), "--resume", "--seed", "3")
     assert exit_.value.code == 2
     assert "seed was 0, now 3" in error_line(capsys)
     with pytest.raises(SystemExit) as exit_:
-        command(*PPO, "--run-dir", str(run))
+        command(*PPO, "--out", str(run))
     assert exit_.value.code == 2
-    assert "exists; choose another --run-dir" in error_line(capsys)
+    assert "exists; choose another --out" in error_line(capsys)
     assert (run / "config.json").read_bytes() == before
 
 
@@ -288,21 +289,24 @@ def test_resume_with_another_config_names_the_field(
         (("--checkpoint", "highway", "--observe", "none"), "has no effect with observe=none"),
         (("--steps", "-5"), "steps must be at least 1, got -5"),
         (("--steps", "0"), "steps must be at least 1, got 0"),
-        (("--envs", "0"), "envs must be at least 1, got 0"),
+        (("--num-envs", "0"), "num_envs must be at least 1, got 0"),
         (("--eval-episodes", "0"), "eval_episodes must be at least 1, got 0"),
         (("--seed", "-1"), "seed must lie in"),
         (("--device", "tpu9"), "device must be cpu, cuda or auto, got 'tpu9'"),
-        (("--env", "nonsense"), "cannot make env 'nonsense'"),
+        (("--env-id", "nonsense"), "cannot make env 'nonsense'"),
         (
-            ("--env", "simple_tag_v3", "--observe", "none", "--learners", "nonsense"),
+            ("--env-id", "simple_tag_v3", "--observe", "none", "--learners", "nonsense"),
             "learners: 'nonsense' is neither an agent nor a role of simple_tag_v3",
         ),
         (("--learners", "adversary"), "learners are for PettingZoo environments, highway-fast-v0 has one ego"),
-        (("--env", "simple_tag_v3", "--partner", "nonsense"), "partner must be one of random, idle, varied"),
-        (("--env", TOY, "--observe", "none", "--learners", "ant"), "no heuristic drives meadow_v0"),
-        (("--env", TOY, "--observe", "constant-velocity"), "no scene reader knows meadow_v0"),
-        (("--backend", "envpool", "--env", "roundabout-generic-v1"), "EnvPool has no copy of 'roundabout-generic-v1'"),
-        (("--backend", "envpool", "--env", "simple_tag_v3"), "backend envpool has no simple_tag_v3"),
+        (("--env-id", "simple_tag_v3", "--driver", "nonsense"), "driver must be one of random, idle, varied"),
+        (("--env-id", TOY, "--observe", "none", "--learners", "ant"), "no heuristic drives meadow_v0"),
+        (("--env-id", TOY, "--observe", "constant-velocity"), "no scene reader knows meadow_v0"),
+        (
+            ("--backend", "envpool", "--env-id", "roundabout-generic-v1"),
+            "EnvPool has no copy of 'roundabout-generic-v1'",
+        ),
+        (("--backend", "envpool", "--env-id", "simple_tag_v3"), "backend envpool has no simple_tag_v3"),
         (
             ("--env-id", "racetrack-v1", "--algorithm", "dqn", "--observe", "none"),
             "dqn needs a discrete action space",
@@ -319,7 +323,7 @@ def test_bad_input_is_one_clear_line_and_leaves_nothing(
 ):
     run = tmp_path / "run"
     with pytest.raises(SystemExit) as exit_:
-        command(*arguments, "--run-dir", str(run))
+        command(*arguments, "--out", str(run))
     assert exit_.value.code == 2
     assert message in error_line(capsys)
     assert not run.exists()
@@ -332,7 +336,7 @@ def test_help_explains_every_field(command: Callable[..., None], capsys: pytest.
     text = " ".join(capsys.readouterr().out.split())
     for option in (
         "--env-id", "--observe", "--checkpoint", "--resume", "--eval-episodes", "--no-video",
-        "--backend", "--learners", "--partner",
+        "--backend", "--learners", "--driver",
     ):  # fmt: skip
         assert option in text
 

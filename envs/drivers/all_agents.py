@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from envs.drivers.sampled_actions import uniform_action, varied_actions
-from envs.readers import parallel_env_id
+from envs.readers import multiagent_env_id
 from envs.readers.mpe import mpe_scenario
 from envs.readers.pursuit import is_pursuit_env
 from predictor.errors import UserError
@@ -127,7 +127,7 @@ def _has_heuristic(env: Any) -> bool:
 def _heuristic(env: Any, rng: np.random.Generator) -> Callable[[str], Chooser]:
     if not _has_heuristic(env):
         raise UserError(
-            f"no heuristic drives {parallel_env_id(env)}, only pursuit and mpe2's {', '.join(_AIMS)}; use "
+            f"no heuristic drives {multiagent_env_id(env)}, only pursuit and mpe2's {', '.join(_AIMS)}; use "
             + ", ".join(name for name in DRIVER_NAMES if name != "heuristic")
         )
     family = _PursuitIntentions(env, rng) if is_pursuit_env(env) else _MpeIntentions(env, rng)

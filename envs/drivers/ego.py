@@ -38,7 +38,7 @@ def make_ego(name: str, env: gym.Env, rng: np.random.Generator) -> Ego:
         return _keep_lane(env, rng)
     if name.endswith(".zip"):
         return _trained(name)
-    raise UserError(f"ego must be one of {', '.join(EGO_NAMES)} or the path of a policy .zip, got '{name}'")
+    raise UserError(f"driver must be one of {', '.join(EGO_NAMES)} or the path of a policy .zip, got '{name}'")
 
 
 def idle_action(env: gym.Env) -> Any:

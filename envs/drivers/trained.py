@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 
 from envs.drivers.all_agents import Driver, make_driver
-from envs.sb3.padded_spaces import SharedObservation, learners_named, own_action, roles_of
+from envs.sb3.padded_spaces import PaddedObservation, learners_named, own_action, roles_of
 from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.errors import UserError
 
@@ -42,7 +42,7 @@ def trained_driver(path: str, env: Any, rng: np.random.Generator) -> Driver:
     sees_forecasts = isinstance(policy.observation_space, gym.spaces.Dict)
     spaces = {agent: _seen_space(env.observation_space(agent), sees_forecasts) for agent in learners}
     actions = {agent: env.action_space(agent) for agent in learners}
-    rows = SharedObservation(spaces, roles_of(spaces, actions), None)
+    rows = PaddedObservation(spaces, roles_of(spaces, actions), None)
     if rows.space != policy.observation_space:
         raise UserError(
             f"policy {path} was trained on {_line(policy.observation_space)}, but the env gives {_line(rows.space)}"

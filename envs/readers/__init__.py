@@ -1,72 +1,81 @@
-"""Scene readers: how to see the agents of an environment. One module per family; `envs.readers.base` has the rules."""
+"""Scene readers: which one reads an environment. One module per family; `envs.readers.base` has the rules.
 
-from collections.abc import Callable
+A `SceneReader` serves a Gymnasium environment with one ego, a `MultiagentReader` a PettingZoo environment. Both kinds
+are registered with `register_reader`, and checked alike when they are made.
+"""
+
 from typing import Any
 
 import gymnasium as gym
 
-from envs.readers.base import Reader, SceneReader, SharedScene, SharedSceneReader, build_reader, perceive, share
+from envs.readers.base import (
+    MakeReader,
+    MultiagentReader,
+    MultiagentScene,
+    Reader,
+    SceneReader,
+    build_multiagent_reader,
+    build_reader,
+    comes_from,
+    pad_multiagent_scene,
+    perceive,
+)
 from envs.readers.entities import EntityRowsReader
 from envs.readers.envpool import EnvPoolReader, is_envpool_env
 from envs.readers.function import FunctionReader
 from envs.readers.highway import HighwayReader, is_highway_env
-from envs.readers.highway_multiagent import HighwaySharedReader
 from envs.readers.mpe import MPE_IDS, MpeReader, is_mpe_env, mpe_scenario
 from envs.readers.pursuit import PursuitReader, is_pursuit_env
-from envs.simulators.highway_multiagent import HighwayParallelEnv
+from envs.simulators import mixed_traffic  # noqa: F401  (registers its ids, as the import of highway-env does)
 from predictor.errors import UserError
 
-MakeSharedReader = Callable[[Any], SharedSceneReader]
-"""From a parallel environment to a reader for it."""
-
-_SHARED_REGISTERED: dict[type, MakeSharedReader] = {}
 __all__ = [
     "EntityRowsReader",
     "EnvPoolReader",
     "FunctionReader",
     "HighwayReader",
     "MakeReader",
+    "MultiagentReader",
+    "MultiagentScene",
     "Reader",
     "SceneReader",
-    "SharedScene",
-    "SharedSceneReader",
+    "multiagent_env_id",
+    "multiagent_reader_for",
+    "pad_multiagent_scene",
     "perceive",
     "reader_for",
     "register_reader",
-    "share",
 ]
-
-MakeReader = Callable[[Any], SceneReader]
-"""From an environment to a reader for it."""
 
 _REGISTERED: dict[type, MakeReader] = {}
 
 
 def register_reader(env_class: type, make_reader: MakeReader) -> None:
-    """Let every wrapper and command know how to read an environment class (and what derives from it).
+    """Registers a reader for an environment class and what derives from it, for every wrapper and command.
 
     Args:
-        env_class: class of the unwrapped environment.
-        make_reader: from an environment (not reset yet) to its reader.
+        env_class: class of the unwrapped environment; of the AEC environment where PettingZoo converts one.
+        make_reader: takes an environment (not reset yet, wrapped or not) and returns its reader: a `SceneReader` for
+            Gymnasium environments, a `MultiagentReader` for PettingZoo's.
     """
     _REGISTERED[env_class] = make_reader
 
 
 def reader_for(env: gym.Env, perception_m: float | None = None, max_agents: int | None = None) -> SceneReader:
-    """The reader that knows this environment: registered for its class, or of a known family.
+    """Returns the reader for an environment with one ego: the one registered for its class, or of a known family.
 
     Args:
-        env: any gymnasium environment, wrapped or not.
+        env: any Gymnasium environment, wrapped or not.
         perception_m: how far the ego sees [m]; None takes the family's default. A registered reader sets its own.
-        max_agents: rows of a scene, the ego included; None takes the family's default.
+        max_agents: size of a scene, the ego included; None takes the family's default.
 
     Raises:
-        UserError: no reader knows the environment.
+        UserError: no reader knows the environment, or the registered one is a `MultiagentReader`.
     """
-    for env_class in type(env.unwrapped).__mro__:
-        if env_class in _REGISTERED:
-            reader: SceneReader = build_reader(_REGISTERED[env_class], env)
-            return reader
+    make_reader = _registered(env)
+    if make_reader is not None:
+        reader: SceneReader = build_reader(make_reader, env)
+        return reader
     if is_highway_env(env):
         return HighwayReader(env, perception_m=perception_m, max_agents=max_agents)
     if is_envpool_env(env):
@@ -78,8 +87,47 @@ def reader_for(env: gym.Env, perception_m: float | None = None, max_agents: int 
     )
 
 
-def parallel_env_id(env: Any) -> str:
-    """What to call the environment in messages: its id where it is listed here, else its own name."""
+def multiagent_reader_for(
+    env: Any, perception_m: float | None = None, max_agents: int | None = None
+) -> MultiagentReader:
+    """Returns the reader for a PettingZoo environment: registered for its class, its own, or of a known family.
+
+    Args:
+        env: a parallel environment, wrapped or not.
+        perception_m: how far an agent sees [m]; None takes the family's default. A registered reader sets its own.
+        max_agents: size of a scene; None takes the family's default. A registered reader sets its own.
+
+    Raises:
+        UserError: no reader knows the environment, or the registered one is for an environment with one ego.
+    """
+    make_reader = _registered(env)
+    if make_reader is not None:
+        reader: MultiagentReader = build_multiagent_reader(make_reader, env)
+        return reader
+    if comes_from(env, "envs.simulators.highway_multiagent"):
+        from envs.readers.highway_multiagent import HighwayMultiagentReader  # needs PettingZoo
+
+        return HighwayMultiagentReader(env, perception_m, max_agents)
+    if getattr(env, "make_scene_reader", None) is not None:
+        given = {"perception_m": perception_m, "max_agents": max_agents}
+
+        def make_scene_reader(env: Any) -> Any:
+            return env.make_scene_reader(**{name: value for name, value in given.items() if value is not None})
+
+        reader = build_multiagent_reader(make_scene_reader, env)
+        return reader
+    if is_mpe_env(env):
+        return MpeReader(env, max_agents=max_agents, perception_m=perception_m)
+    if is_pursuit_env(env):
+        return PursuitReader(env, max_agents=max_agents, perception_m=perception_m)
+    raise UserError(
+        f"no scene reader knows {multiagent_env_id(env)}; pass reader= (any MultiagentReader), give the environment a "
+        "make_scene_reader() method, or call register_reader for its class; see docs/wrap_your_env.md"
+    )
+
+
+def multiagent_env_id(env: Any) -> str:
+    """Returns what messages call a PettingZoo environment: its id where it is listed here, else its own name."""
     scenario = mpe_scenario(env)
     for env_id in MPE_IDS:
         if scenario and env_id.rpartition("_v")[0] == scenario:
@@ -88,42 +136,5 @@ def parallel_env_id(env: Any) -> str:
     return str(metadata.get("name", type(env.unwrapped).__name__))
 
 
-def register_shared_reader(env_class: type, make_reader: MakeSharedReader) -> None:
-    """Let every wrapper and command know how to read a parallel environment class (and what derives from it).
-
-    Args:
-        env_class: class of the unwrapped environment; of the AEC environment where PettingZoo converts one.
-        make_reader: from an environment (not reset yet, wrapped or not) to its reader.
-    """
-    _SHARED_REGISTERED[env_class] = make_reader
-
-
-def shared_reader_for(env: Any, perception_m: float | None = None, max_agents: int | None = None) -> SharedSceneReader:
-    """The reader that knows this environment: registered for its class, its own, or of a known family.
-
-    Args:
-        env: a parallel environment, wrapped or not.
-        perception_m: how far an agent sees [m]; None takes the family's default. A registered reader sets its own.
-        max_agents: rows of a scene; None takes the family's default. A registered reader sets its own.
-
-    Raises:
-        UserError: no reader knows the environment.
-    """
-    for env_class in type(env.unwrapped).__mro__:
-        if env_class in _SHARED_REGISTERED:
-            return _SHARED_REGISTERED[env_class](env)
-    if isinstance(env.unwrapped, HighwayParallelEnv):
-        return HighwaySharedReader(env, perception_m, max_agents)
-    own = getattr(env, "make_scene_reader", None)
-    if own is not None:
-        given = {"perception_m": perception_m, "max_agents": max_agents}
-        reader: SharedSceneReader = own(**{name: value for name, value in given.items() if value is not None})
-        return reader
-    if is_mpe_env(env):
-        return MpeReader(env, max_agents=max_agents, perception_m=perception_m)
-    if is_pursuit_env(env):
-        return PursuitReader(env, max_agents=max_agents, perception_m=perception_m)
-    raise UserError(
-        f"no scene reader knows {parallel_env_id(env)}; pass reader= (any SharedSceneReader), give the environment a "
-        "make_scene_reader() method, or call register_shared_reader for its class; see docs/wrap_your_env.md"
-    )
+def _registered(env: Any) -> MakeReader | None:
+    return next((_REGISTERED[kind] for kind in type(env.unwrapped).__mro__ if kind in _REGISTERED), None)

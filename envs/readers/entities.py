@@ -25,9 +25,12 @@ _HEADINGS = ("heading", "cos_h", "sin_h")
 class EntityRowsReader:
     """Makes readers of the env's own observation, a Box of entities × columns (or the same as one row of numbers).
 
+        >>> from envs import ForecastObservation, make_env
         >>> columns = ("presence", "x", "y", "vx", "vy")
-        >>> reader = EntityRowsReader(columns, SceneSpec(dt_s=0.1), gate_m=1.0)
-        >>> ForecastObservation(env, checkpoint, reader=reader)
+        >>> observation = {"type": "Kinematics", "features": [*columns], "absolute": True, "normalize": False}
+        >>> env = make_env("highway-fast-v0", config={"observation": observation})
+        >>> reader = EntityRowsReader(columns, SceneSpec(dt_s=1.0))
+        >>> env = ForecastObservation(env, "highway", reader=reader)
 
     An observation that is clipped cannot be undone: take it without, or with bounds that are never met.
     """
@@ -37,9 +40,9 @@ class EntityRowsReader:
     "presence", more than 0.5 where there is an agent; "id"; the heading as "heading" or as "cos_h" and "sin_h", of
     which the ego's is used; further features by their names in the spec. Others ("") are skipped."""
     spec: SceneSpec
-    """What the scenes look like. Features beyond the kinematic ones need a column of that name."""
+    """Layout of the scenes. Features beyond the kinematic ones need a column of that name."""
     gate_m: float = 10.0
-    """Without an "id" column: who is found at this distance or more from where its motion led is somebody new [m]; see
+    """Without an "id" column: an agent found at this distance or more from where its motion led is a new one [m]; see
     `envs.readers.identity`. The default is for cars at 1 s per step; less where agents are closer."""
     scales: tuple[float, ...] | None = None
     """What 1.0 is in SI units, for each column, where the observation is normalised; None takes SI units."""
@@ -54,7 +57,7 @@ class EntityRowsReader:
     """Without an "id" column: for how many steps an agent that is out of sight is remembered."""
 
     def __post_init__(self) -> None:
-        """Check that columns, scales and spec fit together."""
+        """Checks that columns, scales and spec fit together."""
         named = [name for name in self.columns if name]
         needed = (*_KINEMATIC[self.spec.position_dim - 2], *self.spec.feature_names[2 * self.spec.position_dim :])
         missing = [name for name in needed if name not in named]
@@ -75,7 +78,7 @@ class EntityRowsReader:
             )
 
     def __call__(self, env: gym.Env) -> Reader:
-        """A reader for this environment.
+        """Returns a reader for this environment.
 
         Raises:
             UserError: its observation does not have these columns.
@@ -87,7 +90,7 @@ class EntityRowsReader:
         return _EntityRows(self)
 
     def rows_of(self, observation: Any) -> Float[np.ndarray, "entities columns"]:
-        """The table of an observation, in SI units, float64.
+        """Returns the table of an observation, in SI units, float64.
 
         Raises:
             UserError: it does not have these columns.
@@ -104,7 +107,7 @@ class EntityRowsReader:
 
 
 class _EntityRows(Reader):
-    """What `EntityRowsReader` makes; the work is done once per observation, in `see`."""
+    """Reader that `EntityRowsReader` makes; the work is done once per observation, in `see`."""
 
     def __init__(self, config: EntityRowsReader) -> None:
         super().__init__(config.spec)
@@ -150,7 +153,7 @@ class _EntityRows(Reader):
         return present
 
     def _restore(self, states: Float[np.ndarray, "agents state"]) -> None:
-        """World positions and velocities, in place."""
+        """Makes positions and velocities those of the world, in place."""
         axes = self.spec.position_dim
         if self._config.dead_reckoning:
             velocity = states[0, axes : 2 * axes].copy()

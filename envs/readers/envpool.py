@@ -1,8 +1,8 @@
 """Reads scenes out of EnvPool's native highway environments (EnvPool ≥ 1.2.5): of one environment, or of a whole pool.
 
 Sees what a perception system could: position, speed and heading. Lanes, routes, driver parameters and the order of the
-simulator's list are not used; who is who between two steps is told from the motion alone. The ego knows itself: it is
-the list's first vehicle. Parking, lane keeping and the multi-agent intersection are not covered.
+simulator's list are not used; agents are re-identified between two steps by their motion alone. The ego is the list's
+first vehicle. Parking, lane keeping and the multi-agent intersection are not covered.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,17 +31,17 @@ _STATE = tuple(map(attrgetter, ("x", "y", "speed", "heading")))
 
 
 class NativeEnv(Protocol):
-    """What `EnvPoolReader` needs of an environment."""
+    """Part of an environment that `EnvPoolReader` needs."""
 
     task_id: str
     native_config: Mapping[str, Any]
 
     def debug_states(self) -> Sequence[Any]:
-        """EnvPool's own description of the one environment."""
+        """Returns EnvPool's own description of the one environment."""
 
 
 def is_envpool_env(env: gym.Env) -> bool:
-    """Whether the environment is one of EnvPool's highway environments behind `envs.simulators.envpool.EnvPoolEnv`."""
+    """Returns whether the environment is one of EnvPool's, behind `envs.simulators.envpool.EnvPoolEnv`."""
     inner = env.unwrapped
     return getattr(inner, "task_id", None) in HIGHWAY_ENV_OF and hasattr(inner, "debug_states")
 
@@ -49,13 +49,13 @@ def is_envpool_env(env: gym.Env) -> bool:
 def native_spec(
     task_id: str, config: Mapping[str, Any], perception_m: float | None = None, max_agents: int | None = None
 ) -> SceneSpec:
-    """Layout of a task's scenes: what `HighwayReader` gives for the id that it mirrors.
+    """Returns the layout of a task's scenes, as `HighwayReader` has it for the id that it copies.
 
     Args:
         task_id: a key of `HIGHWAY_ENV_OF`.
         config: EnvPool's, with `simulation_frequency` and `policy_frequency`.
         perception_m: how far the ego sees [m]; None takes `SceneSpec`'s default.
-        max_agents: rows of a scene, the ego included; None takes `SceneSpec`'s default.
+        max_agents: size of a scene, the ego included; None takes `SceneSpec`'s default.
 
     Raises:
         UserError: a task that is not covered, or numbers that make no spec.
@@ -71,81 +71,81 @@ def native_spec(
 
 
 class PoolIdentity:
-    """`IdentityTracker` for many environments in one go: the same costs, pairs and numbers.
+    """Numbers the agents of many environments at once, with the costs, pairs and numbers of `IdentityTracker`.
 
-    Nearly always each agent's cheapest observation is nobody else's; that is the best pairing then, and one argmin over
-    all rows finds it. The rest is paired row by row.
+    If no two agents have the same cheapest observation, taking each agent's cheapest is optimal, and one argmin over
+    all environments finds it. The other environments are paired one by one.
 
     Args:
-        rows: parallel environments.
+        envs: number of parallel environments.
         gate_m: an agent is not found again at this cost or more [m].
     """
 
-    def __init__(self, rows: int, gate_m: float = GATE_M) -> None:
-        """Start with nobody known."""
+    def __init__(self, envs: int, gate_m: float = GATE_M) -> None:
+        """Starts without known agents."""
         self._gate_m = gate_m
-        self._next_id = np.zeros(rows, dtype=np.int64)
-        self._ids: np.ndarray = np.zeros((rows, 0), dtype=np.int64)
-        self._known: np.ndarray = np.zeros((rows, 0), dtype=np.bool_)
-        self._place = np.zeros((rows, 0, 2))
-        self._motion = np.zeros((rows, 0, 2))
+        self._next_id = np.zeros(envs, dtype=np.int64)
+        self._ids: np.ndarray = np.zeros((envs, 0), dtype=np.int64)
+        self._known: np.ndarray = np.zeros((envs, 0), dtype=np.bool_)
+        self._place = np.zeros((envs, 0, 2))
+        self._motion = np.zeros((envs, 0, 2))
 
-    def reset(self, rows: Int[np.ndarray, " some"]) -> None:
-        """Forget everyone in some rows; their numbering starts anew at 0."""
-        self._next_id[rows] = 0
-        self._known[rows] = False
+    def reset(self, envs: Int[np.ndarray, " some"]) -> None:
+        """Forgets the agents of some environments; their numbering starts anew at 0."""
+        self._next_id[envs] = 0
+        self._known[envs] = False
 
     def update(
         self,
         place: Float[np.ndarray, "some agents 2"],
         motion: Float[np.ndarray, "some agents 2"],
         present: Bool[np.ndarray, "some agents"],
-        rows: Int[np.ndarray, " some"],
+        envs: Int[np.ndarray, " some"],
         passed_s: Float[np.ndarray, " some"],
     ) -> Int[np.ndarray, "some agents"]:
-        """Take in one step of some rows; the number of each agent, -1 where none is present.
+        """Takes in one step of some environments; returns the number of each agent, -1 where none is present.
 
         Args:
             place: positions [m].
             motion: velocities [m/s].
             present: which entries hold an agent.
-            rows: which environments these are.
-            passed_s: time since each row's last update [s]; 0 repeats it.
+            envs: which environments these are.
+            passed_s: time since each environment's last update [s]; 0 repeats it.
         """
         if not place.shape[1]:
             return np.zeros(present.shape, dtype=np.int64)
         self._make_room(place.shape[1])
-        cost = self._costs(place, motion, present, rows, passed_s)
+        cost = self._costs(place, motion, present, envs, passed_s)
         first = cost.argmin(axis=2)
         near = np.take_along_axis(cost, first[:, :, None], axis=2)[:, :, 0] < self._gate_m
         found = np.full(present.shape, PADDING_ID, dtype=np.int64)
         some, known = np.nonzero(near)
-        found[some, first[some, known]] = self._ids[rows[some], known]
+        found[some, first[some, known]] = self._ids[envs[some], known]
         for i in np.flatnonzero((found != PADDING_ID).sum(axis=1) != near.sum(axis=1)):
             found[i] = PADDING_ID
             agents, seen = best_pairs(cost[i], self._gate_m)
-            found[i, seen] = self._ids[rows[i], agents]
+            found[i, seen] = self._ids[envs[i], agents]
         fresh = present & (found == PADDING_ID)
-        found[fresh] = (self._next_id[rows, None] + fresh.cumsum(axis=1) - 1)[fresh]
-        self._next_id[rows] += fresh.sum(axis=1)
+        found[fresh] = (self._next_id[envs, None] + fresh.cumsum(axis=1) - 1)[fresh]
+        self._next_id[envs] += fresh.sum(axis=1)
         width = place.shape[1]
-        self._known[rows] = False
-        self._ids[rows, :width], self._known[rows, :width] = found, present
-        self._place[rows, :width], self._motion[rows, :width] = place, motion
+        self._known[envs] = False
+        self._ids[envs, :width], self._known[envs, :width] = found, present
+        self._place[envs, :width], self._motion[envs, :width] = place, motion
         return found
 
     def _costs(
-        self, place: np.ndarray, motion: np.ndarray, present: np.ndarray, rows: np.ndarray, passed_s: np.ndarray
+        self, place: np.ndarray, motion: np.ndarray, present: np.ndarray, envs: np.ndarray, passed_s: np.ndarray
     ) -> Float[np.ndarray, "some known agents"]:
         # Both parts of the cost are differences between something of the old and something of the new alone.
         half_s, weight_s = 0.5 * passed_s[:, None, None], _CHANGE_WEIGHT * passed_s[:, None, None]
-        old_motion = self._motion[rows]
-        old = np.concatenate([self._place[rows] + old_motion * half_s, old_motion * weight_s], axis=-1)
+        old_motion = self._motion[envs]
+        old = np.concatenate([self._place[envs] + old_motion * half_s, old_motion * weight_s], axis=-1)
         new = np.concatenate([place - motion * half_s, motion * weight_s], axis=-1)
-        squares = np.zeros((len(rows), old.shape[1], new.shape[1]))
+        squares = np.zeros((len(envs), old.shape[1], new.shape[1]))
         for column in range(old.shape[-1]):
             squares += np.square(new[:, None, :, column] - old[:, :, None, column])
-        squares[~(self._known[rows][:, :, None] & present[:, None])] = np.inf
+        squares[~(self._known[envs][:, :, None] & present[:, None])] = np.inf
         return np.sqrt(squares, out=squares)
 
     def _make_room(self, agents: int) -> None:
@@ -157,66 +157,66 @@ class PoolIdentity:
 
 
 class PoolReader:
-    """Reads the scenes of a pool's environments, all rows in one go.
+    """Reads the scenes of all environments of a pool at once.
 
-    A row whose clock stands at 0 begins a new episode; reading twice at the same instant changes nothing.
+    An environment whose clock is at 0 begins a new episode; reading twice at the same instant changes nothing.
 
     Args:
         spec: layout of the scenes; its `perception_m` and `max_agents` decide what is perceived.
-        rows: environments of the pool.
+        envs: number of environments of the pool.
     """
 
-    def __init__(self, spec: SceneSpec, rows: int) -> None:
-        """Know nobody."""
+    def __init__(self, spec: SceneSpec, envs: int) -> None:
+        """Starts without known agents."""
         self.spec = spec
-        self._identity = PoolIdentity(rows)
-        self._step = np.zeros(rows, dtype=np.int64)
+        self._identity = PoolIdentity(envs)
+        self._step = np.zeros(envs, dtype=np.int64)
 
-    def reset(self, rows: Int[np.ndarray, " some"]) -> None:
-        """Forget all identities of some rows: a new episode has begun."""
-        self._identity.reset(rows)
-        self._step[rows] = 0
+    def reset(self, envs: Int[np.ndarray, " some"]) -> None:
+        """Forgets all identities of some environments: a new episode has begun."""
+        self._identity.reset(envs)
+        self._step[envs] = 0
 
-    def read(self, states: Sequence[Any], rows: Int[np.ndarray, " some"]) -> SceneBatch:
-        """What each ego perceives, as `envs.readers.base.perceive` has it for one environment.
+    def read(self, states: Sequence[Any], envs: Int[np.ndarray, " some"]) -> SceneBatch:
+        """Returns what each ego perceives, as `envs.readers.base.perceive` has it for one environment.
 
         Args:
-            states: `debug_states()` of these rows.
-            rows: which environments these are.
+            states: `debug_states()` of these environments.
+            envs: which environments these are.
         """
-        return perceive_batch(self.read_all(states, rows), self.spec)
+        return perceive_batch(self.read_all(states, envs), self.spec)
 
-    def read_all(self, states: Sequence[Any], rows: Int[np.ndarray, " some"]) -> SceneBatch:
-        """Everyone, ego first, padded to the fullest row.
+    def read_all(self, states: Sequence[Any], envs: Int[np.ndarray, " some"]) -> SceneBatch:
+        """Returns all agents, ego first, padded to the fullest scene.
 
         Raises:
             UserError: a vehicle whose state is not finite.
         """
         kinematics, valid = vehicles_of(states)
         step = np.fromiter(map(attrgetter("elapsed_step"), states), np.int64, len(states))
-        self._identity.reset(rows[(step == 0) | (step < self._step[rows])])
-        passed_s = np.maximum(step - self._step[rows], 0) * self.spec.dt_s
-        self._step[rows] = step
+        self._identity.reset(envs[(step == 0) | (step < self._step[envs])])
+        passed_s = np.maximum(step - self._step[envs], 0) * self.spec.dt_s
+        self._step[envs] = step
         scenes = np.empty_like(kinematics)
         scenes[..., :2] = kinematics[..., :2]
         np.multiply(kinematics[..., 2], np.cos(kinematics[..., 3]), out=scenes[..., 2])
         np.multiply(kinematics[..., 2], np.sin(kinematics[..., 3]), out=scenes[..., 3])
         ids = np.zeros(valid.shape, dtype=np.int64)
-        ids[:, 1:] = 1 + self._identity.update(scenes[:, 1:, :2], scenes[:, 1:, 2:], valid[:, 1:], rows, passed_s)
+        ids[:, 1:] = 1 + self._identity.update(scenes[:, 1:, :2], scenes[:, 1:, 2:], valid[:, 1:], envs, passed_s)
         ids[~valid] = PADDING_ID
         return SceneBatch(scenes, ids, valid, kinematics[:, 0, 3].copy())
 
 
 def vehicles_of(
     states: Sequence[Any],
-) -> tuple[Float[np.ndarray, "rows agents 4"], Bool[np.ndarray, "rows agents"]]:
-    """Position, speed and heading of each vehicle of each environment, ego first, zeros in padded entries.
+) -> tuple[Float[np.ndarray, "envs agents 4"], Bool[np.ndarray, "envs agents"]]:
+    """Returns position, speed and heading of each vehicle of each environment, ego first, zeros in padded entries.
 
     Raises:
         UserError: a vehicle whose state is not finite.
     """
     lists = [state.vehicles for state in states]  # each access copies the list out of the simulator
-    vehicles = [vehicle for row in lists for vehicle in row]
+    vehicles = [vehicle for listed in lists for vehicle in listed]
     counts = np.fromiter(map(len, lists), np.int64, len(lists))
     valid = np.arange(counts.max(initial=0)) < counts[:, None]
     kinematics = np.zeros((*valid.shape, len(_STATE)))
@@ -233,14 +233,14 @@ class EnvPoolReader(Reader):
     Args:
         env: the environment; its frequencies give `dt_s`, its task the frame.
         perception_m: how far the ego sees [m]; None takes `SceneSpec`'s default.
-        max_agents: rows of a scene, the ego included; None takes `SceneSpec`'s default.
+        max_agents: size of a scene, the ego included; None takes `SceneSpec`'s default.
 
     Raises:
         UserError: not such an environment.
     """
 
     def __init__(self, env: gym.Env, perception_m: float | None = None, max_agents: int | None = None) -> None:
-        """Derive the spec from the environment."""
+        """Derives the spec from the environment."""
         if not is_envpool_env(env):
             raise UserError(
                 f"EnvPoolReader needs an EnvPoolEnv (envs.simulators.envpool), got {type(env.unwrapped).__name__}"
@@ -251,11 +251,11 @@ class EnvPoolReader(Reader):
         self._pool = PoolReader(self._spec, 1)
 
     def reset(self) -> None:
-        """Forget all identities; numbering starts anew, so equal seeds give equal ids."""
+        """Forgets all identities; numbering starts anew, so equal seeds give equal ids."""
         self._pool.reset(self._rows)
 
     def read_all(self, env: gym.Env) -> Scene:
-        """Every vehicle on the road, ego first, unpadded: ground truth for collection and evaluation."""
+        """Returns every vehicle on the road, ego first, unpadded: ground truth for collection and evaluation."""
         native: NativeEnv = env.unwrapped  # type: ignore[assignment]
         scenes = self._pool.read_all(native.debug_states(), self._rows)
         return Scene(scenes.states[0], scenes.ids[0], scenes.valid[0], float(scenes.heading_rad[0]))

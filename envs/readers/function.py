@@ -1,4 +1,4 @@
-"""A plain function as a reader: `FunctionReader(read, spec)`, for environments that name their agents themselves."""
+"""Makes a reader of a plain function, `FunctionReader(read, spec)`: for environments that number their agents."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,26 +11,30 @@ from predictor.scene import Scene, SceneSpec
 
 @dataclass(frozen=True)
 class FunctionReader:
-    """Makes readers of a function that says who is there; what the ego perceives of it is decided as everywhere.
+    """Makes readers of a function that reports all agents; what the ego perceives is decided as for every reader.
 
-        >>> def read_walkers(env) -> Scene:
-        ...     world = env.unwrapped
-        ...     return Scene(world.states, world.ids, np.ones(len(world.ids), dtype=bool))
-        >>> reader = FunctionReader(read_walkers, SceneSpec(dt_s=0.1))
-        >>> ForecastObservation(env, checkpoint, reader=reader)
-        >>> register_reader(MyEnv, reader)  # from then on, no wrapper and no command needs to be told
+        >>> import numpy as np
+        >>> from envs import ForecastObservation, make_env
+        >>> def read_cars(env) -> Scene:
+        ...     cars = env.unwrapped.road.vehicles  # the ego is the first
+        ...     states = np.array([[*car.position, *car.velocity] for car in cars])
+        ...     return Scene(states, np.array([id(car) for car in cars]), np.ones(len(cars), dtype=bool))
+        >>> reader = FunctionReader(read_cars, SceneSpec(dt_s=1.0))
+        >>> env = ForecastObservation(make_env("highway-fast-v0"), "highway", reader=reader)
+
+    After `register_reader(MyEnv, reader)` no wrapper and no command needs `reader=` for environments of that class.
 
     It can be pickled, for environments in processes of their own, if the function can: one at the top of a module.
     """
 
     read: Callable[[Any], Scene]
-    """From the environment (as it was wrapped; `env.unwrapped` is the innermost) to everyone in it: ego first, any
-    number of rows, an id that stays with its agent."""
+    """Function of the environment (as it was wrapped; `env.unwrapped` is innermost) that returns all its agents: ego
+    first, any number of them, each with an id that stays with it."""
     spec: SceneSpec
-    """What the scenes look like; `dt_s` has no default."""
+    """Layout of the scenes; `dt_s` has no default."""
 
     def __post_init__(self) -> None:
-        """Check that a function and a spec are what was given."""
+        """Checks that a function and a spec were given."""
         if not callable(self.read) or not isinstance(self.spec, SceneSpec):
             raise UserError(
                 "FunctionReader needs a function read(env) -> Scene and a SceneSpec, got "
@@ -38,7 +42,7 @@ class FunctionReader:
             )
 
     def __call__(self, env: Any) -> Reader:
-        """A reader for this environment."""
+        """Returns a reader for this environment."""
         return _Reading(self)
 
 

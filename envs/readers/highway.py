@@ -5,7 +5,6 @@ Sees what a perception system could: vehicles within `perception_m`, the nearest
 parameters.
 """
 
-import weakref
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -16,6 +15,7 @@ from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.vehicle.kinematics import Vehicle
 
 from envs.readers.base import Reader
+from envs.readers.identity import IdentityDict
 from predictor.errors import ProtocolError, UserError
 from predictor.scene import KINEMATIC_FEATURES, AxisFrame, Scene, SceneSpec
 
@@ -31,12 +31,12 @@ _FRAMES: dict[str, tuple[AxisFrame, AxisFrame]] = {
 
 
 def is_highway_env(env: gym.Env) -> bool:
-    """Whether the environment comes from highway-env."""
+    """Returns whether the environment comes from highway-env."""
     return isinstance(env.unwrapped, AbstractEnv)
 
 
 def vehicles_of(env: gym.Env) -> list[Vehicle]:
-    """Every vehicle on the road, ego first: the rows of `HighwayReader.read_all`.
+    """Returns every vehicle on the road, ego first, in the order of `HighwayReader.read_all`.
 
     Raises:
         ProtocolError: before the first reset.
@@ -48,7 +48,7 @@ def vehicles_of(env: gym.Env) -> list[Vehicle]:
 
 
 def _dt_s(config: dict[str, Any]) -> float:
-    """What a policy step really simulates: whole simulation frames, rounded down."""
+    """Returns the time that a policy step really simulates: whole simulation frames, rounded down."""
     frames = config["simulation_frequency"] // config["policy_frequency"]
     return float(frames / config["simulation_frequency"])
 
@@ -59,11 +59,11 @@ class HighwayReader(Reader):
     Args:
         env: the environment; its `policy_frequency` gives `dt_s`, its id the frame.
         perception_m: how far the ego sees [m]; None takes `SceneSpec`'s default.
-        max_agents: rows of a scene, the ego included; None takes `SceneSpec`'s default.
+        max_agents: size of a scene, the ego included; None takes `SceneSpec`'s default.
     """
 
     def __init__(self, env: gym.Env, perception_m: float | None = None, max_agents: int | None = None) -> None:
-        """Derive the spec from the environment."""
+        """Derives the spec from the environment."""
         if not is_highway_env(env):
             raise UserError(f"HighwayReader needs a highway-env environment, got {env.unwrapped.__class__.__name__}")
         config = env.unwrapped.config  # type: ignore[attr-defined]
@@ -77,17 +77,16 @@ class HighwayReader(Reader):
         self.reset()
 
     def reset(self) -> None:
-        """Forget all identities; numbering starts anew, so equal seeds give equal ids."""
-        # Keyed by the living object: id() is reused after garbage collection and would join two vehicles.
-        self._ids: weakref.WeakKeyDictionary[Vehicle, int] = weakref.WeakKeyDictionary()
+        """Forgets all identities; numbering starts anew, so equal seeds give equal ids."""
+        self._ids: IdentityDict[int] = IdentityDict()
         self._next_id = 0
 
     def read_all(self, env: gym.Env) -> Scene:
-        """Every vehicle on the road, ego first, unpadded: ground truth for collection and evaluation."""
+        """Returns every vehicle on the road, ego first, unpadded: ground truth for collection and evaluation."""
         return self.read_vehicles(env, vehicles_of(env))
 
     def read_vehicles(self, env: gym.Env, vehicles: Sequence[Vehicle]) -> Scene:
-        """These vehicles of the environment, a row each; the heading is the first one's.
+        """Returns a scene of these vehicles of the environment; the heading is the first one's.
 
         Raises:
             UserError: the environment's time step is no longer the one of the spec.

@@ -1,4 +1,4 @@
-"""Who follows whom in highway-env, read from the drivers themselves: labels for training and for scores.
+"""Leaders and followers in highway-env, read from the drivers themselves: labels for training and for scores.
 
 A vehicle driven by the intelligent driver model (IDM) brakes for the vehicle in front of it on its lane, and while it
 changes lane for the one on the lane it changes to as well. Those are its leaders. highway-env's linear drivers, and the
@@ -39,20 +39,20 @@ MAX_TIME_GAP_S = 10.0
 
 @dataclass(frozen=True)
 class SceneLabels:
-    """The edges of one instant, in the order of the rows of `HighwayReader.read_all`."""
+    """Edges at one instant, agents in the order of `HighwayReader.read_all`."""
 
     edge_types: Int[np.ndarray, "agents agents"]
-    """int8, receiver first: LEADER, NO_EDGE or UNKNOWN. Unknown is who receives without an IDM driver (the ego), the
-    pair of an agent with itself, and all but the leaders of one that yields to an unnamed other by a crossing's rules.
+    """int8, receiver first: LEADER, NO_EDGE or UNKNOWN. Unknown are the edges to an agent without an IDM driver (the
+    ego), those of an agent with itself, and all but the leaders of one that yields to another by a crossing's rules.
     """
     edge_attributes: Float[np.ndarray, "agents agents attributes"]
     """float32, named in `ATTRIBUTE_NAMES`; zeros without a leader edge."""
 
 
 def read_labels(env: gym.Env) -> SceneLabels:
-    """The edges between the vehicles that are on the road now; changes nothing in the simulation.
+    """Returns the edges between the vehicles on the road; changes nothing in the simulation.
 
-    Obstacles are no agents: who follows one has no leader, since a driver does not react to what is beyond.
+    Obstacles are no agents: a vehicle that follows one has no leader, since a driver does not react to what is beyond.
     """
     vehicles = vehicles_of(env)
     row = {vehicle: i for i, vehicle in enumerate(vehicles)}
@@ -75,10 +75,10 @@ def read_labels(env: gym.Env) -> SceneLabels:
 
 
 def leaders_of(vehicle: IDMVehicle) -> dict[RoadObject, float]:
-    """Whom the driver brakes for in `IDMVehicle.act`, with the headway [m]: on its lane, and on the one it changes to.
+    """Returns the vehicles that the driver brakes for, on its lane and on the one it changes to, with headways [m].
 
     IDM reacts to its leader however far it is; a linear driver only to one that is slower, or nearer than it wishes.
-    A driver that has crashed reacts to nobody. The headway is the driver's own: its lane is extended past its end, and
+    A driver that has crashed does not react. The headway is the driver's own: its lane is extended past its end, and
     the sign is lost in a square. So it is short of the road between two vehicles where the lane bends, and drivers who
     leave intersection-v2 brake for oncoming ones, as near as they are: highway-env takes the lanes for connected.
     """
@@ -93,7 +93,7 @@ def leaders_of(vehicle: IDMVehicle) -> dict[RoadObject, float]:
 
 
 def driver_kind(vehicle: IDMVehicle) -> int:
-    """Place of the driver's law of acceleration in `envs.simulators.mixed_traffic.DRIVER_KINDS`, or OTHER_KIND."""
+    """Returns the index of the driver's law in `envs.simulators.mixed_traffic.DRIVER_KINDS`, or OTHER_KIND."""
     if isinstance(vehicle, MixedDriver):
         return DRIVER_KINDS.index(vehicle.traits.kind)
     if isinstance(vehicle, LinearVehicle):
@@ -102,13 +102,13 @@ def driver_kind(vehicle: IDMVehicle) -> int:
 
 
 def desired_speed_mps(vehicle: IDMVehicle) -> float:
-    """The speed that the driver would keep with nobody ahead, now: 0 while it yields. IDM heeds its lane's limit."""
+    """Returns the speed that the driver would keep on a free road now: 0 while it yields; IDM keeps to lane limits."""
     limit_mps = vehicle.lane.speed_limit if driver_kind(vehicle) == DRIVER_KINDS.index("idm") else None
     return float(vehicle.target_speed if limit_mps is None else np.clip(vehicle.target_speed, 0, limit_mps))
 
 
 def with_labels(episode: Episode, scenes: Sequence[Scene], labels: Sequence[SceneLabels]) -> Episode:
-    """The episode with the labels of its scenes, moved from the scenes' rows to the episode's columns."""
+    """Returns the episode with the labels of its scenes, moved from the scenes' order to the episode's columns."""
     column = {int(agent): i for i, agent in enumerate(episode.ids)}
     types = np.full((*episode.valid.shape, len(column)), UNKNOWN, dtype=np.int8)
     attributes = np.zeros((*types.shape, len(ATTRIBUTE_NAMES)), dtype=np.float32)

@@ -8,57 +8,57 @@ from typing import Any
 import numpy as np
 from pettingzoo import ParallelEnv
 
-from envs.readers.base import SharedScene, share
+from envs.readers.base import MultiagentScene, pad_multiagent_scene
 from envs.readers.highway import HighwayReader
 from envs.simulators.highway_multiagent import HighwayParallelEnv
 from predictor.errors import UserError
 from predictor.scene import SceneSpec
 
 
-class HighwaySharedReader:
-    """Reads every vehicle on the road of a `HighwayParallelEnv`, learners and traffic; nobody is the ego.
+class HighwayMultiagentReader:
+    """Reads every vehicle on the road of a `HighwayParallelEnv`, learners and traffic; none is the ego.
 
-    An agent has a row as long as it is observed, its last observation included; its vehicle stays in the scene.
+    An agent is named as long as it is observed, its last observation included; its vehicle stays in the scene.
 
     Args:
         env: the environment, wrapped or not.
         perception_m: how far an agent sees [m]; None takes `SceneSpec`'s default.
-        max_agents: rows of a scene; None takes as many as the config can bring into one episode.
+        max_agents: size of a scene; None takes as many as the config can bring into one episode.
 
     Raises:
         UserError: another environment.
     """
 
     def __init__(self, env: ParallelEnv, perception_m: float | None = None, max_agents: int | None = None) -> None:
-        """Derive the spec from the environment."""
+        """Derives the spec from the environment."""
         if not isinstance(env.unwrapped, HighwayParallelEnv):
-            raise UserError(f"HighwaySharedReader needs a HighwayParallelEnv, got {type(env.unwrapped).__name__}")
+            raise UserError(f"HighwayMultiagentReader needs a HighwayParallelEnv, got {type(env.unwrapped).__name__}")
         highway = env.unwrapped.highway
-        rows = most_vehicles(highway.config) if max_agents is None else max_agents
-        self._reader = HighwayReader(highway, perception_m, rows)
+        size = most_vehicles(highway.config) if max_agents is None else max_agents
+        self._reader = HighwayReader(highway, perception_m, size)
         self._spec = replace(self._reader.spec, has_ego=False)
 
     @property
     def spec(self) -> SceneSpec:
-        """What the scenes look like."""
+        """Returns the layout of the scenes."""
         return self._spec
 
     def reset(self) -> None:
-        """Forget all identities; numbering starts anew, so equal seeds give equal ids."""
+        """Forgets all identities; numbering starts anew, so equal seeds give equal ids."""
         self._reader.reset()
 
-    def read(self, env: ParallelEnv) -> SharedScene:
-        """Everyone on the road now."""
+    def read(self, env: ParallelEnv) -> MultiagentScene:
+        """Returns all vehicles on the road now."""
         inner: HighwayParallelEnv = env.unwrapped
         vehicles = inner.highway.road.vehicles
-        row = {vehicle: i for i, vehicle in enumerate(vehicles)}
-        rows = {agent: row[vehicle] for agent, vehicle in inner.vehicles.items()}
+        index = {vehicle: i for i, vehicle in enumerate(vehicles)}
+        indices = {agent: index[vehicle] for agent, vehicle in inner.vehicles.items()}
         headings = np.array([float(vehicle.heading) for vehicle in vehicles])
         everyone = self._reader.read_vehicles(inner.highway, vehicles)
-        return share(everyone, rows, headings, self._spec, type(self).__name__)
+        return pad_multiagent_scene(everyone, indices, headings, self._spec, type(self).__name__)
 
 
 def most_vehicles(config: Mapping[str, Any]) -> int:
-    """The most vehicles that a config can bring to the intersection: those at the start, then one with each step."""
+    """Returns the most vehicles that a config can bring to the intersection: those at the start, one more per step."""
     spawned = math.ceil(config["duration"] * config["policy_frequency"]) + 1  # highway-env's clock rounds
     return int(config["initial_vehicle_count"] + config["controlled_vehicles"] + spawned)

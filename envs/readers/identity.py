@@ -1,4 +1,4 @@
-"""Who is who between two steps, for environments that report agents without names: `IdentityTracker`.
+"""Re-identifies agents between two steps, for environments that report agents without names: `IdentityTracker`.
 
 Each agent of the last step is matched to the observation that its motion explains best. Both velocities are known, so
 the position is predicted with their mean, which is exact under constant acceleration. The matching is the best one for
@@ -7,6 +7,10 @@ those.
 """
 
 import math
+import weakref
+from collections.abc import Iterator
+from copy import deepcopy
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -16,14 +20,37 @@ from predictor.scene import PADDING_ID
 
 _CHANGE_WEIGHT = 0.1
 
+Known = TypeVar("Known")
+
+
+class IdentityDict(weakref.WeakKeyDictionary[Any, Known]):
+    """Dictionary of what is known of the simulator's own objects; an entry ends with its object.
+
+    Keyed by the living object, since `id()` is reused after garbage collection and would join two agents. Unlike its
+    base, it follows its objects: in a copy (`copy.deepcopy`, `pickle`) of reader and environment together, the entries
+    belong to the copied objects.
+    """
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "IdentityDict[Known]":
+        """Returns a dictionary of the copied objects."""
+        copied: IdentityDict[Known] = IdentityDict()
+        for key, value in list(self.items()):
+            copied[deepcopy(key, memo)] = deepcopy(value, memo)
+        return copied
+
+    def __reduce__(self) -> tuple[type, tuple[()], None, None, Iterator[tuple[Any, Known]]]:
+        """Pickles the objects with their entries."""
+        return type(self), (), None, None, iter(list(self.items()))
+
 
 class IdentityTracker:
     """Gives the agents of one environment numbers that stay with them from step to step.
 
-    What it costs to take an observation for an agent [m]: √(r² + c²), with r how far it is from where the mean of both
-    velocities leads, and c a tenth of the change of velocity times the time between them; without c, two that meet
-    head-on could as well have turned round. At `gate_m` and beyond, and where `keys` differ, it is not the same agent.
-    Among all ways to pair agents and observations, the one that stays below the gate by the most in sum is taken.
+    Each known agent is extrapolated with the mean of its old and new velocity and matched to the observations by
+    optimal assignment. A pair costs √(r² + c²) [m], with r its distance from the extrapolated position and c a tenth of
+    its change of velocity times the time between the steps; without c, two agents that meet head-on could as well have
+    turned round. A pair that costs `gate_m` or more, or whose `keys` differ, is no match. The assignment maximises the
+    sum of `gate_m` − cost over its pairs.
 
     Args:
         dt_s: time between two updates [s].
@@ -34,7 +61,7 @@ class IdentityTracker:
     """
 
     def __init__(self, dt_s: float, gate_m: float, memory_steps: int = 0) -> None:
-        """Start with nobody known."""
+        """Starts without known agents."""
         if not 0 < dt_s < np.inf or not 0 < gate_m < np.inf or memory_steps < 0:
             raise UserError(
                 "IdentityTracker needs a positive dt_s and gate_m and memory_steps of at least 0, "
@@ -44,7 +71,7 @@ class IdentityTracker:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everyone: a new episode has begun. Numbering starts anew at 0."""
+        """Forgets all agents: a new episode has begun. Numbering starts anew at 0."""
         self._next_id = 0
         self._ids: np.ndarray = np.empty(0, dtype=np.int64)
         self._place: np.ndarray = np.empty((0, 0))
@@ -59,17 +86,17 @@ class IdentityTracker:
         present: Bool[np.ndarray, " agents"] | None = None,
         keys: Shaped[np.ndarray, "agents ..."] | None = None,
     ) -> Int[np.ndarray, " agents"]:
-        """Take in one step; the number of each row's agent.
+        """Takes in one step and returns the number of each agent.
 
         Args:
             positions: one axis system for all steps [m].
             velocities: in the same axes [m/s].
-            present: which rows hold an agent; None means all.
+            present: which entries hold an agent; None means all.
             keys: what an agent keeps for as long as it is there (its kind, a driver's parameter), in one column or
                 several; compared exactly. The same columns at every step.
 
         Returns:
-            Numbers from 0 on in the order of first sight; -1 in rows that are not present.
+            Numbers from 0 on in the order of first sight; -1 where no agent is present.
 
         Raises:
             UserError: positions or velocities that are not finite, or axes or keys other than those of the last step.
@@ -90,7 +117,7 @@ class IdentityTracker:
         return ids
 
     def _recognise(self, place: np.ndarray, motion: np.ndarray, kinds: np.ndarray) -> np.ndarray:
-        """The number of each observation's agent; -1 for a newcomer."""
+        """Returns the number of each observation's agent; -1 for a new one."""
         found = np.full(len(place), PADDING_ID, dtype=np.int64)
         if not len(self._ids) or not len(place):
             return found
@@ -107,7 +134,7 @@ class IdentityTracker:
         return found
 
     def _costs(self, place: np.ndarray, motion: np.ndarray) -> np.ndarray:
-        """What it would cost to take each observation for each known agent [m], without gate and keys."""
+        """Returns the cost of each pair of known agent and observation [m], without gate and keys."""
         half_s = (0.5 * self._dt_s * self._steps)[:, None]
         weight_s = 2 * _CHANGE_WEIGHT * half_s
         straight = self._place + half_s * self._motion
@@ -133,16 +160,16 @@ class IdentityTracker:
 def best_pairs(
     cost: Float[np.ndarray, "rows columns"], gate: float
 ) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
-    """The pairing with the largest sum of `gate` − cost, of pairs that cost less than `gate`.
+    """Returns the pairing with the largest sum of `gate` − cost, of pairs that cost less than `gate`.
 
     Args:
         cost: not NaN; infinite where a pair is out of the question.
-        gate: what it costs to leave a row and a column without a partner.
+        gate: cost of leaving a row and a column unpaired.
 
     Returns:
         Rows and columns of the pairs; each row and each column at most once.
     """
-    # If everyone's first choice is somebody else's first choice of nobody, no other pairing is better.
+    # If all rows have different nearest columns, taking each row's nearest is optimal; so it is with columns.
     rows, columns = np.arange(cost.shape[0]), cost.argmin(axis=1)
     near = cost[rows, columns] < gate
     if _distinct(columns[near], cost.shape[1]):
@@ -161,7 +188,7 @@ def best_pairs(
 
 
 def assign(cost: Float[np.ndarray, "rows columns"]) -> Int[np.ndarray, " rows"]:
-    """A column for each row, no column twice, with the least sum of costs (shortest augmenting paths).
+    """Returns a column for each row, no column twice, with the least sum of costs (shortest augmenting paths).
 
     Args:
         cost: finite; at least as many columns as rows.

@@ -1,18 +1,18 @@
 """Reads scenes out of mpe2, PettingZoo's particle worlds: every agent and, unless left out, every landmark.
 
 One layout for all scenarios, so that what was learned in one can be run in another. An agent's identity is the
-simulator's own object, never its place in a list. Goals, messages and what an agent carries are not read: nobody who
-looks at the arena sees them.
+simulator's own object, never its place in a list. Goals, messages and what an agent carries are not read: they
+cannot be seen in the arena.
 """
 
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from envs.readers.base import SharedScene, share
+from envs.readers.base import MultiagentScene, pad_multiagent_scene
+from envs.readers.identity import IdentityDict
 from predictor.errors import ProtocolError, UserError
 from predictor.scene import KINEMATIC_FEATURES, Scene, SceneSpec
 
@@ -31,20 +31,20 @@ MPE_IDS = (
 )
 
 MPE_CONSTANTS = ("adversary", "landmark", "radius_m")
-"""What a look tells of an entity besides its motion: 1 or 0, 1 or 0, and its size."""
+"""Visible properties of an entity besides its motion: 1 or 0, 1 or 0, and its size."""
 
 MPE_FEATURES = (*KINEMATIC_FEATURES, *MPE_CONSTANTS)
 _SCALES = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.1)
-_EVERYTHING_M = 1000.0  # the arena is 2 m wide; it has no walls, but nobody gets this far in an episode
+_EVERYTHING_M = 1000.0  # the arena is 2 m wide; it has no walls, but no agent gets this far in an episode
 
 
 def is_mpe_env(env: Any) -> bool:
-    """Whether the environment comes from mpe2; needs no mpe2 to say no."""
+    """Returns whether the environment comes from mpe2; does not import it."""
     return any(_module_path(cls)[0] == "mpe2" for cls in type(env.unwrapped).__mro__)
 
 
 def mpe_scenario(env: Any) -> str:
-    """Which mpe2 scenario it is, without the version ("simple_tag"); "" for an own one, or what is not from mpe2.
+    """Returns the mpe2 scenario without its version ("simple_tag"); "" for an own one, or what is not from mpe2.
 
     Not `metadata["name"]`: mpe2's environments share one such dictionary, which names whichever was made last.
     """
@@ -58,9 +58,9 @@ def _module_path(cls: type) -> tuple[str, str]:
 
 
 def agents_in_sight(env: Any) -> Sequence[str]:
-    """Names of the agents that get a row: the living, or all of them right after an episode's last step.
+    """Returns names of the agents that are observed: those that live, or all of them after an episode's last step.
 
-    The last observation of an agent shows it where it ended, although PettingZoo counts nobody as living by then.
+    The last observation of an agent shows it where it ended, although PettingZoo counts no agent as living by then.
 
     Raises:
         ProtocolError: before the first reset.
@@ -75,17 +75,17 @@ def agents_in_sight(env: Any) -> Sequence[str]:
 class _Known:
     number: int
     place: tuple[float, ...] | None
-    """Where a thing that cannot move stands; None for what moves."""
+    """Position of an entity that cannot move; None for one that moves."""
 
 
 class MpeReader:
-    """Reads mpe2's parallel environments; nobody is the ego.
+    """Reads mpe2's parallel environments; no agent is the ego.
 
     Args:
         env: the environment, wrapped or not; its world gives `dt_s`.
         landmarks: also read landmarks (obstacles, goals, treasures), as agents that stand still: they explain where
             the others go. A treasure that is collected leaves the scene; the one that appears elsewhere is a new one.
-        max_agents: rows of a scene; None takes as many as the world holds.
+        max_agents: size of a scene; None takes as many as the world holds.
         perception_m: how far an agent sees [m]; None sees the whole arena and far beyond.
 
     Raises:
@@ -95,7 +95,7 @@ class MpeReader:
     def __init__(
         self, env: Any, landmarks: bool = True, max_agents: int | None = None, perception_m: float | None = None
     ) -> None:
-        """Derive the spec from the environment."""
+        """Derives the spec from the environment."""
         if not is_mpe_env(env):
             raise UserError(f"MpeReader needs an mpe2 environment, got {type(env.unwrapped).__name__}")
         world = env.unwrapped.world
@@ -115,17 +115,16 @@ class MpeReader:
 
     @property
     def spec(self) -> SceneSpec:
-        """What the scenes look like; ``("world", "world")`` frame: the arena is fixed."""
+        """Returns the layout of the scenes; ``("world", "world")`` frame: the arena is fixed."""
         return self._spec
 
     def reset(self) -> None:
-        """Forget all identities; numbers start anew in the order of `world.entities`."""
-        # Keyed by the living object: id() is reused after garbage collection and would join two entities.
-        self._known: weakref.WeakKeyDictionary[Any, _Known] = weakref.WeakKeyDictionary()
+        """Forgets all identities; numbers start anew in the order of `world.entities`."""
+        self._known: IdentityDict[_Known] = IdentityDict()
         self._next_id = 0
 
-    def read(self, env: Any) -> SharedScene:
-        """Everyone who is there now, at rest or not.
+    def read(self, env: Any) -> MultiagentScene:
+        """Returns all entities that are present now, at rest or not.
 
         Raises:
             ProtocolError: before the first reset.
@@ -137,9 +136,9 @@ class MpeReader:
         still = {id(landmark) for landmark in world.landmarks}
         states = np.array([_state(entity, id(entity) in still) for entity in entities], dtype=np.float64)
         ids = np.array([self._identify(entity) for entity in entities], dtype=np.int64)
-        rows = {entity.name: row for row, entity in enumerate(entities) if entity.name in names}
+        indices = {entity.name: i for i, entity in enumerate(entities) if entity.name in names}
         scene = Scene(states, ids, np.ones(len(entities), dtype=np.bool_))
-        return share(scene, rows, np.zeros(len(entities)), self._spec, type(self).__name__)
+        return pad_multiagent_scene(scene, indices, np.zeros(len(entities)), self._spec, type(self).__name__)
 
     def _listed(self, world: Any) -> list[Any]:
         return list(world.entities if self.landmarks else world.agents)

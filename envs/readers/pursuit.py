@@ -4,14 +4,14 @@ A cell is one metre and a step one second: the grid has no other units. Velociti
 agents on a grid have none. The other SISL environment, multiwalker, is not read.
 """
 
-import weakref
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from envs.readers.base import SharedScene, share
+from envs.readers.base import MultiagentScene, pad_multiagent_scene
+from envs.readers.identity import IdentityDict
 from envs.readers.mpe import agents_in_sight
 from predictor.errors import UserError
 from predictor.scene import KINEMATIC_FEATURES, Scene, SceneSpec
@@ -22,13 +22,13 @@ _SCALES = (10.0, 10.0, 1.0, 1.0, 1.0)
 
 
 def is_pursuit_env(env: Any) -> bool:
-    """Whether the environment is PettingZoo's pursuit."""
+    """Returns whether the environment is PettingZoo's pursuit."""
     return any(cls.__module__ == "pettingzoo.sisl.pursuit.pursuit" for cls in type(env.unwrapped).__mro__)
 
 
 @dataclass
 class _Track:
-    """One body on the grid, as of the last step at which it was read."""
+    """Body on the grid, as of the last step at which it was read."""
 
     number: int
     frame: int
@@ -37,13 +37,13 @@ class _Track:
 
 
 class PursuitReader:
-    """Reads pursuit's parallel environment; nobody is the ego, and only pursuers are learners.
+    """Reads pursuit's parallel environment; no agent is the ego, and only pursuers are learners.
 
-    An evader that is caught is gone from the next scene on, its row goes to the next in the list, its id to nobody.
+    An evader that is caught is gone from the next scene on; its id is not used again.
 
     Args:
         env: the environment, wrapped or not.
-        max_agents: rows of a scene; None takes pursuers and evaders at the start.
+        max_agents: size of a scene; None takes pursuers and evaders at the start.
         perception_m: how far an agent sees [cells]; None sees the whole grid, which is more than pursuit's own
             observations show (`obs_range`).
 
@@ -52,7 +52,7 @@ class PursuitReader:
     """
 
     def __init__(self, env: Any, max_agents: int | None = None, perception_m: float | None = None) -> None:
-        """Derive the spec from the environment."""
+        """Derives the spec from the environment."""
         if not is_pursuit_env(env):
             raise UserError(f"PursuitReader needs PettingZoo's pursuit, got {type(env.unwrapped).__name__}")
         grid = env.unwrapped.env
@@ -69,17 +69,16 @@ class PursuitReader:
 
     @property
     def spec(self) -> SceneSpec:
-        """What the scenes look like; ``("world", "world")`` frame: the walls stay."""
+        """Returns the layout of the scenes; ``("world", "world")`` frame: the walls stay."""
         return self._spec
 
     def reset(self) -> None:
-        """Forget all identities and where they were."""
-        # Keyed by the living object: id() is reused after garbage collection and would join two bodies.
-        self._tracks: weakref.WeakKeyDictionary[Any, _Track] = weakref.WeakKeyDictionary()
+        """Forgets all identities and where they were."""
+        self._tracks: IdentityDict[_Track] = IdentityDict()
         self._next_id = 0
 
-    def read(self, env: Any) -> SharedScene:
-        """Everyone on the grid now; reading twice at a step gives the same scene.
+    def read(self, env: Any) -> MultiagentScene:
+        """Returns all bodies on the grid; reading twice at a step gives the same scene.
 
         Velocities [cells/step] are zero when a body is first seen, and mean ones after a step that was not read.
 
@@ -93,12 +92,12 @@ class PursuitReader:
         bodies = [*pursuers, *evaders]
         tracks = [self._follow(body, unwrapped.env.frames) for body in bodies]
         states = np.zeros((len(bodies), len(PURSUIT_FEATURES)))
-        for row, track in enumerate(tracks):
-            states[row] = (*track.position, *track.velocity, float(row >= len(pursuers)))
+        for i, track in enumerate(tracks):
+            states[i] = (*track.position, *track.velocity, float(i >= len(pursuers)))
         ids = np.array([track.number for track in tracks], dtype=np.int64)
-        rows = {name: row for name, row in unwrapped.agent_name_mapping.items() if name in names}
+        indices = {name: i for name, i in unwrapped.agent_name_mapping.items() if name in names}
         scene = Scene(states, ids, np.ones(len(bodies), dtype=np.bool_))
-        return share(scene, rows, np.zeros(len(bodies)), self._spec, type(self).__name__)
+        return pad_multiagent_scene(scene, indices, np.zeros(len(bodies)), self._spec, type(self).__name__)
 
     def _follow(self, body: Any, frame: int) -> _Track:
         position = np.array(body.current_position(), dtype=np.float64)  # a copy: the grid moves bodies in place

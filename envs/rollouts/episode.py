@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from envs.multiagent_observation import SharedStream
+from envs.multiagent_observation import MultiagentStream
 from envs.observation import ForecastConfig, ForecastStream, into_ego_axes, others_by_distance
 from envs.readers.highway_labels import SceneLabels
 from envs.rollouts.world import EgoWorld, SharedWorld, World, open_world
@@ -196,7 +196,7 @@ class _Probe:
         config = ForecastConfig(task.horizon_steps)
         self._stream: Any
         if isinstance(world, SharedWorld):
-            self._stream = SharedStream(forecaster, world.spec, config)
+            self._stream = MultiagentStream(forecaster, world.spec, config)
         else:
             self._stream = ForecastStream(forecaster, world.spec, 1, config)
 

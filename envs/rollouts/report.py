@@ -13,6 +13,7 @@ from rich.table import Table
 from envs.rollouts.episode import MODEL, NEIGHBOURS, STRAIGHT, Case
 from predictor.evaluation.accuracy import Accuracy
 from predictor.evaluation.graph_accuracy import GraphAccuracy
+from predictor.markdown import table
 from predictor.reports.tables import markdown_table
 
 
@@ -89,25 +90,23 @@ def remarks(result: "EnvAccuracy") -> str:
 
 def overview(results: Sequence["EnvAccuracy"]) -> Table:
     """One line per environment."""
-    table = Table(title="in-env accuracy, held-out seeds")
+    shown = Table(title="in-env accuracy, held-out seeds")
     for i, heading in enumerate(HEADS):
-        table.add_column(heading.replace("[", r"\["), justify="left" if i < 4 else "right")
+        shown.add_column(heading.replace("[", r"\["), justify="left" if i < 4 else "right")
     for row in results:
-        table.add_row(*_cells(row))
-    return table
+        shown.add_row(*_cells(row))
+    return shown
 
 
 def markdown(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], str]) -> str:
     """Overview, transfer matrix (with several checkpoints) and each environment's table as Markdown."""
-    lines = ["| " + " | ".join(HEADS) + " |", "|" + "---|" * len(HEADS)]
-    parts = ["\n".join(lines + ["| " + " | ".join(_cells(r)) + " |" for r in results]) + "\n"]
+    parts = [table(HEADS, [_cells(r) for r in results]) + "\n"]
     if len({r.checkpoint for r in results} | {c for _, c in misfits}) > 1:
         cells = _matrix(results, misfits)
         heads = list(next(iter(cells.values())))
-        table = ["| env | " + " | ".join(heads) + " |", "|" + "---|" * (len(heads) + 1)]
-        table += [f"| {env} | " + " | ".join(row.values()) + " |" for env, row in cells.items()]
+        matrix = table(["env", *heads], [[env, *line.values()] for env, line in cells.items()])
         why = [f"* {env} with {name}: {reason}" for (env, name), reason in misfits.items()]
-        parts.append("### Transfer: minADE₁ [m] (below constant velocity)\n\n" + "\n".join([*table, "", *why]) + "\n")
+        parts.append("### Transfer: minADE₁ [m] (below constant velocity)\n\n" + "\n".join([matrix, "", *why]) + "\n")
     for result in results:
         text = remarks(result).replace("\n", "\n* ")
         parts.append(f"### {title(result)}\n\n{markdown_table(result.rows, result.dt_s)}\n* {text}\n")
@@ -116,14 +115,14 @@ def markdown(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str],
 
 def transfer(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], str]) -> Table:
     """Checkpoints (columns) measured in environments (rows)."""
-    table = Table(title=r"transfer: minADE₁ \[m] (below constant velocity)", caption="–: does not fit, see accuracy.md")
+    shown = Table(title=r"transfer: minADE₁ \[m] (below constant velocity)", caption="–: does not fit, see accuracy.md")
     cells = _matrix(results, misfits)
-    table.add_column("env")
+    shown.add_column("env")
     for name in next(iter(cells.values())):
-        table.add_column(name, justify="right")
+        shown.add_column(name, justify="right")
     for env_id, row in cells.items():
-        table.add_row(env_id, *row.values())
-    return table
+        shown.add_row(env_id, *row.values())
+    return shown
 
 
 def _matrix(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], str]) -> dict[str, dict[str, str]]:

@@ -17,7 +17,15 @@ from envs.parallel import ForecastParallelEnv
 from envs.readers.base import SceneReader
 from envs.readers.highway import is_highway_env
 from envs.readers.highway_labels import SceneLabels, read_labels
-from envs.registry import is_parallel_id, make_env, make_parallel_env, parallel_checkpoint_for
+from envs.registry import (
+    ENVS,
+    HEURISTIC_DRIVERS,
+    checkpoint_for,
+    entry_for,
+    is_multiagent_id,
+    make_env,
+    make_multiagent_env,
+)
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.errors import UserError
@@ -183,9 +191,9 @@ def open_world(
     Raises:
         UserError: unknown env, driver or checkpoint, or things that do not belong together.
     """
-    if is_parallel_id(env_id):
+    if is_multiagent_id(env_id):
         shared = ForecastParallelEnv(
-            make_parallel_env(env_id),
+            make_multiagent_env(env_id),
             checkpoint or _forecaster_for(env_id, driver),
             horizon_steps=horizon_steps,
             num_samples=num_samples,
@@ -211,7 +219,7 @@ def _forecaster_for(env_id: str, driver: str) -> str:
     """Whose forecasts a PettingZoo environment is recorded with: those that its driver was trained on, if any."""
     if not sees_forecasts(driver):
         return CONSTANT_VELOCITY
-    return forecaster_of(Path(driver)) or parallel_checkpoint_for(env_id)
+    return forecaster_of(Path(driver)) or checkpoint_for(env_id)
 
 
 def default_drivers(env_id: str) -> tuple[str, ...]:
@@ -220,14 +228,14 @@ def default_drivers(env_id: str) -> tuple[str, ...]:
     Raises:
         UserError: a parallel environment that cannot be made.
     """
-    if not is_parallel_id(env_id):
-        return ("varied", "random", "idle")
-    return ("heuristic", "mixed", "varied") if _has_heuristic(env_id) else ("varied", "random", "idle")
+    if env_id in ENVS or not is_multiagent_id(env_id):
+        return entry_for(env_id).drivers
+    return HEURISTIC_DRIVERS if _has_heuristic(env_id) else entry_for(env_id).drivers
 
 
 @functools.cache
 def _has_heuristic(env_id: str) -> bool:
-    env = make_parallel_env(env_id)
+    env = make_multiagent_env(env_id)
     try:
         make_driver("heuristic", env, np.random.default_rng(0))
     except UserError:

@@ -1,7 +1,8 @@
 """One policy for every agent: a PettingZoo parallel environment as an SB3 VecEnv whose rows are its agents.
 
 Each copy of the environment gives one row per learning agent; unequal spaces are padded to the largest, and agents may
-die and join mid-episode. All copies run in this process. It does not forecast and knows no scenes: wrap the copies.
+die and join mid-episode. All copies run in this process. For forecasts wrap the copies in `ForecastParallelEnv`: they
+then share one batched forward per step.
 
 >>> from mpe2 import simple_tag_v3
 >>> from stable_baselines3 import PPO
@@ -23,7 +24,8 @@ from pettingzoo import ParallelEnv
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from envs.sb3.padded_spaces import SharedObservation, own_action, roles_of, shared_action
+from envs.parallel import batch_forwards
+from envs.sb3.padded_spaces import PaddedObservation, own_action, roles_of, shared_action
 from predictor.errors import ProtocolError, UserError
 
 Partner = Callable[[ParallelEnv, dict[str, Any], np.random.Generator], Mapping[str, Any]]
@@ -103,13 +105,14 @@ class ParallelVecEnv(VecEnv):
     ) -> None:
         """Make the copies and find the spaces that hold every learner's."""
         self.envs = _make_copies(factories)
+        self._forward = batch_forwards(self.envs)
         names = _choose_learners(self.envs[0].possible_agents, agents)
         drive = _choose_partner(self.envs[0].possible_agents, names, partner)
         self._copies = [_Copy(env, names, drive) for env in self.envs]
         observations = {name: self.envs[0].observation_space(name) for name in names}
         actions = {name: self.envs[0].action_space(name) for name in names}
         roles = roles_of(observations, actions)
-        self._observation = SharedObservation(observations, roles, agent_indicator)
+        self._observation = PaddedObservation(observations, roles, agent_indicator)
         self._own_actions = actions
         self.row_agents = names * len(self.envs)
         self.row_copies = [copy for copy in range(len(self.envs)) for _ in names]
@@ -213,6 +216,8 @@ class ParallelVecEnv(VecEnv):
 
     def _observe(self) -> VecEnvObs:
         """What each row's agent sees now."""
+        if self._forward is not None:
+            self._forward.fill()
         seen = [(copy.living or {}).get(agent) for copy in self._copies for agent in copy.learners]
         return self._observation.stack(list(zip(self.row_agents, seen, strict=True)))
 

@@ -19,6 +19,8 @@ from predictor.scene import SceneSpec
 class EnvPoolVecEnv(VecEnv):
     """Many of EnvPool's highway environments as one SB3 VecEnv, stepped in C++.
 
+        >>> from stable_baselines3.common.vec_env import VecMonitor
+        >>> from envs import EnvPoolVecEnv, VecForecast
         >>> venv = EnvPoolVecEnv("HighwayFast-v0", 64, seed=0)
         >>> venv = VecForecast(VecMonitor(venv), "highway")
 

@@ -5,6 +5,7 @@ observation that closes an episode carries the forecast made from that episode's
 starts from one step. `envs.vector` has the same for gymnasium's vector environments.
 """
 
+import inspect
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,21 +13,24 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
 from envs.observation import (
-    ForecastConfig,
     ForecastStream,
     common_value,
-    forecast_space,
     observe_ended,
     open_forecaster,
     require_scenes,
     scenes_from,
-    with_forecast,
 )
+from envs.readers import MakeReader
+from envs.scene_stream import ForecastConfig
 from predictor.forecaster import Forecaster
+from predictor.scene import SceneBatch
+
+_CLASS_NOTES = "class_attributes"
 
 
-class VecForecast(VecEnvWrapper):
+class VecForecast(ForecastWrapper, VecEnvWrapper):
     """`ForecastObservation` for an SB3 VecEnv whose environments are wrapped in `SceneObservation`.
 
         >>> from stable_baselines3.common.env_util import make_vec_env
@@ -34,17 +38,21 @@ class VecForecast(VecEnvWrapper):
         >>> venv = make_vec_env("highway-fast-v0", n_envs=8, wrapper_class=SceneObservation)
         >>> venv = VecForecast(venv, "highway")
 
+    After each step, `scene` and `forecast` hold, in the world frame, what `observations[i]` shows of environment i.
+
     Args:
         venv: SB3 vector environment (Dummy or Subproc).
         checkpoint: shipped name, folder, or "constant-velocity"; None takes the one that ships for the env's id.
         horizon_steps: steps to forecast; None takes the checkpoint's.
         num_samples: sampled futures per agent.
+        flatten: one Box instead of a Dict.
         device: where the forecaster runs.
-        seed: of the samples' noise.
-        forecaster: use this one instead of loading `checkpoint`.
+        forecaster: instead of a checkpoint; lives on `device`.
+        seed: of the samples' noise, environment i gets seed + i, until `seed(…)` gives others.
+        reader: refused, because the environments report their scenes; give it to `SceneObservation`.
 
     Raises:
-        UserError: the envs report no scenes, differ from each other, or do not fit the checkpoint.
+        UserError: the envs report no scenes, differ from each other, or do not fit the forecaster.
     """
 
     def __init__(
@@ -54,39 +62,57 @@ class VecForecast(VecEnvWrapper):
         *,
         horizon_steps: int | None = None,
         num_samples: int = 1,
+        flatten: bool = False,
         device: str = "cpu",
-        seed: int = 0,
         forecaster: Forecaster | None = None,
+        seed: int = 0,
+        reader: MakeReader | None = None,
     ) -> None:
         """Load the forecaster and extend the observation space."""
+        refuse_reader(reader, "VecForecast")
         space = require_scenes(venv.observation_space, "VecForecast")
         spec = common_value(venv.get_attr("scene_spec"), "scene spec")
         source = common_value(venv.get_attr("scene_source"), "env id")
-        config = ForecastConfig(horizon_steps, num_samples, device, seed)
-        forecaster = forecaster or open_forecaster(checkpoint, spec, source, device)
-        self.stream = ForecastStream(forecaster, spec, venv.num_envs, config)
-        super().__init__(venv, observation_space=forecast_space(space, self.stream))
+        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten)
+        forecaster = open_forecaster(checkpoint, spec, source, device, forecaster)
+        self.stream: ForecastStream = ForecastStream(forecaster, spec, venv.num_envs, config)
+        self._layout = ObservationLayout(space["observation"], self.stream.spaces(), flatten)
+        VecEnvWrapper.__init__(self, venv, observation_space=self._layout.space)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns what a copy or a pickle keeps; VecEnvWrapper's notes on its own class do not pickle."""
+        return {name: value for name, value in super().__getstate__().items() if name != _CLASS_NOTES}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copy or a pickle."""
+        super().__setstate__({**state, _CLASS_NOTES: dict(inspect.getmembers(type(self)))})
+
+    @property
+    def scene(self) -> SceneBatch:
+        """The latest scene of each environment, world frame, ego first."""
+        return self._scenes()
 
     def reset(self) -> Any:
         """Reset all environments and forget all histories."""
         observations: Any = self.venv.reset()
         self.stream.reset()
-        return with_forecast(observations, self.stream.observe(scenes_from(observations)))
+        return self._layout.batch(observations["observation"], self.stream.observe(scenes_from(observations)))
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step; one batched forward serves running rows, terminal observations and fresh episodes."""
+        """Step; one batched forward serves running episodes, terminal observations and fresh episodes."""
         observations: Any
         observations, rewards, dones, step_infos = self.venv.step_wait()
         infos = list(step_infos)  # a tuple, with SubprocVecEnv
         ended = np.flatnonzero(dones)
         closing = [infos[i]["terminal_observation"] for i in ended]
         entries, closing_entries = observe_ended(self.stream, observations, ended, closing)
-        for i, own, extra in zip(ended, closing, closing_entries, strict=True):
-            infos[i]["terminal_observation"] = with_forecast(own, extra)
-        return with_forecast(observations, entries), rewards, dones, infos
+        for i, last, extra in zip(ended, closing, closing_entries, strict=True):
+            infos[i]["terminal_observation"] = self._layout.one(last["observation"], extra)
+        return self._layout.batch(observations["observation"], entries), rewards, dones, infos
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed the environments and the samples' noise."""
+        """Seed the environments and each one's samples with it; None leaves the samples' noise as it is."""
+        seeds = self.venv.seed(seed)
         if seed is not None:
-            self.stream.seed(seed)
-        return self.venv.seed(seed)
+            self.stream.seed(seeds)
+        return seeds

@@ -16,7 +16,7 @@ from predictor.errors import UserError
 _COUNTED = (gym.spaces.Discrete, gym.spaces.MultiDiscrete, gym.spaces.MultiBinary)
 
 
-class SharedObservation:
+class PaddedObservation:
     """The observation space that holds every learner's, and observations put into it."""
 
     def __init__(self, own: dict[str, gym.Space], roles: dict[str, int], indicator: bool | None) -> None:

@@ -5,6 +5,7 @@ and reports scenes as `SceneObservation` does, ready for `VecForecast`. EnvPool 
 when the first environment is made. This module only adapts: what the simulation does is EnvPool's.
 """
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -38,7 +39,7 @@ ENV_IDS: dict[str, str] = {f"envpool/{task_id}": task_id for task_id in HIGHWAY_
 """Gymnasium id → EnvPool task."""
 
 
-# Not a newer version of Intersection-v0, as gymnasium would tell everybody who makes that: its actions are continuous.
+# Named otherwise, since gymnasium would call it a newer version of Intersection-v0: its actions are continuous.
 ENV_IDS["envpool/IntersectionContinuous-v1"] = "Intersection-v1"
 MAX_SEED = 2**31 - 1
 _OWN_SETTINGS = ("num_envs", "batch_size", "seed", "env_seed", "max_num_players", "gym_reset_return_info", "base_path")
@@ -57,20 +58,20 @@ _META_LONGITUDINAL = MetaActions({"SLOWER": 0, "IDLE": 1, "FASTER": 2})
 
 
 def register_envpool_ids() -> None:
-    """Declare `ENV_IDS` to gymnasium; may be called again, and does not import EnvPool."""
+    """Registers `ENV_IDS` with gymnasium; may be called again, and does not import EnvPool."""
     for env_id, task_id in ENV_IDS.items():
         if env_id not in gym.registry:
             gym.register(env_id, entry_point="envs.simulators.envpool:EnvPoolEnv", kwargs={"task_id": task_id})
 
 
 def make_pool(task_id: str, seeds: Sequence[int], num_threads: int = 0, **settings: Any) -> Any:
-    """An EnvPool pool of one task, one environment per seed.
+    """Makes an EnvPool pool of one task, one environment per seed.
 
     Args:
         task_id: a key of `HIGHWAY_ENV_OF`.
-        seeds: of each environment; the first `reset` draws from it, later ones carry on.
-        num_threads: of the simulation; 0 leaves it to EnvPool.
-        settings: of the task (`duration`, `policy_frequency`, … ; docs/envpool.md), or `render_mode`.
+        seeds: seed of each environment; the first `reset` draws from it, later ones carry on.
+        num_threads: number of threads of the simulation; 0 leaves it to EnvPool.
+        settings: settings of the task (`duration`, `policy_frequency`, … ; docs/envpool.md), or `render_mode`.
 
     Raises:
         UserError: no EnvPool, an unknown task or setting.
@@ -102,7 +103,7 @@ def make_pool(task_id: str, seeds: Sequence[int], num_threads: int = 0, **settin
 def is_terminated(
     terminated: NDArray[np.bool_], truncated: NDArray[np.bool_], crashed: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Which environments terminated: EnvPool calls a crash in the very last step a truncation only."""
+    """Returns which environments terminated: EnvPool calls a crash in the very last step a truncation only."""
     return terminated | (truncated & crashed)
 
 
@@ -113,12 +114,12 @@ class EnvPoolEnv(gym.Env[NDArray[Any], Any]):
         >>> env = gym.make("envpool/HighwayFast-v0", vehicles_count=10)
 
     EnvPool seeds when it is built, so a seeded reset builds anew (half a millisecond); a reset without a seed draws the
-    next episode from the last one. Row i of an `EnvPoolVecEnv` seeded with s is this environment seeded with s + i.
+    next episode from the last one. Environment i of an `EnvPoolVecEnv` seeded with s is this one seeded with s + i.
 
     Args:
         task_id: a key of `HIGHWAY_ENV_OF`.
         render_mode: None or "rgb_array".
-        settings: of the task, see `make_pool`.
+        settings: settings of the task, see `make_pool`.
 
     Attributes:
         task_id: as given.
@@ -132,7 +133,7 @@ class EnvPoolEnv(gym.Env[NDArray[Any], Any]):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 5}
 
     def __init__(self, task_id: str, render_mode: str | None = None, **settings: Any) -> None:
-        """Build the pool, which tells the spaces."""
+        """Builds the pool, which has the spaces."""
         self.task_id, self.render_mode = task_id, render_mode
         self._settings = settings if render_mode is None else {**settings, "render_mode": render_mode}
         self._pool = make_pool(task_id, [0], num_threads=1, **self._settings)
@@ -143,7 +144,7 @@ class EnvPoolEnv(gym.Env[NDArray[Any], Any]):
         self._seeded, self._running = False, False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode.
+        """Begins an episode.
 
         Raises:
             UserError: options, of which EnvPool has none.
@@ -160,7 +161,7 @@ class EnvPoolEnv(gym.Env[NDArray[Any], Any]):
         return observations[0], info_of(info, 0)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """One policy step.
+        """Steps the environment once at the policy's frequency.
 
         Raises:
             ProtocolError: before a reset or after the episode's end, where EnvPool would silently begin another.
@@ -178,8 +179,21 @@ class EnvPoolEnv(gym.Env[NDArray[Any], Any]):
         self._running = not (over or truncated[0])
         return observations[0], float(rewards[0]), over, bool(truncated[0]), info_of(info, 0)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickles and copies an environment that was not reset yet, as the arguments of its constructor.
+
+        Raises:
+            UserError: it is running, and EnvPool's C++ state cannot be copied.
+        """
+        if self._seeded:
+            raise UserError(
+                f"a running EnvPool environment cannot be copied or pickled (its state is in C++), got {self.task_id}; "
+                "copy it before the first reset, or use highway-env's own environment"
+            )
+        return functools.partial(EnvPoolEnv, self.task_id, **self._settings), (), {"spec": self.spec}
+
     def debug_states(self) -> Sequence[Any]:
-        """EnvPool's own description of the environment, drivers' parameters included: for readers and tests.
+        """Returns EnvPool's own description of the environment, drivers' parameters included: for readers and tests.
 
         Raises:
             ProtocolError: before the first reset.
@@ -190,7 +204,7 @@ class EnvPoolEnv(gym.Env[NDArray[Any], Any]):
         return states
 
     def render(self) -> Any:
-        """The road around the ego as an image; None without a render mode."""
+        """Returns an image of the road around the ego; None without a render mode."""
         return None if self.render_mode is None else self._pool.render()[0]
 
 
@@ -201,6 +215,6 @@ def meta_actions_of(space: gym.Space) -> MetaActions | None:
     return _META if space.n == len(_META.actions_indexes) else _META_LONGITUDINAL
 
 
-def info_of(info: Mapping[str, Any], row: int) -> dict[str, Any]:
+def info_of(info: Mapping[str, Any], env: int) -> dict[str, Any]:
     """Returns one environment's info out of the pool's."""
-    return {"speed": float(info["speed"][row]), "crashed": bool(info["crashed"][row])}
+    return {"speed": float(info["speed"][env]), "crashed": bool(info["crashed"][env])}

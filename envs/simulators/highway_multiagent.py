@@ -1,6 +1,6 @@
 """highway-env's intersection with several learners, as a PettingZoo parallel environment.
 
-highway-env packs all agents into one tuple and ends the episode for everybody at the first crash. Here an agent that
+highway-env packs all agents into one tuple and ends the episode for all of them at the first crash. Here an agent that
 crashes or arrives leaves, with its own reward, and the others go on.
 
 >>> from envs.simulators.highway_multiagent import HighwayParallelEnv
@@ -23,16 +23,14 @@ from pettingzoo import ParallelEnv
 
 from predictor.errors import ProtocolError, UserError
 
-HIGHWAY_MULTIAGENT_IDS = ("intersection-multi-agent-v2", "intersection-multi-agent-v1", "intersection-multi-agent-v0")
-
-INTERSECTION = HIGHWAY_MULTIAGENT_IDS[0]
+INTERSECTION = "intersection-multi-agent-v2"
 """Its drivers notice who drives on connected lanes, as on intersection-v2."""
 
 
 class HighwayParallelEnv(ParallelEnv):
     """An intersection where "vehicle_0", "vehicle_1", … learn among highway-env's own drivers.
 
-    **Ends.** An agent terminates when it crashes or arrives (25 m into its exit); everybody else is truncated at
+    **Ends.** An agent terminates when it crashes or arrives (25 m into its exit); all others are truncated at
     `duration`. A vehicle whose agent is gone keeps the idle action until it leaves the map, as traffic does; after a
     crash it stays as an obstacle. **Reward**: highway-env's for each agent. **Info**: `speed_mps`, `crashed`,
     `arrived`.
@@ -53,7 +51,7 @@ class HighwayParallelEnv(ParallelEnv):
     """
 
     def __init__(self, env_id: str = INTERSECTION, *, render_mode: str | None = None, **config: Any) -> None:
-        """Make the intersection; agents appear at reset."""
+        """Makes the intersection; agents appear at reset."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # an older id is a choice: results are tied to it
             made = _make(env_id, config=config, render_mode=render_mode)
@@ -75,22 +73,22 @@ class HighwayParallelEnv(ParallelEnv):
 
     @property
     def vehicles(self) -> dict[str, Vehicle]:
-        """The vehicle of each agent that was observed last: the living, and those whose end that was."""
+        """Returns the vehicle of each agent that was observed last: those that live, and those that ended then."""
         all_vehicles = dict(zip(self.possible_agents, self.highway.controlled_vehicles, strict=True))
         return {agent: all_vehicles[agent] for agent in self._observed}
 
     def observation_space(self, agent: str) -> gym.Space:
-        """As highway-env has it for this agent; the same object at each call."""
+        """Returns highway-env's space for this agent, the same object at each call."""
         return self._observation_spaces[agent]
 
     def action_space(self, agent: str) -> gym.Space:
-        """As highway-env has it for this agent; the same object at each call."""
+        """Returns highway-env's space for this agent, the same object at each call."""
         return self._action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode with all agents.
+        """Begins an episode with all agents.
 
         Raises:
             UserError: `options["config"]` changed the number of agents.
@@ -108,10 +106,10 @@ class HighwayParallelEnv(ParallelEnv):
     def step(
         self, actions: Mapping[str, Any]
     ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, Any]]:
-        """Let everybody drive for one policy step; actions of agents that are gone are ignored.
+        """Steps all vehicles once at the policy's frequency; ignores actions of agents that are gone.
 
         Raises:
-            ProtocolError: nobody is there: before the first reset, or all are gone.
+            ProtocolError: no agent lives: before the first reset, or after the last one is gone.
             UserError: a living agent has no action.
         """
         if not self.agents:
@@ -139,11 +137,11 @@ class HighwayParallelEnv(ParallelEnv):
         )
 
     def render(self) -> Any:
-        """The road from above, as `render_mode` says."""
+        """Draws the road from above, as `render_mode` says."""
         return self.highway.render()
 
     def close(self) -> None:
-        """Close the window, if there is one."""
+        """Closes the window, if there is one."""
         self.highway.close()
 
     def _terminated(self, index: int, info: dict[str, Any]) -> bool:
@@ -151,7 +149,7 @@ class HighwayParallelEnv(ParallelEnv):
         return bool(info["agents_terminated"][index] or off_road)
 
     def _clear_abandoned(self) -> None:
-        """Take vehicles without an agent off the end of the road; highway-env spares all that had one."""
+        """Takes vehicles without an agent off the end of the road; highway-env spares all that had one."""
         alive = dict(zip(self.possible_agents, self.highway.controlled_vehicles, strict=True))
         for agent, vehicle in alive.items():
             end_m = vehicle.lane.length - 4 * vehicle.LENGTH  # where highway-env takes traffic off
@@ -170,17 +168,17 @@ class HighwayParallelEnv(ParallelEnv):
 
 
 def _make(env_id: str, **kwargs: Any) -> gym.Env:
-    """`gym.make`'s unwrapped environment; what Gymnasium refuses is a `UserError`."""
+    """Returns `gym.make`'s unwrapped environment; what Gymnasium refuses is a `UserError`."""
     try:
         return gym.make(env_id, disable_env_checker=True, **kwargs).unwrapped
     except (gym.error.Error, ModuleNotFoundError) as error:
         raise UserError(
-            f"cannot make env '{env_id}': {error}; known here: {', '.join(HIGHWAY_MULTIAGENT_IDS)}"
+            f"cannot make env '{env_id}': {error}; pass an intersection with several agents, such as '{INTERSECTION}'"
         ) from error
 
 
 def _idle(space: gym.Space, action_type: Any) -> Any:
-    """The action that changes nothing: highway-env's IDLE, or the middle of steering and acceleration."""
+    """Returns the action that changes nothing: highway-env's IDLE, or the middle of steering and acceleration."""
     if isinstance(space, gym.spaces.Discrete):
         return getattr(action_type, "actions_indexes", {}).get("IDLE", int(space.n) // 2)
     return np.zeros(space.shape, dtype=space.dtype)

@@ -1,4 +1,4 @@
-"""Driving scenarios whose traffic mixes drivers, as gymnasium ids: what a driver did says more than where it is now.
+"""Driving scenarios whose traffic mixes drivers, as gymnasium ids: a driver's past motion tells how it drives.
 
 Each driver of these environments has traits of its own (a law of driving, a wished speed, a time gap, ...), drawn from
 the environment's generator and kept for life. No observation shows them; labels do (`envs.readers.highway_labels`).
@@ -31,7 +31,7 @@ _MAY_BE_ZERO = ("jam_gap_m", "politeness", "lane_change_gain_mps2")
 
 @dataclass(frozen=True)
 class Traits:
-    """What one driver is like; hidden from whoever observes it."""
+    """Traits of one driver, which no observation shows."""
 
     kind: DriverKind
     """Law of acceleration: IDM, or linear with the weights of `AggressiveVehicle` or `DefensiveVehicle`."""
@@ -42,7 +42,7 @@ class Traits:
     jam_gap_m: float
     """Wished distance to a leader at rest, bumper to bumper (`DISTANCE_WANTED` counts one length more)."""
     acceleration_mps2: float
-    """Of IDM on a free road at rest (`COMFORT_ACC_MAX`)."""
+    """IDM's acceleration at rest on a free road (`COMFORT_ACC_MAX`)."""
     braking_mps2: float
     """Comfortable deceleration of IDM, positive (`-COMFORT_ACC_MIN`)."""
     exponent: float
@@ -60,9 +60,9 @@ class KindMix:
     share: float
     """Probability of this kind."""
     speed_factor: Range
-    """Of `Traits.speed_factor`."""
+    """Range of `Traits.speed_factor`."""
     time_gap_s: Range
-    """Of `Traits.time_gap_s`."""
+    """Range of `Traits.time_gap_s`."""
 
 
 @dataclass(frozen=True)
@@ -76,20 +76,20 @@ class DriverMix:
     defensive: KindMix = KindMix(1 / 3, speed_factor=(0.55, 0.9), time_gap_s=(1.8, 2.8))
     """Linear and stiff; slow and far."""
     jam_gap_m: Range = (1.5, 4.0)
-    """All kinds."""
+    """Range for all kinds."""
     acceleration_mps2: Range = (0.4, 1.5)
-    """All kinds; linear drivers use it where they yield and in lane changes."""
+    """Range for all kinds; linear drivers use it where they yield and in lane changes."""
     braking_mps2: Range = (1.5, 3.0)
-    """All kinds; linear drivers use it where they yield and in lane changes."""
+    """Range for all kinds; linear drivers use it where they yield and in lane changes."""
     exponent: Range = (3.5, 4.5)
-    """All kinds, as `acceleration_mps2`."""
+    """Range for all kinds, used as `acceleration_mps2`."""
     politeness: Range = (0.0, 1.0)
-    """All kinds."""
+    """Range for all kinds."""
     lane_change_gain_mps2: Range = (0.1, 1.0)
-    """All kinds."""
+    """Range for all kinds."""
 
     def __post_init__(self) -> None:
-        """Check shares and ranges.
+        """Checks shares and ranges.
 
         Raises:
             UserError: shares that do not sum to 1, or a range that is not positive or the wrong way round.
@@ -107,12 +107,12 @@ class DriverMix:
                 raise UserError(f"{name} needs {least} <= high, got ({low:g}, {high:g})")
 
     def of(self, kind: DriverKind) -> KindMix:
-        """The drivers of a kind."""
+        """Returns the drivers of a kind."""
         found: KindMix = getattr(self, kind)
         return found
 
     def draw(self, rng: np.random.Generator) -> Traits:
-        """One driver; takes as many numbers from the generator whatever its kind."""
+        """Draws one driver; takes as many numbers from the generator whatever its kind."""
         kind = DRIVER_KINDS[int(rng.choice(len(DRIVER_KINDS), p=[self.of(kind).share for kind in DRIVER_KINDS]))]
         own = self.of(kind)
         return Traits(
@@ -129,7 +129,7 @@ class DriverMix:
 
 
 class MixedDriver(LinearVehicle):
-    """A driver with traits of its own, whichever way highway-env creates it.
+    """Driver with traits of its own, whichever way highway-env creates it.
 
     All kinds steer alike, with highway-env's lane controller: its linear one tells nothing more about a driver. Another
     mix is a subclass with another `mix`, named in the env's config as ``other_vehicles_type``.
@@ -148,7 +148,7 @@ class MixedDriver(LinearVehicle):
     """
 
     mix: ClassVar[DriverMix] = DriverMix()
-    """Where traits come from."""
+    """Distribution of the traits."""
 
     def __init__(
         self,
@@ -163,7 +163,7 @@ class MixedDriver(LinearVehicle):
         timer: float | int | None = None,
         traits: Traits | None = None,
     ) -> None:
-        """Draw the traits and become such a driver."""
+        """Draws the traits and sets highway-env's parameters by them."""
         self.traits = self.mix.draw(road.np_random) if traits is None else traits
         super().__init__(
             road, position, heading, speed, target_lane_index, target_speed, route, enable_lane_change, timer
@@ -186,7 +186,7 @@ class MixedDriver(LinearVehicle):
 
     @property
     def target_speed(self) -> float:
-        """Wished speed [m/s]. Setting it says what the road asks for, of which the driver makes its own."""
+        """Wished speed [m/s]. Set it to what the road asks for; the driver scales that."""
         return self.traits.speed_factor * self._asked_mps
 
     @target_speed.setter
@@ -195,7 +195,7 @@ class MixedDriver(LinearVehicle):
 
     @classmethod
     def create_from(cls, vehicle: ControlledVehicle) -> "MixedDriver":
-        """The same driver at the same place; of another class of vehicle, a new driver at its place."""
+        """Returns a copy of the driver at its place; for another class of vehicle, a new driver at its place."""
         same = isinstance(vehicle, MixedDriver)
         return cls(
             vehicle.road,
@@ -211,17 +211,17 @@ class MixedDriver(LinearVehicle):
         )
 
     def randomize_behavior(self) -> None:
-        """Nothing is left to draw; some environments ask for it and some do not."""
+        """Does nothing: the traits are drawn already, and only some environments call this."""
 
     def acceleration(self, ego_vehicle: Any, front_vehicle: Any = None, rear_vehicle: Any = None) -> float:
-        """Acceleration [m/s²] that this driver would choose in the place of `ego_vehicle`; who yields brakes by IDM."""
+        """Returns the acceleration [m/s²] of this driver in the place of `ego_vehicle`; IDM's while it yields."""
         # A linear driver who is told to yield at a crossing would roll on into it.
         by_idm = self.traits.kind == "idm" or getattr(self, "is_yielding", False)
         law = IDMVehicle if by_idm else LinearVehicle
         return float(law.acceleration(self, ego_vehicle, front_vehicle, rear_vehicle))
 
     def steering_control(self, target_lane_index: Any) -> float:
-        """Steering angle [rad] towards the middle of a lane."""
+        """Returns the steering angle [rad] towards the middle of a lane."""
         return float(ControlledVehicle.steering_control(self, target_lane_index))
 
 
@@ -230,7 +230,7 @@ class _Mixed(AbstractEnv):
 
     @classmethod
     def default_config(cls) -> dict[str, Any]:
-        """The base's config with mixed drivers."""
+        """Returns the base's config with mixed drivers."""
         drivers = f"{MixedDriver.__module__}.{MixedDriver.__qualname__}"
         return {**super().default_config(), "other_vehicles_type": drivers, **cls.changes}
 
@@ -252,7 +252,7 @@ class MixedRoundaboutEnv(_Mixed, ConnectedLaneRoundaboutGenericEnv):
     """roundabout-generic-v1 among mixed drivers."""
 
     SPEED_LIMIT_MPS: ClassVar[float] = 14.0
-    """Where highway-env starts its drivers; it names no limit but the lanes' default of 20 m/s, twice gravity here."""
+    """Speed at which highway-env starts its drivers; the lanes' default limit of 20 m/s would be twice gravity here."""
 
     def _make_road(self) -> None:
         super()._make_road()
@@ -280,7 +280,7 @@ _CLASSES: dict[str, type[_Mixed]] = {
 
 
 def register_scenarios() -> None:
-    """Register the ids with gymnasium; again does nothing."""
+    """Registers the ids with gymnasium; may be called again."""
     for env_id, env_class in _CLASSES.items():
         if env_id not in gym.registry:
             gym.register(env_id, entry_point=f"{env_class.__module__}:{env_class.__qualname__}")

@@ -6,7 +6,6 @@ know where everything is.
 
 import io
 import math
-import os
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -17,6 +16,8 @@ import imageio_ffmpeg  # type: ignore[import-untyped]
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
+
+from predictor.files import new_file
 
 Color = tuple[int, int, int]
 Polyline = Float[np.ndarray, "_ 2"]
@@ -185,21 +186,17 @@ def write_video(path: Path, pictures: Iterable[UInt8[np.ndarray, "height width 3
         pictures: at least one, all of one size; height and width are even, as H.264 needs them.
         fps: pictures per second.
     """
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     rest = iter(pictures)
     first = next(rest)
-    writer = imageio_ffmpeg.write_frames(
-        partial, first.shape[1::-1], fps=fps, codec="libx264", quality=7, macro_block_size=2
-    )
-    try:
+    with new_file(path) as partial:
+        writer = imageio_ffmpeg.write_frames(
+            partial, first.shape[1::-1], fps=fps, codec="libx264", quality=7, macro_block_size=2
+        )
         with closing(writer):
             writer.send(None)
             writer.send(np.ascontiguousarray(first))
             for picture in rest:
                 writer.send(np.ascontiguousarray(picture))
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def write_picture(path: Path, picture: UInt8[np.ndarray, "height width 3"]) -> None:

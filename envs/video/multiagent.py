@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from envs.parallel import ForecastParallelEnv
-from envs.readers import parallel_env_id
+from envs.readers import multiagent_env_id
 from envs.readers.base import role_of
 from envs.readers.pursuit import is_pursuit_env
 from envs.simulators.highway_multiagent import HighwayParallelEnv
@@ -325,7 +325,7 @@ class _Recorder:
         self._focus = focus
         # Drawn as their own pictures are.
         y_up = not (isinstance(env.unwrapped, HighwayParallelEnv) or is_pursuit_env(env))
-        self.recording = SharedRecording(parallel_env_id(env), env.scene_spec.dt_s, "", style, y_up)
+        self.recording = SharedRecording(multiagent_env_id(env), env.scene_spec.dt_s, "", style, y_up)
         self._names: dict[int, str] = {}
         self._returns: dict[str, float] = {}
 

@@ -13,9 +13,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from predictor.errors import UserError
+from predictor.config_checks import check_at_least, check_choices
 from predictor.forecaster import Belief, Memory, WindowOutput
 from predictor.graph import pair_mask
+from predictor.layers.pair_noise import Noise
 from predictor.layers.state_codec import Residual, StateCodec
 from predictor.scene import SceneSpec
 
@@ -149,7 +150,7 @@ class UnrolledForecaster(nn.Module, ABC):
         return Memory(nodes, pairs), Belief(states, valid, self.edge_probs(graph, valid), features, internal)
 
     def rollout(
-        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
+        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
         """Feed predictions back; all samples are the same."""
         now: Internal = belief.internal
@@ -232,7 +233,6 @@ def mean_weight(valid: Bool[Tensor, "*batch agents"], dtype: torch.dtype) -> Flo
 
 
 def check_sizes(config: object, *names: str) -> None:
-    """Raise a `UserError` unless these fields of a config are at least 1."""
-    for name in names:
-        if getattr(config, name) < 1:
-            raise UserError(f"{name} must be at least 1, got {getattr(config, name)}")
+    """Raise a `UserError` unless closed choices are among their values, and these fields at least 1."""
+    check_choices(config)
+    check_at_least(config, 1, *names)

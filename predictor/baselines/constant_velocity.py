@@ -1,10 +1,19 @@
-"""Everyone keeps the velocity they have: the baseline that every learned forecaster stands beside."""
+"""Constant velocity, without and with Gaussian noise: the baselines that every learned forecaster stands beside.
 
+`ConstantVelocity` is the control of a single forecast, `NoisyConstantVelocity` that of best-of-K errors and coverage: a
+stochastic model has to beat both.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory, edgeless_belief
+from predictor.layers.pair_noise import Noise
 from predictor.scene import SceneSpec
 
 
@@ -31,7 +40,7 @@ class ConstantVelocity:
         return memory, edgeless_belief(states, valid, self.num_edge_types, self.edge_feature_dim)
 
     def rollout(
-        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
+        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
         """X + v·t; all samples are the same."""
         states = belief.states
@@ -40,3 +49,86 @@ class ConstantVelocity:
         axes = self.spec.position_dim
         future[..., :axes] += states[:, :, None, axes : 2 * axes] * time_s[:, None]
         return future[:, None].expand(-1, num_samples, -1, -1, -1)
+
+
+class NoisyConstantVelocity(ConstantVelocity):
+    """A `Forecaster` whose samples scatter around constant velocity, by two parameters that `fit` takes from data.
+
+    Sample 0 is constant velocity. Every other one draws one offset per agent and axis, n ~ N(0, 1), and holds it: the
+    position t seconds ahead is x + v·t + n·`noise_m`·t^`growth`. With `growth` 1 the velocity is noisy.
+    """
+
+    def __init__(self, spec: SceneSpec, noise_m: float, growth: float, horizon_steps: int = 5) -> None:
+        """Store the two parameters.
+
+        Args:
+            spec: layout of the scenes.
+            noise_m: standard deviation per axis one second ahead [m].
+            growth: exponent of the standard deviation in time.
+            horizon_steps: steps to forecast by default.
+        """
+        super().__init__(spec, horizon_steps)
+        self.noise_m = noise_m
+        self.growth = growth
+
+    @classmethod
+    def fit(cls, spec: SceneSpec, std_m: Sequence[float]) -> "NoisyConstantVelocity":
+        """Fits both parameters to the errors of constant velocity, by least squares on their logarithms.
+
+        Args:
+            spec: layout of the scenes.
+            std_m: standard deviation per axis of the errors at each step of the horizon [m], of training data.
+        """
+        time_s = spec.dt_s * np.arange(1, len(std_m) + 1)
+        found = np.asarray(std_m, dtype=np.float64)
+        used = np.isfinite(found) & (found > 0)
+        if used.sum() < 2:
+            share = float(found[used][0] / time_s[used][0]) if used.any() else 0.0
+            return cls(spec, share, 1.0, len(std_m))
+        growth, offset = np.polyfit(np.log(time_s[used]), np.log(found[used]), 1)
+        return cls(spec, float(np.exp(offset)), float(growth), len(std_m))
+
+    def rollout(
+        self,
+        belief: Belief,
+        horizon_steps: int,
+        num_samples: int = 1,
+        generator: torch.Generator | Sequence[np.random.Generator] | None = None,
+    ) -> Float[Tensor, "batch samples agents horizon state"]:
+        """Returns constant velocity as sample 0, and samples with noise; each one's velocity follows its positions.
+
+        With one generator per scene of the batch, a scene's samples depend on no other scene.
+
+        Raises:
+            UserError: a sequence of generators that has not one for each scene.
+        """
+        future = super().rollout(belief, horizon_steps, num_samples).clone()
+        axes = self.spec.position_dim
+        drawn = _normal(belief.valid, num_samples - 1, axes, generator).to(future)[..., None, :]
+        time_s = self.spec.dt_s * torch.arange(1, horizon_steps + 1, dtype=future.dtype, device=future.device)
+        spread_m = self.noise_m * time_s**self.growth
+        added_m = spread_m.diff(prepend=spread_m.new_zeros(1))
+        future[:, 1:, ..., :axes] += drawn * spread_m[:, None]
+        future[:, 1:, ..., axes : 2 * axes] += drawn * added_m[:, None] / self.spec.dt_s
+        return future
+
+
+def _normal(
+    valid: Bool[Tensor, "batch agents"],
+    samples: int,
+    axes: int,
+    generator: torch.Generator | Sequence[np.random.Generator] | None,
+) -> Float[Tensor, "batch samples agents axes"]:
+    """Draws standard normal numbers; a scene with a generator of its own draws for its present agents only."""
+    shape = (len(valid), samples, valid.shape[1], axes)
+    if generator is None or isinstance(generator, torch.Generator):
+        return torch.randn(shape, device=valid.device, generator=generator)
+    if len(generator) != len(valid):
+        raise UserError(
+            f"noise needs one generator per scene, got {len(generator)} for {len(valid)}; pass one for each"
+        )
+    drawn = torch.zeros(shape)
+    for scene, (own, present) in enumerate(zip(generator, valid.cpu(), strict=True)):
+        numbers = own.standard_normal((samples, int(present.sum()), axes), dtype=np.float32)
+        drawn[scene, :, present] = torch.from_numpy(numbers)
+    return drawn

@@ -23,6 +23,7 @@ from predictor.dgvae.networks import concrete_sample, no_edge_where_absent
 from predictor.errors import UserError
 from predictor.forecaster import Belief, WindowOutput
 from predictor.graph import pair_mask
+from predictor.layers.pair_noise import Noise, PairNoise, noise_of_pairs
 from predictor.layers.state_codec import Residual
 from predictor.scene import SceneSpec
 
@@ -143,7 +144,7 @@ class DNRI(UnrolledForecaster):
         """The prior's probabilities."""
         return torch.softmax(scores, dim=-1)
 
-    def drawn(self, generator: torch.Generator | None) -> GraphRule:
+    def drawn(self, generator: torch.Generator | PairNoise | None) -> GraphRule:
         """A rule that draws graphs."""
 
         def draw(logits: Tensor) -> Tensor:
@@ -178,7 +179,7 @@ class DNRI(UnrolledForecaster):
     # --- Forecaster ---------------------------------------------------------------------------------------------
 
     def rollout(
-        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
+        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
         """Feed predictions back through the encoder; sample 0 takes expected graphs, the others draw theirs."""
         expected = super().rollout(belief, horizon_steps)
@@ -186,12 +187,13 @@ class DNRI(UnrolledForecaster):
             return expected
         now: Internal = belief.internal
         draws = num_samples - 1
+        noise = noise_of_pairs(generator, pair_mask(belief.valid), draws, horizon_steps, self.num_edge_types)
 
         def repeat(*tensors: Tensor) -> Tensors:
             return tuple(t.repeat_interleave(draws, dim=0) for t in tensors)
 
         states, valid, scores = repeat(belief.states, belief.valid, now.scores)
-        memory, before, draw = repeat(*now.pairs), repeat(*now.before), self.drawn(generator)
+        memory, before, draw = repeat(*now.pairs), repeat(*now.before), self.drawn(noise)
         futures = self._branch(states, valid, memory, scores, before, horizon_steps, draw)
         return torch.cat([expected, futures.unflatten(0, (len(belief.states), draws))], dim=1)
 

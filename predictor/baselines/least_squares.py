@@ -16,6 +16,7 @@ from predictor.data.springs import Physics, simulate
 from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory
 from predictor.graph import pair_mask
+from predictor.layers.pair_noise import Noise
 from predictor.scene import SceneSpec
 
 LEAST_CONSTANT = 0.25
@@ -76,7 +77,7 @@ class SpringLeastSquares:
         return Memory((now,), (equations,)), belief
 
     def rollout(
-        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
+        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
         """Integrate the law; all samples are the same."""
         physics = Physics(

@@ -18,6 +18,7 @@ from predictor.data.store import Episode, read_store
 from predictor.data.windows import visible
 from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory, edgeless_belief
+from predictor.layers.pair_noise import Noise
 from predictor.scene import SceneSpec
 
 K = 5
@@ -126,7 +127,7 @@ class NearestNeighbour(nn.Module):
         return memory, edgeless_belief(states, valid, self.num_edge_types, self.edge_feature_dim)
 
     def rollout(
-        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
+        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
         """Sample 0 moves like the mean of the neighbours; sample s like the s-th nearest one alone, over and over.
 

@@ -7,10 +7,12 @@ another (and its time and memory), not how crowds behave.
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
-import tyro
 
+from predictor.command_line import Renamed, parse
+from predictor.config_checks import check_at_least
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.errors import UserError, run_entry_point
 from predictor.provenance import provenance
@@ -21,32 +23,34 @@ class CrowdConfig:
     """Overlay the scenes of a store."""
 
     source: Path
-    """Episode store without an ego."""
+    """Episode store whose scenes are overlaid; it has no ego."""
     out: Path
-    """New store."""
-    agents: tuple[int, ...] = (2, 5, 10, 20, 50, 100, 150)
-    """Agents wanted at the last observed step; each number gives `episodes` episodes."""
+    """Folder of the new store (Zarr)."""
+    num_agents: Annotated[tuple[int, ...], Renamed("agents")] = (2, 5, 10, 20, 50, 100, 150)
+    """Numbers of agents wanted at the last observed step; each gives `episodes` episodes."""
     episodes: int = 8
-    """Episodes for each number."""
-    steps: int = 50
-    """Of an episode; shorter ones of the source are left out."""
+    """Number of episodes for each number of agents."""
+    episode_steps: Annotated[int, Renamed("steps")] = 50
+    """Length of an episode [steps]; shorter ones of the source are left out."""
     at_step: int = 39
-    """Where agents are counted: the last step of the burn-in."""
+    """Step at which agents are counted: the last step of the burn-in."""
     seed: int = 0
-    """Of the choice of scenes."""
+    """Random seed for the choice of scenes."""
     overwrite: bool = False
     """Replace an existing store."""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check ranges.
 
         Raises:
             UserError: a value that makes no sense.
         """
-        if not self.agents or min(self.agents) < 1 or self.episodes < 1:
-            raise UserError(f"agents and episodes must be at least 1, got {self.agents}, {self.episodes}")
-        if not 0 <= self.at_step < self.steps:
-            raise UserError(f"at_step must lie between 0 and {self.steps - 1}, got {self.at_step}")
+        check_at_least(self, 1, "num_agents", "episodes")
+        check_at_least(self, 0, "seed")
+        if not self.num_agents:
+            raise UserError("num_agents needs at least one number; leave it out for the default ones")
+        if not 0 <= self.at_step < self.episode_steps:
+            raise UserError(f"at_step must lie between 0 and {self.episode_steps - 1}, got {self.at_step}")
 
 
 def overlay(episodes: list[Episode], axes: int, seed: int) -> Episode:
@@ -73,12 +77,14 @@ def make_crowds(config: CrowdConfig) -> list[Episode]:
     store = read_store(config.source)
     if store.info.spec.has_ego:
         raise UserError(f"{config.source} has an ego, and there can be only one; overlay stores without")
-    usable = [e for e in store.episodes if len(e.states) >= config.steps and e.valid[config.at_step].any()]
+    usable = [e for e in store.episodes if len(e.states) >= config.episode_steps and e.valid[config.at_step].any()]
     if not usable:
-        raise UserError(f"{config.source}: no episode has {config.steps} steps and an agent at step {config.at_step}")
+        raise UserError(
+            f"{config.source}: no episode has {config.episode_steps} steps and an agent at step {config.at_step}"
+        )
     rng = np.random.default_rng(config.seed)
     crowds: list[Episode] = []
-    for wanted in config.agents:
+    for wanted in config.num_agents:
         for _ in range(config.episodes):
             chosen: list[Episode] = []
             while sum(int(e.valid[config.at_step].sum()) for e in chosen) < wanted:
@@ -89,8 +95,7 @@ def make_crowds(config: CrowdConfig) -> list[Episode]:
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(CrowdConfig, description=__doc__)
-    config.check()
+    config = parse(CrowdConfig, __doc__)
     crowds = make_crowds(config)
     source = read_store(config.source).info
     made = provenance(("numpy", "zarr")) | {"overlaid": source.provenance}

@@ -1,6 +1,5 @@
 """Store and data card of a dataset, written together; the card holds only what was measured on the episodes."""
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +9,8 @@ import numpy as np
 from predictor.data.loading import LoaderConfig, Split, checksum
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.errors import UserError
+from predictor.files import new_file
+from predictor.markdown import table
 from predictor.provenance import provenance
 from predictor.scene import SceneSpec
 
@@ -64,13 +65,9 @@ def save_dataset(
     }
     info = StoreInfo(spec, notes.title, facts)
     config.card_path.parent.mkdir(parents=True, exist_ok=True)
-    partial = config.card_path.with_name(f".{config.card_path.name}.{os.getpid()}.partial")
-    try:
+    with new_file(config.card_path) as partial:
         partial.write_text(card_text(config.split, info, episodes, notes), encoding="utf-8")
         write_store(config.out, info, episodes, config.overwrite)
-        os.replace(partial, config.card_path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def summary(config: LoaderConfig, episodes: Sequence[Episode]) -> str:
@@ -91,15 +88,15 @@ def card_text(split: Split, info: StoreInfo, episodes: Sequence[Episode], notes:
         f"# {notes.title}",
         notes.about,
         "## Facts",
-        _table(("fact", "value"), _facts(split, info, episodes)),
+        table(("fact", "value"), _facts(split, info, episodes)),
         "## Columns of a state",
         f"Frame of the positions for a network: {' × '.join(info.spec.frame)}. The standard deviation is over this "
         "store, with positions in that frame; the scale is what the network divides by, the same for all splits.",
-        _table(("column", "scale", "standard deviation"), _columns(info.spec, episodes)),
+        table(("column", "scale", "standard deviation"), _columns(info.spec, episodes)),
         "## What the loader did",
         "\n".join(f"* {choice}" for choice in notes.choices),
         "## Counts",
-        _table(("what", "count"), [(name, f"{count:,}") for name, count in notes.counts.items()]),
+        table(("what", "count"), [(name, f"{count:,}") for name, count in notes.counts.items()]),
         "## Rights",
         notes.rights,
         "## Made by",
@@ -156,11 +153,6 @@ def _deviations(spec: SceneSpec, episodes: Sequence[Episode]) -> list[float]:
 
 def _spread(values: np.ndarray) -> str:
     return f"{values.min():g} / {np.median(values):g} / {values.max():g}"
-
-
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 def _counted(notes: DatasetNotes) -> str:

@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import tyro
-
+from predictor.command_line import parse
+from predictor.config_checks import check_at_least, check_positive
 from predictor.data.dataset_card import DatasetNotes, most_present, save_dataset, summary
 from predictor.data.levelx_files import CLASS_FEATURES, Features, Layout, layout_of, open_recording, read_tracks
 from predictor.data.loading import NO_LIMIT_M, LoaderConfig, find_files, in_split, progressed, steps_per_frame
@@ -49,27 +49,26 @@ class LevelxConfig(LoaderConfig):
     """Turn recordings in levelXData's CSV layouts into an episode store."""
 
     features: Features = "full"
-    """kinematic: position and velocity; full: heading, acceleration and class, too."""
+    """Features of a state: kinematic (position and velocity) or full (heading, acceleration and class, too)."""
     frame: Literal["world", "centroid"] = "world"
-    """What networks see positions relative to: world keeps the map (one location), centroid forgets it."""
+    """Origin of the positions that networks see: world keeps the map (one location), centroid forgets it."""
     dt_s: float = 0.2
     """Time between steps [s]; whole frames of the recordings (25 Hz). 0.2 as in the dG-VAE paper."""
     episode_steps: int = 50
-    """Cut recordings into episodes of this length [steps]."""
+    """Length of the episodes into which recordings are cut [steps]."""
     locations: tuple[str, ...] = ()
-    """Keep only recordings of these locationIds; none given keeps all. Each location has its own coordinates."""
+    """Keys (locationId) of the locations whose recordings are kept; none given keeps all. Each location has its
+    own coordinates."""
 
-    def check(self) -> None:
-        """Refuse values that make no sense.
+    def __post_init__(self) -> None:
+        """Check choices and ranges.
 
         Raises:
-            UserError: names the field.
+            UserError: a value that makes no sense.
         """
-        super().check()
-        if not 0 < self.dt_s < float("inf"):
-            raise UserError(f"dt_s must be positive, got {self.dt_s:g}")
-        if self.episode_steps < 2:
-            raise UserError(f"episode_steps must be at least 2, got {self.episode_steps}")
+        super().__post_init__()
+        check_positive(self, "dt_s")
+        check_at_least(self, 2, "episode_steps")
 
 
 def scene_spec(config: LevelxConfig, layout: Layout, agents: int = 0) -> SceneSpec:
@@ -149,8 +148,8 @@ def _notes(config: LevelxConfig, layout: Layout, counts: Counter[str]) -> Datase
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(LevelxConfig, description=__doc__)
-    config.check()
+    config = parse(LevelxConfig, __doc__)
+    config.check_paths()
     layout, episodes, notes, files = load(config)
     save_dataset(config, scene_spec(config, layout, most_present(episodes)), episodes, notes, files)
     print(summary(config, episodes))

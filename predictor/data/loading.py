@@ -13,6 +13,7 @@ from typing import Literal, TypeVar
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from predictor.config_checks import check_choices
 from predictor.errors import UserError
 
 Split = Literal["train", "val", "test", "all"]
@@ -26,14 +27,14 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class LoaderConfig:
-    """What every loader is told."""
+    """Options of every dataset loader."""
 
     source: Path
-    """Where the published files are."""
+    """Folder of the published files."""
     out: Path
     """Folder of the new store (Zarr); its data card is written beside it as <out>.md."""
     split: Split = "all"
-    """Which part to write: a fixed function of names (trial, game, video, recording), see docs/datasets."""
+    """Part of the dataset to write: a fixed function of names (trial, game, video, recording), see docs/datasets."""
     overwrite: bool = False
     """Replace an existing store and its card."""
 
@@ -42,11 +43,19 @@ class LoaderConfig:
         """Where the data card goes."""
         return self.out.with_name(f"{self.out.name}.md")
 
-    def check(self) -> None:
-        """Refuse before any work is done.
+    def __post_init__(self) -> None:
+        """Check choices.
 
         Raises:
-            UserError: no source, or something is in the way of the output.
+            UserError: an unknown split.
+        """
+        check_choices(self)
+
+    def check_paths(self) -> None:
+        """Check, before any work is done, that the source is there and nothing is in the way of the output.
+
+        Raises:
+            UserError: no source, or an existing output that may not be replaced.
         """
         if not self.source.exists():
             raise UserError(f"no source at {self.source}; pass the unpacked dataset")

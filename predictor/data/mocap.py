@@ -14,9 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 from jaxtyping import Float
 
+from predictor.command_line import parse
+from predictor.config_checks import check_at_least
 from predictor.data.dataset_card import DatasetNotes, save_dataset, summary
 from predictor.data.loading import NO_LIMIT_M, LoaderConfig, find_files, in_split, progressed
 from predictor.data.mocap_files import Skeleton, joint_positions, read_motion, read_skeleton
@@ -42,24 +43,31 @@ class MocapConfig(LoaderConfig):
     """Turn one subject of the CMU motion capture database into an episode store."""
 
     stride: int = 4
-    """Keep every stride-th frame; 4 gives 30 Hz."""
+    """Number of frames from one kept frame to the next; 4 gives 30 Hz."""
     all_phases: bool = False
-    """One episode for each of the `stride` ways to begin, instead of the first only; for training."""
+    """Make one episode for each of the `stride` ways to begin, instead of the first only; for training."""
     min_steps: int = 50
-    """Skip episodes that are shorter [steps]."""
+    """Least length of an episode; shorter ones are skipped [steps]."""
 
-    def check(self) -> None:
-        """Refuse values that make no sense.
+    def __post_init__(self) -> None:
+        """Check choices and ranges.
 
         Raises:
-            UserError: names the field.
+            UserError: a value that makes no sense.
         """
-        super().check()
+        super().__post_init__()
+        check_at_least(self, 1, "stride")
+        check_at_least(self, 2, "min_steps")
+
+    def check_paths(self) -> None:
+        """Check the paths of every loader, and that the source is a folder.
+
+        Raises:
+            UserError: one does not fit.
+        """
+        super().check_paths()
         if not self.source.is_dir():
             raise UserError(f"source must be one subject's folder, got the file {self.source}")
-        for name, least in (("stride", 1), ("min_steps", 2)):
-            if getattr(self, name) < least:
-                raise UserError(f"{name} must be at least {least}, got {getattr(self, name)}")
 
     @property
     def dt_s(self) -> float:
@@ -155,8 +163,8 @@ def _notes(config: MocapConfig, skeleton: Skeleton, counts: dict[str, int]) -> D
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(MocapConfig, description=__doc__)
-    config.check()
+    config = parse(MocapConfig, __doc__)
+    config.check_paths()
     skeleton, episodes, notes, files = load(config)
     extra = {"joints": skeleton.joint_names, "parents": skeleton.parents, "lengths_m": skeleton.lengths_m.tolist()}
     save_dataset(config, scene_spec(config, len(skeleton.bones)), episodes, notes, files, extra)

@@ -19,12 +19,13 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-import tyro
 from jaxtyping import Float, Int
 
+from predictor.command_line import Renamed, parse
+from predictor.config_checks import check_at_least
 from predictor.data.dataset_card import DatasetNotes, save_dataset, summary
 from predictor.data.loading import (
     NO_LIMIT_M,
@@ -262,21 +263,20 @@ class NbaConfig(LoaderConfig):
     """Turn basketball tracking data into an episode store."""
 
     format: Literal["score", "sportvu"] = "score"
-    """Text files of possessions, or raw SportVU JSON of games."""
-    window_steps: int = 50
+    """Format of the files: score (text files of possessions) or sportvu (raw JSON of games)."""
+    episode_steps: Annotated[int, Renamed("window_steps")] = 50
     """Length of an episode [steps of 0.12 s]; shorter rests of a passage are dropped."""
     skip_broken: bool = False
     """Leave broken files out and count them, instead of stopping at the first."""
 
-    def check(self) -> None:
-        """Refuse values that make no sense.
+    def __post_init__(self) -> None:
+        """Check choices and ranges.
 
         Raises:
-            UserError: names the field.
+            UserError: a value that makes no sense.
         """
-        super().check()
-        if self.window_steps < 2:
-            raise UserError(f"window_steps must be at least 2, got {self.window_steps}")
+        super().__post_init__()
+        check_at_least(self, 2, "episode_steps")
 
 
 def scene_spec() -> SceneSpec:
@@ -326,9 +326,9 @@ def load(config: NbaConfig) -> tuple[list[Episode], DatasetNotes, list[Path]]:
     episodes: list[Episode] = []
     for path in progressed(chosen, "nba"):
         for passage in _passages(path, config, counts):
-            found = windows_of(passage, config.window_steps)
-            counts[f"passages skipped, shorter than {config.window_steps} steps"] += not found
-            counts["steps dropped at the end of passages"] += (len(passage.positions_m) - 1) % config.window_steps
+            found = windows_of(passage, config.episode_steps)
+            counts[f"passages skipped, shorter than {config.episode_steps} steps"] += not found
+            counts["steps dropped at the end of passages"] += (len(passage.positions_m) - 1) % config.episode_steps
             episodes += found
     numbered = [replace(episode, seed=i) for i, episode in enumerate(episodes)]
     return numbered, _notes(config, counts), files
@@ -359,7 +359,7 @@ def _notes(config: NbaConfig, counts: Counter[str]) -> DatasetNotes:
             "The ball's height is not kept.",
             f"A step is {DT_S} s (25/3 Hz).",
             "Velocity is the backward difference over one step; the first frame of each passage is dropped.",
-            f"Passages are cut into windows of {config.window_steps} steps that do not overlap; rests are dropped.",
+            f"Passages are cut into windows of {config.episode_steps} steps that do not overlap; rests are dropped.",
             f"Splits by game, hash with seed {SPLIT_SEED}; 'all' takes every file of the source.",
         ),
         dict(counts),
@@ -368,8 +368,8 @@ def _notes(config: NbaConfig, counts: Counter[str]) -> DatasetNotes:
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(NbaConfig, description=__doc__)
-    config.check()
+    config = parse(NbaConfig, __doc__)
+    config.check_paths()
     episodes, notes, files = load(config)
     save_dataset(config, scene_spec(), episodes, notes, files)
     print(summary(config, episodes))

@@ -17,8 +17,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import tyro
 
+from predictor.command_line import parse
+from predictor.config_checks import check_at_least
 from predictor.data.dataset_card import DatasetNotes, most_present, save_dataset, summary
 from predictor.data.loading import (
     NO_LIMIT_M,
@@ -63,18 +64,17 @@ class SddConfig(LoaderConfig):
     dt_s: float = 0.4
     """Time between steps [s]; whole frames of 1/30 s. 0.4 is customary for this dataset."""
     episode_steps: int = 50
-    """Cut videos into episodes of this length [steps]."""
+    """Length of the episodes into which videos are cut [steps]."""
 
-    def check(self) -> None:
-        """Refuse values that make no sense.
+    def __post_init__(self) -> None:
+        """Check choices and ranges.
 
         Raises:
-            UserError: names the field.
+            UserError: a value that makes no sense.
         """
-        super().check()
+        super().__post_init__()
         steps_per_frame(self.dt_s, FRAMES_PER_S, "the dataset")
-        if self.episode_steps < 2:
-            raise UserError(f"episode_steps must be at least 2, got {self.episode_steps}")
+        check_at_least(self, 2, "episode_steps")
 
 
 def scene_spec(dt_s: float, agents: int = 0) -> SceneSpec:
@@ -226,8 +226,8 @@ def _notes(config: SddConfig, counts: Counter[str]) -> DatasetNotes:
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(SddConfig, description=__doc__)
-    config.check()
+    config = parse(SddConfig, __doc__)
+    config.check_paths()
     episodes, notes, files = load(config)
     save_dataset(config, scene_spec(config.dt_s, most_present(episodes)), episodes, notes, files)
     print(summary(config, episodes))

@@ -13,11 +13,12 @@ from typing import Literal
 
 import numpy as np
 import torch
-import tyro
 from jaxtyping import Bool, Float
 from rich.progress import Progress
 from torch import Tensor
 
+from predictor.command_line import parse
+from predictor.config_checks import check_at_least, check_choices, check_positive
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.errors import UserError, run_entry_point
 from predictor.provenance import provenance
@@ -33,31 +34,34 @@ class Physics:
     """Constants of the simulated box."""
 
     kind: Literal["springs", "charged"] = "springs"
-    """Springs (paper), or NRI's charged particles: attraction and repulsion with 1/r², without constants to infer."""
+    """Kind of interaction: springs (paper), or NRI's charged particles: attraction and repulsion with 1/r², without
+    constants to infer."""
     num_agents: int = 5
-    """Particles (paper: 5)."""
+    """Number of particles (paper: 5)."""
     box_m: float = 5.0
-    """Walls at ± this (NRI: 5)."""
+    """Distance of the walls from the origin (NRI: 5)."""
     position_std_m: float = 0.5
-    """Of the initial positions, Gaussian (NRI: 0.5)."""
+    """Standard deviation of the initial positions, Gaussian (NRI: 0.5)."""
     speed_mps: float = 0.5
     """Norm of the initial velocities, Gaussian in direction (NRI: 0.5)."""
     dt_s: float = DT_S
-    """Between frames (paper: 6 Hz)."""
+    """Time between frames (paper: 6 Hz)."""
     frames: int = FRAMES
-    """Of a rollout (paper: 50)."""
+    """Number of frames of a rollout (paper: 50)."""
     substeps: int = 50
-    """Leapfrog steps per frame (charges: four times as many)."""
+    """Number of leapfrog steps per frame (charges: four times as many)."""
     softening_m: float = 0.1
-    """Charges do not come closer than this in the force law, in place of NRI's cap on the force."""
+    """Least distance of two charges in the force law, in place of NRI's cap on the force."""
 
-    def check(self) -> None:
-        """Check ranges."""
-        for name in ("num_agents", "box_m", "position_std_m", "speed_mps", "dt_s", "substeps", "softening_m"):
-            if getattr(self, name) <= 0:
-                raise UserError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.frames < 2:
-            raise UserError(f"frames must be at least 2, got {self.frames}")
+    def __post_init__(self) -> None:
+        """Check choices and ranges.
+
+        Raises:
+            UserError: a value that makes no sense.
+        """
+        check_choices(self)
+        check_positive(self, "num_agents", "box_m", "position_std_m", "speed_mps", "dt_s", "substeps", "softening_m")
+        check_at_least(self, 2, "frames")
 
 
 @dataclass(frozen=True)
@@ -67,32 +71,29 @@ class SpringsConfig:
     out: Path
     """Folder for the four stores."""
     train: int = 50_000
-    """Rollouts for training (paper: 50,000)."""
+    """Number of rollouts for training (paper: 50,000)."""
     val: int = 10_000
-    """Rollouts for model selection (paper: 10,000)."""
+    """Number of rollouts for model selection (paper: 10,000)."""
     test: int = 10_000
-    """Rollouts for the table (paper: 10,000)."""
+    """Number of rollouts for the table (paper: 10,000)."""
     ood: int = 10_000
-    """Rollouts out of distribution: p = 0.5, k ∈ {1, 2, 3} (charges: twice the strength)."""
+    """Number of rollouts out of distribution: p = 0.5, k ∈ {1, 2, 3} (charges: twice the strength)."""
     edge_probability: float = 0.7
-    """Of a spring between two particles (paper: 0.7)."""
+    """Probability of a spring between two particles (paper: 0.7)."""
     seed: int = 0
-    """Each split draws from its own stream of this seed."""
+    """Random seed for the rollouts; each split draws from its own stream."""
     overwrite: bool = False
     """Replace existing stores."""
     physics: Physics = Physics()
-    """The box."""
+    """Constants of the simulated box."""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Check ranges.
 
         Raises:
             UserError: a value that makes no sense.
         """
-        self.physics.check()
-        for name in ("train", "val", "test", "ood"):
-            if getattr(self, name) < 0:
-                raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
+        check_at_least(self, 0, "train", "val", "test", "ood", "seed")
         if not 0 <= self.edge_probability <= 1:
             raise UserError(f"edge_probability must lie between 0 and 1, got {self.edge_probability}")
 
@@ -257,8 +258,7 @@ def make(config: SpringsConfig) -> dict[str, float]:
 
 def main() -> None:
     """Entry point."""
-    config = tyro.cli(SpringsConfig, description=__doc__)
-    config.check()
+    config = parse(SpringsConfig, __doc__)
     for name, seconds in make(config).items():
         print(f"{config.out / name}: {getattr(config, name)} rollouts in {seconds:.1f} s")
 

@@ -6,8 +6,6 @@ windows are cut (`predictor.data.windows`).
 """
 
 import json
-import shutil
-import uuid
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -18,7 +16,7 @@ import zarr
 from jaxtyping import Bool, Float, Int
 
 from predictor.errors import UserError
-from predictor.files import replace_folder
+from predictor.files import new_folder
 from predictor.scene import PADDING_ID, Scene, SceneSpec
 
 FORMAT = "dgvae-rl episodes"
@@ -119,9 +117,7 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
         states[rows, : episode.states.shape[1]] = episode.states
         valid[rows, : episode.states.shape[1]] = episode.valid
         ids[i, : len(episode.ids)] = episode.ids
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.partial")
-    try:
+    with new_folder(path) as partial:
         group = zarr.open_group(partial, mode="w")
         chunk = max(1, min(len(states), 4096))
         every_chunk: Any = {"write_empty_chunks": True}  # so that a missing chunk is damage, not zeros
@@ -143,9 +139,6 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
                 "edge_attribute_names": list(info.edge_attribute_names),
             }
         )
-        replace_folder(partial, path)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def read_store(path: Path) -> EpisodeStore:

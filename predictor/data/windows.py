@@ -16,7 +16,7 @@ from torch import Tensor
 from predictor.data.store import Episode
 from predictor.data.window_tensors import UNKNOWN_TYPE, Casts, Cut, cast, cut, flatten
 from predictor.errors import UserError
-from predictor.scene import SceneSpec
+from predictor.scene import SceneSpec, perceived_agents
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class WindowBatch:
     """Known properties of each edge; zeros where unknown or absent."""
 
     def to(self, device: torch.device) -> "WindowBatch":
-        """The same windows on another device."""
+        """Returns the windows on another device."""
         return self._each(lambda tensor: tensor.to(device))
 
     def pinned_to(self, device: torch.device) -> "WindowBatch":
-        """The same windows on an accelerator, by a copy that neither side waits for."""
+        """Returns the windows on an accelerator, by a copy that neither side waits for."""
         return self._each(lambda tensor: tensor.pin_memory().to(device, non_blocking=True))
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> "WindowBatch":
@@ -49,16 +49,13 @@ class WindowBatch:
 
 
 def visible(episode: Episode, spec: SceneSpec) -> Bool[np.ndarray, "time agents"]:
-    """Who the ego (column 0) perceives: the nearest `max_agents` within `perception_m`; everyone without an ego."""
+    """Returns which agents the ego (column 0) perceives at each step; all that are present, without an ego."""
     if not spec.has_ego:
         return episode.valid
-    axes = spec.position_dim
-    offsets = episode.states[..., :axes] - episode.states[:, :1, :axes]
-    distance_m = np.where(episode.valid, np.linalg.norm(offsets, axis=-1), np.inf)
-    distance_m[:, 0] = -1.0
-    rank = np.argsort(np.argsort(distance_m, axis=1, kind="stable"), axis=1, kind="stable")
-    seen: np.ndarray = episode.valid & (distance_m <= spec.perception_m) & (rank < spec.max_agents)
-    return seen
+    order, seen = perceived_agents(episode.states, episode.valid, 0, spec)
+    perceived = np.zeros_like(episode.valid)
+    np.put_along_axis(perceived, order, seen, axis=1)
+    return perceived
 
 
 class Windows:
@@ -82,7 +79,7 @@ class Windows:
         min_future_steps: int = 1,
         min_history_steps: int = 1,
     ) -> None:
-        """Index the windows and precompute visibility."""
+        """Indexes the windows and computes which agents are visible."""
         self.spec = spec
         self.history_steps = history_steps
         self.horizon_steps = horizon_steps
@@ -102,11 +99,11 @@ class Windows:
         )
 
     def __len__(self) -> int:
-        """Number of windows."""
+        """Returns the number of windows."""
         return len(self.index)
 
     def batch(self, indices: Int[np.ndarray, " batch"], history_steps: int | None = None) -> WindowBatch:
-        """Cut and pad the given windows; agents beyond the widest window cost nothing.
+        """Cuts and pads the given windows; agents beyond the widest window cost nothing.
 
         Args:
             indices: which windows.
@@ -123,7 +120,7 @@ class Windows:
         return window_batch(cut(self.flat, episode, now, casts, history, self.horizon_steps, time, agents))
 
     def cast(self, episode: Int[Tensor, " batch"], now: Int[Tensor, " batch"], history_steps: int) -> Casts:
-        """Who takes part in windows, given by their episodes and last observed steps.
+        """Returns the agents that take part in windows, given by their episodes and last observed steps.
 
         Raises:
             UserError: the ego is missing at an observed step.
@@ -139,12 +136,12 @@ class Windows:
 
 
 def window_batch(parts: Cut) -> WindowBatch:
-    """Windows as a batch."""
+    """Returns windows as a batch."""
     return WindowBatch(parts.states, parts.valid, parts.last_observed, parts.edge_types, parts.edge_attributes)
 
 
 def _index(lengths: Int[np.ndarray, " episodes"], first: int, future_steps: int) -> Int[np.ndarray, "windows 2"]:
-    """Episode and last observed step of each window."""
+    """Returns episode and last observed step of each window."""
     counts = np.maximum(lengths - future_steps - first, 0)
     episode = np.repeat(np.arange(len(lengths)), counts)
     begins = np.repeat(np.cumsum(counts) - counts, counts)
@@ -152,14 +149,14 @@ def _index(lengths: Int[np.ndarray, " episodes"], first: int, future_steps: int)
 
 
 def split_episodes(count: int, fraction: float, seed: int) -> tuple[list[int], list[int]]:
-    """Indices of training and validation episodes; whole episodes, so that no window straddles."""
+    """Returns indices of training and validation episodes; whole episodes, so that no window straddles."""
     order = np.random.default_rng(seed).permutation(count)
     held_out = int(round(count * fraction))
     return sorted(order[held_out:].tolist()), sorted(order[:held_out].tolist())
 
 
 def padded(batch: WindowBatch, time: int, agents: int) -> WindowBatch:
-    """The same windows with absent agents and steps appended, up to the given size."""
+    """Returns the windows with absent agents and steps appended, up to the given size."""
     if batch.valid.shape[1:] == (time, agents):
         return batch
     states, valid = _grown(batch.states, (time, agents), 0), _grown(batch.valid, (time, agents), 0)
@@ -170,14 +167,14 @@ def padded(batch: WindowBatch, time: int, agents: int) -> WindowBatch:
 
 
 def _grown(tensor: Tensor, size: tuple[int, ...], fill: int) -> Tensor:
-    """With its axes after the first grown to `size`."""
+    """Returns the tensor with its axes after the first grown to `size`."""
     grown = tensor.new_full((len(tensor), *size, *tensor.shape[1 + len(size) :]), fill)
     grown[(slice(None), *(slice(n) for n in tensor.shape[1 : 1 + len(size)]))] = tensor
     return grown
 
 
 def concatenate(batches: Sequence[WindowBatch]) -> WindowBatch:
-    """One batch of windows that were cut from different stores."""
+    """Returns one batch of windows that were cut from different stores."""
     if len(batches) == 1:
         return batches[0]
     time = max(b.states.shape[1] for b in batches)

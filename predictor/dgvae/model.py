@@ -35,6 +35,7 @@ from predictor.dgvae.single_step import Encoding, Internal, Layers, Modules, Pas
 from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory, WindowOutput
 from predictor.graph import NOBODY, among_nearest, nearest, off_diagonal, others, pair_mask, with_diagonal
+from predictor.layers.pair_noise import Noise, PairNoise, noise_of_pairs
 from predictor.layers.rnn import masked_gru
 from predictor.layers.state_codec import StateCodec
 from predictor.scene import SceneSpec
@@ -48,9 +49,8 @@ class DGVAE(nn.Module):
     Forecasts are differentiable, also by `torch.func`; float64 makes Jacobians exact:
 
         >>> model = DGVAE(SceneSpec(dt_s=1.0, max_agents=3), PRESETS["fast"]).double().eval()
-        >>> def forecast(states: Tensor) -> Tensor:
-        ...     memory, belief = model.observe(model.empty_memory(1, 3), states, torch.ones(1, 3).bool())
-        ...     return model.rollout(belief, horizon_steps=2)[0, 0]
+        >>> observe = lambda states: model.observe(model.empty_memory(1, 3), states, torch.ones(1, 3).bool())[1]
+        >>> forecast = lambda states: model.rollout(observe(states), horizon_steps=2)[0, 0]
         >>> torch.func.jacrev(forecast)(torch.ones(1, 3, 4).double()).shape  # (agent, step, state) by observed state
         torch.Size([3, 2, 4, 1, 3, 4])
 
@@ -140,7 +140,7 @@ class DGVAE(nn.Module):
         return after, Belief(states, valid, *shown, known, memory.senders)
 
     def rollout(
-        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
+        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
         """Feed predictions back through the encoder, so that the graph evolves; sample 0 takes expected graphs."""
         known: Internal = belief.internal
@@ -153,6 +153,8 @@ class DGVAE(nn.Module):
         if num_samples == 1:
             return future[:, None]
         draws = num_samples - 1
+        steps = horizon_steps if self.config.rollout_graph == "evolving" else 1
+        noise = noise_of_pairs(generator, graph.pairs_there, draws, steps, self.num_edge_types)
         states, valid, seen = (
             t.repeat_interleave(draws, dim=0) for t in (belief.states, belief.valid, known.past.seen)
         )
@@ -163,7 +165,7 @@ class DGVAE(nn.Module):
         node = graph.repeat_nodes(known.node_before, draws)
         drawn = self._free_run(
             layers, states, valid, graph.repeat(draws), features, Past(hidden, cell, static, seen), node, logits,
-            horizon_steps, self._sampler(generator),
+            horizon_steps, self._sampler(noise),
         )  # fmt: skip
         return torch.cat([future[:, None], drawn.unflatten(0, (len(future), draws))], dim=1)
 
@@ -191,8 +193,7 @@ class DGVAE(nn.Module):
         one_step = self._integrate(self._plain(), states, valid, graph, sampled, shown, change, messages)
         outputs = self._dense(graph, edges.prior_logits, posterior, shown)
         if not rollout_steps:
-            nothing = states.new_zeros(len(states), states.shape[2], 0, states.shape[3])
-            return WindowOutput(one_step, nothing, *outputs)
+            return WindowOutput(one_step, states.new_zeros(len(states), states.shape[2], 0, states.shape[3]), *outputs)
 
         # the longest history; asking a GPU for it would make it wait
         steps = states.shape[1] if last_observed.is_cuda else int(last_observed.max())
@@ -215,10 +216,9 @@ class DGVAE(nn.Module):
         present, near = pair_mask(valid), self.config.num_neighbours
         if near:
             present = present & among_nearest(states[..., : self.spec.position_dim].detach(), valid, near)
-        agents = valid.shape[-1]
-        if self.config.innovation_rounds or agents == 1:
+        if self.config.innovation_rounds or valid.shape[-1] == 1:
             return Padded(present, None)
-        return Padded(off_diagonal(present), others(agents, valid.device))
+        return Padded(off_diagonal(present), others(valid.shape[-1], valid.device))
 
     def _dense(self, graph: Padded, prior: Tensor, posterior: Tensor, features: Tensor) -> tuple[Tensor, ...]:
         """What a window says of pairs, with everyone's own entry in it: no edge, and zeros."""
@@ -247,8 +247,8 @@ class DGVAE(nn.Module):
         seen = zeros(batch, agents, self.codec.num_inputs + 1 if self.sees_changes else 0)
         return (zeros(batch, agents, config.decoder_dim), seen), (pair, pair.clone(), static)
 
-    def _sampler(self, generator: torch.Generator | None) -> Callable[[Tensor], Tensor]:
-        return lambda logits: concrete_sample(logits, self.config.temperature, generator, self.config.hard_samples)
+    def _sampler(self, noise: torch.Generator | PairNoise | None) -> Callable[[Tensor], Tensor]:
+        return lambda logits: concrete_sample(logits, self.config.temperature, noise, self.config.hard_samples)
 
     def _plain(self) -> Layers:
         return Modules(self.encoder, self.decoder)

@@ -14,8 +14,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
+from predictor.config_checks import check_at_least, check_choices
 from predictor.dgvae.innovation import Innovation
 from predictor.errors import UserError
+from predictor.layers.pair_noise import PairNoise
 from predictor.layers.pairs import PairLinear, folded, sum_over_senders
 from predictor.layers.rnn import Correction, masked_lstm
 from predictor.layers.state_codec import Residual
@@ -81,19 +83,10 @@ class DGVAEConfig:
     faster, and less accurate unless trained so."""
 
     def __post_init__(self) -> None:
-        """Check ranges."""
-        for name in ("hidden_dim", "rnn_dim", "head_dim", "message_dim", "decoder_dim", "innovation_dim"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("edge_feature_dim", "innovation_rounds", "static_dim", "substeps", "num_neighbours"):
-            if getattr(self, name) < 0:
-                raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
-        if self.residual not in ("state", "constant_velocity", "trapezoid"):
-            raise UserError(f"residual must be 'state', 'constant_velocity' or 'trapezoid', got '{self.residual}'")
-        if self.pair_matching not in ("window", "causal"):
-            raise UserError(f"pair_matching must be 'window' or 'causal', got '{self.pair_matching}'")
-        if self.rollout_graph not in ("evolving", "frozen"):
-            raise UserError(f"rollout_graph must be 'evolving' or 'frozen', got '{self.rollout_graph}'")
+        """Check choices and ranges."""
+        check_choices(self)
+        check_at_least(self, 1, "hidden_dim", "rnn_dim", "head_dim", "message_dim", "decoder_dim", "innovation_dim")
+        check_at_least(self, 0, "edge_feature_dim", "innovation_rounds", "static_dim", "substeps", "num_neighbours")
         if self.num_neighbours and self.innovation_rounds:
             raise UserError("innovation_rounds needs every pair and its reverse; set num_neighbours to 0")
         if self.static_dim > self.edge_feature_dim:
@@ -135,7 +128,7 @@ class Edges(NamedTuple):
 def concrete_sample(
     logits: Float[Tensor, "*batch types"],
     temperature: float,
-    generator: torch.Generator | None = None,
+    generator: torch.Generator | PairNoise | None = None,
     hard: bool = False,
 ) -> Float[Tensor, "*batch types"]:
     """Reparameterised sample of the concrete distribution (paper Sec. IV, Sampling).
@@ -143,12 +136,15 @@ def concrete_sample(
     Args:
         logits: unnormalised log-probabilities.
         temperature: towards 0 samples become one-hot.
-        generator: source of the Gumbel noise.
+        generator: source of the Gumbel noise; the one of each scene's own pairs, or one for all.
         hard: one-hot samples whose gradient is that of the soft ones (straight-through).
     """
     if logits.dtype in (torch.bfloat16, torch.float16):
         logits = logits.float()  # the tails of the noise are what draws the rare type
-    uniform = torch.rand(logits.shape, generator=generator, device=logits.device, dtype=logits.dtype)
+    if isinstance(generator, PairNoise):
+        uniform = generator.like(logits)
+    else:
+        uniform = torch.rand(logits.shape, generator=generator, device=logits.device, dtype=logits.dtype)
     tiny = torch.finfo(logits.dtype).tiny
     gumbel = -torch.log(-torch.log(uniform.clamp(tiny, 1 - torch.finfo(logits.dtype).eps)))
     soft = edge_probabilities((logits + gumbel) / temperature)

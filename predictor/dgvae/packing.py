@@ -28,6 +28,11 @@ class Padded(NamedTuple):
     senders: Int[Tensor, "*some agents slots"] | None
     """Whose each slot is; None if slot j is agent j's."""
 
+    @property
+    def pairs_there(self) -> Bool[Tensor, "*batch agents slots"]:
+        """Which slots hold a pair."""
+        return self.present
+
     def pack_nodes(self, nodes: Tensor) -> Tensor:
         """The same."""
         return nodes
@@ -123,6 +128,11 @@ class Packed:
             each=torch.arange(len(slots), device=slots.device),
             counts=functional.pad(count[:, None], (0, 0, 0, beyond)),
         )
+
+    @property
+    def pairs_there(self) -> Bool[Tensor, "batch agents slots"]:
+        """Which slots of the padded array hold a pair."""
+        return self.padded.present
 
     def pack_nodes(self, nodes: Float[Tensor, "batch agents node"]) -> Float[Tensor, "listed node"]:
         """Rows of the listed agents."""

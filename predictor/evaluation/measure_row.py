@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
 from predictor.baselines.least_squares import SpringLeastSquares
 from predictor.checkpoint import load_checkpoint
 from predictor.data.store import EpisodeStore, read_store
 from predictor.data.windows import Windows
 from predictor.errors import UserError
-from predictor.evaluation.accuracy import Tally
+from predictor.evaluation.accuracy import Tally, fitted_std_m
 from predictor.evaluation.disentanglement import direct_r2, linear_r2
 from predictor.evaluation.graph_accuracy import GraphTally, edge_entropy
 from predictor.evaluation.outcomes import Outcome, run_windows
-from predictor.evaluation.paper_tables import BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, Row, Sizes, Table
+from predictor.evaluation.paper_tables import BURN_IN_STEPS, HORIZON_STEPS, Row, Sizes, Table
 from predictor.graph import pair_mask
 
 PAIR_BUDGET = 60_000
@@ -37,6 +37,8 @@ def measure_row(
     parameters = 0
     if row.model == "constant-velocity":
         forecaster = ConstantVelocity(spec, HORIZON_STEPS)
+    elif row.model == "constant-velocity-noise":
+        forecaster = _fitted_noise(read_store(data / table.train), sizes)
     elif row.model == "least-squares":
         forecaster = SpringLeastSquares(spec, HORIZON_STEPS)
     else:
@@ -50,6 +52,15 @@ def measure_row(
         for kind, store in stores.items()
     }
     return {"parameters": parameters, "tests": results}
+
+
+def _fitted_noise(store: EpisodeStore, sizes: Sizes) -> NoisyConstantVelocity:
+    """Returns constant velocity with noise fitted to its errors on the training windows of the protocol."""
+    spec, episodes = store.info.spec, store.episodes[: sizes.max_episodes or None]
+    windows = Windows(episodes, spec, 1, HORIZON_STEPS, HORIZON_STEPS, BURN_IN_STEPS)
+    straight = ConstantVelocity(spec, HORIZON_STEPS)
+    outcomes = run_windows(straight, windows, np.arange(len(windows)), HORIZON_STEPS)
+    return NoisyConstantVelocity.fit(spec, fitted_std_m(outcomes))
 
 
 def protocol_indices(windows: Windows, stride: int, limit: int, seed: int) -> np.ndarray:
@@ -75,7 +86,7 @@ def _measure_store(
     except UserError as error:
         raise UserError(f"test store of '{store.info.source}' fits no window of the protocol: {error}") from error
     chosen = protocol_indices(windows, table.test_stride, sizes.test_windows, seed)
-    samples = NUM_SAMPLES if row.model in ("dgvae", "dnri") else 1  # the others are deterministic
+    samples = row.num_samples
     horizon_only, whole = Tally(std_m), Tally(partial_agents=True)
     graph, features, entropies = GraphTally(forecaster.num_edge_types), _Features(), []
     agents = [int(store.episodes[e].valid[t].sum()) for e, t in windows.index[chosen].tolist()]

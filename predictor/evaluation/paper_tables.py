@@ -5,14 +5,17 @@ selection) is the same for every row of a table. `predictor.suite` runs them.
 """
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from predictor.models import ModelName
 
 Budget = Literal["smoke", "cpu", "paper"]
+Untrained = Literal["constant-velocity", "constant-velocity-noise", "least-squares"]
+"""What forecasts without a training run."""
 BURN_IN_STEPS = 40
 HORIZON_STEPS = 10
 NUM_SAMPLES = 20
+"""K of a stochastic model; the others have one forecast."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +26,7 @@ class Row:
     """Short name, for folders."""
     name: str
     """Name in the table."""
-    model: ModelName | Literal["constant-velocity", "least-squares"]
+    model: ModelName | Untrained
     """What forecasts."""
     set: tuple[str, ...] = ()
     """Fields of the model's config, beyond the budget's sizes."""
@@ -31,6 +34,16 @@ class Row:
     """Fields of the training config that differ from the table's."""
     paper: dict[str, float] = field(default_factory=dict)
     """The paper's figures, by column: "rmse", "ade", "fde", "ood_ade", "ood_fde", "graph" [m]."""
+
+    @property
+    def is_trained(self) -> bool:
+        """Whether the row needs a training run."""
+        return self.model not in get_args(Untrained)
+
+    @property
+    def num_samples(self) -> int:
+        """Forecasts per window, K."""
+        return NUM_SAMPLES if self.model in ("dgvae", "dnri", "constant-velocity-noise") else 1
 
 
 @dataclass(frozen=True)
@@ -116,6 +129,7 @@ SPRINGS = Table(
     commands=("python -m predictor.data.springs --out {data}/springs",),
     rows=(
         Row("constant-velocity", "constant velocity", "constant-velocity"),
+        Row("constant-velocity-noise", "constant velocity + noise", "constant-velocity-noise"),
         Row("mlp", "Linear (MLP)", "mlp", paper=_figures(0.196, 0.202, 0.446, 2.158, 3.541)),
         Row("lstm-joint", "LSTM (all agents)", "lstm", _LSTM_JOINT, paper=_figures(0.037, 0.024, 0.159, 0.406, 1.485)),
         Row("lstm", "LSTM (per agent)", "lstm"),
@@ -157,6 +171,7 @@ def _real_rows(
     free = ("residual=trapezoid",)
     return (
         Row("constant-velocity", "constant velocity", "constant-velocity"),
+        Row("constant-velocity-noise", "constant velocity + noise", "constant-velocity-noise"),
         Row("mlp", "Linear (MLP)", "mlp", paper=paper.get("mlp", {})),
         Row("lstm-joint", "LSTM (all agents)", "lstm", _LSTM_JOINT, paper=paper.get("lstm", {})),
         Row("lstm", "LSTM (per agent)", "lstm"),
@@ -229,7 +244,7 @@ def _crowd_rows(paper: dict[str, dict[str, float]]) -> tuple[Row, ...]:
     return tuple(
         row
         for row in _real_rows(64, 16, paper)
-        if row.key in ("constant-velocity", "lstm", "dnri", "dnri-free", "dgvae", "dgvae-pm")
+        if row.key in ("constant-velocity", "constant-velocity-noise", "lstm", "dnri", "dnri-free", "dgvae", "dgvae-pm")
     )
 
 

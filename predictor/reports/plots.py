@@ -12,12 +12,13 @@ from predictor.evaluation.accuracy import Accuracy
 
 
 def plot_error_by_horizon(ax: Axes, rows: Sequence[Accuracy], dt_s: float) -> Axes:
-    """Displacement against time ahead, one line per row; constant velocity is grey."""
+    """Draws displacement against time ahead, a line per forecaster; constant velocity is grey, dotted with noise."""
     for row in rows:
         time_s = dt_s * np.arange(1, len(row.by_step_m) + 1)
-        baseline = row.name == "constant velocity"
-        label = row.name if baseline else f"{row.name}, K = {row.num_samples}"
-        ax.plot(time_s, row.by_step_m, color="grey" if baseline else None, marker="o", label=label)
+        style: dict[str, Any] = {"color": "grey"} if row.name.startswith("constant velocity") else {}
+        if style and row.num_samples > 1:
+            style["ls"] = ":"
+        ax.plot(time_s, row.by_step_m, marker="o", label=f"{row.name}, K = {row.num_samples}", **style)
     ax.set_xlabel("time ahead [s]")
     ax.set_ylabel("displacement of the best sample [m]")
     ax.set_ylim(bottom=0)
@@ -40,12 +41,14 @@ def plot_rows_by_step(ax: Axes, results: Sequence[dict[str, Any]], kind: str, dt
         if row["key"] == "least-squares":  # the limit, orders of magnitude below
             continue
         ours = row["key"].startswith(("dgvae", "dvae"))
-        baseline = row["key"] == "constant-velocity"
+        baseline = row["key"].startswith("constant-velocity")
         time_s = dt_s * np.arange(1, len(view["by_step_m"]) + 1)
         errors = [error or 0.0 for error in view["step_errors"]["by_step_m"]]
-        style: dict[str, Any] = {"ls": "-" if ours else "--", "lw": 2.0 if ours else 1.2, "marker": "o", "ms": 3}
+        label = f"{row['name']}, K = {view['num_samples']}"
+        dashes = "-" if ours else ":" if row["key"] == "constant-velocity-noise" else "--"
+        style: dict[str, Any] = {"ls": dashes, "lw": 2.0 if ours else 1.2, "marker": "o", "ms": 3}
         color = "black" if baseline else colormaps["tab20"](i % 20)
-        ax.errorbar(time_s, view["by_step_m"], yerr=errors, color=color, label=row["name"], **style)
+        ax.errorbar(time_s, view["by_step_m"], yerr=errors, color=color, label=label, **style)
     ax.set_yscale("log")
     ax.set_xlabel("time ahead [s]")
     ax.grid(alpha=0.3, which="both")

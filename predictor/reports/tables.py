@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from predictor import markdown
 from predictor.evaluation.accuracy import Accuracy
 from predictor.evaluation.displacement import COVERAGE_SHARE
 
@@ -29,7 +30,7 @@ MAX_STEPS_SHOWN = 6
 
 VIEWS = {"horizon_only": "Horizon-only", "whole_sequence": "Whole sequence"}
 EXPLAINED = {
-    "horizon_only": "Errors on the 10 future steps after a burn-in of 40, best of K = 20 samples",
+    "horizon_only": "Errors on the 10 future steps after a burn-in of 40, best of K samples",
     "whole_sequence": "Errors over all predicted steps of the sequence, one-step errors of the burn-in included",
 }
 METRICS = {"overall_rmse_m": ("RMSE", "rmse"), "min_ade_m": ("minADE", "ade"), "min_fde_m": ("minFDE", "fde")}
@@ -64,14 +65,14 @@ def latex_table(content: dict[str, Any]) -> str:
     columns = [(view, kind, metric) for view in VIEWS for kind in kinds for metric in METRICS]
     lines = [
         f"% {content['provenance']['command']}, commit {content['provenance']['commit']}",
-        r"\begin{tabular}{l" + "r" * len(columns) + "}",
+        r"\begin{tabular}{l" + "r" * (1 + len(columns)) + "}",
         r"\toprule",
-        " & ".join(["Model", *(f"{VIEWS[v]}, {k}: {METRICS[m][0]} [m]" for v, k, m in columns)]) + r" \\",
+        " & ".join(["Model", "$K$", *(f"{VIEWS[v]}, {k}: {METRICS[m][0]} [m]" for v, k, m in columns)]) + r" \\",
         r"\midrule",
     ]
     for row in content["rows"]:
         cells = [_cell(row, v, k, m).replace("±", r"$\pm$") for v, k, m in columns]
-        lines.append(" & ".join([row["name"], *cells]) + r" \\")
+        lines.append(" & ".join([row["name"], _samples_of(row), *cells]) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
@@ -81,7 +82,7 @@ def _kinds(content: dict[str, Any]) -> list[str]:
 
 def _accuracy_table(content: dict[str, Any], view: str) -> str:
     kinds = _kinds(content)
-    headings, paper_keys = ["model"], []
+    headings, paper_keys = ["model", "K"], []
     for kind in kinds:
         for name, key in METRICS.values():
             headings.append(name if kind == "test" else f"{kind} {name}")
@@ -89,13 +90,18 @@ def _accuracy_table(content: dict[str, Any], view: str) -> str:
     headings.append(
         "paper's " + " / ".join(name for name, _ in METRICS.values()) + (" / OOD" if "ood" in kinds else "")
     )
-    lines = ["| " + " | ".join(headings) + " |", "|---|" + "---:|" * (len(headings) - 2) + "---|"]
+    lines = []
     for row in content["rows"]:
         cells = [_cell(row, view, kind, metric) for kind in kinds for metric in METRICS]
         figures = content["paper"].get(row["key"], {})
         beside = " / ".join(f"{figures[key]:.3f}" for key in paper_keys if key in figures)
-        lines.append("| " + " | ".join([row["name"], *cells, beside or "–"]) + " |")
-    return "\n".join(lines)
+        lines.append([row["name"], _samples_of(row), *cells, beside or "–"])
+    return markdown.table(headings, lines, "-" + "r" * (len(headings) - 2) + "-")
+
+
+def _samples_of(row: dict[str, Any]) -> str:
+    """Returns K, the number of forecasts per window that the best-of-K errors choose from."""
+    return str(next(iter(row["tests"].values()))["horizon_only"]["num_samples"])
 
 
 def _cell(row: dict[str, Any], view: str, kind: str, metric: str) -> str:
@@ -122,7 +128,7 @@ def _graph_table(content: dict[str, Any]) -> str:
             numbers += [scores.get("direct_r2"), scores.get("linear_r2"), coverage and coverage["mean"]]
             cells += [_number(x) for x in numbers]
         if any(c != "–" for c in cells):
-            lines.append("| " + " | ".join([row["name"], *cells]) + " |")
+            lines.append([row["name"], _samples_of(row), *cells])
     if not lines:
         return ""
     names = [
@@ -134,8 +140,8 @@ def _graph_table(content: dict[str, Any]) -> str:
         "R² (linear)",
         "coverage of 90 %",
     ]
-    headings = ["model", *(n if kind == "test" else f"{kind} {n}" for kind in kinds for n in names)]
-    return "\n".join(["| " + " | ".join(headings) + " |", "|---|" + "---:|" * (len(headings) - 1), *lines])
+    headings = ["model", "K", *(n if kind == "test" else f"{kind} {n}" for kind in kinds for n in names)]
+    return markdown.table(headings, lines, "-r")
 
 
 def _number(value: Any) -> str:
@@ -161,7 +167,7 @@ def scores_markdown(content: dict[str, Any]) -> str:
     parts = [
         f"# What the edges of `{content['config']['checkpoint']}` say about {content['source']}",
         f"{content['windows']} windows of {content['episodes']} episodes; features are read at the last of "
-        f"{content['config']['history_steps']} observed steps.",
+        f"{content['config']['burn_in_steps']} observed steps.",
     ]
     relation = content["edges"]
     if content["has_ego"] and relation is not None:
@@ -215,7 +221,7 @@ def _factor_table(scores: Sequence[dict[str, Any]]) -> str:
         for s in scores
     ]
     header = ["property", "pairs", "best", "r", "r²", "chance", "distance", "linear R²", "direct R²"]
-    return _table(header, rows)
+    return markdown.table(header, rows)
 
 
 def _graph_lines(content: dict[str, Any]) -> str:
@@ -227,7 +233,7 @@ def _graph_lines(content: dict[str, Any]) -> str:
     ]
     if apart is not None:
         lines.append(
-            f"* chance that an edge has the larger value than a non-edge (AUC; 0.5 knows nothing, near 0 is as good as "
+            f"* chance that an edge has the larger value than a non-edge (AUC; 0.5 is chance, near 0 is as good as "
             f"near 1): feature {apart['dimension']} {plain(apart['auc'])}, the model's own probability "
             f"{plain(apart['edge_prob_auc'])}"
         )
@@ -261,7 +267,7 @@ def _dimension_table(content: dict[str, Any], scores: Sequence[dict[str, Any]]) 
         row = [str(d), kind, f"{spread:.3g}", plain(whole["within"][d], 2), plain(late["within"][d], 2)]
         rows.append(row + [_signed(s["correlations"][d]) for s in scored])
     header = ["feature", "kind", "spread", "changing", "changing, 2nd half", *(f"r: {s['name']}" for s in scored)]
-    return _table(header, rows)
+    return markdown.table(header, rows)
 
 
 def _stillness_note(content: dict[str, Any]) -> str:
@@ -273,10 +279,6 @@ def _stillness_note(content: dict[str, Any]) -> str:
         f"second half ({late['edges']}). static: averaged over the past (pair matching), so stiller by construction. "
         f"spread: standard deviation in the second half; a dash beside it is a dimension that never changes at all."
     )
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in [header, ["---"] * len(header), *rows])
 
 
 def plain(value: float | None, places: int = 3) -> str:
@@ -314,12 +316,11 @@ def markdown_table(rows: Sequence[Accuracy], dt_s: float) -> str:
     """The same as Markdown; by time ahead the displacement alone."""
     shown = _steps_shown(rows)
     steps = [f"{dt_s * (i + 1):g} s" for i in shown]
-    lines = ["| " + " | ".join(["forecaster", "K", *SCALARS, *steps]) + " |"]
-    lines.append("|" + "---|" * (2 + len(SCALARS) + len(steps)))
-    for row in rows:
-        cells = [row.name, str(row.num_samples), *_scalar_cells(row)]
-        lines.append("| " + " | ".join([*cells, *(_rounded_number(row.by_step_m[i], 2) for i in shown)]) + " |")
-    return "\n".join(lines) + "\n"
+    lines = [
+        [row.name, str(row.num_samples), *_scalar_cells(row), *(_rounded_number(row.by_step_m[i], 2) for i in shown)]
+        for row in rows
+    ]
+    return markdown.table(["forecaster", "K", *SCALARS, *steps], lines) + "\n"
 
 
 def _steps_shown(rows: Sequence[Accuracy]) -> list[int]:

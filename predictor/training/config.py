@@ -1,14 +1,15 @@
-"""What can be set in a training run of the predictor."""
+"""Options of a training run of the predictor."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 
+from predictor.config_checks import check_at_least, check_choices, check_positive
 from predictor.errors import UserError
 from predictor.models import ModelName
+from predictor.runtime import resolve_device
 
 Likelihood = Literal["gaussian", "laplace"]
 TrainPrecision = Literal["float32", "tf32", "bfloat16"]
@@ -25,33 +26,34 @@ class TrainConfig:
     out: Path
     """Run folder: checkpoint/, config.json, TensorBoard, training state."""
     val_data: tuple[Path, ...] = ()
-    """Stores for model selection; left out, episodes of `data` are held out."""
+    """Episode stores for model selection; none given, episodes of `data` are held out."""
     model: ModelName = "dgvae"
-    """Which network."""
+    """Network to train."""
     preset: Literal["fast", "paper"] = "fast"
     """Network size."""
     set: tuple[str, ...] = ()
-    """Single fields of the network's config, as field=value: --set hidden_dim=64 static_dim=16."""
+    """Fields of the network's config to change, as field=value: --set hidden_dim=64 static_dim=16."""
     input_changes: bool = False
-    """The dG-VAE's encoder also sees what changed since the last step (`change_scales`, fitted to the data)."""
+    """Give the dG-VAE's encoder also what changed since the last step (`change_scales`, fitted to the data)."""
     fit_inputs: bool = False
-    """The dG-VAE's inputs are divided by their spread in the data (`input_scales`) instead of the spec's scales."""
+    """Divide the dG-VAE's inputs by their spread in the data (`input_scales`) instead of the spec's scales."""
     steps: int = 4000
-    """Optimiser steps."""
+    """Number of optimiser steps."""
     batch_size: int = 64
-    """Windows per step."""
+    """Number of windows in an optimiser step."""
     lr: float = 2e-3
     """Peak learning rate (Adam), after warm-up, then cosine to 2 %."""
     history_steps: int = 10
-    """Longest history in a training window; at deployment the memory is unlimited."""
+    """Number of observed steps fed to the network, at most; at deployment its memory is unlimited."""
     min_history_steps: int = 0
-    """Each batch draws its longest history between this and `history_steps`; 0 always takes `history_steps`."""
+    """Least value of `history_steps` that a batch may draw; 0 gives every batch `history_steps` itself."""
     val_history_steps: int = 1
-    """Least history of a window for model selection; with `history_steps`, whole sequences are cut as in the tables."""
+    """Number of observed steps that a window for model selection has at least; with the value of `history_steps`, whole
+    sequences are cut as in the tables."""
     horizon_steps: int = 5
-    """Free-running steps in training, and the default horizon of the checkpoint."""
+    """Number of steps forecast in training, and the default horizon of the checkpoint."""
     curriculum_steps: int = 0
-    """The free run grows from 1 step to `horizon_steps` over so many optimiser steps; 0 is all at once."""
+    """Number of optimiser steps over which the forecast grows from 1 step to `horizon_steps`; 0: at once."""
     one_step_weight: float = 0.2
     """Weight of the teacher-forced one-step likelihood."""
     rollout_weight: float = 1.0
@@ -59,7 +61,7 @@ class TrainConfig:
     kl_weight: float = 1.0
     """Weight of KL(posterior ‖ prior)."""
     kl_warmup_steps: int = 0
-    """The KL weight grows linearly from 0 over so many optimiser steps."""
+    """Number of optimiser steps over which the KL weight grows linearly from 0."""
     edge_cost: float = 0.0
     """Price [nats] of a certain edge, so that edges which explain nothing are dropped; 0 is the paper's."""
     label_weight: float = 0.0
@@ -73,41 +75,47 @@ class TrainConfig:
     clip_norm: float = 100.0
     """Largest gradient norm."""
     max_episodes: int = 0
-    """Use only so many episodes of each training store, the first ones; 0 is all."""
+    """Number of episodes taken from each training store, the first ones; 0 takes all."""
     val_fraction: float = 0.1
     """Share of episodes held out for model selection."""
     val_windows: int = 1500
-    """Held-out windows to measure on."""
+    """Number of held-out windows measured for model selection."""
     eval_every: int = 250
-    """Steps between validations; the training state is saved then too."""
+    """Number of optimiser steps between validations; the training state is saved then too."""
     patience: int = 8
-    """Stop after so many validations without a better minADE."""
+    """Number of validations without a better minADE after which training stops."""
     seed: int = 0
-    """Drives initial weights, split, order and noise."""
+    """Random seed for initial weights, split, order and noise."""
     device: str = "cpu"
-    """"cpu" or "cuda"."""
+    """Device that trains: cpu, cuda or auto (cuda where there is one)."""
     precision: TrainPrecision = "float32"
-    """Of matrix products in training: "tf32" (CUDA) rounds their inputs to 10 bits, which tensor cores multiply;
-    "bfloat16" rounds inputs and results to 7 (autocast). Weights, memories and losses stay float32."""
+    """Precision of matrix products in training: "tf32" (CUDA) rounds inputs to 10 bits, which tensor cores
+    multiply; "bfloat16" rounds inputs and results to 7 (autocast). Weights, memories and losses stay float32."""
     data_device: DataDevice = "auto"
     """Where windows are cut: by the CPU, or on the training device, which then holds all the data. "auto" takes the
     device if that is CUDA and the data fits into half of its free memory."""
     capture: Capture = "auto"
-    """"auto" records training steps as CUDA graphs where that is possible; "off" launches kernels one by one."""
+    """How steps are launched: "auto" records them as CUDA graphs where that is possible, "off" launches each kernel."""
     threads: int = 0
-    """CPU threads for torch; 0 leaves torch's choice."""
+    """Number of CPU threads of torch; 0 leaves torch's choice."""
     resume: bool = False
     """Continue a run that was stopped; finished runs stay as they are."""
 
-    def check(self) -> None:
-        """Check ranges.
+    def __post_init__(self) -> None:
+        """Check choices and ranges; `device="auto"` becomes the device that is taken.
 
         Raises:
-            UserError: a value that makes no sense. (In `__post_init__`, tyro would turn it into a box of lines.)
+            UserError: a value that makes no sense, or a device that is not there.
         """
-        for name in ("steps", "batch_size", "history_steps", "horizon_steps", "eval_every", "patience", "val_windows"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_choices(self)
+        check_at_least(
+            self, 1, "steps", "batch_size", "history_steps", "horizon_steps", "eval_every", "patience", "val_windows"
+        )
+        check_positive(self, "lr", "variance", "clip_norm")
+        check_at_least(
+            self, 0, "one_step_weight", "rollout_weight", "kl_weight", "seed", "threads", "curriculum_steps",
+            "kl_warmup_steps", "edge_cost", "label_weight", "type_label_weight", "min_history_steps", "max_episodes",
+        )  # fmt: skip
         if self.one_step_weight == self.rollout_weight == 0:
             raise UserError("one_step_weight and rollout_weight are both 0; nothing would be learned")
         if self.min_history_steps > self.history_steps:
@@ -120,28 +128,18 @@ class TrainConfig:
             raise UserError(f"val_fraction must lie between 0 and 1, got {self.val_fraction}")
         if not self.data:
             raise UserError("data needs at least one episode store; make one with python -m envs.collect")
-        for name in ("lr", "variance", "clip_norm"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise UserError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in (
-            "one_step_weight", "rollout_weight", "kl_weight", "seed", "threads", "curriculum_steps", "kl_warmup_steps",
-            "edge_cost", "label_weight", "type_label_weight", "min_history_steps", "max_episodes",
-        ):  # fmt: skip
-            if not 0 <= getattr(self, name) < math.inf:
-                raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
-        self._check_machine()
+        object.__setattr__(self, "device", resolve_device(self.device))
+        check_precision(self.precision, self.device)
 
-    def _check_machine(self) -> None:
-        if self.device != "cpu" and not self.device.startswith("cuda"):
-            raise UserError(f"device must be 'cpu' or 'cuda', got '{self.device}'")
-        for name, kind in (("precision", TrainPrecision), ("data_device", DataDevice), ("capture", Capture)):
-            if getattr(self, name) not in get_args(kind):
-                raise UserError(f"{name} must be one of {', '.join(get_args(kind))}, got '{getattr(self, name)}'")
-        if not self.device.startswith("cuda"):
-            if self.precision == "tf32":
-                raise UserError("precision 'tf32' needs a CUDA device; use --precision float32 or --device cuda")
-            return
-        if not torch.cuda.is_available():
-            raise UserError(f"device '{self.device}' asked for but torch sees no CUDA device; use --device cpu")
-        if self.precision == "bfloat16" and not torch.cuda.is_bf16_supported(including_emulation=False):
-            raise UserError(f"device '{self.device}' has no bfloat16 arithmetic; use --precision float32")
+
+def check_precision(precision: TrainPrecision, device: str) -> None:
+    """Checks that a device has the arithmetic of a precision.
+
+    Raises:
+        UserError: it has not.
+    """
+    if precision == "tf32" and not device.startswith("cuda"):
+        raise UserError("precision 'tf32' needs a CUDA device; use --precision float32 or --device cuda")
+    if precision == "bfloat16" and device.startswith("cuda"):
+        if not torch.cuda.is_bf16_supported(including_emulation=False):
+            raise UserError(f"device '{device}' has no bfloat16 arithmetic; use --precision float32")

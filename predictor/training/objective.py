@@ -1,12 +1,14 @@
 """What training minimises: likelihoods of one step and of a free run, KL to the prior, labels, the price of edges."""
 
 import math
+from typing import get_args
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
+from predictor.config_checks import check_choice
 from predictor.data.windows import WindowBatch
 from predictor.errors import UserError
 from predictor.evaluation.graph_accuracy import edge_entropy
@@ -33,7 +35,11 @@ def nll(
         scales: divisors that make features comparable; the variance is in these units.
         variance: σ of the paper (which uses it as a variance), 5e-5 there.
         likelihood: "gaussian" (paper) or "laplace" with the same variance, whose gradient does not grow with the error.
+
+    Raises:
+        UserError: another likelihood.
     """
+    check_choice("likelihood", likelihood, get_args(Likelihood))
     # masked before it is squared: the gradient of an infinite error is NaN, also times zero
     error = torch.where(valid[..., None], (predicted - target) / scales, 0.0)
     if likelihood == "gaussian":

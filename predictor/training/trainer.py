@@ -5,7 +5,6 @@ that was not.
 """
 
 import math
-import os
 import pickle
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,6 +23,7 @@ from predictor.data.windows import WindowBatch, Windows, split_episodes
 from predictor.errors import UserError
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import run_windows
+from predictor.files import new_file
 from predictor.forecaster import WindowOutput
 from predictor.layers.state_codec import Residual, StateCodec, drift
 from predictor.models import build, configure
@@ -325,18 +325,15 @@ class Trainer:
 
     def save(self, path: Path) -> None:
         """Write the training state so that a kill leaves the old or the new one."""
-        partial = path.with_name(f".{path.name}.partial")
-        torch.save(
-            {
-                "model": self.model.state_dict(),
-                "optimizer": self.optimizer.state_dict(),
-                "step": self.step,
-                "best": self.best,
-                "stale": self.stale,
-            },
-            partial,
-        )
-        os.replace(partial, path)
+        state = {
+            "model": self.model.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "step": self.step,
+            "best": self.best,
+            "stale": self.stale,
+        }
+        with new_file(path) as partial:
+            torch.save(state, partial)
 
     def restore(self, path: Path) -> None:
         """Continue from a saved training state, of this kind of device or another."""

@@ -9,7 +9,7 @@ from agents.task import Task
 from agents.vec_envs import DrivenEnv, EpisodeResult, MakeCopy, drive, make_parallel_rows
 from agents.video import record_task
 from envs.drivers.all_agents import make_driver
-from envs.registry import make_parallel_env
+from envs.registry import make_multiagent_env
 from predictor.errors import UserError
 from tests.agents.helpers import LIVES, TOY, policy_for
 
@@ -49,7 +49,7 @@ def test_unknown_learners_are_named():
 
 def test_rows_observe_what_the_task_says():
     own = make_parallel_rows(Task(SPREAD, "none"), 1)
-    assert own.observation_space == make_parallel_env(SPREAD).observation_space("agent_0")
+    assert own.observation_space == make_multiagent_env(SPREAD).observation_space("agent_0")
     seeing = make_parallel_rows(Task(SPREAD, "constant-velocity"), 1)
     assert isinstance(seeing.observation_space, gym.spaces.Dict)
     assert seeing.observation_space["observation"] == own.observation_space
@@ -73,7 +73,7 @@ def prey_actions(env: Any, observations: Any) -> list[int]:
 @pytest.mark.parametrize("observe", ["none", "constant-velocity"])
 @pytest.mark.parametrize("partner", ["varied", "heuristic"])
 def test_the_prey_is_driven_anew_in_each_episode_by_seed(partner: str, observe: Any):
-    env = MakeCopy(Task(TAG, observe, learners=("adversary",), partner=partner))()
+    env = MakeCopy(Task(TAG, observe, learners=("adversary",), driver=partner))()
     played = [prey_actions(env, env.reset(seed=seed)[0]) for seed in (7, None, 7, None, 8)]
     assert played[:2] == played[2:4]
     assert played[0] != played[1]
@@ -82,7 +82,7 @@ def test_the_prey_is_driven_anew_in_each_episode_by_seed(partner: str, observe: 
 
 
 def test_a_driver_serves_one_episode():
-    env = DrivenEnv(make_parallel_env(TAG), "random")
+    env = DrivenEnv(make_multiagent_env(TAG), "random")
     env.reset(seed=0)
     first = env.driver
     assert env.driver is first
@@ -107,10 +107,10 @@ def test_drivers_by_name_see_no_forecasts():
 
 
 def test_where_all_learn_nobody_needs_to_be_able_to_drive():
-    rows = make_parallel_rows(Task(TOY, "none", partner="heuristic"), 1)
+    rows = make_parallel_rows(Task(TOY, "none", driver="heuristic"), 1)
     rows.reset()
     assert rows.step(np.array([1, 0]))[1].tolist() == [1.0, 0.0]
-    rows = make_parallel_rows(Task(TOY, "none", learners=("ant",), partner="heuristic"), 1)
+    rows = make_parallel_rows(Task(TOY, "none", learners=("ant",), driver="heuristic"), 1)
     rows.reset()
     with pytest.raises(UserError, match="no heuristic drives meadow_v0"):
         rows.step(np.array([1]))
@@ -121,7 +121,7 @@ def test_where_all_learn_nobody_needs_to_be_able_to_drive():
 
 @pytest.mark.parametrize("observe", ["none", "constant-velocity"])
 def test_results_depend_on_the_seed_alone(observe: Any):
-    task = Task(TAG, observe, learners=("adversary",), partner="varied")
+    task = Task(TAG, observe, learners=("adversary",), driver="varied")
     model, arena = policy_for(task), ParallelArena(task)
     for policy in (model, *arena.baselines):
         results = arena.play(policy, [3, 4])
@@ -134,7 +134,7 @@ def test_results_depend_on_the_seed_alone(observe: Any):
 def test_a_policy_is_played_as_in_a_plain_loop():
     task = Task(SPREAD, "none")
     model = policy_for(task)
-    env = make_parallel_env(SPREAD)
+    env = make_multiagent_env(SPREAD)
     expected, acted = [], set()
     for seed in (1, 2):
         observations, _ = env.reset(seed=seed)
@@ -153,7 +153,7 @@ def test_a_policy_is_played_as_in_a_plain_loop():
 
 @pytest.mark.parametrize("name", ["random", "heuristic"])
 def test_a_driver_is_played_as_in_a_plain_loop(name: str):
-    env = make_parallel_env(SPREAD)
+    env = make_multiagent_env(SPREAD)
     observations, _ = env.reset(seed=6)
     driver = make_driver(name, env, np.random.default_rng(6))
     total = 0.0
@@ -185,7 +185,7 @@ def test_baselines_can_drive():
 
 @pytest.mark.parametrize("learner", list(LIVES))
 def test_an_episode_ends_with_the_last_learner_whoever_drives(learner: str):
-    task = Task(TOY, "none", learners=(learner,), partner="random")
+    task = Task(TOY, "none", learners=(learner,), driver="random")
     arena = ParallelArena(task)
     for policy in (policy_for(task), "random"):
         assert [r.length for r in arena.play(policy, [0, 1])] == [LIVES[learner]] * 2
@@ -205,7 +205,7 @@ def test_progress_is_reported_per_episode():
 def test_the_film_shows_the_episode_that_is_measured(
     env_id: str, learners: tuple[str, ...], observe: Any, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("agents.vec_envs.PARALLEL_CHECKPOINTS", {})  # as long as none needs to ship
+    monkeypatch.setattr("agents.video.MULTIAGENT_CHECKPOINTS", {})  # as long as none needs to ship
     task = Task(env_id, observe, learners=learners)
     model = policy_for(task)
     (result,) = ParallelArena(task).play(model, [4])

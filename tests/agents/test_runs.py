@@ -51,7 +51,7 @@ def test_new_run_holds_its_config(tmp_path: Path):
 def test_existing_run_is_not_touched_without_resume(tmp_path: Path):
     open_run(tmp_path / "run", CONFIG, MADE, resume=False)
     before = (tmp_path / "run" / "config.json").read_bytes()
-    with pytest.raises(UserError, match="exists; choose another --run-dir, or continue it with --resume"):
+    with pytest.raises(UserError, match="exists; choose another --out, or continue it with --resume"):
         open_run(tmp_path / "run", CONFIG | {"steps": 7}, MADE, resume=False)
     assert (tmp_path / "run" / "config.json").read_bytes() == before
 
@@ -126,7 +126,7 @@ def test_failed_save_leaves_the_old_file(tmp_path: Path, venv: VecEnv, monkeypat
     def die(*args: Any) -> None:
         raise OSError("killed before the rename")
 
-    monkeypatch.setattr("agents.runs.os.replace", die)
+    monkeypatch.setattr("predictor.files.os.replace", die)
     with pytest.raises(OSError, match="killed"):
         save_model(make_ppo(venv), path, {"steps": 2})
     assert path.read_bytes() == before

@@ -20,7 +20,7 @@ def without_envpool(monkeypatch: pytest.MonkeyPatch) -> None:
         ("nonsense", {"backend": "envpool"}, "EnvPool has no copy of 'nonsense'"),
         (TAG, {"backend": "envpool"}, f"backend envpool has no {TAG}; leave it out"),
         ("highway-fast-v0", {"learners": ("adversary",)}, "highway-fast-v0 has one ego; leave them out"),
-        (TAG, {"partner": "fast"}, "partner must be one of random, idle, varied, heuristic, mixed, got 'fast'"),
+        (TAG, {"driver": "fast"}, "driver must be one of random, idle, varied, heuristic, mixed, got 'fast'"),
         (TAG, {"observe": "none", "checkpoint": "highway"}, "has no effect with observe=none"),
         (TAG, {"device": "tpu9"}, "device must be cpu, cuda or auto, got 'tpu9'"),
     ],
@@ -62,7 +62,7 @@ def test_the_check_gives_the_action_space_of_the_learners():
 
 def test_the_check_finds_partners_that_cannot_drive():
     assert Task(TOY, "none").check() == gym.spaces.Discrete(2)  # everyone learns
-    assert Task(TOY, "none", learners=("ant",), partner="varied").check() == gym.spaces.Discrete(2)
+    assert Task(TOY, "none", learners=("ant",), driver="varied").check() == gym.spaces.Discrete(2)
     with pytest.raises(UserError, match="no heuristic drives meadow_v0"):
         Task(TOY, "none", learners=("ant",)).check()
 

@@ -6,7 +6,7 @@ import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 from agents.arena import run_episodes
-from agents.task import Task, resolve_device
+from agents.task import Task
 from agents.vec_envs import EpisodeResult, SeededEpisodes, make_rows
 from predictor.errors import UserError
 
@@ -87,13 +87,6 @@ def test_missing_checkpoint_is_one_clear_line():
 def test_checkpoint_without_forecast_is_refused():
     with pytest.raises(UserError, match="has no effect with observe=none"):
         Task("highway-fast-v0", "none", "highway")
-
-
-def test_devices():
-    assert resolve_device("cpu") == "cpu"
-    assert resolve_device("auto") in ("cpu", "cuda")
-    with pytest.raises(UserError, match="got 'tpu9'"):
-        resolve_device("tpu9")
 
 
 def test_rows_observe_what_the_task_says():

@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 
 from benchmarks.compare import OTHER_PROCESSOR, better_of, compare, read_baseline
-from benchmarks.results import Compared, Row, skipped
+from benchmarks.results import Compared, Line, skipped
 from benchmarks.settings import Settings
 from predictor.errors import UserError
-from tests.benchmarks.helpers import HERE, QUICK, baseline, row, write
+from tests.benchmarks.helpers import HERE, QUICK, baseline, line, write
 
 
-def held(before: Row, after: Row, machine: str = HERE):
+def held(before: Line, after: Line, machine: str = HERE):
     return compare(baseline(before), [after], ("data",), machine)
 
 
@@ -28,67 +28,67 @@ def held(before: Row, after: Row, machine: str = HERE):
     ],
 )
 def test_what_counts_as_slower_or_faster(better, after, slower, faster, factor):
-    comparison = held(row(2.0, better=better), row(after, better=better))
+    comparison = held(line(2.0, better=better), line(after, better=better))
     assert (bool(comparison.slower), bool(comparison.faster)) == (slower, faster)
     assert comparison.changes[0].slowdown == pytest.approx(factor, abs=1e-3)
 
 
-def test_a_slower_row_is_named_with_its_factor_and_both_values():
-    lines = held(row(2.0, kind="matmul"), row(4.0, kind="matmul")).lines()
+def test_a_slower_line_is_named_with_its_factor_and_both_values():
+    lines = held(line(2.0, kind="matmul"), line(4.0, kind="matmul")).report()
     assert lines == [
         "SLOWER  2.00× slower (2 → 4 matmul-equivalents, tolerance 1.50×): data | step | agents 5",
-        "1 rows compared: 1 slower, 0 faster, 0 missing, 0 new",
+        "1 lines compared: 1 slower, 0 faster, 0 missing, 0 new",
     ]
 
 
 def test_the_worst_comes_first():
-    before = [row(1.0, name) for name in "abc"]
-    after = [row(value, name) for name, value in zip("abc", (2.0, 9.0, 3.0), strict=True)]
+    before = [line(1.0, name) for name in "abc"]
+    after = [line(value, name) for name, value in zip("abc", (2.0, 9.0, 3.0), strict=True)]
     comparison = compare(baseline(*before), after, ("data",), HERE)
     assert [change.key.split(" | ")[1] for change in comparison.slower] == ["b", "c", "a"]
 
 
-def test_rows_that_are_gone_or_new_are_named_and_do_not_fail():
-    comparison = compare(baseline(row(1.0, "old")), [row(1.0, "fresh")], ("data",), HERE)
+def test_lines_that_are_gone_or_new_are_named_and_do_not_fail():
+    comparison = compare(baseline(line(1.0, "old")), [line(1.0, "fresh")], ("data",), HERE)
     assert comparison.missing == ("data | old | agents 5",)
     assert comparison.new == ("data | fresh | agents 5",)
     assert not comparison.slower
-    assert comparison.lines()[:2] == ["missing data | old | agents 5", "new     data | fresh | agents 5"]
+    assert comparison.report()[:2] == ["missing data | old | agents 5", "new     data | fresh | agents 5"]
 
 
 def test_a_section_that_did_not_run_misses_nothing():
-    assert compare(baseline(row(1.0)), [], ("machine",), HERE).missing == ()
+    assert compare(baseline(line(1.0)), [], ("machine",), HERE).missing == ()
 
 
-def test_a_skipped_row_is_missing():
-    before = row(1.0)
+def test_a_skipped_line_is_missing():
+    before = line(1.0)
     gone = skipped("data", before.name, "needs envpool", before.what)
     assert compare(baseline(before), [gone], ("data",), HERE).missing == (before.key,)
 
 
 def test_the_tolerance_is_the_baselines():
-    assert held(row(1.0, tolerance=1.1), row(1.2, tolerance=9.0)).slower
+    assert held(line(1.0, tolerance=1.1), line(1.2, tolerance=9.0)).slower
 
 
 @pytest.mark.parametrize(("kind", "slower"), [("ratio", True), ("matmul", False), ("interpreter", False)])
 def test_another_processor_widens_equivalents_only(kind, slower):
-    before, after = row(1.0, kind=kind), row(1.5 * OTHER_PROCESSOR - 0.01, kind=kind)
+    before, after = line(1.0, kind=kind), line(1.5 * OTHER_PROCESSOR - 0.01, kind=kind)
     assert held(before, after).slower
     assert bool(held(before, after, "another processor").slower) is slower
 
 
 def test_absolute_times_are_neither_stored_nor_compared(tmp_path: Path):
-    slow = replace(row(1.0), value=1e9)
-    assert not held(row(1.0), slow).slower
-    path = write(tmp_path / "baseline.json", [slow, Row("data", "absolute", {}, 3.0, "ms")])
-    rows = json.loads(path.read_text())["rows"]
-    assert rows == {slow.key: {"value": 1.0, "kind": "ratio", "better": "lower", "tolerance": 1.5}}
+    slow = replace(line(1.0), value=1e9)
+    assert not held(line(1.0), slow).slower
+    path = write(tmp_path / "baseline.json", [slow, Line("data", "absolute", {}, 3.0, "ms")])
+    lines = json.loads(path.read_text())["lines"]
+    assert lines == {slow.key: {"value": 1.0, "kind": "ratio", "better": "lower", "tolerance": 1.5}}
 
 
 def test_a_baseline_comes_back_as_it_was_written(tmp_path: Path):
-    rows = [row(1.0), row(2.0, "other", "interpreter", "higher", 3.0)]
-    read = read_baseline(write(tmp_path / "new" / "baseline.json", rows), QUICK)
-    assert read == baseline(*rows)
+    lines = [line(1.0), line(2.0, "other", "interpreter", "higher", 3.0)]
+    read = read_baseline(write(tmp_path / "new" / "baseline.json", lines), QUICK)
+    assert read == baseline(*lines)
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["baseline.json"]
 
 
@@ -103,7 +103,7 @@ def test_a_value_of_zero_does_not_divide():
         ("{", "is not a readable baseline"),
         ("[]", "is not a readable baseline"),
         ('{"format": "other", "version": 1}', "is not a readable baseline .*'other'"),
-        ('{"format": "dgvae-rl benchmark baseline", "version": 1}', "is not a readable baseline .*rows"),
+        ('{"format": "dgvae-rl benchmark baseline", "version": 1}', "is not a readable baseline .*lines"),
     ],
 )
 def test_an_unreadable_baseline_is_one_clear_line(tmp_path: Path, content: str, message: str):
@@ -127,20 +127,20 @@ def test_no_baseline_says_how_to_make_one(tmp_path: Path):
     ],
 )
 def test_a_baseline_of_other_settings_is_refused(tmp_path: Path, settings: Settings, message: str):
-    path = write(tmp_path / "baseline.json", [row(1.0)])
+    path = write(tmp_path / "baseline.json", [line(1.0)])
     with pytest.raises(UserError, match=message):
         read_baseline(path, settings)
 
 
 def test_a_second_measurement_counts_only_where_it_is_better_and_was_asked_for():
-    first = [row(3.0, "a"), row(3.0, "b"), row(3.0, "c")]
-    again = [row(2.0, "a"), row(4.0, "b"), row(1.0, "c")]
+    first = [line(3.0, "a"), line(3.0, "b"), line(3.0, "c")]
+    again = [line(2.0, "a"), line(4.0, "b"), line(1.0, "c")]
     chosen = better_of(first, again, [first[0].key, first[1].key])
     assert [r.value for r in chosen] == [2.0, 3.0, 3.0]
     assert [r.note for r in chosen] == ["measured twice", "", ""]
 
 
 def test_of_rates_the_higher_one_is_better():
-    first, again = row(3.0, better="higher"), row(5.0, better="higher")
+    first, again = line(3.0, better="higher"), line(5.0, better="higher")
     assert better_of([first], [again], [first.key])[0].value == 5.0
     assert better_of([again], [first], [first.key])[0].value == 5.0

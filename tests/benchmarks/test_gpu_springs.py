@@ -15,7 +15,9 @@ from benchmarks.gpu_springs import Counter, GpuSpringsConfig, Kernel, on_card
 from predictor.errors import UserError, run_entry_point
 from predictor.training.trainer import Trainer
 
-CARD = GpuSpringsConfig(peak_tflops=10.0, bandwidth_gbs=1000.0, share=0.5, kernel_us=2.0, target_minutes=1.0)
+CARD = GpuSpringsConfig(
+    project=True, peak_tflops=10.0, bandwidth_gbs=1000.0, share=0.5, kernel_us=2.0, target_minutes=1.0
+)
 
 
 @pytest.fixture(autouse=True)
@@ -167,7 +169,7 @@ def test_matmul_rate_is_a_rate():
         ({"peak_tflops": -1.0}, "peak_tflops must not be negative, got -1.0"),
         ({"kernel_us": 0.0}, "kernel_us must be positive, got 0.0"),
         ({"share": 1.5}, "share must lie between 0 and 1, got 1.5"),
-        ({"device": "cuda"}, "torch sees no CUDA device; pass --project for an estimate"),
+        ({"device": "cuda"}, "torch finds no CUDA device; use --device cpu, or pass --project for an estimate"),
     ],
 )
 def test_bad_settings_are_named(
@@ -175,8 +177,8 @@ def test_bad_settings_are_named(
 ):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(UserError, match=message):
-        replace(small, **changes).check()
-    replace(small, device="cuda", project=True).check()
+        replace(small, **changes)
+    assert replace(small, device="cuda", project=True).suite.device == "cpu"
 
 
 def test_without_a_card_one_line_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
@@ -185,5 +187,6 @@ def test_without_a_card_one_line_says_so(monkeypatch: pytest.MonkeyPatch, capsys
     with pytest.raises(SystemExit) as stop:
         run_entry_point(script.main)
     assert stop.value.code == 2
-    expected = "error: device 'cuda' asked for but torch sees no CUDA device; pass --project for an estimate\n"
-    assert capsys.readouterr().err == expected
+    missing = "device 'cuda' was asked for but torch finds no CUDA device"
+    advice = "use --device cpu, or pass --project for an estimate"
+    assert capsys.readouterr().err == f"error: {missing}; {advice}\n"

@@ -8,11 +8,11 @@ import torch
 
 from benchmarks import __main__ as entry
 from benchmarks import forecast, suite
-from benchmarks.results import Row
+from benchmarks.results import Line
 from benchmarks.timing import Meter
 from predictor.errors import run_entry_point
 from predictor.runtime import processor
-from tests.benchmarks.helpers import row, write
+from tests.benchmarks.helpers import line, write
 
 
 @pytest.fixture(autouse=True)
@@ -33,11 +33,11 @@ def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return 0
 
 
-def serve(monkeypatch: pytest.MonkeyPatch, *measurements: Sequence[Row]) -> list[str]:
-    """Let section "data" give these rows, one measurement after the other; returns what was run."""
+def serve(monkeypatch: pytest.MonkeyPatch, *measurements: Sequence[Line]) -> list[str]:
+    """Let section "data" give these lines, one measurement after the other; returns what was run."""
     left, ran = list(measurements), []
 
-    def run(section: str, settings: object) -> list[Row]:
+    def run(section: str, settings: object) -> list[Line]:
         ran.append(section)
         return list(left.pop(0)) if section == "data" else []
 
@@ -61,41 +61,41 @@ def test_a_section_from_the_command_line_to_the_table_and_the_file(
     assert result["machine"] == processor() and result["threads"] == 1 and result["mode"] == "quick"
     assert result["keeps_freed_memory"] is False
     assert {"commit", "versions"} <= set(result["provenance"])
-    assert len(result["rows"]) == 10
-    assert result["rows"][0]["key"] == "forecast | observe | preset fast, batch 1, agents 3, horizon 2, samples 1"
-    assert result["rows"][0]["flop"] > 0
+    assert len(result["lines"]) == 10
+    assert result["lines"][0]["key"] == "forecast | observe | preset fast, batch 1, agents 3, horizon 2, samples 1"
+    assert result["lines"][0]["flop"] > 0
     assert [path.name for path in out.parent.iterdir()] == ["benchmarks.json"]  # no half-written file
 
 
 def test_what_got_slower_is_measured_twice_reported_and_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):
-    path = write(tmp_path / "baseline.json", [row(1.0), row(1.0, "other")], machine=processor())
-    ran = serve(monkeypatch, [row(4.0), row(1.0, "other")], [row(3.0), row(9.0, "other")])
+    path = write(tmp_path / "baseline.json", [line(1.0), line(1.0, "other")], machine=processor())
+    ran = serve(monkeypatch, [line(4.0), line(1.0, "other")], [line(3.0), line(9.0, "other")])
     arguments = ("--only", "data", "machine", "--baseline", str(path), "--out", str(tmp_path / "out.json"))
     assert call(monkeypatch, *arguments) == 1
     shown = capsys.readouterr().out
     assert ran == ["machine", "data", "data"]
     assert "SLOWER  3.00× slower (1 → 3, tolerance 1.50×): data | step | agents 5" in shown
-    assert "2 rows compared: 1 slower, 0 faster, 0 missing, 0 new" in shown
+    assert "2 lines compared: 1 slower, 0 faster, 0 missing, 0 new" in shown
     assert "measured twice" in shown and "another processor" not in shown
 
 
 def test_noise_that_a_second_measurement_takes_away_does_not_fail(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):
-    path = write(tmp_path / "baseline.json", [row(1.0)], machine="another one")
-    serve(monkeypatch, [row(4.0)], [row(1.1)])
+    path = write(tmp_path / "baseline.json", [line(1.0)], machine="another one")
+    serve(monkeypatch, [line(4.0)], [line(1.1)])
     arguments = ("--only", "data", "--baseline", str(path), "--out", str(tmp_path / "out.json"))
     assert call(monkeypatch, *arguments) == 0
     shown = capsys.readouterr().out
-    assert "1 rows compared: 0 slower" in shown
+    assert "1 lines compared: 0 slower" in shown
     assert "the baseline is of another processor (another one)" in shown
 
 
 def test_a_written_baseline_is_what_the_next_run_is_held_against(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path, out = tmp_path / "baseline.json", str(tmp_path / "out.json")
-    serve(monkeypatch, [row(2.0)], [row(2.9)], [row(3.1)], [row(3.2)])
+    serve(monkeypatch, [line(2.0)], [line(2.9)], [line(3.1)], [line(3.2)])
     assert call(monkeypatch, "--write-baseline", str(path), "--out", out) == 0
     assert call(monkeypatch, "--baseline", str(path), "--out", out) == 0
     assert call(monkeypatch, "--baseline", str(path), "--out", out) == 1

@@ -20,13 +20,13 @@ def test_the_exponent_is_a_least_squares_fit():
     assert exponent({1: 1.0, 10: 1.0, 100: 100.0}) == pytest.approx(1.0)
 
 
-class _Child:
+class _Worker:
     """Says that memory grows with the square of agents."""
 
     def __init__(self, threads: int, environment: dict[str, str]) -> None:
         assert threads == 1 and environment["MALLOC_MMAP_THRESHOLD_"]
 
-    def __enter__(self) -> "_Child":
+    def __enter__(self) -> "_Worker":
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -39,7 +39,7 @@ class _Child:
 
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(many_agents, "Child", _Child)
+    monkeypatch.setattr(many_agents, "WorkerProcess", _Worker)
     monkeypatch.setattr(many_agents, "COUNTS", {"quick": (3, 4, 6)})
     monkeypatch.setattr(many_agents, "MEMORY_COUNTS", {"quick": (4, 6)})
     monkeypatch.setattr(many_agents, "FIT_FROM", 4)
@@ -51,11 +51,11 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_section_measures_both_graphs_and_fits_from_its_threshold(tiny: None):
-    rows = many_agents.run(QUICK)
-    assert [(r.what["graph"], r.what["agents"]) for r in rows if r.name == "forecast"] == [
+    lines = many_agents.run(QUICK)
+    assert [(r.what["graph"], r.what["agents"]) for r in lines if r.name == "forecast"] == [
         ("all pairs", 3), ("all pairs", 4), ("2 nearest", 3), ("2 nearest", 4), ("2 nearest", 6),
     ]  # fmt: skip
-    fits = {r.name: r for r in rows if r.name.startswith("exponent")}
+    fits = {r.name: r for r in lines if r.name.startswith("exponent")}
     assert fits["exponent of memory"].value == pytest.approx(2.0)
     assert fits["exponent of time"].what["agents"] == "4 to 6"
     assert all(r.what["graph"] == "2 nearest" for r in fits.values())  # one dense count is no line
@@ -64,6 +64,6 @@ def test_the_section_measures_both_graphs_and_fits_from_its_threshold(tiny: None
 
 def test_what_does_not_fit_into_memory_is_skipped_with_a_note(tiny: None, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(many_agents, "MOST_BYTES", dense_bytes(sized("fast"), 3))
-    rows = [r for r in many_agents.run(QUICK) if r.name == "forecast" and r.what["graph"] == "all pairs"]
-    assert [r.value is None for r in rows] == [False, True]
-    assert "all pairs need more than" in rows[1].note
+    lines = [r for r in many_agents.run(QUICK) if r.name == "forecast" and r.what["graph"] == "all pairs"]
+    assert [r.value is None for r in lines] == [False, True]
+    assert "all pairs need more than" in lines[1].note

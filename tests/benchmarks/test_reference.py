@@ -89,10 +89,10 @@ def test_the_section_times_both_in_turns_and_says_how_large_they_are(
     monkeypatch.setattr(reference, "TRAINING", Training(2, 3, 5))
     monkeypatch.setattr(reference, "PREDICTION", Prediction(2, 3, 4, 2))
     monkeypatch.setattr(reference, "ROUNDS", {"quick": 3})
-    rows = reference.run(Settings(quick=True, threads=1, reference=checkout(tmp_path, STAND_IN)))
-    assert rows[0].value == 2 * (16 + 4)  # what is not learned does not count
-    assert (rows[1].value or 0) > 1e6
-    ratios = [r for r in rows if r.unit == "×"]
+    lines = reference.run(Settings(quick=True, threads=1, reference=checkout(tmp_path, STAND_IN)))
+    assert lines[0].value == 2 * (16 + 4)  # what is not learned does not count
+    assert (lines[1].value or 0) > 1e6
+    ratios = [r for r in lines if r.unit == "×"]
     assert [r.name for r in ratios] == [
         "training step: reference / ours",
         f"training step, {reference.AS_SHIPPED}: reference / ours",
@@ -102,5 +102,5 @@ def test_the_section_times_both_in_turns_and_says_how_large_they_are(
         "prediction, both encode the history: reference / ours",
     ]
     assert all(r.quartiles is not None and (r.value or 0) > 0 for r in ratios)
-    assert len([r for r in rows if r.unit == "ms"]) == 12
+    assert len([r for r in lines if r.unit == "ms"]) == 12
     assert "built for" not in capsys.readouterr().out

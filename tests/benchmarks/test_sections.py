@@ -18,22 +18,22 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_machines_rate_is_of_all_products_together():
-    rows = machine.run(QUICK)
-    assert len(rows) == 6
-    assert all(r.unit == "GFLOP/s" and (r.value or 0) > 0 and r.compared is None for r in rows)
-    assert rows[-1].flop == sum(r.flop or 0 for r in rows[:4])
+    lines = machine.run(QUICK)
+    assert len(lines) == 6
+    assert all(r.unit == "GFLOP/s" and (r.value or 0) > 0 and r.compared is None for r in lines)
+    assert lines[-1].flop == sum(r.flop or 0 for r in lines[:4])
 
 
 def test_forecasts_have_rates_and_ratios_to_the_evolving_graph(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(forecast, "CASES", {"quick": (forecast.Case(2, 3, 4, 2),)})
-    rows = {r.name: r for r in forecast.run(QUICK) if r.what["preset"] == "fast"}
-    assert len(rows) == 5
-    assert all((r.flop or 0) > 0 or "half" in r.name for r in rows.values())
-    assert all(r.compared is not None for r in rows.values())
-    assert [name for name, r in rows.items() if r.ratio is not None] == ["roll-out, frozen graph"]
-    frozen, evolving = rows["roll-out, frozen graph"], rows["roll-out"]
+    lines = {r.name: r for r in forecast.run(QUICK) if r.what["preset"] == "fast"}
+    assert len(lines) == 5
+    assert all((r.flop or 0) > 0 or "half" in r.name for r in lines.values())
+    assert all(r.compared is not None for r in lines.values())
+    assert [name for name, r in lines.items() if r.ratio is not None] == ["roll-out, frozen graph"]
+    frozen, evolving = lines["roll-out, frozen graph"], lines["roll-out"]
     assert (frozen.flop or 0) < (evolving.flop or 0)
-    assert rows["observe + roll-out"].unit == "agent-forecasts/s"
+    assert lines["observe + roll-out"].unit == "agent-forecasts/s"
 
 
 def test_streaming_keeps_each_history_near_its_mark(monkeypatch: pytest.MonkeyPatch):
@@ -51,18 +51,18 @@ def test_streaming_keeps_each_history_near_its_mark(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(streaming, "BATCH", 1)
     monkeypatch.setattr(streaming, "AGENTS", 3)
     monkeypatch.setattr(streaming, "ROUNDS", {"quick": 5})
-    rows = streaming.run(QUICK)
+    lines = streaming.run(QUICK)
     assert seen == {10: [13, 13, 13, 13, 13], 30: [33, 37, 33, 37, 33]}
-    ratio = next(r for r in rows if r.unit == "×")
+    ratio = next(r for r in lines if r.unit == "×")
     assert ratio.name == "a step after 30 steps / after 10" and ratio.compared is not None
-    assert [r.what["history"] for r in rows if r.unit == "ms"] == [10, 30, 2]
+    assert [r.what["history"] for r in lines if r.unit == "ms"] == [10, 30, 2]
 
 
-class _Child:
+class _Worker:
     def __init__(self, threads: int, environment: dict[str, str] | None = None) -> None:
         pass
 
-    def __enter__(self) -> "_Child":
+    def __enter__(self) -> "_Worker":
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -76,7 +76,7 @@ def test_training_counts_windows_memory_and_the_allocator(monkeypatch: pytest.Mo
     case = training.Case("fast", 3, 6, 4, 2)
     monkeypatch.setattr(training, "CASES", {"quick": (case,)})
     monkeypatch.setattr(training, "ALLOCATOR_CASE", case)
-    monkeypatch.setattr(training, "Child", _Child)
+    monkeypatch.setattr(training, "WorkerProcess", _Worker)
     monkeypatch.setattr(training, "keep_freed_memory", lambda: True)
     steps, windows, rounded, memory, allocator = training.run(QUICK)
     assert (steps.unit, windows.unit, memory.unit, memory.value) == ("steps/s", "windows/s", "MiB", 3.0)
@@ -90,36 +90,36 @@ def test_training_counts_windows_memory_and_the_allocator(monkeypatch: pytest.Mo
 def test_data_is_read_and_cut_and_absent_simulators_are_skipped(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(reading, "EPISODES", {"quick": 8})
     monkeypatch.setattr(reading, "missing", lambda *modules: f"needs {modules[0]}")
-    rows = reading.run(QUICK)
-    assert [r.unit for r in rows] == ["MB/s", "windows/s"] * 2 + ["rollouts/s", "", ""]
-    assert [r.note for r in rows[-2:]] == ["skipped: needs highway_env", "skipped: needs envpool"]
+    lines = reading.run(QUICK)
+    assert [r.unit for r in lines] == ["MB/s", "windows/s"] * 2 + ["rollouts/s", "", ""]
+    assert [r.note for r in lines[-2:]] == ["skipped: needs highway_env", "skipped: needs envpool"]
 
 
-def test_without_envpool_its_rows_are_skipped_in_one_line_each(monkeypatch: pytest.MonkeyPatch):
+def test_without_envpool_its_lines_are_skipped_in_one_line_each(monkeypatch: pytest.MonkeyPatch):
     for module in (wrappers, ppo):
         monkeypatch.setattr(module, "missing", lambda *modules: "needs envpool")
     monkeypatch.setattr(wrappers, "CASES", {"quick": (wrappers.Case("EnvPool", 2, "native", False, 1, 1),)})
     for section in (wrappers, ppo):
-        (row,) = section.run(QUICK)
-        assert row.value is None and row.note == "skipped: needs envpool"
+        (line,) = section.run(QUICK)
+        assert line.value is None and line.note == "skipped: needs envpool"
 
 
 def test_without_simulators_whole_sections_are_skipped(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(suite, "missing", lambda *modules: f"needs {modules[-1]}" if modules else "")
     names: list[str] = []
-    rows = suite.measure(QUICK, ("wrappers", "ppo"), names.append)
+    lines = suite.measure(QUICK, ("wrappers", "ppo"), names.append)
     assert names == ["wrappers", "ppo"]
-    assert [r.note for r in rows] == ["skipped: needs stable_baselines3"] * 2
+    assert [r.note for r in lines] == ["skipped: needs stable_baselines3"] * 2
 
 
 def test_an_environment_is_measured_plain_with_forecasts_and_at_the_papers_size(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(wrappers, "CASES", {"quick": (wrappers.Case("highway-env", 1, "dummy", True, 1, 3),)})
-    rows = wrappers.run(QUICK)
-    assert [(r.name, r.unit) for r in rows] == [
+    lines = wrappers.run(QUICK)
+    assert [(r.name, r.unit) for r in lines] == [
         ("plain", "steps/s"),
         ("with forecasts", "steps/s"),
         ("with forecasts, paper size", "steps/s"),
         ("with forecasts / plain", "×"),
         ("with forecasts, paper size / plain", "×"),
     ]
-    assert [r.compared is not None for r in rows] == [False, True, True, True, True]
+    assert [r.compared is not None for r in lines] == [False, True, True, True, True]

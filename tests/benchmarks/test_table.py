@@ -3,10 +3,10 @@ import io
 import pytest
 from rich.console import Console
 
-from benchmarks.results import Row, skipped
+from benchmarks.results import Line, skipped
 from benchmarks.table import HEADINGS, cells, number, plain, rich_table
 
-FULL = Row(
+FULL = Line(
     "forecast", "roll-out", {"preset": "fast", "batch": 8}, 12.345, "ms", (11.0, 13.0), ratio=0.5, ratio_to="evolving",
     flop=3e9, flops_per_s=2.5e10, matmul_share=0.256, note="a note",
 )  # fmt: skip
@@ -22,13 +22,13 @@ def test_three_digits(value: float, text: str):
     assert number(value) == text
 
 
-def test_a_row_says_all_it_knows():
+def test_a_line_says_all_it_knows():
     assert cells(FULL) == (
         "forecast", "roll-out", "preset fast, batch 8", "12.3 ms", "11–13", "0.50 of evolving", "25", "26 %", "a note",
     )  # fmt: skip
 
 
-def test_a_skipped_row_says_why():
+def test_a_skipped_line_says_why():
     assert cells(ABSENT) == ("ppo", "ratio", "", "–", "", "", "", "", "skipped: needs envpool")
 
 
@@ -44,4 +44,4 @@ def test_the_terminals_table_holds_the_same_cells():
     console = Console(file=io.StringIO(), width=300)
     console.print(rich_table([FULL, ABSENT]))
     text = console.file.getvalue()  # type: ignore[attr-defined]
-    assert all(cell in text for row in (FULL, ABSENT) for cell in cells(row))
+    assert all(cell in text for line in (FULL, ABSENT) for cell in cells(line))

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.results import Row
+from benchmarks.results import Line
 from benchmarks.timing import (
     Meter,
     Timing,
@@ -10,9 +10,9 @@ from benchmarks.timing import (
     interpreter,
     products,
     quartiles,
-    rate_row,
-    ratio_row,
-    timed_row,
+    rate_line,
+    ratio_line,
+    timed_line,
 )
 
 STICK = Yardstick("matmul", lambda: None, flop=100.0)
@@ -58,28 +58,28 @@ def test_a_yardstick_without_flop_gives_no_share():
     assert Timing(TIMING.seconds, TIMING.yard, Yardstick("interpreter", lambda: None)).matmul_share(1.0) is None
 
 
-def test_a_timed_row_has_milliseconds_a_ratio_and_equivalents():
+def test_a_timed_line_has_milliseconds_a_ratio_and_equivalents():
     base = Timing(np.array([1.0, 4.0, 12.0]), TIMING.yard, STICK)
-    row = timed_row("data", "step", {}, TIMING, flop=200.0, base=base, ratio_to="other", tolerance=2.0)
-    assert (row.value, row.unit, row.quartiles) == (4000.0, "ms", (3000.0, 5000.0))
-    assert (row.ratio, row.ratio_to) == (1.0, "other")
-    assert (row.flop, row.flops_per_s, row.matmul_share) == (200.0, 50.0, pytest.approx(2 / 3))
-    assert row.compared is not None
-    assert (row.compared.value, row.compared.kind, row.compared.better) == (3.0, "matmul", "lower")
-    assert row.compared.tolerance == 2.0
+    line = timed_line("data", "step", {}, TIMING, flop=200.0, base=base, ratio_to="other", tolerance=2.0)
+    assert (line.value, line.unit, line.quartiles) == (4000.0, "ms", (3000.0, 5000.0))
+    assert (line.ratio, line.ratio_to) == (1.0, "other")
+    assert (line.flop, line.flops_per_s, line.matmul_share) == (200.0, 50.0, pytest.approx(2 / 3))
+    assert line.compared is not None
+    assert (line.compared.value, line.compared.kind, line.compared.better) == (3.0, "matmul", "lower")
+    assert line.compared.tolerance == 2.0
 
 
 def test_a_rate_is_compared_by_its_time():
-    row = rate_row("data", "cut", {}, TIMING, 8, "windows/s")
-    assert (row.value, row.unit) == (2.0, "windows/s")
-    assert row.compared is not None and (row.compared.value, row.compared.better) == (3.0, "lower")
+    line = rate_line("data", "cut", {}, TIMING, 8, "windows/s")
+    assert (line.value, line.unit) == (2.0, "windows/s")
+    assert line.compared is not None and (line.compared.value, line.compared.better) == (3.0, "lower")
 
 
 def test_a_ratio_is_compared_as_it_is():
-    row = ratio_row("ppo", "ratio", {}, np.array([2.0, 3.0, 4.0]), "plain", better="higher")
-    assert isinstance(row, Row) and row.compared is not None
-    assert (row.value, row.quartiles) == (3.0, (2.5, 3.5))
-    assert (row.compared.value, row.compared.kind, row.compared.better) == (3.0, "ratio", "higher")
+    line = ratio_line("ppo", "ratio", {}, np.array([2.0, 3.0, 4.0]), "plain", better="higher")
+    assert isinstance(line, Line) and line.compared is not None
+    assert (line.value, line.quartiles) == (3.0, (2.5, 3.5))
+    assert (line.compared.value, line.compared.kind, line.compared.better) == (3.0, "ratio", "higher")
 
 
 def test_quartiles():

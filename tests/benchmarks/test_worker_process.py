@@ -2,13 +2,13 @@ from typing import Any
 
 import pytest
 
-from benchmarks import worker_process as child
-from benchmarks.worker_process import Child, exact_memory, peak_rise
+from benchmarks import worker_process
+from benchmarks.worker_process import WorkerProcess, exact_memory, peak_rise
 
 
-def test_a_child_measures_memory_and_reports_what_it_cannot_do():
+def test_a_worker_measures_memory_and_reports_what_it_cannot_do():
     arguments: dict[str, Any] = {"preset": "fast", "neighbours": 0, "horizon": 2}
-    with Child(1, exact_memory()) as other:
+    with WorkerProcess(1, exact_memory()) as other:
         few, many = (other.ask("forecast", agents=agents, **arguments)["peak_bytes"] for agents in (20, 120))
         with pytest.raises(RuntimeError, match="in a process of its own: KeyError"):
             other.ask("forecast", agents=2, **(arguments | {"preset": "huge"}))
@@ -19,8 +19,8 @@ def test_a_child_measures_memory_and_reports_what_it_cannot_do():
     assert again == pytest.approx(many, rel=0.3)
 
 
-def test_a_child_that_dies_is_reported():
-    with Child(1) as other:
+def test_a_worker_that_dies_is_reported():
+    with WorkerProcess(1) as other:
         other._process.kill()
         other._process.wait()
         with pytest.raises(RuntimeError, match="in a process of its own: it died"):
@@ -31,5 +31,5 @@ def test_memory_that_nobody_reports_is_none(monkeypatch: pytest.MonkeyPatch):
     def nobody(name: str) -> int:
         raise OSError
 
-    monkeypatch.setattr(child, "_status_bytes", nobody)
+    monkeypatch.setattr(worker_process, "_status_bytes", nobody)
     assert peak_rise(lambda: None) is None

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import torch
 
-from envs.readers import shared_reader_for
-from envs.registry import make_parallel_env
+from envs.readers import multiagent_reader_for
+from envs.registry import make_multiagent_env
 from envs.rollouts import episode as live
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE
@@ -20,7 +20,7 @@ TAG_CHANGES = (0.1, 0.1, 0.5, 0.5, 1.0, 1.0, 1.0)
 
 def tag_spec() -> SceneSpec:
     """Scenes of simple_tag_v3."""
-    return shared_reader_for(make_parallel_env(TAG)).spec
+    return multiagent_reader_for(make_multiagent_env(TAG)).spec
 
 
 def save_tag(path: Path, has_ego: bool = False) -> str:

@@ -19,14 +19,14 @@ import pytest
 import torch
 from pettingzoo import ParallelEnv
 
-from envs.multiagent_observation import SharedStream, agent_entries
+from envs.multiagent_observation import MultiagentStream, agent_entries
 from envs.observation import FORECAST_KEYS, ForecastConfig, ForecastStream, ego_entries
 from envs.parallel import ForecastParallelEnv
-from envs.readers import reader_for, shared_reader_for
-from envs.readers.base import Reader, SharedScene, share
+from envs.readers import multiagent_reader_for, reader_for
+from envs.readers.base import MultiagentScene, Reader, pad_multiagent_scene
 from envs.readers.entities import EntityRowsReader
 from envs.readers.function import FunctionReader
-from envs.registry import make_env, make_parallel_env
+from envs.registry import make_env, make_multiagent_env
 from envs.wrappers import ForecastObservation
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE
@@ -220,13 +220,13 @@ class SwarmReader:
     def reset(self) -> None:
         """The numbers are the cast's."""
 
-    def read(self, env: Any) -> SharedScene:
+    def read(self, env: Any) -> MultiagentScene:
         bodies = env.unwrapped.bodies
         states = np.array([walker.state for walker in bodies.values()])
         ids = np.array([walker.number for walker in bodies.values()], dtype=np.int64)
         rows = {name: row for row, name in enumerate(bodies) if LIVES[name].learns}
         scene = Scene(states, ids, np.ones(len(bodies), dtype=np.bool_))
-        return share(scene, rows, np.arctan2(states[:, 3], states[:, 2]), self.spec)
+        return pad_multiagent_scene(scene, rows, np.arctan2(states[:, 3], states[:, 2]), self.spec)
 
 
 # --- Who stands where, by the simulators' own objects -----------------------------------------------------------------
@@ -321,7 +321,7 @@ def crowd(reader: Callable[[SceneSpec], Any], shift_m: float = 0.0) -> Subject:
 
 
 def parallel(env_id: str, **kwargs: Any) -> Callable[[], Any]:
-    return partial(make_parallel_env, env_id, **kwargs)
+    return partial(make_multiagent_env, env_id, **kwargs)
 
 
 UNNAMED = ("presence", "x", "y", "vx", "vy", "", "heading")
@@ -382,7 +382,7 @@ def named(condition: Callable[[Subject], bool] = lambda subject: True) -> Any:
 class Moment:
     """One instant of an episode."""
 
-    shared: SharedScene
+    shared: MultiagentScene
     """What the forecaster got; with one ego, it is the one agent that has a row."""
     views: Views
     """The entries that each agent got."""
@@ -425,7 +425,7 @@ class Session:
         sight_m = subject.sight_m if sight_m is None else sight_m
         if subject.shared:
             maker = subject.reader and subject.reader(subject.spec)
-            spec = (shared_reader_for(bare) if maker is None else maker(bare)).spec
+            spec = (multiagent_reader_for(bare) if maker is None else maker(bare)).spec
             self.model = tiny(spec)
             self.env = ForecastParallelEnv(
                 bare, forecaster=self.model, reader=maker, perception_m=sight_m, max_agents=rows
@@ -454,7 +454,7 @@ class Session:
         """Empty memory."""
         return Stream(self)
 
-    def first_sight(self, shared: SharedScene) -> "Stream":
+    def first_sight(self, shared: MultiagentScene) -> "Stream":
         """Memory of nothing but this scene."""
         stream = Stream(self)
         stream.observe(shared)
@@ -481,7 +481,7 @@ class Session:
     def _moment(self, seen: Any) -> Moment:
         scene: Any = self.env.scene
         if not self.subject.shared:
-            scene, seen = SharedScene(scene, {EGO: 0}, np.full(len(scene.ids), scene.heading_rad)), {EGO: seen}
+            scene, seen = MultiagentScene(scene, {EGO: 0}, np.full(len(scene.ids), scene.heading_rad)), {EGO: seen}
         views = {name: {key: view[key] for key in view if key != "observation"} for name, view in seen.items()}
         assert all(set(view) == set(FORECAST_KEYS) for view in views.values())
         return Moment(scene, views, self.env.forecast, self.subject.bodies(self.env))
@@ -494,12 +494,12 @@ class Stream:
         self._shared, view = session.subject.shared, session.view
         config = ForecastConfig()
         self._stream: Any = (
-            SharedStream(session.model, session.spec, config, view.perception_m, view.max_agents)
+            MultiagentStream(session.model, session.spec, config, view.perception_m, view.max_agents)
             if self._shared
             else ForecastStream(session.model, session.spec, 1, config)
         )
 
-    def observe(self, shared: SharedScene) -> Views:
+    def observe(self, shared: MultiagentScene) -> Views:
         if self._shared:
             views: Views = self._stream.observe(shared)
             return views

@@ -8,10 +8,10 @@ from stable_baselines3 import PPO
 from envs import collect
 from envs.collect import CollectConfig
 from envs.drivers.ego import idle_action
-from envs.readers import shared_reader_for
+from envs.readers import multiagent_reader_for
 from envs.readers.highway import HighwayReader
 from envs.readers.highway_labels import ATTRIBUTE_NAMES, LEADER
-from envs.registry import make_env, make_parallel_env
+from envs.registry import make_env, make_multiagent_env
 from predictor.data.store import Episode, read_store
 from predictor.data.windows import Windows
 from predictor.errors import UserError
@@ -35,7 +35,7 @@ def assert_same_episodes(first: list[Episode], second: list[Episode]) -> None:
 
 
 def test_an_episode_is_what_the_simulator_did():
-    (episode,) = collect.collect(config(episodes=1, ego=("idle",), seed=11))
+    (episode,) = collect.collect(config(episodes=1, driver=("idle",), seed=11))
     env = make_env(ENV_ID)
     env.reset(seed=11)
     reader = HighwayReader(env)
@@ -50,17 +50,17 @@ def test_an_episode_is_what_the_simulator_did():
 
 
 def test_an_episode_ends_with_its_last_scene():
-    (episode,) = collect.collect(config(episodes=1, env_id="u-turn-v1", ego=("idle",), max_steps=200))
+    (episode,) = collect.collect(config(episodes=1, env_id="u-turn-v1", driver=("idle",), max_steps=200))
     assert 2 < len(episode.states) <= 11  # highway-env stops u-turn-v1 after 10 s
     assert episode.valid[:, 0].all()
 
 
 def test_an_episode_depends_on_its_seed_alone():
     """Neither on its place in the order nor on what the process did before."""
-    many = list(collect.collect(config(episodes=3, seed=4, ego=("random",))))
-    again = list(collect.collect(config(episodes=3, seed=4, ego=("random",))))
+    many = list(collect.collect(config(episodes=3, seed=4, driver=("random",))))
+    again = list(collect.collect(config(episodes=3, seed=4, driver=("random",))))
     assert_same_episodes(again, many)
-    single = list(collect.collect(config(episodes=1, seed=6, ego=("random",))))
+    single = list(collect.collect(config(episodes=1, seed=6, driver=("random",))))
     assert_same_episodes(single, many[2:])
     assert not np.array_equal(many[0].states, many[1].states)
 
@@ -91,17 +91,17 @@ def test_every_ego_drives(tmp_path: Path):
     env = make_env(ENV_ID)
     PPO("MlpPolicy", env, n_steps=4, batch_size=4, policy_kwargs={"net_arch": [4]}, device="cpu").save(tmp_path / "p")
     egos = ("random", "idle", "varied", str(tmp_path / "p.zip"))
-    episodes = list(collect.collect(config(episodes=4, ego=egos)))
+    episodes = list(collect.collect(config(episodes=4, driver=egos)))
     assert tuple(e.label for e in episodes) == egos
-    (kept,) = collect.collect(config(episodes=1, env_id="racetrack-v1", ego=("keep-lane",)))
+    (kept,) = collect.collect(config(episodes=1, env_id="racetrack-v1", driver=("keep-lane",)))
     assert kept.label == "keep-lane"
     assert all(np.isfinite(e.states).all() and e.valid[:, 0].all() for e in [*episodes, kept])
 
 
 def test_a_policy_trained_on_forecasts_drives_the_same_each_time(tmp_path: Path, highway_checkpoint: str):
     ego = (str(save_forecast_policy(tmp_path, ENV_ID, highway_checkpoint)),)
-    first = list(collect.collect(config(episodes=2, seed=8, ego=ego)))
-    (alone,) = collect.collect(config(episodes=1, seed=9, ego=ego))
+    first = list(collect.collect(config(episodes=2, seed=8, driver=ego)))
+    (alone,) = collect.collect(config(episodes=1, seed=9, driver=ego))
     assert_same_episodes([alone], first[1:])
     assert first[0].valid[:, 0].all()
 
@@ -129,10 +129,10 @@ def test_labels_can_be_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 
 
 def test_an_episode_of_many_learners_is_what_the_simulator_did():
-    (episode,) = collect.collect(config(episodes=1, env_id=TAG, ego=("idle",), seed=11))
-    env = make_parallel_env(TAG)
+    (episode,) = collect.collect(config(episodes=1, env_id=TAG, driver=("idle",), seed=11))
+    env = make_multiagent_env(TAG)
     env.reset(seed=11)
-    reader = shared_reader_for(env)
+    reader = multiagent_reader_for(env)
     assert (episode.label, episode.seed, len(episode.states)) == ("idle", 11, STEPS + 1)
     assert (episode.edge_types, episode.edge_attributes) == (None, None)
     assert episode.valid.all()
@@ -144,7 +144,7 @@ def test_an_episode_of_many_learners_is_what_the_simulator_did():
 
 
 def test_an_episode_of_many_learners_ends_with_its_last_scene():
-    (episode,) = collect.collect(config(episodes=1, env_id=TAG, ego=("random",), max_steps=200))
+    (episode,) = collect.collect(config(episodes=1, env_id=TAG, driver=("random",), max_steps=200))
     assert len(episode.states) == 26  # mpe2 stops after 25 cycles
     assert episode.valid.all()
 
@@ -158,7 +158,7 @@ def test_many_learners_are_recorded_without_labels(
     assert (code, errors) == (0, [])
     assert "4 episodes, 24 scenes, seeds 30–33" in output
     store = read_store(tmp_path / "s")
-    assert store.info.spec == shared_reader_for(make_parallel_env(TAG)).spec
+    assert store.info.spec == multiagent_reader_for(make_multiagent_env(TAG)).spec
     assert (store.info.spec.has_ego, store.info.source) == (False, TAG)
     assert store.info.edge_attribute_names == ()
     assert all(e.edge_types is None for e in store.episodes)
@@ -179,12 +179,12 @@ ERRORS = {
     "negative-steps": (["--max-steps", "-1"], "max_steps must be at least 1, got -1"),
     "zero-workers": (["--workers", "0"], "workers must be at least 1, got 0"),
     "negative-seed": (["--seed", "-1"], "seed must not be negative, got -1"),
-    "unknown-ego": (["--ego", "random", "reckless"], "ego must be one of random, idle,"),
-    "unfit-ego": (["--ego", "keep-lane"], "keep-lane needs continuous steering"),
-    "missing-policy": (["--ego", "absent.zip"], "no policy at absent.zip"),
-    "unknown-driver": (["--env-id", TAG, "--ego", "heuristic", "reckless"], "driver must be one of random, idle,"),
-    "unfit-driver": (["--env-id", TAG, "--ego", "keep-lane"], "driver must be one of random, idle,"),
-    "policy-among-many": (["--env-id", TAG, "--ego", "absent.zip"], "no policy at absent.zip"),
+    "unknown-ego": (["--driver", "random", "reckless"], "driver must be one of random, idle,"),
+    "unfit-ego": (["--driver", "keep-lane"], "keep-lane needs continuous steering"),
+    "missing-policy": (["--driver", "absent.zip"], "no policy at absent.zip"),
+    "unknown-driver": (["--env-id", TAG, "--driver", "heuristic", "reckless"], "driver must be one of random, idle,"),
+    "unfit-driver": (["--env-id", TAG, "--driver", "keep-lane"], "driver must be one of random, idle,"),
+    "policy-among-many": (["--env-id", TAG, "--driver", "absent.zip"], "no policy at absent.zip"),
     "nothing-moves": (["--env-id", "mpe2.simple_crypto_v3:parallel_env"], "nothing moves in simple_crypto"),
 }
 
@@ -207,7 +207,7 @@ def test_a_policy_of_another_env_is_one_line(
     tmp_path: Path, highway_checkpoint: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):
     policy = save_forecast_policy(tmp_path, ENV_ID, highway_checkpoint)
-    arguments = ["--env-id", "intersection-v2", "--out", str(tmp_path / "store"), "--ego", str(policy)]
+    arguments = ["--env-id", "intersection-v2", "--out", str(tmp_path / "store"), "--driver", str(policy)]
     code, errors, _ = run_command(collect.main, arguments, monkeypatch, capsys)
     assert code == 2
     assert len(errors) == 1
@@ -228,6 +228,6 @@ def test_an_existing_store_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_ranges_are_checked_before_anything_runs():
-    config(episodes=1, max_steps=1).check()
+    config(episodes=1, max_steps=1)
     with pytest.raises(UserError, match="episodes must be at least 1, got 0"):
-        config(episodes=0).check()
+        config(episodes=0)

@@ -150,7 +150,7 @@ def test_json_has_null_for_what_is_no_number():
 
 
 def run_config(**changes: Any) -> EvaluateConfig:
-    base = {"episodes": 2, "samples": 3, "workers": 1, "max_steps": 6, "horizon_steps": 2}
+    base = {"episodes": 2, "num_samples": 3, "workers": 1, "max_steps": 6, "horizon_steps": 2}
     return EvaluateConfig(**{**base, **changes})
 
 
@@ -189,7 +189,7 @@ def test_a_learned_checkpoint_is_measured(in_process: None, tmp_path: Path):
     path = tmp_path / "learned"
     info = CheckpointInfo(HIGHWAY_SPEC, SIZES, HORIZON, std_m=(1.0, 2.0, 3.0))
     save_checkpoint(path, tiny_model(HIGHWAY_SPEC), info)
-    settings = {"horizon_steps": None, "history_steps": (1, 9)}
+    settings = {"horizon_steps": None, "memory_steps": (1, 9)}
     result, again = (measure(ROAD, str(path), **settings) for _ in range(2))
     assert timeless(result) == timeless(again)
     assert result.checkpoint == "learned"
@@ -213,7 +213,7 @@ def test_a_learned_checkpoint_is_measured(in_process: None, tmp_path: Path):
 
 
 def test_a_learned_checkpoint_is_measured_among_many_learners(in_process: None, tmp_path: Path):
-    result = measure(TAG, save_tag(tmp_path / "tag"), horizon_steps=None, history_steps=(1,))
+    result = measure(TAG, save_tag(tmp_path / "tag"), horizon_steps=None, memory_steps=(1,))
     assert (result.checkpoint, result.driver, result.graph) == ("tag", "heuristic", None)
     assert len(result.model.by_step_m) == HORIZON
     assert result.model.agents == result.histories[1].agents == 2 * 4 * 4
@@ -238,7 +238,7 @@ def test_neighbours_have_a_row_where_there_is_data(in_process: None, tmp_path: P
 
 def test_a_policy_trained_on_forecasts_drives(in_process: None, tmp_path: Path, highway_checkpoint: str):
     policy = str(save_forecast_policy(tmp_path, ROAD, highway_checkpoint))
-    driven = measure(ROAD, highway_checkpoint, horizon_steps=None, ego=policy)
+    driven = measure(ROAD, highway_checkpoint, horizon_steps=None, driver=policy)
     assert driven.model.agents > 0
     assert driven.driver == policy
     assert driven.model != measure(ROAD, highway_checkpoint, horizon_steps=None).model
@@ -251,7 +251,7 @@ def test_a_policy_trained_on_other_forecasts_is_named(
     """It gets the forecasts that are measured; these have other edges, or fewer steps, than it was trained on."""
     policy = str(save_forecast_policy(tmp_path, ROAD, highway_checkpoint))
     with pytest.raises(UserError, match="policy .*policy.zip was trained on"):
-        measure(ROAD, checkpoint or highway_checkpoint, horizon_steps=horizon, ego=policy)
+        measure(ROAD, checkpoint or highway_checkpoint, horizon_steps=horizon, driver=policy)
 
 
 def test_worst_cases_are_of_different_episodes_worst_first(in_process: None):
@@ -281,7 +281,7 @@ def transfer_run(tmp_path_factory: pytest.TempPathFactory, highway_checkpoint: s
     """Two checkpoints in two environments; the one that learned at steps of 1 s does not fit racetrack-v1."""
     out, text = tmp_path_factory.mktemp("transfer") / "results", StringIO()
     arguments = ["--env-ids", ROAD, "racetrack-v1", "--checkpoint", STILL, highway_checkpoint, "--episodes", "2"]
-    arguments += ["--samples", "2", "--max-steps", "5", "--horizon-steps", "2", "--history-steps", "1"]
+    arguments += ["--num-samples", "2", "--max-steps", "5", "--horizon-steps", "2", "--memory-steps", "1"]
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(text):
         no_processes(patch)
         forget()
@@ -338,7 +338,7 @@ def test_the_command_writes_json_and_markdown(
 ):
     """With a real worker process, as a user runs it."""
     out = tmp_path / "results"
-    arguments = ["--env-ids", TAG, "--checkpoint", STILL, "--episodes", "2", "--samples", "2"]
+    arguments = ["--env-ids", TAG, "--checkpoint", STILL, "--episodes", "2", "--num-samples", "2"]
     arguments += ["--max-steps", "5", "--horizon-steps", "2", "--workers", "1", "--out", str(out)]
     code, errors, output = run_command(evaluate.main, arguments, monkeypatch, capsys)
     assert (code, errors) == (0, [])
@@ -363,16 +363,16 @@ ERRORS = {
     "unknown-checkpoint": (["--checkpoint", "nowhere"], "no checkpoint 'nowhere'"),
     "same-names": (["--checkpoint", "a/best", "b/best"], "each checkpoint needs a name of its own, got best, best"),
     "zero-episodes": (["--episodes", "0"], "episodes must be at least 1, got 0"),
-    "zero-samples": (["--samples", "0"], "samples must be at least 1, got 0"),
+    "zero-samples": (["--num-samples", "0"], "num_samples must be at least 1, got 0"),
     "zero-workers": (["--workers", "0"], "workers must be at least 1, got 0"),
     "negative-steps": (["--max-steps", "-5"], "max_steps must be at least 1, got -5"),
     "zero-horizon": (["--horizon-steps", "0"], "horizon_steps must be at least 1, got 0"),
-    "zero-history": (["--history-steps", "3", "0"], "history_steps must be at least 1, got (3, 0)"),
+    "zero-memory": (["--memory-steps", "3", "0"], "memory_steps must be at least 1, got (3, 0)"),
     "negative-seed": (["--seed", "-1"], "seed must not be negative, got -1"),
     "zero-miss": (["--miss-m", "0"], "miss_m must be positive, got 0"),
-    "unfit-ego": (["--ego", "keep-lane"], "keep-lane needs continuous steering"),
-    "unknown-ego": (["--ego", "reckless"], "ego must be one of random"),
-    "unfit-driver": (["--env-ids", TAG, "--ego", "keep-lane"], "driver must be one of random"),
+    "unfit-ego": (["--driver", "keep-lane"], "keep-lane needs continuous steering"),
+    "unknown-ego": (["--driver", "reckless"], "driver must be one of random"),
+    "unfit-driver": (["--env-ids", TAG, "--driver", "keep-lane"], "driver must be one of random"),
     "no-neighbours": (["--neighbours", "nowhere"], "nowhere is not a readable episode store"),
     "no-store": (["--neighbours", "."], ". is not a readable episode store"),
     "too-short": (["--max-steps", "1", "--episodes", "1"], f"{ROAD}: no forecast has 5 steps of truth"),

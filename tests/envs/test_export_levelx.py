@@ -112,7 +112,7 @@ ERRORS = {
     "zero-episodes": (["--episodes", "0"], "episodes must be at least 1, got 0"),
     "zero-steps": (["--max-steps", "0"], "max_steps must be at least 1, got 0"),
     "negative-seed": (["--seed", "-1"], "seed must not be negative, got -1"),
-    "unknown-ego": (["--ego", "reckless"], "ego must be one of random, idle,"),
+    "unknown-ego": (["--driver", "reckless"], "driver must be one of random, idle,"),
 }
 
 

@@ -9,9 +9,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.multiagent_observation import SharedStream, agent_entries, check_shared
+from envs.multiagent_observation import MultiagentStream, agent_entries, check_multiagent_scene
 from envs.observation import FORECAST_KEYS, ForecastConfig
-from envs.readers.base import SharedScene
+from envs.readers.base import MultiagentScene
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.errors import UserError
 from predictor.scene import KINEMATIC_FEATURES_3D, PADDING_ID, Forecast, Scene, SceneSpec
@@ -30,7 +30,7 @@ def shared_scene(
     headings_rad: tuple[float, ...] = (),
     ids: tuple[int, ...] | None = None,
     rows: int = 6,
-) -> SharedScene:
+) -> MultiagentScene:
     """These agents in the first rows; all are learners "0", "1", … unless said."""
     count = len(states)
     full = np.zeros((rows, 4))
@@ -40,16 +40,16 @@ def shared_scene(
     heading = np.zeros(rows)
     heading[: len(headings_rad)] = headings_rad
     learners = {str(i): i for i in range(count)} if names is None else names
-    return SharedScene(Scene(full, numbers, np.arange(rows) < count), learners, heading)
+    return MultiagentScene(Scene(full, numbers, np.arange(rows) < count), learners, heading)
 
 
-def random_shared(rng: np.random.Generator, rows: int = 6) -> SharedScene:
+def random_shared(rng: np.random.Generator, rows: int = 6) -> MultiagentScene:
     """A random number of agents in random rows; some of them learn."""
     valid = rng.random(rows) < 0.7
     states = rng.normal(size=(rows, 4)) * 30 * valid[:, None]
     ids = np.where(valid, rng.permutation(rows), PADDING_ID)
     learners = [int(row) for row in np.flatnonzero(valid) if rng.random() < 0.7]
-    return SharedScene(
+    return MultiagentScene(
         Scene(states, ids, valid), {f"agent_{row}": row for row in learners}, rng.uniform(-np.pi, np.pi, rows)
     )
 
@@ -70,7 +70,7 @@ def random_world_forecast(
     )
 
 
-def view_by_loops(shared: SharedScene, forecast: Forecast, row: int, view: SceneSpec) -> dict[str, np.ndarray]:
+def view_by_loops(shared: MultiagentScene, forecast: Forecast, row: int, view: SceneSpec) -> dict[str, np.ndarray]:
     """What the agent in a row sees, one agent, sample, step and edge type at a time."""
     states, valid = shared.scene.states, shared.scene.valid
     xy, probs, features = (t[0].cpu().numpy() for t in (forecast.xy, forecast.edge_probs, forecast.edge_features))
@@ -108,30 +108,30 @@ def view_by_loops(shared: SharedScene, forecast: Forecast, row: int, view: Scene
     return entries
 
 
-def moved(rng: np.random.Generator, shared: SharedScene) -> SharedScene:
+def moved(rng: np.random.Generator, shared: MultiagentScene) -> MultiagentScene:
     """The same agents a step later."""
     scene = shared.scene
     states = (scene.states + rng.normal(size=scene.states.shape)) * scene.valid[:, None]
     return replace(shared, scene=replace(scene, states=states))
 
 
-def reordered(shared: SharedScene, order: np.ndarray) -> SharedScene:
+def reordered(shared: MultiagentScene, order: np.ndarray) -> MultiagentScene:
     """The same agents in other rows: row i holds what was in row order[i]."""
     scene = shared.scene
     place = np.argsort(order)
     rows = {name: int(place[row]) for name, row in shared.rows.items()}
-    return SharedScene(
+    return MultiagentScene(
         Scene(scene.states[order], scene.ids[order], scene.valid[order]), rows, shared.heading_rad[order]
     )
 
 
 def stream(spec: SceneSpec, perception_m: float | None = None, max_agents: int | None = None, **config: Any):
     model = tiny_model(spec)
-    return SharedStream(model, replace(spec, has_ego=False), ForecastConfig(**config), perception_m, max_agents)
+    return MultiagentStream(model, replace(spec, has_ego=False), ForecastConfig(**config), perception_m, max_agents)
 
 
-def straight(shared: SharedScene, spec: SceneSpec = WORLD, horizon: int = 2) -> dict[str, dict[str, np.ndarray]]:
-    return SharedStream(ConstantVelocity(spec, horizon), spec, ForecastConfig()).observe(shared)
+def straight(shared: MultiagentScene, spec: SceneSpec = WORLD, horizon: int = 2) -> dict[str, dict[str, np.ndarray]]:
+    return MultiagentStream(ConstantVelocity(spec, horizon), spec, ForecastConfig()).observe(shared)
 
 
 # --- agent_entries: one forecast, everyone's own view -----------------------------------------------------------------
@@ -230,13 +230,13 @@ def test_nobody_who_learns_gets_nothing():
     assert agent_entries(shared, random_world_forecast(rng, 6, 1, 2, 2, 1), WORLD) == {}
 
 
-# --- SharedStream -----------------------------------------------------------------------------------------------------
+# --- MultiagentStream ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("spec", FRAMES, ids=FRAME_NAMES)
 def test_forecast_is_in_world_coordinates(spec: SceneSpec):
     shared = shared_scene((100, 200, 4, 0), (-50, 30, 0, -8))
-    made = SharedStream(ConstantVelocity(spec, 2), replace(spec, has_ego=False), ForecastConfig())
+    made = MultiagentStream(ConstantVelocity(spec, 2), replace(spec, has_ego=False), ForecastConfig())
     made.observe(shared)
     assert made.forecast is not None
     expected = [[[102, 200], [104, 200]], [[-50, 26], [-50, 22]]]
@@ -382,7 +382,7 @@ def test_a_view_is_what_was_asked_for():
 def test_a_forecaster_that_needs_an_ego_is_refused():
     model = tiny_model(replace(AROUND_EGO, frame=("ego", "world")))
     with pytest.raises(UserError, match="relative to one ego, but these scenes have many learners"):
-        SharedStream(model, WORLD, ForecastConfig())
+        MultiagentStream(model, WORLD, ForecastConfig())
 
 
 def test_scenes_with_an_ego_or_a_height_are_refused():
@@ -391,7 +391,7 @@ def test_scenes_with_an_ego_or_a_height_are_refused():
     )
     for spec, found in ((AROUND_EGO, "has_ego=True and 2 axes"), (high, "has_ego=False and 3 axes")):
         with pytest.raises(UserError, match=f"need has_ego=False and positions on two axes, got {found}"):
-            SharedStream(ConstantVelocity(spec), spec, ForecastConfig())
+            MultiagentStream(ConstantVelocity(spec), spec, ForecastConfig())
 
 
 @pytest.mark.parametrize(("perception_m", "max_agents"), [(0.0, None), (-1.0, None), (None, 0)])
@@ -400,21 +400,21 @@ def test_bounds_out_of_range_are_refused(perception_m: float | None, max_agents:
         stream(WORLD, perception_m, max_agents)
 
 
-# --- check_shared -----------------------------------------------------------------------------------------------------
+# --- check_multiagent_scene -------------------------------------------------------------------------------------------
 
 GOOD = shared_scene((1, 2, 3, 4), (5, 6, 7, 8))
 
 
 def test_a_good_scene_passes():
-    assert check_shared(GOOD, WORLD) is GOOD
-    assert check_shared(shared_scene(), WORLD).rows == {}
+    assert check_multiagent_scene(GOOD, WORLD) is GOOD
+    assert check_multiagent_scene(shared_scene(), WORLD).rows == {}
 
 
 @pytest.mark.parametrize(
     ("shared", "message"),
     [
-        (GOOD.scene, r"toy: reading must give a SharedScene .* got Scene"),
-        (None, r"toy: reading must give a SharedScene .* got NoneType"),
+        (GOOD.scene, r"toy: reading must give a MultiagentScene .* got Scene"),
+        (None, r"toy: reading must give a MultiagentScene .* got NoneType"),
         (shared_scene((1, 2, 3, 4), rows=3), r"toy: a scene needs 6 rows \(max_agents\), padding included, got 3"),
         (shared_scene((1, 2, 3, 4), (5, 6, 7, 8), ids=(4, 4)), "toy: ids must be unique"),
         (replace(GOOD, heading_rad=np.zeros(5)), "toy: heading_rad must hold 6 finite numbers"),
@@ -427,4 +427,4 @@ def test_a_good_scene_passes():
 )
 def test_a_bad_scene_is_named(shared: Any, message: str):
     with pytest.raises(UserError, match=message):
-        check_shared(shared, WORLD, "toy")
+        check_multiagent_scene(shared, WORLD, "toy")

@@ -432,3 +432,20 @@ def test_three_axes_are_refused():
     spec = SceneSpec(dt_s=1.0, frame=("world",) * 3, feature_names=names, feature_scales=(1.0,) * 6)
     with pytest.raises(UserError, match="observations are of positions in a plane, got 3 axes"):
         ForecastStream(ConstantVelocity(spec), spec, 1, ForecastConfig())
+
+
+# --- Devices ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("there", "taken"), [(True, "cuda"), (False, "cpu")])
+def test_auto_takes_the_cuda_device_where_there_is_one(there: bool, taken: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
+    assert ForecastConfig(device="auto").device == taken
+
+
+def test_devices_that_are_not_there_are_named(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(UserError, match="device 'cuda' was asked for but torch finds no CUDA device"):
+        ForecastConfig(device="cuda")
+    with pytest.raises(UserError, match="device must be cpu, cuda or auto, got 'tpu'"):
+        ForecastConfig(device="tpu")

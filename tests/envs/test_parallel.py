@@ -14,9 +14,9 @@ from pettingzoo.utils import BaseParallelWrapper
 
 from envs.observation import FORECAST_KEYS
 from envs.parallel import ForecastParallelEnv
-from envs.readers import shared_reader_for
-from envs.readers.base import SharedScene, share
-from envs.registry import PARALLEL_CHECKPOINTS, PARALLEL_IDS, make_parallel_env
+from envs.readers import multiagent_reader_for
+from envs.readers.base import MultiagentScene, pad_multiagent_scene
+from envs.registry import ENVS, MULTIAGENT_IDS, EnvEntry, make_multiagent_env
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE
@@ -130,7 +130,7 @@ class ToyReader:
     def reset(self) -> None:
         """Identities are the script's."""
 
-    def read(self, env: Any) -> SharedScene:
+    def read(self, env: Any) -> MultiagentScene:
         toy = env.unwrapped
         order = np.array(toy.bodies(), dtype=np.int64)
         if self._shuffle:
@@ -138,7 +138,7 @@ class ToyReader:
         names = list(toy.lives)
         rows = {names[i]: row for row, i in enumerate(order) if names[i] in toy.observed}
         everyone = Scene(toy.tracks[toy.t][order], 100 + order, np.ones(len(order), dtype=np.bool_))
-        return share(everyone, rows, toy.headings[toy.t][order], self.spec, "ToyReader")
+        return pad_multiagent_scene(everyone, rows, toy.headings[toy.t][order], self.spec, "ToyReader")
 
 
 class Reference:
@@ -168,7 +168,7 @@ class Reference:
             edge_features=forecast.edge_features[:, front:, front:],
             valid=forecast.valid[:, front:],
         )
-        shared = SharedScene(scene, {}, toy.headings[toy.t])
+        shared = MultiagentScene(scene, {}, toy.headings[toy.t])
         return {
             name: view_by_loops(shared, forecast, i, self._view)
             for i, name in enumerate(toy.lives)
@@ -310,7 +310,7 @@ def test_reset_forgets_and_nothing_else_does():
     amnesiac = wrap(Toy(), shuffle=False)
     amnesiac.reset(seed=0)
     while amnesiac.agents:
-        amnesiac._stream.reset()
+        amnesiac.stream.reset()
         last, *_ = amnesiac.step(act(amnesiac))
     assert set(last) == set(first[-1]) == {"stays", "joins", "takes over"}
     for name in last:
@@ -324,7 +324,7 @@ def test_identities_are_forgotten_before_a_new_episode_is_read():
         def reset(self) -> None:
             calls.append("reset")
 
-        def read(self, env: Any) -> SharedScene:
+        def read(self, env: Any) -> MultiagentScene:
             calls.append("read")
             return super().read(env)
 
@@ -347,7 +347,7 @@ def test_who_takes_a_leavers_row_gets_none_of_its_memory(learns: bool):
     for _ in range(4):
         observations, *_ = env.step(act(env))
         rows.append({int(i): row for row, i in enumerate(env.scene.scene.ids) if i >= 0})
-        fresh._stream.reset()
+        fresh.stream.reset()
         first_sight, *_ = fresh.step(act(fresh))
     assert rows[2][101] == rows[3][102] == 1
     assert observations["stays"]["valid"].sum() == 1
@@ -487,7 +487,7 @@ def test_more_rows_than_agents_are_padding():
 
 def test_without_a_name_it_takes_the_checkpoint_of_the_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path = save_tiny(tmp_path / "toy", WORLD)
-    monkeypatch.setitem(PARALLEL_CHECKPOINTS, "toy_v0", path)
+    monkeypatch.setitem(ENVS, "toy_v0", EnvEntry(checkpoint=path))
     implied = play(ForecastParallelEnv(Toy(), reader=ToyReader))
     for seen, wanted in zip(implied, play(ForecastParallelEnv(Toy(), path, reader=ToyReader)), strict=True):
         assert data_equivalence(seen, wanted)
@@ -548,7 +548,7 @@ def test_an_aec_env_is_told_how_to_convert(monkeypatch: pytest.MonkeyPatch):
 
 def test_a_reader_that_breaks_the_contract_is_named():
     class Careless(ToyReader):
-        def read(self, env: Any) -> SharedScene:
+        def read(self, env: Any) -> MultiagentScene:
             return replace(super().read(env), rows={"stays": 7})
 
     env = ForecastParallelEnv(Toy(), "constant-velocity", reader=Careless)
@@ -564,12 +564,12 @@ SHORT = 5
 def short_env(env_id: str, **kwargs: Any) -> ParallelEnv:
     """A registered environment whose episodes end after a few steps."""
     length = {"duration": SHORT} if env_id.startswith("intersection") else {"max_cycles": SHORT}
-    return make_parallel_env(env_id, **length, **kwargs)
+    return make_multiagent_env(env_id, **length, **kwargs)
 
 
 def save_tiny_for(env: ParallelEnv, path: Path) -> str:
     """As `save_tiny`, for any number of features."""
-    spec = shared_reader_for(env).spec
+    spec = multiagent_reader_for(env).spec
     sizes = replace(SIZES, delta_scales=())
     save_checkpoint(path, DGVAE(spec, sizes, HORIZON), CheckpointInfo(spec, sizes, HORIZON))
     return str(path)
@@ -591,7 +591,7 @@ def test_toy_keeps_pettingzoos_contracts():
     check_episodes_repeat(lambda: wrap(Toy(), shuffle=False))
 
 
-@pytest.mark.parametrize("env_id", PARALLEL_IDS)
+@pytest.mark.parametrize("env_id", MULTIAGENT_IDS)
 def test_registered_envs_keep_pettingzoos_contracts(env_id: str):
     parallel_api_test(ForecastParallelEnv(short_env(env_id), "constant-velocity"), num_cycles=SHORT)
     parallel_seed_test(lambda: ForecastParallelEnv(short_env(env_id), "constant-velocity"), num_cycles=SHORT)

@@ -1,8 +1,31 @@
+import subprocess
+import sys
+from pathlib import Path
+
 import gymnasium as gym
+import numpy as np
 import pytest
 
-from envs.registry import CHECKPOINTS, checkpoint_for, make_env, native_task_of
+from envs.drivers.all_agents import make_driver
+from envs.drivers.ego import make_ego
+from envs.readers.base import role_of
+from envs.registry import (
+    CHECKPOINTS,
+    ENVS,
+    MULTIAGENT_CHECKPOINTS,
+    MULTIAGENT_IDS,
+    EnvEntry,
+    checkpoint_for,
+    entry_for,
+    is_multiagent_id,
+    make_env,
+    make_multiagent_env,
+    native_task_of,
+)
+from envs.simulators.envpool import ENV_IDS as ENVPOOL_IDS
 from envs.simulators.envpool import HIGHWAY_ENV_OF
+from envs.wrappers import SceneObservation
+from predictor.checkpoint import resolve
 from predictor.errors import UserError
 
 
@@ -11,6 +34,27 @@ def test_an_unknown_id_is_one_clear_line(env_id: str):
     with pytest.raises(UserError, match=f"cannot make env '{env_id}'.*known here: highway-v0, ") as error:
         make_env(env_id)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("absent", ["envpool", "envpool stable_baselines3"])
+def test_an_env_of_envpool_without_envpool_says_what_to_install(absent: str):
+    code = f"""
+import sys
+for name in {absent.split()!r}:
+    sys.modules[name] = None  # importing it raises ImportError
+from envs.registry import make_env
+from predictor.errors import UserError
+try:
+    make_env("envpool/HighwayFast-v0")
+except UserError as error:
+    print(error)
+"""
+    root = Path(__file__).resolve().parents[2]
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    (line,) = done.stdout.splitlines()
+    assert "need the envpool package" in line and "pip install 'dgvae-rl[envpool]'" in line
 
 
 def test_native_environments_are_made_by_id():
@@ -53,6 +97,7 @@ def test_what_was_not_copied_is_named(env_id: str):
         ("envpool/Merge-v0", "merge"),
         ("envpool/Intersection-v0", "intersection"),
         ("envpool/RacetrackLarge-v0", "racetrack-large"),
+        ("envpool/IntersectionContinuous-v1", "intersection"),
         ("highway-fast-v0", "highway"),
         ("racetrack-v1", "racetrack"),
     ],
@@ -68,5 +113,55 @@ def test_where_no_checkpoint_ships_the_others_are_named(env_id: str):
 
 
 def test_every_known_id_has_its_checkpoint():
-    for env_id, checkpoint in CHECKPOINTS.items():
+    for env_id, checkpoint in (CHECKPOINTS | MULTIAGENT_CHECKPOINTS).items():
         assert checkpoint_for(env_id) == checkpoint
+        assert resolve(checkpoint).is_dir()
+
+
+def test_one_entry_tells_which_kind_an_id_is():
+    assert set(MULTIAGENT_CHECKPOINTS) < set(MULTIAGENT_IDS)
+    assert not set(CHECKPOINTS) & set(MULTIAGENT_IDS)
+    assert {env_id for env_id in ENVS if is_multiagent_id(env_id)} == set(MULTIAGENT_IDS)
+
+
+@pytest.mark.parametrize("env_id", [env_id for env_id in ENVS if env_id not in ENVPOOL_IDS])
+def test_every_listed_id_is_made_and_driven_by_its_default_drivers(env_id: str):
+    """An entry that names a heuristic where there is none, or none where there is one, is wrong."""
+    entry = entry_for(env_id)
+    rng = np.random.default_rng(0)
+    if not entry.multiagent:
+        env = make_env(env_id)
+        for name in entry.drivers:
+            make_ego(name, SceneObservation(env), rng)
+        env.close()
+        return
+    multiagent = make_multiagent_env(env_id)
+    for name in entry.drivers:
+        make_driver(name, multiagent, rng)
+    assert set(entry.learners) <= {role_of(agent) for agent in multiagent.possible_agents}
+    if "heuristic" not in entry.drivers:
+        with pytest.raises(UserError, match="no heuristic drives"):
+            make_driver("heuristic", multiagent, rng)
+    multiagent.close()
+
+
+def test_an_id_that_is_not_listed_has_an_entry_without_a_checkpoint():
+    assert entry_for("CartPole-v1") == EnvEntry()
+
+
+@pytest.mark.parametrize("door", ["envs.registry", "envs.readers", "envs.wrappers"])
+def test_gymnasium_environments_are_made_without_pettingzoo(door: str):
+    code = f"""
+import sys
+sys.modules["pettingzoo"] = sys.modules["mpe2"] = sys.modules["envpool"] = None  # importing them raises ImportError
+import {door}
+import gymnasium, envs.registry
+envs.registry.make_env("highway-mixed-v0").close()
+assert not envs.registry.is_multiagent_id("highway-v0") and envs.registry.is_multiagent_id("pursuit_v5")
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_importing_the_wrappers_registers_our_ids():
+    code = "import envs.wrappers, gymnasium; gymnasium.make('highway-mixed-v0'); gymnasium.make('highway-fast-v0')"
+    subprocess.run([sys.executable, "-c", code], check=True)

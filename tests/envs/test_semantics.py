@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from envs.observation import FORECAST_KEYS
-from envs.readers.base import SharedScene
+from envs.readers.base import MultiagentScene
 from envs.readers.mpe import MPE_FEATURES
 from envs.readers.pursuit import PURSUIT_FEATURES
 from predictor.scene import KINEMATIC_FEATURES, Scene
@@ -143,13 +143,14 @@ def test_an_id_is_a_body(name: str, take: Callable[[str], Take]):
     assert any(set(before.views) - set(after.views) for before, after in pairs) == subject.dies
 
 
-def sorted_anew(shared: SharedScene, rng: np.random.Generator) -> SharedScene:
+def sorted_anew(shared: MultiagentScene, rng: np.random.Generator) -> MultiagentScene:
     """The same scene with everyone in another row; a single ego keeps the first."""
     fixed = int(EGO in shared.rows)
     order = np.r_[np.arange(fixed), fixed + rng.permutation(len(shared.scene.ids) - fixed)]
     place, scene = np.argsort(order), shared.scene
     moved = Scene(scene.states[order], scene.ids[order], scene.valid[order], scene.heading_rad)
-    return SharedScene(moved, {name: int(place[row]) for name, row in shared.rows.items()}, shared.heading_rad[order])
+    rows = {name: int(place[row]) for name, row in shared.rows.items()}
+    return MultiagentScene(moved, rows, shared.heading_rad[order])
 
 
 @named()
@@ -251,7 +252,7 @@ def test_the_viewer_alone_works(name: str, bounds: dict[str, Any], fresh: Callab
 # --- 6. Frame ---------------------------------------------------------------------------------------------------------
 
 
-def shifted(shared: SharedScene, axis: int, shift_m: float) -> SharedScene:
+def shifted(shared: MultiagentScene, axis: int, shift_m: float) -> MultiagentScene:
     states = shared.scene.states.copy()
     states[shared.scene.valid, axis] += shift_m
     return replace(shared, scene=replace(shared.scene, states=states))

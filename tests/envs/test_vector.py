@@ -1,3 +1,5 @@
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -7,9 +9,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
+import envs.vector
 from envs.observation import FORECAST_KEYS
 from envs.registry import make_env
 from envs.sb3.forecast import VecForecast
@@ -449,3 +453,102 @@ def test_zero_is_named(name: str, highway_checkpoint: str):
         VecForecast(DummyVecEnv(MAKERS), highway_checkpoint, **{name: 0})
     with pytest.raises(UserError, match=f"{name} must be at least 1, got 0"):
         VectorForecast(SyncVectorEnv(MAKERS), highway_checkpoint, **{name: 0})
+
+
+# --- Under other wrappers, and without Stable-Baselines3 --------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore:.*use of fork.. may lead to deadlocks:DeprecationWarning")
+@pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv], ids=["sync", "async"])
+@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.name)
+def test_a_wrapper_below_changes_nothing(mode: AutoresetMode, kind: Any, highway_checkpoint: str):
+    plain = vector(mode, highway_checkpoint)
+    env = VectorForecast(RecordEpisodeStatistics(kind(MAKERS, autoreset_mode=mode)), highway_checkpoint)
+    try:
+        assert_same(env.reset(seed=SEED)[0], plain.reset(seed=SEED)[0])
+        episodes = 0
+        for t in range(4):
+            obs, _, terminations, truncations, infos = env.step(ACTIONS[t])
+            expected, _, _, _, plain_infos = plain.step(ACTIONS[t])
+            assert_same(obs, expected)
+            ended = terminations | truncations
+            episodes += int(infos["episode"]["l"].astype(bool).sum()) if "episode" in infos else 0
+            for row in np.flatnonzero(ended) if mode is AutoresetMode.SAME_STEP else ():
+                assert_same(infos["final_obs"][row], plain_infos["final_obs"][row])
+            if mode is AutoresetMode.DISABLED and ended.any():
+                masks = [{"reset_mask": ended.copy()} for _ in range(2)]
+                assert_same(env.reset(options=masks[0])[0], plain.reset(options=masks[1])[0])
+        assert episodes
+    finally:
+        env.close()
+
+
+def test_a_vector_environment_without_get_attr_is_named():
+    env = SyncVectorEnv(MAKERS)
+
+    class Bare(gym.vector.VectorEnv):
+        num_envs = env.num_envs
+        single_observation_space = env.single_observation_space
+
+    with pytest.raises(UserError, match="asks each environment for its scene_spec, but Bare has no get_attr"):
+        VectorForecast(Bare(), "constant-velocity")
+
+
+def test_a_reset_seeds_the_noise_of_the_environments_it_resets(highway_checkpoint: str):
+    """With seeds [None, s, None] only environment 1 draws anew; its samples are those of an environment alone."""
+    env = vector(AutoresetMode.DISABLED, highway_checkpoint, num_samples=4)
+    untouched = vector(AutoresetMode.DISABLED, highway_checkpoint, num_samples=4)
+    for each in (env, untouched):
+        each.reset(seed=SEED)
+    mask = np.array([False, True, False])
+    obs, _ = env.reset(seed=[None, 5, None], options={"reset_mask": mask})
+    alone = ForecastObservation(short_env(DURATIONS[1]), highway_checkpoint, num_samples=4)
+    assert_same(row_of(obs, 1), alone.reset(seed=5)[0])
+    found, expected = env.step(ACTIONS[0])[0], untouched.step(ACTIONS[0])[0]
+    for row in (0, 2):
+        assert_same(row_of(found, row), row_of(expected, row))
+    assert_same(row_of(found, 1), alone.step(int(ACTIONS[0, 1]))[0])
+
+
+@pytest.mark.parametrize("maker", ["sb3", "gymnasium"])
+def test_samples_of_a_row_are_those_of_its_environment_alone(maker: str, highway_checkpoint: str):
+    """Also over the ends of episodes, where the stream forecasts a row twice in one batch."""
+    alone = [ForecastObservation(short_env(d), highway_checkpoint, num_samples=5) for d in DURATIONS]
+    venv: Any = VecForecast(DummyVecEnv(MAKERS), highway_checkpoint, num_samples=5)
+    if maker == "gymnasium":
+        venv = vector(AutoresetMode.SAME_STEP, highway_checkpoint, num_samples=5)
+        obs = venv.reset(seed=SEED)[0]
+    else:
+        venv.seed(SEED)
+        obs = venv.reset()
+    for row, env in enumerate(alone):
+        assert_same(row_of(obs, row), env.reset(seed=SEED + row)[0], 1e-3)
+    for t in range(4):
+        obs = venv.step(ACTIONS[t])[0]
+        for row, env in enumerate(alone):
+            own, _, terminated, truncated, _ = env.step(int(ACTIONS[t, row]))
+            assert_same(row_of(obs, row), env.reset()[0] if terminated or truncated else own, 1e-3)
+
+
+def test_the_old_import_of_vec_forecast_still_works():
+    assert envs.vector.VecForecast is VecForecast
+    with pytest.raises(AttributeError, match="module 'envs.vector' has no attribute 'Nothing'"):
+        _ = envs.vector.Nothing
+
+
+WITHOUT_SB3 = """
+import sys
+sys.modules["stable_baselines3"] = None  # an import of it fails
+import gymnasium as gym
+from envs.vector import VectorForecast
+from envs.wrappers import SceneObservation
+from envs.parallel import ForecastParallelEnv
+env = gym.make_vec("highway-fast-v0", 2, vectorization_mode="sync", wrappers=(SceneObservation,))
+print(VectorForecast(env, "constant-velocity").reset(seed=0)[0]["forecast"].shape)
+"""
+
+
+def test_gymnasium_needs_no_stable_baselines():
+    done = subprocess.run([sys.executable, "-c", WITHOUT_SB3], capture_output=True, text=True, timeout=90)
+    assert done.returncode == 0, done.stderr
+    assert "(2, 11, 5, 2)" in done.stdout

@@ -98,7 +98,7 @@ def test_own_observation_and_rewards_are_untouched(env_id: str, kind: str, check
     assert [step[1:] for step in actual] == [step[1:] for step in expected]
     for (obs, *_), (own, *_) in zip(actual, expected, strict=True):
         if kind == "flat":
-            obs = gym.spaces.unflatten(wrapped._dict_space, obs)
+            obs = gym.spaces.unflatten(wrapped._layout.dict_space, obs)
         np.testing.assert_array_equal(obs["observation"], own)
 
 

@@ -7,6 +7,7 @@ import pytest
 from predictor.card import CardConfig, write_card
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.errors import UserError
+from predictor.evaluation.in_env_record import read_record
 from tests.predictor.helpers import model, write_circles
 
 ROW = {
@@ -46,13 +47,15 @@ def test_card_says_what_the_files_say(config: CardConfig):
     assert path == config.checkpoint / "README.md"
     assert text.startswith("# Predictor checkpoint `toy`\n")
     assert [line for line in text.splitlines() if line.startswith("| toy-v0")] == [
-        "| toy-v0 | 1.25 | 2.50 | 0.750 | – | 5.00 / 9.00 | 75 % | 50 to 88 % |"
+        "| toy-v0 | idle | 40 | 20 | 1.25 / 2.50 | 0.750 | – | 5.00 / 9.00 | 75 % (50 to 88) |"
     ]
+    (measured,) = read_record(config.checkpoint)
+    assert (measured.env_id, measured.min_ade_m, measured.below_cv_interval) == ("toy-v0", 1.254, (0.5, 0.875))
     for fact in (
         "forecasts 3 steps of 1 s",
-        "Held-out seeds from 10,000, 40 episodes each, driven `idle`; the ego itself is not counted",
+        "Held-out seeds from 10,000; the ego itself is not counted",
         "* circles: 6 episodes, 60 scenes.",
-        "`python -m envs.evaluate --all`",
+        "* toy-v0: `python -m envs.evaluate --all`, commit not recorded",
         "`python -m predictor.train --data a`",
         "Seed 3, commit abc, torch 2.13.0.",
         "step 500: minADE 0.500 m against 1.500 m of constant velocity",
@@ -65,7 +68,7 @@ def test_card_says_what_the_files_say(config: CardConfig):
     [
         ("{", "is not an accuracy.json of envs.evaluate"),
         ('{"rows": []}', r"is not an accuracy.json of envs.evaluate \('results'\)"),
-        (json.dumps(RESULTS | {"results": [ROW | {"checkpoint": "other"}]}), "has no row for checkpoint 'toy'"),
+        (json.dumps(RESULTS | {"results": [ROW | {"checkpoint": "other"}]}), "has no result of checkpoint 'toy'"),
     ],
     ids=["broken", "foreign", "another_checkpoint"],
 )

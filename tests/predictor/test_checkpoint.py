@@ -11,7 +11,14 @@ from safetensors.torch import load_file, save_file
 
 from predictor import checkpoint
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.checkpoint import CheckpointInfo, load_checkpoint, load_forecaster, resolve, save_checkpoint
+from predictor.checkpoint import (
+    CheckpointInfo,
+    load_checkpoint,
+    load_forecaster,
+    name_of_folder,
+    resolve,
+    save_checkpoint,
+)
 from predictor.dgvae import DGVAE
 from predictor.errors import UserError
 from predictor.scene import SceneSpec
@@ -60,6 +67,18 @@ def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
 # --- Round trip -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("mask", "file_mode", "folder_mode"), [(0o022, 0o644, 0o755), (0o077, 0o600, 0o700)])
+def test_modes_follow_the_umask(tmp_path: Path, mask: int, file_mode: int, folder_mode: int):
+    before = os.umask(mask)
+    try:
+        save_checkpoint(tmp_path / "toy", made(), INFO)
+    finally:
+        os.umask(before)
+    modes = {file.name: file.stat().st_mode & 0o777 for file in (tmp_path / "toy").iterdir()}
+    assert modes == {"config.json": file_mode, "model.safetensors": file_mode}
+    assert (tmp_path / "toy").stat().st_mode & 0o777 == folder_mode
+
+
 def test_round_trip_is_exact(path: Path):
     assert_holds(path, made())
     loaded, info = load_checkpoint(path)
@@ -106,7 +125,7 @@ def test_failed_save_leaves_the_old_checkpoint_whole(
     before = {p.name: p.read_bytes() for p in path.iterdir()} if existing else {}
     match point:
         case "weights":
-            monkeypatch.setattr(checkpoint, "save_file", crash)
+            monkeypatch.setattr(checkpoint, "save", crash)
         case "config":
             monkeypatch.setattr(checkpoint, "asdict", crash)
         case "replace":
@@ -383,3 +402,63 @@ def test_weights_of_another_model_are_refused(path: Path, tmp_path: Path):
         UserError, match=r"tensor '\S+' should be \S+.* by config\.json but is .*do not belong together"
     ):
         load_checkpoint(path)
+
+
+# --- Run folders ------------------------------------------------------------------------------------------------------
+
+
+def run_folder(path: Path) -> Path:
+    """A folder as `python -m predictor.train` leaves it, named as its checkpoint's parent."""
+    save_checkpoint(path / "checkpoint", made(), CheckpointInfo(spec(), made().config, 2))
+    (path / "config.json").write_text("{}")
+    return path
+
+
+def test_a_run_folder_stands_for_its_best_checkpoint(tmp_path: Path):
+    run = run_folder(tmp_path / "run")
+    assert resolve(run) == resolve(run / "checkpoint") == run / "checkpoint"
+    assert_holds(run, made())
+
+
+def test_a_folder_with_weights_of_its_own_stands_for_itself(path: Path):
+    run_folder(path)
+    assert resolve(path) == path
+
+
+def test_a_run_without_a_checkpoint_stands_for_itself(tmp_path: Path):
+    (tmp_path / "checkpoint").mkdir()
+    assert resolve(tmp_path) == tmp_path
+    with pytest.raises(UserError, match="is .* a predictor checkpoint"):
+        load_checkpoint(tmp_path)
+
+
+def test_folders_and_shipped_names_keep_their_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    assert resolve("highway").parent == checkpoint.PRETRAINED
+    run_folder(Path("highway"))
+    assert resolve("highway") == Path("highway") / "checkpoint"
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [("highway", "highway"), ("runs/a", "a"), ("runs/a/", "a"), ("runs/a/checkpoint", "a"), ("a/best", "best")],
+)
+def test_a_checkpoint_is_called_like_its_folder_or_its_run(given: str, name: str):
+    assert name_of_folder(given) == name
+
+
+def test_a_run_is_named_also_from_within(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "run" / "checkpoint").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "run")
+    assert name_of_folder(".") == name_of_folder("checkpoint") == "run"
+
+
+# --- Devices ----------------------------------------------------------------------------------------------------------
+
+
+def test_auto_is_a_device(path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    loaded, _ = load_checkpoint(path, "auto")
+    assert {parameter.device.type for parameter in loaded.parameters()} == {"cpu"}
+    with pytest.raises(UserError, match="device 'cuda' was asked for but torch finds no CUDA device"):
+        load_checkpoint(path, "cuda")

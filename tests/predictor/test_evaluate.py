@@ -56,7 +56,7 @@ def test_smoke(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], data: Path, checkpoint: Path, tmp_path: Path
 ):
     out = tmp_path / "out"
-    run(monkeypatch, "--checkpoint", checkpoint, "--data", data, "--samples", 3, "--out", out)
+    run(monkeypatch, "--checkpoint", checkpoint, "--data", data, "--num-samples", 3, "--out", out)
     printed = capsys.readouterr().out
     assert "minADE" in printed and "constant velocity" in printed
     assert "displacement of the best sample [m] / RMSE of the mean [m] / NLL [nats]" in " ".join(printed.split())
@@ -76,15 +76,17 @@ def test_smoke(
         ("dG-VAE", 1),
         ("dG-VAE", 3),
         ("constant velocity", 1),
+        ("constant velocity + noise", 3),
     ]
     assert all(len(r["by_step_m"]) == len(r["rmse_m"]) == len(r["nll"]) == 2 for r in content["rows"])
     lines = (out / "accuracy.md").read_text().splitlines()
     assert lines[0] == f"{HEADING} 1 s | 2 s |"
-    assert [line.split("|")[1].strip() for line in lines[2:]] == ["dG-VAE", "dG-VAE", "constant velocity"]
+    names = [line.split("|")[1].strip() for line in lines[2:]]
+    assert names == ["dG-VAE", "dG-VAE", "constant velocity", "constant velocity + noise"]
 
 
 def test_known_model_scores_what_it_must(data: Path, checkpoint: Path):
-    one, many, straight = evaluate(EvaluateConfig(str(checkpoint), data, samples=4))
+    one, many, straight, _ = evaluate(EvaluateConfig(str(checkpoint), data, num_samples=4))
     for row in (one, many):
         assert row.min_ade_m == pytest.approx(straight.min_ade_m, rel=1e-5)
         assert row.min_fde_m == pytest.approx(straight.min_fde_m, rel=1e-5)
@@ -103,11 +105,11 @@ def test_known_model_scores_what_it_must(data: Path, checkpoint: Path):
 def test_horizon_and_number_of_windows_can_be_chosen(data: Path, checkpoint: Path):
     rows = evaluate(EvaluateConfig(str(checkpoint), data, horizon_steps=4, max_windows=5))
     assert all(len(r.by_step_m) == 4 and r.agents <= 5 for r in rows)
-    assert [r.num_samples for r in rows] == [1, 20, 1]
+    assert [r.num_samples for r in rows] == [1, 20, 1, 20]
 
 
 def test_one_sample_gives_one_row(data: Path, checkpoint: Path):
-    assert [r.name for r in evaluate(EvaluateConfig(str(checkpoint), data, samples=1))] == [
+    assert [r.name for r in evaluate(EvaluateConfig(str(checkpoint), data, num_samples=1))] == [
         "dG-VAE",
         "constant velocity",
     ]
@@ -116,12 +118,12 @@ def test_one_sample_gives_one_row(data: Path, checkpoint: Path):
 def test_rows_bear_the_name_of_the_model(data: Path, tmp_path: Path):
     torch.manual_seed(0)
     save_checkpoint(tmp_path / "mlp", MLP(spec(), MLPConfig(), 2), CheckpointInfo(spec(), MLPConfig(), 2, model="mlp"))
-    rows = evaluate(EvaluateConfig(str(tmp_path / "mlp"), data, samples=2))
-    assert [r.name for r in rows] == ["MLP", "MLP", "constant velocity"]
+    rows = evaluate(EvaluateConfig(str(tmp_path / "mlp"), data, num_samples=2))
+    assert [r.name for r in rows] == ["MLP", "MLP", "constant velocity", "constant velocity + noise"]
 
 
 def test_equal_seeds_give_equal_rows(data: Path, checkpoint: Path):
-    settings = EvaluateConfig(str(checkpoint), data, samples=3, max_windows=6)
+    settings = EvaluateConfig(str(checkpoint), data, num_samples=3, max_windows=6)
     assert evaluate(settings) == evaluate(settings)
 
 
@@ -165,14 +167,15 @@ def test_constant_velocity_is_a_checkpoint_of_every_store(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], data: Path, checkpoint: Path, tmp_path: Path
 ):
     settings = EvaluateConfig("constant-velocity", data, horizon_steps=2)
-    (row,) = evaluate(settings)
-    assert row == evaluate(EvaluateConfig(str(checkpoint), data, samples=1))[-1]
+    row, noisy = evaluate(settings)
+    assert (noisy.num_samples, noisy.agents) == (20, row.agents) and noisy.min_ade_m < row.min_ade_m
+    assert row == evaluate(EvaluateConfig(str(checkpoint), data, num_samples=1))[-1]
     assert len(evaluate(EvaluateConfig("constant-velocity", data))[0].by_step_m) == 5
     out = tmp_path / "out"
     run(monkeypatch, "--checkpoint", "constant-velocity", "--data", data, "--horizon-steps", 2, "--out", out)
     assert "constant velocity" in capsys.readouterr().out
     content = json.loads((out / "accuracy.json").read_text(), parse_constant=refuse)
-    assert [r["name"] for r in content["rows"]] == ["constant velocity"]
+    assert [r["name"] for r in content["rows"]] == ["constant velocity", "constant velocity + noise"]
     assert (out / "scenes.png").exists()
 
 
@@ -185,7 +188,7 @@ def test_three_axes(tmp_path: Path):
     states[:, :, 5] = 2 * np.arange(8.0)[:, None]
     episode = Episode(states, np.ones((8, 2), dtype=np.bool_), np.arange(2))
     write_store(tmp_path / "solid", StoreInfo(layout, "solid"), [episode])
-    (row,) = evaluate(EvaluateConfig("constant-velocity", tmp_path / "solid", horizon_steps=2, out=tmp_path / "out"))
+    row, _ = evaluate(EvaluateConfig("constant-velocity", tmp_path / "solid", horizon_steps=2, out=tmp_path / "out"))
     assert row.axes == 3
     assert row.by_step_m == pytest.approx([1.0, 4.0])  # what v·t leaves out of (t + h)²
     assert (tmp_path / "out" / "scenes.png").exists()
@@ -229,7 +232,7 @@ def truncated_checkpoint(data: Path, checkpoint: Path) -> list[Any]:
 
 
 def negative_samples(data: Path, checkpoint: Path) -> list[Any]:
-    return ["--checkpoint", checkpoint, "--data", data, "--samples", -1]
+    return ["--checkpoint", checkpoint, "--data", data, "--num-samples", -1]
 
 
 def no_horizon(data: Path, checkpoint: Path) -> list[Any]:
@@ -286,5 +289,5 @@ def test_windows_without_a_future_are_refused(data: Path, checkpoint: Path, tmp_
 
 
 def test_longest_horizon_that_fits_is_measured(data: Path, checkpoint: Path):
-    rows = evaluate(EvaluateConfig(str(checkpoint), data, horizon_steps=5, samples=2))
+    rows = evaluate(EvaluateConfig(str(checkpoint), data, horizon_steps=5, num_samples=2))
     assert all(len(r.by_step_m) == 5 and r.agents == 3 and math.isfinite(r.min_ade_m) for r in rows)

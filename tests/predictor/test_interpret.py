@@ -275,6 +275,7 @@ def test_watching_ends_with_what_the_forecaster_believes():
     np.testing.assert_array_equal(watched.edge_probs[:, -1], outcome.edge_probs)
     static = slice(0, forecaster.config.static_dim)
     first = watch(forecaster, windows.batch(np.array([0]), history_steps=4)).features[:, 0]
+    # a batch of three against a batch of one: float32 products round by the size of their batch
     np.testing.assert_allclose(watched.features[:1, 0, ..., static], first[..., static], rtol=1e-5, atol=1e-6)
 
 
@@ -419,7 +420,7 @@ def springs(tmp_path: Path) -> Path:
     return tmp_path / "springs"
 
 
-SHORT = ("--history-steps", 4, "--horizon-steps", 3, "--samples", 3, "--windows", 20)
+SHORT = ("--burn-in-steps", 4, "--horizon-steps", 3, "--num-samples", 3, "--max-windows", 20)
 
 
 def test_smoke_with_labels(
@@ -440,7 +441,7 @@ def test_smoke_with_labels(
     assert score["name"] == "spring_constant" and 0 < score["rows"] < 20 * 12
     assert len(score["correlations"]) == len(content["stillness"]["within"]) == 6
     assert score["direct_r2"] < 0 < score["chance"] < 1  # nobody trained it
-    assert content["config"]["history_steps"] == 4 and content["provenance"]["command"]
+    assert content["config"]["burn_in_steps"] == 4 and content["provenance"]["command"]
     text = (out / "scores.md").read_text()
     assert "| property | pairs | best | r |" in text and "* DCI: disentanglement – (not defined for one" in text
     assert "| 2 | static |" in text and "| 3 | dynamic |" in text and "nan" not in text
@@ -465,7 +466,7 @@ def test_smoke_without_labels_and_with_an_ego(springs: Path, tmp_path: Path):
     )
     assert (out / "graph.png").exists()
     (out / "notes.txt").write_text("mine")
-    found = interpret(InterpretConfig(str(saved(tmp_path / "toy", spec())), data, out, 5, 4, 3, samples=1))
+    found = interpret(InterpretConfig(str(saved(tmp_path / "toy", spec())), data, out, 5, 4, 3, num_samples=1))
     assert (found.graph, found.edges, found.attributes, found.disentanglement) == (None, None, [], None)
     assert found.stillness.edges == 5 * 6
     names = {"features.png", "trajectories.png", "scores.json", "scores.md", "notes.txt"}
@@ -486,7 +487,9 @@ def test_smoke_of_driving_where_agents_come_and_go(tmp_path: Path):
         episodes.append(episode)
     layout, out = spec(max_agents=5), tmp_path / "out"
     write_store(tmp_path / "road", StoreInfo(layout, "road", edge_attribute_names=("headway_m",)), episodes)
-    found = interpret(InterpretConfig(str(saved(tmp_path / "toy", layout)), tmp_path / "road", out, 8, 4, 3, samples=2))
+    found = interpret(
+        InterpretConfig(str(saved(tmp_path / "toy", layout)), tmp_path / "road", out, 8, 4, 3, num_samples=2)
+    )
     assert found.attributes[0].distance_correlation == pytest.approx(1.0)
     assert found.graph is not None and 0 < found.graph.pairs < 8 * 20
     assert "An edge exists where the sender is the receiver's leader." in (out / "scores.md").read_text()
@@ -503,7 +506,7 @@ def test_types_without_attributes_and_joints_with_names(tmp_path: Path):
     episode = Episode(states, np.ones((8, 2), dtype=np.bool_), np.arange(2), edge_types=types)
     write_store(tmp_path / "solid", StoreInfo(layout, "solid", {"joints": ["hip", "toe"]}), [episode])
     checkpoint = saved(tmp_path / "toy", layout, static_dim=6)  # all of them: no dynamic block
-    found = interpret(InterpretConfig(str(checkpoint), tmp_path / "solid", tmp_path / "out", 3, 4, 2, samples=1))
+    found = interpret(InterpretConfig(str(checkpoint), tmp_path / "solid", tmp_path / "out", 3, 4, 2, num_samples=1))
     assert found.attributes == [] and found.disentanglement is None and found.reading is None
     assert found.edges is not None and found.edges.rows == 2 * 3
     assert (tmp_path / "out" / "graph.png").exists()
@@ -570,11 +573,11 @@ def out_is_a_file(springs: Path, folder: Path) -> list[Any]:
         (alone, "in 20 windows there are never two agents at once, so no edges"),
         (lambda s, f: [*fitting(f), "--data", f / "nowhere"], "no episode store at "),
         (
-            lambda s, f: [*fitting(f), "--history-steps", 8],
-            "springs: no window fits: episodes have at most 10 steps, a window needs 11; lower --history-steps or",
+            lambda s, f: [*fitting(f), "--burn-in-steps", 8],
+            "springs: no window fits: episodes have at most 10 steps, a window needs 11; lower --burn-in-steps or",
         ),
-        (lambda s, f: [*fitting(f), "--windows", 0], "windows must be at least 1, got 0"),
-        (lambda s, f: [*fitting(f), "--samples", -1], "samples must be at least 1, got -1"),
+        (lambda s, f: [*fitting(f), "--max-windows", 0], "max_windows must be at least 1, got 0"),
+        (lambda s, f: [*fitting(f), "--num-samples", -1], "num_samples must be at least 1, got -1"),
         (out_is_a_file, "file is a file; choose another path"),
     ],
 )
@@ -599,7 +602,7 @@ def test_bad_input_is_one_line(
 def test_the_longest_window_that_fits_is_watched(monkeypatch: pytest.MonkeyPatch, springs: Path, tmp_path: Path):
     monkeypatch.setattr(interpretation, "_draw", lambda *_, **__: None)
     checkpoint = saved(tmp_path / "toy", spring_spec(Physics(num_agents=4)))
-    found = interpret(InterpretConfig(str(checkpoint), springs, tmp_path / "out", 20, 7, 3, samples=1))
+    found = interpret(InterpretConfig(str(checkpoint), springs, tmp_path / "out", 20, 7, 3, num_samples=1))
     assert (found.windows, found.episodes, found.stillness.steps) == (12, 12, 7)
     with pytest.raises(UserError, match="a window needs 11"):
-        interpret(InterpretConfig(str(checkpoint), springs, tmp_path / "out", 20, 7, 4, samples=1))
+        interpret(InterpretConfig(str(checkpoint), springs, tmp_path / "out", 20, 7, 4, num_samples=1))

@@ -18,7 +18,7 @@ from predictor import runtime
 from predictor.checkpoint import CheckpointInfo, load_checkpoint, save_checkpoint
 from predictor.dgvae import DGVAE
 from predictor.errors import UserError
-from predictor.runtime import keep_freed_memory, precision, prefer_onednn, processor, tune
+from predictor.runtime import keep_freed_memory, precision, prefer_onednn, processor, resolve_device, tune
 from tests.predictor.helpers import FAST_LIKE, model, random_states, spec
 
 # --- Precision of products --------------------------------------------------------------------------------------------
@@ -41,6 +41,38 @@ def test_precision_is_restored_after_an_exception():
     with pytest.raises(KeyError), precision("bfloat16", "cpu"):
         raise KeyError
     assert product() == torch.float32
+
+
+# --- Devices ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "there", "taken"),
+    [
+        ("cpu", False, "cpu"),
+        ("auto", False, "cpu"),
+        ("auto", True, "cuda"),
+        ("cuda", True, "cuda"),
+        ("cuda:1", True, "cuda:1"),
+    ],
+)
+def test_names_of_devices(name: str, there: bool, taken: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
+    assert resolve_device(name) == taken
+
+
+@pytest.mark.parametrize("name", ["tpu9", "", "gpu", "meta", "mps"])
+def test_other_devices_are_refused(name: str):
+    with pytest.raises(UserError, match=f"device must be cpu, cuda or auto, got '{name}'"):
+        resolve_device(name)
+
+
+def test_an_absent_device_is_refused(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(
+        UserError, match="device 'cuda:1' was asked for but torch finds no CUDA device; use --device cpu"
+    ):
+        resolve_device("cuda:1")
 
 
 # --- Memory and machine -----------------------------------------------------------------------------------------------

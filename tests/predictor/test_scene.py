@@ -1,3 +1,4 @@
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from itertools import product
@@ -19,6 +20,7 @@ from predictor.scene import (
     SceneBatch,
     SceneSpec,
     dense_edges,
+    perceived_agents,
 )
 from tests.predictor.helpers import batch, scene
 
@@ -140,10 +142,70 @@ def test_broken_scene_is_refused(change: Mapping[str, np.ndarray], message: str)
         Scene(**(good | change)).check("my reader")
 
 
-def test_padding_may_repeat_ids_and_hold_anything():
-    Scene(
-        np.array([[0.0] * 4, [np.nan] * 4, [np.inf] * 4]), np.array([0, -1, -1]), np.array([True, False, False])
-    ).check()
+def test_padding_may_repeat_ids_and_hold_any_finite_number():
+    states = np.array([[0.0] * 4, [-3.0] * 4, [1e9] * 4])
+    Scene(states, np.array([0, -1, -1]), np.array([True, False, False])).check()
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_padding_that_is_not_finite_is_refused(number: float):
+    """A network multiplies padding by zero, which makes a NaN of it."""
+    states = np.array([[0.0] * 4, [number] * 4])
+    with pytest.raises(UserError, match=r"reader: states must be finite, those of padded agents too \(zeros\), got"):
+        Scene(states, np.array([0, -1]), np.array([True, False])).check()
+
+
+def perceived_by_loop(states: np.ndarray, valid: np.ndarray, ego: int, spec: SceneSpec) -> list[int]:
+    """Indices of the agents that one ego perceives, the nearest first."""
+    axes = spec.position_dim
+    distances = {
+        agent: math.sqrt(sum(float(d) ** 2 for d in states[agent, :axes] - states[ego, :axes]))
+        for agent in range(len(states))
+        if valid[agent] and agent != ego
+    }
+    others = sorted((agent for agent in distances), key=lambda agent: (distances[agent], agent))
+    nearest = ([ego] if valid[ego] else []) + others
+    limit = spec.max_agents if valid[ego] else spec.max_agents - 1  # an absent ego keeps its place
+    return [agent for agent in nearest[:limit] if agent == ego or distances[agent] <= spec.perception_m]
+
+
+def crowd(seed: int, perception_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, SceneSpec]:
+    """States and presence of some scenes, an ego in each, and a spec; on a grid, ties and overlaps are frequent."""
+    rng = np.random.default_rng(seed)
+    axes, batch, agents, max_agents = rng.integers([2, 1, 1, 1], [4, 5, 10, 11])
+    grid = rng.integers(-2, 3, size=(batch, agents, 2 * axes)).astype(np.float64)
+    states = grid if rng.random() < 0.5 else rng.normal(size=grid.shape) * 30
+    layout = {} if axes == 2 else IN_SPACE | {"frame": ("world",) * 3}
+    spec = SceneSpec(dt_s=1.0, perception_m=perception_m, max_agents=int(max_agents), **layout)
+    return states, rng.random((batch, agents)) < 0.7, rng.integers(agents, size=batch), spec
+
+
+seeds, ranges = st.integers(0, 2**16), st.sampled_from([1.0, 2.0, 25.0, float("inf")])
+
+
+@given(seed=seeds, perception_m=ranges)
+def test_an_ego_perceives_itself_and_the_nearest_within_range(seed: int, perception_m: float):
+    states, valid, egos, spec = crowd(seed, perception_m)
+    order, seen = perceived_agents(states, valid, egos, spec)
+    assert order.shape == seen.shape == (len(states), min(spec.max_agents, states.shape[1]))
+    for scene_, present, ego, agents, kept in zip(states, valid, egos, order, seen, strict=True):
+        assert agents[kept].tolist() == perceived_by_loop(scene_, present, int(ego), spec)
+        assert agents[0] == ego
+
+
+@given(seed=seeds, perception_m=ranges)
+def test_one_ego_for_all_scenes_is_that_ego_for_each(seed: int, perception_m: float):
+    states, valid, egos, spec = crowd(seed, perception_m)
+    found = perceived_agents(states, valid, 0, spec), perceived_agents(states, valid, np.zeros_like(egos), spec)
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_an_ego_that_sees_everything_sees_no_padding():
+    everything = SceneSpec(dt_s=1.0, perception_m=float("inf"), max_agents=4)
+    valid = np.array([True, False, True])
+    order, seen = perceived_agents(np.zeros((3, 4)), valid, 0, everything)
+    assert order[seen].tolist() == [0, 2]
 
 
 def test_stacking_keeps_the_order_of_rows():

@@ -17,7 +17,7 @@ from predictor.data.windows import Windows
 from predictor.errors import UserError
 from predictor.evaluation import paper_tables as tables
 from predictor.evaluation.measure_row import protocol_indices
-from predictor.evaluation.paper_tables import TABLES, Row
+from predictor.evaluation.paper_tables import NUM_SAMPLES, TABLES, Row
 from predictor.models import configure
 from predictor.reports.tables import latex_table, markdown_report
 from predictor.suite import SuiteConfig, row_config, row_folder, run_row, run_suite
@@ -32,7 +32,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def config(data: Path, out: Path, **changes: Any) -> SuiteConfig:
-    return SuiteConfig("springs", data, out, "smoke", **({"steps": 2, "jobs": 1} | changes))
+    return SuiteConfig("springs", data, out, "smoke", **({"steps": 2, "workers": 1} | changes))
 
 
 def row(key: str) -> Row:
@@ -78,7 +78,7 @@ def test_a_row_on_labelled_data_needs_scikit_learn_before_it_is_trained(
 
 
 def test_all_rows_of_a_table_share_data_steps_and_protocol(data: Path, tmp_path: Path):
-    trained = [r for r in TABLES["springs"].rows if r.model not in ("constant-velocity", "least-squares")]
+    trained = [r for r in TABLES["springs"].rows if r.is_trained]
     configs = [row_config(config(data, tmp_path), r, tmp_path / r.key) for r in trained]
     shared = ("data", "val_data", "steps", "batch_size", "max_episodes", "history_steps", "horizon_steps", "lr", "seed")
     for name in shared:
@@ -98,11 +98,11 @@ def test_a_row_has_a_folder_of_its_own_for_each_config_and_data(data: Path, tmp_
         row_folder(base, replace(row("dgvae"), set=("edge_feature_dim=4",))),
     }
     assert len(folders) == 5
-    assert row_folder(replace(base, jobs=2), row("dgvae")) in folders  # nothing that changes no number
+    assert row_folder(replace(base, workers=2), row("dgvae")) in folders  # nothing that changes no number
 
 
 def test_suite_runs_what_is_missing_and_nothing_else(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    settings = config(data, tmp_path, rows=("constant-velocity", "mlp"), jobs=2)
+    settings = config(data, tmp_path, rows=("constant-velocity", "mlp"), workers=2)
     content = run_suite(settings)
     assert [r["key"] for r in content["rows"]] == ["constant-velocity", "mlp"]
     assert not content["failed"]
@@ -114,7 +114,7 @@ def test_suite_runs_what_is_missing_and_nothing_else(data: Path, tmp_path: Path,
 
 
 def test_a_row_that_fails_says_why_and_leaves_the_others(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    broken = config(data, tmp_path, rows=("constant-velocity", "mlp"), jobs=2)
+    broken = config(data, tmp_path, rows=("constant-velocity", "mlp"), workers=2)
     folder = row_folder(broken, row("mlp")) / "run"
     folder.mkdir(parents=True)
     (folder / "somebody.txt").write_text("not a run")
@@ -128,13 +128,32 @@ def test_a_row_that_fails_says_why_and_leaves_the_others(data: Path, tmp_path: P
 
 
 def test_reports_have_a_line_for_each_row_and_the_papers_figures(data: Path, tmp_path: Path):
-    settings = config(data, tmp_path, rows=("constant-velocity", "least-squares"), jobs=2)
+    settings = config(data, tmp_path, rows=("constant-velocity", "least-squares"), workers=2)
     content = run_suite(settings)
     content["paper"] = {"least-squares": {"rmse": 0.125, "ade": 0.25, "fde": 0.5}}
     text, latex = markdown_report(content), latex_table(content)
     assert text.count("| least squares (limit) |") == 3  # two views and the graph
     assert "0.125 / 0.250 / 0.500" in text
-    assert latex.count(r"\\") == 3 and latex.count("&") == 3 * 12
+    assert latex.count(r"\\") == 3 and latex.count("&") == 3 * 13
+
+
+def test_the_stochastic_control_has_as_many_samples_as_the_models_and_says_so(data: Path, tmp_path: Path):
+    content = run_suite(config(data, tmp_path, rows=("constant-velocity", "constant-velocity-noise"), workers=2))
+    straight, noisy = (r["tests"]["test"]["horizon_only"] for r in content["rows"])
+    assert (straight["num_samples"], noisy["num_samples"]) == (1, 20)
+    assert noisy["min_ade_m"] < 0.8 * straight["min_ade_m"]
+    lines = markdown_report(content).splitlines()
+    for name, samples in (("constant velocity", "1"), ("constant velocity + noise", "20")):
+        found = [line.split("|")[2].strip() for line in lines if line.startswith(f"| {name} |")]
+        assert len(found) >= 2 and set(found) == {samples}  # in every table that names it
+    assert 0.7 < noisy["statistics"]["coverage"]["mean"] <= 1
+
+
+@pytest.mark.parametrize("name", ["springs", "mocap", "nba", "sdd", "ind"])
+def test_every_table_of_the_paper_has_the_stochastic_control(name: str):
+    rows = {r.key: r for r in TABLES[name].rows}
+    assert rows["constant-velocity-noise"].num_samples == rows["dgvae"].num_samples == NUM_SAMPLES
+    assert not rows["constant-velocity-noise"].is_trained
 
 
 @pytest.mark.parametrize("name", list(TABLES))
@@ -144,9 +163,8 @@ def test_every_row_of_every_table_is_a_valid_config(name: Any, budget: Any, tmp_
     keys = [r.key for r in TABLES[name].rows]
     assert len(set(keys)) == len(keys)
     for each in TABLES[name].rows:
-        if each.model not in ("constant-velocity", "least-squares"):
+        if each.is_trained:
             made = row_config(settings, each, tmp_path)
-            made.check()
             configure(made.model, made.preset, made.set)
 
 
@@ -165,19 +183,22 @@ def test_windows_end_their_burn_in_at_every_stride():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rows": ("dgvea",)}, "table 'springs' has no row 'dgvea'; there are constant-velocity, mlp"),
+        (
+            {"rows": ("dgvea",)},
+            "table 'springs' has no row 'dgvea'; there are constant-velocity, constant-velocity-noise",
+        ),
         ({"steps": -1}, "steps must not be negative, got -1"),
-        ({"device": "cuda:7"}, "device 'cuda:7' asked for but torch sees no CUDA device"),
+        ({"device": "cuda:7"}, "device 'cuda:7' was asked for but torch finds no CUDA device"),
     ],
 )
 def test_suite_refuses(data: Path, tmp_path: Path, changes: Mapping[str, Any], message: str):
     with pytest.raises(UserError, match=message):
-        config(data, tmp_path, **changes).check()
+        config(data, tmp_path, **changes)
 
 
 def test_a_missing_store_is_named_with_the_command_that_makes_it(tmp_path: Path):
     with pytest.raises(UserError, match=r"no store at .*springs/train; make the stores .* predictor\.data\.springs"):
-        SuiteConfig("springs", tmp_path).check()
+        run_suite(SuiteConfig("springs", tmp_path))
 
 
 def test_test_stores_too_short_for_the_protocol_are_refused(data: Path, tmp_path: Path):

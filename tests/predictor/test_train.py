@@ -424,7 +424,7 @@ def test_bad_input_ends_a_real_process_with_one_line(tmp_path: Path):
             ["--model", "mlp", "--input-changes"],
             "--input-changes belongs to the dG-VAE; leave it out for --model mlp",
         ),
-        (["--device", "cuda"], "device 'cuda' asked for but torch sees no CUDA device; use --device cpu"),
+        (["--device", "cuda"], "device 'cuda' was asked for but torch finds no CUDA device; use --device cpu"),
     ],
 )
 def test_bad_arguments_are_named(
@@ -548,7 +548,9 @@ def test_loss_closed_form(tmp_path: Path):
     posterior[0, 0, 0, 1] = torch.tensor([0.8, 0.2]).log()
     posterior[0, :, 0, 0] = posterior[0, 2] = 100.0 * torch.tensor([1.0, -1.0])  # no pairs there
     output = WindowOutput(one_step, rollout, even, posterior, torch.zeros(1, 3, 2, 2, 1))
-    settings = TrainConfig((), tmp_path, variance=0.5, likelihood="gaussian", one_step_weight=10.0, kl_weight=100.0)
+    settings = TrainConfig(
+        (tmp_path,), tmp_path, variance=0.5, likelihood="gaussian", one_step_weight=10.0, kl_weight=100.0
+    )
     forecaster = model(horizon_steps=2)
     loss, terms = window_loss(forecaster, WindowBatch(states, valid, torch.tensor([0])), output, settings)
     divergence = 0.8 * np.log(1.6) + 0.2 * np.log(0.4)

@@ -10,10 +10,10 @@ from pettingzoo.utils import BaseParallelWrapper
 
 from envs.drivers import all_agents as drivers
 from envs.drivers.all_agents import DRIVER_NAMES, Habits, idle_action, make_driver
-from envs.registry import PARALLEL_IDS, make_parallel_env
+from envs.registry import MULTIAGENT_IDS, make_multiagent_env
 from predictor.errors import UserError
 
-MPE = [env_id for env_id in PARALLEL_IDS if env_id.startswith(("simple", "collect"))]
+MPE = [env_id for env_id in MULTIAGENT_IDS if env_id.startswith(("simple", "collect"))]
 STAY, PLUS_X, MINUS_X, PLUS_Y = 0, 2, 1, 4
 PERFECT = Habits(attention=1.0, slip=0.0, lead_s=0.0, pace=1.0, lean_rad=0.0)
 
@@ -77,7 +77,7 @@ def perfect(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("continuous", [False, True])
 @pytest.mark.parametrize("env_id", MPE)
 def test_every_driver_acts_within_every_space(env_id: str, continuous: bool):
-    env = make_parallel_env(env_id, max_cycles=4, continuous_actions=continuous)
+    env = make_multiagent_env(env_id, max_cycles=4, continuous_actions=continuous)
     for name in DRIVER_NAMES:
         actions, _ = played(env, name, seed=1)
         assert len(actions) == 4
@@ -89,7 +89,7 @@ def test_every_driver_acts_within_every_space(env_id: str, continuous: bool):
 
 @pytest.mark.parametrize("name", DRIVER_NAMES)
 def test_every_driver_acts_in_pursuit(name: str):
-    env = make_parallel_env("pursuit_v5", max_cycles=10)
+    env = make_multiagent_env("pursuit_v5", max_cycles=10)
     actions, _ = played(env, name, seed=1)
     assert len(actions) == 10
     assert all(env.action_space(agent).contains(a) for step in actions for agent, a in step.items())
@@ -98,7 +98,7 @@ def test_every_driver_acts_in_pursuit(name: str):
 @pytest.mark.parametrize("env_id", ["simple_tag_v3", "simple_spread_v3", "pursuit_v5"])
 @pytest.mark.parametrize("name", ["random", "varied", "heuristic", "mixed"])
 def test_an_episode_is_a_function_of_its_seed(env_id: str, name: str):
-    env, again = make_parallel_env(env_id, max_cycles=15), make_parallel_env(env_id, max_cycles=15)
+    env, again = make_multiagent_env(env_id, max_cycles=15), make_multiagent_env(env_id, max_cycles=15)
     first, _ = played(env, name, seed=3)
     assert played(again, name, seed=3)[0] == first
     again.reset(seed=8)
@@ -108,7 +108,7 @@ def test_an_episode_is_a_function_of_its_seed(env_id: str, name: str):
 
 @pytest.mark.parametrize("name", DRIVER_NAMES)
 def test_only_the_living_act(name: str):
-    env = make_parallel_env("simple_tag_v3")
+    env = make_multiagent_env("simple_tag_v3")
     observations, _ = env.reset(seed=0)
     driver = make_driver(name, env, rng())
     assert list(driver(observations)) == env.possible_agents
@@ -120,7 +120,7 @@ def test_only_the_living_act(name: str):
 
 @pytest.mark.parametrize("name", DRIVER_NAMES)
 def test_some_agents_may_be_driven_by_somebody_else(name: str):
-    env = make_parallel_env("simple_tag_v3")
+    env = make_multiagent_env("simple_tag_v3")
     observations, _ = env.reset(seed=0)
     driver = make_driver(name, env, rng())
     assert list(driver({"adversary_1": observations["adversary_1"]})) == ["adversary_1"]
@@ -137,7 +137,7 @@ def test_agents_may_come_late():
 
 def test_drivers_are_made_before_the_first_reset_and_see_through_wrappers():
     for name in DRIVER_NAMES:
-        plain, inner = (make_parallel_env("simple_spread_v3", max_cycles=5) for _ in range(2))
+        plain, inner = (make_multiagent_env("simple_spread_v3", max_cycles=5) for _ in range(2))
         driver, same = make_driver(name, plain, rng()), make_driver(name, BaseParallelWrapper(inner), rng())
         observations, _ = plain.reset(seed=2)
         others, _ = inner.reset(seed=2)
@@ -169,7 +169,7 @@ def test_random_fills_a_box():
 
 @pytest.mark.parametrize("continuous", [False, True])
 def test_idle_agents_stay_where_they_are(continuous: bool):
-    env = make_parallel_env("collect_treasure_v1", max_cycles=5, continuous_actions=continuous)
+    env = make_multiagent_env("collect_treasure_v1", max_cycles=5, continuous_actions=continuous)
     env.reset(seed=0)
     before = [body.state.p_pos.copy() for body in bodies(env).values()]
     played(env, "idle", seed=0)
@@ -177,7 +177,7 @@ def test_idle_agents_stay_where_they_are(continuous: bool):
 
 
 def test_idle_pursuers_stay_where_they_are():
-    env = make_parallel_env("pursuit_v5", max_cycles=5)
+    env = make_multiagent_env("pursuit_v5", max_cycles=5)
     env.reset(seed=0)
     layer = env.unwrapped.env.pursuer_layer
     before = layer.get_state()
@@ -231,7 +231,7 @@ def test_varied_agents_differ_in_persistence():
 
 
 def test_mixed_agents_are_of_all_kinds_and_stay_so(monkeypatch: pytest.MonkeyPatch):
-    env = make_parallel_env("simple_tag_v3")
+    env = make_multiagent_env("simple_tag_v3")
     env.reset(seed=0)
     monkeypatch.setattr(drivers, "uniform_action", lambda space, rng, who: 1)
     monkeypatch.setattr(drivers, "varied_actions", lambda space, rng, who: lambda seen: 2)
@@ -257,7 +257,7 @@ def test_mixed_does_without_a_heuristic_where_there_is_none(monkeypatch: pytest.
 @pytest.mark.parametrize("continuous", [False, True])
 @pytest.mark.parametrize("env_id", [i for i in MPE if i not in ("simple_tag_v3", "simple_adversary_v3")])
 def test_heuristics_earn_more_than_chance(env_id: str, continuous: bool):
-    env = make_parallel_env(env_id, max_cycles=50, continuous_actions=continuous)
+    env = make_multiagent_env(env_id, max_cycles=50, continuous_actions=continuous)
     earned = {name: [played(env, name, seed)[1] for seed in range(4)] for name in ("heuristic", "random")}
     assert np.mean(earned["heuristic"]) > np.mean(earned["random"]) + 0.5 * np.std(earned["random"])
     assert np.mean(earned["heuristic"]) > np.mean(earned["random"]) + 3.0
@@ -276,7 +276,7 @@ def contacts(env: ParallelEnv, name: str, seed: int) -> tuple[int, float]:
 
 
 def test_hunters_catch_prey_that_stays_in_the_arena():
-    env = make_parallel_env("simple_tag_v3", max_cycles=60)
+    env = make_multiagent_env("simple_tag_v3", max_cycles=60)
     hunted, chance = ([contacts(env, name, seed) for seed in range(6)] for name in ("heuristic", "random"))
     assert sum(caught for caught, _ in hunted) > 2 * sum(caught for caught, _ in chance)
     assert np.median([out_m for _, out_m in hunted]) < 1.3
@@ -294,14 +294,14 @@ def test_hunters_catch_prey_that_stays_in_the_arena():
 def test_hunters_chase_and_prey_flees(
     perfect: None, hunter: tuple[float, float], prey: tuple[float, float], hunts: int, flees: int
 ):
-    env = make_parallel_env("simple_tag_v3", num_adversaries=1, num_obstacles=0)
+    env = make_multiagent_env("simple_tag_v3", num_adversaries=1, num_obstacles=0)
     observations, _ = env.reset(seed=0)
     put(env, adversary_0=hunter, agent_0=prey)
     assert make_driver("heuristic", env, rng())(observations) == {"adversary_0": hunts, "agent_0": flees}
 
 
 def test_prey_turns_away_from_obstacles(perfect: None):
-    env = make_parallel_env("simple_tag_v3", num_adversaries=1, num_obstacles=1)
+    env = make_multiagent_env("simple_tag_v3", num_adversaries=1, num_obstacles=1)
     observations, _ = env.reset(seed=0)
     put(env, adversary_0=(-0.6, 0.0), agent_0=(0.0, 0.0), landmark_0=(0.3, -0.05))
     assert make_driver("heuristic", env, rng())(observations)["agent_0"] != PLUS_X
@@ -310,7 +310,7 @@ def test_prey_turns_away_from_obstacles(perfect: None):
 
 
 def test_hunters_lead_by_the_velocity_of_the_prey(monkeypatch: pytest.MonkeyPatch):
-    env = make_parallel_env("simple_tag_v3", num_adversaries=1, num_obstacles=0)
+    env = make_multiagent_env("simple_tag_v3", num_adversaries=1, num_obstacles=0)
     observations, _ = env.reset(seed=0)
     put(env, adversary_0=(-0.5, 0.0), agent_0=(0.0, 0.0))
     bodies(env)["agent_0"].state.p_vel = np.array([0.0, 1.3])
@@ -322,7 +322,7 @@ def test_hunters_lead_by_the_velocity_of_the_prey(monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize("continuous", [False, True])
 def test_agents_brake_before_their_goal(perfect: None, continuous: bool):
-    env = make_parallel_env("simple_v3", max_cycles=60, continuous_actions=continuous)
+    env = make_multiagent_env("simple_v3", max_cycles=60, continuous_actions=continuous)
     observations, _ = env.reset(seed=0)
     put(env, agent_0=(-0.9, 0.2), landmark_0=(0.8, -0.3))
     driver = make_driver("heuristic", env, rng())
@@ -336,7 +336,7 @@ def test_agents_brake_before_their_goal(perfect: None, continuous: bool):
 
 
 def test_agents_spread_over_all_places_and_then_swap(perfect: None):
-    env = make_parallel_env("simple_spread_v3", max_cycles=100)
+    env = make_multiagent_env("simple_spread_v3", max_cycles=100)
     observations, _ = env.reset(seed=1)
     put(env, landmark_0=(-0.8, 0.0), landmark_1=(0.8, 0.0), landmark_2=(0.0, 0.8))
     put(env, agent_0=(0.7, 0.3), agent_1=(-0.1, 0.4), agent_2=(-0.7, -0.5))
@@ -355,7 +355,7 @@ def test_agents_spread_over_all_places_and_then_swap(perfect: None):
 
 
 def test_good_agents_cover_all_landmarks_and_the_adversary_follows_the_best_placed(perfect: None):
-    env = make_parallel_env("simple_adversary_v3")
+    env = make_multiagent_env("simple_adversary_v3")
     observations, _ = env.reset(seed=0)
     put(env, landmark_0=(-0.8, 0.0), landmark_1=(0.8, 0.0))
     put(env, agent_0=(-0.5, 0.0), agent_1=(-0.6, 0.0), adversary_0=(0.0, 0.0))
@@ -364,7 +364,7 @@ def test_good_agents_cover_all_landmarks_and_the_adversary_follows_the_best_plac
 
 
 def test_the_pusher_guards_the_landmark_that_the_agent_is_nearest_to(perfect: None):
-    env = make_parallel_env("simple_push_v3")
+    env = make_multiagent_env("simple_push_v3")
     observations, _ = env.reset(seed=0)
     put(env, landmark_0=(-0.8, 0.0), landmark_1=(0.8, 0.0), agent_0=(-0.2, 0.0), adversary_0=(0.5, 0.0))
     bodies(env)["agent_0"].goal_a = env.unwrapped.world.landmarks[1]
@@ -373,7 +373,7 @@ def test_the_pusher_guards_the_landmark_that_the_agent_is_nearest_to(perfect: No
 
 
 def test_prey_eats_only_while_nobody_is_near(perfect: None):
-    env = make_parallel_env("simple_world_comm_v3", num_adversaries=1, num_good=1, num_food=1, num_obstacles=1)
+    env = make_multiagent_env("simple_world_comm_v3", num_adversaries=1, num_good=1, num_food=1, num_obstacles=1)
     observations, _ = env.reset(seed=0)
     world = env.unwrapped.world
     put(env, leadadversary_0=(-0.9, 0.0), agent_0=(0.0, 0.0), landmark_0=(0.9, 0.9))
@@ -385,7 +385,7 @@ def test_prey_eats_only_while_nobody_is_near(perfect: None):
 
 
 def test_collectors_fetch_and_deliver_and_deposits_come_to_meet_them(perfect: None):
-    env = make_parallel_env("collect_treasure_v1", num_collectors=1, num_treasures=1)
+    env = make_multiagent_env("collect_treasure_v1", num_collectors=1, num_treasures=1)
     observations, _ = env.reset(seed=0)
     put(env, collector_0=(0.0, 0.0), deposit_0=(0.5, 0.0), deposit_1=(-0.5, 0.0), landmark_0=(0.0, 0.5))
     driver = make_driver("heuristic", env, rng())
@@ -406,7 +406,7 @@ def test_the_nearest_pair_chooses_first():
 
 
 def test_pursuers_close_in_and_catch():
-    env = make_parallel_env("pursuit_v5", max_cycles=150, n_evaders=12)
+    env = make_multiagent_env("pursuit_v5", max_cycles=150, n_evaders=12)
     left = {}
     for name in ("heuristic", "random"):
         left[name] = 0
@@ -417,7 +417,7 @@ def test_pursuers_close_in_and_catch():
 
 
 def test_pursuers_go_round_nobody_stands_in_a_wall(perfect: None):
-    env = make_parallel_env("pursuit_v5", n_pursuers=1, n_evaders=1, freeze_evaders=True, max_cycles=40)
+    env = make_multiagent_env("pursuit_v5", n_pursuers=1, n_evaders=1, freeze_evaders=True, max_cycles=40)
     observations, _ = env.reset(seed=0)
     grid = env.unwrapped.env
     grid.pursuer_layer.set_position(0, 1, 1)
@@ -435,7 +435,7 @@ def test_everyone_has_habits_of_its_own_in_each_episode(monkeypatch: pytest.Monk
     drawn: list[Habits] = []
     draw = Habits.draw
     monkeypatch.setattr(Habits, "draw", staticmethod(lambda rng: drawn.append(draw(rng)) or drawn[-1]))
-    env = make_parallel_env("simple_tag_v3", max_cycles=5)
+    env = make_multiagent_env("simple_tag_v3", max_cycles=5)
     for seed in range(5):
         played(env, "heuristic", seed)
     assert len(set(drawn)) == len(drawn) == 20
@@ -446,7 +446,7 @@ def test_everyone_has_habits_of_its_own_in_each_episode(monkeypatch: pytest.Monk
 def test_inattention_repeats_and_slips_are_random(attention: float, slip: float, monkeypatch: pytest.MonkeyPatch):
     habits = Habits(attention=attention, slip=slip, lead_s=0.0, pace=1.0, lean_rad=0.0)
     monkeypatch.setattr(Habits, "draw", staticmethod(lambda rng: habits))
-    env = make_parallel_env("simple_v3")
+    env = make_multiagent_env("simple_v3")
     observations, _ = env.reset(seed=0)
     intended = itertools.count()
     monkeypatch.setattr(drivers._MpeIntentions, "_discrete", lambda self, *_: next(intended) % 5)
@@ -463,7 +463,7 @@ def test_inattention_repeats_and_slips_are_random(attention: float, slip: float,
 @pytest.mark.parametrize("name", ["fast", "policy.zip"])
 def test_unknown_names_are_listed(name: str):
     with pytest.raises(UserError, match=rf"driver must be one of {', '.join(DRIVER_NAMES)}, got '{name}'"):
-        make_driver(name, make_parallel_env("simple_tag_v3"), rng())
+        make_driver(name, make_multiagent_env("simple_tag_v3"), rng())
 
 
 def test_where_there_is_no_heuristic_the_others_are_named():

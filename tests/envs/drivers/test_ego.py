@@ -152,7 +152,7 @@ def test_policies_trained_on_forecasts_get_those_of_their_run(
 
 
 def test_unknown_names_are_listed(discrete: gym.Env):
-    expected = rf"ego must be one of {', '.join(EGO_NAMES)} or the path of a policy .zip, got 'fast'"
+    expected = rf"driver must be one of {', '.join(EGO_NAMES)} or the path of a policy .zip, got 'fast'"
     with pytest.raises(UserError, match=expected):
         make_ego("fast", discrete, np.random.default_rng(0))
 

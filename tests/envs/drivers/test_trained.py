@@ -11,7 +11,7 @@ from agents.arena import ParallelArena
 from agents.task import Task
 from envs.drivers.trained import trained_driver
 from envs.parallel import ForecastParallelEnv
-from envs.registry import make_parallel_env
+from envs.registry import make_multiagent_env
 from envs.rollouts.world import SharedWorld
 from predictor.errors import UserError
 from tests.agents.helpers import policy_for
@@ -25,13 +25,13 @@ def save_run(folder: Path, task: Task, config: bool = True) -> tuple[str, PPO]:
     model = policy_for(task)
     model.save(folder / "policy.zip")
     if config:
-        settings = {"observe": task.observe, "learners": task.learners, "partner": task.partner}
+        settings = {"observe": task.observe, "learners": task.learners, "partner": task.driver}
         (folder / "config.json").write_text(json.dumps({"config": settings}))
     return str(folder / "policy.zip"), model
 
 
 def forecast_env(env_id: str = SPREAD, **settings: Any) -> ForecastParallelEnv:
-    return ForecastParallelEnv(make_parallel_env(env_id), "constant-velocity", **settings)
+    return ForecastParallelEnv(make_multiagent_env(env_id), "constant-velocity", **settings)
 
 
 def played(env: ForecastParallelEnv, path: str) -> tuple[dict[str, float], list[dict[str, Any]]]:
@@ -51,7 +51,7 @@ def played(env: ForecastParallelEnv, path: str) -> tuple[dict[str, float], list[
 @pytest.mark.parametrize("observe", ["none", "constant-velocity"])
 @pytest.mark.parametrize("learners", [(), ("agent_0", "agent_2")], ids=["all", "two"])
 def test_it_acts_as_where_it_was_measured(learners: tuple[str, ...], observe: Any, num_samples: int, tmp_path: Path):
-    task = Task(SPREAD, observe, learners=learners, partner="varied")
+    task = Task(SPREAD, observe, learners=learners, driver="varied")
     path, model = save_run(tmp_path, task)
     (expected,) = ParallelArena(task).play(model, [SEED])
     returns, actions = played(forecast_env(num_samples=num_samples), path)

@@ -7,12 +7,16 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from envs.readers.base import Reader, perceive
+from envs.readers.base import Reader, perceive, perceive_batch
 from envs.readers.function import FunctionReader
 from envs.wrappers import ForecastObservation, SceneObservation
+from predictor.data.store import Episode
+from predictor.data.windows import visible
 from predictor.errors import UserError
-from predictor.scene import PADDING_ID, Scene, SceneSpec
+from predictor.scene import PADDING_ID, Scene, SceneBatch, SceneSpec
 
 SPEC = SceneSpec(dt_s=0.5, max_agents=4, perception_m=50.0)
 GOOD: dict[str, Any] = {
@@ -92,7 +96,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "negative_id": ({"ids": np.array([0, 8, -2])}, r"ids of valid agents must be non-negative, got \[0, 8, -2\]"),
     "padding_id": ({"ids": np.array([0, 8, PADDING_ID])}, r"ids of valid agents must be non-negative"),
     "no_ego": ({"valid": np.array([False, True, True])}, "row 0 must hold the ego, but it is not valid"),
-    "nan": ({"states": GOOD["states"] * [1, 1, np.nan, 1]}, r"states must be finite, got \[\[.*nan"),
+    "nan": ({"states": GOOD["states"] * [1, 1, np.nan, 1]}, r"states must be finite, .*got \[\[.*nan"),
     "infinite": ({"states": GOOD["states"] + [np.inf, 0, 0, 0]}, "states must be finite"),
     "nan_heading": ({"heading_rad": float("nan")}, "heading_rad must be .*finite.*, got nan"),
     "object_states": (
@@ -228,6 +232,26 @@ def test_an_absent_agent_is_out_of_sight_also_of_an_ego_that_sees_everything():
     seen = perceive(everyone, replace(SPEC, perception_m=np.inf))
     assert seen.ids.tolist() == [0, 3, PADDING_ID, PADDING_ID]
     assert seen.valid.tolist() == [True, True, False, False]
+
+
+@given(seed=st.integers(0, 2**16), perception_m=st.sampled_from([2.0, 40.0, np.inf]), max_agents=st.integers(1, 8))
+def test_a_batch_perceives_what_each_ego_does_and_so_do_training_windows(
+    seed: int, perception_m: float, max_agents: int
+):
+    rng = np.random.default_rng(seed)
+    spec = SceneSpec(dt_s=1.0, perception_m=perception_m, max_agents=max_agents)
+    states, valid = rng.integers(-3, 4, size=(5, 6, 4)).astype(np.float64), rng.random((5, 6)) < 0.7
+    valid[:, 0] = True
+    states[~valid] = 0.0
+    ids = np.where(valid, np.arange(6), PADDING_ID)
+    scenes = [Scene(*arrays) for arrays in zip(states, ids, valid, strict=True)]
+    expected = SceneBatch.stack([perceive(scene, spec) for scene in scenes])
+    found = perceive_batch(SceneBatch(states, ids, valid, np.zeros(5)), spec)
+    for name in ("states", "ids", "valid"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    in_windows = visible(Episode(states.astype(np.float32), valid, np.arange(6)), spec)
+    for scene, kept in zip(expected.ids, in_windows, strict=True):
+        assert set(scene) - {PADDING_ID} == set(np.flatnonzero(kept))
 
 
 def test_a_reader_without_an_ego_is_refused_where_there_is_one():

@@ -326,7 +326,7 @@ def test_leaders_are_those_that_the_drivers_then_brake_for(env_id: str, monkeypa
 
 
 def config(env_id: str, **changes: Any) -> CollectConfig:
-    return CollectConfig(**{"env_id": env_id, "out": Path("unused"), "workers": 1, "ego": ("random",), **changes})
+    return CollectConfig(**{"env_id": env_id, "out": Path("unused"), "workers": 1, "driver": ("random",), **changes})
 
 
 @pytest.mark.parametrize("env_id", ["highway-fast-v0", "intersection-v2", "roundabout-v1", "u-turn-v1", "racetrack-v1"])

@@ -11,7 +11,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.sisl.pursuit.pursuit import parallel_env as pursuit_env
 from pettingzoo.utils import BaseParallelWrapper
 
-from envs.readers.base import SharedScene, SharedSceneReader
+from envs.readers.base import MultiagentReader, MultiagentScene
 from envs.readers.mpe import MPE_FEATURES, MpeReader, is_mpe_env, mpe_scenario
 from predictor.errors import ProtocolError, UserError
 from predictor.scene import PADDING_ID
@@ -50,7 +50,7 @@ def named(env: ParallelEnv, name: str) -> Any:
     return next(body for body in world_of(env).agents if body.name == name)
 
 
-def entity_of_id(env: ParallelEnv, shared: SharedScene) -> dict[int, Any]:
+def entity_of_id(env: ParallelEnv, shared: MultiagentScene) -> dict[int, Any]:
     """Which entity each id stands for, found by position."""
     scene = shared.scene
     found = {}
@@ -75,7 +75,7 @@ def tag() -> ParallelEnv:
 def test_every_scenario_reads(env_id: str, landmarks: bool):
     env = make(env_id, max_cycles=5)
     reader = MpeReader(env, landmarks=landmarks)
-    assert isinstance(reader, SharedSceneReader)
+    assert isinstance(reader, MultiagentReader)
     env.reset(seed=3)
     rng = np.random.default_rng(0)
     still = len(world_of(env).landmarks) if landmarks else 0

@@ -9,7 +9,7 @@ from pettingzoo.sisl.pursuit.pursuit import parallel_env
 from pettingzoo.sisl.pursuit.utils.discrete_agent import DiscreteAgent
 from pettingzoo.utils import BaseParallelWrapper
 
-from envs.readers.base import SharedScene, SharedSceneReader
+from envs.readers.base import MultiagentReader, MultiagentScene
 from envs.readers.pursuit import PursuitReader, is_pursuit_env
 from predictor.errors import ProtocolError, UserError
 
@@ -37,7 +37,7 @@ def step(env: ParallelEnv, *actions: int) -> None:
     env.step(dict(zip(env.agents, actions or [STAY] * len(env.agents), strict=True)))
 
 
-def by_id(shared: SharedScene) -> dict[int, list[float]]:
+def by_id(shared: MultiagentScene) -> dict[int, list[float]]:
     scene = shared.scene
     return {int(i): s.tolist() for i, s in zip(scene.ids[scene.valid], scene.states[scene.valid], strict=True)}
 
@@ -45,7 +45,7 @@ def by_id(shared: SharedScene) -> dict[int, list[float]]:
 def test_scene_is_what_stands_on_the_grid():
     env = placed([(0, 0), (3, 2)], [(15, 15), (1, 12), (2, 2)])
     reader = PursuitReader(env)
-    assert isinstance(reader, SharedSceneReader)
+    assert isinstance(reader, MultiagentReader)
     shared = reader.read(env)
     shared.scene.check("pursuit", reader.spec, rows=5)
     expected = [[0, 0, 0, 0, 0], [3, 2, 0, 0, 0], [15, 15, 0, 0, 1], [1, 12, 0, 0, 1], [2, 2, 0, 0, 1]]

@@ -67,7 +67,7 @@ def clean_slate() -> Iterator[None]:
 def drifting(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every env wrapped from here on is forecast by `Drifting`."""
 
-    def open_drifting(checkpoint: str | None, spec: SceneSpec, source: str, device: str = "cpu") -> Drifting:
+    def open_drifting(checkpoint: str | None, spec: SceneSpec, source: str, *_: object) -> Drifting:
         return Drifting(spec, HORIZON)
 
     monkeypatch.setattr("envs.wrappers.open_forecaster", open_drifting)

@@ -101,7 +101,7 @@ def test_a_policy_gets_the_most_likely_of_several_forecasts(tmp_path: Path, high
     ("env_id", "driver", "checkpoint", "message"),
     [
         ("nope-v0", "idle", None, "cannot make env 'nope-v0'"),
-        (ROAD, "reckless", None, "ego must be one of random"),
+        (ROAD, "reckless", None, "driver must be one of random"),
         (ROAD, "keep-lane", "constant-velocity", "keep-lane needs continuous steering"),
         (ROAD, "absent.zip", None, "no policy at absent.zip"),
         (ROAD, "idle", "nowhere", "no checkpoint 'nowhere'"),

@@ -94,7 +94,7 @@ def test_ids_are_declared_without_envpool():
     code = """
 import sys
 sys.modules["envpool"] = None  # importing it raises ImportError
-from envs.native import ENV_IDS, register_envpool_ids
+from envs.simulators.envpool import ENV_IDS, register_envpool_ids
 register_envpool_ids()
 register_envpool_ids()
 import gymnasium as gym

@@ -7,12 +7,12 @@ from gymnasium.utils.env_checker import data_equivalence
 from highway_env.vehicle.kinematics import Vehicle
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
-from envs.multiagent_observation import check_shared
+from envs.multiagent_observation import check_multiagent_scene
 from envs.parallel import ForecastParallelEnv
-from envs.readers import shared_reader_for
-from envs.readers.base import SharedScene, SharedSceneReader
-from envs.readers.highway_multiagent import HighwaySharedReader, most_vehicles
-from envs.registry import make_parallel_env
+from envs.readers import multiagent_reader_for
+from envs.readers.base import MultiagentReader, MultiagentScene
+from envs.readers.highway_multiagent import HighwayMultiagentReader, most_vehicles
+from envs.registry import make_multiagent_env
 from envs.simulators.highway_multiagent import INTERSECTION, HighwayParallelEnv
 from predictor.errors import ProtocolError, UserError
 from predictor.scene import Scene
@@ -221,16 +221,16 @@ def test_it_can_be_looked_at():
     env.close()
 
 
-# --- HighwaySharedReader ----------------------------------------------------------------------------------------------
+# --- HighwayMultiagentReader ------------------------------------------------------------------------------------------
 
 
 def test_reader_sees_every_vehicle_as_it_is():
     env = HighwayParallelEnv(controlled_vehicles=3)
-    reader = shared_reader_for(env)
-    assert isinstance(reader, SharedSceneReader)
+    reader = multiagent_reader_for(env)
+    assert isinstance(reader, MultiagentReader)
     env.reset(seed=2)
     for _ in range(4):
-        shared = check_shared(reader.read(env), reader.spec)
+        shared = check_multiagent_scene(reader.read(env), reader.spec)
         vehicles = env.highway.road.vehicles
         assert shared.scene.valid.sum() == len(vehicles) > 3
         for i, vehicle in enumerate(vehicles):
@@ -246,7 +246,7 @@ def test_reader_sees_every_vehicle_as_it_is():
 
 def test_ids_are_the_vehicles_own():
     env = HighwayParallelEnv(controlled_vehicles=2)
-    reader = shared_reader_for(env)
+    reader = multiagent_reader_for(env)
     env.reset(seed=0)
     known: dict[Vehicle, int] = {}
     for _ in range(3):
@@ -265,7 +265,7 @@ def test_ids_are_the_vehicles_own():
 
 def test_an_agent_has_a_row_for_its_last_observation_and_no_longer():
     env = empty_road(2)
-    reader = shared_reader_for(env)
+    reader = multiagent_reader_for(env)
     wreck = env.highway.controlled_vehicles[0]
     number = reader.read(env).scene.ids[0]
     wreck.crashed = True
@@ -282,17 +282,17 @@ def test_an_empty_road_can_be_read():
     env = empty_road(2)
     env.highway.road.vehicles = []
     env._observed = []
-    shared = shared_reader_for(env).read(env)
+    shared = multiagent_reader_for(env).read(env)
     assert not shared.scene.valid.any()
     assert shared.rows == {}
 
 
 def test_spec_follows_the_config():
     env = HighwayParallelEnv(controlled_vehicles=3, policy_frequency=5, duration=2)
-    spec = shared_reader_for(env).spec
+    spec = multiagent_reader_for(env).spec
     assert (spec.dt_s, spec.frame, spec.has_ego) == (0.2, ("world", "world"), False)
     assert spec.max_agents == most_vehicles(env.highway.config) == 10 + 3 + 11
-    narrow = shared_reader_for(env, perception_m=30.0, max_agents=20).spec
+    narrow = multiagent_reader_for(env, perception_m=30.0, max_agents=20).spec
     assert (narrow.perception_m, narrow.max_agents) == (30.0, 20)
 
 
@@ -309,13 +309,13 @@ def test_default_holds_the_most_that_can_come():
 def test_too_small_a_scene_is_named():
     env = HighwayParallelEnv()
     env.reset(seed=0)
-    with pytest.raises(UserError, match="HighwaySharedReader: .* agents do not fit max_agents=2; raise max_agents"):
-        shared_reader_for(env, max_agents=2).read(env)
+    with pytest.raises(UserError, match="HighwayMultiagentReader: .* agents do not fit max_agents=2; raise max_agents"):
+        multiagent_reader_for(env, max_agents=2).read(env)
 
 
 def test_a_time_step_that_changed_is_named():
     env = HighwayParallelEnv()
-    reader = shared_reader_for(env)
+    reader = multiagent_reader_for(env)
     env.reset(seed=0, options={"config": {"policy_frequency": 5}})
     with pytest.raises(UserError, match=r"wrapped at dt_s=1 but now steps at dt_s=0.2"):
         reader.read(env)
@@ -323,7 +323,7 @@ def test_a_time_step_that_changed_is_named():
 
 def test_other_envs_are_refused():
     with pytest.raises(UserError, match="needs a HighwayParallelEnv, got raw_env"):
-        HighwaySharedReader(make_parallel_env("simple_tag_v3"))
+        HighwayMultiagentReader(make_multiagent_env("simple_tag_v3"))
 
 
 # --- With forecasts ---------------------------------------------------------------------------------------------------
@@ -351,7 +351,7 @@ def test_the_checkpoint_of_the_single_ego_serves_and_beats_constant_velocity():
         forecasts: dict[str, list[np.ndarray]] = {"model": [], "straight": []}
         observations, _ = env.reset(seed=seed)
         while True:
-            shared: SharedScene = env.scene
+            shared: MultiagentScene = env.scene
             scenes.append(shared.scene)
             forecasts["model"].append(env.forecast.xy[0, 0].numpy())
             steps_s = np.arange(1, 6)[:, None]

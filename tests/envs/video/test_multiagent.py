@@ -15,7 +15,7 @@ from pettingzoo import ParallelEnv
 from PIL import Image
 
 from envs.parallel import ForecastParallelEnv
-from envs.readers.base import SharedScene, share
+from envs.readers.base import MultiagentScene, pad_multiagent_scene
 from envs.simulators.highway_multiagent import HighwayParallelEnv
 from envs.video.drawing import Arena
 from envs.video.multiagent import LANDMARK, SharedRecording, SharedStyle, record_parallel_episode
@@ -121,7 +121,7 @@ class StraightReader:
     def reset(self) -> None:
         pass
 
-    def read(self, env: Any) -> SharedScene:
+    def read(self, env: Any) -> MultiagentScene:
         base = env.unwrapped
         names = list(self._rng.permutation(base.present()))
         states = np.array([[*place(n, base.step_count), *BODIES[n][1], float(n == "rock"), 0.4] for n in names])
@@ -129,7 +129,7 @@ class StraightReader:
             states[:, : self.spec.num_features], np.array([NUMBERS[n] for n in names]), np.ones(len(names)) > 0
         )
         rows = {name: row for row, name in enumerate(names) if name in base.agents}
-        return share(scene, rows, np.full(len(names), -np.pi / 2 * self._headings), self.spec)
+        return pad_multiagent_scene(scene, rows, np.full(len(names), -np.pi / 2 * self._headings), self.spec)
 
 
 class OneEdge(ForecastParallelEnv):

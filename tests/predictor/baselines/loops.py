@@ -34,7 +34,7 @@ def embed(encoder: FrameEncoder, inputs: Tensor, valid: Tensor) -> dict[Pair, Te
     }
     again, others = {}, max(len(nodes) - 1, 1)
     for i in nodes:
-        incoming = sum((first[i, j] for j in nodes if j != i), torch.zeros(encoder.pair_out.out_features))
+        incoming = sum((first[i, j] for j in nodes if j != i), inputs.new_zeros(encoder.pair_out.out_features))
         again[i] = encoder.again_node(incoming / others)
     return {
         (i, j): functional.elu(
@@ -50,7 +50,8 @@ def lstm_of_pairs(
     rnn: PairLSTM, embeddings: list[dict[Pair, Tensor]], reverse: bool = False
 ) -> list[dict[Pair, Tensor]]:
     """Hidden state of each present pair after each step, by torch's own cell; absence means starting anew."""
-    cell = nn.LSTMCell(rnn.inputs.in_features, rnn.hidden.in_features).requires_grad_(False)
+    kind = rnn.inputs.weight.dtype
+    cell = nn.LSTMCell(rnn.inputs.in_features, rnn.hidden.in_features, dtype=kind).requires_grad_(False)
     cell.weight_ih.copy_(rnn.inputs.weight), cell.bias_ih.copy_(rnn.inputs.bias)
     cell.weight_hh.copy_(rnn.hidden.weight), cell.bias_hh.zero_()
     state: dict[Pair, tuple[Tensor, Tensor]] = {}
@@ -66,9 +67,9 @@ def decode(
 ) -> dict[int, Tensor]:
     """Memory of each present agent one step on; `weights` has one number per kind of message, ready to be added."""
     width, after = decoder.message_out[0].in_features, {}
-    zero = torch.zeros(decoder.readout[0].in_features)
+    zero = inputs.new_zeros(decoder.readout[0].in_features)
     for i in present(valid):
-        messages = torch.zeros(width)
+        messages = inputs.new_zeros(width)
         for j in present(valid):
             for k, out in enumerate(decoder.message_out):
                 if i != j:

@@ -1,6 +1,9 @@
+import numpy as np
+import pytest
 import torch
 
-from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
+from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from tests.predictor.helpers import random_presence, random_states, spec
@@ -63,3 +66,66 @@ def test_history_leaves_no_trace():
         memory, belief = forecaster.observe(memory, now, present)
     assert memory == Memory()
     assert torch.equal(belief.states, states[-1]) and torch.equal(belief.valid, valid[-1])
+
+
+# --- With noise -----------------------------------------------------------------------------------------------------
+
+
+def test_both_parameters_of_the_noise_are_recovered_from_the_errors_they_cause():
+    layout = spec(dt_s=0.5)
+    fitted = NoisyConstantVelocity.fit(layout, [0.3 * (0.5 * step) ** 1.7 for step in range(1, 11)])
+    assert (fitted.noise_m, fitted.growth) == (pytest.approx(0.3), pytest.approx(1.7))
+    assert fitted.horizon_steps == 10
+
+
+@pytest.mark.parametrize(("std_m", "noise_m"), [([2.0], 4.0), ([0.0, 0.0], 0.0), ([0.0, 3.0], 3.0)])
+def test_fewer_than_two_errors_give_noise_on_the_velocity(std_m: list[float], noise_m: float):
+    fitted = NoisyConstantVelocity.fit(spec(dt_s=0.5), std_m)
+    assert (fitted.noise_m, fitted.growth) == (pytest.approx(noise_m), 1.0)
+
+
+def test_samples_scatter_around_constant_velocity_as_fitted():
+    layout, states = spec(dt_s=0.5), random_states(0, 3, 4, 4)
+    noisy, straight = NoisyConstantVelocity(layout, 0.3, 1.5), ConstantVelocity(layout)
+    belief = observe(noisy, states)
+    samples = noisy.rollout(belief, 4, 4001, torch.Generator().manual_seed(0))
+    exact = straight.rollout(belief, 4)
+    assert torch.equal(samples[:, :1], exact)  # sample 0 is the most likely forecast
+    offsets = (samples - exact)[:, 1:]
+    spread_m = 0.3 * torch.tensor([0.5, 1.0, 1.5, 2.0]) ** 1.5
+    torch.testing.assert_close(offsets[..., :2].std((0, 1, 2)), spread_m[:, None].expand(4, 2), rtol=0.02, atol=0)
+    assert float(offsets[..., :2].mean().abs()) < 0.01
+    correlation = torch.corrcoef(
+        torch.stack([offsets[..., 0].flatten(0, 2)[:, 3], offsets[..., 1].flatten(0, 2)[:, 3]])
+    )
+    assert abs(float(correlation[0, 1])) < 0.02  # axes are drawn apart
+
+
+def test_a_sample_with_noise_moves_with_the_velocity_it_states():
+    noisy, states = NoisyConstantVelocity(spec(dt_s=0.5), 0.3, 1.5), random_states(0, 1, 2, 4)
+    samples = noisy.rollout(observe(noisy, states), 4, 3, torch.Generator().manual_seed(0))
+    positions = torch.cat([states[:, None, :, None, :2].expand(1, 3, 2, 1, 2), samples[..., :2]], dim=3)
+    torch.testing.assert_close(positions.diff(dim=3) / 0.5, samples[..., 2:4], rtol=1e-4, atol=1e-4)
+
+
+def test_equal_generators_give_equal_noise_and_the_batch_is_left_alone():
+    noisy, states = NoisyConstantVelocity(spec(), 0.3, 1.0), random_states(0, 2, 3, 4)
+    belief = observe(noisy, states)
+    first, second = (noisy.rollout(belief, 3, 5, torch.Generator().manual_seed(7)) for _ in range(2))
+    assert torch.equal(first, second) and not torch.equal(first[:, 1], first[:, 2])
+    assert torch.equal(belief.states, states)
+
+
+def test_a_scene_with_its_own_generator_draws_the_same_in_any_batch_and_with_any_padding():
+    noisy, states = NoisyConstantVelocity(spec(), 0.3, 1.0), random_states(0, 2, 3, 4)
+    both = noisy.rollout(observe(noisy, states), 3, 5, [np.random.default_rng(7), np.random.default_rng(8)])
+    padded = torch.cat([states[1:], torch.zeros(1, 2, 4)], dim=1)
+    belief = noisy.observe(noisy.empty_memory(1, 5), padded, torch.tensor([[True] * 3 + [False] * 2]))[1]
+    alone = noisy.rollout(belief, 3, 5, [np.random.default_rng(8)])
+    assert torch.equal(alone[0, :, :3], both[1]) and not torch.equal(both[0, 1], both[1, 1])
+
+
+def test_generators_must_be_as_many_as_scenes():
+    noisy, states = NoisyConstantVelocity(spec(), 0.3, 1.0), random_states(0, 2, 3, 4)
+    with pytest.raises(UserError, match="noise needs one generator per scene, got 1 for 2"):
+        noisy.rollout(observe(noisy, states), 3, 5, [np.random.default_rng(7)])

@@ -18,7 +18,7 @@ def store(tmp_path: Path, episodes: list[Episode], has_ego: bool = False) -> Pat
 
 
 def config(source: Path, **changes: object) -> CrowdConfig:
-    small = CrowdConfig(source, source.with_name("crowd"), agents=(2, 7), episodes=2, steps=10, at_step=7)
+    small = CrowdConfig(source, source.with_name("crowd"), num_agents=(2, 7), episodes=2, episode_steps=10, at_step=7)
     return replace(small, **changes)  # type: ignore[arg-type]
 
 
@@ -44,13 +44,13 @@ def test_everybody_moves_as_recorded_and_scenes_share_a_centre():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"agents": (0,)}, "agents and episodes must be at least 1"),
+        ({"num_agents": (3, 0)}, r"num_agents must be at least 1, got \(3, 0\)"),
         ({"at_step": 10}, "at_step must lie between 0 and 9, got 10"),
     ],
 )
 def test_refused(tmp_path: Path, changes: dict[str, object], message: str):
     with pytest.raises(UserError, match=message):
-        config(tmp_path / "scenes", **changes).check()
+        config(tmp_path / "scenes", **changes)
 
 
 def test_scenes_with_an_ego_or_too_short_ones_are_refused(tmp_path: Path):

@@ -172,13 +172,13 @@ def test_a_store_that_cannot_be_written_leaves_no_card(tmp_path: Path):
 @pytest.mark.parametrize("name", ["store", "store.md"])
 def test_what_is_in_the_way_stays(tmp_path: Path, name: str):
     config = LoaderConfig(tmp_path, tmp_path / "store")
-    config.check()
+    config.check_paths()
     (tmp_path / name).write_text("mine")
     with pytest.raises(UserError, match=rf"{name} exists; choose another path or pass --overwrite"):
-        config.check()
-    LoaderConfig(tmp_path, tmp_path / "store", overwrite=True).check()
+        config.check_paths()
+    LoaderConfig(tmp_path, tmp_path / "store", overwrite=True).check_paths()
     with pytest.raises(UserError, match="no source at"):
-        LoaderConfig(tmp_path / "absent", tmp_path / "other").check()
+        LoaderConfig(tmp_path / "absent", tmp_path / "other").check_paths()
 
 
 def test_overwrite_replaces_both(tmp_path: Path):

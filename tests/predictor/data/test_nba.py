@@ -61,7 +61,7 @@ def assert_rolls(states: np.ndarray, first_step: int) -> None:
 
 
 def test_windows_tile_a_possession(possessions: Path, loader: Loader):
-    store = loader.load(possessions, "--window-steps", 4)
+    store = loader.load(possessions, "--episode-steps", 4)
     spec = store.info.spec
     assert (spec.dt_s, spec.max_agents, spec.has_ego, spec.frame) == (0.12, 11, False, ("world", "world"))
     assert spec.feature_names == ("x_m", "y_m", "vx_mps", "vy_mps", "is_ball")
@@ -76,7 +76,7 @@ def test_windows_tile_a_possession(possessions: Path, loader: Loader):
 
 def test_rests_and_short_possessions_are_counted(possessions: Path, loader: Loader):
     (possessions / "ATL_BKN_1_1_40.0_39.0.txt").write_text(score(5))
-    store = loader.load(possessions, "--window-steps", 5)
+    store = loader.load(possessions, "--episode-steps", 5)
     assert len(store.episodes) == 1
     assert "| files | 2 |" in loader.card
     assert "| games | 1 |" in loader.card
@@ -94,7 +94,7 @@ def test_games_are_not_divided(possessions: Path, loader: Loader):
             (possessions / f"ATL_BKN_{game}_{quarter}_60.0_50.0.txt").write_text(score(5))
     seen: list[str] = []
     for split in ("train", "val", "test"):
-        episodes = loader.load(possessions, "--split", split, "--window-steps", 4, "--overwrite").episodes
+        episodes = loader.load(possessions, "--split", split, "--episode-steps", 4, "--overwrite").episodes
         games = {"_".join(e.label.split("_")[:3]) for e in episodes}
         assert all(split_of(game, nba.SPLIT_SEED) == split for game in games)
         seen += games
@@ -123,7 +123,7 @@ def test_broken_possessions_are_one_line(case: str, possessions: Path, loader: L
     changed, text, line, message = SCORE_ERRORS[case]
     (path,) = possessions.iterdir()
     change_line(path, changed, text)
-    loader.refuses(possessions, f"{path}, line {line}: {message}", "--window-steps", 4)
+    loader.refuses(possessions, f"{path}, line {line}: {message}", "--episode-steps", 4)
 
 
 def test_a_gap_is_one_line(possessions: Path, loader: Loader):
@@ -139,7 +139,7 @@ def test_a_gap_is_one_line(possessions: Path, loader: Loader):
 
 def test_broken_files_can_be_left_out(possessions: Path, loader: Loader):
     (possessions / "BOS_MIA_2_1_60.0_50.0.txt").write_text(score(9).replace("PLAYER", "COACH", 1))
-    store = loader.load(possessions, "--skip-broken", "--window-steps", 4)
+    store = loader.load(possessions, "--skip-broken", "--episode-steps", 4)
     assert {e.label for e in store.episodes} == {"ATL_BKN_1_1_60.0_50.0"}
     assert "| broken files left out | 1 |" in loader.card
 
@@ -147,7 +147,7 @@ def test_broken_files_can_be_left_out(possessions: Path, loader: Loader):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--window-steps", 1), "window_steps must be at least 2, got 1"),
+        (("--episode-steps", 1), "episode_steps must be at least 2, got 1"),
         (("--format", "sportvu"), "{source} holds no files of format 'sportvu' (*.json)"),
     ],
 )
@@ -178,7 +178,7 @@ def games(tmp_path: Path) -> Path:
 
 def test_sportvu_is_thinned_and_sorted(games: Path, loader: Loader):
     (games / "0021500001.json").write_text(game([moment(t) for t in range(25)]))
-    store = loader.load(games, "--format", "sportvu", "--window-steps", 4)
+    store = loader.load(games, "--format", "sportvu", "--episode-steps", 4)
     assert [len(e.states) for e in store.episodes] == [4, 4]  # 25 moments, 9 kept, 8 velocities
     for begin, episode in zip((1, 5), store.episodes, strict=True):
         # Team 100 (the second five) stands before team 101; ids ascend in each.
@@ -197,7 +197,7 @@ def test_events_overlap_and_play_is_interrupted(games: Path, loader: Loader):
     substituted = [moment(t, players=[99, *PLAYERS[1:]]) for t in range(34, 47)]
     next_quarter = [moment(t, quarter=2, players=[99, *PLAYERS[1:]]) for t in range(47, 60)]
     (games / "7.json").write_text(game(first, again, [], [*later, ten, *substituted], next_quarter))
-    store = loader.load(games, "--format", "sportvu", "--window-steps", 4)
+    store = loader.load(games, "--format", "sportvu", "--episode-steps", 4)
     # 13 moments in each passage, 5 kept, 4 velocities.
     assert [e.label for e in store.episodes] == ["7/0", "7/1", "7/2", "7/3"]
     for row in (
@@ -214,7 +214,7 @@ def test_events_overlap_and_play_is_interrupted(games: Path, loader: Loader):
 def test_a_substitution_ends_a_passage(games: Path, loader: Loader):
     moments = [moment(t, players=PLAYERS if t < 13 else [99, *PLAYERS[1:]]) for t in range(26)]
     (games / "7.json").write_text(game(moments))
-    first, second = loader.load(games, "--format", "sportvu", "--window-steps", 4).episodes
+    first, second = loader.load(games, "--format", "sportvu", "--episode-steps", 4).episodes
     assert (11 in first.ids, 99 in first.ids) == (True, False)
     assert (11 in second.ids, 99 in second.ids) == (False, True)
 
@@ -223,7 +223,7 @@ def test_a_late_moment_ends_a_passage_and_an_uneven_one_does_not(games: Path, lo
     path = games / "7.json"
     for late_ms, passages in ((15, 1), (16, 2)):
         path.write_text(game([moment(t, late_ms if t >= 7 else 0) for t in range(14)]))
-        loader.load(games, "--format", "sportvu", "--window-steps", 2, "--overwrite")
+        loader.load(games, "--format", "sportvu", "--episode-steps", 2, "--overwrite")
         assert f"| passages without interruption | {passages} |" in loader.card
 
 
@@ -268,7 +268,7 @@ def test_broken_games_are_one_line(case: str, games: Path, loader: Loader):
 def test_broken_games_can_be_left_out(games: Path, loader: Loader):
     (games / "7.json").write_text("{")
     (games / "8.json").write_text(game([moment(t) for t in range(13)]))
-    arguments = ("--format", "sportvu", "--skip-broken", "--window-steps", 4)
+    arguments = ("--format", "sportvu", "--skip-broken", "--episode-steps", 4)
     assert [e.label for e in loader.load(games, *arguments).episodes] == ["8/0"]
     assert "| broken files left out | 1 |" in loader.card
 

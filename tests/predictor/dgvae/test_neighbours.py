@@ -629,7 +629,7 @@ def test_config_refuses_an_unknown_graph():
     """As when a checkpoint is read where types are not checked; here it would be refused earlier."""
     config = DGVAEConfig()
     object.__setattr__(config, "rollout_graph", "froze")
-    with pytest.raises(UserError, match="rollout_graph must be 'evolving' or 'frozen', got 'froze'"):
+    with pytest.raises(UserError, match="rollout_graph must be one of evolving, frozen, got 'froze'"):
         config.__post_init__()
 
 

@@ -230,8 +230,8 @@ def test_without_edge_features_there_are_no_layers_for_them():
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("residual", "midpoint", "residual must be 'state', 'constant_velocity' or 'trapezoid', got 'midpoint'"),
-        ("pair_matching", "future", "pair_matching must be 'window' or 'causal', got 'future'"),
+        ("residual", "midpoint", "residual must be one of state, constant_velocity, trapezoid, got 'midpoint'"),
+        ("pair_matching", "future", "pair_matching must be one of window, causal, got 'future'"),
     ],
 )
 def test_config_refuses_unknown_choices(field: str, value: str, message: str):

@@ -26,7 +26,7 @@ def test_error_curves_are_drawn_over_seconds(ax: Axes):
     assert model.get_xdata().tolist() == straight.get_xdata().tolist() == [0.5, 1.0]
     assert (list(model.get_ydata()), list(straight.get_ydata())) == ([1.0, 2.0], [3.0, 4.0])
     assert straight.get_color() == "grey" != model.get_color()
-    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["dG-VAE, K = 20", "constant velocity"]
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["dG-VAE, K = 20", "constant velocity, K = 1"]
 
 
 def test_scene_has_solid_history_dashed_forecast_and_thin_truth(ax: Axes):

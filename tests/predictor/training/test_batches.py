@@ -33,7 +33,7 @@ from tests.predictor.helpers import FAST_LIKE, circling_episode, spec, write_cir
 
 CPU = torch.device("cpu")
 ON_HOST = "windows are cut on the host, one batch ahead"
-CONFIG = TrainConfig((), Path(), steps=20, batch_size=6, history_steps=4, horizon_steps=3, min_history_steps=1)
+CONFIG = TrainConfig((Path(),), Path(), steps=20, batch_size=6, history_steps=4, horizon_steps=3, min_history_steps=1)
 
 
 @pytest.fixture(autouse=True)

@@ -30,7 +30,7 @@ from tests.predictor.helpers import EVERY_MODEL, RICH, random_presence, random_s
 
 META = torch.device("meta")
 FROM_HOST = (torch.tensor, torch.as_tensor, torch.asarray, torch.from_numpy, Tensor.new_tensor)
-CONFIG = TrainConfig((), Path(), edge_cost=1.0, label_weight=1.0, type_label_weight=1.0)
+CONFIG = TrainConfig((Path(),), Path(), edge_cost=1.0, label_weight=1.0, type_label_weight=1.0)
 KINDS: dict[str, tuple[str, Any]] = EVERY_MODEL | {
     "dgvae-paper": ("dgvae", DGVAEConfig()),
     "dgvae-springs": (

@@ -71,7 +71,6 @@ def config(data: Path, out: Path, **changes: Any) -> TrainConfig:
 
 def made(settings: TrainConfig, recorder: FakeRecorder | None = None, padded: bool = False) -> Trainer:
     """A trainer as it is on a CUDA device: with `padded` fixed shapes, with a recorder replayed steps."""
-    settings.check()
     trainer = Trainer(settings, load_data(settings))
     trainer._recorder = recorder
     if padded:
@@ -364,5 +363,4 @@ def test_run_on_cuda_is_resumed_to_the_same_weights(circles: Path, tmp_path: Pat
 
 
 def made_on_cuda(settings: TrainConfig) -> Trainer:
-    settings.check()
     return Trainer(settings, load_data(settings))

@@ -161,7 +161,8 @@ def test_tensor_cores_are_allowed_for_the_step_alone(circles: Path, tmp_path: Pa
     monkeypatch.setattr(Tensor, "backward", watching)
     before = torch.get_float32_matmul_precision()
     for precision in ("tf32", "float32"):
-        settings = config(circles, tmp_path, precision=precision)
+        settings = config(circles, tmp_path)
+        object.__setattr__(settings, "precision", precision)  # a config refuses it on a CPU
         Trainer(settings, load_data(settings)).train_step()
     assert seen == ["high", before] and torch.get_float32_matmul_precision() == before
 
@@ -176,8 +177,8 @@ def test_tensor_cores_are_allowed_for_the_step_alone(circles: Path, tmp_path: Pa
         ({"precision": "tf32"}, "precision 'tf32' needs a CUDA device; use --precision float32 or --device cuda"),
         ({"data_device": "gpu"}, "data_device must be one of auto, cpu, device, got 'gpu'"),
         ({"capture": "on"}, "capture must be one of auto, off, got 'on'"),
-        ({"device": "tpu"}, "device must be 'cpu' or 'cuda', got 'tpu'"),
-        ({"device": "cuda"}, "device 'cuda' asked for but torch sees no CUDA device; use --device cpu"),
+        ({"device": "tpu"}, "device must be cpu, cuda or auto, got 'tpu'"),
+        ({"device": "cuda"}, "device 'cuda' was asked for but torch finds no CUDA device; use --device cpu"),
     ],
 )
 def test_wrong_choices_are_named(
@@ -185,19 +186,19 @@ def test_wrong_choices_are_named(
 ):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     settings = config(circles, tmp_path)
-    for name, value in changes.items():  # as tyro never would
+    for name, value in changes.items():  # in tests, the checks of types would refuse a wrong choice first
         object.__setattr__(settings, name, value)
     with pytest.raises(UserError) as error:
-        settings.check()
+        settings.__post_init__()
     assert str(error.value) == message
 
 
 def test_a_card_without_bfloat16_is_refused(circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: False)
-    config(circles, tmp_path, device="cuda").check()
+    config(circles, tmp_path, device="cuda")
     with pytest.raises(UserError, match="device 'cuda' has no bfloat16 arithmetic; use --precision float32"):
-        config(circles, tmp_path, device="cuda", precision="bfloat16").check()
+        config(circles, tmp_path, device="cuda", precision="bfloat16")
 
 
 # --- The process ------------------------------------------------------------------------------------------------------
@@ -208,6 +209,7 @@ def test_the_process_is_tuned_for_its_device(
     circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str
 ):
     called: list[str] = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(training, "tune", called.append)
     monkeypatch.setattr(training, "load_data", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
@@ -228,11 +230,13 @@ def test_background_work_ends_with_the_run(circles: Path, tmp_path: Path, monkey
 
 def test_precision_is_part_of_a_row_and_the_machine_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("predictor.suite._fingerprint", str)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: True)
     row = next(r for r in TABLES["springs"].rows if r.key == "dgvae")
     suite = SuiteConfig("springs", tmp_path, tmp_path)
     assert row_config(replace(suite, precision="bfloat16"), row, tmp_path).precision == "bfloat16"
     folders = [
         row_folder(s, row)
-        for s in (suite, replace(suite, precision="bfloat16"), replace(suite, device="cuda"), replace(suite, jobs=1))
+        for s in (suite, replace(suite, precision="bfloat16"), replace(suite, device="cuda"), replace(suite, workers=1))
     ]
     assert folders[0] != folders[1] and folders[0] == folders[2] == folders[3]

@@ -1,5 +1,6 @@
 """Each term of the training objective in closed form, and what it is a mean over."""
 
+import inspect
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +15,12 @@ from predictor.data.windows import WindowBatch
 from predictor.errors import UserError
 from predictor.forecaster import WindowOutput
 from predictor.training.config import TrainConfig
-from predictor.training.objective import window_loss
+from predictor.training.objective import nll, window_loss
 from tests.predictor.helpers import any_model, model, random_states
 
 # Agent 1 is absent at the last of three steps, so there are 2 · 2 ordered pairs, at the first two steps.
 VALID = torch.tensor([[[True, True], [True, True], [True, False]]])
-CONFIG = TrainConfig((), Path(), variance=0.5, likelihood="gaussian", one_step_weight=1.0)
+CONFIG = TrainConfig((Path(),), Path(), variance=0.5, likelihood="gaussian", one_step_weight=1.0)
 SILENT = replace(CONFIG, kl_weight=0.0)
 
 
@@ -236,3 +237,10 @@ def test_more_attributes_than_features_are_refused():
     attributes = torch.zeros(1, 3, 2, 2, 3)
     with pytest.raises(UserError, match="restricted labelling of 3 attributes needs as many edge features, got 1"):
         terms(replace(SILENT, label_weight=1.0), batch(None, attributes), output(features=torch.zeros(1, 3, 2, 2, 1)))
+
+
+def test_an_unknown_likelihood_is_named():
+    unchecked: Any = inspect.unwrap(nll)  # shape checks would refuse it first
+    states = torch.zeros(2, 4)
+    with pytest.raises(UserError, match="likelihood must be one of gaussian, laplace, got 'gausian'"):
+        unchecked(states, states, torch.tensor([True, True]), torch.ones(4), 1.0, "gausian")

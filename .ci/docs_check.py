@@ -1,0 +1,280 @@
+"""Runs every fenced bash and python block of README.md and docs/ as written: `python .ci/docs_check.py`.
+
+Each page runs in a fresh copy of the repository, so that nothing here is overwritten and no page relies on files that
+another one left. The blocks of a page run in order and build on each other: Python's names and the shell's exported
+variables are kept. Every block is timed; a comment on the line before a block says what else to do with it:
+
+    <!-- docs-check: skip because it needs a GPU -->
+    <!-- docs-check: short: python -m envs.collect --env-id roundabout-v1 --out data --episodes 2 -->
+
+A short form (one or several lines) runs instead of its block. It must call the same programs with at least the same
+options, so that a renamed option or module is still found in the text.
+"""
+
+import argparse
+import json
+import os
+import re
+import select
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+LIMIT_S = 300.0
+"""Seconds a block may take; longer ones need a short form."""
+TAIL_LINES = 25
+OTHER_LANGUAGES = ("text", "json", "toml", "yaml", "bibtex", "mermaid", "markdown", "diff", "make", "csv")
+"""Languages of blocks that are not run."""
+
+_BLOCK = re.compile(
+    r"(?:^[ \t]*<!--\s*docs-check:(?P<note>.*?)-->[ \t]*\n)?"
+    r"^(?P<indent>[ \t]*)```(?P<language>\S*)[ \t]*\n(?P<code>.*?)^[ \t]*```[ \t]*$",
+    flags=re.MULTILINE | re.DOTALL,
+)
+_COMMAND = re.compile(r"^\s*(?:\$ |>>> |python3? |pip |make |git |export |tensorboard )", flags=re.MULTILINE)
+_WORKER = """
+import contextlib, json, os, sys, traceback
+names, answers = {"__name__": "__docs__"}, os.fdopen(os.dup(1), "w")
+os.dup2(2, 1)
+for line in sys.stdin:
+    request = json.loads(line)
+    os.environ.clear(), os.environ.update(request["environment"])
+    sys.path[:0] = [p for p in os.environ.get("PYTHONPATH", "").split(os.pathsep) if p and p not in sys.path]
+    try:
+        exec(compile(request["code"], request["where"], "exec"), names)
+        error = ""
+    except BaseException:
+        error = traceback.format_exc()
+    print(json.dumps(error), file=answers, flush=True)
+"""
+"""Executes Python blocks in one namespace; what they print goes to standard error, the answers to standard output."""
+
+
+class DocsError(Exception):
+    """A block that fails, or an annotation that cannot be obeyed."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of a page."""
+
+    page: str
+    """Path of the page."""
+    line: int
+    """Line of the opening fence."""
+    language: str
+    """Language behind the fence."""
+    code: str
+    """Text of the block."""
+    note: str = ""
+    """Annotation on the line before the fence, without "docs-check:"."""
+
+    @property
+    def where(self) -> str:
+        """Page and line."""
+        return f"{self.page}:{self.line}"
+
+    @property
+    def skipped(self) -> str:
+        """Reason for which the block is not run; empty if it is run."""
+        return self.note.removeprefix("skip because ") if self.note.startswith("skip because ") else ""
+
+    @property
+    def to_run(self) -> str:
+        """Code to run: the block, or its short form.
+
+        Raises:
+            DocsError: the annotation is unknown, or the short form leaves out a program or an option of the block.
+        """
+        if not self.note:
+            return self.code
+        kind, _, short = self.note.partition("short:")
+        if kind or not short.strip():
+            raise DocsError(f"{self.where}: unknown annotation '{self.note}'; write 'short: …' or 'skip because …'")
+        if missing := sorted(programs_and_options(self.code) - programs_and_options(short)):
+            raise DocsError(f"{self.where}: the short form must also have {', '.join(missing)}, as the block does")
+        return short.strip() + "\n"
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a block fared."""
+
+    block: Block
+    seconds: float
+    error: str = ""
+    """Empty if the block ran to its end."""
+
+    def __str__(self) -> str:
+        """One line; for a failure, the end of its output besides."""
+        if self.block.skipped:
+            return f"{self.block.where:32} {self.block.language:6}   skipped because {self.block.skipped}"
+        short = ", short form" if self.block.note else ""
+        verdict = f"FAILED\n{self.error}" if self.error else f"ok{short}"
+        return f"{self.block.where:32} {self.block.language:6} {self.seconds:6.1f} s  {verdict}"
+
+
+def programs_and_options(code: str) -> set[str]:
+    """Returns the modules and scripts that lines of bash run, and the names of their options."""
+    found: set[str] = set()
+    for line in code.replace("\\\n", " ").splitlines():
+        words = shlex.split(line, comments=True)
+        found |= {word.partition("=")[0] for word in words if re.match(r"--[a-z]", word)}
+        found |= {after for word, after in zip(words, words[1:], strict=False) if word in ("-m", "make")}
+        found |= {word for word in words if word.endswith((".py", ".sh"))}
+    return found
+
+
+def blocks_of(page: Path, root: Path = ROOT) -> list[Block]:
+    """Returns the fenced bash and python blocks of a page.
+
+    Raises:
+        DocsError: a block with commands has no language, or a language is unknown here.
+    """
+    text, name, found = page.read_text(encoding="utf-8"), page.relative_to(root).as_posix(), []
+    for match in _BLOCK.finditer(text):
+        indent, language, code = match["indent"], match["language"], match["code"]
+        fence = text.count("\n", 0, match.start("language")) + 1
+        if language in ("bash", "python"):
+            dedented = re.sub(f"^{indent}", "", code, flags=re.MULTILINE)
+            found.append(Block(name, fence, language, dedented, (match["note"] or "").strip()))
+        elif language and language not in OTHER_LANGUAGES:
+            raise DocsError(f"{name}:{fence}: blocks of '{language}' are not known; write bash, python or text")
+        elif not language and _COMMAND.search(code):
+            raise DocsError(f"{name}:{fence}: a block with commands needs a language (bash or python) behind its fence")
+    return found
+
+
+class Page:
+    """The state that the blocks of a page share: a folder, exported variables, Python's names."""
+
+    def __init__(self, folder: Path, limit_s: float = LIMIT_S) -> None:
+        """Start Python in the folder; `python` on the path is the interpreter that runs this check."""
+        path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+        self.folder, self.limit_s = folder, limit_s
+        self.environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"PATH": path}
+        self._python: subprocess.Popen[str] | None = None
+        self._printed = tempfile.TemporaryFile("w+")
+
+    def run(self, block: Block) -> Result:
+        """Runs a block; a failure is part of the result."""
+        if block.skipped:
+            return Result(block, 0.0)
+        began, code = time.monotonic(), block.code
+        try:
+            code = block.to_run
+            error = self._run_bash(code) if block.language == "bash" else self._run_python(code, block.where)
+        except DocsError as wrong:
+            error = str(wrong)
+        tail = "\n".join(error.splitlines()[-TAIL_LINES:])
+        return Result(block, time.monotonic() - began, f"{code}{tail}" if error else "")
+
+    def close(self) -> None:
+        """End Python."""
+        self._stop_python()
+        self._printed.close()
+
+    def _stop_python(self) -> None:
+        if self._python is not None:
+            self._python.kill()
+            self._python.communicate()
+            self._python = None
+
+    def _run_bash(self, code: str) -> str:
+        with tempfile.NamedTemporaryFile() as exported:
+            command = ["bash", "-euo", "pipefail", "-c", f"{code}\nenv -0 > {shlex.quote(exported.name)}"]
+            try:
+                done = subprocess.run(
+                    command, cwd=self.folder, env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                    stdin=subprocess.DEVNULL, text=True, timeout=self.limit_s,
+                )  # fmt: skip
+            except subprocess.TimeoutExpired:
+                return self._too_long
+            if done.returncode:
+                return f"{done.stdout}\nexit status {done.returncode}"
+            pairs = [line.partition("=") for line in Path(exported.name).read_text().split("\0") if line]
+            self.environment = {name: value for name, _, value in pairs}
+        return ""
+
+    def _run_python(self, code: str, where: str) -> str:
+        if self._python is None:
+            self._python = subprocess.Popen(
+                [sys.executable, "-c", _WORKER], cwd=self.folder, env=self.environment, text=True,
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._printed,
+            )  # fmt: skip
+        assert self._python.stdin is not None and self._python.stdout is not None
+        request = {"code": code, "where": where, "environment": self.environment}
+        print(json.dumps(request), file=self._python.stdin, flush=True)
+        answered = bool(select.select([self._python.stdout], [], [], self.limit_s)[0])
+        answer = self._python.stdout.readline() if answered else ""
+        if answer:
+            return str(json.loads(answer))
+        self._stop_python()
+        if not answered:
+            return self._too_long
+        self._printed.seek(0)
+        return f"{self._printed.read()}\nPython died"
+
+    @property
+    def _too_long(self) -> str:
+        return f"took more than {self.limit_s:.0f} s: give the block a short form"
+
+
+def copy_tree(target: Path, root: Path = ROOT) -> None:
+    """Copies what a clone would hold, uncommitted changes included."""
+    listed = ["git", "-C", str(root), "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    for name in filter(None, subprocess.check_output(listed, text=True).split("\0")):
+        if (root / name).is_file():  # a file may be deleted and not committed yet
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(root / name, target / name)
+
+
+def check(pages: Sequence[Path], limit_s: float = LIMIT_S) -> Iterator[Result]:
+    """Runs the blocks of pages of this repository, each page in its own copy.
+
+    Raises:
+        DocsError: a page has a block that cannot be understood.
+    """
+    every = {page: blocks_of(page) for page in pages}  # a block that cannot be understood is said before anything runs
+    for blocks in every.values():
+        if not blocks:
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            copy_tree(Path(folder))
+            page = Page(Path(folder), limit_s)
+            try:
+                yield from map(page.run, blocks)
+            finally:
+                page.close()
+
+
+def main() -> int:
+    """Entry point; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("pages", nargs="*", type=Path, help="pages to check; all of README.md and docs/ if left out")
+    parser.add_argument("--limit-s", type=float, default=LIMIT_S, help="seconds that a block may take")
+    arguments = parser.parse_args()
+    pages = [page.resolve() for page in arguments.pages] or [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    results = []
+    try:
+        for result in check(pages, arguments.limit_s):
+            print(result, flush=True)
+            results.append(result)
+    except DocsError as error:
+        print(error)
+        return 1
+    failed, skipped = sum(bool(r.error) for r in results), sum(bool(r.block.skipped) for r in results)
+    ran, seconds = len(results) - failed - skipped, sum(result.seconds for result in results)
+    print(f"{len(results)} blocks in {seconds:.0f} s: {ran} ran, {skipped} skipped, {failed} failed")
+    return 1 if failed or not results else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,155 @@
+"""Builds the wheel and tries each extra in a fresh virtual environment: `python .ci/install_check.py`.
+
+Every environment gets the wheel with one extra, at the versions of constraints.txt, and runs that extra's commands in
+an empty folder, where the repository is out of sight. What an extra must not bring is checked as well: otherwise a
+command could need it without saying so. `--only core envs` tries some of them.
+"""
+
+import argparse
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import venv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+SPRINGS = "predictor.data.springs --out springs --train 40 --val 8 --test 8 --ood 4"
+TRAIN = "predictor.train --data springs/train --out run --steps 4 --eval-every 2 --batch-size 4 --val-windows 8"
+EVALUATE = "predictor.evaluate --checkpoint run/checkpoint --data springs/test --out report --max-windows 16"
+WRAPPED = """
+from envs import ForecastObservation, make_env
+observation, _ = ForecastObservation(make_env("{env_id}")).reset(seed=0)
+assert observation["forecast"].shape[-1] == 2
+"""
+WITHOUT_ENVPOOL = """
+from envs import make_env
+from predictor import UserError
+try:
+    make_env("envpool/HighwayFast-v0")
+except UserError as error:
+    assert "pip install" in str(error), error
+else:
+    raise SystemExit("made an environment of EnvPool, which is not installed")
+"""
+
+
+@dataclass(frozen=True)
+class Extra:
+    """One way to install the package, and what must work then."""
+
+    commands: Sequence[str]
+    """Commands to run one after the other in one folder: "module --option", or Python code if it has several lines."""
+    absent: Sequence[str] = ()
+    """Modules that this extra must not bring."""
+
+
+EXTRAS: dict[str, Extra] = {
+    "core": Extra(
+        (
+            *(f"predictor.{door} --help" for door in ("train", "evaluate", "suite", "interpret", "card")),
+            "\nfrom predictor import *\n",
+            SPRINGS,
+            TRAIN,
+            EVALUATE,
+        ),
+        absent=("gymnasium", "pettingzoo", "highway_env", "stable_baselines3", "envpool"),
+    ),
+    "scores": Extra(
+        ("\nfrom predictor.evaluation.disentanglement import dci\nimport sklearn\n",), absent=("gymnasium",)
+    ),
+    "envs": Extra(
+        (
+            WRAPPED.format(env_id="highway-fast-v0"),
+            WITHOUT_ENVPOOL,
+            "envs.collect --env-id highway-fast-v0 --out data --episodes 2 --max-steps 12 --workers 1",
+            "envs.evaluate --env-ids highway-fast-v0 --checkpoint highway --episodes 1 --max-steps 8 --workers 1",
+        ),
+        absent=("stable_baselines3", "envpool"),
+    ),
+    "rl": Extra(
+        (
+            "\nfrom agents import *\nfrom envs import VecForecast, ParallelVecEnv\n",
+            "train_policy --steps 128 --selections 1 --selection-episodes 1 --eval-episodes 2",
+        ),
+        absent=("envpool",),
+    ),
+    "envpool": Extra((WRAPPED.format(env_id="envpool/HighwayFast-v0"), "\nfrom envs import EnvPoolVecEnv\n")),
+}
+"""Name of an extra → what it must be able to do; "core" is the package alone."""
+
+
+def run(command: Sequence[str | Path], folder: Path) -> None:
+    """Runs a command in a folder.
+
+    Raises:
+        RuntimeError: it failed; the message ends with the last lines of its output.
+    """
+    done = subprocess.run(
+        [str(part) for part in command], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    if done.returncode:
+        tail = "\n".join(done.stdout.splitlines()[-25:])
+        raise RuntimeError(f"{' '.join(map(str, command[1:]))}\nended with status {done.returncode}:\n{tail}")
+
+
+def build_wheel(folder: Path) -> Path:
+    """Builds the wheel of this tree into a folder, from a copy: an old build/ here would add modules that are gone."""
+    listed = ["git", "-C", str(ROOT), "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    for name in filter(None, subprocess.check_output(listed, text=True).split("\0")):
+        if (ROOT / name).is_file():  # a file may be deleted and not committed yet
+            (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, folder / "source" / name)
+    run(
+        [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, folder / "source"], folder
+    )
+    (wheel,) = folder.glob("*.whl")
+    return wheel
+
+
+def try_extra(name: str, wheel: Path, folder: Path) -> None:
+    """Installs the wheel with an extra into a new environment below `folder` and runs the extra's commands.
+
+    Raises:
+        RuntimeError: it cannot be installed, a command fails, or a module is there that must be absent.
+    """
+    extra, python, work = EXTRAS[name], folder / "venv" / "bin" / "python", folder / "work"
+    work.mkdir()
+    venv.create(folder / "venv", with_pip=True)
+    target = str(wheel) if name == "core" else f"{wheel}[{name}]"
+    run([python, "-m", "pip", "install", "--quiet", "-c", ROOT / "constraints.txt", target], work)
+    for module in extra.absent:
+        code = f"import importlib.util, sys; sys.exit(importlib.util.find_spec({module!r}) is not None)"
+        try:
+            run([python, "-c", code], work)
+        except RuntimeError:
+            raise RuntimeError(f"'{name}' brings {module}, which it must not") from None
+    for command in extra.commands:
+        run([python, "-c", command] if "\n" in command else [python, "-m", *command.split()], work)
+
+
+def main() -> int:
+    """Entry point; returns the number of extras that failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="+", choices=list(EXTRAS), default=list(EXTRAS), help="extras to try")
+    names, failed = parser.parse_args().only, 0
+    with tempfile.TemporaryDirectory() as built:
+        wheel = build_wheel(Path(built))
+        for name in names:
+            began = time.monotonic()
+            with tempfile.TemporaryDirectory() as folder:
+                try:
+                    try_extra(name, wheel, Path(folder))
+                    verdict = "ok"
+                except RuntimeError as error:
+                    verdict, failed = f"FAILED: {error}", failed + 1
+            print(f"{name:8} {time.monotonic() - began:5.0f} s  {verdict}", flush=True)
+    print(f"{len(names) - failed} of {len(names)} installations work")
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main())

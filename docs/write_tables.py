@@ -1,0 +1,118 @@
+"""Writes the tables of README.md, docs/in_env.md and the checkpoints' cards: `python docs/write_tables.py [--check]`.
+
+Every number comes from a record, predictor/pretrained/NAME/in_env.json, which `python -m predictor.card` fills. Tables
+stand between `<!-- table: NAME -->` and `<!-- end -->`. With `--check` nothing is written: the exit status is 1 if a
+page differs from its records.
+"""
+
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS  # noqa: E402
+from predictor.errors import UserError, run_entry_point  # noqa: E402
+from predictor.evaluation.in_env_record import FILE_NAME, Measurement, read_record  # noqa: E402
+from predictor.files import write_text  # noqa: E402
+from predictor.reports.in_env_tables import COLUMNS, card_section, measurement_table, metres, replace_tables  # noqa: E402
+
+PRETRAINED = Path("predictor/pretrained")
+PAGES = (Path("README.md"), Path("docs/in_env.md"))
+SERVED_BY = CHECKPOINTS | MULTIAGENT_CHECKPOINTS
+"""Id → checkpoint that ships for it, in the order of the tables."""
+SAMPLES = 20
+"""K of the tables by environment; the transfer matrix has the most likely forecast alone, K = 1."""
+
+SHORT = (
+    "env", "driver", "episodes", "horizon", "minADE₁ / minFDE₁ [m]", "nearest neighbours ADE [m]",
+    "constant velocity ADE / FDE [m]", "ADE below constant velocity (95 %)", "forecasts",
+)  # fmt: skip
+LONG = (
+    "env", "driver", "episodes", "K", "horizon", "minADE₁ (95 %) / minFDE₁ [m]", "best of K [m]",
+    "one step of history (95 %) [m]", "nearest neighbours ADE [m]", "constant velocity ADE / FDE [m]",
+    "ADE below constant velocity (95 %)", "latency median / p95 [ms]", "forecasts",
+)  # fmt: skip
+LENT = (
+    "env", "driver", "episodes", "minADE₁ [m]", "nearest neighbours ADE [m]", "constant velocity ADE / FDE [m]",
+    "ADE below constant velocity (95 %)",
+)  # fmt: skip
+
+Records = dict[str, list[Measurement]]
+"""Measurements by the name of the checkpoint."""
+
+
+def tables(records: Records) -> dict[str, str]:
+    """Returns the tables of README.md and docs/in_env.md by name."""
+    at_k = {name: [m for m in found if m.samples == SAMPLES] for name, found in records.items()}
+    own = [m for env_id, name in SERVED_BY.items() for m in at_k.get(name, []) if m.env_id == env_id]
+    return {
+        "forecasts": measurement_table(own, SHORT),
+        "forecasts-long": measurement_table(own, LONG),
+        "lent": _lent(at_k),
+        "transfer": _transfer(records),
+    }
+
+
+def pages(root: Path) -> dict[Path, tuple[str, str]]:
+    """Returns every page with tables as it is, and as the records say.
+
+    Raises:
+        UserError: a record cannot be read, or a page marks a table that is not known.
+    """
+    folders = sorted(path.parent for path in (root / PRETRAINED).glob(f"*/{FILE_NAME}"))
+    records = {folder.name: read_record(folder) for folder in folders}
+    found = {}
+    written = tables(records)
+    for path in PAGES:
+        page = (root / path).read_text()
+        found[path] = page, replace_tables(page, written)
+    for name, measurements in records.items():
+        path = PRETRAINED / name / "README.md"
+        page = (root / path).read_text()
+        shown = [m for m in measurements if m.samples == SAMPLES]
+        found[path] = page, replace_tables(page, {"accuracy": card_section(shown)})
+    return found
+
+
+def _lent(records: Records) -> str:
+    """Returns the table of ids without a checkpoint of their own, by id, each with the checkpoint measured."""
+    lines = [(m, name) for name, found in records.items() for m in found if m.env_id not in SERVED_BY]
+    heading, *rest = LENT
+    text = ["| " + " | ".join([heading, "checkpoint", *rest]) + " |", "|---" * 2 + "|---:" * len(rest) + "|"]
+    for measurement, name in sorted(lines, key=lambda line: line[0].env_id):
+        cells = [COLUMNS[column](measurement) for column in rest]
+        text.append("| " + " | ".join([measurement.env_id, name, *cells]) + " |")
+    return "\n".join(text)
+
+
+def _transfer(records: Records) -> str:
+    """Returns minADE₁ of each checkpoint (columns) in each environment (lines), and how far below constant velocity."""
+    measured = {(m.env_id, name): m for name, found in records.items() for m in found if m.samples == 1}
+    names = sorted({name for _, name in measured})
+    text = ["| env | episodes | " + " | ".join(names) + " |", "|---|---:" + "|---:" * len(names) + "|"]
+    for env_id in sorted({env_id for env_id, _ in measured}):
+        line = [measured[env_id, name] for name in names]
+        episodes = {m.episodes for m in line}
+        if len(episodes) > 1:
+            raise UserError(f"transfer to {env_id}: lines need equal episodes, got {sorted(episodes)}; measure again")
+        cells = [f"{metres(m.min_ade_m)} ({100 * (m.below_cv or 0):.0f} %)" for m in line]
+        text.append("| " + " | ".join([env_id, str(episodes.pop()), *cells]) + " |")
+    return "\n".join(text)
+
+
+def main() -> None:
+    """Entry point."""
+    arguments = sys.argv[1:]
+    if arguments not in ([], ["--check"]):
+        raise UserError(f"write_tables takes --check or nothing, got {' '.join(arguments)}")
+    changed = {path: new for path, (old, new) in pages(ROOT).items() if new != old}
+    if arguments and changed:
+        raise UserError(f"{', '.join(map(str, changed))} differ from the records; run python docs/write_tables.py")
+    for path, text in changed.items():
+        write_text(ROOT / path, text)
+    print(f"{len(changed)} pages rewritten" if changed else "all tables are as the records say")
+
+
+if __name__ == "__main__":
+    run_entry_point(main)

@@ -1,0 +1,128 @@
+"""One forward for many copies of a PettingZoo environment, which would each make its own.
+
+Copies step one after another and each wants its forecast at once. A vector environment needs none before the last copy
+has stepped: attached to a `BatchedForward`, the copies return observations whose forecast entries are missing, and
+`fill` puts them in, all copies in one batch. What each copy sees is what it would see by itself.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from envs.multiagent_observation import AgentEntries, MultiagentStream
+from envs.readers.base import MultiagentScene
+from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.forecaster import Forecaster
+from predictor.scene import Forecast
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """A scene of one environment, and what its agents' observations still lack."""
+
+    scene: MultiagentScene
+    observations: Mapping[str, dict[str, Any]]
+
+
+class BatchedForward:
+    """Forecasts for several environments whose scenes arrive one by one.
+
+    Args:
+        streams: of the environments; equal but for their noise, which goes on here.
+
+    Attributes:
+        stream: history and noise of all environments.
+    """
+
+    def __init__(self, streams: Sequence[MultiagentStream]) -> None:
+        """Start with empty memory."""
+        first = streams[0]
+        view = first.view_spec
+        self.stream = MultiagentStream(
+            first.forecaster, first.scene_spec, first.config, view.perception_m, view.max_agents, len(streams)
+        )
+        self.stream.continue_noise(streams)
+        self._stepped: dict[int, _Moment] = {}
+        self._opened: dict[int, _Moment] = {}
+
+    def begin(
+        self, env: int, scene: MultiagentScene, observations: Mapping[str, dict[str, Any]], seed: int | None = None
+    ) -> None:
+        """Note the first scene of an environment's episode; a seed restarts its noise."""
+        if env in self._opened or seed is not None:
+            self.fill()
+        if seed is not None:
+            self.stream.seed([seed if i == env else None for i in range(self.stream.num_envs)])
+        self._opened[env] = _Moment(scene, observations)
+
+    def go_on(self, env: int, scene: MultiagentScene, observations: Mapping[str, dict[str, Any]]) -> None:
+        """Note the next scene of an environment's episode."""
+        if env in self._stepped or env in self._opened:
+            self.fill()
+        self._stepped[env] = _Moment(scene, observations)
+
+    def fill(self) -> None:
+        """Put the forecast entries into all observations that were noted; an agent that is not seen gets zeros."""
+        stepped, opened = self._stepped, self._opened
+        self._stepped, self._opened = {}, {}
+        if opened.keys() <= stepped.keys() and len(stepped) == self.stream.num_envs:
+            moments = [*(stepped[env] for env in sorted(stepped)), *opened.values()]
+            self._put(moments, self._over_boundary(moments, np.array(list(opened), dtype=np.int64)))
+            return
+        for moments_of, opening in ((stepped, False), (opened, True)):
+            if moments_of:
+                envs = np.array(list(moments_of), dtype=np.int64)
+                if opening:
+                    self.stream.reset(envs)
+                moments = list(moments_of.values())
+                self._put(moments, self.stream.observe_each([moment.scene for moment in moments], envs))
+
+    def forecast_of(self, env: int) -> Forecast | None:
+        """Returns the latest forecast of an environment, a batch of one."""
+        self.fill()
+        return self.stream.forecast_of(env)
+
+    def _over_boundary(self, moments: list[_Moment], ended: np.ndarray) -> list[AgentEntries]:
+        scenes, envs = [moment.scene for moment in moments], self.stream.num_envs
+        if not len(ended):
+            return self.stream.observe_each(scenes)
+        return self.stream.observe_boundary(scenes[:envs], ended, scenes[envs:])
+
+    def _put(self, moments: list[_Moment], entries: list[AgentEntries]) -> None:
+        for moment, seen in zip(moments, entries, strict=True):
+            for agent, observation in moment.observations.items():
+                observation.update(seen[agent] if agent in seen else self.stream.nothing_seen())
+
+
+def can_share(streams: Sequence[MultiagentStream]) -> bool:
+    """Whether one `BatchedForward` gives each of these what it gives by itself: equal views and equal networks."""
+    first = streams[0]
+    return all(
+        (one.scene_spec, one.view_spec, replace(one.config, seed=0))
+        == (first.scene_spec, first.view_spec, replace(first.config, seed=0))
+        and _equal(one.forecaster, first.forecaster)
+        for one in streams
+    )
+
+
+def _equal(one: Forecaster, other: Forecaster) -> bool:
+    if one is other:
+        return True
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, ConstantVelocity):
+        return vars(one) == vars(other)
+    if not isinstance(one, nn.Module) or not isinstance(other, nn.Module):
+        return False
+    settings = [(f.spec, f.horizon_steps, getattr(f, "config", None)) for f in (one, other)]
+    weights, others = one.state_dict(), other.state_dict()
+    return (
+        settings[0] == settings[1]
+        and bool(weights)
+        and weights.keys() == others.keys()
+        and all(torch.equal(tensor, others[name]) for name, tensor in weights.items())
+    )

@@ -1,0 +1,111 @@
+"""Shared parts of all wrappers with forecasts: the layout of an observation, the forecast behind it, and copies."""
+
+from collections.abc import Mapping
+from copy import deepcopy
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.scene_stream import SceneStream
+from predictor.errors import ProtocolError, UserError
+from predictor.forecaster import Forecaster
+from predictor.scene import Forecast, SceneBatch
+
+
+class ForecastWrapper:
+    """Base of `ForecastObservation`, `ForecastParallelEnv`, `VecForecast` and `VectorForecast`.
+
+    A deep copy continues exactly as the original would, and shares only the forecaster, which no step changes. A pickle
+    continues likewise and carries the forecaster's weights.
+
+    Attributes:
+        stream: history and noise of each environment.
+    """
+
+    stream: SceneStream
+
+    @property
+    def forecaster(self) -> Forecaster:
+        """Makes the forecasts."""
+        return self.stream.forecaster
+
+    @property
+    def forecast(self) -> Forecast:
+        """The forecast behind the latest observation: one entry per environment, agents as in `scene`, world axes."""
+        if self.stream.forecast is None:
+            raise ProtocolError("there is no forecast yet; call reset() first")
+        return self.stream.forecast
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+        """Returns a copy with its own environment, history and noise."""
+        memo[id(self.forecaster)] = self.forecaster
+        twin = object.__new__(type(self))
+        memo[id(self)] = twin
+        state: Any = self.__getstate__()
+        twin.__setstate__(deepcopy(state, memo))
+        return twin
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns what a copy or a pickle keeps."""
+        state: Any = super().__getstate__()
+        return dict(state)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copy or a pickle; wrappers that look attributes up in what they wrap would look for this there."""
+        restore = getattr(super(), "__setstate__", self.__dict__.update)
+        restore(state)
+
+    def _scenes(self) -> SceneBatch:
+        """The scenes of all environments behind the latest observation."""
+        if self.stream.scenes is None:
+            raise ProtocolError("there is no scene yet; call reset() first")
+        return self.stream.scenes
+
+
+class ObservationLayout:
+    """A policy's observation: the environment's own and the forecast entries, as a Dict or as one Box.
+
+    Args:
+        own: space of the environment's own observation.
+        entries: spaces of the forecast entries.
+        flatten: one Box, in the Dict's key order.
+
+    Attributes:
+        space: of one observation.
+        dict_space: its space before it is flattened.
+    """
+
+    def __init__(self, own: gym.Space, entries: Mapping[str, gym.Space], flatten: bool) -> None:
+        """Put the space together."""
+        self.dict_space = gym.spaces.Dict({"observation": own, **entries})
+        self._flatten = flatten
+        self.space: gym.Space = gym.spaces.flatten_space(self.dict_space) if flatten else self.dict_space
+
+    def one(self, own: Any, entries: Mapping[str, NDArray[Any]]) -> Any:
+        """Returns one environment's observation."""
+        full = {"observation": own, **entries}
+        return gym.spaces.flatten(self.dict_space, full) if self._flatten else full
+
+    def batch(self, own: Any, entries: Mapping[str, NDArray[Any]]) -> Any:
+        """Returns the observations of many environments, stacked."""
+        full = {"observation": own, **entries}
+        if not self._flatten:
+            return full
+        return np.concatenate([_flattened(space, full[key]) for key, space in self.dict_space.spaces.items()], axis=1)
+
+
+def _flattened(space: gym.Space, stacked: Any) -> NDArray[Any]:
+    if isinstance(space, gym.spaces.Box):
+        return np.asarray(stacked, space.dtype).reshape(len(stacked), -1)
+    return np.stack([np.asarray(gym.spaces.flatten(space, one)) for one in stacked])
+
+
+def refuse_reader(reader: Any, wrapper: str) -> None:
+    """Raise a `UserError` if a wrapper whose environments report their scenes is given a reader."""
+    if reader is not None:
+        raise UserError(
+            f"{wrapper} takes no reader: its environments report their scenes, possibly from other processes; give "
+            "reader= to SceneObservation, for example with wrapper_kwargs={'reader': ...} of make_vec_env"
+        )

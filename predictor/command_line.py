@@ -1,0 +1,114 @@
+"""Turns the words of a command line into a config: tyro's options, errors in one line, old names of options.
+
+A config checks itself in `__post_init__`. tyro draws a box around such an error and exits; `parse` raises the error
+itself, so that `predictor.errors.run_entry_point` prints one line and exits with status 2.
+"""
+
+import contextlib
+import io
+import itertools
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import TypeVar, get_type_hints
+
+import tyro
+
+from predictor.errors import UserError
+
+Config = TypeVar("Config")
+
+_SAID_IN_A_SENTENCE = ("Invalid choice", "Missing argument", "Value error")
+"""Titles of tyro's boxes whose first part is a sentence; the other boxes list options and stay as they are."""
+
+
+@dataclass(frozen=True)
+class Renamed:
+    """Marks a config's field whose option had another name: `num_envs: Annotated[int, Renamed("envs")] = 1`.
+
+    The old option works for one release and says on stderr what it is called now.
+    """
+
+    old: str
+    """Former name of the field; the option is --old-name."""
+
+
+def parse(config_class: type[Config], description: str | None = None, args: Sequence[str] | None = None) -> Config:
+    """Reads a config from the command line.
+
+    Args:
+        config_class: dataclass with a string under every field.
+        description: text at the head of `--help`.
+        args: words of the command line; None takes those of this process.
+
+    Raises:
+        UserError: a value that the config refuses, or that is not of its field's type.
+        SystemExit: unknown or missing options (status 2, listed on stderr), or `--help` (status 0).
+    """
+    words = with_new_names(config_class, sys.argv[1:] if args is None else args)
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(config_class, description=description, args=words)
+    except SystemExit as leaving:
+        if (error := _user_error_behind(leaving)) is not None:
+            raise error from None
+        if sentence := _sentence_in(said.getvalue()):
+            raise UserError(sentence) from None
+        print(said.getvalue(), end="", file=sys.stderr)
+        raise
+
+
+def with_new_names(config_class: type, words: Sequence[str]) -> list[str]:
+    """Returns the words with options' old names replaced; prints a line on stderr for each."""
+    new_names = renamed_options(config_class)
+    replaced = []
+    for word in words:
+        name, equals, value = word.partition("=")
+        spelled = name.replace("_", "-")
+        if name.startswith("--") and spelled in new_names:
+            print(f"option {name} is now {new_names[spelled]}; the next release drops {name}", file=sys.stderr)
+            word = new_names[spelled] + equals + value
+        replaced.append(word)
+    return replaced
+
+
+def renamed_options(config_class: type) -> dict[str, str]:
+    """Returns the new option of each old one, such as {"--envs": "--num-envs"}."""
+    hints = get_type_hints(config_class, include_extras=True)
+    renamed: dict[str, str] = {}
+    for field in fields(config_class):
+        for mark in getattr(hints[field.name], "__metadata__", ()):
+            if isinstance(mark, Renamed):
+                renamed[_option(mark.old)] = _option(field.name)
+                if hints[field.name].__origin__ is bool:
+                    renamed[_option(f"no_{mark.old}")] = _option(f"no_{field.name}")
+    return renamed
+
+
+def _option(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def _user_error_behind(error: BaseException | None) -> UserError | None:
+    """Returns the `UserError` while handling which this exception was raised."""
+    while error is not None and not isinstance(error, UserError):
+        error = error.__context__
+    return error
+
+
+def _sentence_in(box: str) -> str:
+    """Returns what a box of tyro says in a sentence, without its frame; empty for a box that lists options."""
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines()
+    if not lines or lines[0].strip("╭─╮+- ") not in _SAID_IN_A_SENTENCE:
+        return ""
+    inside = [line.strip("│ ") for line in lines[1:]]
+    after_title = itertools.dropwhile(_is_rule, inside)
+    sentence = itertools.takewhile(lambda line: not _is_rule(line), after_title)
+    return " ".join(sentence).removeprefix("Error parsing ")
+
+
+def _is_rule(line: str) -> bool:
+    """Returns whether a line of a box is empty or a rule; tyro draws with ASCII where stdout has nothing else."""
+    return not line.strip("╰╯─-")

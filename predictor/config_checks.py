@@ -1,0 +1,81 @@
+"""Checks that configs call in `__post_init__`; each raises a `UserError` that names the field and its value.
+
+They look at values alone. What a file system or a run must fulfil is checked by the function that uses the config.
+"""
+
+import math
+import types
+from dataclasses import fields
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from predictor.errors import UserError
+
+
+def check_choices(config: Any) -> None:
+    """Checks every field whose type is a `Literal`, also inside an optional or a tuple.
+
+    Raises:
+        UserError: a value that the type does not list.
+    """
+    for name, allowed in _closed_fields(type(config)).items():
+        value = getattr(config, name)
+        for given in value if isinstance(value, tuple) else (value,):
+            check_choice(name, given, allowed)
+
+
+def check_choice(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
+    """Checks one value.
+
+    Raises:
+        UserError: it is not among the allowed ones.
+    """
+    if value not in allowed:
+        listed = ", ".join(str(choice) for choice in allowed if choice is not None)
+        raise UserError(f"{name} must be one of {listed}, got '{value}'")
+
+
+def check_at_least(config: Any, least: int, *names: str) -> None:
+    """Checks that numbers, or all entries of tuples, are finite and not below a bound; None passes.
+
+    Raises:
+        UserError: one is.
+    """
+    bound = f"be at least {least}" if least else "not be negative"
+    for name in names:
+        value = getattr(config, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is not None and not least <= number < math.inf:
+                raise UserError(f"{name} must {bound}, got {value}")
+
+
+def check_positive(config: Any, *names: str) -> None:
+    """Checks that numbers are finite and above zero; None passes.
+
+    Raises:
+        UserError: one is not.
+    """
+    for name in names:
+        value = getattr(config, name)
+        if value is not None and not 0 < value < math.inf:
+            raise UserError(f"{name} must be positive, got {value}")
+
+
+def _closed_fields(config_class: type) -> dict[str, tuple[Any, ...]]:
+    """Returns the choices of each field that has a closed list of them."""
+    hints = get_type_hints(config_class)
+    found = {field.name: _choices(hints[field.name]) for field in fields(config_class)}
+    return {name: allowed for name, allowed in found.items() if allowed}
+
+
+def _choices(kind: Any) -> tuple[Any, ...]:
+    """Returns what a type lists; empty if it is open."""
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return arguments
+    if origin is tuple and len(arguments) == 2 and arguments[1] is Ellipsis:
+        return _choices(arguments[0])
+    if origin in (Union, types.UnionType):
+        listed = [(None,) if part is type(None) else _choices(part) for part in arguments]
+        closed = all(listed) and any(part != (None,) for part in listed)
+        return tuple(choice for part in listed for choice in part) if closed else ()
+    return ()

@@ -1,0 +1,145 @@
+"""Accuracy of a checkpoint in live environments, kept beside its weights as `in_env.json`.
+
+`python -m envs.evaluate` writes accuracy.json; `python -m predictor.card` takes what the tables show from it into the
+record. The cards and the tables of README.md and docs/in_env.md are written from the records alone.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from predictor.errors import UserError
+from predictor.files import write_json
+
+FILE_NAME = "in_env.json"
+
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Accuracy in one environment, with one driver and one number of samples; None where it was not measured."""
+
+    env_id: str
+    """Environment."""
+    driver: str
+    """Who drove."""
+    episodes: int
+    """Number of episodes."""
+    samples: int
+    """K of `best_of_k_m`."""
+    command: str
+    """Command that measured it."""
+    commit: str
+    """Commit at which it was measured, or the first and the last that it may have been; empty if not recorded."""
+    constant_velocity_ade_m: float | None = None
+    """ADE of constant velocity on the same scenes [m]."""
+    constant_velocity_fde_m: float | None = None
+    """FDE of constant velocity [m]."""
+    min_ade_m: float | None = None
+    """ADE of the most likely forecast (K = 1) [m]."""
+    min_ade_interval_m: Interval | None = None
+    """95 % bootstrap interval of `min_ade_m` over episodes [m]."""
+    min_fde_m: float | None = None
+    """FDE of the most likely forecast [m]."""
+    best_of_k_m: float | None = None
+    """minADE of the best of K samples [m]."""
+    one_step_m: float | None = None
+    """ADE (K = 1) with a memory of one step [m]."""
+    one_step_interval_m: Interval | None = None
+    """95 % bootstrap interval of `one_step_m` over episodes [m]."""
+    neighbours_m: float | None = None
+    """ADE of nearest neighbours, fitted to the checkpoint's training data [m]."""
+    below_cv: float | None = None
+    """1 − `min_ade_m` / `constant_velocity_ade_m`."""
+    below_cv_interval: Interval | None = None
+    """95 % bootstrap interval of `below_cv` over episodes."""
+    latency_ms: Interval | None = None
+    """Median and 95th percentile of the time of one forecast [ms]."""
+    forecasts: int | None = None
+    """Number of forecasts behind `min_ade_m`."""
+    horizon_steps: int | None = None
+    """Number of steps forecast."""
+    dt_s: float | None = None
+    """Length of a step [s]."""
+    note: str = ""
+    """What a reader of the number has to know; printed under the tables."""
+
+    @property
+    def key(self) -> tuple[str, str, int]:
+        """What a later measurement of the same thing has in common with this one."""
+        return self.env_id, self.driver, self.samples
+
+
+def measurements_of(accuracy: dict[str, Any], checkpoint: str) -> list[Measurement]:
+    """Returns what the content of an accuracy.json of `envs.evaluate` says about a checkpoint.
+
+    Raises:
+        KeyError, TypeError: it is not such a file.
+    """
+    rows = [row for row in accuracy["results"] if row["checkpoint"] == checkpoint]
+    return [_measurement(row, accuracy["config"], accuracy["provenance"]) for row in rows]
+
+
+def read_record(folder: Path) -> list[Measurement]:
+    """Reads `in_env.json` of a checkpoint's folder; none if there is no such file.
+
+    Raises:
+        UserError: the file is not a record.
+    """
+    path = folder / FILE_NAME
+    if not path.exists():
+        return []
+    try:
+        entries = json.loads(path.read_text())["measurements"]
+        return [Measurement(**{name: _frozen(value) for name, value in entry.items()}) for entry in entries]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path} is not a record of measurements ({error}); write it with python -m predictor.card"
+        ) from error
+
+
+def update_record(folder: Path, found: Sequence[Measurement]) -> list[Measurement]:
+    """Puts measurements into `in_env.json`, in place of those with the same key; returns all."""
+    new = {measurement.key: measurement for measurement in found}
+    kept = [new.pop(old.key, old) for old in read_record(folder)]
+    everything = [*kept, *new.values()]
+    entries = [{k: v for k, v in asdict(m).items() if v is not None and (k, v) != ("note", "")} for m in everything]
+    write_json(folder / FILE_NAME, {"measurements": entries})
+    return everything
+
+
+def _measurement(row: dict[str, Any], config: dict[str, Any], made: dict[str, Any]) -> Measurement:
+    one, straight = row["model"], row["constant_velocity"]
+    short = (row.get("histories") or {}).get("1") or {}
+    near = row.get("nearest_neighbours") or {}
+    median_ms, p95_ms = row.get("latency_median_ms"), row.get("latency_p95_ms")
+    return Measurement(
+        env_id=row["env_id"],
+        driver=row.get("driver") or config["ego"],
+        episodes=config["episodes"],
+        samples=config["num_samples"] if "num_samples" in config else config["samples"],  # its name until version 0.1
+        command=made["command"],
+        commit=made.get("commit") or "",
+        constant_velocity_ade_m=straight["min_ade_m"],
+        constant_velocity_fde_m=straight["min_fde_m"],
+        min_ade_m=one["min_ade_m"],
+        min_ade_interval_m=_frozen((one.get("intervals") or {}).get("min_ade_m")),
+        min_fde_m=one["min_fde_m"],
+        best_of_k_m=row["model_samples"]["min_ade_m"],
+        one_step_m=short.get("min_ade_m"),
+        one_step_interval_m=_frozen((short.get("intervals") or {}).get("min_ade_m")),
+        neighbours_m=near.get("min_ade_m"),
+        below_cv=row["reduction"],
+        below_cv_interval=_frozen(row["reduction_interval"]),
+        latency_ms=None if median_ms is None or p95_ms is None else (median_ms, p95_ms),
+        forecasts=one.get("agents"),
+        horizon_steps=len(one["by_step_m"]) if one.get("by_step_m") else None,
+        dt_s=row.get("dt_s"),
+    )
+
+
+def _frozen(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value

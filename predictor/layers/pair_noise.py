@@ -1,0 +1,72 @@
+"""Noise for samples of a batch of scenes in which each scene draws from a generator of its own.
+
+What a scene draws depends on its own generator, on its own present pairs and on the number of samples; other scenes of
+the batch, their order and padding have no say. All numbers of a roll-out are drawn at once, scene by scene, so that a
+scene whose forecast stands twice in a batch draws for the first one before it draws for the second.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from predictor.errors import UserError
+
+Noise = torch.Generator | Sequence[np.random.Generator]
+"""Source of the samples' noise: one generator for a whole batch, or one for each of its scenes."""
+
+
+class PairNoise:
+    """Uniform numbers in [0, 1) for the present pairs of each scene, sample and step of one roll-out.
+
+    Args:
+        generators: one per scene; a generator may be listed more than once.
+        present: which pairs are there.
+        draws: samples per scene.
+        steps: times that the roll-out draws.
+        types: numbers per pair.
+
+    Raises:
+        UserError: not one generator per scene.
+    """
+
+    def __init__(
+        self,
+        generators: Sequence[np.random.Generator],
+        present: Bool[Tensor, "scenes agents slots"],
+        draws: int,
+        steps: int,
+        types: int,
+    ) -> None:
+        """Draw for all steps; listed by scene, sample, receiver and slot."""
+        if len(generators) != len(present):
+            raise UserError(
+                f"samples need one generator per scene, got {len(generators)} generators for {len(present)} scenes"
+            )
+        pairs = (draws * present.flatten(1).sum(1)).tolist()
+        drawn = [
+            generator.random((steps, count, types), dtype=np.float32)
+            for generator, count in zip(generators, pairs, strict=True)
+        ]
+        self._steps = iter(torch.from_numpy(np.concatenate(drawn, axis=1)).to(present.device))
+        self._present = present.repeat_interleave(draws, dim=0)
+
+    def like(self, logits: Float[Tensor, "*batch types"]) -> Float[Tensor, "*batch types"]:
+        """Returns the next step's numbers: for listed present pairs, or for an array with a place for every pair."""
+        listed = next(self._steps).to(logits.dtype)
+        if logits.ndim == 2:
+            return listed
+        placed = torch.full_like(logits, 0.5)
+        placed[self._present] = listed
+        return placed
+
+
+def noise_of_pairs(
+    noise: Noise | None, present: Bool[Tensor, "scenes agents slots"], draws: int, steps: int, types: int
+) -> torch.Generator | PairNoise | None:
+    """Returns what `concrete_sample` draws from during one roll-out; see `PairNoise` for the arguments."""
+    if noise is None or isinstance(noise, torch.Generator):
+        return noise
+    return PairNoise(noise, present, draws, steps, types)

@@ -1,0 +1,30 @@
+"""Lets a package export names of its modules and import each module only when one of its names is used.
+
+`from envs import VectorForecast` must not need the packages of `envs.sb3`, so `envs/__init__.py` cannot import its
+modules. It lists them instead, and once more under `TYPE_CHECKING` for type checkers and editors.
+"""
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+
+def lazy_exports(package: str, modules: Mapping[str, Sequence[str]]) -> tuple[Callable[[str], Any], list[str]]:
+    """Makes the `__getattr__` and the `__all__` of a package.
+
+    Args:
+        package: name of the package, for the error message.
+        modules: module → names it exports.
+
+    Returns:
+        The function that imports the module of a name and returns the name's value; it raises an AttributeError for
+        other names. The sorted names.
+    """
+    module_of = {name: module for module, names in modules.items() for name in names}
+
+    def load(name: str) -> Any:
+        if name not in module_of:
+            raise AttributeError(f"module '{package}' has no attribute '{name}'")
+        return getattr(importlib.import_module(module_of[name]), name)
+
+    return load, sorted(module_of)

@@ -1,0 +1,99 @@
+"""Tables of measurements in live environments as Markdown, and their places between the markers of a page.
+
+A table of a page stands between `<!-- table: NAME -->` and `<!-- end -->`; what is between them is replaced.
+"""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+
+from predictor.errors import UserError
+from predictor.evaluation.in_env_record import Interval, Measurement
+
+MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+"""A table with its markers."""
+
+Column = Callable[[Measurement], str]
+
+
+def metres(value: float | None, interval: Interval | None = None) -> str:
+    """Returns three decimals below a metre and two above, with the interval if there is one; a dash for None."""
+    if value is None:
+        return "–"
+    return _rounded(value) + ("" if interval is None else " ({} to {})".format(*map(_rounded, interval)))
+
+
+def _rounded(value: float) -> str:
+    return f"{value:.2f}" if value >= 1 else f"{value:.3f}"
+
+
+def _per_cent(value: float | None, interval: Interval | None) -> str:
+    if value is None:
+        return "–"
+    return f"{100 * value:.0f} %" + (
+        "" if interval is None else f" ({100 * interval[0]:.0f} to {100 * interval[1]:.0f})"
+    )
+
+
+def _either(first: str, second: str) -> str:
+    return first if second == "–" else f"{first} / {second}"
+
+
+COLUMNS: dict[str, Column] = {
+    "env": lambda m: m.env_id + ("*" if m.note else ""),
+    "driver": lambda m: m.driver,
+    "episodes": lambda m: str(m.episodes),
+    "K": lambda m: str(m.samples),
+    "horizon": lambda m: "–" if m.horizon_steps is None else f"{m.horizon_steps} × {m.dt_s:g} s",
+    "minADE₁ / minFDE₁ [m]": lambda m: _either(metres(m.min_ade_m), metres(m.min_fde_m)),
+    "minADE₁ (95 %) / minFDE₁ [m]": lambda m: _either(metres(m.min_ade_m, m.min_ade_interval_m), metres(m.min_fde_m)),
+    "minADE₁ [m]": lambda m: metres(m.min_ade_m, m.min_ade_interval_m),
+    "best of K [m]": lambda m: metres(m.best_of_k_m),
+    "one step of history (95 %) [m]": lambda m: metres(m.one_step_m, m.one_step_interval_m),
+    "nearest neighbours ADE [m]": lambda m: metres(m.neighbours_m),
+    "constant velocity ADE / FDE [m]": lambda m: _either(
+        metres(m.constant_velocity_ade_m), metres(m.constant_velocity_fde_m)
+    ),
+    "ADE below constant velocity (95 %)": lambda m: _per_cent(m.below_cv, m.below_cv_interval),
+    "latency median / p95 [ms]": lambda m: "–" if m.latency_ms is None else "{:.0f} / {:.0f}".format(*m.latency_ms),
+    "forecasts": lambda m: "–" if m.forecasts is None else f"{m.forecasts:,}",
+}
+"""Every column, by its heading."""
+
+CARD = (
+    "env", "driver", "episodes", "K", "minADE₁ / minFDE₁ [m]", "best of K [m]", "nearest neighbours ADE [m]",
+    "constant velocity ADE / FDE [m]", "ADE below constant velocity (95 %)",
+)  # fmt: skip
+"""Columns of a checkpoint's card."""
+
+
+def measurement_table(measurements: Sequence[Measurement], headings: Sequence[str] = CARD) -> str:
+    """Returns a Markdown table, one line for each measurement, and the notes below it."""
+    lines = ["| " + " | ".join(headings) + " |", "|---" + "|---:" * (len(headings) - 1) + "|"]
+    lines += ["| " + " | ".join(COLUMNS[name](m) for name in headings) + " |" for m in measurements]
+    envs_of: dict[str, list[str]] = {}
+    for measurement in measurements:
+        if measurement.note:
+            envs_of.setdefault(measurement.note, []).append(measurement.env_id)
+    return "\n".join(lines) + "".join(f"\n\n\\* {', '.join(envs)}: {note}." for note, envs in envs_of.items())
+
+
+def card_section(measurements: Sequence[Measurement]) -> str:
+    """Returns the table of a checkpoint's card, and the command and commit of each line."""
+    commands = "\n".join(f"* {m.env_id}: `{m.command}`, {_commit(m)}" for m in measurements)
+    return f"{measurement_table(measurements)}\n\n{commands}"
+
+
+def _commit(measurement: Measurement) -> str:
+    return f"commit {measurement.commit}" if measurement.commit else "commit not recorded"
+
+
+def replace_tables(page: str, tables: Mapping[str, str]) -> str:
+    """Returns a page with each marked table replaced.
+
+    Raises:
+        UserError: the page marks a table that is not among `tables`.
+    """
+    unknown = [name for _, name, _ in MARKED.findall(page) if name not in tables]
+    if unknown:
+        raise UserError(f"no table is called '{unknown[0]}'; there are {', '.join(tables)}: rename the marker")
+    return MARKED.sub(lambda found: f"{found[1]}\n{tables[found[2]]}\n\n{found[3]}", page)

@@ -1,0 +1,144 @@
+"""Claims of the pages that were wrong once, each held by what it is about."""
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, MULTIAGENT_IDS
+from predictor.evaluation.paper_tables import NUM_SAMPLES
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+README = (ROOT / "README.md").read_text()
+RESULTS = (ROOT / "docs" / "results.md").read_text()
+CONTROL = "constant velocity + noise"
+STOCHASTIC = ("dG-VAE", "dVAE", "dNRI", CONTROL)
+TITLES = {  # the run that a picture's title names
+    "springs.png": "runs/springs-rl",
+    "springs_trajectories.png": "runs/springs-rl",
+    "mocap_trajectories.png": "runs/mocap-pm",
+    "mocap_features.png": "runs/mocap-pm",
+    "nba_trajectories.png": "runs/nba-pm",
+    "sdd_trajectories.png": "runs/sdd-g",
+}
+
+
+def tables(page: str) -> Iterator[list[list[str]]]:
+    """Cells of each Markdown table of a page, heading first, without the rule below it."""
+    for block in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE):
+        yield [line.strip().strip("|").split("|") for line in block.splitlines() if not line.startswith("|---")]
+
+
+def lines_with_k(page: str) -> list[list[dict[str, str]]]:
+    """Lines of each table of models, by heading."""
+    found = []
+    for heading, *lines in tables(page):
+        names = [cell.strip() for cell in heading]
+        if names[0] in ("model", "row", "5-Spring"):
+            found.append(
+                [dict(zip(names, (c.strip() for c in line), strict=True)) | {"": line[0].strip()} for line in lines]
+            )
+    return found
+
+
+@pytest.mark.parametrize("path", [p for p in PAGES if lines_with_k(p.read_text())], ids=lambda p: p.name)
+def test_every_line_of_a_table_of_models_says_how_many_forecasts_it_chooses_from(path: Path):
+    for lines in lines_with_k(path.read_text()):
+        for line in lines:
+            stochastic = line[""].replace("*", "").startswith(STOCHASTIC)
+            assert line.get("K") == str(NUM_SAMPLES if stochastic else 1), line
+
+
+def test_every_table_of_results_has_the_stochastic_control():
+    found = lines_with_k(RESULTS)
+    assert len(found) == 12  # two views and the graph, of four datasets
+    assert all(CONTROL in {line[""] for line in lines} for lines in found)
+    assert any(CONTROL in {line[""] for line in lines} for lines in lines_with_k(README))
+
+
+@pytest.mark.parametrize("title", ["NBA", "Stanford Drone Dataset", "5-Spring", "Motion capture"])
+def test_the_text_names_the_leader_at_equal_k(title: str):
+    """Which row is best in the horizon-only table, and what the bold first sentence below says of it."""
+    section = next(part for part in RESULTS.split("\n## ") if part.startswith(title))
+    horizon = lines_with_k(section)[0]
+    error = {line[""]: float(line["minADE"].split()[0]) for line in horizon if line["K"] == str(NUM_SAMPLES)}
+    leader = min(error, key=lambda name: error[name])
+    claim = section.split("### What it says")[1].strip().split("**")[1].lower()
+    assert "lead" in claim
+    assert (CONTROL in claim) == (leader == CONTROL), f"{leader} leads, but: {claim}"
+
+
+def test_what_wraps_with_one_argument_is_what_has_a_checkpoint():
+    lines = {
+        cells[0].strip(): cells[1].strip() for cells in next(t for t in tables(README) if "environments" in t[0][0])
+    }
+    one_argument = " ".join(name for name, code in lines.items() if re.search(r"\(env\)`", code))
+    for env_id in ("simple_tag_v3", "simple_spread_v3", "highway-mixed-v0"):
+        assert f"`{env_id}`" in one_argument
+    assert len([e for e in CHECKPOINTS if "mixed" not in e]) == 13 and "thirteen ids" in one_argument
+    assert [e for e in CHECKPOINTS if "mixed" in e] == ["highway-mixed-v0"]
+    assert set(MULTIAGENT_CHECKPOINTS) == {"simple_tag_v3", "simple_spread_v3", "intersection-multi-agent-v2"}
+    others = [e for e in MULTIAGENT_IDS if e not in MULTIAGENT_CHECKPOINTS]
+    named = next(name for name in lines if "nine more mpe2 ids" in name)
+    assert "pursuit" in named and len([e for e in others if "intersection" not in e and "pursuit" not in e]) == 9
+    assert "checkpoint" in lines[named]
+
+
+def test_what_the_shipped_checkpoints_use_of_the_newer_parts_is_what_their_configs_say():
+    configs = {
+        p.parent.name: json.loads(p.read_text())["config"]
+        for p in (ROOT / "predictor/pretrained").glob("*/config.json")
+    }
+    sees_changes = {name for name, config in configs.items() if config.get("change_scales")}
+    fitted = {name for name, config in configs.items() if config.get("input_scales")}
+    words = {3: "three", 6: "six"}
+    assert f"Of {len(configs)}, {words[len(sees_changes)]} see changes" in README
+    assert f"{words[len(fitted)]} of these have fitted input scales" in README and fitted <= sees_changes
+    assert all(f"`{name}`" in README.split("fitted input scales")[1].split("\n* ")[0] for name in fitted)
+    for config in configs.values():
+        assert not config.get("innovation_rounds") and not config.get("gated_messages")
+        assert config["residual"] == "constant_velocity"
+
+
+@pytest.mark.parametrize("picture", TITLES)
+def test_the_run_in_a_pictures_title_is_the_one_that_the_page_names(picture: str):
+    pages = [page for page in PAGES if f"{picture})" in page.read_text() and page.name != "README.md"]
+    assert pages
+    for page in pages:
+        assert TITLES[picture] in page.read_text(), page.name
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda p: p.name)
+def test_benchmarks_are_run_as_modules(path: Path):
+    assert not re.findall(r"python\d? benchmarks/\w+", path.read_text())
+
+
+def test_ten_tasks_lead_to_files_that_exist():
+    page = (ROOT / "docs" / "architecture.md").read_text().split("## Where does a line belong?")[1].split("\n## ")[0]
+    lines = next(tables(page))[1:]
+    assert len(lines) == 10
+    for task, where in lines:
+        named = re.findall(r"`((?:predictor|envs|agents|benchmarks)/[\w/.]*)`", where)
+        assert named and all((ROOT / path).exists() for path in named), task
+
+
+def test_every_link_to_a_file_leads_there():
+    missing = [
+        f"{page.relative_to(ROOT)}: {target}"
+        for page in PAGES
+        for target in re.findall(r"\]\(([^)#\s]+)(?:#[\w-]+)?\)", page.read_text())
+        if "://" not in target and not (page.parent / target).exists()
+    ]
+    assert missing == []
+
+
+def test_the_paper_is_named_linked_and_cited():
+    for part in (
+        "Disentangled Neural Relational Inference for Interpretable Motion Prediction",
+        "arxiv.org/abs/2401.03599",
+    ):
+        assert part in README
+    assert "@article{" in README and "Dax, Victoria M." in README

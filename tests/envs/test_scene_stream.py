@@ -1,0 +1,139 @@
+"""What all streams keep apart: the noise, history and latest forecast of each environment."""
+
+from copy import deepcopy
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envs.observation import ForecastStream
+from envs.scene_stream import ForecastConfig
+from predictor.errors import UserError
+from predictor.scene import Forecast, SceneBatch
+from tests.envs.helpers import HIGHWAY_SPEC, assert_same, random_scenes, tiny_model
+
+ENVS, SAMPLES = 3, 4
+
+
+def stream(envs: int = ENVS, seed: int = 0, samples: int = SAMPLES) -> ForecastStream:
+    return ForecastStream(tiny_model(HIGHWAY_SPEC), HIGHWAY_SPEC, envs, ForecastConfig(num_samples=samples, seed=seed))
+
+
+def scenes(seed: int, envs: int = ENVS) -> SceneBatch:
+    return random_scenes(np.random.default_rng(seed), envs, 6, present=[4] * envs)
+
+
+def of(entries: dict[str, Any], env: int) -> dict[str, Any]:
+    return {key: value[env] for key, value in entries.items()}
+
+
+def assert_shows(made: ForecastStream, env: int, alone: ForecastStream) -> None:
+    """The public forecast and scene of an environment are those of a stream that has only this one."""
+    assert made.forecast is not None and alone.forecast is not None
+    for field in fields(Forecast):
+        if (expected := getattr(alone.forecast, field.name)) is not None:
+            assert_same(getattr(made.forecast, field.name)[env].numpy(), expected[0].numpy())
+    assert made.scenes is not None and alone.scenes is not None
+    np.testing.assert_array_equal(made.scenes.states[env], alone.scenes.states[0])
+
+
+def test_an_environment_draws_what_it_draws_alone():
+    together, now = stream(seed=10), [scenes(t) for t in range(3)]
+    found = [together.observe(each) for each in now]
+    for env in range(ENVS):
+        alone = stream(envs=1, seed=10 + env)
+        for each, entries in zip(now, found, strict=True):
+            assert_same(of(entries, env), of(alone.observe(each[np.array([env])]), 0))
+
+
+def test_environments_draw_different_noise():
+    made = stream()
+    same = scenes(0, 1)[np.zeros(ENVS, dtype=np.int64)]
+    samples = made.observe(same)["forecast"]
+    np.testing.assert_allclose(samples[0, :, 0], samples[1, :, 0], atol=1e-4)
+    for one, other in ((0, 1), (0, 2), (1, 2)):
+        assert np.abs(samples[one, :, 1:] - samples[other, :, 1:]).max() > 1e-2
+
+
+def test_a_seed_restarts_the_noise_of_its_environment_only():
+    made, untouched = stream(), stream()
+    for each in (made, untouched):
+        each.observe(scenes(0))
+    made.seed([None, 77, None])
+    found, expected = made.observe(scenes(1)), untouched.observe(scenes(1))
+    assert_same(of(found, 0), of(expected, 0), tolerance=0.0)
+    assert_same(of(found, 2), of(expected, 2), tolerance=0.0)
+    assert np.abs(found["forecast"][1] - expected["forecast"][1]).max() > 1e-3
+    fresh = stream(seed=77 - 1)
+    fresh.observe(scenes(0))
+    fresh.seed(77 - 1)
+    assert_same(of(found, 1), of(fresh.observe(scenes(1)), 1), tolerance=0.0)
+
+
+def test_noise_is_not_what_an_environment_draws_from_the_same_seed():
+    """Gymnasium's generator of an environment with seed 5 is default_rng(5)."""
+    [noise] = stream(envs=1, seed=5)._noise
+    assert not np.intersect1d(noise.random(100), np.random.default_rng(5).random(100)).size
+
+
+def test_over_a_boundary_scene_and_forecast_are_those_of_the_new_episode():
+    made, first, last, opening = stream(), scenes(0), scenes(1), scenes(2, 1)
+    made.observe(first)
+    entries = made.observe_boundary(last, np.array([1]), opening)
+    alone = [stream(envs=1, seed=env) for env in range(ENVS)]
+    for env, single in enumerate(alone):
+        single.observe(first[np.array([env])])
+        assert_same(of(entries, env), of(single.observe(last[np.array([env])]), 0))
+    alone[1].reset()
+    assert_same(of(entries, ENVS), of(alone[1].observe(opening), 0))
+    for env, single in enumerate(alone):
+        assert_shows(made, env, single)
+    assert made.forecast is not None and len(made.forecast.xy) == ENVS
+
+
+def test_after_some_environments_scene_and_forecast_of_the_others_stay():
+    made, first, second = stream(), scenes(0), scenes(1, 2)
+    alone = [stream(envs=1, seed=env) for env in range(ENVS)]
+    made.observe(first)
+    made.observe(second, np.array([2, 0]))
+    for env, single in enumerate(alone):
+        single.observe(first[np.array([env])])
+    alone[2].observe(second[np.array([0])])
+    alone[0].observe(second[np.array([1])])
+    for env, single in enumerate(alone):
+        assert_shows(made, env, single)
+
+
+def test_environments_may_come_one_by_one_from_the_start():
+    made, alone = stream(), stream(envs=1, seed=2)
+    made.observe(scenes(0, 1), np.array([2]))
+    alone.observe(scenes(0, 1))
+    assert_shows(made, 2, alone)
+    assert made.forecast is not None and not made.forecast.xy[:2].any()
+
+
+def test_a_copy_continues_by_itself_and_shares_the_network():
+    made = stream()
+    made.observe(scenes(0))
+    copy = deepcopy(made)
+    assert copy.forecaster is made.forecaster
+    expected = [made.observe(scenes(t)) for t in (1, 2)]
+    for t, entries in zip((1, 2), expected, strict=True):
+        assert_same(copy.observe(scenes(t)), entries, tolerance=0.0)
+
+
+def test_a_copy_is_not_touched_by_a_reset_of_the_original():
+    made, kept = stream(), stream()
+    for each in (made, kept):
+        each.observe(scenes(0))
+    copy = deepcopy(made)
+    made.reset()
+    made.seed(9)
+    assert_same(copy.observe(scenes(1)), kept.observe(scenes(1)), tolerance=0.0)
+
+
+def test_a_negative_seed_is_named():
+    assert ForecastConfig(seed=0).seed == 0
+    with pytest.raises(UserError, match="seed must not be negative, got -1"):
+        ForecastConfig(seed=-1)

@@ -1,0 +1,57 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from predictor.errors import UserError
+from predictor.evaluation.in_env_record import FILE_NAME, Measurement, measurements_of, read_record, update_record
+
+FIRST = Measurement("toy-v0", "varied", 50, 20, "python -m envs.evaluate", "abc", 5.0, 9.0, 1.25, (1.0, 1.5), 2.5)
+
+
+def test_a_record_is_read_as_it_was_written(tmp_path: Path):
+    assert update_record(tmp_path, [FIRST]) == read_record(tmp_path) == [FIRST]
+
+
+def test_a_later_measurement_replaces_the_one_of_the_same_env_driver_and_k(tmp_path: Path):
+    again = Measurement("toy-v0", "varied", 10, 20, "later", "def", 4.0)
+    others = [Measurement("toy-v0", "idle", 50, 20, "", "", 3.0), Measurement("toy-v0", "varied", 6, 1, "", "", 3.0)]
+    update_record(tmp_path, [FIRST, *others])
+    assert update_record(tmp_path, [again]) == read_record(tmp_path) == [again, *others]
+
+
+def test_a_folder_without_a_record_has_no_measurements(tmp_path: Path):
+    assert read_record(tmp_path) == []
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"measurements": [{"env": "toy-v0"}]}', '{"measurements": 3}'])
+def test_a_file_that_is_no_record_is_refused(tmp_path: Path, content: str):
+    (tmp_path / FILE_NAME).write_text(content)
+    with pytest.raises(UserError, match=r"in_env\.json is not a record of measurements .* predictor\.card"):
+        read_record(tmp_path)
+
+
+def test_everything_that_accuracy_json_says_of_a_checkpoint_is_taken_over():
+    one = {
+        "min_ade_m": 1.0,
+        "min_fde_m": 2.0,
+        "agents": 7,
+        "by_step_m": [0.5, 2.0],
+        "intervals": {"min_ade_m": [0.5, 1.5]},
+    }
+    row = {
+        "env_id": "toy-v0", "checkpoint": "toy", "driver": "varied", "dt_s": 0.5, "model": one,
+        "model_samples": {"min_ade_m": 0.75}, "constant_velocity": {"min_ade_m": 4.0, "min_fde_m": 8.0},
+        "nearest_neighbours": {"min_ade_m": 3.0}, "histories": {"1": one | {"min_ade_m": 1.75}},
+        "reduction": 0.75, "reduction_interval": [0.5, 0.875], "latency_median_ms": 3.0, "latency_p95_ms": 9.0,
+    }  # fmt: skip
+    content = {
+        "config": {"episodes": 6, "samples": 20, "ego": None},
+        "results": [row, row | {"checkpoint": "other"}],
+        "provenance": {"command": "python -m envs.evaluate", "commit": "abc"},
+    }
+    (found,) = measurements_of(json.loads(json.dumps(content)), "toy")
+    assert found == Measurement(
+        "toy-v0", "varied", 6, 20, "python -m envs.evaluate", "abc", 4.0, 8.0, 1.0, (0.5, 1.5), 2.0, 0.75,
+        1.75, (0.5, 1.5), 3.0, 0.75, (0.5, 0.875), (3.0, 9.0), 7, 2, 0.5,
+    )  # fmt: skip

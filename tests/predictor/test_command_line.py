@@ -1,0 +1,129 @@
+import sys
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+import pytest
+
+from predictor.command_line import Renamed, parse, renamed_options
+from predictor.config_checks import check_at_least
+from predictor.errors import UserError, run_entry_point
+
+
+@dataclass(frozen=True)
+class Box:
+    """Size of a box."""
+
+    width: int = 1
+    """Width of the box."""
+
+    def __post_init__(self) -> None:
+        check_at_least(self, 1, "width")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of a test."""
+
+    num_envs: Annotated[int | None, Renamed("envs")] = 2
+    """Number of environments."""
+    out_paths: Annotated[tuple[str, ...], Renamed("run_dirs")] = ()
+    """Folders to write."""
+    record: Annotated[bool, Renamed("film")] = True
+    """Film it."""
+    colour: Literal["red", "blue"] = "red"
+    """Colour of the box."""
+    box: Box = field(default_factory=Box)
+    """Box itself."""
+
+    def __post_init__(self) -> None:
+        check_at_least(self, 1, "num_envs")
+
+
+def test_words_become_a_config(capsys: pytest.CaptureFixture[str]):
+    words = ["--num-envs", "3", "--out-paths", "a", "b", "--no-record", "--colour", "blue", "--box.width", "4"]
+    assert parse(Settings, args=words) == Settings(3, ("a", "b"), False, "blue", Box(4))
+    assert capsys.readouterr() == ("", "")
+
+
+def test_the_words_of_the_process_are_read_by_default(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys, "argv", ["command", "--num-envs", "5"])
+    assert parse(Settings).num_envs == 5
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--num-envs", "0"], "num_envs must be at least 1, got 0"),
+        (["--box.width", "-1"], "width must be at least 1, got -1"),
+        (["--colour", "green"], "invalid choice 'green' for argument '--colour'. Expected one of ('red', 'blue')."),
+        (["--box.width", "1.5"], "--box.width: invalid literal for int() with base 10: '1.5'"),
+        (["--box.width"], "Missing value for argument '--box.width'. Expected 1 values."),
+    ],
+)
+@pytest.mark.parametrize("columns", ["40", "80", "200"])
+def test_a_refused_value_is_one_line(
+    words: list[str],
+    line: str,
+    columns: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    monkeypatch.setenv("COLUMNS", columns)
+    monkeypatch.setattr(sys, "argv", ["command", *words])
+    with pytest.raises(SystemExit) as stop:
+        run_entry_point(lambda: print(parse(Settings)))
+    assert stop.value.code == 2
+    assert capsys.readouterr() == ("", f"error: {line}\n")
+
+
+def test_the_error_of_the_config_itself_is_raised():
+    with pytest.raises(UserError) as error:
+        parse(Settings, args=["--box.width", "0"])
+    assert error.value.__suppress_context__ and not isinstance(error.value.__cause__, SystemExit)
+
+
+def test_options_that_do_not_exist_are_listed_with_similar_ones(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as stop:
+        parse(Settings, args=["--num-env", "3"])
+    assert stop.value.code == 2
+    out, errors = capsys.readouterr()
+    assert out == "" and "Unrecognized options: --num-env" in errors and "--num-envs" in errors
+
+
+def test_help_has_the_description_and_every_field(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as stop:
+        parse(Settings, "Reads settings.", args=["--help"])
+    out, errors = capsys.readouterr()
+    assert stop.value.code == 0 and errors == ""
+    for text in ("Reads settings.", "--num-envs", "Number of environments.", "--box.width", "Width of the box."):
+        assert text in out
+    assert "--envs" not in out
+
+
+@pytest.mark.parametrize(
+    ("words", "same_as", "lines"),
+    [
+        (["--envs", "3"], ["--num-envs", "3"], [("--envs", "--num-envs")]),
+        (["--envs=3"], ["--num-envs=3"], [("--envs", "--num-envs")]),
+        (["--run-dirs", "a", "b"], ["--out-paths", "a", "b"], [("--run-dirs", "--out-paths")]),
+        (["--run_dirs", "a"], ["--out-paths", "a"], [("--run_dirs", "--out-paths")]),
+        (["--film"], ["--record"], [("--film", "--record")]),
+        (["--no-film"], ["--no-record"], [("--no-film", "--no-record")]),
+        (["--out-paths", "envs"], ["--out-paths", "envs"], []),
+    ],
+)
+def test_old_names_of_options_work_and_say_so(
+    words: list[str], same_as: list[str], lines: list[tuple[str, str]], capsys: pytest.CaptureFixture[str]
+):
+    assert parse(Settings, args=words) == parse(Settings, args=same_as)
+    said = "".join(f"option {old} is now {new}; the next release drops {old}\n" for old, new in lines)
+    assert capsys.readouterr() == ("", said)
+
+
+def test_renamed_options_are_listed():
+    assert renamed_options(Settings) == {
+        "--envs": "--num-envs",
+        "--run-dirs": "--out-paths",
+        "--film": "--record",
+        "--no-film": "--no-record",
+    }

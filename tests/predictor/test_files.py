@@ -1,0 +1,83 @@
+"""Files and folders are replaced whole or not at all."""
+
+import json
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from predictor.files import copy_file, delete_leftovers, new_file, new_folder, scratch_folder, write_json, write_text
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_text_and_json_arrive(tmp_path: Path):
+    write_text(tmp_path / "a.md", "ü\n")
+    write_json(tmp_path / "a.json", {"path": tmp_path, "n": 1})
+    copy_file(tmp_path / "a.md", tmp_path / "b.md")
+    assert (tmp_path / "b.md").read_bytes() == "ü\n".encode()
+    assert json.loads((tmp_path / "a.json").read_text()) == {"path": str(tmp_path), "n": 1}
+    assert names(tmp_path) == ["a.json", "a.md", "b.md"]
+
+
+def test_a_failed_write_leaves_the_old_file_alone(tmp_path: Path):
+    write_text(tmp_path / "a", "old")
+    with pytest.raises(RuntimeError), new_file(tmp_path / "a") as partial:
+        partial.write_text("half")
+        raise RuntimeError
+    assert names(tmp_path) == ["a"] and (tmp_path / "a").read_text() == "old"
+
+
+def test_nothing_stands_under_the_name_before_it_is_whole(tmp_path: Path):
+    with new_file(tmp_path / "a.mp4") as partial:
+        partial.write_text("half")
+        assert not (tmp_path / "a.mp4").exists() and partial.suffix == ".mp4" and partial.name.startswith(".")
+    assert (tmp_path / "a.mp4").read_text() == "half"
+
+
+def test_a_folder_replaces_the_old_one_with_all_it_held(tmp_path: Path):
+    for content in ("old", "new"):
+        with new_folder(tmp_path / "deep" / "x") as partial:
+            (partial / content).write_text(content)
+    assert names(tmp_path / "deep") == ["x"] and names(tmp_path / "deep" / "x") == ["new"]
+
+
+def test_a_failed_folder_leaves_the_old_one_alone(tmp_path: Path):
+    with new_folder(tmp_path / "x") as partial:
+        (partial / "old").touch()
+    with pytest.raises(RuntimeError), new_folder(tmp_path / "x") as partial:
+        raise RuntimeError
+    assert names(tmp_path) == ["x"] and names(tmp_path / "x") == ["old"]
+
+
+def test_a_scratch_folder_is_gone_afterwards(tmp_path: Path):
+    with scratch_folder(tmp_path / "x") as scratch:
+        assert scratch.parent == tmp_path and names(scratch) == []
+    assert names(tmp_path) == []
+
+
+def test_leftovers_of_a_killed_process_are_deleted_and_nothing_else(tmp_path: Path):
+    write_text(tmp_path / "a.partial", "the user's own")
+    manager = new_file(tmp_path / "a.mp4")
+    manager.__enter__().write_text("half")
+    folder = scratch_folder(tmp_path / "b")
+    folder.__enter__()
+    assert len(names(tmp_path)) == 3
+    delete_leftovers(tmp_path)
+    assert names(tmp_path) == ["a.partial"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="file modes")
+def test_others_may_read_what_the_umask_lets_them_read(tmp_path: Path):
+    before = os.umask(0o022)
+    try:
+        write_text(tmp_path / "a", "x")
+        with new_folder(tmp_path / "b"):
+            pass
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o644
+    assert stat.S_IMODE((tmp_path / "b").stat().st_mode) == 0o755

@@ -1,0 +1,155 @@
+"""The check of the documentation's blocks fails where a block is wrong, and says where and why."""
+
+import importlib.util
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+FILE = Path(__file__).resolve().parents[1] / ".ci" / "docs_check.py"
+SPEC = importlib.util.spec_from_file_location("docs_check", FILE)
+assert SPEC is not None and SPEC.loader is not None
+docs_check: Any = importlib.util.module_from_spec(SPEC)
+sys.modules["docs_check"] = docs_check
+SPEC.loader.exec_module(docs_check)
+
+
+def results(folder: Path, text: str, limit_s: float = 60.0) -> Sequence[Any]:
+    """Runs the blocks of a page with this text."""
+    (folder / "page.md").write_text(text.replace("~~~", "```"))
+    page = docs_check.Page(folder, limit_s)
+    try:
+        return [page.run(block) for block in docs_check.blocks_of(folder / "page.md", folder)]
+    finally:
+        page.close()
+
+
+def test_blocks_build_on_each_other_across_languages(tmp_path: Path):
+    text = """
+~~~bash
+export GREETING=hello  # also for Python
+mkdir made && echo one > made/file.txt
+~~~
+~~~python
+import os, pathlib
+read = pathlib.Path("made/file.txt").read_text()
+~~~
+1. In a list:
+   ~~~python
+   assert read == "one\\n" and os.environ["GREETING"] == "hello"
+   ~~~
+~~~bash
+test "$GREETING" = hello
+python -c "import sys; assert sys.argv == ['-c', 'a']" a
+~~~
+"""
+    done = results(tmp_path, text)
+    assert [(result.block.line, result.block.language) for result in done] == [
+        (2, "bash"), (6, "python"), (11, "python"), (14, "bash"),
+    ]  # fmt: skip
+    assert [result.error for result in done] == [""] * 4
+    assert all(result.seconds > 0 for result in done)
+
+
+@pytest.mark.parametrize(
+    ("block", "said"),
+    [
+        ("bash\npython -m no_such_module --option 1", "No module named no_such_module"),
+        ("bash\nfalse\ntrue", "exit status 1"),
+        ("bash\nfalse | cat", "exit status 1"),
+        ("bash\necho $NOT_SET", "NOT_SET: unbound variable"),
+        ("python\nfrom math import no_such_name", "cannot import name 'no_such_name'"),
+        ("python\nraise SystemExit(0)", "SystemExit"),
+        ("python\nimport os\nprint('last words', flush=True)\nos._exit(3)", "last words"),
+    ],
+)
+def test_a_broken_block_fails_with_its_place_and_its_output(tmp_path: Path, block: str, said: str):
+    broken, after = results(tmp_path, f"# Title\n\n~~~{block}\n~~~\n\n~~~bash\ntrue\n~~~\n")
+    assert said in broken.error
+    shown = str(broken)
+    assert shown.startswith("page.md:3 ") and "FAILED" in shown and block.partition("\n")[2].splitlines()[0] in shown
+    assert after.error == "" and str(after).endswith("s  ok")
+
+
+def test_a_block_that_takes_too_long_is_stopped(tmp_path: Path):
+    done = results(tmp_path, "~~~bash\nsleep 30\n~~~\n~~~python\nimport time\ntime.sleep(30)\n~~~\n", limit_s=0.5)
+    assert ["took more than 0 s: give the block a short form" in result.error for result in done] == [True, True]
+    assert all(result.seconds < 20 for result in done)
+
+
+def test_a_short_form_runs_instead(tmp_path: Path):
+    text = """
+<!-- docs-check: short: python train.py --steps 2 --out a -->
+~~~bash
+python train.py --steps 100000 \\
+    --out a   # hours
+~~~
+"""
+    (tmp_path / "train.py").write_text("import sys\nassert sys.argv[1:] == ['--steps', '2', '--out', 'a']\n")
+    (done,) = results(tmp_path, text)
+    assert done.error == "" and str(done).endswith("ok, short form")
+
+
+@pytest.mark.parametrize(
+    ("short", "missing"),
+    [
+        ("python train.py --steps 2", "--out"),
+        ("python other.py --steps 2 --out a", "train.py"),
+        ("true", "--out, --steps, train.py"),
+    ],
+)
+def test_a_short_form_leaves_no_program_and_no_option_out(tmp_path: Path, short: str, missing: str):
+    text = f"<!-- docs-check: short: {short} -->\n~~~bash\npython train.py --steps 9 --out a\n~~~\n"
+    (done,) = results(tmp_path, text)
+    assert f"page.md:2: the short form must also have {missing}, as the block does" in done.error
+
+
+def test_a_skipped_block_is_listed_with_its_reason(tmp_path: Path):
+    (done,) = results(tmp_path, "<!-- docs-check: skip because it needs a GPU -->\n~~~bash\nexit 1\n~~~\n")
+    assert done.error == "" and str(done).endswith("skipped because it needs a GPU")
+
+
+@pytest.mark.parametrize("note", ["skip", "shrot: true", "short:", "skip because"])
+def test_an_unknown_annotation_fails(tmp_path: Path, note: str):
+    (done,) = results(tmp_path, f"<!-- docs-check: {note} -->\n~~~bash\ntrue\n~~~\n")
+    assert f"unknown annotation '{note}'" in done.error
+
+
+@pytest.mark.parametrize(
+    ("fence", "said"),
+    [
+        ("~~~\npython -m envs.collect\n~~~", "page.md:1: a block with commands needs a language"),
+        ("~~~sh\nls\n~~~", "page.md:1: blocks of 'sh' are not known; write bash, python or text"),
+    ],
+)
+def test_no_block_escapes_by_its_language(tmp_path: Path, fence: str, said: str):
+    with pytest.raises(docs_check.DocsError, match=said.replace("(", r"\(")):
+        results(tmp_path, fence + "\n")
+    assert results(tmp_path, "~~~text\npython -m envs.collect\n~~~\n~~~\nx = 1\n~~~\n") == []
+
+
+def test_every_page_of_this_repository_is_understood():
+    root = FILE.parents[1]
+    pages = [root / "README.md", *(root / "docs").rglob("*.md")]
+    blocks = [block for page in pages for block in docs_check.blocks_of(page)]
+    assert len(blocks) > 15
+    fences = sum(page.read_text().count("```bash") + page.read_text().count("```python") for page in pages)
+    assert len(blocks) == fences
+
+
+def test_the_command_fails_with_the_block(tmp_path: Path):
+    """As `make docs-check` runs it: on a repository of its own, with status 1 and the place."""
+    (tmp_path / ".ci").mkdir()
+    (tmp_path / ".ci" / "docs_check.py").write_text(FILE.read_text())
+    (tmp_path / "README.md").write_text("```bash\ntest -f README.md && touch left\n```\n")
+    subprocess.run(["git", "init", "-q"], cwd=tmp_path, check=True)
+    command = [sys.executable, ".ci/docs_check.py"]
+    good = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert good.returncode == 0 and "1 blocks in" in good.stdout and "0 failed" in good.stdout, good
+    assert not (tmp_path / "left").exists()  # it ran in a copy
+    (tmp_path / "README.md").write_text("```bash\ntest -f NO_SUCH_FILE\n```\n")
+    bad = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert bad.returncode == 1 and "README.md:1" in bad.stdout and "1 failed" in bad.stdout

@@ -1,0 +1,390 @@
+"""Every command: bad values end in one line, options have one name, and devices are called the same everywhere."""
+
+import importlib
+import inspect
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+import gymnasium as gym
+import pytest
+import torch
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from envs.parallel import ForecastParallelEnv
+from envs.registry import make_env, make_multiagent_env
+from envs.sb3.forecast import VecForecast
+from envs.vector import VectorForecast
+from envs.wrappers import ForecastObservation, SceneObservation
+from predictor.command_line import parse, renamed_options
+from predictor.config_checks import check_choices
+from predictor.data.store import StoreInfo, write_store
+from predictor.errors import UserError, run_entry_point
+from tests.predictor.helpers import circling_episode, spec
+
+ROOT = Path(__file__).resolve().parents[1]
+
+REFUSED: dict[str, list[tuple[str, str]]] = {
+    "predictor.train": [
+        ("--data absent --out new", "no episode store at absent"),
+        ("--data absent --out new --steps -1", "steps must be at least 1, got -1"),
+        ("--data absent --out new --likelihood gausian", "invalid choice 'gausian' for argument '--likelihood'"),
+        ("--data absent --out new --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
+        ("--data absent --out new --seed 1.5", "--seed: invalid literal for int()"),
+    ],
+    "predictor.evaluate": [
+        ("--checkpoint absent --data absent", "no checkpoint 'absent'"),
+        ("--checkpoint highway --data absent", "no episode store at absent"),
+        ("--checkpoint highway --data absent --num-samples 0", "num_samples must be at least 1, got 0"),
+        ("--checkpoint highway --data absent --seed -1", "seed must not be negative, got -1"),
+        ("--checkpoint highway --data absent --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
+    ],
+    "predictor.suite": [
+        ("--table springs --data absent", "no store at absent/springs/train; make the stores of this table with"),
+        ("--table springs --data absent --only-row mlp", "no store at absent/springs/train"),
+        ("--table spring", "invalid choice 'spring' for argument '--table'"),
+        ("--table springs --workers -1", "workers must not be negative, got -1"),
+        ("--table springs --precision tf32", "precision 'tf32' needs a CUDA device"),
+        ("--table springs --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
+    ],
+    "predictor.interpret": [
+        ("--checkpoint absent --data absent --out new", "no checkpoint 'absent'"),
+        ("--checkpoint highway --data absent --out file", "out must be a folder, but file is a file"),
+        ("--checkpoint highway --data absent --out new --burn-in-steps 0", "burn_in_steps must be at least 1, got 0"),
+        ("--checkpoint highway --data absent --out new --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
+    ],
+    "predictor.card": [("--checkpoint absent --data absent --accuracy absent", "no checkpoint 'absent'")],
+    "predictor.data.springs": [
+        ("--out new --train -1", "train must not be negative, got -1"),
+        ("--out new --physics.num-agents 0", "num_agents must be positive, got 0"),
+        ("--out new --physics.kind spring", "invalid choice 'spring' for argument '--physics.kind'"),
+    ],
+    "predictor.data.crowd": [
+        ("--source absent --out new", "no episode store at absent"),
+        ("--source absent --out new --num-agents 3 0", "num_agents must be at least 1, got (3, 0)"),
+    ],
+    "predictor.data.nba": [
+        ("--source absent --out new", "no source at absent"),
+        ("--source absent --out new --episode-steps 1", "episode_steps must be at least 2, got 1"),
+        ("--source absent --out new --split tset", "invalid choice 'tset' for argument '--split'"),
+    ],
+    "predictor.data.levelx": [
+        ("--source absent --out new", "no source at absent"),
+        ("--source absent --out new --dt-s 0", "dt_s must be positive, got 0.0"),
+    ],
+    "predictor.data.mocap": [
+        ("--source file --out new", "source must be one subject's folder, got the file file"),
+        ("--source absent --out new --stride 0", "stride must be at least 1, got 0"),
+    ],
+    "predictor.data.sdd": [
+        ("--source absent --out new", "no source at absent"),
+        ("--source absent --out new --episode-steps 1", "episode_steps must be at least 2, got 1"),
+    ],
+    "envs.collect": [
+        ("--env-id nope-v0 --out new", "cannot make env 'nope-v0'"),
+        ("--env-id merge-v1 --out new --episodes 0", "episodes must be at least 1, got 0"),
+        ("--env-id merge-v1 --out file", "file exists; choose another path or pass --overwrite"),
+    ],
+    "envs.evaluate": [
+        ("--checkpoint absent --env-ids merge-v1", "no checkpoint 'absent'"),
+        ("--workers 0", "workers must be at least 1, got 0"),
+        ("--memory-steps 3 0", "memory_steps must be at least 1, got (3, 0)"),
+        ("--checkpoint runs/a/checkpoint runs/a", "each checkpoint needs a name of its own, got a, a"),
+    ],
+    "envs.export_levelx": [
+        ("--env-id nope-v0 --out new", "cannot make env 'nope-v0'"),
+        ("--env-id merge-v1 --out new --max-steps 0", "max_steps must be at least 1, got 0"),
+        ("--env-id merge-v1 --out file", "file exists; choose another path or pass --overwrite"),
+    ],
+    "agents.evaluate": [
+        ("--run-dir absent", "absent holds no training run"),
+        ("--run-dir absent --num-envs 0", "num_envs must be at least 1, got 0"),
+        ("--run-dir absent --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
+    ],
+    "train_policy": [
+        ("--env-id nope-v0 --observe none", "cannot make env 'nope-v0'"),
+        ("--num-envs 0", "num_envs must be at least 1, got 0"),
+        ("--seed -1", "seed must lie in [0, 1000000000), got -1"),
+        ("--algorithm sac", "invalid choice 'sac' for argument '--algorithm'"),
+        ("--env-id simple_tag_v3 --driver nobody", "driver must be one of random, idle, varied, heuristic, mixed"),
+        ("--checkpoint absent", "no checkpoint 'absent'"),
+        ("--device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
+    ],
+    "benchmarks.__main__": [
+        ("--threads 0", "threads must be at least 1, got 0"),
+        ("--only forcast", "there is no section forcast"),
+        ("--out .", ". is a folder; name a file"),
+    ],
+    "benchmarks.wrapper_overhead": [
+        ("--num-envs 0", "num_envs must be at least 1, got 0"),
+        ("--vec thread", "invalid choice 'thread' for argument '--vec'"),
+    ],
+    "benchmarks.time_shares": [("--calls 0", "calls must be at least 1, got 0")],
+    "benchmarks.graph_accuracy": [
+        ("--checkpoint absent --data absent", "no episode store at absent"),
+        ("--checkpoint absent --data absent --neighbours 0", "neighbours must be at least 1, got (0,)"),
+    ],
+    "benchmarks.gpu_springs": [
+        ("--steps -1", "steps must not be negative, got -1"),
+        ("--device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
+    ],
+    "benchmarks.churn": [
+        ("--num-envs 0", "num_envs must be at least 1, got 0"),
+        ("--checkpoint absent", "no checkpoint 'absent'"),
+    ],
+    "benchmarks.envpool_identity": [("--num-envs 0", "num_envs must be at least 1, got 0")],
+    "benchmarks.envpool_parity": [("--task-ids Nope-v0", "cannot compare Nope-v0: unknown")],
+    "benchmarks.envpool_training": [("--num-envpool-envs 0", "num_envpool_envs must be at least 1, got 0")],
+}
+"""Words of a command line → how the one line begins after "error: ", for each command."""
+
+RENAMED: dict[str, dict[str, str]] = {
+    "predictor.evaluate": {"--samples": "--num-samples"},
+    "predictor.suite": {"--jobs": "--workers"},
+    "predictor.interpret": {
+        "--samples": "--num-samples",
+        "--windows": "--max-windows",
+        "--history-steps": "--burn-in-steps",
+    },
+    "predictor.data.crowd": {"--agents": "--num-agents", "--steps": "--episode-steps"},
+    "predictor.data.nba": {"--window-steps": "--episode-steps"},
+    "envs.collect": {"--ego": "--driver"},
+    "envs.evaluate": {"--ego": "--driver", "--samples": "--num-samples", "--history-steps": "--memory-steps"},
+    "envs.export_levelx": {"--ego": "--driver"},
+    "agents.evaluate": {"--workers": "--num-envs"},
+    "train_policy": {"--env": "--env-id", "--envs": "--num-envs", "--partner": "--driver", "--run-dir": "--out"},
+    "benchmarks.wrapper_overhead": {"--envs": "--num-envs"},
+    "benchmarks.graph_accuracy": {
+        "--checkpoints": "--checkpoint",
+        "--stores": "--data",
+        "--windows": "--max-windows",
+        "--history-steps": "--burn-in-steps",
+    },
+    "benchmarks.churn": {"--rows": "--num-envs", "--agents": "--num-agents", "--samples": "--measurements"},
+    "benchmarks.envpool_identity": {"--envs": "--num-envs"},
+    "benchmarks.envpool_parity": {"--egos": "--driver"},
+    "benchmarks.envpool_training": {
+        "--native-envs": "--num-envpool-envs",
+        "--plain-envs": "--num-plain-envs",
+        "--native-steps": "--envpool-steps",
+    },
+}
+"""Old option → new option, for each command."""
+
+REQUIRED: dict[str, list[str]] = {
+    "predictor.train": ["--data", "store", "--out", "run"],
+    "predictor.evaluate": ["--checkpoint", "highway", "--data", "store"],
+    "predictor.suite": ["--table", "springs"],
+    "predictor.interpret": ["--checkpoint", "highway", "--data", "store", "--out", "new"],
+    "predictor.card": ["--checkpoint", "highway", "--data", "store", "--accuracy", "accuracy.json"],
+    "predictor.data.springs": ["--out", "new"],
+    "predictor.data.crowd": ["--source", "store", "--out", "new"],
+    **{f"predictor.data.{name}": ["--source", "files", "--out", "new"] for name in ("nba", "levelx", "mocap", "sdd")},
+    "envs.collect": ["--env-id", "merge-v1", "--out", "new"],
+    "envs.export_levelx": ["--env-id", "merge-v1", "--out", "new"],
+    "agents.evaluate": ["--run-dir", "run"],
+    "benchmarks.graph_accuracy": ["--checkpoint", "highway", "--data", "store"],
+    "benchmarks.gpu_springs": ["--device", "cpu"],
+}
+"""Words that a command does not do without."""
+
+VALUE_OF = {"--driver": "varied", "--out": "elsewhere", "--env-id": "merge-v1", "--checkpoint": "a", "--data": "b"}
+
+
+def source_of(command: str) -> str:
+    return (ROOT / f"{command.replace('.', '/')}.py").read_text()
+
+
+def config_of(command: str) -> type:
+    """The dataclass that a command's `main` reads."""
+    (name,) = re.findall(r"parse\((\w+), __doc__\)", source_of(command))
+    found = getattr(importlib.import_module(command), name)
+    assert is_dataclass(found)
+    return found
+
+
+def all_configs() -> list[type]:
+    """The commands' dataclasses and those inside of them."""
+    found = [config_of(command) for command in REFUSED]
+    for config in found:
+        found += [kind for kind in get_type_hints(config).values() if is_dataclass(kind)]
+    return found
+
+
+def test_every_command_is_here():
+    """Whatever reads a command line does it by `parse`."""
+    listed = subprocess.run(["git", "ls-files", "*.py"], cwd=ROOT, capture_output=True, text=True, check=True)
+    sources = {name: (ROOT / name).read_text() for name in listed.stdout.split() if not name.startswith("tests/")}
+    reading = {name for name, text in sources.items() if re.search(r"\bparse\(\w+, __doc__\)", text)}
+    assert reading == {f"{command.replace('.', '/')}.py" for command in REFUSED}
+    assert [name for name, text in sources.items() if "tyro.cli(" in text] == ["predictor/command_line.py"]
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "message"),
+    [(command, words, message) for command, cases in REFUSED.items() for words, message in cases],
+)
+def test_bad_values_end_in_one_line(
+    command: str,
+    words: str,
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    module = importlib.import_module(command)
+    monkeypatch.chdir(tmp_path)
+    Path("file").write_text("mine")
+    monkeypatch.setattr(torch, "set_num_threads", lambda _: None)
+    monkeypatch.setattr(sys, "argv", ["command", *words.split()])
+    with pytest.raises(SystemExit) as stop:
+        run_entry_point(module.main)
+    errors = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert errors.startswith(f"error: {message}") and errors.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+# --- Names of options -------------------------------------------------------------------------------------------------
+
+
+def test_renamed_options_are_those_of_the_table():
+    found = {command: renamed_options(config_of(command)) for command in REFUSED}
+    assert {command: renamed for command, renamed in found.items() if renamed} == RENAMED
+
+
+@pytest.mark.parametrize(
+    ("command", "old", "new"), [(command, *names) for command, table in RENAMED.items() for names in table.items()]
+)
+def test_an_old_option_is_the_new_one_and_says_so(command: str, old: str, new: str, capsys: pytest.CaptureFixture[str]):
+    config, value = config_of(command), VALUE_OF.get(new, "60")
+    base = [word for word in REQUIRED.get(command, [])]
+    if new in base:
+        at = base.index(new)
+        del base[at : at + 2]
+    if command == "train_policy" and new == "--driver":
+        base += ["--env-id", "simple_tag_v3"]
+    expected = parse(config, args=[*base, new, value])
+    assert capsys.readouterr().err == ""
+    assert parse(config, args=[*base, old, value]) == expected
+    assert capsys.readouterr().err == f"option {old} is now {new}; the next release drops {old}\n"
+
+
+def test_no_option_has_a_name_that_was_given_up():
+    """One word for one thing; `run_dir` is the folder that `agents.evaluate` reads."""
+    given_up = {"jobs", "envs", "samples", "ego", "egos", "partner", "rows_at_once", "stores", "checkpoints"}
+    for config in all_configs():
+        assert not given_up & {field.name for field in fields(config)}, config
+    with_history = {c for c in REFUSED if "history_steps" in {f.name for f in fields(config_of(c))}}
+    assert with_history == {"predictor.train", "predictor.evaluate"}  # steps fed to the model
+    assert [c for c in REFUSED if "run_dir" in {f.name for f in fields(config_of(c))}] == ["agents.evaluate"]
+
+
+@pytest.mark.parametrize("command", REFUSED)
+def test_help_is_whole_phrases(command: str, capsys: pytest.CaptureFixture[str]):
+    """Every option is explained, by a phrase that does not need the name of its option."""
+    with pytest.raises(SystemExit) as stop:
+        parse(config_of(command), "Description.", args=["--help"])
+    assert stop.value.code == 0
+    out = " ".join(re.sub(r"[│╭╮╰╯─|]", " ", capsys.readouterr().out).split())
+    source = inspect.getsource(config_of(command))
+    strings = re.findall(r'^    \w+: [^\n]+\n    """(.+?)"""$', source, flags=re.MULTILINE | re.DOTALL)
+    assert strings
+    for string in strings:
+        assert not string.startswith(("Of ", "The same", "Whose ", "Which ")), string
+        assert string.endswith("."), string
+    for field in fields(config_of(command)):
+        if not is_dataclass(get_type_hints(config_of(command))[field.name]):
+            assert f"--{field.name.replace('_', '-')}" in out, field.name
+
+
+# --- Configs made from Python -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("config", all_configs(), ids=lambda config: f"{config.__module__}.{config.__name__}")
+def test_closed_choices_are_checked_from_python(config: type):
+    """Whatever makes a config: a value that a `Literal` does not list is refused by `__post_init__`."""
+    hints = get_type_hints(config)
+    closed = [field.name for field in fields(config) if get_origin(hints[field.name]) is Literal]
+    for name in closed:
+        made = object.__new__(config)  # in tests, the checks of types would refuse a wrong choice first
+        for field in fields(config):
+            object.__setattr__(made, field.name, field.default)
+            if get_origin(hints[field.name]) is Literal:
+                object.__setattr__(made, field.name, get_args(hints[field.name])[0])
+        check_choices(made)
+        object.__setattr__(made, name, "nonsense")
+        with pytest.raises(UserError, match=f"{name} must be one of .*, got 'nonsense'"):
+            made.__post_init__()
+
+
+# --- Devices ----------------------------------------------------------------------------------------------------------
+
+WITH_DEVICE = [command for command in REFUSED if "device" in {f.name for f in fields(config_of(command))}]
+
+
+def test_commands_that_run_a_model_take_a_device():
+    assert WITH_DEVICE == [
+        "predictor.train",
+        "predictor.evaluate",
+        "predictor.suite",
+        "predictor.interpret",
+        "agents.evaluate",
+        "train_policy",
+        "benchmarks.gpu_springs",
+    ]
+
+
+@pytest.mark.parametrize("command", WITH_DEVICE)
+@pytest.mark.parametrize(("there", "taken"), [(True, "cuda"), (False, "cpu")])
+def test_auto_takes_the_cuda_device_where_there_is_one(
+    command: str, there: bool, taken: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
+    config: Any = parse(config_of(command), args=[*REQUIRED.get(command, []), "--device", "auto"])
+    assert config.device == taken
+
+
+@pytest.mark.parametrize("command", WITH_DEVICE)
+def test_a_device_that_is_not_there_is_named(command: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(UserError, match="device 'cuda' was asked for but torch finds no CUDA device; use --device cpu"):
+        parse(config_of(command), args=[*REQUIRED.get(command, []), "--device", "cuda"])
+
+
+def test_a_command_runs_on_auto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    episodes = [circling_episode(seed) for seed in range(3)]
+    write_store(tmp_path / "data", StoreInfo(spec(has_ego=False), "circles"), episodes)
+    words = ["--checkpoint", "constant-velocity", "--data", str(tmp_path / "data"), "--device", "auto"]
+    monkeypatch.setattr(sys, "argv", ["command", *words, "--out", str(tmp_path / "out")])
+    run_entry_point(importlib.import_module("predictor.evaluate").main)
+    assert '"device": "cpu"' in (tmp_path / "out" / "accuracy.json").read_text()
+
+
+WRAPPED: dict[str, Callable[[str], Any]] = {
+    "ForecastObservation": lambda device: ForecastObservation(make_env("highway-fast-v0"), "highway", device=device),
+    "ForecastParallelEnv": lambda device: ForecastParallelEnv(
+        make_multiagent_env("simple_tag_v3"), "simple-tag", device=device
+    ),
+    "VecForecast": lambda device: VecForecast(
+        DummyVecEnv([lambda: SceneObservation(make_env("highway-fast-v0"))]), "highway", device=device
+    ),
+    "VectorForecast": lambda device: VectorForecast(
+        gym.vector.SyncVectorEnv([lambda: SceneObservation(make_env("highway-fast-v0"))]), "highway", device=device
+    ),
+}
+
+
+@pytest.mark.parametrize("wrapper", WRAPPED)
+def test_wrappers_take_auto(wrapper: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    env = WRAPPED[wrapper]("auto")
+    env.reset()
+    env.close()
+    with pytest.raises(UserError, match="device 'cuda' was asked for but torch finds no CUDA device"):
+        WRAPPED[wrapper]("cuda")
