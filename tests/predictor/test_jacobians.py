@@ -5,6 +5,7 @@ from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -45,14 +46,22 @@ def observed(dtype: torch.dtype = torch.float64) -> Tensor:
     return random_states(3, 1, TIME, AGENTS, 4).to(dtype)
 
 
-def streamed(model: TrainableForecaster, num_samples: int = 1) -> Forecast:
+def of_all() -> Any:
+    return torch.Generator().manual_seed(0)
+
+
+def of_each_scene() -> Any:
+    return [np.random.default_rng(0)]
+
+
+def streamed(model: TrainableForecaster, num_samples: int = 1, noise: Callable[[], Any] = of_all) -> Forecast:
     """Observe every step, then roll out."""
 
     def forecast(states: Tensor) -> Tensor:
         memory = model.empty_memory(1, AGENTS)
         for t in range(TIME):
             memory, belief = model.observe(memory, states[:, t], VALID[:, t])
-        return model.rollout(belief, HORIZON, num_samples, torch.Generator().manual_seed(0))[0, -1]
+        return model.rollout(belief, HORIZON, num_samples, noise())[0, -1]
 
     return forecast
 
@@ -101,8 +110,9 @@ def test_jacobians_where_gradients_are_switched_off(kind: str, kind_of_derivativ
 
 
 @pytest.mark.parametrize("kind", ["dgvae", "dgvae-neighbours", "dnri"])
-def test_a_drawn_sample_has_a_jacobian(kind: str):
-    forecast, states = streamed(made(kind), num_samples=2), observed()
+@pytest.mark.parametrize("noise", [of_all, of_each_scene])
+def test_a_drawn_sample_has_a_jacobian(kind: str, noise: Callable[[], Any]):
+    forecast, states = streamed(made(kind), 2, noise), observed()
     jacobian = torch.func.jacrev(forecast)(states)
     torch.testing.assert_close(*difference_quotients(forecast, states, jacobian), rtol=1e-5, atol=1e-6)
     assert (jacobian - torch.func.jacrev(streamed(made(kind)))(states)).abs().max() > 1e-3
