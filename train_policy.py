@@ -106,7 +106,7 @@ class TrainPolicyConfig:
             self.device,
             self.selections,
             self.selection_episodes,
-            self.measuring_rows,
+            self.measuring_envs,
             self.checkpoint_every,
         )
 
@@ -116,7 +116,7 @@ class TrainPolicyConfig:
         return self.envs if self.envs is not None else ENVS[self.backend]
 
     @property
-    def measuring_rows(self) -> int:
+    def measuring_envs(self) -> int:
         """Parallel environments that measure a policy; results do not depend on it."""
         return min(self.num_envs, os.cpu_count() or 1)
 
@@ -137,7 +137,7 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
     policy = train(plan, config.folder)
     model = load_model(policy, config.algorithm)
     evaluation = evaluate_with_progress(
-        plan.task, model, f"{config.algorithm} ({config.observe})", config.eval_episodes, config.measuring_rows
+        plan.task, model, f"{config.algorithm} ({config.observe})", config.eval_episodes, config.measuring_envs
     )
     evaluation.write(config.folder, algorithm=config.algorithm, observe=config.observe)
     console.print(evaluation.table())

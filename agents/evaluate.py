@@ -38,7 +38,7 @@ PACKAGES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2
 
 @dataclass(frozen=True)
 class PolicySummary:
-    """One row of the table: a policy over all episodes."""
+    """Results of one policy over all episodes: a line of the table."""
 
     policy: str
     """Who drove."""
@@ -76,7 +76,7 @@ class Evaluation:
     """Episodes by policy."""
 
     @property
-    def rows(self) -> list[PolicySummary]:
+    def summaries(self) -> list[PolicySummary]:
         """One summary per policy."""
         return [summarize(policy, episodes) for policy, episodes in self.results.items()]
 
@@ -86,7 +86,7 @@ class Evaluation:
             "env_id": self.env_id,
             "first_seed": self.first_seed,
             **extra,
-            "policies": [_finite(asdict(row)) for row in self.rows],
+            "policies": [_finite(asdict(summary)) for summary in self.summaries],
             "episodes": {name: [_finite(asdict(e)) for e in found] for name, found in self.results.items()},
             "provenance": provenance(PACKAGES),
         }
@@ -95,29 +95,29 @@ class Evaluation:
 
     def markdown(self) -> str:
         """The table for a README."""
-        header, rows = self._cells()
+        header, cells = self._cells()
         lines = ["| " + " | ".join(header) + " |", "|---" * len(header) + "|"]
-        lines += ["| " + " | ".join(row) + " |" for row in rows]
+        lines += ["| " + " | ".join(line) + " |" for line in cells]
         return "\n".join(lines) + f"\n\n{self.env_id}: {self._caption()}\n"
 
     def table(self) -> Table:
         """The table for a terminal."""
-        header, rows = self._cells()
+        header, lines = self._cells()
         table = Table(title=self.env_id, caption=self._caption())
         for i, name in enumerate(header):
             table.add_column(escape(name), justify="right" if i else "left")
-        for row in rows:
-            table.add_row(*row)
+        for line in lines:
+            table.add_row(*line)
         return table
 
     def _cells(self) -> tuple[list[str], list[list[str]]]:
-        """Header and rows; what no row has is left out."""
-        summaries = self.rows
-        roles = list(dict.fromkeys(role for row in summaries for role in row.role_returns))
-        with_crashes = any(row.crash_rate is not None for row in summaries)
+        """Returns the header and the cells of each line; a column that would be empty is left out."""
+        summaries = self.summaries
+        roles = list(dict.fromkeys(role for summary in summaries for role in summary.role_returns))
+        with_crashes = any(summary.crash_rate is not None for summary in summaries)
         header = ["policy", "return", *(f"return of {role}" for role in roles), "length"]
         header += ["crash rate (95 %)", "speed [m/s]"] if with_crashes else []
-        return header, [_row_cells(row, roles, with_crashes) for row in summaries]
+        return header, [_cells_of(summary, roles, with_crashes) for summary in summaries]
 
     def _caption(self) -> str:
         count = max(len(found) for found in self.results.values())
@@ -125,7 +125,7 @@ class Evaluation:
             f"{count} episodes each, the same seeds from {self.first_seed} on; mean ± standard error, length in policy "
             "steps"
         )
-        if all(row.crash_rate is None for row in self.rows):
+        if all(summary.crash_rate is None for summary in self.summaries):
             return f"{caption}; return: mean over the learners."
         return f"{caption}, crash rate with its 95 % Wilson interval."
 
@@ -182,7 +182,7 @@ def evaluate_policy_on_seeds(
     model: BaseAlgorithm,
     name: str,
     num_episodes: int,
-    num_rows: int = 1,
+    num_envs: int = 1,
     first_seed: int = EVALUATION_SEED,
     on_episode: Callable[[], None] = lambda: None,
 ) -> Evaluation:
@@ -193,12 +193,12 @@ def evaluate_policy_on_seeds(
         model: the trained policy.
         name: what to call it in the table.
         num_episodes: episodes per policy.
-        num_rows: parallel environments; the results do not depend on it.
+        num_envs: parallel environments; the results do not depend on it.
         first_seed: episode i is reset with first_seed + i.
         on_episode: called after each episode.
     """
     seeds = range(first_seed, first_seed + num_episodes)
-    arena = open_arena(task, min(num_rows, num_episodes))
+    arena = open_arena(task, min(num_envs, num_episodes))
     try:
         results = {name: arena.play(model, seeds, on_episode)}
         for baseline in arena.baselines:
@@ -213,7 +213,7 @@ def evaluate_with_progress(
     model: BaseAlgorithm,
     name: str,
     num_episodes: int,
-    num_rows: int,
+    num_envs: int,
     first_seed: int = EVALUATION_SEED,
 ) -> Evaluation:
     """`evaluate_policy_on_seeds` under a progress bar."""
@@ -221,19 +221,26 @@ def evaluate_with_progress(
     with Progress(*columns) as progress:
         bar = progress.add_task("", total=num_episodes * NUM_POLICIES)
         return evaluate_policy_on_seeds(
-            task, model, name, num_episodes, num_rows, first_seed, lambda: progress.advance(bar)
+            task, model, name, num_episodes, num_envs, first_seed, lambda: progress.advance(bar)
         )
 
 
-def _row_cells(row: PolicySummary, roles: Sequence[str], with_crashes: bool) -> list[str]:
-    cells = [row.policy, f"{row.return_mean:.2f}{_plus_minus(row.return_se, 2)}"]
+def _cells_of(summary: PolicySummary, roles: Sequence[str], with_crashes: bool) -> list[str]:
+    cells = [summary.policy, f"{summary.return_mean:.2f}{_plus_minus(summary.return_se, 2)}"]
     for role in roles:
-        mean, error = row.role_returns.get(role, (math.nan, math.nan))
+        mean, error = summary.role_returns.get(role, (math.nan, math.nan))
         cells.append(f"{mean:.2f}{_plus_minus(error, 2)}")
-    cells.append(f"{row.length_mean:.1f}{_plus_minus(row.length_se, 1)}")
-    if with_crashes and row.crash_rate is not None and row.crash_low is not None and row.crash_high is not None:
-        cells.append(f"{100 * row.crash_rate:.0f} % ({100 * row.crash_low:.0f}–{100 * row.crash_high:.0f} %)")
-        cells.append("–" if math.isnan(row.mean_speed_mps) else f"{row.mean_speed_mps:.1f}")
+    cells.append(f"{summary.length_mean:.1f}{_plus_minus(summary.length_se, 1)}")
+    if (
+        with_crashes
+        and summary.crash_rate is not None
+        and summary.crash_low is not None
+        and summary.crash_high is not None
+    ):
+        cells.append(
+            f"{100 * summary.crash_rate:.0f} % ({100 * summary.crash_low:.0f}–{100 * summary.crash_high:.0f} %)"
+        )
+        cells.append("–" if math.isnan(summary.mean_speed_mps) else f"{summary.mean_speed_mps:.1f}")
     return cells
 
 

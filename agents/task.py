@@ -48,9 +48,9 @@ class Task:
 
     def __post_init__(self) -> None:
         """Check that the fields fit together."""
-        if self.is_parallel and self.backend != "gymnasium":
+        if self.is_multiagent and self.backend != "gymnasium":
             raise UserError(f"backend {self.backend} has no {self.env_id}; leave it out")
-        if self.learners and not self.is_parallel:
+        if self.learners and not self.is_multiagent:
             raise UserError(f"learners are for PettingZoo environments, {self.env_id} has one ego; leave them out")
         if self.partner not in DRIVER_NAMES:
             raise UserError(f"partner must be one of {', '.join(DRIVER_NAMES)}, got '{self.partner}'")
@@ -63,7 +63,7 @@ class Task:
         resolve_device(self.device)
 
     @property
-    def is_parallel(self) -> bool:
+    def is_multiagent(self) -> bool:
         """Whether it is a PettingZoo environment with many learners."""
         return is_parallel_id(self.env_id)
 
@@ -92,7 +92,7 @@ class Task:
         Raises:
             UserError: as `scene_spec`; unknown learners, or a partner that cannot drive the others.
         """
-        if self.is_parallel:
+        if self.is_multiagent:
             return self._check_parallel()
         env = make_env(self.env_id)
         env.close()

@@ -1,4 +1,4 @@
-"""Train an SB3 policy: preset, parallel rows, model selection on seeds of its own, checkpoints that survive a kill.
+"""Train an SB3 policy: preset, parallel environments, selection on its own seeds, checkpoints that survive a kill.
 
 `policy.zip` is the model that did best on the selection seeds (the common practice, and what SB3's EvalCallback keeps);
 those seeds are disjoint from training and from the final evaluation, so the final numbers are not selected for.
@@ -21,7 +21,7 @@ from agents.features import AttentionConfig, ForecastAttention
 from agents.presets import Algorithm, PPOPreset, Preset, preset_for
 from agents.runs import BEST_FILE, CHECKPOINT_FILE, POLICY_FILE, load_model, read_note, save_model
 from agents.task import SELECTION_SEED, Task, resolve_device
-from agents.vec_envs import make_rows
+from agents.vec_envs import make_venv
 from predictor.errors import UserError
 from predictor.files import copy_file
 
@@ -35,8 +35,8 @@ class TrainingPlan:
     algorithm: Algorithm
     """ppo or dqn."""
     steps: int
-    """Environment steps over all rows."""
-    num_rows: int
+    """Environment steps over all environments."""
+    num_envs: int
     """Parallel environments."""
     seed: int
     """Drives torch, NumPy and the environments."""
@@ -46,14 +46,14 @@ class TrainingPlan:
     """How often, evenly spread, the policy is measured on the selection seeds."""
     selection_episodes: int = 20
     """Episodes per measurement; always the same seeds."""
-    selection_rows: int = 2
+    selection_envs: int = 2
     """Parallel environments of the measurement."""
     checkpoint_every: int = 2_000
     """Environment steps between checkpoints."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        for name in ("steps", "num_rows", "selections", "selection_episodes", "selection_rows", "checkpoint_every"):
+        for name in ("steps", "num_envs", "selections", "selection_episodes", "selection_envs", "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
         if not 0 <= self.seed < SELECTION_SEED:
@@ -76,8 +76,8 @@ def train(plan: TrainingPlan, run_dir: Path) -> Path:
     Returns:
         The final policy, `run_dir/policy.zip`.
     """
-    venv = make_rows(plan.task, plan.num_rows)
-    selection = open_arena(plan.task, min(plan.selection_rows, plan.selection_episodes))
+    venv = make_venv(plan.task, plan.num_envs)
+    selection = open_arena(plan.task, min(plan.selection_envs, plan.selection_episodes))
     try:
         model = _resume_or_make(plan, venv, run_dir)
         if model.num_timesteps < plan.steps:
@@ -118,7 +118,9 @@ def make_model(plan: TrainingPlan, venv: VecEnv, tensorboard_log: str | None = N
     options = asdict(preset)
     layers = list(options.pop("net_arch"))
     if isinstance(preset, PPOPreset):
-        options["batch_size"] = min(preset.batch_size, preset.n_steps * venv.num_envs)  # few rows give small rollouts
+        options["batch_size"] = min(
+            preset.batch_size, preset.n_steps * venv.num_envs
+        )  # few environments give small rollouts
     policy_kwargs: dict[str, Any] = {
         "net_arch": {"pi": layers, "vf": layers} if isinstance(preset, PPOPreset) else layers
     }

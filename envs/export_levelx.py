@@ -20,7 +20,7 @@ import tyro
 from jaxtyping import Float
 from rich.progress import track
 
-from envs.drivers.ego import make_ego
+from envs.drivers.ego import make_ego_driver
 from envs.readers.highway import HighwayReader, is_highway_env
 from envs.registry import make_env
 from predictor.data.store import Episode
@@ -101,7 +101,7 @@ def roll_out(
     reader = HighwayReader(env)
     obs: Any
     obs, _ = env.reset(seed=seed)
-    ego = make_ego(ego_name, env, np.random.default_rng(seed))
+    ego = make_ego_driver(ego_name, env, np.random.default_rng(seed))
     road: Any = env.unwrapped.road  # type: ignore[attr-defined]
     scenes, headings = [reader.read_all(env)], [_headings_rad(env)]
     advance = road.step
@@ -195,7 +195,7 @@ def export(config: ExportConfig) -> int:
         UserError: the environment or the ego does not fit.
     """
     env = export_env(config.env_id)
-    make_ego(config.ego, env, np.random.default_rng(0))
+    make_ego_driver(config.ego, env, np.random.default_rng(0))
     partial = config.out.with_name(f".{config.out.name}.{uuid.uuid4().hex[:8]}.partial")
     frames = 0
     try:

@@ -14,14 +14,13 @@ from typing import Literal
 
 import imageio_ffmpeg
 import pytest
-from stable_baselines3 import PPO as SB3PPO
 
 import train_policy
 from agents import evaluate
 from agents.runs import load_model, read_note
 from agents.training import SaveCheckpoint
 from predictor.errors import run_entry_point
-from tests.agents.helpers import TOY, policy_for
+from tests.agents.helpers import TOY
 
 # SB3 silences this warning at import, pytest makes it an error again.
 pytestmark = pytest.mark.filterwarnings("ignore:rich is experimental")
@@ -187,14 +186,6 @@ def test_environments_by_default(backend: Literal["gymnasium", "envpool"], envs:
 def test_who_learns(env_id: str, asked: tuple[str, ...] | None, learners: tuple[str, ...]):
     task = train_policy.TrainPolicyConfig(env_id, learners=asked).plan.task
     assert task.learners == learners
-
-
-def test_what_cannot_be_drawn_gives_no_video_and_no_error(tmp_path: Path):
-    config = train_policy.TrainPolicyConfig("CartPole-v1", observe="none", run_dir=tmp_path)
-    assert train_policy.film(config, SB3PPO("MlpPolicy", "CartPole-v1", device="cpu")) is None
-    config = train_policy.TrainPolicyConfig(TOY, observe="none", run_dir=tmp_path)
-    assert train_policy.film(config, policy_for(config.plan.task)) is None
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

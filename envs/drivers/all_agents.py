@@ -21,7 +21,7 @@ from predictor.errors import UserError
 Driver = Callable[[Mapping[str, Any]], dict[str, Any]]
 """From the observations of a step, of all agents or of some, to the actions of those that live."""
 
-Chooser = Callable[[Any], Any]
+AgentDriver = Callable[[Any], Any]
 """From one agent's observation to its action."""
 
 WHO = "drivers"
@@ -52,20 +52,20 @@ def make_driver(name: str, env: Any, rng: np.random.Generator) -> Driver:
     """
     for agent in getattr(env, "possible_agents", ()):
         uniform_action(env.action_space(agent), np.random.default_rng(0), WHO)
-    draw = _choosers(name, env, rng)
-    choosers: dict[str, Chooser] = {}
+    draw = _agent_drivers(name, env, rng)
+    drivers: dict[str, AgentDriver] = {}
 
     def drive(observations: Mapping[str, Any]) -> dict[str, Any]:
         living = set(env.agents)
         for agent in observations:
-            if agent in living and agent not in choosers:
-                choosers[agent] = draw(agent)
-        return {agent: choosers[agent](seen) for agent, seen in observations.items() if agent in living}
+            if agent in living and agent not in drivers:
+                drivers[agent] = draw(agent)
+        return {agent: drivers[agent](seen) for agent, seen in observations.items() if agent in living}
 
     return drive
 
 
-def _choosers(name: str, env: Any, rng: np.random.Generator) -> Callable[[str], Chooser]:
+def _agent_drivers(name: str, env: Any, rng: np.random.Generator) -> Callable[[str], AgentDriver]:
     """From an agent to how it chooses."""
     if name == "random":
         return lambda agent: lambda seen: uniform_action(env.action_space(agent), rng, WHO)
@@ -77,7 +77,7 @@ def _choosers(name: str, env: Any, rng: np.random.Generator) -> Callable[[str], 
         return _heuristic(env, rng)
     if name == "mixed":
         kinds = ("random", "varied", "heuristic") if _has_heuristic(env) else ("random", "varied")
-        draws = [_choosers(kind, env, rng) for kind in kinds]
+        draws = [_agent_drivers(kind, env, rng) for kind in kinds]
         return lambda agent: draws[rng.integers(len(draws))](agent)
     raise UserError(f"driver must be one of {', '.join(DRIVER_NAMES)}, got '{name}'")
 
@@ -124,7 +124,7 @@ def _has_heuristic(env: Any) -> bool:
     return is_pursuit_env(env) or mpe_scenario(env) in _AIMS
 
 
-def _heuristic(env: Any, rng: np.random.Generator) -> Callable[[str], Chooser]:
+def _heuristic(env: Any, rng: np.random.Generator) -> Callable[[str], AgentDriver]:
     if not _has_heuristic(env):
         raise UserError(
             f"no heuristic drives {parallel_env_id(env)}, only pursuit and mpe2's {', '.join(_AIMS)}; use "
@@ -132,7 +132,7 @@ def _heuristic(env: Any, rng: np.random.Generator) -> Callable[[str], Chooser]:
         )
     family = _PursuitIntentions(env, rng) if is_pursuit_env(env) else _MpeIntentions(env, rng)
 
-    def draw(agent: str) -> Chooser:
+    def draw(agent: str) -> AgentDriver:
         habits = Habits.draw(rng)
         intend = family.of(agent, habits)
         space = env.action_space(agent)

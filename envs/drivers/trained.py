@@ -1,4 +1,4 @@
-"""A trained policy drives a PettingZoo environment: the rows it learned on, rebuilt for one step of one environment.
+"""A trained policy drives a PettingZoo environment: what it learned on is rebuilt for one step of one environment.
 
 Who learned, and who drove the others, is read from the policy's run folder (`train_policy.py` writes it); without one,
 all agents are the policy's.
@@ -21,7 +21,7 @@ from predictor.errors import UserError
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-Ego = Callable[[Any], Any]
+EgoDriver = Callable[[Any], Any]
 """From an observation to an action."""
 
 
@@ -42,10 +42,10 @@ def trained_driver(path: str, env: Any, rng: np.random.Generator) -> Driver:
     sees_forecasts = isinstance(policy.observation_space, gym.spaces.Dict)
     spaces = {agent: _seen_space(env.observation_space(agent), sees_forecasts) for agent in learners}
     actions = {agent: env.action_space(agent) for agent in learners}
-    rows = SharedObservation(spaces, roles_of(spaces, actions), None)
-    if rows.space != policy.observation_space:
+    padded = SharedObservation(spaces, roles_of(spaces, actions), None)
+    if padded.space != policy.observation_space:
         raise UserError(
-            f"policy {path} was trained on {_line(policy.observation_space)}, but the env gives {_line(rows.space)}"
+            f"policy {path} was trained on {_line(policy.observation_space)}, but the env gives {_line(padded.space)}"
         )
     others = (
         make_driver(run.get("partner", "heuristic"), env, rng) if set(learners) < set(env.possible_agents) else None
@@ -54,7 +54,9 @@ def trained_driver(path: str, env: Any, rng: np.random.Generator) -> Driver:
     def drive(observations: Mapping[str, Any]) -> dict[str, Any]:
         chosen = {} if others is None else others({a: s for a, s in observations.items() if a not in learners})
         for agent in (a for a in observations if a in learners and a in env.agents):
-            action, _ = policy.predict(rows.one(agent, _seen(observations[agent], sees_forecasts)), deterministic=True)
+            action, _ = policy.predict(
+                padded.one(agent, _seen(observations[agent], sees_forecasts)), deterministic=True
+            )
             chosen[agent] = own_action(action, actions[agent])
         return chosen
 
@@ -92,7 +94,7 @@ def _seen(observation: Mapping[str, Any], sees_forecasts: bool) -> Any:
     return {**observation, "forecast": forecast[:, 0] if forecast.ndim == 4 else forecast}
 
 
-def env_for_ego(env: gym.Env, name: str) -> gym.Env:
+def env_for_driver(env: gym.Env, name: str) -> gym.Env:
     """The env as the ego wants to see it: with forecasts for a policy that was trained on them, else as it is.
 
     Raises:

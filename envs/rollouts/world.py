@@ -11,8 +11,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from envs.drivers.all_agents import Driver, make_driver
-from envs.drivers.ego import make_ego
-from envs.drivers.trained import env_for_ego, forecaster_of, require_view, sees_forecasts, trained_driver
+from envs.drivers.ego import make_ego_driver
+from envs.drivers.trained import env_for_driver, forecaster_of, require_view, sees_forecasts, trained_driver
 from envs.parallel import ForecastParallelEnv
 from envs.readers.base import SceneReader
 from envs.readers.highway import is_highway_env
@@ -36,16 +36,16 @@ class World(Protocol):
         """Begin the episode of a seed: environment and drivers are a function of it."""
 
     def step(self) -> bool:
-        """Let everybody act once; whether the episode is over."""
+        """Let all agents act once; returns whether the episode is over."""
 
     def perceived(self) -> Scene:
         """The scene as forecasters get it, padded."""
 
-    def everyone(self) -> Scene:
-        """Everyone who is there, unpadded: the truth."""
+    def full_scene(self) -> Scene:
+        """Returns all agents that are there, unpadded: the truth."""
 
     def labels(self) -> SceneLabels | None:
-        """True edges between the rows of `everyone`, where the simulator knows them."""
+        """True edges between the agents of `full_scene`, where the simulator knows them."""
 
     def close(self) -> None:
         """Close the environment."""
@@ -75,7 +75,7 @@ class EgoWorld:
     def reset(self, seed: int) -> None:
         """Begin the episode of a seed."""
         self.observation, _ = self.env.reset(seed=seed)
-        self._ego = make_ego(self._name, self.env, np.random.default_rng(seed))
+        self._ego = make_ego_driver(self._name, self.env, np.random.default_rng(seed))
 
     def step(self) -> bool:
         """Let the ego act."""
@@ -87,8 +87,8 @@ class EgoWorld:
         scene: Scene = self.env.scene
         return scene
 
-    def everyone(self) -> Scene:
-        """Everyone, ego first."""
+    def full_scene(self) -> Scene:
+        """Returns all agents, ego first."""
         return self._reader.read_all(self.env)
 
     def labels(self) -> SceneLabels | None:
@@ -107,7 +107,7 @@ class EgoWorld:
         return {**self.observation, "forecast": forecast[:, 0] if forecast.ndim == 4 else forecast}
 
 
-class SharedWorld:
+class MultiagentWorld:
     """A PettingZoo parallel environment; all its agents are driven.
 
     Args:
@@ -133,7 +133,7 @@ class SharedWorld:
         self._driver = self._make_driver(np.random.default_rng(seed))
 
     def step(self) -> bool:
-        """Let everybody act."""
+        """Let all agents act."""
         seen = self._observations
         if not self._name.endswith(".zip"):
             seen = {name: entries["observation"] for name, entries in seen.items()}
@@ -141,11 +141,11 @@ class SharedWorld:
         return not self.env.agents
 
     def perceived(self) -> Scene:
-        """Everyone, padded: nobody is the ego."""
+        """Returns all agents, padded; none is the ego."""
         return self.env.scene.scene
 
-    def everyone(self) -> Scene:
-        """Everyone."""
+    def full_scene(self) -> Scene:
+        """Returns all agents."""
         scene = self.env.scene.scene
         return Scene(scene.states[scene.valid], scene.ids[scene.valid], scene.valid[scene.valid])
 
@@ -190,10 +190,10 @@ def open_world(
             horizon_steps=horizon_steps,
             num_samples=num_samples,
         )
-        return SharedWorld(shared, driver)
+        return MultiagentWorld(shared, driver)
     env = make_env(env_id, disable_env_checker=True)
     if checkpoint is None:
-        seen = env_for_ego(env, driver)
+        seen = env_for_driver(env, driver)
         world = EgoWorld(seen if isinstance(seen, ForecastObservation) else SceneObservation(seen), driver)
     else:
         if sees_forecasts(driver):
@@ -203,7 +203,7 @@ def open_world(
         world = EgoWorld(
             ForecastObservation(env, checkpoint, horizon_steps=horizon_steps, num_samples=num_samples), driver
         )
-    make_ego(driver, world.env, np.random.default_rng(0))
+    make_ego_driver(driver, world.env, np.random.default_rng(0))
     return world
 
 

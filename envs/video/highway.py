@@ -217,8 +217,8 @@ class _Recorder:
         """Called by highway-env for every picture within a step, and by us for the one at its end."""
         pixels = np.ascontiguousarray(self._base.render())
         surface = self._base.viewer.sim_surface
-        everyone = self._reader.read_all(self._env)
-        places = zip(everyone.ids.tolist(), everyone.states[:, :2].tolist(), strict=True)
+        full = self._reader.read_all(self._env)
+        places = zip(full.ids.tolist(), full.states[:, :2].tolist(), strict=True)
         positions = {key: (x, y) for key, (x, y) in places}
         view = View((float(surface.origin[0]), float(surface.origin[1])), float(surface.scaling))
         step = len(self.recording._steps) - 1

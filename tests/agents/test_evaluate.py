@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.arena import ParallelArena
+from agents.arena import MultiagentArena
 from agents.evaluate import (
     NUM_POLICIES,
     Evaluation,
@@ -122,5 +122,5 @@ def test_everyone_plays_the_same_held_out_seeds():
     assert len(calls) == 3 * NUM_POLICIES
     seeds = range(EVALUATION_SEED, EVALUATION_SEED + 3)
     for name, found in evaluation.results.items():
-        expected = ParallelArena(task).play(model if name == "ppo" else name, seeds)
+        expected = MultiagentArena(task).play(model if name == "ppo" else name, seeds)
         assert [(e.seed, e.episode_return) for e in found] == [(e.seed, e.episode_return) for e in expected]

@@ -126,7 +126,7 @@ def test_failed_save_leaves_the_old_file(tmp_path: Path, venv: VecEnv, monkeypat
     def die(*args: Any) -> None:
         raise OSError("killed before the rename")
 
-    monkeypatch.setattr("agents.runs.os.replace", die)
+    monkeypatch.setattr("predictor.files.os.replace", die)
     with pytest.raises(OSError, match="killed"):
         save_model(make_ppo(venv), path, {"steps": 2})
     assert path.read_bytes() == before

@@ -15,7 +15,7 @@ from agents.presets import DQNPreset, PPOPreset, preset_for
 from agents.runs import read_note, save_model
 from agents.task import EVALUATION_SEED, SELECTION_SEED, Task
 from agents.training import SaveCheckpoint, SelectBest, TrainingPlan, make_model
-from agents.vec_envs import EpisodeResult, SeededEpisodes, make_rows
+from agents.vec_envs import EpisodeResult, SeededEpisodes, make_venv
 from predictor.errors import UserError
 
 CONSTANT_VELOCITY = Task("highway-fast-v0", "constant-velocity")
@@ -41,11 +41,11 @@ class Coin(gym.Env[np.ndarray, np.int64]):
 def make_selection(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], EgoArena]:
     """From a number of rows to an arena of coins."""
 
-    def make_rows(task: Task, num_rows: int, seeded: bool) -> VecMonitor:
+    def make_venv(task: Task, num_envs: int, seeded: bool) -> VecMonitor:
         assert seeded
-        return VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Coin())] * num_rows))
+        return VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Coin())] * num_envs))
 
-    monkeypatch.setattr("agents.arena.make_rows", make_rows)
+    monkeypatch.setattr("agents.arena.make_venv", make_venv)
     return lambda rows: EgoArena(CONSTANT_VELOCITY, rows)
 
 
@@ -55,7 +55,7 @@ def make_ppo() -> PPO:
 
 
 def plan(**changes: Any) -> TrainingPlan:
-    defaults = {"task": CONSTANT_VELOCITY, "algorithm": "ppo", "steps": 10, "num_rows": 1, "seed": 0}
+    defaults = {"task": CONSTANT_VELOCITY, "algorithm": "ppo", "steps": 10, "num_envs": 1, "seed": 0}
     return TrainingPlan(**(defaults | changes))
 
 
@@ -132,7 +132,7 @@ def test_seeds_of_training_selection_and_evaluation_are_apart():
         plan(seed=SELECTION_SEED)
 
 
-@pytest.mark.parametrize("field", ["steps", "num_rows", "selections", "selection_episodes", "checkpoint_every"])
+@pytest.mark.parametrize("field", ["steps", "num_envs", "selections", "selection_episodes", "checkpoint_every"])
 def test_numbers_below_one_are_refused(field: str):
     assert getattr(plan(**{field: 1}), field) == 1
     with pytest.raises(UserError, match=f"{field} must be at least 1, got 0"):
@@ -147,7 +147,7 @@ def test_dqn_needs_discrete_actions():
 
 
 def test_models_follow_their_preset():
-    venv = make_rows(CONSTANT_VELOCITY, 1)
+    venv = make_venv(CONSTANT_VELOCITY, 1)
     ppo = make_model(plan(), venv)
     assert isinstance(ppo, PPO)
     assert (ppo.n_steps, ppo.batch_size, ppo.gamma, ppo.learning_rate) == (128, 64, 0.8, 5e-4)
@@ -173,7 +173,7 @@ def test_presets():
 
 def test_same_seed_same_policy():
     def trained() -> dict[str, torch.Tensor]:
-        venv = make_rows(CONSTANT_VELOCITY, 1)
+        venv = make_venv(CONSTANT_VELOCITY, 1)
         model = make_model(plan(seed=3), venv)
         model.learn(128)
         venv.close()

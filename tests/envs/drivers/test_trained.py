@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
-from agents.arena import ParallelArena
+from agents.arena import MultiagentArena
 from agents.task import Task
 from envs.drivers.trained import trained_driver
 from envs.parallel import ForecastParallelEnv
 from envs.registry import make_parallel_env
-from envs.rollouts.world import SharedWorld
+from envs.rollouts.world import MultiagentWorld
 from predictor.errors import UserError
 from tests.agents.helpers import policy_for
 
@@ -53,7 +53,7 @@ def played(env: ForecastParallelEnv, path: str) -> tuple[dict[str, float], list[
 def test_it_acts_as_where_it_was_measured(learners: tuple[str, ...], observe: Any, num_samples: int, tmp_path: Path):
     task = Task(SPREAD, observe, learners=learners, partner="varied")
     path, model = save_run(tmp_path, task)
-    (expected,) = ParallelArena(task).play(model, [SEED])
+    (expected,) = MultiagentArena(task).play(model, [SEED])
     returns, actions = played(forecast_env(num_samples=num_samples), path)
     assert len(actions) == expected.length
     assert len({acted["agent_0"] for acted in actions}) > 1
@@ -64,7 +64,7 @@ def test_it_acts_as_where_it_was_measured(learners: tuple[str, ...], observe: An
 def test_unequal_agents_are_padded_as_in_training(tmp_path: Path):
     task = Task("simple_tag_v3", "constant-velocity")
     path, model = save_run(tmp_path, task)
-    (expected,) = ParallelArena(task).play(model, [SEED])
+    (expected,) = MultiagentArena(task).play(model, [SEED])
     returns, _ = played(forecast_env("simple_tag_v3"), path)
     assert np.mean(list(returns.values())) == pytest.approx(expected.episode_return, rel=1e-5)
     assert returns["agent_0"] == pytest.approx(expected.returns_by_role["agent"], rel=1e-5)
@@ -74,7 +74,7 @@ def test_it_drives_a_world(tmp_path: Path):
     path, _ = save_run(tmp_path, Task(SPREAD, "constant-velocity", learners=("agent_1",)))
     env = forecast_env()
     played(env, path)
-    world = SharedWorld(forecast_env(), path)
+    world = MultiagentWorld(forecast_env(), path)
     for _ in range(2):
         world.reset(SEED)
         while not world.step():
@@ -104,20 +104,20 @@ def test_a_damaged_config_names_nobody(damage: str, tmp_path: Path):
 def test_another_observation_space_is_one_clear_line(observe: Any, tmp_path: Path):
     path, _ = save_run(tmp_path, Task("simple_tag_v3", observe), config=False)
     with pytest.raises(UserError, match="was trained on .* but the env gives ") as error:
-        SharedWorld(forecast_env(), path)
+        MultiagentWorld(forecast_env(), path)
     assert "\n" not in str(error.value)
 
 
 def test_learners_that_are_not_there_are_named(tmp_path: Path):
     path, _ = save_run(tmp_path, Task("simple_tag_v3", "none", learners=("adversary",)))
     with pytest.raises(UserError, match="learners: 'adversary' is neither an agent nor a role of .*policy.zip"):
-        SharedWorld(forecast_env(), path)
+        MultiagentWorld(forecast_env(), path)
 
 
 def test_a_stray_zip_is_one_clear_line(tmp_path: Path):
     with zipfile.ZipFile(tmp_path / "stray.zip", "w") as archive:
         archive.writestr("thesis.tex", "")
     with pytest.raises(UserError, match="stray.zip is neither a PPO nor a DQN policy$"):
-        SharedWorld(forecast_env(), str(tmp_path / "stray.zip"))
+        MultiagentWorld(forecast_env(), str(tmp_path / "stray.zip"))
     with pytest.raises(UserError, match="no policy at absent.zip"):
-        SharedWorld(forecast_env(), "absent.zip")
+        MultiagentWorld(forecast_env(), "absent.zip")

@@ -11,7 +11,7 @@ from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark, Obstacle, RoadObject
 
 from envs.collect import CollectConfig, collect
-from envs.drivers.ego import make_ego
+from envs.drivers.ego import make_ego_driver
 from envs.readers.highway import HighwayReader, vehicles_of
 from envs.readers.highway_labels import (
     ATTRIBUTE_NAMES,
@@ -372,7 +372,7 @@ def replay(episode: Episode, env_id: str) -> list[dict[tuple[int, int], tuple[in
     """The labels of each step by the agents' ids, from another run of the same seed."""
     env = make_env(env_id)
     obs, _ = env.reset(seed=episode.seed)
-    ego, reader = make_ego(episode.label, env, np.random.default_rng(episode.seed)), HighwayReader(env)
+    ego, reader = make_ego_driver(episode.label, env, np.random.default_rng(episode.seed)), HighwayReader(env)
     steps = []
     for _ in range(len(episode.states)):
         ids, labels = reader.read_all(env).ids.tolist(), read_labels(env)
