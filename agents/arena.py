@@ -14,6 +14,7 @@ from agents.vec_envs import EPISODE_INFO, EpisodeResult, make_multiagent_venv, m
 from envs.drivers.all_agents import make_driver
 from envs.readers.base import role_of
 from envs.sb3.agents_as_rows import ParallelVecEnv
+from envs.seeding import driver_rng
 from predictor.errors import UserError
 
 
@@ -151,7 +152,7 @@ class MultiagentArena:
     def _driven(self, name: str, seed: int) -> EpisodeResult:
         env = self._env
         observations, _ = env.reset(seed=seed)
-        driver = make_driver(name, env, np.random.default_rng(seed))
+        driver = make_driver(name, env, driver_rng(seed, group=1))  # partners are group 0
         returns = dict.fromkeys(self._venv.row_agents, 0.0)
         steps, lived = 0, set(env.agents)
         while env.agents and not (lived.issuperset(returns) and returns.keys().isdisjoint(env.agents)):

@@ -28,6 +28,7 @@ from envs.sb3.agents_as_rows import AgentMonitor, ParallelVecEnv
 from envs.sb3.envpool import EnvPoolVecEnv
 from envs.sb3.forecast import VecForecast
 from envs.sb3.padded_spaces import learners_named
+from envs.seeding import driver_rng
 from envs.wrappers import SceneObservation
 from predictor.scene import SceneSpec
 
@@ -68,7 +69,7 @@ class DrivenEnv(BaseParallelWrapper):
         """Nothing is reset yet."""
         super().__init__(env)
         self._name = driver
-        self._rng = np.random.default_rng(0)
+        self._rng = driver_rng(0)
         self._driver: Driver | None = None
         self.episodes = 0
 
@@ -87,7 +88,7 @@ class DrivenEnv(BaseParallelWrapper):
         """Reset; a seed also fixes the drivers of this and the following episodes."""
         observations, infos = self.env.reset(seed=seed, options=options)
         if seed is not None:
-            self._rng = np.random.default_rng(seed)
+            self._rng = driver_rng(seed)
         self._driver = None
         self.episodes += 1
         return observations, infos
@@ -210,7 +211,7 @@ class SeededEpisodes(gym.Wrapper):
         obs, info = self.env.reset(seed=seed if self._seed is None else self._seed, options=options)
         self._driver = None
         if self._driver_name is not None:
-            self._driver = make_ego_driver(self._driver_name, self.env, np.random.default_rng(self._seed))
+            self._driver = make_ego_driver(self._driver_name, self.env, driver_rng(self._seed))
         self._rewards: list[float] = []
         self._speeds_mps: list[float] = []
         self._crashed = False

@@ -23,6 +23,7 @@ from rich.progress import track
 from envs.drivers.ego import make_ego_driver
 from envs.readers.highway import HighwayReader, is_highway_env
 from envs.registry import make_env
+from envs.seeding import driver_rng
 from predictor.data.store import Episode
 from predictor.errors import UserError, run_entry_point
 from predictor.files import replace_folder, write_json
@@ -101,7 +102,7 @@ def roll_out(
     reader = HighwayReader(env)
     obs: Any
     obs, _ = env.reset(seed=seed)
-    ego = make_ego_driver(ego_name, env, np.random.default_rng(seed))
+    ego = make_ego_driver(ego_name, env, driver_rng(seed))
     road: Any = env.unwrapped.road  # type: ignore[attr-defined]
     scenes, headings = [reader.read_all(env)], [_headings_rad(env)]
     advance = road.step

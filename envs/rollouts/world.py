@@ -18,6 +18,7 @@ from envs.readers.base import SceneReader
 from envs.readers.highway import is_highway_env
 from envs.readers.highway_labels import SceneLabels, read_labels
 from envs.registry import is_parallel_id, make_env, make_parallel_env, parallel_checkpoint_for
+from envs.seeding import driver_rng
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.errors import UserError
@@ -75,7 +76,7 @@ class EgoWorld:
     def reset(self, seed: int) -> None:
         """Begin the episode of a seed."""
         self.observation, _ = self.env.reset(seed=seed)
-        self._ego = make_ego_driver(self._name, self.env, np.random.default_rng(seed))
+        self._ego = make_ego_driver(self._name, self.env, driver_rng(seed))
 
     def step(self) -> bool:
         """Let the ego act."""
@@ -130,7 +131,7 @@ class MultiagentWorld:
     def reset(self, seed: int) -> None:
         """Begin the episode of a seed."""
         self._observations, _ = self.env.reset(seed=seed)
-        self._driver = self._make_driver(np.random.default_rng(seed))
+        self._driver = self._make_driver(driver_rng(seed))
 
     def step(self) -> bool:
         """Let all agents act."""

@@ -9,6 +9,7 @@ from agents.task import Task
 from agents.vec_envs import DrivenEnv, EpisodeResult, MakeCopy, drive, make_multiagent_venv
 from envs.drivers.all_agents import make_driver
 from envs.registry import make_parallel_env
+from envs.seeding import driver_rng
 from predictor.errors import UserError
 from tests.agents.helpers import LIVES, TOY, policy_for
 
@@ -154,7 +155,7 @@ def test_a_policy_is_played_as_in_a_plain_loop():
 def test_a_driver_is_played_as_in_a_plain_loop(name: str):
     env = make_parallel_env(SPREAD)
     observations, _ = env.reset(seed=6)
-    driver = make_driver(name, env, np.random.default_rng(6))
+    driver = make_driver(name, env, driver_rng(6, group=1))
     total = 0.0
     while env.agents:
         observations, rewards, *_ = env.step(driver(observations))
