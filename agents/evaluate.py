@@ -53,7 +53,7 @@ class PolicySummary:
     length_se: float
     """Its standard error."""
     crash_rate: float | None
-    """Share of episodes with a crash; None where there is no ego."""
+    """Share of episodes with a crash; None where the env reports none."""
     crash_low: float | None
     """Lower end of its 95 % Wilson interval."""
     crash_high: float | None
@@ -74,6 +74,8 @@ class Evaluation:
     """Episode i was reset with first_seed + i."""
     results: dict[str, list[EpisodeResult]]
     """Episodes by policy."""
+    has_ego: bool = True
+    """Whether one agent is driven: the table then has its crash rate and speed, "–" where the env reports none."""
 
     @property
     def summaries(self) -> list[PolicySummary]:
@@ -114,10 +116,9 @@ class Evaluation:
         """Returns the header and the cells of each line; a column that would be empty is left out."""
         summaries = self.summaries
         roles = list(dict.fromkeys(role for summary in summaries for role in summary.role_returns))
-        with_crashes = any(summary.crash_rate is not None for summary in summaries)
         header = ["policy", "return", *(f"return of {role}" for role in roles), "length"]
-        header += ["crash rate (95 %)", "speed [m/s]"] if with_crashes else []
-        return header, [_cells_of(summary, roles, with_crashes) for summary in summaries]
+        header += ["crash rate (95 %)", "speed [m/s]"] if self.has_ego else []
+        return header, [_cells_of(summary, roles, self.has_ego) for summary in summaries]
 
     def _caption(self) -> str:
         count = max(len(found) for found in self.results.values())
@@ -125,8 +126,10 @@ class Evaluation:
             f"{count} episodes each, the same seeds from {self.first_seed} on; mean ± standard error, length in policy "
             "steps"
         )
-        if all(summary.crash_rate is None for summary in self.summaries):
+        if not self.has_ego:
             return f"{caption}; return: mean over the learners."
+        if all(summary.crash_rate is None for summary in self.summaries):
+            return f"{caption}; the environment reports no crashes."
         return f"{caption}, crash rate with its 95 % Wilson interval."
 
 
@@ -205,7 +208,7 @@ def evaluate_policy_on_seeds(
             results[baseline] = arena.play(baseline, seeds, on_episode)
     finally:
         arena.close()
-    return Evaluation(task.env_id, first_seed, results)
+    return Evaluation(task.env_id, first_seed, results, has_ego=not task.is_multiagent)
 
 
 def evaluate_with_progress(
@@ -225,23 +228,22 @@ def evaluate_with_progress(
         )
 
 
-def _cells_of(summary: PolicySummary, roles: Sequence[str], with_crashes: bool) -> list[str]:
+def _cells_of(summary: PolicySummary, roles: Sequence[str], has_ego: bool) -> list[str]:
     cells = [summary.policy, f"{summary.return_mean:.2f}{_plus_minus(summary.return_se, 2)}"]
     for role in roles:
         mean, error = summary.role_returns.get(role, (math.nan, math.nan))
         cells.append(f"{mean:.2f}{_plus_minus(error, 2)}")
     cells.append(f"{summary.length_mean:.1f}{_plus_minus(summary.length_se, 1)}")
-    if (
-        with_crashes
-        and summary.crash_rate is not None
-        and summary.crash_low is not None
-        and summary.crash_high is not None
-    ):
-        cells.append(
-            f"{100 * summary.crash_rate:.0f} % ({100 * summary.crash_low:.0f}–{100 * summary.crash_high:.0f} %)"
-        )
+    if has_ego:
+        cells.append(_crashes(summary))
         cells.append("–" if math.isnan(summary.mean_speed_mps) else f"{summary.mean_speed_mps:.1f}")
     return cells
+
+
+def _crashes(summary: PolicySummary) -> str:
+    if summary.crash_rate is None or summary.crash_low is None or summary.crash_high is None:
+        return "–"
+    return f"{100 * summary.crash_rate:.0f} % ({100 * summary.crash_low:.0f}–{100 * summary.crash_high:.0f} %)"
 
 
 def _plus_minus(error: float, digits: int) -> str:

@@ -1,10 +1,11 @@
 """Train an SB3 policy: preset, parallel environments, selection on its own seeds, checkpoints that survive a kill.
 
-`policy.zip` is the model that did best on the selection seeds (the common practice, and what SB3's EvalCallback keeps);
-those seeds are disjoint from training and from the final evaluation, so the final numbers are not selected for.
+`policy.zip` is the latest model that is not significantly worse on the selection seeds than the best one measured.
+Those seeds are disjoint from training and from the final evaluation, so the final numbers are not selected for.
 """
 
 import zipfile
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ from agents.task import SELECTION_SEED, Task, resolve_device
 from agents.vec_envs import make_venv
 from predictor.errors import UserError
 from predictor.files import copy_file
+
+_NORMAL_95 = 1.959963984540054  # two-sided 95 % quantile of the normal distribution
 
 
 @dataclass(frozen=True)
@@ -178,11 +181,15 @@ class SaveCheckpoint(BaseCallback):
 
 
 class SelectBest(BaseCallback):
-    """Plays the same seeds each time; the best model is saved atomically with its result inside.
+    """Keeps the latest model that is not significantly worse than the best one measured, with its result inside.
+
+    Few episodes cannot tell two similar models apart, and the highest of several noisy means belongs to a lucky one. A
+    later model, which has learned longer, therefore replaces the kept one unless it is `significantly_worse` than the
+    model with the highest mean so far; comparing with that one keeps a chain of small losses from adding up.
 
     Args:
-        arena: where the seeds are played.
-        path: where the best model goes.
+        arena: where the seeds are played, the same ones each time.
+        path: where the selected model goes, atomically.
         num_episodes: episodes per measurement.
         every_steps: environment steps between measurements; there is always one at the end.
     """
@@ -193,13 +200,13 @@ class SelectBest(BaseCallback):
         self._arena, self._path, self._every = arena, path, every_steps
         self._seeds = range(SELECTION_SEED, SELECTION_SEED + num_episodes)
         self._measured_at = 0
-        self.best_return = -np.inf
+        self._highest: list[float] = []
 
     def _on_training_start(self) -> None:
-        """Continue from the result inside an existing file."""
+        """Continue from the results inside an existing file."""
         self._measured_at = self.model.num_timesteps
         try:
-            self.best_return = float(read_note(self._path).get("selection_return", -np.inf))
+            self._highest = list(read_note(self._path).get("highest_returns", []))
         except zipfile.BadZipFile as error:
             raise UserError(f"{self._path} is damaged; remove it to go on without it") from error
 
@@ -215,11 +222,32 @@ class SelectBest(BaseCallback):
     def _measure(self) -> None:
         self._measured_at = self.num_timesteps
         results = self._arena.play(self.model, self._seeds)
-        mean = float(np.mean([r.episode_return for r in results]))
+        returns = [r.episode_return for r in results]
+        mean = float(np.mean(returns))
         self.logger.record("eval/mean_reward", mean)
         self.logger.record("eval/mean_ep_length", float(np.mean([r.length for r in results])))
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
-        if mean > self.best_return:
-            self.best_return = mean
-            save_model(self.model, self._path, {"selection_return": mean, "steps": self.num_timesteps})
+        comparable = len(self._highest) == len(returns)
+        if comparable and significantly_worse(returns, self._highest):
+            return
+        if not comparable or mean > np.mean(self._highest):
+            self._highest = returns
+        note = {"selection_return": mean, "steps": self.num_timesteps, "highest_returns": self._highest}
+        save_model(self.model, self._path, note)
+
+
+def significantly_worse(returns: Sequence[float], best: Sequence[float]) -> bool:
+    """Returns whether `returns` are lower than `best` beyond what so few episodes leave open.
+
+    The 95 % normal interval of the mean paired difference must lie below zero; a single episode decides nothing.
+
+    Args:
+        returns: of a model, by seed.
+        best: of another model, by the same seeds in the same order.
+    """
+    difference = np.subtract(returns, best)
+    if len(difference) < 2:
+        return False
+    error = difference.std(ddof=1) / np.sqrt(len(difference))
+    return bool(difference.mean() + _NORMAL_95 * error < 0)

@@ -47,7 +47,7 @@ class EpisodeResult:
     length: int
     """Policy steps."""
     crashed: bool | None
-    """Whether the env reported a crash of the ego at any step; None where there is no ego."""
+    """Whether the env reported a crash of the ego at any step; None where it never says (or there is no ego)."""
     mean_speed_mps: float
     """Mean over steps of the ego's speed [m/s]; NaN where the env reports none."""
     returns_by_role: dict[str, float] = field(default_factory=dict)
@@ -214,7 +214,7 @@ class SeededEpisodes(gym.Wrapper):
             self._driver = make_ego_driver(self._driver_name, self.env, driver_rng(self._seed))
         self._rewards: list[float] = []
         self._speeds_mps: list[float] = []
-        self._crashed = False
+        self._crashed: bool | None = None
         self._obs = obs
         return obs, info
 
@@ -226,7 +226,8 @@ class SeededEpisodes(gym.Wrapper):
         self._obs = obs
         self._rewards.append(float(reward))
         self._speeds_mps.append(float(info.get("speed", np.nan)))
-        self._crashed |= bool(info.get("crashed", False))
+        if "crashed" in info:
+            self._crashed = bool(self._crashed) or bool(info["crashed"])
         if (terminated or truncated) and self._seed is not None:
             speed = float(np.mean(self._speeds_mps))
             info[EPISODE_INFO] = EpisodeResult(

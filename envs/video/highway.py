@@ -114,11 +114,11 @@ class Recording:
             decode_png(frame.png), frame.view, frame.positions_m[self._ego], agents, caption, self.style
         )
 
-    def write_video(self, path: Path) -> None:
+    def write_video(self, path: str | Path) -> None:
         """Encode as MP4 (H.264, yuv420p); `path` is always a whole file."""
         write_video(path, (self.draw(index) for index in range(len(self))), self.fps)
 
-    def write_frame(self, path: Path, index: int) -> None:
+    def write_frame(self, path: str | Path, index: int) -> None:
         """Save one annotated picture as PNG."""
         write_picture(path, self.draw(index))
 

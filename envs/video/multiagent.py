@@ -172,11 +172,11 @@ class MultiagentRecording:
         above = self._roles(self._moments[step])
         return draw_page(arena, self._caption(index), above, self._legend, self._width_px, self.style.lines)
 
-    def write_video(self, path: Path) -> None:
+    def write_video(self, path: str | Path) -> None:
         """Encode as MP4 (H.264, yuv420p); `path` is always a whole file."""
         write_video(path, (self.draw(index) for index in range(len(self))), self.fps)
 
-    def write_frame(self, path: Path, index: int) -> None:
+    def write_frame(self, path: str | Path, index: int) -> None:
         """Save one picture as PNG."""
         write_picture(path, self.draw(index))
 

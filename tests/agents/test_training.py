@@ -1,4 +1,5 @@
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from agents.features import ForecastAttention
 from agents.presets import DQNPreset, PPOPreset, preset_for
 from agents.runs import read_note, save_model
 from agents.task import EVALUATION_SEED, SELECTION_SEED, Task
-from agents.training import SaveCheckpoint, SelectBest, TrainingPlan, make_model
+from agents.training import SaveCheckpoint, SelectBest, TrainingPlan, make_model, significantly_worse
 from agents.vec_envs import EpisodeResult, SeededEpisodes, make_venv
 from predictor.errors import UserError
 
@@ -81,36 +82,74 @@ def test_there_is_always_a_selection_at_the_end(make_selection: Callable[[int], 
     assert read_note(tmp_path / "best.zip")["steps"] == 24
 
 
+class Scripted:
+    """An arena whose results are given: one list of returns per measurement."""
+
+    baselines = ()
+
+    def __init__(self, *measurements: list[float]) -> None:
+        self.measurements, self.seeds = list(measurements), list[range]()
+
+    def play(self, policy: Any, seeds: Any, on_episode: Any = None) -> list[EpisodeResult]:
+        self.seeds.append(seeds)
+        returns = self.measurements.pop(0)
+        return [EpisodeResult(s, value, 3, None, float("nan")) for s, value in zip(seeds, returns, strict=True)]
+
+    def close(self) -> None: ...
+
+
+NOISE = np.random.default_rng(0).normal(scale=4.0, size=(4, 20))
+CLEAR, CLOSE = np.full(20, 10.0) + NOISE[0], np.full(20, 10.0) + NOISE[1]
+
+
+@pytest.mark.parametrize(
+    ("measured", "kept"),
+    [
+        ([CLOSE, CLEAR], 16),
+        ([CLEAR, CLOSE], 16),
+        ([CLEAR, CLEAR], 16),
+        ([CLEAR, CLEAR - 0.5], 8),
+        ([CLEAR, CLEAR - 5.0 + NOISE[2]], 8),
+        ([CLEAR, CLEAR - 5.0 + NOISE[2], CLEAR + NOISE[3]], 24),
+        ([CLEAR - 5.0 + NOISE[2], CLEAR], 16),
+    ],
+    ids=["within noise", "within noise, reversed", "tie", "surely worse by little", "worse", "recovers", "improves"],
+)
+def test_the_latest_model_that_is_not_significantly_worse_is_kept(measured: list, kept: int, tmp_path: Path):
+    arena, path = Scripted(*(list(map(float, returns)) for returns in measured)), tmp_path / "best.zip"
+    make_ppo().learn(8 * len(measured), callback=SelectBest(arena, path, 20, every_steps=8))
+    assert arena.measurements == []
+    assert set(arena.seeds) == {range(SELECTION_SEED, SELECTION_SEED + 20)}
+    note = read_note(path)
+    assert note["steps"] == kept == PPO.load(path, device="cpu").num_timesteps
+    assert note["selection_return"] == pytest.approx(np.mean(measured[kept // 8 - 1]))
+
+
+def test_small_losses_do_not_add_up(tmp_path: Path):
+    """Each model is a little worse than the one before; those that are significantly below the best are not kept."""
+    falling = [list(map(float, CLEAR - 0.35 * step + NOISE[step % 3 + 1] / 4)) for step in range(6)]
+    assert not any(significantly_worse(after, before) for before, after in pairwise(falling))
+    path = tmp_path / "best.zip"
+    make_ppo().learn(48, callback=SelectBest(Scripted(*falling), path, 20, every_steps=8))
+    kept = read_note(path)["steps"] // 8 - 1
+    assert kept < 5
+    assert not significantly_worse(falling[kept], falling[0])
+    assert all(significantly_worse(later, falling[0]) for later in falling[kept + 1 :])
+
+
 @pytest.mark.parametrize(("stored", "replaced"), [(-1.0, True), (100.0, False)], ids=["worse", "better"])
-def test_best_model_of_an_earlier_start_counts(
+def test_the_best_result_of_an_earlier_start_counts(
     stored: float, replaced: bool, make_selection: Callable[[int], EgoArena], tmp_path: Path
 ):
     path = tmp_path / "best.zip"
-    save_model(make_ppo(), path, {"selection_return": stored, "steps": 0})
+    save_model(make_ppo(), path, {"selection_return": stored, "steps": 0, "highest_returns": [stored, stored + 1]})
     make_ppo().learn(8, callback=SelectBest(make_selection(1), path, 2, every_steps=8))
     assert (read_note(path)["steps"] == 8) is replaced
 
 
-def test_the_model_with_the_best_return_is_kept(tmp_path: Path):
-    class Scripted:
-        baselines = ()
-
-        def __init__(self) -> None:
-            self.returns, self.seeds = [2.0, 5.0, 3.0, 5.0], list[range]()
-
-        def play(self, policy: Any, seeds: Any, on_episode: Any = None) -> list[EpisodeResult]:
-            self.seeds.append(seeds)
-            mean = self.returns.pop(0)
-            return [EpisodeResult(seed, mean + seed % 2 * 2 - 1, 3, None, float("nan")) for seed in seeds]
-
-        def close(self) -> None: ...
-
-    arena, path = Scripted(), tmp_path / "best.zip"
-    make_ppo().learn(32, callback=SelectBest(arena, path, 4, every_steps=8))
-    assert arena.returns == []
-    assert set(arena.seeds) == {range(SELECTION_SEED, SELECTION_SEED + 4)}
-    assert read_note(path) == {"selection_return": 5.0, "steps": 16}
-    assert PPO.load(path, device="cpu").num_timesteps == 16
+def test_one_episode_decides_nothing():
+    assert not significantly_worse([0.0], [100.0])
+    assert significantly_worse([0.0, 1.0], [100.0, 100.0])
 
 
 def test_damaged_best_model_is_one_clear_line(make_selection: Callable[[int], EgoArena], tmp_path: Path):

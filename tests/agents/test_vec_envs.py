@@ -30,6 +30,14 @@ class Dice(gym.Env[np.ndarray, np.int64]):
         return np.zeros(1, np.float32), float(action), ended and self._crashes, ended and not self._crashes, info
 
 
+class Silent(Dice):
+    """Never says whether the ego crashed."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        obs, reward, terminated, truncated, info = super().step(action)
+        return obs, reward, terminated, truncated, {"speed": info["speed"]}
+
+
 def dice_venv(rows: int) -> VecEnv:
     return VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Dice())] * rows))
 
@@ -50,6 +58,12 @@ def expected(seed: int) -> EpisodeResult:
 def test_every_seed_is_played_once_for_any_number_of_rows(rows: int):
     seeds = range(100, 107)
     assert run_episodes(dice_venv(rows), always_two, seeds) == [expected(seed) for seed in seeds]
+
+
+def test_a_crash_flag_that_is_never_reported_is_unknown():
+    venv = VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Silent())]))
+    assert [e.crashed for e in run_episodes(venv, always_two, range(4))] == [None] * 4
+    assert {e.crashed for e in run_episodes(dice_venv(1), always_two, range(8))} == {False, True}
 
 
 def test_second_evaluation_starts_afresh():

@@ -187,7 +187,7 @@ def test_video_has_every_picture_and_its_size_is_even(recording: MultiagentRecor
     assert len(recording) == 1 + STEPS * recording.frames_per_step
     assert recording.frame_of_step(2) == 2 * recording.frames_per_step
     path = tmp_path / "video.mp4"
-    recording.write_video(path)
+    recording.write_video(str(path))
     height, width, _ = recording.draw(0).shape
     assert height % 2 == width % 2 == 0
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(path)]
@@ -200,7 +200,7 @@ def test_video_has_every_picture_and_its_size_is_even(recording: MultiagentRecor
 
 
 def test_frame_is_saved_as_drawn(recording: MultiagentRecording, tmp_path: Path):
-    recording.write_frame(tmp_path / "frame.png", 9)
+    recording.write_frame(str(tmp_path / "frame.png"), 9)
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "frame.png")), recording.draw(9))
 
 
