@@ -15,8 +15,7 @@ import tyro
 from rich.console import Console
 
 from agents.evaluate import PACKAGES, evaluate_with_progress
-from agents.features import AttentionConfig
-from agents.runs import load_model, open_run
+from agents.runs import FORECASTER, check_forecaster, load_model, open_run
 from agents.task import Task
 from agents.training import TrainingPlan, train
 from agents.video import film
@@ -126,11 +125,17 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
     config.check()
     plan = config.plan
     plan.check_action_space(plan.task.check())
-    settings = asdict(config) | {"preset": asdict(plan.preset), "attention": asdict(AttentionConfig())}
+    settings = asdict(config) | {"preset": asdict(plan.preset), "attention": asdict(plan.attention)}
     settings |= {"learners": plan.task.learners, "envs": config.num_envs}
+    pin = plan.task.note.forecaster
+    settings[FORECASTER] = None if pin is None else asdict(pin)
     for name in ("run_dir", "resume"):
         settings.pop(name)
-    free = ("checkpoint_every", "eval_episodes", "video", "device")
+    if config.resume and not check_forecaster(config.folder, pin):
+        console.print(
+            f"note: {config.folder} does not say which forecaster it was trained on; it goes on with this one"
+        )
+    free = ("checkpoint_every", "eval_episodes", "video", "device", FORECASTER)  # the last is compared above
     open_run(config.folder, settings, provenance(PACKAGES) | {"seed": config.seed}, config.resume, free)
     if config.backend == "envpool" and (copy := native_task_of(config.env_id)) in ONE_START:
         console.print(f"note: EnvPool's {copy} begins every episode in the same state; the original does not")

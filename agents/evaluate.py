@@ -24,6 +24,7 @@ from agents.arena import open_arena
 from agents.runs import POLICY_FILE, load_model, read_config
 from agents.task import EVALUATION_SEED, Task
 from agents.vec_envs import EpisodeResult
+from envs.sb3.policy_file import read_policy_note
 from predictor.errors import UserError, run_entry_point
 from predictor.files import write_json, write_text
 from predictor.provenance import provenance
@@ -33,6 +34,7 @@ NUM_POLICIES = 3
 """The trained one and an arena's two baselines."""
 
 _WILSON_Z = 1.959963984540054  # two-sided 95 %
+NOT_PINNED = "note: {} does not say which forecaster it was trained on; it gets the one of its run's config"
 PACKAGES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2", "envpool", "torch", "numpy")
 
 
@@ -301,7 +303,13 @@ def main() -> None:
         partner=run.get("partner", "heuristic"),
     )
     task.check()
-    model = load_model(config.run_dir / POLICY_FILE, run["algorithm"])
+    policy = config.run_dir / POLICY_FILE
+    model = load_model(policy, run["algorithm"])
+    note, now = read_policy_note(policy), task.note
+    if note is None:
+        Console(stderr=True).print(NOT_PINNED.format(policy))
+    elif note.forecaster is not None and now.forecaster is not None:
+        note.forecaster.check(now.forecaster, f"policy {policy}")
     name = f"{run['algorithm']} ({run['observe']})"
     evaluation = evaluate_with_progress(task, model, name, config.episodes, config.workers, config.seed)
     out = config.out or config.run_dir / "evaluation"

@@ -18,10 +18,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from predictor.errors import UserError
+from predictor.scene import SceneSpec
 
 EGO_KEY = "observation"
 VALID_KEY = "valid"
 TOKEN_KEYS = ("agents", "forecast", "edge_probs", "edge_features")
+
+NEAR, FAR, SPEED = 0.1, 0.5, 1.0
+"""Scales of near and far positions and of velocities, as fractions of a scene's `feature_scales`."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +39,18 @@ class AttentionConfig:
     heads: int = 4
     """Attention heads; must divide `width`."""
     near_m: float = 10.0
-    """Positions enter once as tanh(x / near_m): resolves lanes and gaps, saturates far away [m]."""
+    """Positions enter once as tanh(x / near_m): resolves lanes and gaps, saturates far away [m]; default: on a road."""
     far_m: float = 50.0
     """… and once as x / far_m: keeps what is far in order of distance [m]."""
     speed_mps: float = 30.0
-    """Divisor of relative velocities [m/s]; highway-env's top speed."""
+    """Divisor of relative velocities [m/s]; highway-env's top speed by default."""
+
+    @classmethod
+    def for_scenes(cls, spec: SceneSpec) -> "AttentionConfig":
+        """Returns the scaling that fits scenes of this layout: 10 m, 50 m and 30 m/s on roads, less in small arenas."""
+        axes = spec.position_dim
+        position_m, velocity_mps = max(spec.feature_scales[:axes]), max(spec.feature_scales[axes : 2 * axes])
+        return cls(near_m=NEAR * position_m, far_m=FAR * position_m, speed_mps=SPEED * velocity_mps)
 
     def __post_init__(self) -> None:
         """Check that the fields fit together."""

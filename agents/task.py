@@ -2,7 +2,7 @@
 
 import importlib.util
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -10,9 +10,17 @@ import torch
 
 from envs.drivers.all_agents import DRIVER_NAMES, make_driver
 from envs.parallel import ForecastParallelEnv
-from envs.registry import is_parallel_id, make_env, make_parallel_env, native_task_of
+from envs.registry import (
+    checkpoint_for,
+    is_parallel_id,
+    make_env,
+    make_parallel_env,
+    native_task_of,
+    parallel_checkpoint_for,
+)
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.sb3.padded_spaces import learners_named
+from envs.sb3.policy_file import PolicyNote, pin_forecaster
 from envs.wrappers import ForecastObservation
 from predictor.errors import UserError
 from predictor.scene import SceneSpec
@@ -74,17 +82,39 @@ class Task:
 
     @property
     def scene_spec(self) -> SceneSpec | None:
-        """Scenes as the forecaster was trained on them; None if the policy sees none.
+        """Layout of the scenes behind the forecasts; None if the policy sees none.
 
         Raises:
             UserError: unknown env, missing checkpoint, or a checkpoint that does not fit the env.
         """
-        if self.observe == "none":
-            return None
-        env = ForecastObservation(make_env(self.env_id), self.forecaster, device=resolve_device(self.device))
-        spec: SceneSpec = env.get_wrapper_attr("scene_spec")
+        return None if self.observe == "none" else self._forecasts()[1]
+
+    @property
+    def note(self) -> PolicyNote:
+        """What a policy of this task needs beside its weights.
+
+        Raises:
+            UserError: as `scene_spec`.
+        """
+        pin = None
+        if self.observe != "none":
+            shipped = parallel_checkpoint_for if self.is_multiagent else checkpoint_for
+            pin = pin_forecaster(self.forecaster or shipped(self.env_id), *self._forecasts())
+        return PolicyNote(pin, self.learners, self.partner)
+
+    def _forecasts(self) -> tuple[gym.spaces.Dict, SceneSpec]:
+        """Returns an observation space with forecasts, and the layout of the scenes behind them."""
+        device = resolve_device(self.device)
+        space: Any
+        if self.is_multiagent:
+            many = ForecastParallelEnv(make_parallel_env(self.env_id), self.forecaster, device=device)
+            space, spec = many.observation_space(many.possible_agents[0]), many.scene_spec
+            many.close()
+            return space, spec
+        env = ForecastObservation(make_env(self.env_id), self.forecaster, device=device)
+        space, spec = env.observation_space, env.get_wrapper_attr("scene_spec")
         env.close()
-        return spec
+        return space, spec
 
     def check(self) -> gym.Space:
         """Make the environment, with its forecaster, and return its action space.

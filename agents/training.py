@@ -20,9 +20,10 @@ from stable_baselines3.common.vec_env import VecEnv
 from agents.arena import Arena, open_arena
 from agents.features import AttentionConfig, ForecastAttention
 from agents.presets import Algorithm, PPOPreset, Preset, preset_for
-from agents.runs import BEST_FILE, CHECKPOINT_FILE, POLICY_FILE, load_model, read_note, save_model
+from agents.runs import BEST_FILE, CHECKPOINT_FILE, POLICY_FILE, load_model, save_model
 from agents.task import SELECTION_SEED, Task, resolve_device
 from agents.vec_envs import make_venv
+from envs.sb3.policy_file import PolicyNote, read_note
 from predictor.errors import UserError
 from predictor.files import copy_file
 
@@ -67,6 +68,12 @@ class TrainingPlan:
         """Hyperparameters."""
         return preset_for(self.task.env_id, self.algorithm, self.task.backend)
 
+    @property
+    def attention(self) -> AttentionConfig:
+        """Sizes and scales of the features extractor; the scales are those of the task's scenes."""
+        spec = self.task.scene_spec
+        return AttentionConfig() if spec is None else AttentionConfig.for_scenes(spec)
+
     def check_action_space(self, space: spaces.Space) -> None:
         """Raise if the algorithm cannot drive this action space."""
         if self.algorithm == "dqn" and not isinstance(space, spaces.Discrete):
@@ -79,13 +86,14 @@ def train(plan: TrainingPlan, run_dir: Path) -> Path:
     Returns:
         The final policy, `run_dir/policy.zip`.
     """
+    note = plan.task.note  # loads the forecaster, which draws random numbers: before the model is seeded
     venv = make_venv(plan.task, plan.num_envs)
     selection = open_arena(plan.task, min(plan.selection_envs, plan.selection_episodes))
     try:
         model = _resume_or_make(plan, venv, run_dir)
         if model.num_timesteps < plan.steps:
-            _learn(plan, model, selection, run_dir)
-            save_model(model, run_dir / CHECKPOINT_FILE, buffer=True)
+            _learn(plan, model, selection, run_dir, note)
+            save_model(model, run_dir / CHECKPOINT_FILE, note=note, buffer=True)
     finally:
         venv.close()
         selection.close()
@@ -93,13 +101,13 @@ def train(plan: TrainingPlan, run_dir: Path) -> Path:
     return run_dir / POLICY_FILE
 
 
-def _learn(plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: Path) -> None:
+def _learn(plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: Path, note: PolicyNote) -> None:
     """The remaining steps, under SB3's progress bar."""
     every = max(plan.steps // plan.selections, 1)
     progress = ProgressBarCallback()
     callbacks = [
-        SaveCheckpoint(run_dir / CHECKPOINT_FILE, plan.checkpoint_every),
-        SelectBest(selection, run_dir / BEST_FILE, plan.selection_episodes, every),
+        SaveCheckpoint(run_dir / CHECKPOINT_FILE, plan.checkpoint_every, note),
+        SelectBest(selection, run_dir / BEST_FILE, plan.selection_episodes, every, note),
         progress,
     ]
     try:
@@ -132,7 +140,7 @@ def make_model(plan: TrainingPlan, venv: VecEnv, tensorboard_log: str | None = N
         policy = "MultiInputPolicy"
         policy_kwargs |= {
             "features_extractor_class": ForecastAttention,
-            "features_extractor_kwargs": {"config": AttentionConfig()},
+            "features_extractor_kwargs": {"config": plan.attention},
         }
     algorithm: type[PPO] | type[DQN] = PPO if isinstance(preset, PPOPreset) else DQN
     return algorithm(
@@ -162,9 +170,10 @@ def _resume_or_make(plan: TrainingPlan, venv: VecEnv, run_dir: Path) -> BaseAlgo
 class SaveCheckpoint(BaseCallback):
     """Keeps the latest model on disk, taken between updates so that no collected step is lost or counted twice."""
 
-    def __init__(self, path: Path, every_steps: int) -> None:
-        """Save to `path` about every `every_steps` environment steps."""
+    def __init__(self, path: Path, every_steps: int, note: PolicyNote | None = None) -> None:
+        """Save to `path` about every `every_steps` environment steps, with the note inside."""
         super().__init__()
+        self._note = note
         self._path, self._every = path, every_steps
         self._saved_at = 0
 
@@ -174,7 +183,7 @@ class SaveCheckpoint(BaseCallback):
     def _on_rollout_start(self) -> None:
         if self.model.num_timesteps - self._saved_at >= self._every:
             self._saved_at = self.model.num_timesteps
-            save_model(self.model, self._path, buffer=True)
+            save_model(self.model, self._path, note=self._note, buffer=True)
 
     def _on_step(self) -> bool:
         return True
@@ -192,11 +201,15 @@ class SelectBest(BaseCallback):
         path: where the selected model goes, atomically.
         num_episodes: episodes per measurement.
         every_steps: environment steps between measurements; there is always one at the end.
+        note: what the policy needs beside its weights.
     """
 
-    def __init__(self, arena: Arena, path: Path, num_episodes: int, every_steps: int) -> None:
+    def __init__(
+        self, arena: Arena, path: Path, num_episodes: int, every_steps: int, note: PolicyNote | None = None
+    ) -> None:
         """Nothing is measured yet."""
         super().__init__()
+        self._note = note
         self._arena, self._path, self._every = arena, path, every_steps
         self._seeds = range(SELECTION_SEED, SELECTION_SEED + num_episodes)
         self._measured_at = 0
@@ -233,8 +246,8 @@ class SelectBest(BaseCallback):
             return
         if not comparable or mean > np.mean(self._highest):
             self._highest = returns
-        note = {"selection_return": mean, "steps": self.num_timesteps, "highest_returns": self._highest}
-        save_model(self.model, self._path, note)
+        extra = {"selection_return": mean, "steps": self.num_timesteps, "highest_returns": self._highest}
+        save_model(self.model, self._path, extra, self._note)
 
 
 def significantly_worse(returns: Sequence[float], best: Sequence[float]) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 from highway_env.vehicle.controller import ControlledVehicle
 
 from envs.drivers.sampled_actions import uniform_action, varied_actions
-from envs.drivers.trained import EgoDriver, load_policy
+from envs.drivers.trained import EgoDriver, kept_policy
 from predictor.errors import UserError
 
 WHO = "random egos"
@@ -71,5 +71,5 @@ def _keep_lane(env: gym.Env, rng: np.random.Generator) -> EgoDriver:
 
 
 def _trained(path: str) -> EgoDriver:
-    policy = load_policy(path)
+    policy = kept_policy(path)
     return lambda obs: policy.predict(obs, deterministic=True)[0]

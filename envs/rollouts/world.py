@@ -5,14 +5,20 @@ policy is trained with, so what is recorded and measured is what is deployed.
 """
 
 import functools
-from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from envs.drivers.all_agents import Driver, make_driver
 from envs.drivers.ego import make_ego_driver
-from envs.drivers.trained import env_for_driver, forecaster_of, require_view, sees_forecasts, trained_driver
+from envs.drivers.trained import (
+    env_for_driver,
+    forecaster_of,
+    require_forecaster,
+    require_view,
+    sees_forecasts,
+    trained_driver,
+)
 from envs.parallel import ForecastParallelEnv
 from envs.readers.base import SceneReader
 from envs.readers.highway import is_highway_env
@@ -185,20 +191,26 @@ def open_world(
         UserError: unknown env, driver or checkpoint, or things that do not belong together.
     """
     if is_parallel_id(env_id):
+        checkpoint = checkpoint or _forecaster_for(env_id, driver)
         shared = ForecastParallelEnv(
-            make_parallel_env(env_id),
-            checkpoint or _forecaster_for(env_id, driver),
-            horizon_steps=horizon_steps,
-            num_samples=num_samples,
+            make_parallel_env(env_id), checkpoint, horizon_steps=horizon_steps, num_samples=num_samples
         )
-        return MultiagentWorld(shared, driver)
+        multiagent = MultiagentWorld(shared, driver)
+        if sees_forecasts(driver):
+            require_forecaster(
+                driver, checkpoint, shared.observation_space(shared.possible_agents[0]), shared.scene_spec
+            )
+        return multiagent
     env = make_env(env_id, disable_env_checker=True)
     if checkpoint is None:
         seen = env_for_driver(env, driver)
         world = EgoWorld(seen if isinstance(seen, ForecastObservation) else SceneObservation(seen), driver)
     else:
         if sees_forecasts(driver):
-            require_view(ForecastObservation(env, checkpoint, horizon_steps=horizon_steps), driver)
+            seen = ForecastObservation(env, checkpoint, horizon_steps=horizon_steps)
+            require_view(seen, driver)
+            space: Any = seen.observation_space
+            require_forecaster(driver, checkpoint, space, seen.get_wrapper_attr("scene_spec"))
         else:
             require_view(env, driver)
         world = EgoWorld(
@@ -212,7 +224,7 @@ def _forecaster_for(env_id: str, driver: str) -> str:
     """Whose forecasts a PettingZoo environment is recorded with: those that its driver was trained on, if any."""
     if not sees_forecasts(driver):
         return CONSTANT_VELOCITY
-    return forecaster_of(Path(driver)) or parallel_checkpoint_for(env_id)
+    return forecaster_of(driver) or parallel_checkpoint_for(env_id)
 
 
 def default_drivers(env_id: str) -> tuple[str, ...]:

@@ -13,10 +13,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 from agents.arena import EgoArena
 from agents.features import ForecastAttention
 from agents.presets import DQNPreset, PPOPreset, preset_for
-from agents.runs import read_note, save_model
+from agents.runs import save_model
 from agents.task import EVALUATION_SEED, SELECTION_SEED, Task
 from agents.training import SaveCheckpoint, SelectBest, TrainingPlan, make_model, significantly_worse
 from agents.vec_envs import EpisodeResult, SeededEpisodes, make_venv
+from envs.sb3.policy_file import read_note
 from predictor.errors import UserError
 
 CONSTANT_VELOCITY = Task("highway-fast-v0", "constant-velocity")
@@ -160,7 +161,11 @@ def test_damaged_best_model_is_one_clear_line(make_selection: Callable[[int], Eg
 
 def test_checkpoints_are_taken_between_updates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     saved: list[int] = []
-    monkeypatch.setattr("agents.training.save_model", lambda model, path, buffer: saved.append(model.num_timesteps))
+
+    def note_steps(model: PPO, path: Path, note: Any, buffer: bool) -> None:
+        saved.append(model.num_timesteps)
+
+    monkeypatch.setattr("agents.training.save_model", note_steps)
     make_ppo().learn(40, callback=SaveCheckpoint(tmp_path / "checkpoint.zip", every_steps=12))
     assert saved == [16, 32]
 

@@ -1,5 +1,3 @@
-import json
-import shutil
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ from stable_baselines3 import DQN, PPO
 from envs.drivers.ego import EGO_DRIVER_NAMES, idle_action, make_ego_driver
 from envs.drivers.trained import env_for_driver, sees_forecasts
 from envs.registry import CHECKPOINTS, make_env
+from envs.sb3.policy_file import NOTE_ENTRY
 from envs.wrappers import ForecastObservation
 from predictor.errors import UserError
 from tests.envs.helpers import assert_same, save_forecast_policy
@@ -196,10 +195,13 @@ def test_policy_of_another_env_is_named(policies: Path):
         env_for_driver(make_env("highway-fast-v0"), str(policies / "ppo.zip"))
 
 
-def test_policy_of_other_forecasts_is_named(forecast_policy: Path, tmp_path: Path):
-    """Without its run folder, the forecasts it saw are unknown: those of constant velocity have other edges."""
+@pytest.mark.filterwarnings("ignore:.* has no note")
+def test_policy_of_other_forecasts_is_named(forecast_policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Without its note, the forecasts it saw are unknown: those of constant velocity have other edges."""
     stray = tmp_path / "policy.zip"
-    shutil.copy(forecast_policy, stray)
-    (tmp_path / "config.json").write_text(json.dumps({"config": {"observe": "constant-velocity"}}))
+    with zipfile.ZipFile(forecast_policy) as whole, zipfile.ZipFile(stray, "w") as bare:
+        for name in set(whole.namelist()) - {NOTE_ENTRY}:
+            bare.writestr(name, whole.read(name))
+    monkeypatch.setattr("envs.observation.checkpoint_for", lambda source: "constant-velocity")
     with pytest.raises(UserError, match="policy .*policy.zip was trained on Dict.*, but the env gives Dict"):
         env_for_driver(make_env("two-way-v0"), str(stray))

@@ -1,4 +1,3 @@
-import json
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -8,11 +7,12 @@ import pytest
 from stable_baselines3 import PPO
 
 from agents.arena import MultiagentArena
+from agents.runs import save_model
 from agents.task import Task
 from envs.drivers.trained import trained_driver
 from envs.parallel import ForecastParallelEnv
 from envs.registry import make_parallel_env
-from envs.rollouts.world import MultiagentWorld
+from envs.rollouts.world import MultiagentWorld, open_world
 from envs.seeding import driver_rng
 from predictor.errors import UserError
 from tests.agents.helpers import policy_for
@@ -21,13 +21,10 @@ SPREAD = "simple_spread_v3"
 SEED = 7
 
 
-def save_run(folder: Path, task: Task, config: bool = True) -> tuple[str, PPO]:
-    """A run folder as train_policy leaves it."""
+def save_run(folder: Path, task: Task, noted: bool = True) -> tuple[str, PPO]:
+    """A policy as train_policy leaves it."""
     model = policy_for(task)
-    model.save(folder / "policy.zip")
-    if config:
-        settings = {"observe": task.observe, "learners": task.learners, "partner": task.partner}
-        (folder / "config.json").write_text(json.dumps({"config": settings}))
+    save_model(model, folder / "policy.zip", note=task.note if noted else None)
     return str(folder / "policy.zip"), model
 
 
@@ -83,27 +80,35 @@ def test_it_drives_a_world(tmp_path: Path):
         np.testing.assert_array_equal(world.perceived().states, env.scene.scene.states)
 
 
-def test_without_a_run_folder_all_agents_are_the_policys(tmp_path: Path):
-    path, model = save_run(tmp_path, Task(SPREAD, "none"), config=False)
+def test_without_a_note_all_agents_are_the_policys(tmp_path: Path):
+    path, model = save_run(tmp_path, Task(SPREAD, "none"), noted=False)
     env = forecast_env()
     observations, _ = env.reset(seed=SEED)
-    acted = trained_driver(path, env, np.random.default_rng(0))(observations)
+    with pytest.warns(UserWarning, match="policy.zip has no note on its forecaster and learners"):
+        acted = trained_driver(path, env, np.random.default_rng(0))(observations)
     expected = {a: model.predict(seen["observation"], deterministic=True)[0] for a, seen in observations.items()}
     assert acted == expected
 
 
-@pytest.mark.parametrize("damage", ["not json", "[]", '{"config": {}}'], ids=["broken", "list", "empty"])
-def test_a_damaged_config_names_nobody(damage: str, tmp_path: Path):
-    path, _ = save_run(tmp_path, Task(SPREAD, "none"), config=False)
-    (tmp_path / "config.json").write_text(damage)
-    env = forecast_env()
-    observations, _ = env.reset(seed=SEED)
-    assert set(trained_driver(path, env, np.random.default_rng(0))(observations)) == set(env.possible_agents)
+def test_a_damaged_note_is_one_clear_line(tmp_path: Path):
+    path, _ = save_run(tmp_path, Task(SPREAD, "none"), noted=False)
+    with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
+        archive.writestr("note.json", '{"policy": {"learners": []}}')
+    with pytest.raises(UserError, match=r"note inside .*policy.zip cannot be understood \(KeyError\('forecaster'\)\)"):
+        trained_driver(path, forecast_env(), np.random.default_rng(0))
 
 
+def test_a_policy_refuses_forecasts_of_other_options(tmp_path: Path):
+    path, _ = save_run(tmp_path, Task(SPREAD, "constant-velocity"))
+    assert open_world(SPREAD, path, "constant-velocity", num_samples=2)
+    with pytest.raises(UserError, match="was trained on"):
+        open_world(SPREAD, path, "constant-velocity", horizon_steps=7)
+
+
+@pytest.mark.filterwarnings("ignore:.* has no note")
 @pytest.mark.parametrize("observe", ["none", "constant-velocity"])
 def test_another_observation_space_is_one_clear_line(observe: Any, tmp_path: Path):
-    path, _ = save_run(tmp_path, Task("simple_tag_v3", observe), config=False)
+    path, _ = save_run(tmp_path, Task("simple_tag_v3", observe), noted=False)
     with pytest.raises(UserError, match="was trained on .* but the env gives ") as error:
         MultiagentWorld(forecast_env(), path)
     assert "\n" not in str(error.value)
