@@ -14,9 +14,8 @@ import torch
 from rich.console import Console
 
 from agents.evaluate import PACKAGES, evaluate_with_progress
-from agents.features import AttentionConfig
 from agents.presets import Algorithm
-from agents.runs import load_model, open_run
+from agents.runs import FORECASTER, check_forecaster, load_model, open_run
 from agents.task import Backend, Observe, Task
 from agents.training import TrainingPlan, train
 from agents.video import film
@@ -105,7 +104,7 @@ class TrainPolicyConfig:
             self.device,
             self.selections,
             self.selection_episodes,
-            self.measuring_rows,
+            self.measuring_envs,
             self.checkpoint_every,
         )
 
@@ -115,7 +114,7 @@ class TrainPolicyConfig:
         return self.num_envs if self.num_envs is not None else ENVS[self.backend]
 
     @property
-    def measuring_rows(self) -> int:
+    def measuring_envs(self) -> int:
         """Number of parallel environments that measure a policy; results do not depend on it."""
         return min(self.parallel_envs, os.cpu_count() or 1)
 
@@ -124,19 +123,25 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
     """Train, evaluate, film. Nothing is written before the input has been checked."""
     plan = config.plan
     plan.check_action_space(plan.task.check())
-    settings = asdict(config) | {"preset": asdict(plan.preset), "attention": asdict(AttentionConfig())}
+    settings = asdict(config) | {"preset": asdict(plan.preset), "attention": asdict(plan.attention)}
     # config.json keeps the names that runs had when their options were called so: they can be read and resumed
     settings |= {"learners": plan.task.learners, "envs": config.parallel_envs, "partner": config.driver}
+    pin = plan.task.note.forecaster
+    settings[FORECASTER] = None if pin is None else asdict(pin)
     for name in ("out", "resume", "num_envs", "driver"):
         settings.pop(name)
-    free = ("checkpoint_every", "eval_episodes", "video", "device")
+    if config.resume and not check_forecaster(config.folder, pin):
+        console.print(
+            f"note: {config.folder} does not say which forecaster it was trained on; it goes on with this one"
+        )
+    free = ("checkpoint_every", "eval_episodes", "video", "device", FORECASTER)  # the last is compared above
     open_run(config.folder, settings, provenance(PACKAGES) | {"seed": config.seed}, config.resume, free)
     if config.backend == "envpool" and (copy := native_task_of(config.env_id)) in ONE_START:
         console.print(f"note: EnvPool's {copy} begins every episode in the same state; the original does not")
     policy = train(plan, config.folder)
     model = load_model(policy, config.algorithm)
     evaluation = evaluate_with_progress(
-        plan.task, model, f"{config.algorithm} ({config.observe})", config.eval_episodes, config.measuring_rows
+        plan.task, model, f"{config.algorithm} ({config.observe})", config.eval_episodes, config.measuring_envs
     )
     evaluation.write(config.folder, algorithm=config.algorithm, observe=config.observe)
     console.print(evaluation.table())

@@ -8,16 +8,19 @@ variables are kept. Every block is timed; a comment on the line before a block s
     <!-- docs-check: short: python -m envs.collect --env-id roundabout-v1 --out data --episodes 2 -->
 
 A short form (one or several lines) runs instead of its block. It must call the same programs with at least the same
-options, so that a renamed option or module is still found in the text.
+options, or import the same names, so that a renamed option or module is still found in the text.
 """
 
 import argparse
+import ast
+import contextlib
 import json
 import os
 import re
 import select
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -34,7 +37,7 @@ OTHER_LANGUAGES = ("text", "json", "toml", "yaml", "bibtex", "mermaid", "markdow
 """Languages of blocks that are not run."""
 
 _BLOCK = re.compile(
-    r"(?:^[ \t]*<!--\s*docs-check:(?P<note>.*?)-->[ \t]*\n)?"
+    r"(?:^[ \t]*<!--\s*docs-check:(?P<note>(?:(?!-->).)*)-->[ \t]*\n)?"
     r"^(?P<indent>[ \t]*)```(?P<language>\S*)[ \t]*\n(?P<code>.*?)^[ \t]*```[ \t]*$",
     flags=re.MULTILINE | re.DOTALL,
 )
@@ -98,7 +101,12 @@ class Block:
         kind, _, short = self.note.partition("short:")
         if kind or not short.strip():
             raise DocsError(f"{self.where}: unknown annotation '{self.note}'; write 'short: …' or 'skip because …'")
-        if missing := sorted(programs_and_options(self.code) - programs_and_options(short)):
+        needs = programs_and_options if self.language == "bash" else imported_names
+        try:
+            missing = sorted(needs(self.code) - needs(short.strip()))
+        except (SyntaxError, ValueError) as error:
+            raise DocsError(f"{self.where}: the block or its short form cannot be read: {error}") from error
+        if missing:
             raise DocsError(f"{self.where}: the short form must also have {', '.join(missing)}, as the block does")
         return short.strip() + "\n"
 
@@ -122,13 +130,21 @@ class Result:
 
 
 def programs_and_options(code: str) -> set[str]:
-    """Returns the modules and scripts that lines of bash run, and the names of their options."""
+    """Returns the modules and scripts that bash code runs, and the names of their options."""
+    words = shlex.split(code.replace("\\\n", " "), comments=True)
+    options = {word.partition("=")[0] for word in words if re.match(r"--[a-z]", word)}
+    modules = {after for word, after in zip(words, words[1:], strict=False) if word in ("-m", "make")}
+    return options | modules | {word for word in words if word.endswith((".py", ".sh"))}
+
+
+def imported_names(code: str) -> set[str]:
+    """Returns the names that Python code imports, as "module.name"."""
     found: set[str] = set()
-    for line in code.replace("\\\n", " ").splitlines():
-        words = shlex.split(line, comments=True)
-        found |= {word.partition("=")[0] for word in words if re.match(r"--[a-z]", word)}
-        found |= {after for word, after in zip(words, words[1:], strict=False) if word in ("-m", "make")}
-        found |= {word for word in words if word.endswith((".py", ".sh"))}
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
     return found
 
 
@@ -149,6 +165,8 @@ def blocks_of(page: Path, root: Path = ROOT) -> list[Block]:
             raise DocsError(f"{name}:{fence}: blocks of '{language}' are not known; write bash, python or text")
         elif not language and _COMMAND.search(code):
             raise DocsError(f"{name}:{fence}: a block with commands needs a language (bash or python) behind its fence")
+    if text.count("<!-- docs-check:") != sum(bool(block.note) for block in found):
+        raise DocsError(f"{name}: a docs-check comment must stand on the line before a bash or python block")
     return found
 
 
@@ -183,22 +201,23 @@ class Page:
 
     def _stop_python(self) -> None:
         if self._python is not None:
-            self._python.kill()
-            self._python.communicate()
+            _stop(self._python)
             self._python = None
 
     def _run_bash(self, code: str) -> str:
         with tempfile.NamedTemporaryFile() as exported:
             command = ["bash", "-euo", "pipefail", "-c", f"{code}\nenv -0 > {shlex.quote(exported.name)}"]
+            process = subprocess.Popen(
+                command, cwd=self.folder, env=self.environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT, text=True, start_new_session=True,
+            )  # fmt: skip
             try:
-                done = subprocess.run(
-                    command, cwd=self.folder, env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-                    stdin=subprocess.DEVNULL, text=True, timeout=self.limit_s,
-                )  # fmt: skip
+                printed, _ = process.communicate(timeout=self.limit_s)
             except subprocess.TimeoutExpired:
+                _stop(process)
                 return self._too_long
-            if done.returncode:
-                return f"{done.stdout}\nexit status {done.returncode}"
+            if process.returncode:
+                return f"{printed}\nexit status {process.returncode}"
             pairs = [line.partition("=") for line in Path(exported.name).read_text().split("\0") if line]
             self.environment = {name: value for name, _, value in pairs}
         return ""
@@ -207,7 +226,7 @@ class Page:
         if self._python is None:
             self._python = subprocess.Popen(
                 [sys.executable, "-c", _WORKER], cwd=self.folder, env=self.environment, text=True,
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._printed,
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._printed, start_new_session=True,
             )  # fmt: skip
         assert self._python.stdin is not None and self._python.stdout is not None
         request = {"code": code, "where": where, "environment": self.environment}
@@ -225,6 +244,13 @@ class Page:
     @property
     def _too_long(self) -> str:
         return f"took more than {self.limit_s:.0f} s: give the block a short form"
+
+
+def _stop(process: subprocess.Popen[str]) -> None:
+    """Ends a process and all that it started."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
 
 
 def copy_tree(target: Path, root: Path = ROOT) -> None:

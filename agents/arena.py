@@ -10,10 +10,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.task import Task
-from agents.vec_envs import EPISODE_INFO, EpisodeResult, make_parallel_rows, make_rows, own_observations
+from agents.vec_envs import EPISODE_INFO, EpisodeResult, make_multiagent_venv, make_venv, own_observations
 from envs.drivers.all_agents import make_driver
 from envs.readers.base import role_of
 from envs.sb3.agents_as_rows import ParallelVecEnv
+from envs.seeding import driver_rng
 from predictor.errors import UserError
 
 
@@ -35,18 +36,18 @@ class Arena(Protocol):
 
 
 class EgoArena:
-    """Parallel rows of an environment with one ego, always the gymnasium one: what counts is the original.
+    """Plays seeds in parallel copies of an environment with one ego, always the Gymnasium one: the original counts.
 
     Args:
         task: what is driven.
-        num_rows: parallel environments.
+        num_envs: parallel environments.
     """
 
     baselines = ("random", "idle")
 
-    def __init__(self, task: Task, num_rows: int) -> None:
-        """Start the rows."""
-        self._venv = make_rows(replace(task, backend="gymnasium"), num_rows, seeded=True)
+    def __init__(self, task: Task, num_envs: int) -> None:
+        """Start the environments."""
+        self._venv = make_venv(replace(task, backend="gymnasium"), num_envs, seeded=True)
 
     def play(
         self, policy: BaseAlgorithm | str, seeds: Sequence[int], on_episode: Callable[[], None] = lambda: None
@@ -57,13 +58,13 @@ class EgoArena:
         return run_episodes(self._venv, lambda obs: policy.predict(obs, deterministic=True)[0], seeds, on_episode)
 
     def close(self) -> None:
-        """Stop the rows."""
+        """Stop the environments."""
         self._venv.close()
 
 
-def open_arena(task: Task, num_rows: int) -> Arena:
+def open_arena(task: Task, num_envs: int) -> Arena:
     """An arena for a task."""
-    return ParallelArena(task) if task.is_parallel else EgoArena(task, num_rows)
+    return MultiagentArena(task) if task.is_multiagent else EgoArena(task, num_envs)
 
 
 def run_episodes(
@@ -72,22 +73,22 @@ def run_episodes(
     seeds: Sequence[int],
     on_episode: Callable[[], None] = lambda: None,
 ) -> list[EpisodeResult]:
-    """Play one episode per seed, all rows in parallel.
+    """Play one episode per seed, all environments in parallel.
 
     Args:
-        venv: from `make_rows(..., seeded=True)`.
-        policy: from a batch of observations to a batch of actions, or the name of an ego from `envs.drivers.ego`.
+        venv: from `make_venv(..., seeded=True)`.
+        policy: from a batch of observations to a batch of actions, or the name of a driver from `envs.drivers.ego`.
         seeds: one per episode, all different.
         on_episode: called after each episode (progress bars).
 
     Returns:
         Results in the order of the seeds.
     """
-    ego = policy if isinstance(policy, str) else None
-    if ego is not None:
-        venv = venv.unwrapped  # nobody looks at the forecasts, so none are made
-    for row in range(venv.num_envs):
-        venv.env_method("queue", list(seeds[row :: venv.num_envs]), ego, indices=[row])
+    driver = policy if isinstance(policy, str) else None
+    if driver is not None:
+        venv = venv.unwrapped  # a driver by name sees no forecasts, so none are made
+    for index in range(venv.num_envs):
+        venv.env_method("queue", list(seeds[index :: venv.num_envs]), driver, indices=[index])
     no_actions = np.zeros((venv.num_envs, *(venv.action_space.shape or ())), dtype=venv.action_space.dtype)
     results: dict[int, EpisodeResult] = {}
     obs = venv.reset()
@@ -102,7 +103,7 @@ def run_episodes(
     return [results[seed] for seed in seeds]
 
 
-class ParallelArena:
+class MultiagentArena:
     """Plays seeds with a policy or with a driver in the learners' place; see `agents.arena.Arena`.
 
     Args:
@@ -114,7 +115,7 @@ class ParallelArena:
 
     def __init__(self, task: Task) -> None:
         """One copy; results do not depend on how many there are."""
-        self._monitor = make_parallel_rows(task, 1)
+        self._monitor = make_multiagent_venv(task, 1)
         venv = self._monitor.venv
         assert isinstance(venv, ParallelVecEnv)
         self._venv = venv
@@ -151,7 +152,7 @@ class ParallelArena:
     def _driven(self, name: str, seed: int) -> EpisodeResult:
         env = self._env
         observations, _ = env.reset(seed=seed)
-        driver = make_driver(name, env, np.random.default_rng(seed))
+        driver = make_driver(name, env, driver_rng(seed, group=1))  # partners are group 0
         returns = dict.fromkeys(self._venv.row_agents, 0.0)
         steps, lived = 0, set(env.agents)
         while env.agents and not (lived.issuperset(returns) and returns.keys().isdisjoint(env.agents)):

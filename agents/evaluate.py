@@ -23,6 +23,7 @@ from agents.arena import open_arena
 from agents.runs import POLICY_FILE, load_model, read_config
 from agents.task import EVALUATION_SEED, Task
 from agents.vec_envs import EpisodeResult
+from envs.sb3.policy_file import read_policy_note
 from predictor import markdown
 from predictor.command_line import Renamed, parse
 from predictor.config_checks import check_at_least
@@ -35,12 +36,13 @@ NUM_POLICIES = 3
 """The trained one and an arena's two baselines."""
 
 _WILSON_Z = 1.959963984540054  # two-sided 95 %
+NOT_PINNED = "note: {} does not say which forecaster it was trained on; it gets the one of its run's config"
 PACKAGES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2", "envpool", "torch", "numpy")
 
 
 @dataclass(frozen=True)
 class PolicySummary:
-    """One row of the table: a policy over all episodes."""
+    """Results of one policy over all episodes: a line of the table."""
 
     policy: str
     """Who drove."""
@@ -55,7 +57,7 @@ class PolicySummary:
     length_se: float
     """Its standard error."""
     crash_rate: float | None
-    """Share of episodes with a crash; None where there is no ego."""
+    """Share of episodes with a crash; None where the env reports none."""
     crash_low: float | None
     """Lower end of its 95 % Wilson interval."""
     crash_high: float | None
@@ -76,9 +78,11 @@ class Evaluation:
     """Episode i was reset with first_seed + i."""
     results: dict[str, list[EpisodeResult]]
     """Episodes by policy."""
+    has_ego: bool = True
+    """Whether one agent is driven: the table then has its crash rate and speed, "–" where the env reports none."""
 
     @property
-    def rows(self) -> list[PolicySummary]:
+    def summaries(self) -> list[PolicySummary]:
         """One summary per policy."""
         return [summarize(policy, episodes) for policy, episodes in self.results.items()]
 
@@ -88,7 +92,7 @@ class Evaluation:
             "env_id": self.env_id,
             "first_seed": self.first_seed,
             **extra,
-            "policies": [_finite(asdict(row)) for row in self.rows],
+            "policies": [_finite(asdict(summary)) for summary in self.summaries],
             "episodes": {name: [_finite(asdict(e)) for e in found] for name, found in self.results.items()},
             "provenance": provenance(PACKAGES),
         }
@@ -97,27 +101,26 @@ class Evaluation:
 
     def markdown(self) -> str:
         """The table for a README."""
-        header, rows = self._cells()
-        return f"{markdown.table(header, rows)}\n\n{self.env_id}: {self._caption()}\n"
+        header, cells = self._cells()
+        return f"{markdown.table(header, cells)}\n\n{self.env_id}: {self._caption()}\n"
 
     def table(self) -> Table:
         """The table for a terminal."""
-        header, rows = self._cells()
+        header, lines = self._cells()
         table = Table(title=self.env_id, caption=self._caption())
         for i, name in enumerate(header):
             table.add_column(escape(name), justify="right" if i else "left")
-        for row in rows:
-            table.add_row(*row)
+        for line in lines:
+            table.add_row(*line)
         return table
 
     def _cells(self) -> tuple[list[str], list[list[str]]]:
-        """Header and rows; what no row has is left out."""
-        summaries = self.rows
-        roles = list(dict.fromkeys(role for row in summaries for role in row.role_returns))
-        with_crashes = any(row.crash_rate is not None for row in summaries)
+        """Returns the header and the cells of each line; a column that would be empty is left out."""
+        summaries = self.summaries
+        roles = list(dict.fromkeys(role for summary in summaries for role in summary.role_returns))
         header = ["policy", "return", *(f"return of {role}" for role in roles), "length"]
-        header += ["crash rate (95 %)", "speed [m/s]"] if with_crashes else []
-        return header, [_row_cells(row, roles, with_crashes) for row in summaries]
+        header += ["crash rate (95 %)", "speed [m/s]"] if self.has_ego else []
+        return header, [_cells_of(summary, roles, self.has_ego) for summary in summaries]
 
     def _caption(self) -> str:
         count = max(len(found) for found in self.results.values())
@@ -125,8 +128,10 @@ class Evaluation:
             f"{count} episodes each, the same seeds from {self.first_seed} on; mean ± standard error, length in policy "
             "steps"
         )
-        if all(row.crash_rate is None for row in self.rows):
+        if not self.has_ego:
             return f"{caption}; return: mean over the learners."
+        if all(summary.crash_rate is None for summary in self.summaries):
+            return f"{caption}; the environment reports no crashes."
         return f"{caption}, crash rate with its 95 % Wilson interval."
 
 
@@ -182,7 +187,7 @@ def evaluate_policy_on_seeds(
     model: BaseAlgorithm,
     name: str,
     num_episodes: int,
-    num_rows: int = 1,
+    num_envs: int = 1,
     first_seed: int = EVALUATION_SEED,
     on_episode: Callable[[], None] = lambda: None,
 ) -> Evaluation:
@@ -193,19 +198,19 @@ def evaluate_policy_on_seeds(
         model: the trained policy.
         name: what to call it in the table.
         num_episodes: episodes per policy.
-        num_rows: parallel environments; the results do not depend on it.
+        num_envs: parallel environments; the results do not depend on it.
         first_seed: episode i is reset with first_seed + i.
         on_episode: called after each episode.
     """
     seeds = range(first_seed, first_seed + num_episodes)
-    arena = open_arena(task, min(num_rows, num_episodes))
+    arena = open_arena(task, min(num_envs, num_episodes))
     try:
         results = {name: arena.play(model, seeds, on_episode)}
         for baseline in arena.baselines:
             results[baseline] = arena.play(baseline, seeds, on_episode)
     finally:
         arena.close()
-    return Evaluation(task.env_id, first_seed, results)
+    return Evaluation(task.env_id, first_seed, results, has_ego=not task.is_multiagent)
 
 
 def evaluate_with_progress(
@@ -213,7 +218,7 @@ def evaluate_with_progress(
     model: BaseAlgorithm,
     name: str,
     num_episodes: int,
-    num_rows: int,
+    num_envs: int,
     first_seed: int = EVALUATION_SEED,
 ) -> Evaluation:
     """`evaluate_policy_on_seeds` under a progress bar."""
@@ -221,20 +226,26 @@ def evaluate_with_progress(
     with Progress(*columns) as progress:
         bar = progress.add_task("", total=num_episodes * NUM_POLICIES)
         return evaluate_policy_on_seeds(
-            task, model, name, num_episodes, num_rows, first_seed, lambda: progress.advance(bar)
+            task, model, name, num_episodes, num_envs, first_seed, lambda: progress.advance(bar)
         )
 
 
-def _row_cells(row: PolicySummary, roles: Sequence[str], with_crashes: bool) -> list[str]:
-    cells = [row.policy, f"{row.return_mean:.2f}{_plus_minus(row.return_se, 2)}"]
+def _cells_of(summary: PolicySummary, roles: Sequence[str], has_ego: bool) -> list[str]:
+    cells = [summary.policy, f"{summary.return_mean:.2f}{_plus_minus(summary.return_se, 2)}"]
     for role in roles:
-        mean, error = row.role_returns.get(role, (math.nan, math.nan))
+        mean, error = summary.role_returns.get(role, (math.nan, math.nan))
         cells.append(f"{mean:.2f}{_plus_minus(error, 2)}")
-    cells.append(f"{row.length_mean:.1f}{_plus_minus(row.length_se, 1)}")
-    if with_crashes and row.crash_rate is not None and row.crash_low is not None and row.crash_high is not None:
-        cells.append(f"{100 * row.crash_rate:.0f} % ({100 * row.crash_low:.0f}–{100 * row.crash_high:.0f} %)")
-        cells.append("–" if math.isnan(row.mean_speed_mps) else f"{row.mean_speed_mps:.1f}")
+    cells.append(f"{summary.length_mean:.1f}{_plus_minus(summary.length_se, 1)}")
+    if has_ego:
+        cells.append(_crashes(summary))
+        cells.append("–" if math.isnan(summary.mean_speed_mps) else f"{summary.mean_speed_mps:.1f}")
     return cells
+
+
+def _crashes(summary: PolicySummary) -> str:
+    if summary.crash_rate is None or summary.crash_low is None or summary.crash_high is None:
+        return "–"
+    return f"{100 * summary.crash_rate:.0f} % ({100 * summary.crash_low:.0f}–{100 * summary.crash_high:.0f} %)"
 
 
 def _plus_minus(error: float, digits: int) -> str:
@@ -289,7 +300,13 @@ def main() -> None:
         driver=run.get("partner", "heuristic"),
     )
     task.check()
-    model = load_model(config.run_dir / POLICY_FILE, run["algorithm"])
+    policy = config.run_dir / POLICY_FILE
+    model = load_model(policy, run["algorithm"])
+    note, now = read_policy_note(policy), task.note
+    if note is None:
+        Console(stderr=True).print(NOT_PINNED.format(policy))
+    elif note.forecaster is not None and now.forecaster is not None:
+        note.forecaster.check(now.forecaster, f"policy {policy}")
     name = f"{run['algorithm']} ({run['observe']})"
     evaluation = evaluate_with_progress(task, model, name, config.episodes, config.num_envs, config.seed)
     out = config.out or config.run_dir / "evaluation"

@@ -2,8 +2,8 @@
 
 Reads the Dict observation of `ForecastObservation` / `VecForecast`: the env's own observation becomes the ego's
 embedding (the query); each agent's state, forecast, edge probabilities and edge features become a token (key, value).
-The result does not depend on the order of agents, and padded rows (`valid` = 0) change nothing. A learned null token is
-always present, so an empty scene works. Not recurrent: memory lives in the forecaster.
+The result does not depend on the order of agents, and padded agents (`valid` = 0) change nothing. A learned null token
+is always present, so an empty scene works. Not recurrent: memory lives in the forecaster.
 """
 
 import math
@@ -18,10 +18,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from predictor.errors import UserError
+from predictor.scene import SceneSpec
 
 EGO_KEY = "observation"
 VALID_KEY = "valid"
 TOKEN_KEYS = ("agents", "forecast", "edge_probs", "edge_features")
+
+NEAR, FAR, SPEED = 0.1, 0.5, 1.0
+"""Scales of near and far positions and of velocities, as fractions of a scene's `feature_scales`."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +39,18 @@ class AttentionConfig:
     heads: int = 4
     """Attention heads; must divide `width`."""
     near_m: float = 10.0
-    """Positions enter once as tanh(x / near_m): resolves lanes and gaps, saturates far away [m]."""
+    """Positions enter once as tanh(x / near_m): resolves lanes and gaps, saturates far away [m]; default: on a road."""
     far_m: float = 50.0
     """… and once as x / far_m: keeps what is far in order of distance [m]."""
     speed_mps: float = 30.0
-    """Divisor of relative velocities [m/s]; highway-env's top speed."""
+    """Divisor of relative velocities [m/s]; highway-env's top speed by default."""
+
+    @classmethod
+    def for_scenes(cls, spec: SceneSpec) -> "AttentionConfig":
+        """Returns the scaling that fits scenes of this layout: 10 m, 50 m and 30 m/s on roads, less in small arenas."""
+        axes = spec.position_dim
+        position_m, velocity_mps = max(spec.feature_scales[:axes]), max(spec.feature_scales[axes : 2 * axes])
+        return cls(near_m=NEAR * position_m, far_m=FAR * position_m, speed_mps=SPEED * velocity_mps)
 
     def __post_init__(self) -> None:
         """Check that the fields fit together."""
@@ -97,7 +108,7 @@ class ForecastAttention(BaseFeaturesExtractor):
     def _tokens(
         self, ego: Float[Tensor, "batch width"], observations: dict[str, Tensor]
     ) -> tuple[Float[Tensor, "tokens width"], Int[Tensor, "batch slots"]]:
-        """A token for each agent that is there, the null token last; and for each row, which ones it attends to.
+        """A token for each agent that is there, the null token last; and for each ego, which ones it attends to.
 
         Padding, which can be most of a scene, is left out before any layer.
         """
@@ -105,13 +116,13 @@ class ForecastAttention(BaseFeaturesExtractor):
         if self.token_in is None:
             return null, torch.zeros(len(ego), 1, dtype=torch.long, device=ego.device)
         valid = self._valid(observations)
-        row, column = valid.nonzero(as_tuple=True)
-        inputs = self._token_inputs({k: observations[k][row, column] for k in self._keys})
+        env, slot = valid.nonzero(as_tuple=True)
+        inputs = self._token_inputs({k: observations[k][env, slot] for k in self._keys})
         # embedding() is indexing with a faster gradient
-        of_ego = functional.embedding(row, functional.linear(ego, self.token_ego.weight, self.token_in.bias))
+        of_ego = functional.embedding(env, functional.linear(ego, self.token_ego.weight, self.token_in.bias))
         tokens = self.token_out(torch.addmm(of_ego, inputs, self.token_in.weight.T))
-        slots = torch.full((len(ego), valid.shape[1] + 1), len(row), device=ego.device)
-        slots[row, column] = torch.arange(len(row), device=ego.device)
+        slots = torch.full((len(ego), valid.shape[1] + 1), len(env), device=ego.device)
+        slots[env, slot] = torch.arange(len(env), device=ego.device)
         return torch.cat([tokens, null]), slots
 
     def _valid(self, observations: dict[str, Tensor]) -> Bool[Tensor, "batch agents"]:

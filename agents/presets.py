@@ -77,7 +77,8 @@ _DQN: dict[str, DQNPreset] = {
 _FIVE_HZ_GAMMA = 0.9
 
 
-# Many native rows give large rollouts: larger batches keep the gradient steps per sample near a tenth of a row's.
+# Many EnvPool environments give large rollouts: larger batches keep the gradient steps per sample near a tenth of
+# those of one environment.
 _ENVPOOL_PPO = PPOPreset(n_steps=32, batch_size=512, n_epochs=5)
 # Agents of the particle world live for 25 steps of 0.1 s; rewards are dense.
 _PARTICLES = PPOPreset(n_steps=100, batch_size=300, n_epochs=8, learning_rate=7e-4, gamma=0.95, ent_coef=0.01)

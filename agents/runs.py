@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.presets import Algorithm
+from envs.sb3.policy_file import ForecasterPin, PolicyNote, algorithm_of, load_policy, write_note
 from predictor.errors import UserError
 from predictor.files import delete_leftovers, new_file, write_json
 
@@ -25,9 +25,9 @@ CONFIG_FILE = "config.json"
 CHECKPOINT_FILE = "checkpoint.zip"
 BEST_FILE = "best_model.zip"
 POLICY_FILE = "policy.zip"
-_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "dqn": DQN}
+FORECASTER = "forecaster"
+"""Field of a run's config: the pin of its forecaster."""
 _BUFFER_ENTRY = "replay_buffer.pkl"
-_NOTE_ENTRY = "note.json"
 
 
 def open_run(
@@ -69,23 +69,29 @@ def read_config(run_dir: Path) -> dict[str, Any]:
     return _read(run_dir / CONFIG_FILE)["config"]
 
 
-def save_model(model: BaseAlgorithm, path: Path, note: dict[str, Any] | None = None, buffer: bool = False) -> None:
+def save_model(
+    model: BaseAlgorithm,
+    path: Path,
+    extra: dict[str, Any] | None = None,
+    note: PolicyNote | None = None,
+    buffer: bool = False,
+) -> None:
     """Save a model so that `path` is always a whole file.
 
     Args:
         model: what to save.
         path: a ``.zip``; readable by SB3's own ``load``.
-        note: small JSON content that travels inside.
+        extra: small JSON content that travels inside; `envs.sb3.policy_file.read_note` returns it.
+        note: what the policy needs beside its weights.
         buffer: put the replay buffer inside as well, if the algorithm has one.
     """
     with new_file(path) as partial:
         with partial.open("wb") as file:
             model.save(file)
-        with zipfile.ZipFile(partial, "a") as archive:
-            archive.writestr(_NOTE_ENTRY, json.dumps(note or {}))
-            if buffer and isinstance(model, OffPolicyAlgorithm):
-                with archive.open(_BUFFER_ENTRY, "w", force_zip64=True) as entry:
-                    pickle.dump(model.replay_buffer, entry, protocol=pickle.HIGHEST_PROTOCOL)
+        write_note(partial, note, extra or {})
+        if buffer and isinstance(model, OffPolicyAlgorithm):
+            with zipfile.ZipFile(partial, "a") as archive, archive.open(_BUFFER_ENTRY, "w", force_zip64=True) as entry:
+                pickle.dump(model.replay_buffer, entry, protocol=pickle.HIGHEST_PROTOCOL)
 
 
 def load_model(path: Path, algorithm: Algorithm, venv: VecEnv | None = None, device: str = "cpu") -> BaseAlgorithm:
@@ -94,25 +100,34 @@ def load_model(path: Path, algorithm: Algorithm, venv: VecEnv | None = None, dev
     Raises:
         UserError: no such file, not a model of this algorithm, or not made for these spaces.
     """
-    if not path.exists():
-        raise UserError(f"no policy at {path}; train one with python train_policy.py")
-    try:
-        model = _ALGORITHMS[algorithm].load(path, env=venv, device=device)
-    except (ValueError, KeyError, TypeError, AttributeError, AssertionError, EOFError, RuntimeError) as error:
-        reason = " ".join(str(error).split())
-        raise UserError(f"{path} is no {algorithm} policy that fits here: {reason}") from error
+    found = algorithm_of(path)
+    if found != algorithm:
+        raise UserError(f"{path} is no {algorithm} policy but a {found} one; pass --algorithm {found}")
+    model = load_policy(path, venv, device)
     with zipfile.ZipFile(path) as archive:
         if isinstance(model, OffPolicyAlgorithm) and _BUFFER_ENTRY in archive.namelist():
             model.load_replay_buffer(io.BytesIO(archive.read(_BUFFER_ENTRY)))
     return model
 
 
-def read_note(path: Path) -> dict[str, Any]:
-    """The note that travels inside a saved model; empty if there is no such file or note."""
-    if not path.exists():
-        return {}
-    with zipfile.ZipFile(path) as archive:
-        return json.loads(archive.read(_NOTE_ENTRY)) if _NOTE_ENTRY in archive.namelist() else {}
+def check_forecaster(run_dir: Path, found: ForecasterPin | None) -> bool:
+    """Compare the forecaster of a run that is continued with the one it would get now.
+
+    Returns:
+        False if there is a run that does not say what it was trained on (started before forecasters were pinned).
+
+    Raises:
+        UserError: it was trained on another one.
+    """
+    if not (run_dir / CONFIG_FILE).exists():
+        return True
+    stored = _read(run_dir / CONFIG_FILE).get("config", {})
+    if FORECASTER not in stored:
+        return found is None
+    pinned = stored[FORECASTER]
+    if found is not None and pinned is not None:
+        ForecasterPin(**pinned).check(found, f"run {run_dir}")
+    return True
 
 
 def _read(file: Path) -> dict[str, Any]:

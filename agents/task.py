@@ -2,16 +2,23 @@
 
 import importlib.util
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 
 from envs.drivers.all_agents import DRIVER_NAMES, make_driver
 from envs.parallel import ForecastParallelEnv
-from envs.registry import is_multiagent_id, make_env, make_multiagent_env, native_task_of
+from envs.registry import (
+    checkpoint_for,
+    is_multiagent_id,
+    make_env,
+    make_multiagent_env,
+    native_task_of,
+)
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.sb3.padded_spaces import learners_named
+from envs.sb3.policy_file import PolicyNote, pin_forecaster
 from envs.wrappers import ForecastObservation
 from predictor.config_checks import check_choice, check_choices
 from predictor.errors import UserError
@@ -50,9 +57,9 @@ class Task:
     def __post_init__(self) -> None:
         """Check choices, and that the fields fit together; `device="auto"` becomes the device that is taken."""
         check_choices(self)
-        if self.is_parallel and self.backend != "gymnasium":
+        if self.is_multiagent and self.backend != "gymnasium":
             raise UserError(f"backend {self.backend} has no {self.env_id}; leave it out")
-        if self.learners and not self.is_parallel:
+        if self.learners and not self.is_multiagent:
             raise UserError(f"learners are for PettingZoo environments, {self.env_id} has one ego; leave them out")
         check_choice("driver", self.driver, DRIVER_NAMES)
         if self.backend == "envpool":
@@ -64,7 +71,7 @@ class Task:
         object.__setattr__(self, "device", resolve_device(self.device))
 
     @property
-    def is_parallel(self) -> bool:
+    def is_multiagent(self) -> bool:
         """Whether it is a PettingZoo environment with many learners."""
         return is_multiagent_id(self.env_id)
 
@@ -75,17 +82,37 @@ class Task:
 
     @property
     def scene_spec(self) -> SceneSpec | None:
-        """Scenes as the forecaster was trained on them; None if the policy sees none.
+        """Layout of the scenes behind the forecasts; None if the policy sees none.
 
         Raises:
             UserError: unknown env, missing checkpoint, or a checkpoint that does not fit the env.
         """
-        if self.observe == "none":
-            return None
+        return None if self.observe == "none" else self._forecasts()[1]
+
+    @property
+    def note(self) -> PolicyNote:
+        """What a policy of this task needs beside its weights.
+
+        Raises:
+            UserError: as `scene_spec`.
+        """
+        pin = None
+        if self.observe != "none":
+            pin = pin_forecaster(self.forecaster or checkpoint_for(self.env_id), *self._forecasts())
+        return PolicyNote(pin, self.learners, self.driver)
+
+    def _forecasts(self) -> tuple[gym.spaces.Dict, SceneSpec]:
+        """Returns an observation space with forecasts, and the layout of the scenes behind them."""
+        space: Any
+        if self.is_multiagent:
+            many = ForecastParallelEnv(make_multiagent_env(self.env_id), self.forecaster, device=self.device)
+            space, spec = many.observation_space(many.possible_agents[0]), many.scene_spec
+            many.close()
+            return space, spec
         env = ForecastObservation(make_env(self.env_id), self.forecaster, device=self.device)
-        spec: SceneSpec = env.get_wrapper_attr("scene_spec")
+        space, spec = env.observation_space, env.get_wrapper_attr("scene_spec")
         env.close()
-        return spec
+        return space, spec
 
     def check(self) -> gym.Space:
         """Make the environment, with its forecaster, and return its action space.
@@ -93,7 +120,7 @@ class Task:
         Raises:
             UserError: as `scene_spec`; unknown learners, or a driver that cannot drive the others.
         """
-        if self.is_parallel:
+        if self.is_multiagent:
             return self._check_parallel()
         env = make_env(self.env_id)
         env.close()

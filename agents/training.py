@@ -1,10 +1,11 @@
-"""Train an SB3 policy: preset, parallel rows, model selection on seeds of its own, checkpoints that survive a kill.
+"""Train an SB3 policy: preset, parallel environments, selection on its own seeds, checkpoints that survive a kill.
 
-`policy.zip` is the model that did best on the selection seeds (the common practice, and what SB3's EvalCallback keeps);
-those seeds are disjoint from training and from the final evaluation, so the final numbers are not selected for.
+`policy.zip` is the latest model that is not significantly worse on the selection seeds than the best one measured.
+Those seeds are disjoint from training and from the final evaluation, so the final numbers are not selected for.
 """
 
 import zipfile
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,16 @@ from stable_baselines3.common.vec_env import VecEnv
 from agents.arena import Arena, open_arena
 from agents.features import AttentionConfig, ForecastAttention
 from agents.presets import Algorithm, PPOPreset, Preset, preset_for
-from agents.runs import BEST_FILE, CHECKPOINT_FILE, POLICY_FILE, load_model, read_note, save_model
+from agents.runs import BEST_FILE, CHECKPOINT_FILE, POLICY_FILE, load_model, save_model
 from agents.task import SELECTION_SEED, Task
-from agents.vec_envs import make_rows
+from agents.vec_envs import make_venv
+from envs.sb3.policy_file import PolicyNote, read_note
 from predictor.config_checks import check_at_least, check_choices
 from predictor.errors import UserError
 from predictor.files import copy_file
 from predictor.runtime import resolve_device
+
+_NORMAL_95 = 1.959963984540054  # two-sided 95 % quantile of the normal distribution
 
 
 @dataclass(frozen=True)
@@ -37,8 +41,8 @@ class TrainingPlan:
     algorithm: Algorithm
     """ppo or dqn."""
     steps: int
-    """Environment steps over all rows."""
-    num_rows: int
+    """Environment steps over all environments."""
+    num_envs: int
     """Parallel environments."""
     seed: int
     """Drives torch, NumPy and the environments."""
@@ -48,7 +52,7 @@ class TrainingPlan:
     """How often, evenly spread, the policy is measured on the selection seeds."""
     selection_episodes: int = 20
     """Episodes per measurement; always the same seeds."""
-    selection_rows: int = 2
+    selection_envs: int = 2
     """Parallel environments of the measurement."""
     checkpoint_every: int = 2_000
     """Environment steps between checkpoints."""
@@ -57,7 +61,7 @@ class TrainingPlan:
         """Check choices and ranges; `device="auto"` becomes the device that is taken."""
         check_choices(self)
         check_at_least(
-            self, 1, "steps", "num_rows", "selections", "selection_episodes", "selection_rows", "checkpoint_every"
+            self, 1, "steps", "num_envs", "selections", "selection_episodes", "selection_envs", "checkpoint_every"
         )
         if not 0 <= self.seed < SELECTION_SEED:
             raise UserError(f"seed must lie in [0, {SELECTION_SEED}), got {self.seed}")
@@ -67,6 +71,12 @@ class TrainingPlan:
     def preset(self) -> Preset:
         """Hyperparameters."""
         return preset_for(self.task.env_id, self.algorithm, self.task.backend)
+
+    @property
+    def attention(self) -> AttentionConfig:
+        """Sizes and scales of the features extractor; the scales are those of the task's scenes."""
+        spec = self.task.scene_spec
+        return AttentionConfig() if spec is None else AttentionConfig.for_scenes(spec)
 
     def check_action_space(self, space: spaces.Space) -> None:
         """Raise if the algorithm cannot drive this action space."""
@@ -80,13 +90,14 @@ def train(plan: TrainingPlan, run_dir: Path) -> Path:
     Returns:
         The final policy, `run_dir/policy.zip`.
     """
-    venv = make_rows(plan.task, plan.num_rows)
-    selection = open_arena(plan.task, min(plan.selection_rows, plan.selection_episodes))
+    note = plan.task.note  # loads the forecaster, which draws random numbers: before the model is seeded
+    venv = make_venv(plan.task, plan.num_envs)
+    selection = open_arena(plan.task, min(plan.selection_envs, plan.selection_episodes))
     try:
         model = _resume_or_make(plan, venv, run_dir)
         if model.num_timesteps < plan.steps:
-            _learn(plan, model, selection, run_dir)
-            save_model(model, run_dir / CHECKPOINT_FILE, buffer=True)
+            _learn(plan, model, selection, run_dir, note)
+            save_model(model, run_dir / CHECKPOINT_FILE, note=note, buffer=True)
     finally:
         venv.close()
         selection.close()
@@ -94,13 +105,13 @@ def train(plan: TrainingPlan, run_dir: Path) -> Path:
     return run_dir / POLICY_FILE
 
 
-def _learn(plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: Path) -> None:
+def _learn(plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: Path, note: PolicyNote) -> None:
     """The remaining steps, under SB3's progress bar."""
     every = max(plan.steps // plan.selections, 1)
     progress = ProgressBarCallback()
     callbacks = [
-        SaveCheckpoint(run_dir / CHECKPOINT_FILE, plan.checkpoint_every),
-        SelectBest(selection, run_dir / BEST_FILE, plan.selection_episodes, every),
+        SaveCheckpoint(run_dir / CHECKPOINT_FILE, plan.checkpoint_every, note),
+        SelectBest(selection, run_dir / BEST_FILE, plan.selection_episodes, every, note),
         progress,
     ]
     try:
@@ -122,7 +133,9 @@ def make_model(plan: TrainingPlan, venv: VecEnv, tensorboard_log: str | None = N
     options = asdict(preset)
     layers = list(options.pop("net_arch"))
     if isinstance(preset, PPOPreset):
-        options["batch_size"] = min(preset.batch_size, preset.n_steps * venv.num_envs)  # few rows give small rollouts
+        options["batch_size"] = min(
+            preset.batch_size, preset.n_steps * venv.num_envs
+        )  # few environments give small rollouts
     policy_kwargs: dict[str, Any] = {
         "net_arch": {"pi": layers, "vf": layers} if isinstance(preset, PPOPreset) else layers
     }
@@ -131,7 +144,7 @@ def make_model(plan: TrainingPlan, venv: VecEnv, tensorboard_log: str | None = N
         policy = "MultiInputPolicy"
         policy_kwargs |= {
             "features_extractor_class": ForecastAttention,
-            "features_extractor_kwargs": {"config": AttentionConfig()},
+            "features_extractor_kwargs": {"config": plan.attention},
         }
     algorithm: type[PPO] | type[DQN] = PPO if isinstance(preset, PPOPreset) else DQN
     return algorithm(
@@ -161,9 +174,10 @@ def _resume_or_make(plan: TrainingPlan, venv: VecEnv, run_dir: Path) -> BaseAlgo
 class SaveCheckpoint(BaseCallback):
     """Keeps the latest model on disk, taken between updates so that no collected step is lost or counted twice."""
 
-    def __init__(self, path: Path, every_steps: int) -> None:
-        """Save to `path` about every `every_steps` environment steps."""
+    def __init__(self, path: Path, every_steps: int, note: PolicyNote | None = None) -> None:
+        """Save to `path` about every `every_steps` environment steps, with the note inside."""
         super().__init__()
+        self._note = note
         self._path, self._every = path, every_steps
         self._saved_at = 0
 
@@ -173,35 +187,43 @@ class SaveCheckpoint(BaseCallback):
     def _on_rollout_start(self) -> None:
         if self.model.num_timesteps - self._saved_at >= self._every:
             self._saved_at = self.model.num_timesteps
-            save_model(self.model, self._path, buffer=True)
+            save_model(self.model, self._path, note=self._note, buffer=True)
 
     def _on_step(self) -> bool:
         return True
 
 
 class SelectBest(BaseCallback):
-    """Plays the same seeds each time; the best model is saved atomically with its result inside.
+    """Keeps the latest model that is not significantly worse than the best one measured, with its result inside.
+
+    Few episodes cannot tell two similar models apart, and the highest of several noisy means belongs to a lucky one. A
+    later model, which has learned longer, therefore replaces the kept one unless it is `significantly_worse` than the
+    model with the highest mean so far; comparing with that one keeps a chain of small losses from adding up.
 
     Args:
-        arena: where the seeds are played.
-        path: where the best model goes.
+        arena: where the seeds are played, the same ones each time.
+        path: where the selected model goes, atomically.
         num_episodes: episodes per measurement.
         every_steps: environment steps between measurements; there is always one at the end.
+        note: what the policy needs beside its weights.
     """
 
-    def __init__(self, arena: Arena, path: Path, num_episodes: int, every_steps: int) -> None:
+    def __init__(
+        self, arena: Arena, path: Path, num_episodes: int, every_steps: int, note: PolicyNote | None = None
+    ) -> None:
         """Nothing is measured yet."""
         super().__init__()
+        self._note = note
         self._arena, self._path, self._every = arena, path, every_steps
         self._seeds = range(SELECTION_SEED, SELECTION_SEED + num_episodes)
         self._measured_at = 0
-        self.best_return = -np.inf
+        self._highest: list[float] = []
 
     def _on_training_start(self) -> None:
-        """Continue from the result inside an existing file."""
+        """Continue from the results inside an existing file."""
         self._measured_at = self.model.num_timesteps
         try:
-            self.best_return = float(read_note(self._path).get("selection_return", -np.inf))
+            self._highest = list(read_note(self._path).get("highest_returns", []))
         except zipfile.BadZipFile as error:
             raise UserError(f"{self._path} is damaged; remove it to go on without it") from error
 
@@ -217,11 +239,32 @@ class SelectBest(BaseCallback):
     def _measure(self) -> None:
         self._measured_at = self.num_timesteps
         results = self._arena.play(self.model, self._seeds)
-        mean = float(np.mean([r.episode_return for r in results]))
+        returns = [r.episode_return for r in results]
+        mean = float(np.mean(returns))
         self.logger.record("eval/mean_reward", mean)
         self.logger.record("eval/mean_ep_length", float(np.mean([r.length for r in results])))
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
-        if mean > self.best_return:
-            self.best_return = mean
-            save_model(self.model, self._path, {"selection_return": mean, "steps": self.num_timesteps})
+        comparable = len(self._highest) == len(returns)
+        if comparable and significantly_worse(returns, self._highest):
+            return
+        if not comparable or mean > np.mean(self._highest):
+            self._highest = returns
+        extra = {"selection_return": mean, "steps": self.num_timesteps, "highest_returns": self._highest}
+        save_model(self.model, self._path, extra, self._note)
+
+
+def significantly_worse(returns: Sequence[float], best: Sequence[float]) -> bool:
+    """Returns whether `returns` are lower than `best` beyond what so few episodes leave open.
+
+    The 95 % normal interval of the mean paired difference must lie below zero; a single episode decides nothing.
+
+    Args:
+        returns: of a model, by seed.
+        best: of another model, by the same seeds in the same order.
+    """
+    difference = np.subtract(returns, best)
+    if len(difference) < 2:
+        return False
+    error = difference.std(ddof=1) / np.sqrt(len(difference))
+    return bool(difference.mean() + _NORMAL_95 * error < 0)

@@ -20,14 +20,15 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 from agents.task import Task
 from envs.drivers.all_agents import Driver, make_driver
-from envs.drivers.ego import make_ego
-from envs.drivers.trained import Ego
+from envs.drivers.ego import make_ego_driver
+from envs.drivers.trained import EgoDriver
 from envs.parallel import ForecastParallelEnv
 from envs.registry import make_env, make_multiagent_env, native_task_of
 from envs.sb3.agents_as_rows import AgentMonitor, ParallelVecEnv
 from envs.sb3.envpool import EnvPoolVecEnv
 from envs.sb3.forecast import VecForecast
 from envs.sb3.padded_spaces import learners_named
+from envs.seeding import driver_rng
 from envs.wrappers import SceneObservation
 from predictor.scene import SceneSpec
 
@@ -46,7 +47,7 @@ class EpisodeResult:
     length: int
     """Policy steps."""
     crashed: bool | None
-    """Whether the env reported a crash of the ego at any step; None where there is no ego."""
+    """Whether the env reported a crash of the ego at any step; None where it never says (or there is no ego)."""
     mean_speed_mps: float
     """Mean over steps of the ego's speed [m/s]; NaN where the env reports none."""
     returns_by_role: dict[str, float] = field(default_factory=dict)
@@ -68,7 +69,7 @@ class DrivenEnv(BaseParallelWrapper):
         """Nothing is reset yet."""
         super().__init__(env)
         self._name = driver
-        self._rng = np.random.default_rng(0)
+        self._rng = driver_rng(0)
         self._driver: Driver | None = None
         self.episodes = 0
 
@@ -87,7 +88,7 @@ class DrivenEnv(BaseParallelWrapper):
         """Reset; a seed also fixes the drivers of this and the following episodes."""
         observations, infos = self.env.reset(seed=seed, options=options)
         if seed is not None:
-            self._rng = np.random.default_rng(seed)
+            self._rng = driver_rng(seed)
         self._driver = None
         self.episodes += 1
         return observations, infos
@@ -126,7 +127,7 @@ def learners_of(task: Task, env: ParallelEnv) -> list[str]:
     return learners_named(env.possible_agents, task.learners, task.env_id)
 
 
-def make_parallel_rows(task: Task, copies: int) -> AgentMonitor:
+def make_multiagent_venv(task: Task, copies: int) -> AgentMonitor:
     """All learners of some copies of a task's environment, with statistics over lives."""
     make = MakeCopy(task)
     env = make()
@@ -136,38 +137,38 @@ def make_parallel_rows(task: Task, copies: int) -> AgentMonitor:
     return AgentMonitor(ParallelVecEnv([make] * copies, agents=learners, partner=partner))
 
 
-def make_rows(task: Task, num_rows: int, seeded: bool = False) -> VecEnv:
-    """Parallel rows of a task, with episode statistics and (unless `observe` is none) forecasts.
+def make_venv(task: Task, num_envs: int, seeded: bool = False) -> VecEnv:
+    """Makes the parallel environments of a task, with episode statistics and (unless `observe` is none) forecasts.
 
     Args:
         task: what to make.
-        num_rows: rows; one runs in this process, more in spawned ones. Copies of a PettingZoo environment, each with
-            a row per learner. Native environments of EnvPool.
-        seeded: wrap each row in `SeededEpisodes`, for evaluation (gymnasium backend only).
+        num_envs: number of environments; one runs in this process, more in spawned ones. Copies of a PettingZoo
+            environment, each with one environment of the vector per learner. Environments of EnvPool.
+        seeded: wrap each environment in `SeededEpisodes`, for evaluation (gymnasium backend only).
     """
-    if task.is_parallel:
-        return make_parallel_rows(task, num_rows)
+    if task.is_multiagent:
+        return make_multiagent_venv(task, num_envs)
     venv: VecEnv
     spec = task.scene_spec
     if task.backend == "envpool":
         venv = EnvPoolVecEnv(
             native_task_of(task.env_id),
-            num_rows,
+            num_envs,
             scenes=spec is not None,
             perception_m=None if spec is None else spec.perception_m,
             max_agents=None if spec is None else spec.max_agents,
         )
     else:
-        row = _MakeRow(task.env_id, spec, seeded)
-        venv = DummyVecEnv([row]) if num_rows == 1 else SubprocVecEnv([row] * num_rows, start_method="spawn")
+        make = _MakeEnv(task.env_id, spec, seeded)
+        venv = DummyVecEnv([make]) if num_envs == 1 else SubprocVecEnv([make] * num_envs, start_method="spawn")
     if task.observe != "none":
         venv = VecForecast(venv, task.forecaster, device=task.device)
     return VecMonitor(venv)
 
 
 @dataclass(frozen=True)
-class _MakeRow:
-    """Picklable constructor of one row."""
+class _MakeEnv:
+    """Picklable constructor of one environment."""
 
     env_id: str
     scene_spec: SceneSpec | None
@@ -175,7 +176,7 @@ class _MakeRow:
 
     def __call__(self) -> gym.Env:
         if multiprocessing.parent_process() is not None:
-            torch.set_num_threads(1)  # the rows already fill the cores
+            torch.set_num_threads(1)  # the environments already fill the cores
         env = make_env(self.env_id, disable_env_checker=True)
         if self.scene_spec is not None:
             env = SceneObservation(env, self.scene_spec.perception_m, self.scene_spec.max_agents)
@@ -185,48 +186,48 @@ class _MakeRow:
 class SeededEpisodes(gym.Wrapper):
     """Plays queued seeds one after another and leaves an `EpisodeResult` in the last info of each episode.
 
-    Episodes beyond the queue go on unseeded and leave no result. An ego from `envs.drivers.ego` may drive in
-    place of the actions that arrive, with its own generator per seed, so its episodes do not depend on the number of
-    rows.
+    Episodes beyond the queue go on unseeded and leave no result. A driver from `envs.drivers.ego` may replace the
+    actions that arrive, with its own generator per seed, so its episodes do not depend on the number of environments.
 
     Args:
-        env: one row.
+        env: one environment.
     """
 
     def __init__(self, env: gym.Env) -> None:
         """Nothing is queued yet."""
         super().__init__(env)
         self._seeds: list[int] = []
-        self._ego_name: str | None = None
-        self._ego: Ego | None = None
+        self._driver_name: str | None = None
+        self._driver: EgoDriver | None = None
         self._seed: int | None = None
 
-    def queue(self, seeds: Sequence[int], ego: str | None = None) -> None:
-        """Seeds of the next episodes, from the next reset on; `ego` drives them if given."""
-        self._seeds, self._ego_name = list(seeds), ego
+    def queue(self, seeds: Sequence[int], driver: str | None = None) -> None:
+        """Seeds of the next episodes, from the next reset on; `driver` drives them if given."""
+        self._seeds, self._driver_name = list(seeds), driver
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start the next queued episode."""
         self._seed = self._seeds.pop(0) if self._seeds else None
         obs, info = self.env.reset(seed=seed if self._seed is None else self._seed, options=options)
-        self._ego = None
-        if self._ego_name is not None:
-            self._ego = make_ego(self._ego_name, self.env, np.random.default_rng(self._seed))
+        self._driver = None
+        if self._driver_name is not None:
+            self._driver = make_ego_driver(self._driver_name, self.env, driver_rng(self._seed))
         self._rewards: list[float] = []
         self._speeds_mps: list[float] = []
-        self._crashed = False
+        self._crashed: bool | None = None
         self._obs = obs
         return obs, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step, and note what the result needs."""
-        if self._ego is not None:
-            action = self._ego(self._obs)
+        if self._driver is not None:
+            action = self._driver(self._obs)
         obs, reward, terminated, truncated, info = self.env.step(action)
         self._obs = obs
         self._rewards.append(float(reward))
         self._speeds_mps.append(float(info.get("speed", np.nan)))
-        self._crashed |= bool(info.get("crashed", False))
+        if "crashed" in info:
+            self._crashed = bool(self._crashed) or bool(info["crashed"])
         if (terminated or truncated) and self._seed is not None:
             speed = float(np.mean(self._speeds_mps))
             info[EPISODE_INFO] = EpisodeResult(

@@ -10,14 +10,14 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from agents.arena import partner_actions
 from agents.features import EGO_KEY
 from agents.task import EVALUATION_SEED, Task
-from agents.vec_envs import MakeCopy, learners_of, make_parallel_rows, own_observations
+from agents.vec_envs import MakeCopy, learners_of, make_multiagent_venv, own_observations
 from envs.parallel import ForecastParallelEnv
 from envs.readers import multiagent_reader_for
 from envs.readers.highway import is_highway_env
 from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, make_env, make_multiagent_env
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.video.highway import record_episode
-from envs.video.multiagent import SharedRecording, record_parallel_episode
+from envs.video.multiagent import MultiagentRecording, record_multiagent_episode
 from envs.wrappers import ForecastObservation
 from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.errors import UserError
@@ -26,7 +26,7 @@ MAX_VIDEO_STEPS = 200
 """Longest video [policy steps]; racetracks go on for 1500."""
 
 
-def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) -> SharedRecording | None:
+def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) -> MultiagentRecording | None:
     """Play one episode for a film; forecasts are drawn also for a policy that sees none.
 
     Returns:
@@ -41,8 +41,8 @@ def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) ->
     env = MakeCopy(filmed)()
     assert isinstance(env, ForecastParallelEnv)
     learners = learners_of(task, env)
-    rows = make_parallel_rows(task, 1).venv  # knows how spaces are padded
-    assert isinstance(rows, ParallelVecEnv)
+    venv = make_multiagent_venv(task, 1).venv  # knows how spaces are padded
+    assert isinstance(venv, ParallelVecEnv)
 
     def act(observations: dict[str, Any]) -> dict[str, Any]:
         own = own_observations(observations)
@@ -50,15 +50,15 @@ def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) ->
         for agent in observations:
             if agent in learners:
                 seen = own[agent] if task.observe == "none" else observations[agent]
-                chosen = policy.predict(rows.row_of(agent, seen), deterministic=True)[0]
-                actions[agent] = rows.own_action(agent, chosen)
+                chosen = policy.predict(venv.row_of(agent, seen), deterministic=True)[0]
+                actions[agent] = venv.own_action(agent, chosen)
         return actions
 
     try:
-        return record_parallel_episode(env, act, seed=seed, max_steps=max_steps)
+        return record_multiagent_episode(env, act, seed=seed, max_steps=max_steps)
     finally:
         env.close()
-        rows.close()
+        venv.close()
 
 
 def _has_reader(env_id: str) -> bool:
@@ -83,7 +83,7 @@ def film(task: Task, model: BaseAlgorithm, path: Path) -> Path | None:
     Returns:
         The video; None for an environment that cannot be drawn.
     """
-    if task.is_parallel:
+    if task.is_multiagent:
         recording = record_task(task, model, EVALUATION_SEED, MAX_VIDEO_STEPS)
         if recording is None:
             return None

@@ -18,10 +18,11 @@ from highway_env.vehicle.behavior import IDMVehicle
 from rich.console import Console
 from rich.table import Table
 
-from envs.drivers.ego import make_ego
+from envs.drivers.ego import make_ego_driver
 from envs.drivers.trained import sees_forecasts
 from envs.readers import reader_for
 from envs.registry import make_env
+from envs.seeding import driver_rng
 from envs.simulators.envpool import ENV_IDS, HIGHWAY_ENV_OF
 from envs.wrappers import ForecastObservation
 from predictor.command_line import Renamed, parse
@@ -194,7 +195,7 @@ def play(env: gym.Env, ego: str, config: ParityConfig) -> Episodes:
     starts = set()
     for seed in range(config.seed, config.seed + config.episodes):
         obs, _ = env.reset(seed=seed)
-        act = make_ego(ego, env, np.random.default_rng(seed))
+        act = make_ego_driver(ego, env, driver_rng(seed))
         reader.reset()
         scene = reader.read_all(env)
         starts.add(scene.states.round(6).tobytes())

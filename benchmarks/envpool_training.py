@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from agents.task import Task
 from agents.training import TrainingPlan, make_model
-from agents.vec_envs import make_rows
+from agents.vec_envs import make_venv
 from predictor.command_line import Renamed, parse
 from predictor.config_checks import check_at_least
 from predictor.errors import run_entry_point
@@ -89,7 +89,7 @@ class _Quiet(BaseCallback):
 
 def make(task: Task, rows: int, seed: int) -> BaseAlgorithm:
     """A model with its environments, as train_policy.py makes them."""
-    return make_model(TrainingPlan(task, "ppo", 1_000_000, rows, seed), make_rows(task, rows))
+    return make_model(TrainingPlan(task, "ppo", 1_000_000, rows, seed), make_venv(task, rows))
 
 
 def run_block(model: BaseAlgorithm, steps: int) -> float:

@@ -105,9 +105,9 @@ def _simulators(settings: Settings) -> list[Line]:
 
 @contextmanager
 def _highway(settings: Settings) -> Iterator[tuple[Callable[[], float], int]]:
-    from benchmarks.wrapper_overhead import blocks_of, make_rows
+    from benchmarks.wrapper_overhead import blocks_of, make_venv
 
-    with closing(make_rows(settings.env_id, 1, "dummy", scenes=False)) as venv:
+    with closing(make_venv(settings.env_id, 1, "dummy", scenes=False)) as venv:
         yield blocks_of(venv, STEPS[settings.mode]), 1
 
 

@@ -90,7 +90,7 @@ def blocks_of(venv: VecEnv, steps: int) -> Callable[[], float]:
     return lambda: run_block(venv, steps, next(seeds))
 
 
-def make_rows(env_id: str, envs: int, vec: Literal["dummy", "subproc"], scenes: bool) -> VecEnv:
+def make_venv(env_id: str, envs: int, vec: Literal["dummy", "subproc"], scenes: bool) -> VecEnv:
     """Environments as they are, or reporting scenes for `VecForecast`."""
     vec_class = DummyVecEnv if vec == "dummy" else SubprocVecEnv
     # a function of ours: a worker that unpickles it has the ids registered
@@ -110,7 +110,7 @@ def main() -> None:
     config = parse(OverheadConfig, __doc__)
     keep_freed_memory()
     torch.set_num_threads(config.threads)
-    plain, scenes = (make_rows(config.env_id, config.num_envs, config.vec, scenes) for scenes in (False, True))
+    plain, scenes = (make_venv(config.env_id, config.num_envs, config.vec, scenes) for scenes in (False, True))
     paper = paper_sized(scenes) if config.paper_size else None
     forecast = VecForecast(scenes, config.checkpoint, forecaster=paper)
     made = {name: blocks_of(venv, config.steps) for name, venv in (("plain", plain), ("forecast", forecast))}

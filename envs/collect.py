@@ -106,7 +106,7 @@ def _record(task: _Task) -> Episode:
     labels: list[SceneLabels] = []
 
     def note() -> None:
-        scenes.append(world.everyone())
+        scenes.append(world.full_scene())
         if task.labels and (found := world.labels()) is not None:
             labels.append(found)
 

@@ -17,9 +17,10 @@ import numpy as np
 from jaxtyping import Float
 from rich.progress import track
 
-from envs.drivers.ego import make_ego
+from envs.drivers.ego import make_ego_driver
 from envs.readers.highway import HighwayReader, is_highway_env
 from envs.registry import make_env
+from envs.seeding import driver_rng
 from predictor.command_line import Renamed, parse
 from predictor.config_checks import check_at_least
 from predictor.data.store import Episode
@@ -104,7 +105,7 @@ def roll_out(
     reader = HighwayReader(env)
     obs: Any
     obs, _ = env.reset(seed=seed)
-    ego = make_ego(ego_name, env, np.random.default_rng(seed))
+    ego = make_ego_driver(ego_name, env, driver_rng(seed))
     road: Any = env.unwrapped.road  # type: ignore[attr-defined]
     scenes, headings = [reader.read_all(env)], [_headings_rad(env)]
     advance = road.step
@@ -199,7 +200,7 @@ def export(config: ExportConfig) -> int:
     """
     config.check_out()
     env = export_env(config.env_id)
-    make_ego(config.driver, env, np.random.default_rng(0))
+    make_ego_driver(config.driver, env, np.random.default_rng(0))
     frames = 0
     with new_folder(config.out) as partial:
         for i in track(range(config.episodes), f"export {config.env_id}"):

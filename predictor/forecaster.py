@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from predictor.graph import NOBODY
-from predictor.layers.pair_noise import Noise
+from predictor.noise import Noise
 from predictor.scene import SceneSpec, dense_edges
 
 

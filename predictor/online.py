@@ -17,7 +17,7 @@ from torch.nn import functional
 from predictor.errors import ProtocolError
 from predictor.forecaster import Belief, Forecaster, Memory
 from predictor.graph import NOBODY
-from predictor.layers.pair_noise import Noise
+from predictor.noise import Noise
 from predictor.runtime import resolve_device
 from predictor.scene import PADDING_ID, Forecast, SceneBatch
 

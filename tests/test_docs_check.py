@@ -3,6 +3,7 @@
 import importlib.util
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -75,9 +76,13 @@ def test_a_broken_block_fails_with_its_place_and_its_output(tmp_path: Path, bloc
 
 
 def test_a_block_that_takes_too_long_is_stopped(tmp_path: Path):
-    done = results(tmp_path, "~~~bash\nsleep 30\n~~~\n~~~python\nimport time\ntime.sleep(30)\n~~~\n", limit_s=0.5)
+    done = results(
+        tmp_path, "~~~bash\nsleep 5 && touch late\n~~~\n~~~python\nimport time\ntime.sleep(30)\n~~~\n", limit_s=0.5
+    )
     assert ["took more than 0 s: give the block a short form" in result.error for result in done] == [True, True]
-    assert all(result.seconds < 20 for result in done)
+    assert all(result.seconds < 4 for result in done)
+    time.sleep(6)
+    assert not (tmp_path / "late").exists()  # what the block had started is stopped as well
 
 
 def test_a_short_form_runs_instead(tmp_path: Path):
@@ -107,6 +112,17 @@ def test_a_short_form_leaves_no_program_and_no_option_out(tmp_path: Path, short:
     assert f"page.md:2: the short form must also have {missing}, as the block does" in done.error
 
 
+def test_a_short_form_of_python_imports_the_same_names(tmp_path: Path):
+    block = '~~~python\nfrom math import tau, pi\nprint("it\'s", tau)\n~~~\n'
+    good, bad = results(
+        tmp_path,
+        f"<!-- docs-check: short:\nfrom math import pi, tau\nassert tau == 2 * pi\n-->\n{block}\n"
+        f"<!-- docs-check: short: from math import pi -->\n{block}",
+    )
+    assert good.error == ""
+    assert "the short form must also have math.tau" in bad.error
+
+
 def test_a_skipped_block_is_listed_with_its_reason(tmp_path: Path):
     (done,) = results(tmp_path, "<!-- docs-check: skip because it needs a GPU -->\n~~~bash\nexit 1\n~~~\n")
     assert done.error == "" and str(done).endswith("skipped because it needs a GPU")
@@ -122,6 +138,10 @@ def test_an_unknown_annotation_fails(tmp_path: Path, note: str):
     ("fence", "said"),
     [
         ("~~~\npython -m envs.collect\n~~~", "page.md:1: a block with commands needs a language"),
+        (
+            "<!-- docs-check: skip because -->\n\n~~~bash\nls\n~~~",
+            "page.md: a docs-check comment must stand",
+        ),
         ("~~~sh\nls\n~~~", "page.md:1: blocks of 'sh' are not known; write bash, python or text"),
     ],
 )

@@ -4,24 +4,27 @@ import contextlib
 import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+import zipfile
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import imageio_ffmpeg
 import pytest
-from stable_baselines3 import PPO as SB3PPO
 
 import train_policy
 from agents import evaluate
-from agents.runs import load_model, read_note
+from agents.runs import load_model
 from agents.training import SaveCheckpoint
+from envs.sb3.policy_file import NOTE_ENTRY, read_note, read_policy_note
 from predictor.errors import run_entry_point
-from tests.agents.helpers import TOY, policy_for
+from tests.agents.helpers import TOY
 
 # SB3 silences this warning at import, pytest makes it an error again.
 pytestmark = pytest.mark.filterwarnings("ignore:rich is experimental")
@@ -119,6 +122,85 @@ def test_a_finished_policy_is_evaluated_again(finished: tuple[Path, str], monkey
     assert again["episodes"] == json.loads((run / "summary.json").read_text())["episodes"]
 
 
+def with_note(run: Path, target: Path, change: Callable[[dict[str, Any]], None]) -> Path:
+    """A copy of a run whose policy has another note."""
+    shutil.copytree(run, target, ignore=shutil.ignore_patterns("evaluation"))
+    with zipfile.ZipFile(run / "policy.zip") as whole, zipfile.ZipFile(target / "policy.zip", "w") as copy:
+        for name in whole.namelist():
+            content = whole.read(name)
+            if name == NOTE_ENTRY:
+                note = json.loads(content)
+                change(note)
+                content = json.dumps(note).encode()
+            copy.writestr(name, content)
+    return target
+
+
+OTHER = {"checkpoint": "mine", "sha256": "ab" * 32}
+
+
+def test_a_policy_and_its_run_pin_their_forecaster(finished: tuple[Path, str]):
+    run, _ = finished
+    note = read_policy_note(run / "policy.zip")
+    assert note is not None and note.forecaster is not None
+    assert (note.forecaster.checkpoint, note.forecaster.sha256) == ("constant-velocity", None)
+    assert (note.forecaster.horizon_steps, note.forecaster.num_samples) == (5, 1)
+    assert json.loads((run / "config.json").read_text())["config"]["forecaster"] == asdict(note.forecaster)
+    assert read_policy_note(run / "checkpoint.zip") == note
+
+
+def test_a_policy_is_not_evaluated_on_another_forecaster(
+    finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    run = with_note(finished[0], tmp_path / "run", lambda note: note["policy"]["forecaster"].update(OTHER))
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--run-dir", str(run), "--episodes", "1", "--workers", "1"])
+    with pytest.raises(SystemExit) as exit_:
+        run_entry_point(evaluate.main)
+    assert exit_.value.code == 2
+    line = error_line(capsys)
+    assert "was trained on forecaster 'mine' (SHA-256 abababababab…), but gets 'constant-velocity'" in line
+    assert not (run / "evaluation").exists()
+
+
+def test_a_policy_without_a_pin_is_evaluated_with_a_notice(
+    finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    run = with_note(finished[0], tmp_path / "run", lambda note: note.pop("policy"))
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--run-dir", str(run), "--episodes", "1", "--workers", "1"])
+    run_entry_point(evaluate.main)
+    assert "does not say which forecaster it was trained on" in " ".join(capsys.readouterr().err.split())
+    assert (run / "evaluation" / "summary.json").exists()
+
+
+@pytest.mark.parametrize("pinned", [True, False])
+def test_a_run_goes_on_with_its_own_forecaster_only(
+    command: Callable[..., None],
+    pinned: bool,
+    finished: tuple[Path, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    run = tmp_path / "run"
+    run.mkdir()
+    content = json.loads((finished[0] / "config.json").read_text())
+    if pinned:
+        content["config"]["forecaster"].update(OTHER)
+    else:
+        del content["config"]["forecaster"]
+    (run / "config.json").write_text(json.dumps(content))
+    monkeypatch.setattr(train_policy, "train", lambda *arguments: sys.exit(0))
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as exit_:
+        command(*PPO, "--run-dir", str(run), "--resume")
+    if pinned:
+        assert exit_.value.code == 2
+        assert "was trained on forecaster 'mine' (SHA-256 abababababab…)" in error_line(capsys)
+    else:
+        assert exit_.value.code == 0
+        assert "does not say which forecaster it was trained on" in " ".join(capsys.readouterr().out.split())
+
+
 def test_pursuers_learn_to_chase_a_prey_that_flees_by_rule(chased: tuple[Path, str]):
     run, printed = chased
     names = {p.name for p in run.iterdir()}
@@ -187,15 +269,6 @@ def test_environments_by_default(backend: Literal["gymnasium", "envpool"], envs:
 def test_who_learns(env_id: str, asked: tuple[str, ...] | None, learners: tuple[str, ...]):
     task = train_policy.TrainPolicyConfig(env_id, learners=asked).plan.task
     assert task.learners == learners
-
-
-def test_what_cannot_be_drawn_gives_no_video_and_no_error(tmp_path: Path):
-    config = train_policy.TrainPolicyConfig("CartPole-v1", observe="none", out=tmp_path)
-    model = SB3PPO("MlpPolicy", "CartPole-v1", device="cpu")
-    assert train_policy.film(config.plan.task, model, tmp_path / "video.mp4") is None
-    config = train_policy.TrainPolicyConfig(TOY, observe="none", out=tmp_path)
-    assert train_policy.film(config.plan.task, policy_for(config.plan.task), tmp_path / "video.mp4") is None
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

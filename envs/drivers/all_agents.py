@@ -1,7 +1,8 @@
 """Who drives all agents of a PettingZoo parallel environment while data is collected or accuracy is measured.
 
-Every agent draws its own habits anew in each episode, so that only its history tells who it is. Heuristics look into
-the simulator, as the agents of a study may; what is recorded of them is what a scene reader sees.
+Every agent draws its own habits anew in each episode, from a random stream of its own that is independent of the
+environment's (`envs.seeding`): the start of an episode says nothing about the habits, only an agent's history does.
+Heuristics look into the simulator; what is recorded of them is what a scene reader sees.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,8 +22,11 @@ from predictor.errors import UserError
 Driver = Callable[[Mapping[str, Any]], dict[str, Any]]
 """From the observations of a step, of all agents or of some, to the actions of those that live."""
 
-Chooser = Callable[[Any], Any]
+AgentDriver = Callable[[Any], Any]
 """From one agent's observation to its action."""
+
+DrawAgentDriver = Callable[[str, np.random.Generator], AgentDriver]
+"""From an agent's name and a generator of its own to its driver for one episode."""
 
 WHO = "drivers"
 DRIVER_NAMES = ("random", "idle", "varied", "heuristic", "mixed")
@@ -52,33 +56,33 @@ def make_driver(name: str, env: Any, rng: np.random.Generator) -> Driver:
     """
     for agent in getattr(env, "possible_agents", ()):
         uniform_action(env.action_space(agent), np.random.default_rng(0), WHO)
-    draw = _choosers(name, env, rng)
-    choosers: dict[str, Chooser] = {}
+    draw = _agent_drivers(name, env, rng)
+    drivers: dict[str, AgentDriver] = {}
 
     def drive(observations: Mapping[str, Any]) -> dict[str, Any]:
         living = set(env.agents)
         for agent in observations:
-            if agent in living and agent not in choosers:
-                choosers[agent] = draw(agent)
-        return {agent: choosers[agent](seen) for agent, seen in observations.items() if agent in living}
+            if agent in living and agent not in drivers:
+                drivers[agent] = draw(agent, rng.spawn(1)[0])
+        return {agent: drivers[agent](seen) for agent, seen in observations.items() if agent in living}
 
     return drive
 
 
-def _choosers(name: str, env: Any, rng: np.random.Generator) -> Callable[[str], Chooser]:
-    """From an agent to how it chooses."""
+def _agent_drivers(name: str, env: Any, rng: np.random.Generator) -> DrawAgentDriver:
+    """Returns what makes the driver of an agent; `rng` is for what the agents decide together."""
     if name == "random":
-        return lambda agent: lambda seen: uniform_action(env.action_space(agent), rng, WHO)
+        return lambda agent, own: lambda seen: uniform_action(env.action_space(agent), own, WHO)
     if name == "idle":
-        return lambda agent: lambda seen: idle_action(env, agent)
+        return lambda agent, own: lambda seen: idle_action(env, agent)
     if name == "varied":
-        return lambda agent: varied_actions(env.action_space(agent), rng, WHO)
+        return lambda agent, own: varied_actions(env.action_space(agent), own, WHO)
     if name == "heuristic":
         return _heuristic(env, rng)
     if name == "mixed":
         kinds = ("random", "varied", "heuristic") if _has_heuristic(env) else ("random", "varied")
-        draws = [_choosers(kind, env, rng) for kind in kinds]
-        return lambda agent: draws[rng.integers(len(draws))](agent)
+        draws = [_agent_drivers(kind, env, rng) for kind in kinds]
+        return lambda agent, own: draws[own.integers(len(draws))](agent, own)
     raise UserError(f"driver must be one of {', '.join(DRIVER_NAMES)}, got '{name}'")
 
 
@@ -124,23 +128,23 @@ def _has_heuristic(env: Any) -> bool:
     return is_pursuit_env(env) or mpe_scenario(env) in _AIMS
 
 
-def _heuristic(env: Any, rng: np.random.Generator) -> Callable[[str], Chooser]:
+def _heuristic(env: Any, rng: np.random.Generator) -> DrawAgentDriver:
     if not _has_heuristic(env):
         raise UserError(
             f"no heuristic drives {multiagent_env_id(env)}, only pursuit and mpe2's {', '.join(_AIMS)}; use "
             + ", ".join(name for name in DRIVER_NAMES if name != "heuristic")
         )
-    family = _PursuitIntentions(env, rng) if is_pursuit_env(env) else _MpeIntentions(env, rng)
+    family = _PursuitIntentions(env) if is_pursuit_env(env) else _MpeIntentions(env, rng)
 
-    def draw(agent: str) -> Chooser:
-        habits = Habits.draw(rng)
-        intend = family.of(agent, habits)
+    def draw(agent: str, own: np.random.Generator) -> AgentDriver:
+        habits = Habits.draw(own)
+        intend = family.of(agent, habits, own)
         space = env.action_space(agent)
         last: list[Any] = []
 
         def choose(seen: Any) -> Any:
-            if not last or rng.random() < habits.attention:
-                last[:] = [uniform_action(space, rng, WHO) if rng.random() < habits.slip else intend()]
+            if not last or own.random() < habits.attention:
+                last[:] = [uniform_action(space, own, WHO) if own.random() < habits.slip else intend()]
             return last[0]
 
         return choose
@@ -151,14 +155,13 @@ def _heuristic(env: Any, rng: np.random.Generator) -> Callable[[str], Chooser]:
 class _PursuitIntentions:
     """Each pursuer heads for its favourite side of the nearest evader, along its favourite axis first."""
 
-    def __init__(self, env: Any, rng: np.random.Generator) -> None:
+    def __init__(self, env: Any) -> None:
         self._env = env.unwrapped
-        self._rng = rng
 
-    def of(self, agent: str, habits: Habits) -> Callable[[], int]:
+    def of(self, agent: str, habits: Habits, rng: np.random.Generator) -> Callable[[], int]:
         index = self._env.agent_name_mapping[agent]
-        side = _PURSUIT_STEPS[self._rng.integers(4)]
-        axes = self._rng.permutation([1.0, 1.01])  # breaks ties between the two axes
+        side = _PURSUIT_STEPS[rng.integers(4)]
+        axes = rng.permutation([1.0, 1.01])  # breaks ties between the two axes
 
         def intend() -> int:
             grid = self._env.env
@@ -190,9 +193,9 @@ class _MpeIntentions:
         self._places: dict[str, Float[np.ndarray, " axes"]] = {}
         self._new_round_at = 0
 
-    def of(self, agent: str, habits: Habits) -> Callable[[], Any]:
+    def of(self, agent: str, habits: Habits, rng: np.random.Generator) -> Callable[[], Any]:
         body = next(body for body in self.world.agents if body.name == agent)
-        word = 0 if body.silent else int(self.rng.integers(self.world.dim_c))
+        word = 0 if body.silent else int(rng.integers(self.world.dim_c))
         act = self._continuous if self.env.continuous_actions else self._discrete
 
         def intend() -> Any:

@@ -7,14 +7,14 @@ import numpy as np
 from highway_env.vehicle.controller import ControlledVehicle
 
 from envs.drivers.sampled_actions import uniform_action, varied_actions
-from envs.drivers.trained import Ego, load_policy
+from envs.drivers.trained import EgoDriver, kept_policy
 from predictor.errors import UserError
 
 WHO = "random egos"
-EGO_NAMES = ("random", "idle", "varied", "keep-lane")
+EGO_DRIVER_NAMES = ("random", "idle", "varied", "keep-lane")
 
 
-def make_ego(name: str, env: gym.Env, rng: np.random.Generator) -> Ego:
+def make_ego_driver(name: str, env: gym.Env, rng: np.random.Generator) -> EgoDriver:
     """An ego for one episode.
 
     Args:
@@ -38,7 +38,7 @@ def make_ego(name: str, env: gym.Env, rng: np.random.Generator) -> Ego:
         return _keep_lane(env, rng)
     if name.endswith(".zip"):
         return _trained(name)
-    raise UserError(f"driver must be one of {', '.join(EGO_NAMES)} or the path of a policy .zip, got '{name}'")
+    raise UserError(f"driver must be one of {', '.join(EGO_DRIVER_NAMES)} or the path of a policy .zip, got '{name}'")
 
 
 def idle_action(env: gym.Env) -> Any:
@@ -52,7 +52,7 @@ def idle_action(env: gym.Env) -> Any:
     raise UserError(f"no idle action is known for {space}")
 
 
-def _keep_lane(env: gym.Env, rng: np.random.Generator) -> Ego:
+def _keep_lane(env: gym.Env, rng: np.random.Generator) -> EgoDriver:
     """Follow the current lane with highway-env's own lane controller, with a little steering noise per episode."""
     action_type: Any = getattr(env.unwrapped, "action_type", None)
     if not isinstance(env.action_space, gym.spaces.Box) or not hasattr(action_type, "steering_range"):
@@ -70,6 +70,6 @@ def _keep_lane(env: gym.Env, rng: np.random.Generator) -> Ego:
     return act
 
 
-def _trained(path: str) -> Ego:
-    policy = load_policy(path)
+def _trained(path: str) -> EgoDriver:
+    policy = kept_policy(path)
     return lambda obs: policy.predict(obs, deterministic=True)[0]

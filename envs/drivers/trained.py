@@ -1,12 +1,13 @@
-"""A trained policy drives a PettingZoo environment: the rows it learned on, rebuilt for one step of one environment.
+"""A trained policy drives a PettingZoo environment: what it learned on is rebuilt for one step of one environment.
 
-Who learned, and who drove the others, is read from the policy's run folder (`train_policy.py` writes it); without one,
-all agents are the policy's.
+Who learned, who drove the others, and on which forecaster, is read from the note inside the policy's zip
+(`envs.sb3.policy_file`); without one, all agents are the policy's.
 """
 
 import functools
-import json
+import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,13 +16,15 @@ import numpy as np
 
 from envs.drivers.all_agents import Driver, make_driver
 from envs.sb3.padded_spaces import PaddedObservation, learners_named, own_action, roles_of
-from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.errors import UserError
+from predictor.scene import SceneSpec
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-Ego = Callable[[Any], Any]
+    from envs.sb3.policy_file import PolicyNote
+
+EgoDriver = Callable[[Any], Any]
 """From an observation to an action."""
 
 
@@ -36,37 +39,30 @@ def trained_driver(path: str, env: Any, rng: np.random.Generator) -> Driver:
     Raises:
         UserError: no such policy, or one of other observations than the environment gives.
     """
-    policy = load_policy(path)
-    run = _run_of(path)
-    learners = learners_named(env.possible_agents, tuple(run.get("learners") or ()), path)
+    policy, note = kept_policy(path), note_of(path)
+    learners = learners_named(env.possible_agents, () if note is None else note.learners, path)
     sees_forecasts = isinstance(policy.observation_space, gym.spaces.Dict)
     spaces = {agent: _seen_space(env.observation_space(agent), sees_forecasts) for agent in learners}
     actions = {agent: env.action_space(agent) for agent in learners}
-    rows = PaddedObservation(spaces, roles_of(spaces, actions), None)
-    if rows.space != policy.observation_space:
+    padded = PaddedObservation(spaces, roles_of(spaces, actions), None)
+    if padded.space != policy.observation_space:
         raise UserError(
-            f"policy {path} was trained on {_line(policy.observation_space)}, but the env gives {_line(rows.space)}"
+            f"policy {path} was trained on {_line(policy.observation_space)}, but the env gives {_line(padded.space)}"
         )
     others = (
-        make_driver(run.get("partner", "heuristic"), env, rng) if set(learners) < set(env.possible_agents) else None
+        make_driver(note.driver, env, rng) if note is not None and set(learners) < set(env.possible_agents) else None
     )
 
     def drive(observations: Mapping[str, Any]) -> dict[str, Any]:
         chosen = {} if others is None else others({a: s for a, s in observations.items() if a not in learners})
         for agent in (a for a in observations if a in learners and a in env.agents):
-            action, _ = policy.predict(rows.one(agent, _seen(observations[agent], sees_forecasts)), deterministic=True)
+            action, _ = policy.predict(
+                padded.one(agent, _seen(observations[agent], sees_forecasts)), deterministic=True
+            )
             chosen[agent] = own_action(action, actions[agent])
         return chosen
 
     return drive
-
-
-def _run_of(path: str) -> dict[str, Any]:
-    try:
-        config: dict[str, Any] = json.loads((Path(path).parent / "config.json").read_text())["config"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
-    return config
 
 
 def _line(space: gym.Space) -> str:
@@ -92,7 +88,7 @@ def _seen(observation: Mapping[str, Any], sees_forecasts: bool) -> Any:
     return {**observation, "forecast": forecast[:, 0] if forecast.ndim == 4 else forecast}
 
 
-def env_for_ego(env: gym.Env, name: str) -> gym.Env:
+def env_for_driver(env: gym.Env, name: str) -> gym.Env:
     """The env as the ego wants to see it: with forecasts for a policy that was trained on them, else as it is.
 
     Raises:
@@ -103,7 +99,13 @@ def env_for_ego(env: gym.Env, name: str) -> gym.Env:
     if sees_forecasts(name):
         from envs.wrappers import ForecastObservation  # the wrappers need no egos; most egos need no wrappers
 
-        env = ForecastObservation(env, forecaster_of(Path(name)))
+        checkpoint = forecaster_of(name)
+        env = ForecastObservation(env, checkpoint)
+        require_view(env, name)
+        if checkpoint is not None:
+            space: Any = env.observation_space
+            require_forecaster(name, checkpoint, space, env.get_wrapper_attr("scene_spec"))
+        return env
     require_view(env, name)
     return env
 
@@ -112,39 +114,56 @@ def require_view(env: gym.Env, name: str) -> None:
     """Raise a `UserError` if the ego is a policy that was trained on other observations than the env gives."""
     if not name.endswith(".zip"):
         return
-    wanted = load_policy(name).observation_space
+    wanted = kept_policy(name).observation_space
     if env.observation_space != wanted:
         raise UserError(f"policy {name} was trained on {wanted}, but the env gives {env.observation_space}")
 
 
 def sees_forecasts(name: str) -> bool:
     """Whether the ego is a policy that was trained on forecasts."""
-    return name.endswith(".zip") and isinstance(load_policy(name).observation_space, gym.spaces.Dict)
+    return name.endswith(".zip") and isinstance(kept_policy(name).observation_space, gym.spaces.Dict)
 
 
 @functools.cache
-def load_policy(path: str) -> "BaseAlgorithm":
-    """A PPO or DQN policy of Stable-Baselines3, loaded once per process. Its zip holds pickled data: trust its source.
+def kept_policy(path: str) -> "BaseAlgorithm":
+    """Returns the policy of a zip, loaded once per process; errors as `envs.sb3.policy_file.load_policy`."""
+    from envs.sb3.policy_file import load_policy  # most drivers need no SB3
 
-    Raises:
-        UserError: not there, or neither PPO nor DQN.
+    return load_policy(Path(path))
+
+
+def note_of(path: str) -> "PolicyNote | None":
+    """Returns what travels with a policy; None, with a warning, if nothing does (saved by SB3 alone or long ago)."""
+    from envs.sb3.policy_file import read_policy_note
+
+    note = read_policy_note(Path(path))
+    if note is None:
+        warnings.warn(
+            f"{path} has no note on its forecaster and learners: it gets the forecaster that ships for the environment "
+            "and drives all agents; policies that train_policy.py saves now have one",
+            stacklevel=2,
+        )
+    return note
+
+
+def forecaster_of(path: str) -> str | None:
+    """Returns the checkpoint that a policy was trained on; None if it does not say."""
+    note = note_of(path)
+    return None if note is None or note.forecaster is None else note.forecaster.checkpoint
+
+
+def require_forecaster(path: str, checkpoint: str, space: gym.spaces.Dict, spec: SceneSpec) -> None:
+    """Raise a `UserError` if a policy was trained on another forecaster, or with other options.
+
+    Args:
+        path: of the policy's zip.
+        checkpoint: forecaster that it gets.
+        space: observation space with that forecaster's forecasts; of several samples the policy sees the first.
+        spec: layout of the scenes.
     """
-    from stable_baselines3 import DQN, PPO
+    from envs.sb3.policy_file import pin_forecaster
 
-    if not Path(path).exists():
-        raise UserError(f"no policy at {path}; train one with python train_policy.py")
-    for algorithm in (PPO, DQN):
-        try:
-            return algorithm.load(path, device="cpu")
-        except (TypeError, KeyError, AttributeError, ValueError, AssertionError):
-            continue
-    raise UserError(f"{path} is neither a PPO nor a DQN policy")
-
-
-def forecaster_of(policy: Path) -> str | None:
-    """The checkpoint that the policy's run folder names; None (the one that ships) if there is no such folder."""
-    try:
-        config = json.loads((policy.parent / "config.json").read_text())["config"]
-    except (OSError, ValueError, KeyError):
-        return None
-    return CONSTANT_VELOCITY if config.get("observe") == CONSTANT_VELOCITY else config.get("checkpoint")
+    note = note_of(path)
+    if note is not None and note.forecaster is not None:
+        found = pin_forecaster(checkpoint, space, spec)
+        note.forecaster.check(replace(found, num_samples=note.forecaster.num_samples), f"policy {path}")

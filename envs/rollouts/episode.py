@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from envs.multiagent_observation import MultiagentStream
 from envs.observation import ForecastConfig, ForecastStream, into_ego_axes, others_by_distance
 from envs.readers.highway_labels import SceneLabels
-from envs.rollouts.world import EgoWorld, SharedWorld, World, open_world
+from envs.rollouts.world import EgoWorld, MultiagentWorld, World, open_world
 from envs.wrappers import ForecastObservation
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.baselines.nearest_neighbour import NearestNeighbour, fit_from_stores
@@ -132,7 +132,7 @@ def play(task: EpisodeTask) -> Episode:
     others = _baselines(task, world.spec)
     probe = _Probe(task, world)
     scenes: list[Scene] = []
-    truths = [world.everyone()]
+    truths = [world.full_scene()]
     forecasts: dict[str, list[torch.Tensor]] = {key: [] for key in (MODEL, *others)}
     episode = Episode({}, [])
     for step in range(task.max_steps + 1):
@@ -146,7 +146,7 @@ def play(task: EpisodeTask) -> Episode:
         if step == task.max_steps:
             break
         ended = world.step()
-        truths.append(world.everyone())
+        truths.append(world.full_scene())
         if ended:
             break
     future, valid = futures(scenes, truths, task.horizon_steps, world.spec)
@@ -195,14 +195,14 @@ class _Probe:
         forecaster = _kept_forecaster(task.checkpoint, world.spec, task.env_id)
         config = ForecastConfig(task.horizon_steps)
         self._stream: Any
-        if isinstance(world, SharedWorld):
+        if isinstance(world, MultiagentWorld):
             self._stream = MultiagentStream(forecaster, world.spec, config)
         else:
             self._stream = ForecastStream(forecaster, world.spec, 1, config)
 
     def __call__(self) -> float:
         world = self._world
-        scene: Any = world.env.scene if isinstance(world, SharedWorld) else SceneBatch.stack([world.perceived()])
+        scene: Any = world.env.scene if isinstance(world, MultiagentWorld) else SceneBatch.stack([world.perceived()])
         start = time.perf_counter()
         self._stream.observe(scene)
         return time.perf_counter() - start
@@ -210,7 +210,7 @@ class _Probe:
 
 def _measured(world: World, samples: int) -> torch.Tensor:
     """The deployed forecast (K, A, H, 2) in rows of the perceived scene, world axes, relative to the ego if any."""
-    if isinstance(world, SharedWorld):
+    if isinstance(world, MultiagentWorld):
         return world.env.forecast.xy[0, :samples].cpu()
     assert isinstance(world, EgoWorld)
     return world_forecast(world.observation["forecast"], world.perceived())[:samples]
@@ -236,7 +236,7 @@ def futures(
 
     Args:
         scenes: as perceived, padded.
-        truths: everyone, at the same instants and beyond.
+        truths: all agents, at the same instants and beyond.
         horizon_steps: steps ahead.
         spec: layout of the scenes.
     """
@@ -260,18 +260,18 @@ def futures(
     return torch.from_numpy(future).float(), torch.from_numpy(valid)
 
 
-def _note_edges(episode: Episode, world: World, scene: Scene, everyone: Scene) -> None:
+def _note_edges(episode: Episode, world: World, scene: Scene, full: Scene) -> None:
     """The believed and the true graph of the perceived scene, where the simulator knows it."""
     labels = world.labels()
     if labels is None or not isinstance(world, EgoWorld):
         return
     assert isinstance(world.env, ForecastObservation)
     episode.edge_probs.append(world.env.forecast.dense().edge_probs[0].cpu().numpy())
-    episode.edge_types.append(_types_of(scene, everyone, labels))
+    episode.edge_types.append(_types_of(scene, full, labels))
 
 
-def _types_of(scene: Scene, everyone: Scene, labels: SceneLabels) -> Int[np.ndarray, "agents agents"]:
-    row = {int(agent): i for i, agent in enumerate(everyone.ids)}
+def _types_of(scene: Scene, full: Scene, labels: SceneLabels) -> Int[np.ndarray, "agents agents"]:
+    row = {int(agent): i for i, agent in enumerate(full.ids)}
     known = np.flatnonzero(scene.valid)
     source = np.array([row[int(agent)] for agent in scene.ids[known]], dtype=np.int64)
     types = np.full((len(scene.ids), len(scene.ids)), -1, dtype=np.int64)

@@ -5,14 +5,20 @@ policy is trained with, so what is recorded and measured is what is deployed.
 """
 
 import functools
-from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from envs.drivers.all_agents import Driver, make_driver
-from envs.drivers.ego import make_ego
-from envs.drivers.trained import env_for_ego, forecaster_of, require_view, sees_forecasts, trained_driver
+from envs.drivers.ego import make_ego_driver
+from envs.drivers.trained import (
+    env_for_driver,
+    forecaster_of,
+    require_forecaster,
+    require_view,
+    sees_forecasts,
+    trained_driver,
+)
 from envs.parallel import ForecastParallelEnv
 from envs.readers.base import SceneReader
 from envs.readers.highway import is_highway_env
@@ -26,6 +32,7 @@ from envs.registry import (
     make_env,
     make_multiagent_env,
 )
+from envs.seeding import driver_rng
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.errors import UserError
@@ -44,16 +51,16 @@ class World(Protocol):
         """Begin the episode of a seed: environment and drivers are a function of it."""
 
     def step(self) -> bool:
-        """Let everybody act once; whether the episode is over."""
+        """Let all agents act once; returns whether the episode is over."""
 
     def perceived(self) -> Scene:
         """The scene as forecasters get it, padded."""
 
-    def everyone(self) -> Scene:
-        """Everyone who is there, unpadded: the truth."""
+    def full_scene(self) -> Scene:
+        """Returns all agents that are there, unpadded: the truth."""
 
     def labels(self) -> SceneLabels | None:
-        """True edges between the rows of `everyone`, where the simulator knows them."""
+        """True edges between the agents of `full_scene`, where the simulator knows them."""
 
     def close(self) -> None:
         """Close the environment."""
@@ -83,7 +90,7 @@ class EgoWorld:
     def reset(self, seed: int) -> None:
         """Begin the episode of a seed."""
         self.observation, _ = self.env.reset(seed=seed)
-        self._ego = make_ego(self._name, self.env, np.random.default_rng(seed))
+        self._ego = make_ego_driver(self._name, self.env, driver_rng(seed))
 
     def step(self) -> bool:
         """Let the ego act."""
@@ -95,8 +102,8 @@ class EgoWorld:
         scene: Scene = self.env.scene
         return scene
 
-    def everyone(self) -> Scene:
-        """Everyone, ego first."""
+    def full_scene(self) -> Scene:
+        """Returns all agents, ego first."""
         return self._reader.read_all(self.env)
 
     def labels(self) -> SceneLabels | None:
@@ -115,7 +122,7 @@ class EgoWorld:
         return {**self.observation, "forecast": forecast[:, 0] if forecast.ndim == 4 else forecast}
 
 
-class SharedWorld:
+class MultiagentWorld:
     """A PettingZoo parallel environment; all its agents are driven.
 
     Args:
@@ -138,10 +145,10 @@ class SharedWorld:
     def reset(self, seed: int) -> None:
         """Begin the episode of a seed."""
         self._observations, _ = self.env.reset(seed=seed)
-        self._driver = self._make_driver(np.random.default_rng(seed))
+        self._driver = self._make_driver(driver_rng(seed))
 
     def step(self) -> bool:
-        """Let everybody act."""
+        """Let all agents act."""
         seen = self._observations
         if not self._name.endswith(".zip"):
             seen = {name: entries["observation"] for name, entries in seen.items()}
@@ -149,11 +156,11 @@ class SharedWorld:
         return not self.env.agents
 
     def perceived(self) -> Scene:
-        """Everyone, padded: nobody is the ego."""
+        """Returns all agents, padded; none is the ego."""
         return self.env.scene.scene
 
-    def everyone(self) -> Scene:
-        """Everyone."""
+    def full_scene(self) -> Scene:
+        """Returns all agents."""
         scene = self.env.scene.scene
         return Scene(scene.states[scene.valid], scene.ids[scene.valid], scene.valid[scene.valid])
 
@@ -192,26 +199,31 @@ def open_world(
         UserError: unknown env, driver or checkpoint, or things that do not belong together.
     """
     if is_multiagent_id(env_id):
+        checkpoint = checkpoint or _forecaster_for(env_id, driver)
         shared = ForecastParallelEnv(
-            make_multiagent_env(env_id),
-            checkpoint or _forecaster_for(env_id, driver),
-            horizon_steps=horizon_steps,
-            num_samples=num_samples,
+            make_multiagent_env(env_id), checkpoint, horizon_steps=horizon_steps, num_samples=num_samples
         )
-        return SharedWorld(shared, driver)
+        multiagent = MultiagentWorld(shared, driver)
+        if sees_forecasts(driver):
+            space: Any = shared.observation_space(shared.possible_agents[0])
+            require_forecaster(driver, checkpoint, space, shared.scene_spec)
+        return multiagent
     env = make_env(env_id, disable_env_checker=True)
     if checkpoint is None:
-        seen = env_for_ego(env, driver)
+        seen = env_for_driver(env, driver)
         world = EgoWorld(seen if isinstance(seen, ForecastObservation) else SceneObservation(seen), driver)
     else:
         if sees_forecasts(driver):
-            require_view(ForecastObservation(env, checkpoint, horizon_steps=horizon_steps), driver)
+            seen = ForecastObservation(env, checkpoint, horizon_steps=horizon_steps)
+            require_view(seen, driver)
+            space = seen.observation_space
+            require_forecaster(driver, checkpoint, space, seen.get_wrapper_attr("scene_spec"))
         else:
             require_view(env, driver)
         world = EgoWorld(
             ForecastObservation(env, checkpoint, horizon_steps=horizon_steps, num_samples=num_samples), driver
         )
-    make_ego(driver, world.env, np.random.default_rng(0))
+    make_ego_driver(driver, world.env, np.random.default_rng(0))
     return world
 
 
@@ -219,7 +231,7 @@ def _forecaster_for(env_id: str, driver: str) -> str:
     """Whose forecasts a PettingZoo environment is recorded with: those that its driver was trained on, if any."""
     if not sees_forecasts(driver):
         return CONSTANT_VELOCITY
-    return forecaster_of(Path(driver)) or checkpoint_for(env_id)
+    return forecaster_of(driver) or checkpoint_for(env_id)
 
 
 def default_drivers(env_id: str) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 from envs.parallel import batch_forwards
 from envs.sb3.padded_spaces import PaddedObservation, own_action, roles_of, shared_action
+from envs.seeding import driver_rng
 from predictor.errors import ProtocolError, UserError
 
 Partner = Callable[[ParallelEnv, dict[str, Any], np.random.Generator], Mapping[str, Any]]
@@ -290,7 +291,7 @@ class _Copy:
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Mapping[str, Any]:
         if seed is not None:
-            self._generator = np.random.default_rng(seed)
+            self._generator = driver_rng(seed)
         observations, infos = self.env.reset(seed=seed, options=options or None)
         self._lived = set()
         self._enter(self.env.agents, observations)

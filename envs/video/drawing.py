@@ -178,7 +178,7 @@ def encode_png(pixels: UInt8[np.ndarray, "height width 3"]) -> bytes:
     return buffer.getvalue()
 
 
-def write_video(path: Path, pictures: Iterable[UInt8[np.ndarray, "height width 3"]], fps: int) -> None:
+def write_video(path: str | Path, pictures: Iterable[UInt8[np.ndarray, "height width 3"]], fps: int) -> None:
     """Encode as MP4 (H.264, yuv420p); `path` is always a whole file.
 
     Args:
@@ -186,6 +186,7 @@ def write_video(path: Path, pictures: Iterable[UInt8[np.ndarray, "height width 3
         pictures: at least one, all of one size; height and width are even, as H.264 needs them.
         fps: pictures per second.
     """
+    path = Path(path)
     rest = iter(pictures)
     first = next(rest)
     with new_file(path) as partial:
@@ -199,7 +200,7 @@ def write_video(path: Path, pictures: Iterable[UInt8[np.ndarray, "height width 3
                 writer.send(np.ascontiguousarray(picture))
 
 
-def write_picture(path: Path, picture: UInt8[np.ndarray, "height width 3"]) -> None:
+def write_picture(path: str | Path, picture: UInt8[np.ndarray, "height width 3"]) -> None:
     """Save as PNG."""
     Image.fromarray(picture).save(path, format="PNG")
 

@@ -114,11 +114,11 @@ class Recording:
             decode_png(frame.png), frame.view, frame.positions_m[self._ego], agents, caption, self.style
         )
 
-    def write_video(self, path: Path) -> None:
+    def write_video(self, path: str | Path) -> None:
         """Encode as MP4 (H.264, yuv420p); `path` is always a whole file."""
         write_video(path, (self.draw(index) for index in range(len(self))), self.fps)
 
-    def write_frame(self, path: Path, index: int) -> None:
+    def write_frame(self, path: str | Path, index: int) -> None:
         """Save one annotated picture as PNG."""
         write_picture(path, self.draw(index))
 
@@ -217,8 +217,8 @@ class _Recorder:
         """Called by highway-env for every picture within a step, and by us for the one at its end."""
         pixels = np.ascontiguousarray(self._base.render())
         surface = self._base.viewer.sim_surface
-        everyone = self._reader.read_all(self._env)
-        places = zip(everyone.ids.tolist(), everyone.states[:, :2].tolist(), strict=True)
+        full = self._reader.read_all(self._env)
+        places = zip(full.ids.tolist(), full.states[:, :2].tolist(), strict=True)
         positions = {key: (x, y) for key, (x, y) in places}
         view = View((float(surface.origin[0]), float(surface.origin[1])), float(surface.scaling))
         step = len(self.recording._steps) - 1

@@ -1,4 +1,4 @@
-"""Film an episode of a PettingZoo parallel environment, with everyone's forecast and what then happened drawn in.
+"""Film an episode of a PettingZoo parallel environment, with each agent's forecast and what then happened drawn in.
 
 The picture is drawn from the scenes alone, so it is the same for every family of environments: agents are discs, and
 what no reader reports (walls, lanes, the simulator's own artwork) is not there. The episode is played first and drawn
@@ -53,7 +53,7 @@ _AT_REST_MPS = 1e-3
 
 
 @dataclass(frozen=True)
-class SharedStyle:
+class MultiagentStyle:
     """Colours [RGB] and sizes [px of the picture] of a film without a simulator's picture."""
 
     arena_px: int = 600
@@ -120,7 +120,7 @@ class _Moment:
 
 
 @dataclass
-class SharedRecording:
+class MultiagentRecording:
     """A played episode, ready to be drawn."""
 
     env_id: str
@@ -129,7 +129,7 @@ class SharedRecording:
     """Length of a policy step [s]."""
     focus: str
     """The agent whose incoming edges are drawn."""
-    style: SharedStyle
+    style: MultiagentStyle
     """How it will look."""
     y_up: bool = True
     """Whether y points up in the picture."""
@@ -172,11 +172,11 @@ class SharedRecording:
         above = self._roles(self._moments[step])
         return draw_page(arena, self._caption(index), above, self._legend, self._width_px, self.style.lines)
 
-    def write_video(self, path: Path) -> None:
+    def write_video(self, path: str | Path) -> None:
         """Encode as MP4 (H.264, yuv420p); `path` is always a whole file."""
         write_video(path, (self.draw(index) for index in range(len(self))), self.fps)
 
-    def write_frame(self, path: Path, index: int) -> None:
+    def write_frame(self, path: str | Path, index: int) -> None:
         """Save one picture as PNG."""
         write_picture(path, self.draw(index))
 
@@ -283,15 +283,15 @@ class SharedRecording:
         return np.array([moment.bodies[key].now_m for moment in there])
 
 
-def record_parallel_episode(
+def record_multiagent_episode(
     env: ForecastParallelEnv,
     act: Callable[[dict[str, Any]], dict[str, Any]],
     *,
     seed: int = 0,
     max_steps: int | None = None,
     focus: str | None = None,
-    style: SharedStyle | None = None,
-) -> SharedRecording:
+    style: MultiagentStyle | None = None,
+) -> MultiagentRecording:
     """Play one episode and keep what is needed to draw it.
 
     Args:
@@ -305,7 +305,7 @@ def record_parallel_episode(
     Raises:
         UserError: nobody is called like `focus`, or nobody is there to be filmed.
     """
-    recorder = _Recorder(env, focus, style or SharedStyle())
+    recorder = _Recorder(env, focus, style or MultiagentStyle())
     observations, _ = env.reset(seed=seed)
     recorder.begin()
     while env.agents and recorder.recording.num_steps != max_steps:
@@ -318,14 +318,14 @@ def record_parallel_episode(
 class _Recorder:
     """Follows an episode; remembers who is who, also when the environment no longer counts them."""
 
-    def __init__(self, env: ForecastParallelEnv, focus: str | None, style: SharedStyle) -> None:
+    def __init__(self, env: ForecastParallelEnv, focus: str | None, style: MultiagentStyle) -> None:
         if focus is not None and focus not in env.possible_agents:
             raise UserError(f"focus must be one of {', '.join(env.possible_agents)}, got '{focus}'")
         self._env = env
         self._focus = focus
         # Drawn as their own pictures are.
         y_up = not (isinstance(env.unwrapped, HighwayParallelEnv) or is_pursuit_env(env))
-        self.recording = SharedRecording(multiagent_env_id(env), env.scene_spec.dt_s, "", style, y_up)
+        self.recording = MultiagentRecording(multiagent_env_id(env), env.scene_spec.dt_s, "", style, y_up)
         self._names: dict[int, str] = {}
         self._returns: dict[str, float] = {}
 

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from predictor.config_checks import check_at_least, check_choices
 from predictor.forecaster import Belief, Memory, WindowOutput
 from predictor.graph import pair_mask
-from predictor.layers.pair_noise import Noise
 from predictor.layers.state_codec import Residual, StateCodec
+from predictor.noise import Noise
 from predictor.scene import SceneSpec
 
 Tensors = tuple[Tensor, ...]

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory, edgeless_belief
-from predictor.layers.pair_noise import Noise
+from predictor.noise import Noise
 from predictor.scene import SceneSpec
 
 

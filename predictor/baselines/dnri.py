@@ -23,8 +23,8 @@ from predictor.dgvae.networks import concrete_sample, no_edge_where_absent
 from predictor.errors import UserError
 from predictor.forecaster import Belief, WindowOutput
 from predictor.graph import pair_mask
-from predictor.layers.pair_noise import Noise, PairNoise, noise_of_pairs
 from predictor.layers.state_codec import Residual
+from predictor.noise import Noise, PairNoise, noise_of_pairs
 from predictor.scene import SceneSpec
 
 

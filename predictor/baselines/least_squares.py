@@ -16,7 +16,7 @@ from predictor.data.springs import Physics, simulate
 from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory
 from predictor.graph import pair_mask
-from predictor.layers.pair_noise import Noise
+from predictor.noise import Noise
 from predictor.scene import SceneSpec
 
 LEAST_CONSTANT = 0.25

@@ -18,7 +18,7 @@ from predictor.data.store import Episode, read_store
 from predictor.data.windows import visible
 from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory, edgeless_belief
-from predictor.layers.pair_noise import Noise
+from predictor.noise import Noise
 from predictor.scene import SceneSpec
 
 K = 5

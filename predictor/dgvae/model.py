@@ -35,9 +35,9 @@ from predictor.dgvae.single_step import Encoding, Internal, Layers, Modules, Pas
 from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory, WindowOutput
 from predictor.graph import NOBODY, among_nearest, nearest, off_diagonal, others, pair_mask, with_diagonal
-from predictor.layers.pair_noise import Noise, PairNoise, noise_of_pairs
 from predictor.layers.rnn import masked_gru
 from predictor.layers.state_codec import StateCodec
+from predictor.noise import Noise, PairNoise, noise_of_pairs
 from predictor.scene import SceneSpec
 
 __all__ = ["DGVAE", "PRESETS", "DGVAEConfig", "Decoder", "Edges", "Encoder", "WindowOutput", "concrete_sample"]

@@ -9,7 +9,7 @@ from pettingzoo import ParallelEnv
 from stable_baselines3 import PPO
 
 from agents.task import Task
-from agents.vec_envs import make_parallel_rows
+from agents.vec_envs import make_multiagent_venv
 
 TOY = f"{__name__}:Meadow"
 LIVES = {"ant_0": 2, "bee_0": 5}
@@ -54,7 +54,7 @@ _SEEN, _DONE = gym.spaces.Box(0, 10, (1,), np.float32), gym.spaces.Discrete(2)
 
 def policy_for(task: Task) -> PPO:
     """Untrained, with weights large enough that its actions depend on what it sees."""
-    rows = make_parallel_rows(task, 1)
+    rows = make_multiagent_venv(task, 1)
     kind = "MultiInputPolicy" if isinstance(rows.observation_space, gym.spaces.Dict) else "MlpPolicy"
     model = PPO(kind, rows, n_steps=4, batch_size=4 * rows.num_envs, policy_kwargs={"net_arch": [8]}, seed=0)
     with torch.no_grad():

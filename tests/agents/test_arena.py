@@ -5,14 +5,14 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from agents.arena import Arena, EgoArena, ParallelArena, open_arena
+from agents.arena import Arena, EgoArena, MultiagentArena, open_arena
 from agents.task import Task
-from agents.vec_envs import make_rows
+from agents.vec_envs import make_venv
 from envs.registry import make_env
 
 
 def test_every_task_has_its_arena():
-    for task, kind in ((Task("highway-fast-v0", "none"), EgoArena), (Task("simple_tag_v3", "none"), ParallelArena)):
+    for task, kind in ((Task("highway-fast-v0", "none"), EgoArena), (Task("simple_tag_v3", "none"), MultiagentArena)):
         arena = open_arena(task, 1)
         assert isinstance(arena, kind)
         assert isinstance(arena, Arena)
@@ -23,11 +23,11 @@ def test_native_policies_are_measured_on_the_original(monkeypatch: pytest.Monkey
     pytest.importorskip("envpool")
     asked: list[tuple[Task, int, bool]] = []
 
-    def note(task: Task, num_rows: int, seeded: bool) -> Any:
-        asked.append((task, num_rows, seeded))
-        return make_rows(task, num_rows, seeded)
+    def note(task: Task, num_envs: int, seeded: bool) -> Any:
+        asked.append((task, num_envs, seeded))
+        return make_venv(task, num_envs, seeded)
 
-    monkeypatch.setattr("agents.arena.make_rows", note)
+    monkeypatch.setattr("agents.arena.make_venv", note)
     arena = open_arena(Task("highway-fast-v0", "none", backend="envpool"), 1)
     assert asked == [(Task("highway-fast-v0", "none"), 1, True)]
     arena.close()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.arena import ParallelArena
+from agents.arena import MultiagentArena
 from agents.evaluate import (
     NUM_POLICIES,
     Evaluation,
@@ -90,7 +90,9 @@ def herd(seed: int, ants: float, bees: float) -> EpisodeResult:
 
 
 def test_without_an_ego_there_are_roles_but_no_crashes(tmp_path: Path):
-    evaluation = Evaluation("meadow", 1, {"ppo": [herd(1, 1.0, 4.0), herd(2, 3.0, 8.0)], "random": [herd(1, 0.0, 0.5)]})
+    evaluation = Evaluation(
+        "meadow", 1, {"ppo": [herd(1, 1.0, 4.0), herd(2, 3.0, 8.0)], "random": [herd(1, 0.0, 0.5)]}, False
+    )
     evaluation.write(tmp_path)
     lines = (tmp_path / "summary.md").read_text().splitlines()
     assert lines[0] == "| policy | return | return of ant | return of bee | length |"
@@ -105,13 +107,26 @@ def test_without_an_ego_there_are_roles_but_no_crashes(tmp_path: Path):
     assert content["episodes"]["ppo"][1]["returns_by_role"] == {"ant": 3.0, "bee": 8.0}
 
 
+def test_crashes_that_are_never_reported_are_unknown_not_zero():
+    silent = EpisodeResult(1, 2.0, 5, None, 20.0)
+    mixed = Evaluation("toy-v0", 10, {"ppo": EPISODES, "silent": [silent]})
+    lines = mixed.markdown().splitlines()
+    assert lines[2].endswith("% (6–79 %) | 25.0 |")
+    assert lines[3] == "| silent | 2.00 | 5.0 | – | 20.0 |"
+    alone = Evaluation("toy-v0", 10, {"silent": [silent]}).markdown()
+    assert "0 %" not in alone
+    assert "the environment reports no crashes" in alone
+
+
 def test_the_caption_of_an_ego_explains_its_interval():
     assert "95 % Wilson interval" in Evaluation("toy-v0", 10, {"ppo": EPISODES}).markdown()
 
 
 def test_one_role_needs_no_column():
     single = EpisodeResult(1, 2.0, 5, None, math.nan)
-    assert Evaluation("meadow", 1, {"ppo": [single]}).markdown().startswith("| policy | return | length |")
+    assert (
+        Evaluation("meadow", 1, {"ppo": [single]}, has_ego=False).markdown().startswith("| policy | return | length |")
+    )
 
 
 def test_everyone_plays_the_same_held_out_seeds():
@@ -122,5 +137,5 @@ def test_everyone_plays_the_same_held_out_seeds():
     assert len(calls) == 3 * NUM_POLICIES
     seeds = range(EVALUATION_SEED, EVALUATION_SEED + 3)
     for name, found in evaluation.results.items():
-        expected = ParallelArena(task).play(model if name == "ppo" else name, seeds)
+        expected = MultiagentArena(task).play(model if name == "ppo" else name, seeds)
         assert [(e.seed, e.episode_return) for e in found] == [(e.seed, e.episode_return) for e in expected]

@@ -1,10 +1,17 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from stable_baselines3 import PPO
 
 from agents.features import AttentionConfig, ForecastAttention
+from agents.task import Task
+from agents.training import TrainingPlan, make_model
+from agents.vec_envs import make_venv
 from predictor.errors import UserError
+from predictor.scene import SceneSpec
 
 BATCH, AGENTS, HORIZON, FEATURES = 3, 5, 4, 6
 SHAPES = {
@@ -30,9 +37,9 @@ def make_observations(shapes: dict[str, tuple[int, ...]], seed: int = 0) -> dict
     return observations
 
 
-def make_extractor(shapes: dict[str, tuple[int, ...]]) -> ForecastAttention:
+def make_extractor(shapes: dict[str, tuple[int, ...]], config: AttentionConfig | None = None) -> ForecastAttention:
     torch.manual_seed(0)
-    extractor = ForecastAttention(make_space(shapes))
+    extractor = ForecastAttention(make_space(shapes), config)
     with torch.no_grad():
         extractor.null_token.normal_()
     return extractor
@@ -169,6 +176,37 @@ def test_several_samples_are_read():
 def test_missing_observation_is_named():
     with pytest.raises(UserError, match="needs a Dict with the key 'observation', got Dict\\('agents'"):
         ForecastAttention(make_space({"agents": (AGENTS, 4)}))
+
+
+def test_scales_on_roads_are_those_of_the_default():
+    assert AttentionConfig.for_scenes(SceneSpec(dt_s=1.0)) == AttentionConfig()
+    assert TrainingPlan(Task("highway-fast-v0"), "ppo", 1, 1, 0).attention == AttentionConfig()
+
+
+def test_scales_in_a_small_arena_are_small():
+    config = TrainingPlan(Task("simple_tag_v3"), "ppo", 1, 1, 0).attention
+    assert (config.near_m, config.far_m, config.speed_mps) == (0.1, 0.5, 1.0)
+    assert TrainingPlan(Task("simple_tag_v3", "none"), "ppo", 1, 1, 0).attention == AttentionConfig()
+
+
+def test_features_depend_on_a_place_relative_to_the_scale_of_its_scene():
+    """An arena a hundredth the size of a road, seen at its own scale, gives the features of the road."""
+    arena = SceneSpec(dt_s=0.1, feature_scales=(1.0, 1.0, 0.3, 0.3))
+    road, small = make_extractor(SHAPES), make_extractor(SHAPES, AttentionConfig.for_scenes(arena))
+    observations = make_observations(SHAPES)
+    shrunk = {k: v / 100 if k in ("agents", "forecast") else v for k, v in observations.items()}
+    torch.testing.assert_close(small(shrunk), road(observations), rtol=1e-5, atol=1e-5)
+    assert (road(shrunk) - road(observations)).abs().max() > 1e-2
+
+
+def test_scales_travel_in_the_zip(tmp_path: Path):
+    task = Task("simple_tag_v3", "constant-velocity", learners=("adversary",))
+    venv = make_venv(task, 1)
+    make_model(TrainingPlan(task, "ppo", 1, 1, 0), venv).save(tmp_path / "policy.zip")
+    venv.close()
+    extractor = PPO.load(tmp_path / "policy.zip", device="cpu").policy.features_extractor
+    assert isinstance(extractor, ForecastAttention)
+    assert (extractor.config.near_m, extractor.config.far_m, extractor.config.speed_mps) == (0.1, 0.5, 1.0)
 
 
 def test_heads_must_divide_width():

@@ -4,12 +4,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.arena import ParallelArena
+from agents.arena import MultiagentArena
 from agents.task import Task
-from agents.vec_envs import DrivenEnv, EpisodeResult, MakeCopy, drive, make_parallel_rows
-from agents.video import record_task
+from agents.vec_envs import DrivenEnv, EpisodeResult, MakeCopy, drive, make_multiagent_venv
 from envs.drivers.all_agents import make_driver
 from envs.registry import make_multiagent_env
+from envs.seeding import driver_rng
 from predictor.errors import UserError
 from tests.agents.helpers import LIVES, TOY, policy_for
 
@@ -35,7 +35,7 @@ def told(results: list[EpisodeResult]) -> list[tuple]:
     ids=["all", "role", "agent", "both"],
 )
 def test_every_learner_of_every_copy_is_a_row(learners: tuple[str, ...], expected: list[str]):
-    rows = make_parallel_rows(Task(TAG, "none", learners=learners), 2)
+    rows = make_multiagent_venv(Task(TAG, "none", learners=learners), 2)
     assert rows.num_envs == 2 * len(expected)
     assert rows.get_attr("possible_agents")[0] == ["adversary_0", "adversary_1", "adversary_2", "agent_0"]
     assert rows.venv.row_agents == 2 * expected  # type: ignore[attr-defined]
@@ -44,13 +44,13 @@ def test_every_learner_of_every_copy_is_a_row(learners: tuple[str, ...], expecte
 
 def test_unknown_learners_are_named():
     with pytest.raises(UserError, match=f"'wolf' is neither an agent nor a role of {TAG}; it has adversary_0, "):
-        make_parallel_rows(Task(TAG, learners=("wolf",), observe="none"), 1)
+        make_multiagent_venv(Task(TAG, learners=("wolf",), observe="none"), 1)
 
 
 def test_rows_observe_what_the_task_says():
-    own = make_parallel_rows(Task(SPREAD, "none"), 1)
+    own = make_multiagent_venv(Task(SPREAD, "none"), 1)
     assert own.observation_space == make_multiagent_env(SPREAD).observation_space("agent_0")
-    seeing = make_parallel_rows(Task(SPREAD, "constant-velocity"), 1)
+    seeing = make_multiagent_venv(Task(SPREAD, "constant-velocity"), 1)
     assert isinstance(seeing.observation_space, gym.spaces.Dict)
     assert seeing.observation_space["observation"] == own.observation_space
     assert {"agents", "forecast", "valid"} <= set(seeing.observation_space)
@@ -107,10 +107,10 @@ def test_drivers_by_name_see_no_forecasts():
 
 
 def test_where_all_learn_nobody_needs_to_be_able_to_drive():
-    rows = make_parallel_rows(Task(TOY, "none", driver="heuristic"), 1)
+    rows = make_multiagent_venv(Task(TOY, "none", driver="heuristic"), 1)
     rows.reset()
     assert rows.step(np.array([1, 0]))[1].tolist() == [1.0, 0.0]
-    rows = make_parallel_rows(Task(TOY, "none", learners=("ant",), driver="heuristic"), 1)
+    rows = make_multiagent_venv(Task(TOY, "none", learners=("ant",), driver="heuristic"), 1)
     rows.reset()
     with pytest.raises(UserError, match="no heuristic drives meadow_v0"):
         rows.step(np.array([1]))
@@ -122,13 +122,13 @@ def test_where_all_learn_nobody_needs_to_be_able_to_drive():
 @pytest.mark.parametrize("observe", ["none", "constant-velocity"])
 def test_results_depend_on_the_seed_alone(observe: Any):
     task = Task(TAG, observe, learners=("adversary",), driver="varied")
-    model, arena = policy_for(task), ParallelArena(task)
+    model, arena = policy_for(task), MultiagentArena(task)
     for policy in (model, *arena.baselines):
         results = arena.play(policy, [3, 4])
         assert told(arena.play(policy, [4, 3])) == told(results)[::-1]
         assert [r.seed for r in results] == [3, 4]
         assert told(results)[0][1:] != told(results)[1][1:] or policy is model
-    assert told(ParallelArena(task).play(model, [4])) == told(arena.play(model, [4]))
+    assert told(MultiagentArena(task).play(model, [4])) == told(arena.play(model, [4]))
 
 
 def test_a_policy_is_played_as_in_a_plain_loop():
@@ -145,7 +145,7 @@ def test_a_policy_is_played_as_in_a_plain_loop():
             observations, rewards, *_ = env.step(actions)
             total += sum(rewards.values()) / 3
         expected.append(total)
-    results = ParallelArena(task).play(model, [1, 2])
+    results = MultiagentArena(task).play(model, [1, 2])
     assert len(acted) > 1
     assert [r.episode_return for r in results] == pytest.approx(expected, rel=1e-5)
     assert [(r.length, r.crashed) for r in results] == [(25, None)] * 2
@@ -155,29 +155,29 @@ def test_a_policy_is_played_as_in_a_plain_loop():
 def test_a_driver_is_played_as_in_a_plain_loop(name: str):
     env = make_multiagent_env(SPREAD)
     observations, _ = env.reset(seed=6)
-    driver = make_driver(name, env, np.random.default_rng(6))
+    driver = make_driver(name, env, driver_rng(6, group=1))
     total = 0.0
     while env.agents:
         observations, rewards, *_ = env.step(driver(observations))
         total += sum(rewards.values()) / 3
-    (result,) = ParallelArena(Task(SPREAD, "constant-velocity")).play(name, [6])
+    (result,) = MultiagentArena(Task(SPREAD, "constant-velocity")).play(name, [6])
     assert result.episode_return == pytest.approx(total)
 
 
 def test_returns_by_role_where_there_are_several():
-    arena = ParallelArena(Task(TAG, "none"))
+    arena = MultiagentArena(Task(TAG, "none"))
     (result,) = arena.play("heuristic", [0])
     roles = result.returns_by_role
     assert set(roles) == {"adversary", "agent"}
     assert roles["adversary"] > roles["agent"]  # a catch pays the one and costs the other
     assert result.episode_return == pytest.approx((3 * roles["adversary"] + roles["agent"]) / 4)
-    (alone,) = ParallelArena(Task(TAG, "none", learners=("adversary",))).play("random", [0])
+    (alone,) = MultiagentArena(Task(TAG, "none", learners=("adversary",))).play("random", [0])
     assert alone.returns_by_role == {}
 
 
 def test_baselines_can_drive():
-    assert ParallelArena(Task(SPREAD, "none")).baselines == ("random", "heuristic")
-    arena = ParallelArena(Task(TOY, "none"))
+    assert MultiagentArena(Task(SPREAD, "none")).baselines == ("random", "heuristic")
+    arena = MultiagentArena(Task(TOY, "none"))
     assert arena.baselines == ("random", "idle")
     (result,) = arena.play("idle", [0])
     assert (result.episode_return, result.length) == (0.0, LIVES["bee_0"])
@@ -186,36 +186,12 @@ def test_baselines_can_drive():
 @pytest.mark.parametrize("learner", list(LIVES))
 def test_an_episode_ends_with_the_last_learner_whoever_drives(learner: str):
     task = Task(TOY, "none", learners=(learner,), driver="random")
-    arena = ParallelArena(task)
+    arena = MultiagentArena(task)
     for policy in (policy_for(task), "random"):
         assert [r.length for r in arena.play(policy, [0, 1])] == [LIVES[learner]] * 2
 
 
 def test_progress_is_reported_per_episode():
     calls: list[None] = []
-    ParallelArena(Task(TOY, "none")).play("random", range(4), lambda: calls.append(None))
+    MultiagentArena(Task(TOY, "none")).play("random", range(4), lambda: calls.append(None))
     assert len(calls) == 4
-
-
-# --- Film -------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("env_id", "learners"), [(SPREAD, ()), (TAG, ("adversary",))])
-@pytest.mark.parametrize("observe", ["none", "constant-velocity"])
-def test_the_film_shows_the_episode_that_is_measured(
-    env_id: str, learners: tuple[str, ...], observe: Any, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr("agents.video.MULTIAGENT_CHECKPOINTS", {})  # as long as none needs to ship
-    task = Task(env_id, observe, learners=learners)
-    model = policy_for(task)
-    (result,) = ParallelArena(task).play(model, [4])
-    recording = record_task(task, model, 4, max_steps=100)
-    assert recording is not None
-    assert recording.num_steps == result.length
-    by_role = recording._moments[-1].returns
-    assert by_role[learners[0] if learners else "agent"] == pytest.approx(result.episode_return, rel=1e-5)
-
-
-def test_what_nobody_can_read_is_not_filmed():
-    task = Task(TOY, "none")
-    assert record_task(task, policy_for(task), 0, max_steps=5) is None

@@ -8,7 +8,8 @@ import pytest
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from agents.runs import load_model, open_run, read_config, read_note, save_model
+from agents.runs import load_model, open_run, read_config, save_model
+from envs.sb3.policy_file import read_note
 from predictor.errors import UserError
 
 CONFIG = {"env_id": "toy-v0", "steps": 100, "device": "cpu"}
@@ -144,7 +145,7 @@ def test_damaged_policy_is_one_clear_line(tmp_path: Path, venv: VecEnv, damage: 
     path = tmp_path / "model.zip"
     save_model(make_ppo(venv), path)
     path.write_bytes(path.read_bytes()[:-2000] if damage == "truncated" else b"not a zip")
-    with pytest.raises(UserError, match="is no ppo policy that fits here") as error:
+    with pytest.raises(UserError, match="is neither a PPO nor a DQN policy") as error:
         load_model(path, "ppo")
     assert "\n" not in str(error.value)
 
@@ -157,5 +158,5 @@ def test_policy_of_other_spaces_is_refused(tmp_path: Path, venv: VecEnv):
 
 def test_policy_of_another_algorithm_is_refused(tmp_path: Path, venv: VecEnv):
     save_model(make_ppo(venv), tmp_path / "model.zip")
-    with pytest.raises(UserError, match="is no dqn policy"):
+    with pytest.raises(UserError, match="is no dqn policy but a ppo one; pass --algorithm ppo"):
         load_model(tmp_path / "model.zip", "dqn")

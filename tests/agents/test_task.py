@@ -41,9 +41,9 @@ def test_a_missing_envpool_hinders_nobody_else(without_envpool: None):
 
 
 def test_one_ego_or_many_learners():
-    assert Task(TAG).is_parallel
-    assert Task(TOY).is_parallel
-    assert not Task("highway-fast-v0").is_parallel
+    assert Task(TAG).is_multiagent
+    assert Task(TOY).is_multiagent
+    assert not Task("highway-fast-v0").is_multiagent
 
 
 def test_what_the_wrappers_get():

@@ -1,4 +1,5 @@
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 from agents.arena import EgoArena
 from agents.features import ForecastAttention
 from agents.presets import DQNPreset, PPOPreset, preset_for
-from agents.runs import read_note, save_model
+from agents.runs import save_model
 from agents.task import EVALUATION_SEED, SELECTION_SEED, Task
-from agents.training import SaveCheckpoint, SelectBest, TrainingPlan, make_model
-from agents.vec_envs import EpisodeResult, SeededEpisodes, make_rows
+from agents.training import SaveCheckpoint, SelectBest, TrainingPlan, make_model, significantly_worse
+from agents.vec_envs import EpisodeResult, SeededEpisodes, make_venv
+from envs.sb3.policy_file import read_note
 from predictor.errors import UserError
 
 CONSTANT_VELOCITY = Task("highway-fast-v0", "constant-velocity")
@@ -41,11 +43,11 @@ class Coin(gym.Env[np.ndarray, np.int64]):
 def make_selection(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], EgoArena]:
     """From a number of rows to an arena of coins."""
 
-    def make_rows(task: Task, num_rows: int, seeded: bool) -> VecMonitor:
+    def make_venv(task: Task, num_envs: int, seeded: bool) -> VecMonitor:
         assert seeded
-        return VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Coin())] * num_rows))
+        return VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Coin())] * num_envs))
 
-    monkeypatch.setattr("agents.arena.make_rows", make_rows)
+    monkeypatch.setattr("agents.arena.make_venv", make_venv)
     return lambda rows: EgoArena(CONSTANT_VELOCITY, rows)
 
 
@@ -55,7 +57,7 @@ def make_ppo() -> PPO:
 
 
 def plan(**changes: Any) -> TrainingPlan:
-    defaults = {"task": CONSTANT_VELOCITY, "algorithm": "ppo", "steps": 10, "num_rows": 1, "seed": 0}
+    defaults = {"task": CONSTANT_VELOCITY, "algorithm": "ppo", "steps": 10, "num_envs": 1, "seed": 0}
     return TrainingPlan(**(defaults | changes))
 
 
@@ -81,36 +83,74 @@ def test_there_is_always_a_selection_at_the_end(make_selection: Callable[[int], 
     assert read_note(tmp_path / "best.zip")["steps"] == 24
 
 
+class Scripted:
+    """An arena whose results are given: one list of returns per measurement."""
+
+    baselines = ()
+
+    def __init__(self, *measurements: list[float]) -> None:
+        self.measurements, self.seeds = list(measurements), list[range]()
+
+    def play(self, policy: Any, seeds: Any, on_episode: Any = None) -> list[EpisodeResult]:
+        self.seeds.append(seeds)
+        returns = self.measurements.pop(0)
+        return [EpisodeResult(s, value, 3, None, float("nan")) for s, value in zip(seeds, returns, strict=True)]
+
+    def close(self) -> None: ...
+
+
+NOISE = np.random.default_rng(0).normal(scale=4.0, size=(4, 20))
+CLEAR, CLOSE = np.full(20, 10.0) + NOISE[0], np.full(20, 10.0) + NOISE[1]
+
+
+@pytest.mark.parametrize(
+    ("measured", "kept"),
+    [
+        ([CLOSE, CLEAR], 16),
+        ([CLEAR, CLOSE], 16),
+        ([CLEAR, CLEAR], 16),
+        ([CLEAR, CLEAR - 0.5], 8),
+        ([CLEAR, CLEAR - 5.0 + NOISE[2]], 8),
+        ([CLEAR, CLEAR - 5.0 + NOISE[2], CLEAR + NOISE[3]], 24),
+        ([CLEAR - 5.0 + NOISE[2], CLEAR], 16),
+    ],
+    ids=["within noise", "within noise, reversed", "tie", "surely worse by little", "worse", "recovers", "improves"],
+)
+def test_the_latest_model_that_is_not_significantly_worse_is_kept(measured: list, kept: int, tmp_path: Path):
+    arena, path = Scripted(*(list(map(float, returns)) for returns in measured)), tmp_path / "best.zip"
+    make_ppo().learn(8 * len(measured), callback=SelectBest(arena, path, 20, every_steps=8))
+    assert arena.measurements == []
+    assert set(arena.seeds) == {range(SELECTION_SEED, SELECTION_SEED + 20)}
+    note = read_note(path)
+    assert note["steps"] == kept == PPO.load(path, device="cpu").num_timesteps
+    assert note["selection_return"] == pytest.approx(np.mean(measured[kept // 8 - 1]))
+
+
+def test_small_losses_do_not_add_up(tmp_path: Path):
+    """Each model is a little worse than the one before; those that are significantly below the best are not kept."""
+    falling = [list(map(float, CLEAR - 0.35 * step + NOISE[step % 3 + 1] / 4)) for step in range(6)]
+    assert not any(significantly_worse(after, before) for before, after in pairwise(falling))
+    path = tmp_path / "best.zip"
+    make_ppo().learn(48, callback=SelectBest(Scripted(*falling), path, 20, every_steps=8))
+    kept = read_note(path)["steps"] // 8 - 1
+    assert kept < 5
+    assert not significantly_worse(falling[kept], falling[0])
+    assert all(significantly_worse(later, falling[0]) for later in falling[kept + 1 :])
+
+
 @pytest.mark.parametrize(("stored", "replaced"), [(-1.0, True), (100.0, False)], ids=["worse", "better"])
-def test_best_model_of_an_earlier_start_counts(
+def test_the_best_result_of_an_earlier_start_counts(
     stored: float, replaced: bool, make_selection: Callable[[int], EgoArena], tmp_path: Path
 ):
     path = tmp_path / "best.zip"
-    save_model(make_ppo(), path, {"selection_return": stored, "steps": 0})
+    save_model(make_ppo(), path, {"selection_return": stored, "steps": 0, "highest_returns": [stored, stored + 1]})
     make_ppo().learn(8, callback=SelectBest(make_selection(1), path, 2, every_steps=8))
     assert (read_note(path)["steps"] == 8) is replaced
 
 
-def test_the_model_with_the_best_return_is_kept(tmp_path: Path):
-    class Scripted:
-        baselines = ()
-
-        def __init__(self) -> None:
-            self.returns, self.seeds = [2.0, 5.0, 3.0, 5.0], list[range]()
-
-        def play(self, policy: Any, seeds: Any, on_episode: Any = None) -> list[EpisodeResult]:
-            self.seeds.append(seeds)
-            mean = self.returns.pop(0)
-            return [EpisodeResult(seed, mean + seed % 2 * 2 - 1, 3, None, float("nan")) for seed in seeds]
-
-        def close(self) -> None: ...
-
-    arena, path = Scripted(), tmp_path / "best.zip"
-    make_ppo().learn(32, callback=SelectBest(arena, path, 4, every_steps=8))
-    assert arena.returns == []
-    assert set(arena.seeds) == {range(SELECTION_SEED, SELECTION_SEED + 4)}
-    assert read_note(path) == {"selection_return": 5.0, "steps": 16}
-    assert PPO.load(path, device="cpu").num_timesteps == 16
+def test_one_episode_decides_nothing():
+    assert not significantly_worse([0.0], [100.0])
+    assert significantly_worse([0.0, 1.0], [100.0, 100.0])
 
 
 def test_damaged_best_model_is_one_clear_line(make_selection: Callable[[int], EgoArena], tmp_path: Path):
@@ -121,7 +161,11 @@ def test_damaged_best_model_is_one_clear_line(make_selection: Callable[[int], Eg
 
 def test_checkpoints_are_taken_between_updates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     saved: list[int] = []
-    monkeypatch.setattr("agents.training.save_model", lambda model, path, buffer: saved.append(model.num_timesteps))
+
+    def note_steps(model: PPO, path: Path, note: Any, buffer: bool) -> None:
+        saved.append(model.num_timesteps)
+
+    monkeypatch.setattr("agents.training.save_model", note_steps)
     make_ppo().learn(40, callback=SaveCheckpoint(tmp_path / "checkpoint.zip", every_steps=12))
     assert saved == [16, 32]
 
@@ -132,7 +176,7 @@ def test_seeds_of_training_selection_and_evaluation_are_apart():
         plan(seed=SELECTION_SEED)
 
 
-@pytest.mark.parametrize("field", ["steps", "num_rows", "selections", "selection_episodes", "checkpoint_every"])
+@pytest.mark.parametrize("field", ["steps", "num_envs", "selections", "selection_episodes", "checkpoint_every"])
 def test_numbers_below_one_are_refused(field: str):
     assert getattr(plan(**{field: 1}), field) == 1
     with pytest.raises(UserError, match=f"{field} must be at least 1, got 0"):
@@ -147,7 +191,7 @@ def test_dqn_needs_discrete_actions():
 
 
 def test_models_follow_their_preset():
-    venv = make_rows(CONSTANT_VELOCITY, 1)
+    venv = make_venv(CONSTANT_VELOCITY, 1)
     ppo = make_model(plan(), venv)
     assert isinstance(ppo, PPO)
     assert (ppo.n_steps, ppo.batch_size, ppo.gamma, ppo.learning_rate) == (128, 64, 0.8, 5e-4)
@@ -173,7 +217,7 @@ def test_presets():
 
 def test_same_seed_same_policy():
     def trained() -> dict[str, torch.Tensor]:
-        venv = make_rows(CONSTANT_VELOCITY, 1)
+        venv = make_venv(CONSTANT_VELOCITY, 1)
         model = make_model(plan(seed=3), venv)
         model.learn(128)
         venv.close()

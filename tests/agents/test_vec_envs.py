@@ -7,7 +7,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 from agents.arena import run_episodes
 from agents.task import Task
-from agents.vec_envs import EpisodeResult, SeededEpisodes, make_rows
+from agents.vec_envs import EpisodeResult, SeededEpisodes, make_venv
 from predictor.errors import UserError
 
 
@@ -30,7 +30,15 @@ class Dice(gym.Env[np.ndarray, np.int64]):
         return np.zeros(1, np.float32), float(action), ended and self._crashes, ended and not self._crashes, info
 
 
-def make_venv(rows: int) -> VecEnv:
+class Silent(Dice):
+    """Never says whether the ego crashed."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        obs, reward, terminated, truncated, info = super().step(action)
+        return obs, reward, terminated, truncated, {"speed": info["speed"]}
+
+
+def dice_venv(rows: int) -> VecEnv:
     return VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Dice())] * rows))
 
 
@@ -49,11 +57,17 @@ def expected(seed: int) -> EpisodeResult:
 @pytest.mark.parametrize("rows", [1, 2, 5, 9])
 def test_every_seed_is_played_once_for_any_number_of_rows(rows: int):
     seeds = range(100, 107)
-    assert run_episodes(make_venv(rows), always_two, seeds) == [expected(seed) for seed in seeds]
+    assert run_episodes(dice_venv(rows), always_two, seeds) == [expected(seed) for seed in seeds]
+
+
+def test_a_crash_flag_that_is_never_reported_is_unknown():
+    venv = VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Silent())]))
+    assert [e.crashed for e in run_episodes(venv, always_two, range(4))] == [None] * 4
+    assert {e.crashed for e in run_episodes(dice_venv(1), always_two, range(8))} == {False, True}
 
 
 def test_second_evaluation_starts_afresh():
-    venv = make_venv(2)
+    venv = dice_venv(2)
     first = run_episodes(venv, always_two, range(5))
     assert run_episodes(venv, "random", range(3)) != first[:3]
     assert run_episodes(venv, always_two, range(5)) == first
@@ -61,16 +75,16 @@ def test_second_evaluation_starts_afresh():
 
 @pytest.mark.parametrize("rows", [1, 3])
 def test_random_ego_depends_on_the_seed_alone(rows: int):
-    assert run_episodes(make_venv(rows), "random", range(6)) == run_episodes(make_venv(2), "random", range(6))
+    assert run_episodes(dice_venv(rows), "random", range(6)) == run_episodes(dice_venv(2), "random", range(6))
 
 
 def test_idle_ego_ignores_the_actions_that_arrive():
-    assert all(e.episode_return == 0 for e in run_episodes(make_venv(2), "idle", range(4)))
+    assert all(e.episode_return == 0 for e in run_episodes(dice_venv(2), "idle", range(4)))
 
 
 def test_progress_is_reported_per_episode():
     calls: list[None] = []
-    run_episodes(make_venv(2), always_two, range(5), lambda: calls.append(None))
+    run_episodes(dice_venv(2), always_two, range(5), lambda: calls.append(None))
     assert len(calls) == 5
 
 
@@ -90,10 +104,10 @@ def test_checkpoint_without_forecast_is_refused():
 
 
 def test_rows_observe_what_the_task_says():
-    own = make_rows(Task("highway-fast-v0", "none"), 1)
+    own = make_venv(Task("highway-fast-v0", "none"), 1)
     assert isinstance(own.observation_space, gym.spaces.Box)
     own.close()
-    forecast = make_rows(Task("highway-fast-v0", "constant-velocity"), 1)
+    forecast = make_venv(Task("highway-fast-v0", "constant-velocity"), 1)
     assert isinstance(forecast.observation_space, gym.spaces.Dict)
     assert {"observation", "agents", "forecast", "valid"} <= set(forecast.observation_space)
     forecast.close()
@@ -102,8 +116,8 @@ def test_rows_observe_what_the_task_says():
 def test_native_rows_observe_what_the_others_do():
     pytest.importorskip("envpool")
     for observe in ("none", "constant-velocity"):
-        native = make_rows(Task("highway-fast-v0", observe, backend="envpool"), 3)
-        plain = make_rows(Task("highway-fast-v0", observe), 1)
+        native = make_venv(Task("highway-fast-v0", observe, backend="envpool"), 3)
+        plain = make_venv(Task("highway-fast-v0", observe), 1)
         assert native.num_envs == 3
         assert native.get_attr("task_id") == ["HighwayFast-v0"] * 3
         assert native.observation_space == plain.observation_space
@@ -113,6 +127,6 @@ def test_native_rows_observe_what_the_others_do():
 
 
 def test_agents_of_a_parallel_env_are_rows():
-    rows = make_rows(Task("simple_tag_v3", "none", learners=("adversary",)), 2)
+    rows = make_venv(Task("simple_tag_v3", "none", learners=("adversary",)), 2)
     assert rows.num_envs == 6
     rows.close()

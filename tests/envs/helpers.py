@@ -1,6 +1,5 @@
 """What several test files of `envs` share: tiny checkpoints, short episodes, readers and references."""
 
-import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -17,6 +16,7 @@ from stable_baselines3 import PPO
 from envs.observation import ForecastConfig, ForecastStream
 from envs.readers.highway import HighwayReader
 from envs.registry import make_env
+from envs.sb3.policy_file import PolicyNote, pin_forecaster, write_note
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE
@@ -63,12 +63,14 @@ def save_tiny(path: Path, spec: SceneSpec) -> str:
 
 
 def save_forecast_policy(run_dir: Path, env_id: str, checkpoint: str) -> Path:
-    """A run folder as train_policy leaves it: a policy (untrained) and the checkpoint whose forecasts it sees."""
+    """A policy (untrained) with its note, as train_policy leaves it."""
     env = ForecastObservation(make_env(env_id), checkpoint)
     model = PPO("MultiInputPolicy", env, n_steps=4, batch_size=4, policy_kwargs={"net_arch": [4]}, device="cpu", seed=0)
-    model.save(run_dir / "policy.zip")
-    (run_dir / "config.json").write_text(json.dumps({"config": {"observe": "forecast", "checkpoint": checkpoint}}))
-    return run_dir / "policy.zip"
+    path = run_dir / "policy.zip"
+    model.save(path)
+    space: Any = env.observation_space
+    write_note(path, PolicyNote(pin_forecaster(checkpoint, space, env.get_wrapper_attr("scene_spec"))), {})
+    return path
 
 
 def light_env(env_id: str) -> gym.Env:

@@ -11,6 +11,7 @@ from pettingzoo.utils import BaseParallelWrapper
 from envs.drivers import all_agents as drivers
 from envs.drivers.all_agents import DRIVER_NAMES, Habits, idle_action, make_driver
 from envs.registry import MULTIAGENT_IDS, make_multiagent_env
+from envs.seeding import driver_rng
 from predictor.errors import UserError
 
 MPE = [env_id for env_id in MULTIAGENT_IDS if env_id.startswith(("simple", "collect"))]
@@ -37,7 +38,7 @@ def seen(env: ParallelEnv) -> dict[str, Any]:
 
 
 def rng(seed: int = 0) -> np.random.Generator:
-    return np.random.default_rng(seed)
+    return driver_rng(seed)
 
 
 def played(env: ParallelEnv, name: str, seed: int, steps: int = 1000) -> tuple[list[dict[str, Any]], float]:
@@ -235,7 +236,7 @@ def test_mixed_agents_are_of_all_kinds_and_stay_so(monkeypatch: pytest.MonkeyPat
     env.reset(seed=0)
     monkeypatch.setattr(drivers, "uniform_action", lambda space, rng, who: 1)
     monkeypatch.setattr(drivers, "varied_actions", lambda space, rng, who: lambda seen: 2)
-    monkeypatch.setattr(drivers, "_heuristic", lambda env, rng: lambda agent: lambda seen: 3)
+    monkeypatch.setattr(drivers, "_heuristic", lambda env, rng: lambda agent, own: lambda seen: 3)
     kinds = []
     for seed in range(100):
         driver = make_driver("mixed", env, rng(seed))

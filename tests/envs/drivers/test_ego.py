@@ -1,5 +1,3 @@
-import json
-import shutil
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -9,9 +7,10 @@ import numpy as np
 import pytest
 from stable_baselines3 import DQN, PPO
 
-from envs.drivers.ego import EGO_NAMES, idle_action, make_ego
-from envs.drivers.trained import env_for_ego, sees_forecasts
+from envs.drivers.ego import EGO_DRIVER_NAMES, idle_action, make_ego_driver
+from envs.drivers.trained import env_for_driver, sees_forecasts
 from envs.registry import CHECKPOINTS, make_env
+from envs.sb3.policy_file import NOTE_ENTRY
 from envs.wrappers import ForecastObservation
 from predictor.errors import UserError
 from tests.envs.helpers import assert_same, save_forecast_policy
@@ -20,7 +19,7 @@ TRACK_STEPS = 40
 
 
 def actions_of(name: str, env: gym.Env, seed: int, count: int = 200) -> list[Any]:
-    ego = make_ego(name, env, np.random.default_rng(seed))
+    ego = make_ego_driver(name, env, np.random.default_rng(seed))
     return [ego(None) for _ in range(count)]
 
 
@@ -100,7 +99,7 @@ def steps_on_road(name: str) -> int:
     # As envs.collect makes it: gymnasium's checker takes an action that is passed twice for a flaw of the env.
     env = make_env("racetrack-v1", config={"other_vehicles": 0}, disable_env_checker=True)
     obs, _ = env.reset(seed=2)
-    ego = make_ego(name, env, np.random.default_rng(2))
+    ego = make_ego_driver(name, env, np.random.default_rng(2))
     for step in range(TRACK_STEPS):
         obs, _, terminated, truncated, _ = env.step(ego(obs))
         if terminated or truncated or not env.unwrapped.vehicle.on_road:
@@ -115,7 +114,7 @@ def test_keep_lane_follows_the_track_where_idling_leaves_it():
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
 def test_trained_policies_drive(algorithm: str, policies: Path, discrete: gym.Env):
-    ego = make_ego(str(policies / f"{algorithm}.zip"), discrete, np.random.default_rng(0))
+    ego = make_ego_driver(str(policies / f"{algorithm}.zip"), discrete, np.random.default_rng(0))
     model = {"ppo": PPO, "dqn": DQN}[algorithm].load(policies / f"{algorithm}.zip", device="cpu")
     rng = np.random.default_rng(1)
     observations = [rng.normal(size=discrete.observation_space.shape).astype(np.float32) for _ in range(20)]
@@ -123,11 +122,11 @@ def test_trained_policies_drive(algorithm: str, policies: Path, discrete: gym.En
     assert actions == [int(model.predict(obs, deterministic=True)[0]) for obs in observations]
 
 
-@pytest.mark.parametrize("name", EGO_NAMES)
+@pytest.mark.parametrize("name", EGO_DRIVER_NAMES)
 def test_only_policies_change_the_view(name: str, discrete: gym.Env, policies: Path):
-    assert env_for_ego(discrete, name) is discrete
+    assert env_for_driver(discrete, name) is discrete
     assert not sees_forecasts(name)
-    assert env_for_ego(discrete, str(policies / "dqn.zip")) is discrete
+    assert env_for_driver(discrete, str(policies / "dqn.zip")) is discrete
     assert not sees_forecasts(str(policies / "dqn.zip"))
 
 
@@ -136,8 +135,8 @@ def test_policies_trained_on_forecasts_get_those_of_their_run(
 ):
     name = str(forecast_policy)
     assert sees_forecasts(name)
-    env, expected = env_for_ego(discrete, name), ForecastObservation(make_env("two-way-v0"), highway_checkpoint)
-    ego = make_ego(name, env, np.random.default_rng(0))
+    env, expected = env_for_driver(discrete, name), ForecastObservation(make_env("two-way-v0"), highway_checkpoint)
+    ego = make_ego_driver(name, env, np.random.default_rng(0))
     model = PPO.load(forecast_policy, device="cpu")
     obs, _ = env.reset(seed=0)
     own, _ = expected.reset(seed=0)
@@ -152,14 +151,14 @@ def test_policies_trained_on_forecasts_get_those_of_their_run(
 
 
 def test_unknown_names_are_listed(discrete: gym.Env):
-    expected = rf"driver must be one of {', '.join(EGO_NAMES)} or the path of a policy .zip, got 'fast'"
+    expected = rf"driver must be one of {', '.join(EGO_DRIVER_NAMES)} or the path of a policy .zip, got 'fast'"
     with pytest.raises(UserError, match=expected):
-        make_ego("fast", discrete, np.random.default_rng(0))
+        make_ego_driver("fast", discrete, np.random.default_rng(0))
 
 
 def test_keep_lane_needs_steering(discrete: gym.Env):
     with pytest.raises(UserError, match=r"keep-lane needs continuous steering, got Discrete\(5\); use random"):
-        make_ego("keep-lane", discrete, np.random.default_rng(0))
+        make_ego_driver("keep-lane", discrete, np.random.default_rng(0))
 
 
 def test_spaces_without_an_idle_or_random_action_are_named():
@@ -167,12 +166,12 @@ def test_spaces_without_an_idle_or_random_action_are_named():
     with pytest.raises(UserError, match="no idle action is known for Tuple"):
         idle_action(env)
     with pytest.raises(UserError, match="random egos need a Discrete or a bounded Box action space, got Tuple"):
-        make_ego("random", env, np.random.default_rng(0))(None)
+        make_ego_driver("random", env, np.random.default_rng(0))(None)
 
 
 def test_missing_policy_is_named(tmp_path: Path, discrete: gym.Env):
     with pytest.raises(UserError, match="no policy at .*absent.zip; train one with python train_policy.py"):
-        make_ego(str(tmp_path / "absent.zip"), discrete, np.random.default_rng(0))
+        make_ego_driver(str(tmp_path / "absent.zip"), discrete, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("kind", ["text", "truncated", "foreign"])
@@ -187,19 +186,22 @@ def test_file_that_is_no_policy_is_named(kind: str, tmp_path: Path, policies: Pa
         with zipfile.ZipFile(path, "w") as archive:
             archive.writestr("notes.txt", "a zip, but no policy")
     with pytest.raises(UserError, match=f"{kind}.zip is neither a PPO nor a DQN policy"):
-        make_ego(str(path), discrete, np.random.default_rng(0))
+        make_ego_driver(str(path), discrete, np.random.default_rng(0))
 
 
 def test_policy_of_another_env_is_named(policies: Path):
     expected = r"policy .*ppo.zip was trained on Box\(.*\(3, 3, 5\).*, but the env gives Box\(.*\(5, 5\)"
     with pytest.raises(UserError, match=expected):
-        env_for_ego(make_env("highway-fast-v0"), str(policies / "ppo.zip"))
+        env_for_driver(make_env("highway-fast-v0"), str(policies / "ppo.zip"))
 
 
-def test_policy_of_other_forecasts_is_named(forecast_policy: Path, tmp_path: Path):
-    """Without its run folder, the forecasts it saw are unknown: those of constant velocity have other edges."""
+@pytest.mark.filterwarnings("ignore:.* has no note")
+def test_policy_of_other_forecasts_is_named(forecast_policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Without its note, the forecasts it saw are unknown: those of constant velocity have other edges."""
     stray = tmp_path / "policy.zip"
-    shutil.copy(forecast_policy, stray)
-    (tmp_path / "config.json").write_text(json.dumps({"config": {"observe": "constant-velocity"}}))
+    with zipfile.ZipFile(forecast_policy) as whole, zipfile.ZipFile(stray, "w") as bare:
+        for name in set(whole.namelist()) - {NOTE_ENTRY}:
+            bare.writestr(name, whole.read(name))
+    monkeypatch.setattr("envs.observation.checkpoint_for", lambda source: "constant-velocity")
     with pytest.raises(UserError, match="policy .*policy.zip was trained on Dict.*, but the env gives Dict"):
-        env_for_ego(make_env("two-way-v0"), str(stray))
+        env_for_driver(make_env("two-way-v0"), str(stray))

@@ -1,4 +1,3 @@
-import json
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -7,26 +6,25 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
-from agents.arena import ParallelArena
+from agents.arena import MultiagentArena
+from agents.runs import save_model
 from agents.task import Task
 from envs.drivers.trained import trained_driver
 from envs.parallel import ForecastParallelEnv
 from envs.registry import make_multiagent_env
-from envs.rollouts.world import SharedWorld
+from envs.rollouts.world import MultiagentWorld, open_world
+from envs.seeding import driver_rng
 from predictor.errors import UserError
 from tests.agents.helpers import policy_for
 
 SPREAD = "simple_spread_v3"
-SEED = 5
+SEED = 7
 
 
-def save_run(folder: Path, task: Task, config: bool = True) -> tuple[str, PPO]:
-    """A run folder as train_policy leaves it."""
+def save_run(folder: Path, task: Task, noted: bool = True) -> tuple[str, PPO]:
+    """A policy as train_policy leaves it."""
     model = policy_for(task)
-    model.save(folder / "policy.zip")
-    if config:
-        settings = {"observe": task.observe, "learners": task.learners, "partner": task.driver}
-        (folder / "config.json").write_text(json.dumps({"config": settings}))
+    save_model(model, folder / "policy.zip", note=task.note if noted else None)
     return str(folder / "policy.zip"), model
 
 
@@ -37,7 +35,7 @@ def forecast_env(env_id: str = SPREAD, **settings: Any) -> ForecastParallelEnv:
 def played(env: ForecastParallelEnv, path: str) -> tuple[dict[str, float], list[dict[str, Any]]]:
     """Returns of the agents and their actions, in the episode of the seed."""
     observations, _ = env.reset(seed=SEED)
-    drive = trained_driver(path, env, np.random.default_rng(SEED))
+    drive = trained_driver(path, env, driver_rng(SEED))
     returns, actions = dict.fromkeys(env.agents, 0.0), []
     while env.agents:
         actions.append(drive(observations))
@@ -53,7 +51,7 @@ def played(env: ForecastParallelEnv, path: str) -> tuple[dict[str, float], list[
 def test_it_acts_as_where_it_was_measured(learners: tuple[str, ...], observe: Any, num_samples: int, tmp_path: Path):
     task = Task(SPREAD, observe, learners=learners, driver="varied")
     path, model = save_run(tmp_path, task)
-    (expected,) = ParallelArena(task).play(model, [SEED])
+    (expected,) = MultiagentArena(task).play(model, [SEED])
     returns, actions = played(forecast_env(num_samples=num_samples), path)
     assert len(actions) == expected.length
     assert len({acted["agent_0"] for acted in actions}) > 1
@@ -64,7 +62,7 @@ def test_it_acts_as_where_it_was_measured(learners: tuple[str, ...], observe: An
 def test_unequal_agents_are_padded_as_in_training(tmp_path: Path):
     task = Task("simple_tag_v3", "constant-velocity")
     path, model = save_run(tmp_path, task)
-    (expected,) = ParallelArena(task).play(model, [SEED])
+    (expected,) = MultiagentArena(task).play(model, [SEED])
     returns, _ = played(forecast_env("simple_tag_v3"), path)
     assert np.mean(list(returns.values())) == pytest.approx(expected.episode_return, rel=1e-5)
     assert returns["agent_0"] == pytest.approx(expected.returns_by_role["agent"], rel=1e-5)
@@ -74,7 +72,7 @@ def test_it_drives_a_world(tmp_path: Path):
     path, _ = save_run(tmp_path, Task(SPREAD, "constant-velocity", learners=("agent_1",)))
     env = forecast_env()
     played(env, path)
-    world = SharedWorld(forecast_env(), path)
+    world = MultiagentWorld(forecast_env(), path)
     for _ in range(2):
         world.reset(SEED)
         while not world.step():
@@ -82,42 +80,50 @@ def test_it_drives_a_world(tmp_path: Path):
         np.testing.assert_array_equal(world.perceived().states, env.scene.scene.states)
 
 
-def test_without_a_run_folder_all_agents_are_the_policys(tmp_path: Path):
-    path, model = save_run(tmp_path, Task(SPREAD, "none"), config=False)
+def test_without_a_note_all_agents_are_the_policys(tmp_path: Path):
+    path, model = save_run(tmp_path, Task(SPREAD, "none"), noted=False)
     env = forecast_env()
     observations, _ = env.reset(seed=SEED)
-    acted = trained_driver(path, env, np.random.default_rng(0))(observations)
+    with pytest.warns(UserWarning, match="policy.zip has no note on its forecaster and learners"):
+        acted = trained_driver(path, env, np.random.default_rng(0))(observations)
     expected = {a: model.predict(seen["observation"], deterministic=True)[0] for a, seen in observations.items()}
     assert acted == expected
 
 
-@pytest.mark.parametrize("damage", ["not json", "[]", '{"config": {}}'], ids=["broken", "list", "empty"])
-def test_a_damaged_config_names_nobody(damage: str, tmp_path: Path):
-    path, _ = save_run(tmp_path, Task(SPREAD, "none"), config=False)
-    (tmp_path / "config.json").write_text(damage)
-    env = forecast_env()
-    observations, _ = env.reset(seed=SEED)
-    assert set(trained_driver(path, env, np.random.default_rng(0))(observations)) == set(env.possible_agents)
+def test_a_damaged_note_is_one_clear_line(tmp_path: Path):
+    path, _ = save_run(tmp_path, Task(SPREAD, "none"), noted=False)
+    with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
+        archive.writestr("note.json", '{"policy": {"learners": []}}')
+    with pytest.raises(UserError, match=r"note inside .*policy.zip cannot be understood \(KeyError\('forecaster'\)\)"):
+        trained_driver(path, forecast_env(), np.random.default_rng(0))
 
 
+def test_a_policy_refuses_forecasts_of_other_options(tmp_path: Path):
+    path, _ = save_run(tmp_path, Task(SPREAD, "constant-velocity"))
+    assert open_world(SPREAD, path, "constant-velocity", num_samples=2)
+    with pytest.raises(UserError, match="was trained on"):
+        open_world(SPREAD, path, "constant-velocity", horizon_steps=7)
+
+
+@pytest.mark.filterwarnings("ignore:.* has no note")
 @pytest.mark.parametrize("observe", ["none", "constant-velocity"])
 def test_another_observation_space_is_one_clear_line(observe: Any, tmp_path: Path):
-    path, _ = save_run(tmp_path, Task("simple_tag_v3", observe), config=False)
+    path, _ = save_run(tmp_path, Task("simple_tag_v3", observe), noted=False)
     with pytest.raises(UserError, match="was trained on .* but the env gives ") as error:
-        SharedWorld(forecast_env(), path)
+        MultiagentWorld(forecast_env(), path)
     assert "\n" not in str(error.value)
 
 
 def test_learners_that_are_not_there_are_named(tmp_path: Path):
     path, _ = save_run(tmp_path, Task("simple_tag_v3", "none", learners=("adversary",)))
     with pytest.raises(UserError, match="learners: 'adversary' is neither an agent nor a role of .*policy.zip"):
-        SharedWorld(forecast_env(), path)
+        MultiagentWorld(forecast_env(), path)
 
 
 def test_a_stray_zip_is_one_clear_line(tmp_path: Path):
     with zipfile.ZipFile(tmp_path / "stray.zip", "w") as archive:
         archive.writestr("thesis.tex", "")
     with pytest.raises(UserError, match="stray.zip is neither a PPO nor a DQN policy$"):
-        SharedWorld(forecast_env(), str(tmp_path / "stray.zip"))
+        MultiagentWorld(forecast_env(), str(tmp_path / "stray.zip"))
     with pytest.raises(UserError, match="no policy at absent.zip"):
-        SharedWorld(forecast_env(), "absent.zip")
+        MultiagentWorld(forecast_env(), "absent.zip")

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from envs.readers.highway_labels import LEADER
-from envs.rollouts.world import EgoWorld, SharedWorld, World, default_drivers, open_world
+from envs.rollouts.world import EgoWorld, MultiagentWorld, World, default_drivers, open_world
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.errors import UserError
 from predictor.scene import Scene
@@ -18,10 +18,10 @@ ROAD = "two-way-v0"
 def watched(world: World, seed: int, steps: int = 4) -> list[tuple[Scene, Scene]]:
     """What is perceived, and everyone, at the start of an episode and after each step."""
     world.reset(seed)
-    seen = [(world.perceived(), world.everyone())]
+    seen = [(world.perceived(), world.full_scene())]
     for _ in range(steps):
         world.step()
-        seen.append((world.perceived(), world.everyone()))
+        seen.append((world.perceived(), world.full_scene()))
     return seen
 
 
@@ -55,7 +55,7 @@ def test_a_step_says_when_the_episode_is_over():
     world = open_world(TAG, "random")
     world.reset(0)
     assert [world.step() for _ in range(25)] == [False] * 24 + [True]  # mpe2's max_cycles
-    assert world.everyone().valid.sum() == world.spec.max_agents  # who was there at the end
+    assert world.full_scene().valid.sum() == world.spec.max_agents  # who was there at the end
     road = open_world("u-turn-v1", "idle")
     road.reset(3)
     ends = [road.step() for _ in range(3)]
@@ -67,7 +67,7 @@ def test_edges_are_known_on_roads_in_the_rows_of_everyone():
     world.reset(0)
     labels = world.labels()
     assert labels is not None
-    assert labels.edge_types.shape == (len(world.everyone().ids),) * 2
+    assert labels.edge_types.shape == (len(world.full_scene().ids),) * 2
     assert (labels.edge_types == LEADER).any()
     shared = open_world(TAG, "idle")
     shared.reset(0)
@@ -81,7 +81,7 @@ def test_one_ego_or_many_learners_with_forecasts_or_without(highway_checkpoint: 
     forecast.reset(0)
     assert forecast.observation["forecast"].ndim == 4
     shared = open_world(TAG, "idle", "constant-velocity", horizon_steps=7, num_samples=2)
-    assert isinstance(shared, SharedWorld)
+    assert isinstance(shared, MultiagentWorld)
     shared.reset(0)
     assert shared.env.forecast.xy.shape == (1, 2, shared.spec.max_agents, 7, 2)
 

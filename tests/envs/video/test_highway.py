@@ -54,7 +54,7 @@ def test_video_has_every_simulated_picture(recording: Recording, tmp_path: Path)
     assert len(recording) == 1 + STEPS * recording.frames_per_step == 1 + STEPS * 5
     assert recording.fps == 10  # highway-env plays 5 Hz at twice real time
     path = tmp_path / "video.mp4"
-    recording.write_video(path)
+    recording.write_video(str(path))
     frames = decode(path, 300, 1200)
     assert len(frames) == len(recording)
     error = np.abs(frames[7].astype(int) - recording.draw(7).astype(int)).mean()
@@ -65,7 +65,7 @@ def test_video_has_every_simulated_picture(recording: Recording, tmp_path: Path)
 def test_frame_is_saved_as_drawn(recording: Recording, tmp_path: Path):
     index = recording.frame_of_step(2)
     assert index == 2 * recording.frames_per_step
-    recording.write_frame(tmp_path / "frame.png", index)
+    recording.write_frame(str(tmp_path / "frame.png"), index)
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "frame.png")), recording.draw(index))
 
 

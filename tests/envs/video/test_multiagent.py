@@ -18,7 +18,7 @@ from envs.parallel import ForecastParallelEnv
 from envs.readers.base import MultiagentScene, pad_multiagent_scene
 from envs.simulators.highway_multiagent import HighwayParallelEnv
 from envs.video.drawing import Arena
-from envs.video.multiagent import LANDMARK, SharedRecording, SharedStyle, record_parallel_episode
+from envs.video.multiagent import LANDMARK, MultiagentRecording, MultiagentStyle, record_multiagent_episode
 from predictor.errors import UserError
 from predictor.scene import KINEMATIC_FEATURES, Forecast, Scene, SceneSpec
 
@@ -28,12 +28,12 @@ STEPS = 6
 DIES = 3
 JOINS = 2
 RED, BLUE, GREY, VIOLET = (255, 0, 0), (0, 0, 255), (0, 255, 0), (255, 0, 255)
-PLAIN = SharedStyle(
+PLAIN = MultiagentStyle(
     arena_px=300,
     role_colors=(("adversary", RED), ("agent", BLUE), (LANDMARK, GREY)),
     other_colors=((0, 255, 255), (255, 255, 0)),
     disc_alpha=255,
-    lines=replace(SharedStyle().lines, edge_color=VIOLET, edge_alpha=255),
+    lines=replace(MultiagentStyle().lines, edge_color=VIOLET, edge_alpha=255),
 )
 
 # Where each begins, and its velocity; "agent_1" dies at step DIES, "adversary_1" joins at step JOINS.
@@ -159,15 +159,15 @@ def act(observations: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def recording() -> SharedRecording:
-    return record_parallel_episode(wrapped(), act, style=PLAIN)
+def recording() -> MultiagentRecording:
+    return record_multiagent_episode(wrapped(), act, style=PLAIN)
 
 
 def count(picture: np.ndarray, color: tuple[int, int, int]) -> int:
     return int((picture == color).all(-1).sum())
 
 
-def in_arena(recording: SharedRecording, index: int) -> np.ndarray:
+def in_arena(recording: MultiagentRecording, index: int) -> np.ndarray:
     """The arena alone; it is as wide as the caption or narrower, and stands in the middle."""
     picture = recording.draw(index)
     width, height = recording._arena.size_px
@@ -177,17 +177,17 @@ def in_arena(recording: SharedRecording, index: int) -> np.ndarray:
     return picture[top : top + height, left : left + width]
 
 
-def color_at(recording: SharedRecording, index: int, place_m: np.ndarray) -> tuple[int, ...]:
+def color_at(recording: MultiagentRecording, index: int, place_m: np.ndarray) -> tuple[int, ...]:
     x, y = recording._arena.view.pixels(place_m[None])[0]
     return tuple(in_arena(recording, index)[int(y), int(x)].tolist())
 
 
-def test_video_has_every_picture_and_its_size_is_even(recording: SharedRecording, tmp_path: Path):
+def test_video_has_every_picture_and_its_size_is_even(recording: MultiagentRecording, tmp_path: Path):
     assert recording.num_steps == STEPS
     assert len(recording) == 1 + STEPS * recording.frames_per_step
     assert recording.frame_of_step(2) == 2 * recording.frames_per_step
     path = tmp_path / "video.mp4"
-    recording.write_video(path)
+    recording.write_video(str(path))
     height, width, _ = recording.draw(0).shape
     assert height % 2 == width % 2 == 0
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(path)]
@@ -199,12 +199,12 @@ def test_video_has_every_picture_and_its_size_is_even(recording: SharedRecording
     assert [p.name for p in tmp_path.iterdir()] == ["video.mp4"]
 
 
-def test_frame_is_saved_as_drawn(recording: SharedRecording, tmp_path: Path):
-    recording.write_frame(tmp_path / "frame.png", 9)
+def test_frame_is_saved_as_drawn(recording: MultiagentRecording, tmp_path: Path):
+    recording.write_frame(str(tmp_path / "frame.png"), 9)
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "frame.png")), recording.draw(9))
 
 
-def test_nobody_stands_outside_and_y_points_up(recording: SharedRecording):
+def test_nobody_stands_outside_and_y_points_up(recording: MultiagentRecording):
     width, height = recording._arena.size_px
     for step in range(STEPS + 1):
         for body in recording._moments[step].bodies.values():
@@ -216,7 +216,7 @@ def test_nobody_stands_outside_and_y_points_up(recording: SharedRecording):
     assert low[1] > high[1]
 
 
-def test_agents_are_drawn_where_they_are_in_the_colour_of_their_role(recording: SharedRecording):
+def test_agents_are_drawn_where_they_are_in_the_colour_of_their_role(recording: MultiagentRecording):
     off = np.array([0.2, -0.2])  # beside the lines that leave the centre
     assert color_at(recording, 0, place("agent_0", 0) + off) == BLUE
     assert color_at(recording, 0, place("adversary_0", 0) + off) == RED
@@ -229,7 +229,7 @@ def test_agents_are_drawn_where_they_are_in_the_colour_of_their_role(recording: 
     np.testing.assert_allclose(recording._now_m(NUMBERS["agent_0"], 1, 0.25), place("agent_0", 1.25))
 
 
-def test_the_dead_vanish_and_who_joins_appears(recording: SharedRecording):
+def test_the_dead_vanish_and_who_joins_appears(recording: MultiagentRecording):
     last = place("agent_1", DIES - 1)
     off = np.array([0.2, -0.2])
     before = recording.frame_of_step(DIES) - 1
@@ -240,7 +240,7 @@ def test_the_dead_vanish_and_who_joins_appears(recording: SharedRecording):
     assert color_at(recording, joined - 1, place("adversary_1", JOINS) + off) == PLAIN.ground_color
 
 
-def test_forecast_and_truth_of_straight_motion_coincide(recording: SharedRecording):
+def test_forecast_and_truth_of_straight_motion_coincide(recording: MultiagentRecording):
     """Although the rows of the scene change places at each step."""
     for step, moment in enumerate(recording._moments):
         for name, key in NUMBERS.items():
@@ -254,7 +254,7 @@ def test_forecast_and_truth_of_straight_motion_coincide(recording: SharedRecordi
             np.testing.assert_allclose(truth, expected[: len(truth)], atol=1e-9)
 
 
-def test_forecasts_are_dashed_in_their_roles_colour_and_landmarks_have_none(recording: SharedRecording):
+def test_forecasts_are_dashed_in_their_roles_colour_and_landmarks_have_none(recording: MultiagentRecording):
     ahead = place("agent_0", HORIZON)
     assert color_at(recording, 0, ahead) == BLUE  # the dot of the last step
     alone = replace_bodies(recording, {NUMBERS["rock"]})
@@ -262,7 +262,7 @@ def test_forecasts_are_dashed_in_their_roles_colour_and_landmarks_have_none(reco
     np.testing.assert_array_equal(alone.draw(0), pushed.draw(0))
 
 
-def replace_bodies(recording: SharedRecording, keep: set[int], **changes: Any) -> SharedRecording:
+def replace_bodies(recording: MultiagentRecording, keep: set[int], **changes: Any) -> MultiagentRecording:
     """The same episode with fewer bodies, otherwise described; the arena stays."""
     moments = [
         replace(m, bodies={key: replace(body, **changes) for key, body in m.bodies.items() if key in keep})
@@ -275,7 +275,7 @@ def replace_bodies(recording: SharedRecording, keep: set[int], **changes: Any) -
 
 @pytest.mark.parametrize(("focus", "drawn"), [("agent_0", True), ("adversary_0", False)])
 def test_edges_are_those_that_act_on_the_focus_agent(focus: str, drawn: bool):
-    recording = record_parallel_episode(wrapped(OneEdge), act, focus=focus, style=PLAIN)
+    recording = record_multiagent_episode(wrapped(OneEdge), act, focus=focus, style=PLAIN)
     between = 0.4 * place("adversary_0", 0) + 0.6 * place("agent_0", 0)
     assert (color_at(recording, 0, between) == VIOLET) == drawn
     assert recording.focus == focus
@@ -286,19 +286,19 @@ def test_edges_are_as_wide_as_they_are_likely():
     for prob in (0.0, 0.5, 1.0):
         env = wrapped(OneEdge)
         env.prob = prob  # type: ignore[attr-defined]
-        recording = record_parallel_episode(env, act, focus="agent_0", max_steps=1, style=PLAIN)
+        recording = record_multiagent_episode(env, act, focus="agent_0", max_steps=1, style=PLAIN)
         areas.append(count(in_arena(recording, 0), VIOLET))
     assert areas[1] > areas[0] + 100
     assert areas[2] - areas[0] == pytest.approx(2 * (areas[1] - areas[0]), rel=0.25)
 
 
 def test_edges_end_with_the_focus_agent():
-    recording = record_parallel_episode(wrapped(OneEdge), act, focus="agent_1", style=PLAIN)
+    recording = record_multiagent_episode(wrapped(OneEdge), act, focus="agent_1", style=PLAIN)
     assert count(in_arena(recording, 0), VIOLET) > 0  # its ring
     assert count(in_arena(recording, recording.frame_of_step(DIES)), VIOLET) == 0
 
 
-def test_returns_are_means_over_each_roles_agents(recording: SharedRecording):
+def test_returns_are_means_over_each_roles_agents(recording: MultiagentRecording):
     first, second = float(STEPS), float(STEPS - JOINS)  # who joins at a step earns from the next on
     agents = -2.0 * STEPS, -4.0 * DIES
     assert recording.returns == {"adversary": (first + second) / 2, "agent": sum(agents) / 2}
@@ -308,7 +308,7 @@ def test_returns_are_means_over_each_roles_agents(recording: SharedRecording):
 
 def test_only_the_living_act_and_an_episode_may_be_cut_short():
     env = wrapped()
-    recording = record_parallel_episode(env, act, max_steps=DIES + 1)
+    recording = record_multiagent_episode(env, act, max_steps=DIES + 1)
     assert recording.num_steps == DIES + 1
     assert [sorted(names) for names in env.unwrapped.acted] == [
         ["adversary_0", "agent_0", "agent_1"],
@@ -319,34 +319,34 @@ def test_only_the_living_act_and_an_episode_may_be_cut_short():
 
 
 def test_ticks_follow_the_velocity_or_the_heading_where_there_is_one():
-    moving = record_parallel_episode(wrapped(), act, max_steps=1)._moments[0].bodies
+    moving = record_multiagent_episode(wrapped(), act, max_steps=1)._moments[0].bodies
     np.testing.assert_allclose(moving[NUMBERS["agent_0"]].tick, [-np.sqrt(0.5), np.sqrt(0.5)])
     np.testing.assert_array_equal(moving[NUMBERS["rock"]].tick, [0.0, 0.0])
-    heading = record_parallel_episode(wrapped(headings=True), act, max_steps=1)._moments[0].bodies
+    heading = record_multiagent_episode(wrapped(headings=True), act, max_steps=1)._moments[0].bodies
     np.testing.assert_allclose(heading[NUMBERS["rock"]].tick, [0.0, -1.0], atol=1e-12)
 
 
 def test_agents_of_unknown_size_are_seen():
     style = replace(PLAIN, radius=0.05)
-    small, large = (record_parallel_episode(wrapped(sizes=False), act, max_steps=1, style=s) for s in (PLAIN, style))
+    small, large = (record_multiagent_episode(wrapped(sizes=False), act, max_steps=1, style=s) for s in (PLAIN, style))
     areas = [count(in_arena(recording, 0), GREY) for recording in (small, large)]
     assert areas[0] == pytest.approx(np.pi * PLAIN.min_radius_px**2, rel=0.4)
     assert areas[1] == pytest.approx(np.pi * (0.05 * 300) ** 2, rel=0.15)
 
 
 def test_roles_without_a_colour_get_one_each():
-    recording = record_parallel_episode(wrapped(), act, style=replace(PLAIN, role_colors=(("agent", BLUE),)))
+    recording = record_multiagent_episode(wrapped(), act, style=replace(PLAIN, role_colors=(("agent", BLUE),)))
     assert recording._colors == {"agent": BLUE, "adversary": (0, 255, 255), LANDMARK: (255, 255, 0)}
 
 
 @pytest.mark.parametrize(("steps", "frames"), [(1, 8), (25, 6), (60, 3), (100, 2), (500, 1)])
-def test_videos_are_long_enough_to_watch(recording: SharedRecording, steps: int, frames: int):
+def test_videos_are_long_enough_to_watch(recording: MultiagentRecording, steps: int, frames: int):
     stretched = replace(recording, _moments=recording._moments[:1] * (steps + 1))
     assert stretched.frames_per_step == frames
     assert steps == 1 or len(stretched) / stretched.fps > 5
 
 
-def test_pictures_are_equally_large_whatever_the_returns(recording: SharedRecording):
+def test_pictures_are_equally_large_whatever_the_returns(recording: MultiagentRecording):
     rich = replace(recording._moments[-1], returns={"adversary": 1e9, "agent": -1e9})
     changed = replace(recording, _moments=[*recording._moments[:-1], rich])
     assert changed.draw(0).shape == changed.draw(len(changed) - 1).shape
@@ -389,19 +389,19 @@ def test_grid_is_round_when_the_arena_is_too():
 
 def test_particle_worlds_are_filmed_to_the_last_step():
     env = ForecastParallelEnv(simple_tag_v3.parallel_env(max_cycles=4), "constant-velocity")
-    recording = record_parallel_episode(env, act, seed=3)
+    recording = record_multiagent_episode(env, act, seed=3)
     assert (recording.env_id, recording.dt_s, recording.focus) == ("simple_tag_v3", 0.1, "adversary_0")
     assert recording.num_steps == 4
     assert all(len(moment.bodies) == 6 for moment in recording._moments)  # four agents, two obstacles
     assert set(recording.returns) == {"adversary", "agent"}
-    again = record_parallel_episode(env, act, seed=3)
+    again = record_multiagent_episode(env, act, seed=3)
     np.testing.assert_array_equal(again.draw(9), recording.draw(9))
     env.close()
 
 
 def test_roads_are_shown_as_highway_env_shows_them():
     env = ForecastParallelEnv(HighwayParallelEnv(), "constant-velocity")
-    recording = record_parallel_episode(env, act, max_steps=1)
+    recording = record_multiagent_episode(env, act, max_steps=1)
     assert not recording.y_up
     bodies = recording._moments[0].bodies.values()
     assert {body.role for body in bodies} == {"vehicle", "other"}
@@ -410,17 +410,17 @@ def test_roads_are_shown_as_highway_env_shows_them():
 
 def test_unknown_focus_is_named():
     with pytest.raises(UserError, match="focus must be one of adversary_0, .*, got 'prey'"):
-        record_parallel_episode(wrapped(), act, focus="prey")
+        record_multiagent_episode(wrapped(), act, focus="prey")
 
 
 def test_empty_environment_is_named(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(StraightEnv, "present", lambda self: ["rock"])
     with pytest.raises(UserError, match="straight_v0 has no agents after its reset"):
-        record_parallel_episode(wrapped(), act)
+        record_multiagent_episode(wrapped(), act)
 
 
 @pytest.mark.parametrize("index", [-1, 1 + STEPS * 8])
-def test_pictures_and_steps_outside_the_episode_are_named(recording: SharedRecording, index: int):
+def test_pictures_and_steps_outside_the_episode_are_named(recording: MultiagentRecording, index: int):
     assert len(recording) == 1 + STEPS * 8
     with pytest.raises(UserError, match=f"got {index}"):
         recording.draw(index)

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from predictor.errors import UserError
-from predictor.layers.pair_noise import PairNoise, noise_of_pairs
+from predictor.noise import PairNoise, noise_of_pairs
 
 PRESENT = torch.tensor([[[0, 1], [1, 0]], [[0, 0], [0, 0]], [[0, 1], [0, 0]]], dtype=torch.bool)
 DRAWS, STEPS, TYPES = 2, 3, 2

@@ -1,0 +1,183 @@
+"""Trained policies on disk: a Stable-Baselines3 zip with a note inside.
+
+The note (`note.json`) says what a policy needs beside its weights: the forecaster whose forecasts it was trained on,
+which agents learned, and who drove the others. It is written with the policy and travels inside the zip, so a policy
+drives elsewhere as it was trained. The zip itself stays readable by SB3's own ``load``, and holds pickled data: load
+only files whose source you trust.
+"""
+
+import hashlib
+import json
+import math
+import zipfile
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from predictor.checkpoint import CONSTANT_VELOCITY, WEIGHTS, resolve
+from predictor.errors import UserError
+from predictor.scene import SceneSpec
+
+NOTE_ENTRY = "note.json"
+_POLICY_KEY = "policy"
+_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "dqn": DQN}
+_MARKS = {"ppo": "clip_range", "dqn": "exploration_rate"}
+"""Parameter in SB3's JSON that an algorithm alone has."""
+
+
+@dataclass(frozen=True)
+class ForecasterPin:
+    """Which forecaster a policy was trained on, and with which options of the wrapper."""
+
+    checkpoint: str
+    """Shipped name, folder, or "constant-velocity"."""
+    sha256: str | None
+    """SHA-256 of the weights (model.safetensors); None for constant velocity, which has none."""
+    horizon_steps: int
+    """Steps forecast."""
+    num_samples: int
+    """Sampled futures per agent."""
+    max_agents: int
+    """Agents of a view, the viewer included."""
+    perception_m: float | None
+    """Range of perception [m]; None is unbounded, for which JSON has no number."""
+
+    def check(self, found: "ForecasterPin", policy: str) -> None:
+        """Raise a `UserError` if `found` forecasts otherwise; a folder that only moved does not."""
+        if self.sha256 != found.sha256 or (self.sha256 is None and self.checkpoint != found.checkpoint):
+            raise UserError(
+                f"{policy} was trained on forecaster {self._named}, but gets {found._named}; pass the checkpoint it "
+                "was trained on, or train a policy on this one"
+            )
+        for name in ("horizon_steps", "num_samples", "max_agents", "perception_m"):
+            if getattr(self, name) != getattr(found, name):
+                raise UserError(
+                    f"{policy} was trained on forecasts with {name}={getattr(self, name)}, but gets "
+                    f"{name}={getattr(found, name)}; pass the old value, or train a policy on this one"
+                )
+
+    @property
+    def _named(self) -> str:
+        return f"'{self.checkpoint}'" + (f" (SHA-256 {self.sha256[:12]}…)" if self.sha256 else "")
+
+
+@dataclass(frozen=True)
+class PolicyNote:
+    """What a policy needs beside its weights."""
+
+    forecaster: ForecasterPin | None = None
+    """The forecaster it was trained on; None if it sees no forecasts."""
+    learners: tuple[str, ...] = ()
+    """PettingZoo: agents or roles that learned; none named are all."""
+    driver: str = "heuristic"
+    """PettingZoo: who drove the agents that did not learn."""
+
+
+def pin_forecaster(checkpoint: str, space: gym.spaces.Dict, spec: SceneSpec) -> ForecasterPin:
+    """Returns the pin of a forecaster as a policy sees it.
+
+    Args:
+        checkpoint: shipped name, folder, or "constant-velocity".
+        space: of an observation with forecasts.
+        spec: layout of the scenes behind it.
+
+    Raises:
+        UserError: no such checkpoint.
+    """
+    shape = space["forecast"].shape or ()
+    digest = None
+    if checkpoint != CONSTANT_VELOCITY:
+        with (resolve(checkpoint) / WEIGHTS).open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+    samples = shape[1] if len(shape) == 4 else 1
+    perception_m = float(spec.perception_m) if math.isfinite(spec.perception_m) else None
+    return ForecasterPin(checkpoint, digest, shape[-2], samples, 1 + shape[0], perception_m)
+
+
+def write_note(path: Path, policy: PolicyNote | None, extra: Mapping[str, Any]) -> None:
+    """Put the note into a saved policy.
+
+    Args:
+        path: a zip without a note.
+        policy: what to tell about the policy; None tells nothing.
+        extra: more JSON content, which `read_note` returns.
+    """
+    content = dict(extra) | ({} if policy is None else {_POLICY_KEY: asdict(policy)})
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr(NOTE_ENTRY, json.dumps(content))
+
+
+def read_note(path: Path) -> dict[str, Any]:
+    """Returns the extra content of a policy's note; empty if there is no such file or note."""
+    return {key: value for key, value in _note(path).items() if key != _POLICY_KEY}
+
+
+def read_policy_note(path: Path) -> PolicyNote | None:
+    """Returns what a policy's note says about it; None for a zip that says nothing (saved by SB3 alone or long ago).
+
+    Raises:
+        UserError: the note cannot be understood.
+    """
+    try:
+        content = _note(path).get(_POLICY_KEY)
+    except zipfile.BadZipFile:
+        return None  # `load_policy` says what is wrong with it
+    if content is None:
+        return None
+    try:
+        pin = content["forecaster"]
+        forecaster = None if pin is None else ForecasterPin(**{f.name: pin[f.name] for f in fields(ForecasterPin)})
+        return PolicyNote(forecaster, tuple(content["learners"]), str(content["driver"]))
+    except (KeyError, TypeError) as error:
+        raise UserError(f"the note inside {path} cannot be understood ({error!r}); save the policy again") from error
+
+
+def _note(path: Path) -> dict[str, Any]:
+    if not path.exists():
+        return {}
+    with zipfile.ZipFile(path) as archive:
+        return json.loads(archive.read(NOTE_ENTRY)) if NOTE_ENTRY in archive.namelist() else {}
+
+
+def algorithm_of(path: Path) -> str:
+    """Returns "ppo" or "dqn", told by the parameters inside the zip.
+
+    Raises:
+        UserError: not there, or neither.
+    """
+    if not path.exists():
+        raise UserError(f"no policy at {path}; train one with python train_policy.py")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            parameters = json.loads(archive.read("data"))
+    except (zipfile.BadZipFile, KeyError, ValueError, OSError):
+        parameters = {}
+    found = [name for name, mark in _MARKS.items() if mark in parameters]
+    if len(found) != 1:
+        raise UserError(f"{path} is neither a PPO nor a DQN policy")
+    return found[0]
+
+
+def load_policy(path: Path, venv: VecEnv | None = None, device: str = "cpu") -> BaseAlgorithm:
+    """Load a PPO or DQN policy. Its zip holds pickled data: trust its source.
+
+    Args:
+        path: of the zip.
+        venv: to go on training with; its spaces must be the policy's.
+        device: where the network runs.
+
+    Raises:
+        UserError: not there, neither PPO nor DQN, or not made for these spaces.
+    """
+    algorithm = algorithm_of(path)
+    try:
+        return _ALGORITHMS[algorithm].load(path, env=venv, device=device)
+    except (ValueError, KeyError, TypeError, AttributeError, AssertionError, EOFError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"{path} is no {algorithm} policy that fits here: {reason}") from error

@@ -1,0 +1,41 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+from stable_baselines3 import PPO
+
+from agents.arena import MultiagentArena
+from agents.task import Task
+from agents.video import film, record_task
+from tests.agents.helpers import TOY, policy_for
+
+SPREAD, TAG = "simple_spread_v3", "simple_tag_v3"
+
+
+@pytest.mark.parametrize(("env_id", "learners"), [(SPREAD, ()), (TAG, ("adversary",))])
+@pytest.mark.parametrize("observe", ["none", "constant-velocity"])
+def test_the_film_shows_the_episode_that_is_measured(
+    env_id: str, learners: tuple[str, ...], observe: Any, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("agents.video.MULTIAGENT_CHECKPOINTS", {})  # as long as none needs to ship
+    task = Task(env_id, observe, learners=learners)
+    model = policy_for(task)
+    (result,) = MultiagentArena(task).play(model, [4])
+    recording = record_task(task, model, 4, max_steps=100)
+    assert recording is not None
+    assert recording.num_steps == result.length
+    by_role = recording._moments[-1].returns
+    assert by_role[learners[0] if learners else "agent"] == pytest.approx(result.episode_return, rel=1e-5)
+
+
+def test_an_environment_without_reader_is_not_filmed():
+    task = Task(TOY, "none")
+    assert record_task(task, policy_for(task), 0, max_steps=5) is None
+
+
+def test_what_cannot_be_drawn_gives_no_video_and_no_error(tmp_path: Path):
+    path = tmp_path / "video.mp4"
+    assert film(Task("CartPole-v1", "none"), PPO("MlpPolicy", "CartPole-v1", device="cpu"), path) is None
+    toy = Task(TOY, "none")
+    assert film(toy, policy_for(toy), path) is None
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,165 @@
+import shutil
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from stable_baselines3 import A2C, DQN, PPO
+
+from envs.drivers.trained import env_for_driver
+from envs.registry import make_env
+from envs.rollouts.world import open_world
+from envs.sb3.policy_file import (
+    ForecasterPin,
+    PolicyNote,
+    algorithm_of,
+    load_policy,
+    pin_forecaster,
+    read_note,
+    read_policy_note,
+    write_note,
+)
+from envs.wrappers import ForecastObservation
+from predictor.checkpoint import CONSTANT_VELOCITY
+from predictor.errors import UserError
+from tests.envs.helpers import save_forecast_policy
+
+ENV_ID = "two-way-v0"
+TINY: dict[str, Any] = {"policy_kwargs": {"net_arch": [4]}, "device": "cpu", "seed": 0}
+PIN = ForecasterPin("highway", "ab" * 32, 5, 1, 12, 100.0)
+
+
+def saved(folder: Path, algorithm: str) -> Path:
+    env = gym.make("CartPole-v1")
+    model: Any = {
+        "ppo": lambda: PPO("MlpPolicy", env, n_steps=4, batch_size=4, **TINY),
+        "dqn": lambda: DQN("MlpPolicy", env, buffer_size=10, **TINY),
+        "a2c": lambda: A2C("MlpPolicy", env, **TINY),
+    }[algorithm]()
+    model.save(folder / "policy.zip")
+    return folder / "policy.zip"
+
+
+def pin_of(checkpoint: str, **options: Any) -> ForecasterPin:
+    env = ForecastObservation(make_env(ENV_ID), checkpoint, **options)
+    space: Any = env.observation_space
+    return pin_forecaster(checkpoint, space, env.get_wrapper_attr("scene_spec"))
+
+
+@pytest.fixture
+def retrained(tmp_path: Path, highway_checkpoint: str) -> str:
+    """A checkpoint of the same name and sizes with other weights."""
+    folder = tmp_path / "retrained" / Path(highway_checkpoint).name
+    shutil.copytree(highway_checkpoint, folder)
+    tensors = load_file(folder / "model.safetensors")
+    name = next(iter(tensors))
+    save_file(tensors | {name: tensors[name] + 1e-3 * torch.ones_like(tensors[name])}, folder / "model.safetensors")
+    return str(folder)
+
+
+# --- Note -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("pin", [PIN, None], ids=["forecasts", "none"])
+def test_a_note_travels_inside_the_zip(pin: ForecasterPin | None, tmp_path: Path):
+    path, note = saved(tmp_path, "ppo"), PolicyNote(pin, ("adversary",), "varied")
+    write_note(path, note, {"steps": 3})
+    assert read_policy_note(path) == note
+    assert read_note(path) == {"steps": 3}
+    assert isinstance(load_policy(path), PPO)
+
+
+def test_a_zip_of_sb3_alone_says_nothing(tmp_path: Path):
+    path = saved(tmp_path, "ppo")
+    assert read_policy_note(path) is None
+    assert read_note(path) == {}
+    assert read_policy_note(tmp_path / "absent.zip") is None
+
+
+# --- Pin --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_pin_holds_the_weights_and_what_the_policy_sees(highway_checkpoint: str):
+    pin = pin_of(highway_checkpoint, horizon_steps=4, num_samples=3, max_agents=7, perception_m=60.0)
+    assert (pin.horizon_steps, pin.num_samples, pin.max_agents, pin.perception_m) == (4, 3, 7, 60.0)
+    assert pin.sha256 is not None and len(pin.sha256) == 64
+    assert pin_of(CONSTANT_VELOCITY).sha256 is None
+
+
+def test_a_folder_that_moved_is_the_same_forecaster(tmp_path: Path, highway_checkpoint: str):
+    moved = tmp_path / "elsewhere"
+    shutil.copytree(highway_checkpoint, moved)
+    pin_of(highway_checkpoint).check(pin_of(str(moved)), "policy")
+
+
+def test_other_weights_are_named_with_their_hashes(highway_checkpoint: str, retrained: str):
+    pin, other = pin_of(highway_checkpoint), pin_of(retrained)
+    assert pin.sha256 is not None and other.sha256 is not None
+    expected = (
+        f"policy x was trained on forecaster '{highway_checkpoint}' .SHA-256 {pin.sha256[:12]}…., but gets "
+        f"'{retrained}' .SHA-256 {other.sha256[:12]}….; pass the checkpoint"
+    )
+    with pytest.raises(UserError, match=expected):
+        pin.check(other, "policy x")
+
+
+def test_constant_velocity_has_a_name_only():
+    pin = replace(PIN, checkpoint=CONSTANT_VELOCITY, sha256=None)
+    pin.check(pin, "policy")
+    for one, other in ((pin, PIN), (PIN, pin)):
+        with pytest.raises(UserError, match="was trained on forecaster"):
+            one.check(other, "policy")
+
+
+@pytest.mark.parametrize(
+    ("field", "other"), [("horizon_steps", 7), ("num_samples", 7), ("max_agents", 7), ("perception_m", None)]
+)
+def test_other_options_are_named(field: str, other: int | None):
+    PIN.check(PIN, "policy")
+    with pytest.raises(UserError, match=f"policy was trained on forecasts with {field}=.*, but gets {field}={other};"):
+        PIN.check(replace(PIN, **{field: other}), "policy")
+
+
+def test_a_policy_drives_with_its_own_forecaster_only(tmp_path: Path, highway_checkpoint: str, retrained: str):
+    policy = str(save_forecast_policy(tmp_path, ENV_ID, highway_checkpoint))
+    assert env_for_driver(make_env(ENV_ID), policy)
+    open_world(ENV_ID, policy, highway_checkpoint, num_samples=2).close()
+    with pytest.raises(UserError, match="was trained on forecaster .* but gets '.*retrained"):
+        open_world(ENV_ID, policy, retrained)
+
+
+def test_a_forecaster_trained_anew_in_place_is_noticed(tmp_path: Path, highway_checkpoint: str, retrained: str):
+    folder = tmp_path / "mine"
+    shutil.copytree(highway_checkpoint, folder)
+    policy = str(save_forecast_policy(tmp_path, ENV_ID, str(folder)))
+    shutil.copy(Path(retrained) / "model.safetensors", folder)
+    with pytest.raises(UserError, match="was trained on forecaster .*mine' .SHA-256 .* but gets '.*mine' .SHA-256"):
+        env_for_driver(make_env(ENV_ID), policy)
+
+
+# --- Loading ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("algorithm", "kind"), [("ppo", PPO), ("dqn", DQN)])
+def test_the_algorithm_is_told_by_the_content(algorithm: str, kind: type, tmp_path: Path):
+    path = saved(tmp_path, algorithm)
+    assert algorithm_of(path) == algorithm
+    assert isinstance(load_policy(path), kind)
+
+
+def test_other_algorithms_are_refused(tmp_path: Path):
+    with pytest.raises(UserError, match="policy.zip is neither a PPO nor a DQN policy$"):
+        load_policy(saved(tmp_path, "a2c"))
+
+
+def test_a_zip_that_lacks_its_weights_is_one_clear_line(tmp_path: Path):
+    path, damaged = saved(tmp_path, "ppo"), tmp_path / "damaged.zip"
+    with zipfile.ZipFile(path) as whole, zipfile.ZipFile(damaged, "w") as part:
+        part.writestr("data", whole.read("data"))
+    with pytest.raises(UserError, match="damaged.zip is no ppo policy that fits here: ") as error:
+        load_policy(damaged)
+    assert "\n" not in str(error.value)

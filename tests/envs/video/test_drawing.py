@@ -1,0 +1,19 @@
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from PIL import Image
+
+from envs.video.drawing import write_picture, write_video
+
+PICTURE = np.arange(32 * 48 * 3, dtype=np.uint8).reshape(32, 48, 3)
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_files_are_named_by_strings_or_paths(kind: type, tmp_path: Path):
+    write_video(kind(tmp_path / "x.mp4"), [PICTURE] * 4, fps=4)
+    assert imageio_ffmpeg.count_frames_and_secs(tmp_path / "x.mp4")[0] == 4
+    write_picture(kind(tmp_path / "x.png"), PICTURE)
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "x.png")), PICTURE)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["x.mp4", "x.png"]
