@@ -11,7 +11,7 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +20,9 @@ import pytest
 
 import train_policy
 from agents import evaluate
+from agents.presets import Algorithm, PPOPreset, Preset, preset_for
 from agents.runs import load_model
+from agents.task import Backend
 from agents.training import SaveCheckpoint
 from envs.sb3.policy_file import NOTE_ENTRY, read_note, read_policy_note
 from predictor.errors import run_entry_point
@@ -33,10 +35,30 @@ TINY = (
     "--observe", "constant-velocity", "--num-envs", "1", "--selections", "1", "--selection-episodes", "1",
     "--eval-episodes", "1", "--checkpoint-every", "1",
 )  # fmt: skip
-PPO = (*TINY, "--steps", "256")  # two rollouts of 128
-DQN = (*TINY, "--algorithm", "dqn", "--steps", "230")  # learns from step 200 on
-TAG = (*TINY[2:], "--env-id", "simple_tag_v3", "--checkpoint", "constant-velocity", "--steps", "600")
-"""Two rollouts of 100 steps of three pursuers."""
+ROLLOUT = 20
+PPO = (*TINY, "--steps", str(2 * ROLLOUT))
+DQN = (*TINY, "--algorithm", "dqn", "--steps", str(2 * ROLLOUT))  # learns from step 10 on
+TAG = (*TINY[2:], "--env-id", "simple_tag_v3", "--checkpoint", "constant-velocity", "--steps", str(6 * ROLLOUT))
+"""Two rollouts of three pursuers."""
+
+
+def short_preset(env_id: str, algorithm: Algorithm, backend: Backend = "gymnasium") -> Preset:
+    """The preset with short rollouts and few gradient steps: what is tested is the command, not the learning."""
+    preset = preset_for(env_id, algorithm, backend)
+    if isinstance(preset, PPOPreset):
+        return replace(preset, n_steps=ROLLOUT, batch_size=ROLLOUT, n_epochs=1)
+    return replace(preset, learning_starts=10)
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trains with short rollouts and makes short films."""
+    shorten(monkeypatch)
+
+
+def shorten(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr("agents.training.preset_for", short_preset)
+    patch.setattr("agents.video.MAX_VIDEO_STEPS", 12)
 
 
 @pytest.fixture
@@ -48,10 +70,12 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return run
 
 
-def trained(run: Path, *arguments: str) -> tuple[Path, str]:
+def trained(run: Path, *arguments: str, short: bool = True) -> tuple[Path, str]:
     """A run and what it printed."""
     printed = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
+        if short:
+            shorten(patch)
         patch.setattr(sys, "argv", ["train_policy.py", *arguments, "--out", str(run)])
         run_entry_point(train_policy.main)
     return run, printed.getvalue()
@@ -66,7 +90,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 @pytest.fixture(scope="module")
 def chased(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Of pursuers."""
-    return trained(tmp_path_factory.mktemp("chased") / "run", *TAG[:-1], "300")
+    return trained(tmp_path_factory.mktemp("chased") / "run", *TAG[:-1], str(3 * ROLLOUT))
 
 
 def assert_video(path: Path, least_s: float) -> None:
@@ -96,7 +120,7 @@ def test_one_command_trains_evaluates_and_films(finished: tuple[Path, str]):
     assert [row["policy"] for row in summary["policies"]] == ["ppo (constant-velocity)", "random", "idle"]
     assert {e["seed"] for found in summary["episodes"].values() for e in found} == {evaluate.EVALUATION_SEED}
     config = json.loads((run / "config.json").read_text())
-    assert config["config"]["steps"] == 256
+    assert config["config"]["steps"] == 2 * ROLLOUT
     assert config["provenance"][0]["versions"]["stable-baselines3"]
     assert list((run / "tb").rglob("events.out.tfevents.*"))
     for text in ("ppo", "random", "idle", "crash rate"):
@@ -108,14 +132,14 @@ def test_one_command_trains_evaluates_and_films(finished: tuple[Path, str]):
 def test_best_model_carries_its_result(finished: tuple[Path, str]):
     run, _ = finished
     note = read_note(run / "policy.zip")
-    assert note["steps"] == 256
+    assert note["steps"] == 2 * ROLLOUT
     assert 0 <= note["selection_return"] <= 30  # highway-env's rewards lie in [0, 1], 30 steps
     assert (run / "policy.zip").read_bytes() == (run / "best_model.zip").read_bytes()
 
 
 def test_a_finished_policy_is_evaluated_again(finished: tuple[Path, str], monkeypatch: pytest.MonkeyPatch):
     run, _ = finished
-    arguments = ["evaluate.py", "--run-dir", str(run), "--episodes", "1", "--num-envs", "1"]
+    arguments = ["evaluate.py", "--out", str(run), "--episodes", "1", "--num-envs", "1"]
     monkeypatch.setattr(sys, "argv", arguments)
     run_entry_point(evaluate.main)
     again = json.loads((run / "evaluation" / "summary.json").read_text())
@@ -153,7 +177,7 @@ def test_a_policy_is_not_evaluated_on_another_forecaster(
     finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     run = with_note(finished[0], tmp_path / "run", lambda note: note["policy"]["forecaster"].update(OTHER))
-    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--run-dir", str(run), "--episodes", "1", "--workers", "1"])
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--out", str(run), "--episodes", "1", "--workers", "1"])
     with pytest.raises(SystemExit) as exit_:
         run_entry_point(evaluate.main)
     assert exit_.value.code == 2
@@ -166,12 +190,13 @@ def test_a_policy_without_a_pin_is_evaluated_with_a_notice(
     finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     run = with_note(finished[0], tmp_path / "run", lambda note: note.pop("policy"))
-    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--run-dir", str(run), "--episodes", "1", "--workers", "1"])
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--out", str(run), "--episodes", "1", "--workers", "1"])
     run_entry_point(evaluate.main)
     assert "does not say which forecaster it was trained on" in " ".join(capsys.readouterr().err.split())
     assert (run / "evaluation" / "summary.json").exists()
 
 
+@pytest.mark.usefixtures("short")
 @pytest.mark.parametrize("pinned", [True, False])
 def test_a_run_goes_on_with_its_own_forecaster_only(
     command: Callable[..., None],
@@ -192,7 +217,7 @@ def test_a_run_goes_on_with_its_own_forecaster_only(
     monkeypatch.setattr(train_policy, "train", lambda *arguments: sys.exit(0))
     capsys.readouterr()
     with pytest.raises(SystemExit) as exit_:
-        command(*PPO, "--run-dir", str(run), "--resume")
+        command(*PPO, "--out", str(run), "--resume")
     if pinned:
         assert exit_.value.code == 2
         assert "was trained on forecaster 'mine' (SHA-256 abababababab…)" in error_line(capsys)
@@ -201,14 +226,14 @@ def test_a_run_goes_on_with_its_own_forecaster_only(
         assert "does not say which forecaster it was trained on" in " ".join(capsys.readouterr().out.split())
 
 
-def test_pursuers_learn_to_chase_a_prey_that_flees_by_rule(chased: tuple[Path, str]):
+def test_pursuers_are_trained_measured_and_filmed_against_a_prey_that_is_driven(chased: tuple[Path, str]):
     run, printed = chased
     names = {p.name for p in run.iterdir()}
     assert {"config.json", "policy.zip", "summary.json", "summary.md", "video.mp4"} <= names
     config = json.loads((run / "config.json").read_text())["config"]
     assert (config["env_id"], config["learners"], config["partner"]) == ("simple_tag_v3", ["adversary"], "heuristic")
     assert config["envs"] == 1
-    assert load_model(run / "policy.zip", "ppo").num_timesteps == 300
+    assert load_model(run / "policy.zip", "ppo").num_timesteps == 3 * ROLLOUT
     summary = json.loads((run / "summary.json").read_text())
     assert [row["policy"] for row in summary["policies"]] == ["ppo (forecast)", "random", "heuristic"]
     assert all(row["crash_rate"] is None and row["length_mean"] == 25 for row in summary["policies"])
@@ -219,14 +244,14 @@ def test_pursuers_learn_to_chase_a_prey_that_flees_by_rule(chased: tuple[Path, s
 
 def test_pursuers_are_evaluated_again(chased: tuple[Path, str], monkeypatch: pytest.MonkeyPatch):
     run, _ = chased
-    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--run-dir", str(run), "--episodes", "1"])
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--out", str(run), "--episodes", "1"])
     run_entry_point(evaluate.main)
     again = json.loads((run / "evaluation" / "summary.json").read_text())
     assert again["episodes"] == json.loads((run / "summary.json").read_text())["episodes"]
 
 
-def test_agents_without_forecasts_learn_and_are_filmed(tmp_path: Path):
-    arguments = [*TINY[2:], "--env-id", "simple_spread_v3", "--observe", "none", "--steps", "300"]
+def test_agents_without_forecasts_are_trained_and_filmed(tmp_path: Path):
+    arguments = [*TINY[2:], "--env-id", "simple_spread_v3", "--observe", "none", "--steps", str(3 * ROLLOUT)]
     run, printed = trained(tmp_path / "run", *arguments)
     assert json.loads((run / "config.json").read_text())["config"]["learners"] == []
     assert load_model(run / "policy.zip", "ppo").observation_space.shape == (18,)
@@ -239,7 +264,7 @@ def test_agents_without_forecasts_learn_and_are_filmed(tmp_path: Path):
 def test_native_environments_train_what_is_measured_on_the_original(tmp_path: Path):
     pytest.importorskip("envpool")
     arguments = ["--num-envs", "16", *TINY[4:], "--backend", "envpool", "--checkpoint", "constant-velocity"]
-    run, _ = trained(tmp_path / "run", *arguments, "--steps", "512", "--no-video")
+    run, _ = trained(tmp_path / "run", *arguments, "--steps", "512", "--no-video", short=False)
     config = json.loads((run / "config.json").read_text())["config"]
     assert (config["backend"], config["preset"]["n_steps"]) == ("envpool", 32)
     assert load_model(run / "policy.zip", "ppo").num_timesteps == 512
@@ -272,7 +297,9 @@ def test_who_learns(env_id: str, asked: tuple[str, ...] | None, learners: tuple[
 
 
 @pytest.mark.parametrize(
-    ("arguments", "interrupted_at"), [(PPO, 128), (DQN, 128), (TAG, 300)], ids=["ppo", "dqn", "pursuers"]
+    ("arguments", "interrupted_at"),
+    [(PPO, ROLLOUT), (DQN, ROLLOUT), (TAG, 3 * ROLLOUT)],
+    ids=["ppo", "dqn", "pursuers"],
 )
 def test_interrupted_run_goes_on_where_it_was(
     command: Callable[..., None],
@@ -312,7 +339,7 @@ def test_interrupted_run_goes_on_where_it_was(
     finished = load_model(run / "checkpoint.zip", algorithm)
     assert finished.num_timesteps == int(arguments[-1])
     if algorithm == "dqn":
-        assert finished.replay_buffer.size() == 230  # type: ignore[attr-defined]
+        assert finished.replay_buffer.size() == 2 * ROLLOUT  # type: ignore[attr-defined]
     assert (run / "policy.zip").exists()
     assert (run / "summary.md").exists()
 
@@ -320,7 +347,7 @@ def test_interrupted_run_goes_on_where_it_was(
 @pytest.mark.slow
 def test_kill_nine_then_resume(command: Callable[..., None], tmp_path: Path):
     run = tmp_path / "run"
-    arguments = [*DQN[:-1], "600", "--out", str(run), "--no-video"]
+    arguments = [*DQN[:-1], "240", "--out", str(run), "--no-video"]
     root = Path(train_policy.__file__).parent
     process = subprocess.Popen([sys.executable, "train_policy.py", *arguments], cwd=root, stderr=subprocess.DEVNULL)
     while not (run / "checkpoint.zip").exists():
@@ -329,13 +356,17 @@ def test_kill_nine_then_resume(command: Callable[..., None], tmp_path: Path):
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     reached = load_model(run / "checkpoint.zip", "dqn").num_timesteps
-    assert 0 < reached < 600
+    assert 0 < reached < 240
     command(*arguments, "--resume")
-    assert load_model(run / "checkpoint.zip", "dqn").num_timesteps == 600
+    assert load_model(run / "checkpoint.zip", "dqn").num_timesteps == 240
 
 
 def test_resume_with_another_config_names_the_field(
-    command: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    short: None,
+    command: Callable[..., None],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ):
     run = tmp_path / "run"
     monkeypatch.setattr(train_policy, "train", lambda *arguments: sys.exit(0))
@@ -417,7 +448,7 @@ def test_help_explains_every_field(command: Callable[..., None], capsys: pytest.
 def test_evaluating_no_run_is_one_clear_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--run-dir", str(tmp_path)])
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--out", str(tmp_path)])
     with pytest.raises(SystemExit) as exit_:
         run_entry_point(evaluate.main)
     assert exit_.value.code == 2

@@ -1,4 +1,5 @@
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -215,11 +216,14 @@ def test_presets():
     assert preset_for("highway-fast-v0", "dqn", "envpool") == DQNPreset()
 
 
-def test_same_seed_same_policy():
+def test_same_seed_same_policy(monkeypatch: pytest.MonkeyPatch):
+    short = replace(preset_for("highway-fast-v0", "ppo"), n_steps=16, batch_size=8, n_epochs=2)  # type: ignore[call-arg]
+    monkeypatch.setattr("agents.training.preset_for", lambda *arguments: short)
+
     def trained() -> dict[str, torch.Tensor]:
         venv = make_venv(CONSTANT_VELOCITY, 1)
         model = make_model(plan(seed=3), venv)
-        model.learn(128)
+        model.learn(32)
         venv.close()
         return model.policy.state_dict()
 
