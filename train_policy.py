@@ -21,11 +21,11 @@ from agents.training import TrainingPlan, train
 from agents.video import film
 from envs.registry import entry_for, native_task_of
 from envs.simulators.envpool import ONE_START
-from predictor.command_line import Renamed, parse
-from predictor.config_checks import check_at_least, check_choices
-from predictor.errors import run_entry_point
-from predictor.provenance import provenance
-from predictor.runtime import keep_freed_memory
+from predictor.support.command_line import Renamed, parse
+from predictor.support.config_checks import check_at_least, check_choices
+from predictor.support.errors import run_entry_point
+from predictor.support.provenance import provenance
+from predictor.support.runtime import keep_freed_memory
 
 ENVS = {"gymnasium": 6, "envpool": 64}
 """Number of parallel environments by default."""

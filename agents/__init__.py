@@ -7,7 +7,7 @@ The names below are imported when they are used.
 
 from typing import TYPE_CHECKING
 
-from predictor.lazy_exports import lazy_exports
+from predictor.support.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
     from agents.evaluate import Evaluation, PolicySummary, evaluate_policy_on_seeds

@@ -15,7 +15,7 @@ from envs.drivers.all_agents import make_driver
 from envs.readers.base import role_of
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.seeding import driver_rng
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 
 @runtime_checkable

@@ -24,13 +24,13 @@ from agents.runs import POLICY_FILE, load_model, read_config
 from agents.task import EVALUATION_SEED, Task
 from agents.vec_envs import EpisodeResult
 from envs.sb3.policy_file import read_policy_note
-from predictor import markdown
-from predictor.command_line import Renamed, parse
-from predictor.config_checks import check_at_least
-from predictor.errors import UserError, run_entry_point
-from predictor.files import write_json, write_text
-from predictor.provenance import provenance
-from predictor.runtime import keep_freed_memory, resolve_device
+from predictor.support import markdown
+from predictor.support.command_line import Renamed, parse
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import write_json, write_text
+from predictor.support.provenance import provenance
+from predictor.support.runtime import keep_freed_memory, resolve_device
 
 NUM_POLICIES = 3
 """The trained one and an arena's two baselines."""

@@ -17,8 +17,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 from torch.nn import functional
 
-from predictor.errors import UserError
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
 EGO_KEY = "observation"
 VALID_KEY = "valid"

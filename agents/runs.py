@@ -18,8 +18,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.presets import Algorithm
 from envs.sb3.policy_file import ForecasterPin, PolicyNote, algorithm_of, load_policy, write_note
-from predictor.errors import UserError
-from predictor.files import delete_leftovers, new_file, write_json
+from predictor.support.errors import UserError
+from predictor.support.files import delete_leftovers, new_file, write_json
 
 CONFIG_FILE = "config.json"
 CHECKPOINT_FILE = "checkpoint.zip"

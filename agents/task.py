@@ -20,10 +20,10 @@ from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.sb3.padded_spaces import learners_named
 from envs.sb3.policy_file import PolicyNote, pin_forecaster
 from envs.wrappers import ForecastObservation
-from predictor.config_checks import check_choice, check_choices
-from predictor.errors import UserError
-from predictor.runtime import resolve_device
 from predictor.scene import SceneSpec
+from predictor.support.config_checks import check_choice, check_choices
+from predictor.support.errors import UserError
+from predictor.support.runtime import resolve_device
 
 EVALUATION_SEED = 2_000_000_000
 """First seed of the final evaluation; training stays below 1e9, model selection between 1e9 and 2e9."""

@@ -24,10 +24,10 @@ from agents.runs import BEST_FILE, CHECKPOINT_FILE, POLICY_FILE, load_model, sav
 from agents.task import SELECTION_SEED, Task
 from agents.vec_envs import make_venv
 from envs.sb3.policy_file import PolicyNote, read_note
-from predictor.config_checks import check_at_least, check_choices
-from predictor.errors import UserError
-from predictor.files import copy_file
-from predictor.runtime import resolve_device
+from predictor.support.config_checks import check_at_least, check_choices
+from predictor.support.errors import UserError
+from predictor.support.files import copy_file
+from predictor.support.runtime import resolve_device
 
 _NORMAL_95 = 1.959963984540054  # two-sided 95 % quantile of the normal distribution
 

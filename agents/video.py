@@ -20,7 +20,7 @@ from envs.video.highway import record_episode
 from envs.video.multiagent import MultiagentRecording, record_multiagent_episode
 from envs.wrappers import ForecastObservation
 from predictor.checkpoint import CONSTANT_VELOCITY
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 MAX_VIDEO_STEPS = 200
 """Longest video [policy steps]; racetracks go on for 1500."""

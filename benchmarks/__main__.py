@@ -15,10 +15,10 @@ from benchmarks.compare import Comparison, read_baseline, write_baseline
 from benchmarks.settings import Settings
 from benchmarks.suite import measure, report, settle
 from benchmarks.table import plain, rich_table
-from predictor.command_line import parse
-from predictor.errors import run_entry_point
-from predictor.files import write_json
-from predictor.runtime import keep_freed_memory, processor, tune
+from predictor.support.command_line import parse
+from predictor.support.errors import run_entry_point
+from predictor.support.files import write_json
+from predictor.support.runtime import keep_freed_memory, processor, tune
 
 
 def main() -> None:

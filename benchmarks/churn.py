@@ -20,12 +20,12 @@ from envs.readers.function import FunctionReader
 from envs.sb3.forecast import VecForecast
 from envs.wrappers import SceneObservation
 from predictor.checkpoint import load_checkpoint
-from predictor.command_line import Renamed, parse
-from predictor.config_checks import check_at_least
-from predictor.errors import UserError, run_entry_point
-from predictor.files import write_json
-from predictor.provenance import provenance
 from predictor.scene import Scene, SceneSpec
+from predictor.support.command_line import Renamed, parse
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import write_json
+from predictor.support.provenance import provenance
 
 
 @dataclass(frozen=True)

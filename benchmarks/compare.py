@@ -12,8 +12,8 @@ from typing import Any
 
 from benchmarks.results import Compared, Line
 from benchmarks.settings import Settings
-from predictor.errors import UserError
-from predictor.files import write_json
+from predictor.support.errors import UserError
+from predictor.support.files import write_json
 
 FORMAT = "dgvae-rl benchmark baseline"
 VERSION = 1

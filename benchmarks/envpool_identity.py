@@ -20,9 +20,9 @@ from envs.readers.envpool import PoolIdentity, PoolReader, native_spec
 from envs.readers.highway import HighwayReader
 from envs.registry import make_env
 from envs.simulators.envpool import HIGHWAY_ENV_OF, make_pool
-from predictor.command_line import Renamed, parse
-from predictor.config_checks import check_at_least
-from predictor.errors import UserError, run_entry_point
+from predictor.support.command_line import Renamed, parse
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import UserError, run_entry_point
 
 
 @dataclass(frozen=True)

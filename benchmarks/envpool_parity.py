@@ -25,11 +25,11 @@ from envs.registry import make_env
 from envs.seeding import driver_rng
 from envs.simulators.envpool import ENV_IDS, HIGHWAY_ENV_OF
 from envs.wrappers import ForecastObservation
-from predictor.command_line import Renamed, parse
-from predictor.config_checks import check_at_least
-from predictor.errors import UserError, run_entry_point
-from predictor.files import write_json
-from predictor.provenance import provenance
+from predictor.support.command_line import Renamed, parse
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import write_json
+from predictor.support.provenance import provenance
 
 _SAME_M = 1e-6
 """Vehicles closer than this are in the same place."""

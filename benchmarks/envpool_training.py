@@ -21,12 +21,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from agents.task import Task
 from agents.training import TrainingPlan, make_model
 from agents.vec_envs import make_venv
-from predictor.command_line import Renamed, parse
-from predictor.config_checks import check_at_least
-from predictor.errors import run_entry_point
-from predictor.files import write_json
-from predictor.provenance import provenance
-from predictor.runtime import keep_freed_memory
+from predictor.support.command_line import Renamed, parse
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import run_entry_point
+from predictor.support.files import write_json
+from predictor.support.provenance import provenance
+from predictor.support.runtime import keep_freed_memory
 
 
 @dataclass(frozen=True)

@@ -24,15 +24,15 @@ from torch.utils import _pytree as pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
-from predictor.command_line import parse
-from predictor.config_checks import check_at_least, check_choices, check_positive
 from predictor.data.springs import SpringsConfig, make
-from predictor.errors import UserError, run_entry_point
 from predictor.evaluation.paper_tables import SPRINGS, Budget
-from predictor.files import write_json
-from predictor.provenance import provenance
-from predictor.runtime import processor, resolve_device, tune
 from predictor.suite import SuiteConfig, row_config, row_folder, run_row
+from predictor.support.command_line import parse
+from predictor.support.config_checks import check_at_least, check_choices, check_positive
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import write_json
+from predictor.support.provenance import provenance
+from predictor.support.runtime import processor, resolve_device, tune
 from predictor.training.batches import Shapes
 from predictor.training.config import TrainConfig, TrainPrecision
 from predictor.training.objective import window_loss

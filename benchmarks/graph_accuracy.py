@@ -17,20 +17,20 @@ from rich.table import Table
 
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.checkpoint import load_checkpoint
-from predictor.command_line import Renamed, parse
-from predictor.config_checks import check_at_least
 from predictor.data.store import read_store
 from predictor.data.windows import Windows
 from predictor.dgvae import DGVAE
 from predictor.dgvae.networks import DGVAEConfig
-from predictor.errors import UserError, run_entry_point
 from predictor.evaluation.accuracy import Tally
 from predictor.evaluation.measure_row import protocol_indices
 from predictor.evaluation.outcomes import run_windows
-from predictor.files import write_json
 from predictor.forecaster import Forecaster
-from predictor.provenance import provenance
-from predictor.runtime import tune
+from predictor.support.command_line import Renamed, parse
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import write_json
+from predictor.support.provenance import provenance
+from predictor.support.runtime import tune
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from predictor.data.windows import WindowBatch
 from predictor.dgvae import DGVAE
 from predictor.dgvae.networks import PRESETS, DGVAEConfig
 from predictor.forecaster import Belief, Memory, WindowOutput
-from predictor.runtime import Precision, precision
 from predictor.scene import AxisFrame, SceneSpec
+from predictor.support.runtime import Precision, precision
 from predictor.training.config import TrainConfig
 from predictor.training.objective import window_loss
 

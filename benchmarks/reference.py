@@ -21,7 +21,7 @@ from benchmarks.results import Line
 from benchmarks.settings import Settings
 from benchmarks.timing import Meter, Timing, ratio_line, timed_line
 from predictor.dgvae.networks import DGVAEConfig
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 EQUAL = DGVAEConfig(
     hidden_dim=256, rnn_dim=64, head_dim=128, message_dim=256, decoder_dim=256, edge_feature_dim=32, zero_start=True
@@ -39,7 +39,7 @@ REFERENCE: dict[str, Any] = {
 """Its settings, as its own scripts set them for a dynamic graph."""
 
 AS_SHIPPED = "the reference with torch's own choice of library"
-"""`predictor.runtime.tune` sets who multiplies for the whole process, the reference included; here it is undone."""
+"""`predictor.support.runtime.tune` chooses the library for the whole process, the reference included; here it is undone."""
 
 
 class Training(NamedTuple):

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from predictor.config_checks import check_at_least
-from predictor.errors import UserError
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import UserError
 
 SECTIONS: dict[str, str] = {
     "machine": "benchmarks.machine",

@@ -11,8 +11,8 @@ from benchmarks.compare import Baseline, Comparison, better_of, compare
 from benchmarks.optional_packages import missing
 from benchmarks.results import Line, skipped
 from benchmarks.settings import SECTIONS, Settings
-from predictor.provenance import provenance
-from predictor.runtime import processor
+from predictor.support.provenance import provenance
+from predictor.support.runtime import processor
 
 NEEDED: dict[str, tuple[str, ...]] = {
     "wrappers": ("gymnasium", "highway_env", "stable_baselines3"),

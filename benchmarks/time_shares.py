@@ -16,10 +16,10 @@ from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.models import TrainingStep, box, forecaster, inference, observed, road, scenes, sized
 from benchmarks.reference import EQUAL, PREDICTION
-from predictor.command_line import parse
-from predictor.config_checks import check_at_least
-from predictor.errors import run_entry_point
-from predictor.runtime import processor, tune
+from predictor.support.command_line import parse
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import run_entry_point
+from predictor.support.runtime import processor, tune
 
 KINDS: dict[str, tuple[str, ...]] = {
     "products": ("linear_pointwise", "addmm", "aten::mm", "bmm"),

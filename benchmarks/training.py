@@ -13,7 +13,7 @@ from benchmarks.results import Line, skipped
 from benchmarks.settings import Settings
 from benchmarks.timing import Meter, rate_line, ratio_line
 from benchmarks.worker_process import WorkerProcess, exact_memory
-from predictor.runtime import keep_freed_memory
+from predictor.support.runtime import keep_freed_memory
 
 
 class Case(NamedTuple):
@@ -112,5 +112,5 @@ def _allocator(settings: Settings) -> Line:
         meter = Meter(ALLOCATOR_ROUNDS[settings.mode])
         timings = meter.time_blocks({"default": default, "kept": step.timed})
     ratios = timings["default"].seconds / timings["kept"].seconds
-    line = ratio_line("training", name, case._asdict(), ratios, "predictor.runtime.keep_freed_memory()")
+    line = ratio_line("training", name, case._asdict(), ratios, "predictor.support.runtime.keep_freed_memory()")
     return replace(line, compared=None)  # says something about glibc, not about us

@@ -23,16 +23,16 @@ from benchmarks.timing import alternate, quartiles
 from envs.registry import make_env
 from envs.sb3.forecast import VecForecast
 from envs.wrappers import SceneObservation
-from predictor.command_line import Renamed, parse
-from predictor.config_checks import check_at_least, check_choices
 from predictor.dgvae import DGVAE
 from predictor.dgvae.networks import PRESETS
-from predictor.errors import UserError, run_entry_point
-from predictor.files import write_json
 from predictor.forecaster import Forecaster
-from predictor.provenance import provenance
-from predictor.runtime import keep_freed_memory
 from predictor.scene import SceneSpec
+from predictor.support.command_line import Renamed, parse
+from predictor.support.config_checks import check_at_least, check_choices
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import write_json
+from predictor.support.provenance import provenance
+from predictor.support.runtime import keep_freed_memory
 
 
 @dataclass(frozen=True)

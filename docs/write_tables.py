@@ -12,10 +12,10 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS  # noqa: E402
-from predictor.errors import UserError, run_entry_point  # noqa: E402
 from predictor.evaluation.in_env_record import FILE_NAME, Measurement, read_record  # noqa: E402
-from predictor.files import write_text  # noqa: E402
 from predictor.reports.in_env_tables import COLUMNS, card_section, measurement_table, metres, replace_tables  # noqa: E402
+from predictor.support.errors import UserError, run_entry_point  # noqa: E402
+from predictor.support.files import write_text  # noqa: E402
 
 PRETRAINED = Path("predictor/pretrained")
 PAGES = (Path("README.md"), Path("docs/in_env.md"))

@@ -9,7 +9,7 @@ EnvPool, and the wrappers for these need no more than the one they serve.
 
 from typing import TYPE_CHECKING
 
-from predictor.lazy_exports import lazy_exports
+from predictor.support.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
     from envs.parallel import ForecastParallelEnv

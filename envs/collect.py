@@ -14,12 +14,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from envs.readers.highway_labels import ATTRIBUTE_NAMES, SceneLabels, with_labels
 from envs.rollouts.world import World, default_drivers, open_world
-from predictor.command_line import Renamed, parse
-from predictor.config_checks import check_at_least
 from predictor.data.store import Episode, StoreInfo, write_store
-from predictor.errors import UserError, run_entry_point
-from predictor.provenance import provenance
 from predictor.scene import Scene
+from predictor.support.command_line import Renamed, parse
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.provenance import provenance
 
 PACKAGES = ("highway-env", "mpe2", "pettingzoo", "envpool", "gymnasium", "numpy")
 

@@ -26,20 +26,20 @@ from envs.rollouts.episode import MODEL, NEIGHBOURS, STRAIGHT, Case, Episode, Ep
 from envs.rollouts.report import EnvAccuracy
 from envs.rollouts.world import default_drivers, open_world
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, name_of_folder, read_info, resolve
-from predictor.command_line import Renamed, parse
-from predictor.config_checks import check_at_least, check_positive
 from predictor.data.store import read_info_of
-from predictor.errors import UserError, run_entry_point
 from predictor.evaluation.accuracy import Accuracy, Tally, fitted_std_m
 from predictor.evaluation.displacement import MISS_THRESHOLD_M, min_ade
 from predictor.evaluation.graph_accuracy import GraphAccuracy, GraphTally
 from predictor.evaluation.outcomes import Outcome
-from predictor.files import write_json, write_text
 from predictor.graph import pair_mask
-from predictor.provenance import provenance
 from predictor.reports.tables import ROW_NAMES, accuracy_table
-from predictor.runtime import keep_freed_memory
 from predictor.scene import SceneSpec
+from predictor.support.command_line import Renamed, parse
+from predictor.support.config_checks import check_at_least, check_positive
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import write_json, write_text
+from predictor.support.provenance import provenance
+from predictor.support.runtime import keep_freed_memory
 
 PACKAGES = ("highway-env", "mpe2", "pettingzoo", "envpool", "gymnasium", "torch", "numpy")
 

@@ -21,12 +21,12 @@ from envs.drivers.ego import make_ego_driver
 from envs.readers.highway import HighwayReader, is_highway_env
 from envs.registry import make_env
 from envs.seeding import driver_rng
-from predictor.command_line import Renamed, parse
-from predictor.config_checks import check_at_least
 from predictor.data.store import Episode
-from predictor.errors import UserError, run_entry_point
-from predictor.files import new_folder, write_json
-from predictor.provenance import provenance
+from predictor.support.command_line import Renamed, parse
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import new_folder, write_json
+from predictor.support.provenance import provenance
 
 FRAMES_PER_S = 25
 """As the datasets."""

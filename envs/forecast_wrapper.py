@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.scene_stream import SceneStream
-from predictor.errors import ProtocolError, UserError
 from predictor.forecaster import Forecaster
 from predictor.scene import Forecast, SceneBatch
+from predictor.support.errors import ProtocolError, UserError
 
 
 class ForecastWrapper:

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from envs.observation import ego_entries, entry_spaces
 from envs.readers.base import MultiagentScene
 from envs.scene_stream import ForecastConfig, SceneStream
-from predictor.errors import UserError
 from predictor.forecaster import Forecaster
 from predictor.scene import PADDING_ID, Forecast, Scene, SceneBatch, SceneSpec, perceived_agents
+from predictor.support.errors import UserError
 
 AgentEntries = dict[str, dict[str, NDArray[np.float32]]]
 """Forecast entries by agent."""

@@ -12,10 +12,10 @@ from torch import Tensor
 from envs.registry import checkpoint_for
 from envs.scene_stream import ForecastConfig, SceneStream
 from predictor.checkpoint import load_forecaster
-from predictor.errors import UserError
 from predictor.forecaster import Forecaster
 from predictor.online import use_one_thread_after_fork
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
+from predictor.support.errors import UserError
 
 Observations = dict[str, NDArray[Any]]
 

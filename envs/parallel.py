@@ -26,9 +26,9 @@ from envs.readers import MakeReader, multiagent_env_id, multiagent_reader_for
 from envs.readers.base import MultiagentReader, MultiagentScene, build_multiagent_reader
 from envs.scene_stream import ForecastConfig
 from envs.simulators.copies import RunningCopy
-from predictor.errors import ProtocolError, UserError
 from predictor.forecaster import Forecaster
 from predictor.scene import Forecast, SceneSpec
+from predictor.support.errors import ProtocolError, UserError
 
 _COMPOSED = (gym.spaces.Dict, gym.spaces.Tuple, gym.spaces.Graph, gym.spaces.Sequence, gym.spaces.OneOf)
 

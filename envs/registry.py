@@ -14,7 +14,7 @@ import gymnasium as gym
 from envs.readers.mpe import MPE_IDS
 from envs.simulators.envpool import ENV_IDS as ENVPOOL_IDS
 from envs.simulators.envpool import HIGHWAY_ENV_OF, register_envpool_ids
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv

@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from predictor.config_checks import check_at_least
 from predictor.forecaster import Forecaster
 from predictor.online import OnlineForecaster
-from predictor.runtime import resolve_device
 from predictor.scene import Forecast, SceneBatch
+from predictor.support.config_checks import check_at_least
+from predictor.support.runtime import resolve_device
 
 NOISE_STREAM = 0x6E6F697365
 """Sets the samples' noise apart from what environment and drivers draw from the same seed."""

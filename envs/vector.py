@@ -25,9 +25,9 @@ from envs.observation import (
 )
 from envs.readers import MakeReader
 from envs.scene_stream import ForecastConfig
-from predictor.errors import UserError
 from predictor.forecaster import Forecaster
 from predictor.scene import SceneBatch, SceneSpec
+from predictor.support.errors import UserError
 
 
 def __getattr__(name: str) -> Any:

@@ -19,9 +19,9 @@ from envs.readers import MakeReader, reader_for
 from envs.readers.base import build_reader, require_scene, show
 from envs.scene_stream import ForecastConfig
 from envs.simulators.copies import RunningCopy
-from predictor.errors import ProtocolError, UserError
 from predictor.forecaster import Forecaster
 from predictor.scene import Scene, SceneBatch, SceneSpec
+from predictor.support.errors import ProtocolError, UserError
 
 
 def scene_source(env: gym.Env) -> str:

@@ -2,12 +2,12 @@
 
     >>> from predictor import OnlineForecaster, load_forecaster
 
-The names below are imported when they are used (`predictor.lazy_exports`).
+The names below are imported when they are used (`predictor.support.lazy_exports`).
 """
 
 from typing import TYPE_CHECKING
 
-from predictor.lazy_exports import lazy_exports
+from predictor.support.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
     from predictor.baselines.constant_velocity import ConstantVelocity
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from predictor.checkpoint import CheckpointInfo, load_checkpoint, load_forecaster, save_checkpoint
     from predictor.data.store import Episode, StoreInfo, read_store, write_store
     from predictor.dgvae import DGVAE, PRESETS, DGVAEConfig
-    from predictor.errors import ProtocolError, UserError
     from predictor.forecaster import Belief, Forecaster, Memory, TrainableForecaster
     from predictor.online import OnlineForecaster
     from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
+    from predictor.support.errors import ProtocolError, UserError
     from predictor.training.config import TrainConfig
 
 __getattr__, __all__ = lazy_exports(
@@ -29,7 +29,7 @@ __getattr__, __all__ = lazy_exports(
         "predictor.checkpoint": ("CheckpointInfo", "load_checkpoint", "load_forecaster", "save_checkpoint"),
         "predictor.data.store": ("Episode", "StoreInfo", "read_store", "write_store"),
         "predictor.dgvae": ("DGVAE", "DGVAEConfig", "PRESETS"),
-        "predictor.errors": ("ProtocolError", "UserError"),
+        "predictor.support.errors": ("ProtocolError", "UserError"),
         "predictor.forecaster": ("Belief", "Forecaster", "Memory", "TrainableForecaster"),
         "predictor.online": ("OnlineForecaster",),
         "predictor.scene": ("Forecast", "Scene", "SceneBatch", "SceneSpec"),

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from predictor.checkpoint import WEIGHTS, CheckpointInfo, load_checkpoint, name_of_folder, resolve
-from predictor.command_line import parse
 from predictor.data.store import EpisodeStore, read_store
-from predictor.errors import UserError, run_entry_point
 from predictor.evaluation.in_env_record import measurements_of, update_record
-from predictor.files import write_text
 from predictor.reports.in_env_tables import card_section
+from predictor.support.command_line import parse
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import write_text
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,12 @@ from safetensors.torch import load_file, save
 from torch import nn
 
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.errors import UserError
-from predictor.files import new_folder, write_json
 from predictor.forecaster import TrainableForecaster
 from predictor.models import build, config_from_json, name_of
-from predictor.runtime import resolve_device
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
+from predictor.support.files import new_folder, write_json
+from predictor.support.runtime import resolve_device
 
 FORMAT = "dgvae-rl predictor"
 VERSION = 1

@@ -19,20 +19,20 @@ from rich.progress import track
 
 from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
 from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint
-from predictor.command_line import Renamed, parse
-from predictor.config_checks import check_at_least
 from predictor.data.store import EpisodeStore, read_store
 from predictor.data.windows import Windows
-from predictor.errors import UserError, run_entry_point
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import Outcome, run_window_batch, run_windows
-from predictor.files import write_json, write_text
 from predictor.forecaster import Forecaster
-from predictor.provenance import provenance
 from predictor.reports.plots import plot_error_by_horizon, plot_scene
 from predictor.reports.tables import ROW_NAMES, accuracy_table, markdown_table
-from predictor.runtime import resolve_device, tune
 from predictor.scene import SceneSpec
+from predictor.support.command_line import Renamed, parse
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import write_json, write_text
+from predictor.support.provenance import provenance
+from predictor.support.runtime import resolve_device, tune
 
 
 @dataclass(frozen=True)

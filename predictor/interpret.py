@@ -23,20 +23,20 @@ from rich.markdown import Markdown
 from rich.progress import track
 
 from predictor.checkpoint import CONSTANT_VELOCITY, CheckpointInfo, load_checkpoint
-from predictor.command_line import Renamed, parse
-from predictor.config_checks import check_at_least
 from predictor.data.store import StoreInfo, read_store
 from predictor.data.windows import Windows
-from predictor.errors import UserError, run_entry_point
 from predictor.evaluation.disentanglement import sklearn
 from predictor.evaluation.edge_findings import Findings, measure, watch
 from predictor.evaluation.outcomes import run_window_batch
-from predictor.files import scratch_folder, write_json, write_text
-from predictor.provenance import provenance
 from predictor.reports import edge_plots as pictures
 from predictor.reports.tables import scores_markdown
-from predictor.runtime import resolve_device
 from predictor.scene import SceneSpec
+from predictor.support.command_line import Renamed, parse
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import scratch_folder, write_json, write_text
+from predictor.support.provenance import provenance
+from predictor.support.runtime import resolve_device
 
 BATCH_BYTES = 64_000_000
 """Of a batch's features over time."""

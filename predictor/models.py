@@ -17,8 +17,8 @@ from predictor.baselines.lstm import LSTM, LSTMConfig
 from predictor.baselines.mlp import MLP, MLPConfig
 from predictor.dgvae import DGVAE
 from predictor.dgvae.networks import PRESETS, DGVAEConfig
-from predictor.errors import UserError
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
 ModelName = Literal["dgvae", "dnri", "imma", "lstm", "mlp"]
 

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 Noise = torch.Generator | Sequence[np.random.Generator]
 """Source of the samples' noise: one generator for a whole batch, or one for each of its scenes."""

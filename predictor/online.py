@@ -14,12 +14,12 @@ import torch
 from jaxtyping import Bool, Int
 from torch.nn import functional
 
-from predictor.errors import ProtocolError
 from predictor.forecaster import Belief, Forecaster, Memory
 from predictor.graph import NOBODY
 from predictor.noise import Noise
-from predictor.runtime import resolve_device
 from predictor.scene import PADDING_ID, Forecast, SceneBatch
+from predictor.support.errors import ProtocolError
+from predictor.support.runtime import resolve_device
 
 _process = os.getpid()
 

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from predictor.errors import UserError
 from predictor.graph import to_dense
+from predictor.support.errors import UserError
 
 KINEMATIC_FEATURES = ("x_m", "y_m", "vx_mps", "vy_mps")
 KINEMATIC_FEATURES_3D = ("x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps")

@@ -19,18 +19,18 @@ import matplotlib
 from matplotlib import pyplot as plt
 from rich.progress import Progress
 
-from predictor.command_line import Renamed, parse
-from predictor.config_checks import check_at_least, check_choices
 from predictor.data.store import read_info_of
-from predictor.errors import UserError, run_entry_point
 from predictor.evaluation.disentanglement import sklearn
 from predictor.evaluation.measure_row import measure_row
 from predictor.evaluation.paper_tables import BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, TABLES, Budget, Row, Sizes
-from predictor.files import write_json, write_text
-from predictor.provenance import provenance
 from predictor.reports.plots import plot_rows_by_step
 from predictor.reports.tables import latex_table, markdown_report
-from predictor.runtime import resolve_device, tune
+from predictor.support.command_line import Renamed, parse
+from predictor.support.config_checks import check_at_least, check_choices
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import write_json, write_text
+from predictor.support.provenance import provenance
+from predictor.support.runtime import resolve_device, tune
 from predictor.train import train
 from predictor.training.config import TrainConfig, TrainPrecision, check_precision
 

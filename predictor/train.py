@@ -14,11 +14,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch.utils.tensorboard import SummaryWriter
 
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
-from predictor.command_line import parse
-from predictor.errors import UserError, run_entry_point
-from predictor.files import write_json
-from predictor.provenance import provenance
-from predictor.runtime import tune
+from predictor.support.command_line import parse
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import write_json
+from predictor.support.provenance import provenance
+from predictor.support.runtime import tune
 from predictor.training.config import TrainConfig
 from predictor.training.trainer import LOG_EVERY, Trainer, load_data
 

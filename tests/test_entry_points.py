@@ -20,10 +20,10 @@ from envs.registry import make_env, make_multiagent_env
 from envs.sb3.forecast import VecForecast
 from envs.vector import VectorForecast
 from envs.wrappers import ForecastObservation, SceneObservation
-from predictor.command_line import parse, renamed_options
-from predictor.config_checks import check_choices
 from predictor.data.store import StoreInfo, write_store
-from predictor.errors import UserError, run_entry_point
+from predictor.support.command_line import parse, renamed_options
+from predictor.support.config_checks import check_choices
+from predictor.support.errors import UserError, run_entry_point
 from tests.predictor.helpers import circling_episode, spec
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -221,7 +221,7 @@ def test_every_command_is_here():
     sources = {name: (ROOT / name).read_text() for name in listed.stdout.split() if not name.startswith("tests/")}
     reading = {name for name, text in sources.items() if re.search(r"\bparse\(\w+, __doc__\)", text)}
     assert reading == {f"{command.replace('.', '/')}.py" for command in REFUSED}
-    assert [name for name, text in sources.items() if "tyro.cli(" in text] == ["predictor/command_line.py"]
+    assert [name for name, text in sources.items() if "tyro.cli(" in text] == ["predictor/support/command_line.py"]
 
 
 @pytest.mark.parametrize(

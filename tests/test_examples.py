@@ -19,9 +19,9 @@ from envs.evaluate import EvaluateConfig
 from envs.readers import reader_for
 from envs.readers.entities import EntityRowsReader
 from envs.wrappers import ForecastObservation, SceneObservation
-from predictor.command_line import parse
 from predictor.data.store import StoreInfo, write_store
 from predictor.scene import SceneSpec
+from predictor.support.command_line import parse
 from predictor.train import train
 from predictor.training.config import TrainConfig
 from train_policy import TrainPolicyConfig

@@ -25,7 +25,7 @@ from agents.runs import load_model
 from agents.task import Backend
 from agents.training import SaveCheckpoint
 from envs.sb3.policy_file import NOTE_ENTRY, read_note, read_policy_note
-from predictor.errors import run_entry_point
+from predictor.support.errors import run_entry_point
 from tests.agents.helpers import TOY
 
 # SB3 silences this warning at import, pytest makes it an error again.

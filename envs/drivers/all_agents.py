@@ -17,7 +17,7 @@ from envs.drivers.sampled_actions import uniform_action, varied_actions
 from envs.readers import multiagent_env_id
 from envs.readers.mpe import mpe_scenario
 from envs.readers.pursuit import is_pursuit_env
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 Driver = Callable[[Mapping[str, Any]], dict[str, Any]]
 """From the observations of a step, of all agents or of some, to the actions of those that live."""

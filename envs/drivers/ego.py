@@ -8,7 +8,7 @@ from highway_env.vehicle.controller import ControlledVehicle
 
 from envs.drivers.sampled_actions import uniform_action, varied_actions
 from envs.drivers.trained import EgoDriver, kept_policy
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 WHO = "random egos"
 EGO_DRIVER_NAMES = ("random", "idle", "varied", "keep-lane")

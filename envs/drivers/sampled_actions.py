@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 
 def uniform_action(space: gym.Space, rng: np.random.Generator, who: str) -> Any:

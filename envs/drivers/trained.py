@@ -16,8 +16,8 @@ import numpy as np
 
 from envs.drivers.all_agents import Driver, make_driver
 from envs.sb3.padded_spaces import PaddedObservation, learners_named, own_action, roles_of
-from predictor.errors import UserError
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm

@@ -14,8 +14,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from predictor.errors import UserError
 from predictor.scene import PADDING_ID, Scene, SceneBatch, SceneSpec, perceived_agents
+from predictor.support.errors import UserError
 
 
 @runtime_checkable

@@ -14,8 +14,8 @@ from jaxtyping import Float, Int
 
 from envs.readers.base import Reader
 from envs.readers.identity import IdentityTracker
-from predictor.errors import ProtocolError, UserError
 from predictor.scene import Scene, SceneSpec
+from predictor.support.errors import ProtocolError, UserError
 
 _KINEMATIC = (("x", "y", "vx", "vy"), ("x", "y", "z", "vx", "vy", "vz"))
 _HEADINGS = ("heading", "cos_h", "sin_h")

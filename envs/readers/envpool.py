@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float, Int
 from envs.readers.base import Reader, perceive_batch
 from envs.readers.identity import best_pairs
 from envs.simulators.envpool import HIGHWAY_ENV_OF
-from predictor.errors import UserError
 from predictor.scene import PADDING_ID, AxisFrame, Scene, SceneBatch, SceneSpec
+from predictor.support.errors import UserError
 
 GATE_M = 12.0
 """A vehicle is not found again beyond this cost [m]; docs/envpool.md has what the motion within a step costs."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from envs.readers.base import Reader, perceive, require_scene
-from predictor.errors import UserError
 from predictor.scene import Scene, SceneSpec
+from predictor.support.errors import UserError
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from highway_env.vehicle.kinematics import Vehicle
 
 from envs.readers.base import Reader
 from envs.readers.identity import IdentityDict
-from predictor.errors import ProtocolError, UserError
 from predictor.scene import KINEMATIC_FEATURES, AxisFrame, Scene, SceneSpec
+from predictor.support.errors import ProtocolError, UserError
 
 # Straight roads without end: x is relative to the ego, y (the lane) is the map. All other ids have a fixed map.
 _UNBOUNDED_X: tuple[AxisFrame, AxisFrame] = ("ego", "world")

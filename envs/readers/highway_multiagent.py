@@ -11,8 +11,8 @@ from pettingzoo import ParallelEnv
 from envs.readers.base import MultiagentScene, pad_multiagent_scene
 from envs.readers.highway import HighwayReader
 from envs.simulators.highway_multiagent import HighwayParallelEnv
-from predictor.errors import UserError
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
 
 class HighwayMultiagentReader:

@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from predictor.errors import UserError
 from predictor.scene import PADDING_ID
+from predictor.support.errors import UserError
 
 _CHANGE_WEIGHT = 0.1
 

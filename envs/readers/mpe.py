@@ -13,8 +13,8 @@ import numpy as np
 
 from envs.readers.base import MultiagentScene, pad_multiagent_scene
 from envs.readers.identity import IdentityDict
-from predictor.errors import ProtocolError, UserError
 from predictor.scene import KINEMATIC_FEATURES, Scene, SceneSpec
+from predictor.support.errors import ProtocolError, UserError
 
 MPE_IDS = (
     "simple_v3",

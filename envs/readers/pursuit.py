@@ -13,8 +13,8 @@ from jaxtyping import Float
 from envs.readers.base import MultiagentScene, pad_multiagent_scene
 from envs.readers.identity import IdentityDict
 from envs.readers.mpe import agents_in_sight
-from predictor.errors import UserError
 from predictor.scene import KINEMATIC_FEATURES, Scene, SceneSpec
+from predictor.support.errors import UserError
 
 PURSUIT_FEATURES = (*KINEMATIC_FEATURES, "evader")
 """Motion in cells and cells per step, and 1 for an evader, 0 for a pursuer."""

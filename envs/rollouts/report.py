@@ -13,8 +13,8 @@ from rich.table import Table
 from envs.rollouts.episode import MODEL, NEIGHBOURS, STRAIGHT, Case
 from predictor.evaluation.accuracy import Accuracy
 from predictor.evaluation.graph_accuracy import GraphAccuracy
-from predictor.markdown import table
 from predictor.reports.tables import markdown_table
+from predictor.support.markdown import table
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,8 @@ from envs.registry import (
 from envs.seeding import driver_rng
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import CONSTANT_VELOCITY
-from predictor.errors import UserError
 from predictor.scene import Scene, SceneSpec
+from predictor.support.errors import UserError
 
 
 @runtime_checkable

@@ -27,7 +27,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 from envs.parallel import batch_forwards
 from envs.sb3.padded_spaces import PaddedObservation, own_action, roles_of, shared_action
 from envs.seeding import driver_rng
-from predictor.errors import ProtocolError, UserError
+from predictor.support.errors import ProtocolError, UserError
 
 Partner = Callable[[ParallelEnv, dict[str, Any], np.random.Generator], Mapping[str, Any]]
 """Acts for the agents that do not learn: the env, their observations, a generator → an action for each of them."""

@@ -12,8 +12,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 from envs.observation import batch_entries, scene_spaces
 from envs.readers.envpool import PoolReader, native_spec
 from envs.simulators.envpool import ENV_IDS, MAX_SEED, info_of, is_terminated, make_pool, meta_actions_of
-from predictor.errors import ProtocolError, UserError
 from predictor.scene import SceneSpec
+from predictor.support.errors import ProtocolError, UserError
 
 
 class EnvPoolVecEnv(VecEnv):

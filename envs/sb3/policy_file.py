@@ -21,8 +21,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from predictor.checkpoint import CONSTANT_VELOCITY, WEIGHTS, resolve
-from predictor.errors import UserError
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
 NOTE_ENTRY = "note.json"
 _POLICY_KEY = "policy"

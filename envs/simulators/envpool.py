@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from predictor.errors import ProtocolError, UserError
+from predictor.support.errors import ProtocolError, UserError
 
 HIGHWAY_ENV_OF: dict[str, str] = {
     "Highway-v0": "highway-v0",

@@ -21,7 +21,7 @@ from highway_env.envs.intersection_env import MultiAgentIntersectionEnv
 from highway_env.vehicle.kinematics import Vehicle
 from pettingzoo import ParallelEnv
 
-from predictor.errors import ProtocolError, UserError
+from predictor.support.errors import ProtocolError, UserError
 
 INTERSECTION = "intersection-multi-agent-v2"
 """Its drivers notice who drives on connected lanes, as on intersection-v2."""

@@ -19,7 +19,7 @@ from highway_env.envs.roundabout_env import ConnectedLaneRoundaboutGenericEnv
 from highway_env.vehicle.behavior import AggressiveVehicle, DefensiveVehicle, IDMVehicle, LinearVehicle
 from highway_env.vehicle.controller import ControlledVehicle
 
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 DriverKind = Literal["idm", "aggressive", "defensive"]
 DRIVER_KINDS: tuple[DriverKind, ...] = ("idm", "aggressive", "defensive")

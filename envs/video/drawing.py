@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from predictor.files import new_file
+from predictor.support.files import new_file
 
 Color = tuple[int, int, int]
 Polyline = Float[np.ndarray, "_ 2"]

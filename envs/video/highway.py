@@ -28,7 +28,7 @@ from envs.video.drawing import (
     write_video,
 )
 from envs.wrappers import ForecastObservation
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 ENLARGE = 2.0
 """Size of the picture relative to highway-env's."""

@@ -35,8 +35,8 @@ from envs.video.drawing import (
     write_picture,
     write_video,
 )
-from predictor.errors import UserError
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
 FPS = 20
 """Pictures per second."""

@@ -13,12 +13,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from predictor.config_checks import check_at_least, check_choices
 from predictor.forecaster import Belief, Memory, WindowOutput
 from predictor.graph import pair_mask
 from predictor.layers.state_codec import Residual, StateCodec
 from predictor.noise import Noise
 from predictor.scene import SceneSpec
+from predictor.support.config_checks import check_at_least, check_choices
 
 Tensors = tuple[Tensor, ...]
 GraphRule = Callable[[Tensor], Tensor]

@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory, edgeless_belief
 from predictor.noise import Noise
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
 
 class ConstantVelocity:

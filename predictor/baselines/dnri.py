@@ -20,12 +20,12 @@ from torch import Tensor, nn
 from predictor.baselines.base import Encoded, GraphRule, Internal, Tensors, UnrolledForecaster, check_sizes, mean_weight
 from predictor.baselines.nri_blocks import FrameEncoder, HiddenDecoder, PairLSTM, elu_head
 from predictor.dgvae.networks import concrete_sample, no_edge_where_absent
-from predictor.errors import UserError
 from predictor.forecaster import Belief, WindowOutput
 from predictor.graph import pair_mask
 from predictor.layers.state_codec import Residual
 from predictor.noise import Noise, PairNoise, noise_of_pairs
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,10 @@ from torch import Tensor, nn
 
 from predictor.baselines.base import Encoded, Tensors, UnrolledForecaster, check_sizes
 from predictor.baselines.nri_blocks import FrameEncoder, HiddenDecoder, PairLSTM
-from predictor.errors import UserError
 from predictor.graph import pair_mask
 from predictor.layers.state_codec import Residual
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from predictor.data.springs import Physics, simulate
-from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory
 from predictor.graph import pair_mask
 from predictor.noise import Noise
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
 LEAST_CONSTANT = 0.25
 """A pair whose estimate is below half of the smallest constant of the paper (0.5) has no spring [N/m]."""

@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from predictor.baselines.base import Tensors, UnrolledForecaster, check_sizes
-from predictor.errors import UserError
 from predictor.layers.state_codec import Residual
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ from torch import Tensor, nn
 
 from predictor.data.store import Episode, read_store
 from predictor.data.windows import visible
-from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory, edgeless_belief
 from predictor.noise import Noise
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
 K = 5
 """Neighbours that a forecast averages."""

@@ -11,11 +11,11 @@ from typing import Annotated
 
 import numpy as np
 
-from predictor.command_line import Renamed, parse
-from predictor.config_checks import check_at_least
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
-from predictor.errors import UserError, run_entry_point
-from predictor.provenance import provenance
+from predictor.support.command_line import Renamed, parse
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.provenance import provenance
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ import numpy as np
 
 from predictor.data.loading import LoaderConfig, Split, checksum
 from predictor.data.store import Episode, StoreInfo, write_store
-from predictor.errors import UserError
-from predictor.files import new_file
-from predictor.markdown import table
-from predictor.provenance import provenance
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
+from predictor.support.files import new_file
+from predictor.support.markdown import table
+from predictor.support.provenance import provenance
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from predictor.data.window_tensors import cast, cut, join
 from predictor.data.windows import WindowBatch, Windows, window_batch
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 _CHUNK = 1 << 22
 """Entries looked at in one go when the widest window is searched."""

@@ -18,15 +18,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from predictor.command_line import parse
-from predictor.config_checks import check_at_least, check_positive
 from predictor.data.dataset_card import DatasetNotes, most_present, save_dataset, summary
 from predictor.data.levelx_files import CLASS_FEATURES, Features, Layout, layout_of, open_recording, read_tracks
 from predictor.data.loading import NO_LIMIT_M, LoaderConfig, find_files, in_split, progressed, steps_per_frame
 from predictor.data.store import Episode
 from predictor.data.tracks import cut_episodes
-from predictor.errors import UserError, run_entry_point
 from predictor.scene import KINEMATIC_FEATURES, SceneSpec
+from predictor.support.command_line import parse
+from predictor.support.config_checks import check_at_least, check_positive
+from predictor.support.errors import UserError, run_entry_point
 
 SPLIT_SEED = 360
 """Gives shares near 80/10/10 of the recordings of all four datasets, and different places in inD."""

@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 
 from predictor.data.loading import bad_line, finite, read_lines, whole
 from predictor.data.tracks import TrackRows
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 Layout = Literal["centre", "corner"]
 """inD, rounD, exiD; highD."""

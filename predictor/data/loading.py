@@ -13,8 +13,8 @@ from typing import Literal, TypeVar
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from predictor.config_checks import check_choices
-from predictor.errors import UserError
+from predictor.support.config_checks import check_choices
+from predictor.support.errors import UserError
 
 Split = Literal["train", "val", "test", "all"]
 SPLIT_SHARES = {"test": 0.1, "val": 0.1}

@@ -16,14 +16,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from predictor.command_line import parse
-from predictor.config_checks import check_at_least
 from predictor.data.dataset_card import DatasetNotes, save_dataset, summary
 from predictor.data.loading import NO_LIMIT_M, LoaderConfig, find_files, in_split, progressed
 from predictor.data.mocap_files import Skeleton, joint_positions, read_motion, read_skeleton
 from predictor.data.store import Episode
-from predictor.errors import UserError, run_entry_point
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
+from predictor.support.command_line import parse
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import UserError, run_entry_point
 
 FRAMES_PER_S = 120.0
 """Of the database."""

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from predictor.data.loading import bad_line, finite, read_lines, whole
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 METRES_PER_INCH = 0.0254
 _ROOT_CHANNELS = ("TX", "TY", "TZ", "RX", "RY", "RZ")

@@ -24,8 +24,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from predictor.command_line import Renamed, parse
-from predictor.config_checks import check_at_least
 from predictor.data.dataset_card import DatasetNotes, save_dataset, summary
 from predictor.data.loading import (
     NO_LIMIT_M,
@@ -39,8 +37,10 @@ from predictor.data.loading import (
     whole,
 )
 from predictor.data.store import Episode
-from predictor.errors import UserError, run_entry_point
 from predictor.scene import KINEMATIC_FEATURES, SceneSpec
+from predictor.support.command_line import Renamed, parse
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import UserError, run_entry_point
 
 METRES_PER_FOOT = 0.3048
 

@@ -18,8 +18,6 @@ from pathlib import Path
 
 import numpy as np
 
-from predictor.command_line import parse
-from predictor.config_checks import check_at_least
 from predictor.data.dataset_card import DatasetNotes, most_present, save_dataset, summary
 from predictor.data.loading import (
     NO_LIMIT_M,
@@ -35,8 +33,10 @@ from predictor.data.loading import (
 )
 from predictor.data.store import Episode
 from predictor.data.tracks import TrackRows, cut_episodes, with_velocities
-from predictor.errors import UserError, run_entry_point
 from predictor.scene import KINEMATIC_FEATURES, SceneSpec
+from predictor.support.command_line import parse
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import UserError, run_entry_point
 
 FRAMES_PER_S = 30.0
 """Of the videos."""

@@ -17,12 +17,12 @@ from jaxtyping import Bool, Float
 from rich.progress import Progress
 from torch import Tensor
 
-from predictor.command_line import parse
-from predictor.config_checks import check_at_least, check_choices, check_positive
 from predictor.data.store import Episode, StoreInfo, write_store
-from predictor.errors import UserError, run_entry_point
-from predictor.provenance import provenance
 from predictor.scene import SceneSpec
+from predictor.support.command_line import parse
+from predictor.support.config_checks import check_at_least, check_choices, check_positive
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.provenance import provenance
 
 DT_S = 1 / 6
 FRAMES = 50

@@ -15,9 +15,9 @@ import numpy as np
 import zarr
 from jaxtyping import Bool, Float, Int
 
-from predictor.errors import UserError
-from predictor.files import new_folder
 from predictor.scene import PADDING_ID, Scene, SceneSpec
+from predictor.support.errors import UserError
+from predictor.support.files import new_folder
 
 FORMAT = "dgvae-rl episodes"
 VERSION = 1

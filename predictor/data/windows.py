@@ -15,8 +15,8 @@ from torch import Tensor
 
 from predictor.data.store import Episode
 from predictor.data.window_tensors import UNKNOWN_TYPE, Casts, Cut, cast, cut, flatten
-from predictor.errors import UserError
 from predictor.scene import SceneSpec, perceived_agents
+from predictor.support.errors import UserError
 
 
 @dataclass(frozen=True)

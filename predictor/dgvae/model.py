@@ -32,13 +32,13 @@ from predictor.dgvae.networks import (
 from predictor.dgvae.packing import Packed, Padded
 from predictor.dgvae.pair_matching import running_mean, running_mean_step, window_mean
 from predictor.dgvae.single_step import Encoding, Internal, Layers, Modules, Past, Stepper, differentiable, unpacked
-from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory, WindowOutput
 from predictor.graph import NOBODY, among_nearest, nearest, off_diagonal, others, pair_mask, with_diagonal
 from predictor.layers.rnn import masked_gru
 from predictor.layers.state_codec import StateCodec
 from predictor.noise import Noise, PairNoise, noise_of_pairs
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
 __all__ = ["DGVAE", "PRESETS", "DGVAEConfig", "Decoder", "Edges", "Encoder", "WindowOutput", "concrete_sample"]
 

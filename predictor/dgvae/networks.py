@@ -14,13 +14,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-from predictor.config_checks import check_at_least, check_choices
 from predictor.dgvae.innovation import Innovation
-from predictor.errors import UserError
 from predictor.layers.pairs import PairLinear, folded, sum_over_senders
 from predictor.layers.rnn import Correction, masked_lstm
 from predictor.layers.state_codec import Residual
 from predictor.noise import PairNoise
+from predictor.support.config_checks import check_at_least, check_choices
+from predictor.support.errors import UserError
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 MIN_R2 = 0.01
 """Held-out R² from which on `dci` believes that a factor can be read."""

@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from predictor.errors import UserError
-from predictor.files import write_json
+from predictor.support.errors import UserError
+from predictor.support.files import write_json
 
 FILE_NAME = "in_env.json"
 

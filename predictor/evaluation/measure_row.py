@@ -14,13 +14,13 @@ from predictor.baselines.least_squares import SpringLeastSquares
 from predictor.checkpoint import load_checkpoint
 from predictor.data.store import EpisodeStore, read_store
 from predictor.data.windows import Windows
-from predictor.errors import UserError
 from predictor.evaluation.accuracy import Tally, fitted_std_m
 from predictor.evaluation.disentanglement import direct_r2, linear_r2
 from predictor.evaluation.graph_accuracy import GraphTally, edge_entropy
 from predictor.evaluation.outcomes import Outcome, run_windows
 from predictor.evaluation.paper_tables import BURN_IN_STEPS, HORIZON_STEPS, Row, Sizes, Table
 from predictor.graph import pair_mask
+from predictor.support.errors import UserError
 
 PAIR_BUDGET = 60_000
 """Pairs × samples per batch: what keeps memory small for scenes of any size."""

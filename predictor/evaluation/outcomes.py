@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from predictor.data.windows import WindowBatch, Windows
-from predictor.errors import UserError
 from predictor.forecaster import Belief, Forecaster
+from predictor.support.errors import UserError
 
 
 @dataclass(frozen=True)

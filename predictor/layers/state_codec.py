@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from predictor.errors import UserError
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
 Residual = Literal["state", "constant_velocity", "trapezoid"]
 

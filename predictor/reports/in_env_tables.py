@@ -6,8 +6,8 @@ A table of a page stands between `<!-- table: NAME -->` and `<!-- end -->`; what
 import re
 from collections.abc import Callable, Mapping, Sequence
 
-from predictor.errors import UserError
 from predictor.evaluation.in_env_record import Interval, Measurement
+from predictor.support.errors import UserError
 
 MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 """A table with its markers."""

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from predictor import markdown
 from predictor.evaluation.accuracy import Accuracy
 from predictor.evaluation.displacement import COVERAGE_SHARE
+from predictor.support import markdown
 
 SCALARS = (
     "minADE [m]",

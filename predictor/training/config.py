@@ -6,10 +6,10 @@ from typing import Literal
 
 import torch
 
-from predictor.config_checks import check_at_least, check_choices, check_positive
-from predictor.errors import UserError
 from predictor.models import ModelName
-from predictor.runtime import resolve_device
+from predictor.support.config_checks import check_at_least, check_choices, check_positive
+from predictor.support.errors import UserError
+from predictor.support.runtime import resolve_device
 
 Likelihood = Literal["gaussian", "laplace"]
 TrainPrecision = Literal["float32", "tf32", "bfloat16"]

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from predictor.data.windows import WindowBatch
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 Terms = Mapping[str, Tensor]
 """Named results of a step, scalars on its device."""

@@ -8,13 +8,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from predictor.config_checks import check_choice
 from predictor.data.windows import WindowBatch
-from predictor.errors import UserError
 from predictor.evaluation.graph_accuracy import edge_entropy
 from predictor.forecaster import TrainableForecaster, WindowOutput
 from predictor.graph import pair_mask
 from predictor.layers.pairs import masked_mean
+from predictor.support.config_checks import check_choice
+from predictor.support.errors import UserError
 from predictor.training.config import Likelihood, TrainConfig
 
 

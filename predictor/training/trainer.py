@@ -20,15 +20,15 @@ from torch import Tensor
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.data.store import Episode, EpisodeStore, read_store
 from predictor.data.windows import WindowBatch, Windows, split_episodes
-from predictor.errors import UserError
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import run_windows
-from predictor.files import new_file
 from predictor.forecaster import WindowOutput
 from predictor.layers.state_codec import Residual, StateCodec, drift
 from predictor.models import build, configure
-from predictor.runtime import precision
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
+from predictor.support.files import new_file
+from predictor.support.runtime import precision
 from predictor.training.batches import Plan, open_feed, plan
 from predictor.training.config import TrainConfig
 from predictor.training.cuda_graph import (

@@ -15,7 +15,7 @@ from agents.evaluate import (
 )
 from agents.task import EVALUATION_SEED, Task
 from agents.vec_envs import EpisodeResult
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 from tests.agents.helpers import TOY, policy_for
 
 EPISODES = [

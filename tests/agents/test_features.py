@@ -10,8 +10,8 @@ from agents.features import AttentionConfig, ForecastAttention
 from agents.task import Task
 from agents.training import TrainingPlan, make_model
 from agents.vec_envs import make_venv
-from predictor.errors import UserError
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
 BATCH, AGENTS, HORIZON, FEATURES = 3, 5, 4, 6
 SHAPES = {

@@ -10,7 +10,7 @@ from agents.vec_envs import DrivenEnv, EpisodeResult, MakeCopy, drive, make_mult
 from envs.drivers.all_agents import make_driver
 from envs.registry import make_multiagent_env
 from envs.seeding import driver_rng
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 from tests.agents.helpers import LIVES, TOY, policy_for
 
 TAG, SPREAD = "simple_tag_v3", "simple_spread_v3"

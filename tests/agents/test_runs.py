@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from agents.runs import load_model, open_run, read_config, save_model
 from envs.sb3.policy_file import read_note
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 CONFIG = {"env_id": "toy-v0", "steps": 100, "device": "cpu"}
 MADE = {"command": "python toy.py"}
@@ -127,7 +127,7 @@ def test_failed_save_leaves_the_old_file(tmp_path: Path, venv: VecEnv, monkeypat
     def die(*args: Any) -> None:
         raise OSError("killed before the rename")
 
-    monkeypatch.setattr("predictor.files.os.replace", die)
+    monkeypatch.setattr("predictor.support.files.os.replace", die)
     with pytest.raises(OSError, match="killed"):
         save_model(make_ppo(venv), path, {"steps": 2})
     assert path.read_bytes() == before

@@ -2,7 +2,7 @@ import gymnasium as gym
 import pytest
 
 from agents.task import Task
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 from tests.agents.helpers import TOY
 
 TAG = "simple_tag_v3"

@@ -19,7 +19,7 @@ from agents.task import EVALUATION_SEED, SELECTION_SEED, Task
 from agents.training import SaveCheckpoint, SelectBest, TrainingPlan, make_model, significantly_worse
 from agents.vec_envs import EpisodeResult, SeededEpisodes, make_venv
 from envs.sb3.policy_file import read_note
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 CONSTANT_VELOCITY = Task("highway-fast-v0", "constant-velocity")
 

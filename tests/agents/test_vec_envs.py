@@ -8,7 +8,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 from agents.arena import run_episodes
 from agents.task import Task
 from agents.vec_envs import EpisodeResult, SeededEpisodes, make_venv
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 
 class Dice(gym.Env[np.ndarray, np.int64]):

@@ -7,7 +7,7 @@ import pytest
 from benchmarks.compare import OTHER_PROCESSOR, better_of, compare, read_baseline
 from benchmarks.results import Compared, Line, skipped
 from benchmarks.settings import Settings
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 from tests.benchmarks.helpers import HERE, QUICK, baseline, line, write
 
 

@@ -12,7 +12,7 @@ import torch
 
 from benchmarks import gpu_springs as script
 from benchmarks.gpu_springs import Counter, GpuSpringsConfig, Kernel, on_card
-from predictor.errors import UserError, run_entry_point
+from predictor.support.errors import UserError, run_entry_point
 from predictor.training.trainer import Trainer
 
 CARD = GpuSpringsConfig(

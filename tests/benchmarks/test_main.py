@@ -10,8 +10,8 @@ from benchmarks import __main__ as entry
 from benchmarks import forecast, suite
 from benchmarks.results import Line
 from benchmarks.timing import Meter
-from predictor.errors import run_entry_point
-from predictor.runtime import processor
+from predictor.support.errors import run_entry_point
+from predictor.support.runtime import processor
 from tests.benchmarks.helpers import line, write
 
 

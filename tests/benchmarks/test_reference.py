@@ -8,7 +8,7 @@ import pytest
 from benchmarks import reference
 from benchmarks.reference import Prediction, Training, load
 from benchmarks.settings import Settings
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 STAND_IN = """
 import torch

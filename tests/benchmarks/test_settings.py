@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.optional_packages import missing
 from benchmarks.settings import SECTIONS, Settings
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 
 @pytest.mark.parametrize(

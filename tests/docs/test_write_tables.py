@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from docs import write_tables
-from predictor.errors import UserError
 from predictor.evaluation.in_env_record import read_record
 from predictor.reports.in_env_tables import MARKED
+from predictor.support.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDS = {

@@ -21,9 +21,9 @@ from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE
 from predictor.dgvae.networks import DGVAEConfig
-from predictor.errors import run_entry_point
 from predictor.forecaster import Forecaster
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
+from predictor.support.errors import run_entry_point
 
 PERCEPTION_M = 60.0
 MAX_AGENTS = 6

@@ -14,7 +14,7 @@ from envs.parallel import ForecastParallelEnv, batch_forwards
 from envs.sb3 import agents_as_rows
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.errors import ProtocolError
+from predictor.support.errors import ProtocolError
 from tests.envs.helpers import assert_same, tiny_model
 from tests.envs.test_parallel import WORLD, Life, Toy, ToyReader, act, wrap
 

@@ -14,7 +14,7 @@ from envs.readers.highway_labels import ATTRIBUTE_NAMES, LEADER
 from envs.registry import make_env, make_multiagent_env
 from predictor.data.store import Episode, read_store
 from predictor.data.windows import Windows
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 from tests.envs.helpers import run_command, save_forecast_policy
 
 ENV_ID = "two-way-v0"

@@ -22,9 +22,9 @@ from envs.rollouts.episode import MODEL, STRAIGHT, Episode
 from envs.rollouts.report import EnvAccuracy
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.data.store import StoreInfo, write_store
-from predictor.errors import UserError
 from predictor.evaluation.outcomes import Outcome
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 from tests.envs.evaluation import TAG, forget, save_tag, tag_spec
 from tests.envs.helpers import HIGHWAY_SPEC, HORIZON, SIZES, run_command, save_forecast_policy, tiny_model
 

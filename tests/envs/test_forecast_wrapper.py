@@ -20,8 +20,8 @@ from envs.readers import FunctionReader
 from envs.sb3.forecast import VecForecast
 from envs.vector import VectorForecast
 from envs.wrappers import ForecastObservation, SceneObservation
-from predictor.errors import ProtocolError, UserError
 from predictor.scene import Scene, SceneSpec
+from predictor.support.errors import ProtocolError, UserError
 from tests.envs.helpers import assert_same, tiny_model
 from tests.envs.test_parallel import WORLD, Toy, ToyReader
 

@@ -13,8 +13,8 @@ from envs.multiagent_observation import MultiagentStream, agent_entries, check_m
 from envs.observation import FORECAST_KEYS, ForecastConfig
 from envs.readers.base import MultiagentScene
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.errors import UserError
 from predictor.scene import KINEMATIC_FEATURES_3D, PADDING_ID, Forecast, Scene, SceneSpec
+from predictor.support.errors import UserError
 from tests.envs.helpers import HORIZON, TOLERANCE, assert_same, largest_difference, tiny_model
 
 WORLD = SceneSpec(dt_s=0.5, has_ego=False, perception_m=60.0, max_agents=6)

@@ -18,8 +18,8 @@ from envs.readers.base import MultiagentReader, Reader
 from envs.readers.mpe import MpeReader
 from envs.readers.pursuit import PursuitReader
 from envs.registry import MULTIAGENT_CHECKPOINTS, MULTIAGENT_IDS, checkpoint_for, is_multiagent_id, make_multiagent_env
-from predictor.errors import UserError
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
 HIGHWAY = [env_id for env_id in MULTIAGENT_IDS if env_id.startswith("intersection")]
 SIMULATED = [env_id for env_id in MULTIAGENT_IDS if env_id not in HIGHWAY]

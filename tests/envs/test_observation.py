@@ -31,8 +31,8 @@ from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.checkpoint import CheckpointInfo, load_forecaster, resolve, save_checkpoint, shipped
 from predictor.dgvae import DGVAE
 from predictor.dgvae.networks import DGVAEConfig
-from predictor.errors import UserError
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
+from predictor.support.errors import UserError
 from tests.envs.helpers import (
     HIGHWAY_SPEC,
     HORIZON,

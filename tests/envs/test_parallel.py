@@ -20,10 +20,10 @@ from envs.registry import ENVS, MULTIAGENT_IDS, EnvEntry, make_multiagent_env
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE
-from predictor.errors import ProtocolError, UserError
 from predictor.forecaster import Forecaster
 from predictor.online import OnlineForecaster
 from predictor.scene import Scene, SceneBatch, SceneSpec
+from predictor.support.errors import ProtocolError, UserError
 from tests.envs.helpers import HORIZON, SIZES, assert_same, largest_difference, save_tiny, tiny_model
 from tests.envs.test_multiagent_observation import view_by_loops
 

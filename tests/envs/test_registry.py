@@ -26,7 +26,7 @@ from envs.simulators.envpool import ENV_IDS as ENVPOOL_IDS
 from envs.simulators.envpool import HIGHWAY_ENV_OF
 from envs.wrappers import SceneObservation
 from predictor.checkpoint import resolve
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 
 @pytest.mark.parametrize("env_id", ["nonsense", "envpool/Nonsense-v0", "highway-v99", "no_such_module:Env-v0"])
@@ -43,7 +43,7 @@ import sys
 for name in {absent.split()!r}:
     sys.modules[name] = None  # importing it raises ImportError
 from envs.registry import make_env
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 try:
     make_env("envpool/HighwayFast-v0")
 except UserError as error:

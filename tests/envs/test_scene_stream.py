@@ -9,8 +9,8 @@ import pytest
 
 from envs.observation import ForecastStream
 from envs.scene_stream import ForecastConfig
-from predictor.errors import UserError
 from predictor.scene import Forecast, SceneBatch
+from predictor.support.errors import UserError
 from tests.envs.helpers import HIGHWAY_SPEC, assert_same, random_scenes, tiny_model
 
 ENVS, SAMPLES = 3, 4

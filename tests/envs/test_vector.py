@@ -20,8 +20,8 @@ from envs.sb3.forecast import VecForecast
 from envs.vector import VectorForecast
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import load_checkpoint
-from predictor.errors import UserError
 from predictor.scene import Scene
+from predictor.support.errors import UserError
 from tests.envs.helpers import (
     HIGHWAY_SPEC,
     MAX_AGENTS,

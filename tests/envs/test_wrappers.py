@@ -13,8 +13,8 @@ from envs.observation import FORECAST_KEYS, SCENE_KEYS, ego_entries
 from envs.registry import CHECKPOINTS, checkpoint_for, make_env
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import load_checkpoint
-from predictor.errors import ProtocolError, UserError
 from predictor.scene import Scene, SceneBatch, SceneSpec
+from predictor.support.errors import ProtocolError, UserError
 from tests.envs.helpers import (
     HIGHWAY_SPEC,
     HORIZON,

@@ -6,8 +6,8 @@ import pytest
 
 from predictor.card import CardConfig, write_card
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
-from predictor.errors import UserError
 from predictor.evaluation.in_env_record import read_record
+from predictor.support.errors import UserError
 from tests.predictor.helpers import model, write_circles
 
 ROW = {

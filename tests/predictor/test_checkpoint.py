@@ -20,8 +20,8 @@ from predictor.checkpoint import (
     save_checkpoint,
 )
 from predictor.dgvae import DGVAE
-from predictor.errors import UserError
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 from tests.predictor.helpers import EVERY_MODEL, ROAD, any_model, model, random_presence, random_states, spec
 
 INFO = CheckpointInfo(

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from predictor.data.store import read_store
-from predictor.errors import ProtocolError, UserError
 from predictor.online import OnlineForecaster
+from predictor.support.errors import ProtocolError, UserError
 from predictor.training.config import TrainConfig
 from predictor.training.objective import nll
 from tests.predictor.helpers import batch, model, scene, write_circles

@@ -16,12 +16,12 @@ from predictor.baselines.mlp import MLP, MLPConfig
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.dgvae import DGVAE
-from predictor.errors import UserError, run_entry_point
 from predictor.evaluate import EvaluateConfig, evaluate
 from predictor.evaluation.accuracy import Accuracy
 from predictor.evaluation.standard_errors import Statistic
 from predictor.reports.tables import accuracy_table, markdown_table
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
+from predictor.support.errors import UserError, run_entry_point
 from tests.predictor.helpers import FAST_LIKE, spec, write_circles
 
 HEADING = "| forecaster | K | minADE [m] | minFDE [m] | joint ADE [m] | joint FDE [m] | RMSE [m] | missed | cover |"

@@ -20,7 +20,6 @@ from predictor.data.springs import Physics, SpringsConfig, make_episodes, spring
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.data.windows import Windows
 from predictor.dgvae import DGVAE
-from predictor.errors import UserError, run_entry_point
 from predictor.evaluation.edge_findings import labelled_rows, measure, watch
 from predictor.evaluation.edge_scores import (
     StillnessTally,
@@ -37,6 +36,7 @@ from predictor.forecaster import Belief, Memory
 from predictor.interpret import InterpretConfig, interpret
 from predictor.reports import edge_plots as pictures
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
+from predictor.support.errors import UserError, run_entry_point
 from tests.predictor.helpers import RICH, circling_episode, model, spec, write_circles
 
 ROWS = 600

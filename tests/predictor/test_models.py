@@ -10,9 +10,9 @@ import torch
 from predictor.baselines.lstm import LSTMConfig
 from predictor.baselines.mlp import MLPConfig
 from predictor.dgvae.networks import PRESETS, DGVAEConfig
-from predictor.errors import UserError
 from predictor.forecaster import TrainableForecaster
 from predictor.models import KINDS, ModelName, build, config_from_json, configure, name_of
+from predictor.support.errors import UserError
 from tests.predictor.helpers import EVERY_MODEL, spec
 
 every_model = pytest.mark.parametrize("kind", EVERY_MODEL)

@@ -3,8 +3,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from predictor.errors import UserError
 from predictor.noise import PairNoise, noise_of_pairs
+from predictor.support.errors import UserError
 
 PRESENT = torch.tensor([[[0, 1], [1, 0]], [[0, 0], [0, 0]], [[0, 1], [0, 0]]], dtype=torch.bool)
 DRAWS, STEPS, TYPES = 2, 3, 2

@@ -18,9 +18,9 @@ from torch import Tensor
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.dgvae import DGVAE
 from predictor.dgvae import model as dgvae
-from predictor.errors import ProtocolError
 from predictor.online import OnlineForecaster
 from predictor.scene import PADDING_ID, Forecast, Scene, SceneBatch
+from predictor.support.errors import ProtocolError
 from tests.predictor.helpers import ROAD, batch, model, random_states, scene, spec
 
 ROWS, AGENTS, EGO = 3, 4, 0

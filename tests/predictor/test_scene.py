@@ -10,7 +10,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from predictor.errors import UserError
 from predictor.graph import NOBODY
 from predictor.scene import (
     KINEMATIC_FEATURES,
@@ -22,6 +21,7 @@ from predictor.scene import (
     dense_edges,
     perceived_agents,
 )
+from predictor.support.errors import UserError
 from tests.predictor.helpers import batch, scene
 
 IN_SPACE: dict[str, Any] = {

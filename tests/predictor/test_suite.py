@@ -14,13 +14,13 @@ from predictor import suite
 from predictor.data.springs import SpringsConfig, make
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.data.windows import Windows
-from predictor.errors import UserError
 from predictor.evaluation import paper_tables as tables
 from predictor.evaluation.measure_row import protocol_indices
 from predictor.evaluation.paper_tables import NUM_SAMPLES, TABLES, Row
 from predictor.models import configure
 from predictor.reports.tables import latex_table, markdown_report
 from predictor.suite import SuiteConfig, row_config, row_folder, run_row, run_suite
+from predictor.support.errors import UserError
 from tests.predictor.helpers import spec
 
 

@@ -20,10 +20,10 @@ from predictor.checkpoint import load_checkpoint
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.data.windows import WindowBatch
 from predictor.dgvae.networks import PRESETS
-from predictor.errors import UserError, run_entry_point
 from predictor.evaluation.accuracy import summarise
 from predictor.evaluation.outcomes import run_windows
 from predictor.forecaster import WindowOutput
+from predictor.support.errors import UserError, run_entry_point
 from predictor.train import train
 from predictor.training.config import TrainConfig
 from predictor.training.objective import window_loss

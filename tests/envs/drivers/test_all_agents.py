@@ -12,7 +12,7 @@ from envs.drivers import all_agents as drivers
 from envs.drivers.all_agents import DRIVER_NAMES, Habits, idle_action, make_driver
 from envs.registry import MULTIAGENT_IDS, make_multiagent_env
 from envs.seeding import driver_rng
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 MPE = [env_id for env_id in MULTIAGENT_IDS if env_id.startswith(("simple", "collect"))]
 STAY, PLUS_X, MINUS_X, PLUS_Y = 0, 2, 1, 4

@@ -12,7 +12,7 @@ from envs.drivers.trained import env_for_driver, sees_forecasts
 from envs.registry import CHECKPOINTS, make_env
 from envs.sb3.policy_file import NOTE_ENTRY
 from envs.wrappers import ForecastObservation
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 from tests.envs.helpers import assert_same, save_forecast_policy
 
 TRACK_STEPS = 40

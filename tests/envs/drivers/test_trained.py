@@ -14,7 +14,7 @@ from envs.parallel import ForecastParallelEnv
 from envs.registry import make_multiagent_env
 from envs.rollouts.world import MultiagentWorld, open_world
 from envs.seeding import driver_rng
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 from tests.agents.helpers import policy_for
 
 SPREAD = "simple_spread_v3"

@@ -15,8 +15,8 @@ from envs.readers.function import FunctionReader
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.data.store import Episode
 from predictor.data.windows import visible
-from predictor.errors import UserError
 from predictor.scene import PADDING_ID, Scene, SceneBatch, SceneSpec
+from predictor.support.errors import UserError
 
 SPEC = SceneSpec(dt_s=0.5, max_agents=4, perception_m=50.0)
 GOOD: dict[str, Any] = {

@@ -12,8 +12,8 @@ from envs.readers.entities import EntityRowsReader
 from envs.readers.highway import HighwayReader
 from envs.registry import make_env
 from envs.wrappers import ForecastObservation, SceneObservation
-from predictor.errors import ProtocolError, UserError
 from predictor.scene import KINEMATIC_FEATURES, KINEMATIC_FEATURES_3D, Scene, SceneSpec
+from predictor.support.errors import ProtocolError, UserError
 from tests.envs.helpers import play, random_actions
 
 SPEC = SceneSpec(dt_s=0.5, max_agents=6)

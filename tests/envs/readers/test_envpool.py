@@ -25,8 +25,8 @@ from envs.readers.highway import HighwayReader
 from envs.readers.identity import IdentityTracker  # noqa: E402
 from envs.registry import make_env  # noqa: E402
 from envs.simulators.envpool import HIGHWAY_ENV_OF, ONE_START, EnvPoolEnv, make_pool  # noqa: E402
-from predictor.errors import ProtocolError, UserError  # noqa: E402
 from predictor.scene import Scene, SceneSpec  # noqa: E402
+from predictor.support.errors import ProtocolError, UserError  # noqa: E402
 
 DT_S = 0.5
 BUSY_TASKS = tuple(task_id for task_id in HIGHWAY_ENV_OF if not task_id.startswith("Racetrack"))

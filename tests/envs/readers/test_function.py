@@ -10,8 +10,8 @@ from envs.readers import reader_for, register_reader
 from envs.readers.base import Reader, build_reader
 from envs.readers.function import FunctionReader
 from envs.wrappers import ForecastObservation, SceneObservation
-from predictor.errors import ProtocolError, UserError
 from predictor.scene import PADDING_ID, Scene, SceneSpec
+from predictor.support.errors import ProtocolError, UserError
 from tests.envs.helpers import NamedReader, play
 
 SPEC = SceneSpec(dt_s=0.5, perception_m=10.0, max_agents=3)

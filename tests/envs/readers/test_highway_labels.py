@@ -30,8 +30,8 @@ from envs.seeding import driver_rng
 from envs.simulators.mixed_traffic import BASE_ID, DRIVER_KINDS, DriverMix, MixedDriver
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.data.windows import Windows
-from predictor.errors import ProtocolError
 from predictor.scene import PADDING_ID, Scene
+from predictor.support.errors import ProtocolError
 from tests.envs.helpers import light_env, random_actions, short_env
 
 Place = tuple[float, float]

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envs.readers.identity import IdentityTracker, assign, best_pairs
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 DT_S = 0.5
 

@@ -13,8 +13,8 @@ from pettingzoo.utils import BaseParallelWrapper
 
 from envs.readers.base import MultiagentReader, MultiagentScene
 from envs.readers.mpe import MPE_FEATURES, MpeReader, is_mpe_env, mpe_scenario
-from predictor.errors import ProtocolError, UserError
 from predictor.scene import PADDING_ID
+from predictor.support.errors import ProtocolError, UserError
 
 AGENTS = {
     "simple_v3": 1,

@@ -11,7 +11,7 @@ from pettingzoo.utils import BaseParallelWrapper
 
 from envs.readers.base import MultiagentReader, MultiagentScene
 from envs.readers.pursuit import PursuitReader, is_pursuit_env
-from predictor.errors import ProtocolError, UserError
+from predictor.support.errors import ProtocolError, UserError
 
 LEFT, RIGHT, UP, DOWN, STAY = range(5)
 STEPS = {LEFT: (-1, 0), RIGHT: (1, 0), UP: (0, 1), DOWN: (0, -1), STAY: (0, 0)}

@@ -11,8 +11,8 @@ from envs.readers import reader_for
 from envs.readers.highway import HighwayReader
 from envs.registry import CHECKPOINTS, make_env
 from envs.wrappers import SceneObservation
-from predictor.errors import ProtocolError, UserError
 from predictor.scene import PADDING_ID, Scene
+from predictor.support.errors import ProtocolError, UserError
 from tests.envs.helpers import light_env, random_actions, short_env
 
 FRAMES = {

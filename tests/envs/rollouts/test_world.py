@@ -7,8 +7,8 @@ import pytest
 from envs.readers.highway_labels import LEADER
 from envs.rollouts.world import EgoWorld, MultiagentWorld, World, default_drivers, open_world
 from envs.wrappers import ForecastObservation, SceneObservation
-from predictor.errors import UserError
 from predictor.scene import Scene
+from predictor.support.errors import UserError
 from tests.envs.evaluation import TAG
 from tests.envs.helpers import save_forecast_policy
 

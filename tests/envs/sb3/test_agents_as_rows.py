@@ -20,7 +20,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize
 
 from envs.sb3.agents_as_rows import AgentMonitor, ParallelVecEnv, random_actions
-from predictor.errors import ProtocolError, UserError
+from predictor.support.errors import ProtocolError, UserError
 
 SIZES = {"ant_0": 2, "ant_1": 2, "bee_0": 3}
 GAMMA, LAMBDA = 0.9, 0.8

@@ -25,7 +25,7 @@ from envs.sb3.policy_file import (
 )
 from envs.wrappers import ForecastObservation
 from predictor.checkpoint import CONSTANT_VELOCITY
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 from tests.envs.helpers import save_forecast_policy
 
 ENV_ID = "two-way-v0"

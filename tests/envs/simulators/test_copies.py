@@ -15,8 +15,8 @@ from envs.parallel import ForecastParallelEnv
 from envs.readers import EntityRowsReader, FunctionReader
 from envs.registry import make_env, make_multiagent_env
 from envs.wrappers import ForecastObservation, SceneObservation
-from predictor.errors import UserError
 from predictor.scene import Scene, SceneSpec
+from predictor.support.errors import UserError
 
 Observed = dict[str, Any]
 WAYS: dict[str, Callable[[Any], Any]] = {

@@ -27,7 +27,7 @@ from envs.simulators.envpool import (
 )
 from envs.simulators.envpool import is_terminated as _ends
 from envs.wrappers import ForecastObservation, SceneObservation  # noqa: E402
-from predictor.errors import ProtocolError, UserError  # noqa: E402
+from predictor.support.errors import ProtocolError, UserError  # noqa: E402
 from tests.envs.helpers import MAX_AGENTS, PERCEPTION_M, assert_same, play, random_actions  # noqa: E402
 
 ROOT = Path(__file__).parents[3]

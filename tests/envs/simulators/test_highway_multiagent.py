@@ -14,8 +14,8 @@ from envs.readers.base import MultiagentReader, MultiagentScene
 from envs.readers.highway_multiagent import HighwayMultiagentReader, most_vehicles
 from envs.registry import make_multiagent_env
 from envs.simulators.highway_multiagent import INTERSECTION, HighwayParallelEnv
-from predictor.errors import ProtocolError, UserError
 from predictor.scene import Scene
+from predictor.support.errors import ProtocolError, UserError
 
 SLOWER, IDLE = 0, 1
 

@@ -26,7 +26,7 @@ from envs.simulators.mixed_traffic import (
     Traits,
     register_scenarios,
 )
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 from tests.envs.helpers import random_actions
 
 HIGHWAY = "highway-mixed-v0"

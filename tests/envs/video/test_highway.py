@@ -13,7 +13,7 @@ from envs.registry import make_env
 from envs.video.drawing import AgentOverlay, OverlayStyle, View, dashes, draw_overlay
 from envs.video.highway import Recording, record_episode
 from envs.wrappers import ForecastObservation
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 STEPS = 4
 PLAIN = OverlayStyle(truth_color=(0, 255, 0), forecast_color=(255, 0, 0), edge_color=(0, 0, 255), edge_alpha=255)

@@ -19,8 +19,8 @@ from envs.readers.base import MultiagentScene, pad_multiagent_scene
 from envs.simulators.highway_multiagent import HighwayParallelEnv
 from envs.video.drawing import Arena
 from envs.video.multiagent import LANDMARK, MultiagentRecording, MultiagentStyle, record_multiagent_episode
-from predictor.errors import UserError
 from predictor.scene import KINEMATIC_FEATURES, Forecast, Scene, SceneSpec
+from predictor.support.errors import UserError
 
 DT_S = 0.5
 HORIZON = 3

@@ -10,10 +10,10 @@ from jaxtyping import TypeCheckError
 from torch import Tensor
 from torch.nn import functional
 
-from predictor.errors import UserError
 from predictor.forecaster import Memory, TrainableForecaster, WindowOutput
 from predictor.graph import pair_mask
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
+from predictor.support.errors import UserError
 from predictor.training.objective import kl_categorical
 from tests.predictor.baselines.helpers import (
     AGENTS,

@@ -3,9 +3,9 @@ import pytest
 import torch
 
 from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
-from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
+from predictor.support.errors import UserError
 from tests.predictor.helpers import random_presence, random_states, spec
 
 

@@ -12,9 +12,9 @@ from torch.nn import functional
 
 from predictor.baselines import dnri
 from predictor.baselines.dnri import DNRI, DNRIConfig
-from predictor.errors import UserError
 from predictor.graph import pair_mask
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 from predictor.training.objective import kl_categorical
 from tests.predictor.baselines import loops
 from tests.predictor.baselines.helpers import (

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from torch import Tensor
 
 from predictor.baselines.imma import IMMA, masked_attention
-from predictor.errors import UserError
 from predictor.graph import pair_mask
+from predictor.support.errors import UserError
 from tests.predictor.baselines import loops
 from tests.predictor.baselines.helpers import (
     AGENTS,

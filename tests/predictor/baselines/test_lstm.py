@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from torch import Tensor
 
 from predictor.baselines.lstm import LSTM, LSTMConfig
-from predictor.errors import UserError
 from predictor.forecaster import Memory
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 from tests.predictor.baselines.helpers import (
     AGENTS,
     BATCH,

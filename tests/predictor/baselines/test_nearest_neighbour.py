@@ -24,12 +24,12 @@ from predictor.baselines.nearest_neighbour import (
 )
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.data.windows import Windows
-from predictor.errors import UserError
 from predictor.evaluation.accuracy import summarise
 from predictor.evaluation.outcomes import run_windows
 from predictor.forecaster import Belief, Forecaster, Memory
 from predictor.online import OnlineForecaster
 from predictor.scene import KINEMATIC_FEATURES, KINEMATIC_FEATURES_3D, SceneSpec
+from predictor.support.errors import UserError
 from tests.predictor.helpers import (
     ROAD,
     WORLD,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from predictor.data.store import EpisodeStore, read_store
-from predictor.errors import run_entry_point
+from predictor.support.errors import run_entry_point
 
 
 class Loader:

@@ -8,7 +8,7 @@ import pytest
 
 from predictor.data.crowd import CrowdConfig, make_crowds, overlay
 from predictor.data.store import Episode, StoreInfo, write_store
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 from tests.predictor.helpers import circling_episode, spec
 
 

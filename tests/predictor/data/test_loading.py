@@ -18,8 +18,8 @@ from predictor.data.loading import (
     whole,
 )
 from predictor.data.store import Episode, read_store
-from predictor.errors import UserError
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 
 FILE = Path("a.txt")
 NOTES = DatasetNotes("Toy", "Two agents.", "Free.", ("It was read.",), {"files": 1})

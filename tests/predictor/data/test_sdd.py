@@ -6,7 +6,7 @@ import pytest
 from predictor.data import sdd
 from predictor.data.loading import split_of
 from predictor.data.sdd import read_scales
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 from tests.predictor.data.helpers import Loader, change_line
 
 SCALES = """quad:

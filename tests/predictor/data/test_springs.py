@@ -25,7 +25,7 @@ from predictor.data.springs import (
     spring_spec,
 )
 from predictor.data.store import read_store
-from predictor.errors import UserError, run_entry_point
+from predictor.support.errors import UserError, run_entry_point
 from predictor.training.config import TrainConfig
 from predictor.training.trainer import Trainer, load_data
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from predictor.data.store import EDGE_LABELS, Episode, StoreInfo, read_info_of, read_store, write_store
-from predictor.errors import UserError
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 from tests.predictor.helpers import ROAD, random_presence, random_states, scene, spec
 
 INFO = StoreInfo(spec(ROAD), "toy-v0", {"command": "python -m envs.collect", "seeds": [3, 4]})

@@ -14,8 +14,8 @@ from predictor.data.device_windows import ResidentWindows, bytes_needed, window_
 from predictor.data.store import Episode
 from predictor.data.window_tensors import flatten, join
 from predictor.data.windows import WindowBatch, Windows, concatenate, padded, visible
-from predictor.errors import UserError
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 from tests.predictor.helpers import random_presence, random_states, spec
 
 CPU = torch.device("cpu")

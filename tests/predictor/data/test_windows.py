@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from predictor.data.store import Episode
 from predictor.data.windows import WindowBatch, Windows, concatenate, split_episodes, visible
-from predictor.errors import UserError
 from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
 from tests.predictor.helpers import random_presence, random_states, spec
 
 

@@ -15,9 +15,9 @@ from torch.nn import functional
 from predictor.dgvae import DGVAE
 from predictor.dgvae import model as dgvae
 from predictor.dgvae.networks import DGVAEConfig
-from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory, WindowOutput
 from predictor.graph import pair_mask
+from predictor.support.errors import UserError
 from tests.predictor.helpers import FAST_LIKE, RICH, ROAD, model, precise, random_presence, random_states, spec
 
 BATCH, TIME, AGENTS = 2, 6, 4

@@ -21,11 +21,11 @@ from predictor.dgvae import DGVAE
 from predictor.dgvae import model as dgvae
 from predictor.dgvae.networks import Decoder, DGVAEConfig
 from predictor.dgvae.packing import Packed
-from predictor.errors import UserError
 from predictor.forecaster import Belief, Memory, WindowOutput
 from predictor.graph import NOBODY, others, pair_mask
 from predictor.online import OnlineForecaster
 from predictor.scene import PADDING_ID, Forecast, Scene
+from predictor.support.errors import UserError
 from tests.predictor.helpers import (
     FAST_LIKE,
     RICH,

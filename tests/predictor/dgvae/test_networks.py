@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from predictor.dgvae.networks import PRESETS, Decoder, DGVAEConfig, Encoder, concrete_sample
-from predictor.errors import UserError
 from predictor.graph import pair_mask
+from predictor.support.errors import UserError
 from tests.predictor.helpers import FAST_LIKE, model, random_presence, random_states
 
 BATCH, TIME, AGENTS = 2, 6, 4

@@ -15,9 +15,9 @@ from torch import Tensor
 from predictor.dgvae import DGVAE
 from predictor.dgvae.networks import DGVAEConfig
 from predictor.dgvae.pair_matching import running_mean, window_mean
-from predictor.errors import UserError
 from predictor.forecaster import Belief
 from predictor.graph import pair_mask
+from predictor.support.errors import UserError
 from predictor.training.objective import restricted_labelling
 from tests.predictor.helpers import FAST_LIKE, random_presence, random_states, spec
 

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import r2_score
 
-from predictor.errors import UserError
 from predictor.evaluation.disentanglement import dci, direct_r2, linear_r2, mig, mutual_information
+from predictor.support.errors import UserError
 
 ROWS = 4000
 

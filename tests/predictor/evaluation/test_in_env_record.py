@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from predictor.errors import UserError
 from predictor.evaluation.in_env_record import FILE_NAME, Measurement, measurements_of, read_record, update_record
+from predictor.support.errors import UserError
 
 FIRST = Measurement("toy-v0", "varied", 50, 20, "python -m envs.evaluate", "abc", 5.0, 9.0, 1.25, (1.0, 1.5), 2.5)
 

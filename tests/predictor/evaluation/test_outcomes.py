@@ -7,12 +7,12 @@ from torch import Tensor
 
 from predictor.data.store import Episode
 from predictor.data.windows import WindowBatch, Windows
-from predictor.errors import UserError
 from predictor.evaluation.graph_accuracy import graph_accuracy
 from predictor.evaluation.outcomes import Outcome, run_sequence_batch, run_window_batch, run_windows, sequence_indices
 from predictor.forecaster import Belief, Memory
 from predictor.graph import pair_mask
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
+from predictor.support.errors import UserError
 from tests.predictor.helpers import ROAD, model, random_presence, random_states, spec
 
 SOLID = SceneSpec(

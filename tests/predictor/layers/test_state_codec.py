@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from predictor.errors import UserError
 from predictor.layers.state_codec import Residual, StateCodec, drift
 from predictor.scene import KINEMATIC_FEATURES, KINEMATIC_FEATURES_3D, AxisFrame, SceneSpec
+from predictor.support.errors import UserError
 from tests.predictor.helpers import random_presence, random_states, spec
 
 SCALES_3D = (10.0, 10.0, 2.0, 5.0, 5.0, 4.0)

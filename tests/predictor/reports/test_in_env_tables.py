@@ -1,8 +1,8 @@
 import pytest
 
-from predictor.errors import UserError
 from predictor.evaluation.in_env_record import Measurement
 from predictor.reports.in_env_tables import measurement_table, metres, replace_tables
+from predictor.support.errors import UserError
 
 MEASURED = Measurement(
     "toy-v0", "varied", 50, 20, "", "", 5.0, 9.0, 0.5, (0.25, 1.5), 2.5, below_cv=0.9, below_cv_interval=(0.85, 0.95)

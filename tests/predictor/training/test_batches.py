@@ -15,7 +15,7 @@ import torch
 from predictor.data.device_windows import ResidentWindows
 from predictor.data.windows import WindowBatch, Windows
 from predictor.dgvae.networks import PRESETS
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 from predictor.training import batches as feed_module
 from predictor.training.batches import (
     HostFeed,

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from predictor.data.windows import WindowBatch
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 from predictor.train import train
 from predictor.training import trainer as trainer_module
 from predictor.training.batches import HostFeed, PrefetchedFeed, Shapes

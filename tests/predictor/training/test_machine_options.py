@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from predictor import train as training
-from predictor.errors import UserError
 from predictor.evaluation.paper_tables import TABLES
 from predictor.suite import SuiteConfig, row_config, row_folder
+from predictor.support.errors import UserError
 from predictor.train import train
 from predictor.training import trainer as trainer_module
 from predictor.training.config import TrainConfig

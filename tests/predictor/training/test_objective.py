@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from predictor.data.windows import WindowBatch
-from predictor.errors import UserError
 from predictor.forecaster import WindowOutput
+from predictor.support.errors import UserError
 from predictor.training.config import TrainConfig
 from predictor.training.objective import nll, window_loss
 from tests.predictor.helpers import any_model, model, random_states

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from predictor.checkpoint import load_checkpoint
 from predictor.data.store import Episode, StoreInfo, write_store
-from predictor.errors import UserError
 from predictor.models import name_of
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
+from predictor.support.errors import UserError
 from predictor.train import train
 from predictor.training import trainer as trainer_module
 from predictor.training.config import TrainConfig

@@ -7,7 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from predictor.files import copy_file, delete_leftovers, new_file, new_folder, scratch_folder, write_json, write_text
+from predictor.support.files import (
+    copy_file,
+    delete_leftovers,
+    new_file,
+    new_folder,
+    scratch_folder,
+    write_json,
+    write_text,
+)
 
 
 def names(folder: Path) -> list[str]:

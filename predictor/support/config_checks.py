@@ -8,7 +8,7 @@ import types
 from dataclasses import fields
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 
 def check_choices(config: Any) -> None:

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from predictor.files import write_json
-from predictor.provenance import provenance
+from predictor.support.files import write_json
+from predictor.support.provenance import provenance
 
 
 def test_provenance_says_how_a_result_was_made(monkeypatch: pytest.MonkeyPatch):

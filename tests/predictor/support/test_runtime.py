@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 import torch
 
-from predictor import runtime
 from predictor.checkpoint import CheckpointInfo, load_checkpoint, save_checkpoint
 from predictor.dgvae import DGVAE
-from predictor.errors import UserError
-from predictor.runtime import keep_freed_memory, precision, prefer_onednn, processor, resolve_device, tune
+from predictor.support import runtime
+from predictor.support.errors import UserError
+from predictor.support.runtime import keep_freed_memory, precision, prefer_onednn, processor, resolve_device, tune
 from tests.predictor.helpers import FAST_LIKE, model, random_states, spec
 
 # --- Precision of products --------------------------------------------------------------------------------------------

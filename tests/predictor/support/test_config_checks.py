@@ -3,8 +3,8 @@ from typing import Any, Literal, Optional, Union
 
 import pytest
 
-from predictor.config_checks import check_at_least, check_choices, check_positive
-from predictor.errors import UserError
+from predictor.support.config_checks import check_at_least, check_choices, check_positive
+from predictor.support.errors import UserError
 
 Colour = Literal["red", "blue"]
 

@@ -14,7 +14,7 @@ from typing import Literal
 
 import torch
 
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 Precision = Literal["float32", "bfloat16"]
 """Of products and convolutions: "bfloat16" rounds their inputs and results; weights, states and losses stay float32."""

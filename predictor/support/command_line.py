@@ -1,7 +1,7 @@
 """Turns the words of a command line into a config: tyro's options, errors in one line, old names of options.
 
 A config checks itself in `__post_init__`. tyro draws a box around such an error and exits; `parse` raises the error
-itself, so that `predictor.errors.run_entry_point` prints one line and exits with status 2.
+itself, so that `predictor.support.errors.run_entry_point` prints one line and exits with status 2.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ from typing import TypeVar, get_type_hints
 
 import tyro
 
-from predictor.errors import UserError
+from predictor.support.errors import UserError
 
 Config = TypeVar("Config")
 

@@ -1,6 +1,6 @@
 import pytest
 
-from predictor.markdown import table
+from predictor.support.markdown import table
 
 
 def test_a_line_for_headings_rules_and_cells():

@@ -1,6 +1,6 @@
 import pytest
 
-from predictor.errors import ProtocolError, UserError, run_entry_point
+from predictor.support.errors import ProtocolError, UserError, run_entry_point
 
 
 def raises(error: BaseException):

@@ -4,9 +4,9 @@ from typing import Annotated, Literal
 
 import pytest
 
-from predictor.command_line import Renamed, parse, renamed_options
-from predictor.config_checks import check_at_least
-from predictor.errors import UserError, run_entry_point
+from predictor.support.command_line import Renamed, parse, renamed_options
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import UserError, run_entry_point
 
 
 @dataclass(frozen=True)
