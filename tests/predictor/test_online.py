@@ -145,9 +145,9 @@ class RichStreams(Streams):
 
 
 TestStreams = Streams.TestCase
-TestStreams.settings = settings(max_examples=20, stateful_step_count=8)
+TestStreams.settings = settings(max_examples=10, stateful_step_count=8)
 TestRichStreams = RichStreams.TestCase
-TestRichStreams.settings = settings(max_examples=6, stateful_step_count=6)
+TestRichStreams.settings = settings(max_examples=4, stateful_step_count=6)
 
 
 # --- The same, one fact at a time -------------------------------------------------------------------------------------

@@ -90,7 +90,7 @@ def learned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, episodes: list[Epis
 def test_circles_are_learned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     """Agents that turn at a constant rate: the optimum is exact, and constant velocity is off by metres."""
     episodes = [circling_episode(seed) for seed in range(4)]
-    trainer = learned(monkeypatch, tmp_path, episodes, steps=200, batch_size=16, horizon_steps=3, val_fraction=0.25)
+    trainer = learned(monkeypatch, tmp_path, episodes, steps=150, batch_size=16, horizon_steps=3, val_fraction=0.25)
     trainer.model.eval()
     seen = trainer.data.train[0]
     row = summarise("model", list(run_windows(trainer.model, seen, np.arange(len(seen)), 3)))
