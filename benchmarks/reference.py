@@ -39,7 +39,7 @@ REFERENCE: dict[str, Any] = {
 """Its settings, as its own scripts set them for a dynamic graph."""
 
 AS_SHIPPED = "the reference with torch's own choice of library"
-"""`predictor.support.runtime.tune` chooses the library for the whole process, the reference included; here it is undone."""
+"""`predictor.support.runtime.tune` chooses the library for the whole process; for this line it is undone."""
 
 
 class Training(NamedTuple):
