@@ -16,6 +16,7 @@ from predictor.evaluation.in_env_record import FILE_NAME, Measurement, read_reco
 from predictor.reports.in_env_tables import COLUMNS, card_section, measurement_table, metres, replace_tables  # noqa: E402
 from predictor.support.errors import UserError, run_entry_point  # noqa: E402
 from predictor.support.files import write_text  # noqa: E402
+from predictor.support.markdown import table
 
 PRETRAINED = Path("predictor/pretrained")
 PAGES = (Path("README.md"), Path("docs/in_env.md"))
@@ -79,26 +80,26 @@ def _lent(records: Records) -> str:
     """Returns the table of ids without a checkpoint of their own, by id, each with the checkpoint measured."""
     lines = [(m, name) for name, found in records.items() for m in found if m.env_id not in SERVED_BY]
     heading, *rest = LENT
-    text = ["| " + " | ".join([heading, "checkpoint", *rest]) + " |", "|---" * 2 + "|---:" * len(rest) + "|"]
-    for measurement, name in sorted(lines, key=lambda line: line[0].env_id):
-        cells = [COLUMNS[column](measurement) for column in rest]
-        text.append("| " + " | ".join([measurement.env_id, name, *cells]) + " |")
-    return "\n".join(text)
+    cells = [
+        [measurement.env_id, name, *(COLUMNS[column](measurement) for column in rest)]
+        for measurement, name in sorted(lines, key=lambda line: line[0].env_id)
+    ]
+    return table([heading, "checkpoint", *rest], cells, "--r")
 
 
 def _transfer(records: Records) -> str:
     """Returns minADE₁ of each checkpoint (columns) in each environment (lines), and how far below constant velocity."""
     measured = {(m.env_id, name): m for name, found in records.items() for m in found if m.samples == 1}
     names = sorted({name for _, name in measured})
-    text = ["| env | episodes | " + " | ".join(names) + " |", "|---|---:" + "|---:" * len(names) + "|"]
+    lines = []
     for env_id in sorted({env_id for env_id, _ in measured}):
-        line = [measured[env_id, name] for name in names]
-        episodes = {m.episodes for m in line}
+        found = [measured[env_id, name] for name in names]
+        episodes = {m.episodes for m in found}
         if len(episodes) > 1:
             raise UserError(f"transfer to {env_id}: lines need equal episodes, got {sorted(episodes)}; measure again")
-        cells = [f"{metres(m.min_ade_m)} ({100 * (m.below_cv or 0):.0f} %)" for m in line]
-        text.append("| " + " | ".join([env_id, str(episodes.pop()), *cells]) + " |")
-    return "\n".join(text)
+        cells = [f"{metres(m.min_ade_m)} ({100 * (m.below_cv or 0):.0f} %)" for m in found]
+        lines.append([env_id, str(episodes.pop()), *cells])
+    return table(["env", "episodes", *names], lines, "-r")
 
 
 def main() -> None:

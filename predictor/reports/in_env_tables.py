@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from predictor.evaluation.in_env_record import Interval, Measurement
 from predictor.support.errors import UserError
+from predictor.support.markdown import table
 
 MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 """A table with its markers."""
@@ -68,13 +69,12 @@ CARD = (
 
 def measurement_table(measurements: Sequence[Measurement], headings: Sequence[str] = CARD) -> str:
     """Returns a Markdown table, one line for each measurement, and the notes below it."""
-    lines = ["| " + " | ".join(headings) + " |", "|---" + "|---:" * (len(headings) - 1) + "|"]
-    lines += ["| " + " | ".join(COLUMNS[name](m) for name in headings) + " |" for m in measurements]
+    written = table(headings, [[COLUMNS[name](m) for name in headings] for m in measurements], "-r")
     envs_of: dict[str, list[str]] = {}
     for measurement in measurements:
         if measurement.note:
             envs_of.setdefault(measurement.note, []).append(measurement.env_id)
-    return "\n".join(lines) + "".join(f"\n\n\\* {', '.join(envs)}: {note}." for note, envs in envs_of.items())
+    return written + "".join(f"\n\n\\* {', '.join(envs)}: {note}." for note, envs in envs_of.items())
 
 
 def card_section(measurements: Sequence[Measurement]) -> str:
