@@ -27,6 +27,7 @@ check: .venv/.installed ## lint, formatting, types, who may import whom, the sha
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 	.venv/bin/lint-imports
+	.venv/bin/python -m docs.write_tables --check
 	.venv/bin/python -m pytest -q -o addopts=--import-mode=importlib --doctest-modules \
 		predictor envs agents benchmarks train_policy.py tests/test_structure.py
 

@@ -1,4 +1,4 @@
-"""Writes the tables of README.md, docs/in_env.md and the checkpoints' cards: `python docs/write_tables.py [--check]`.
+"""Writes the tables of README.md, docs/in_env.md and the checkpoints' cards: `python -m docs.write_tables [--check]`.
 
 Every number comes from a record, predictor/pretrained/NAME/in_env.json, which `python -m predictor.card` fills. Tables
 stand between `<!-- table: NAME -->` and `<!-- end -->`. With `--check` nothing is written: the exit status is 1 if a
@@ -8,16 +8,14 @@ page differs from its records.
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-
-from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS  # noqa: E402
-from predictor.evaluation.in_env_record import FILE_NAME, Measurement, read_record  # noqa: E402
-from predictor.reports.in_env_tables import COLUMNS, card_section, measurement_table, metres, replace_tables  # noqa: E402
-from predictor.support.errors import UserError, run_entry_point  # noqa: E402
-from predictor.support.files import write_text  # noqa: E402
+from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS
+from predictor.evaluation.in_env_record import FILE_NAME, Measurement, read_record
+from predictor.reports.in_env_tables import COLUMNS, card_section, measurement_table, metres, replace_tables
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import write_text
 from predictor.support.markdown import table
 
+ROOT = Path(__file__).resolve().parents[1]
 PRETRAINED = Path("predictor/pretrained")
 PAGES = (Path("README.md"), Path("docs/in_env.md"))
 SERVED_BY = CHECKPOINTS | MULTIAGENT_CHECKPOINTS
@@ -109,7 +107,7 @@ def main() -> None:
         raise UserError(f"write_tables takes --check or nothing, got {' '.join(arguments)}")
     changed = {path: new for path, (old, new) in pages(ROOT).items() if new != old}
     if arguments and changed:
-        raise UserError(f"{', '.join(map(str, changed))} differ from the records; run python docs/write_tables.py")
+        raise UserError(f"{', '.join(map(str, changed))} differ from the records; run python -m docs.write_tables")
     for path, text in changed.items():
         write_text(ROOT / path, text)
     print(f"{len(changed)} pages rewritten" if changed else "all tables are as the records say")

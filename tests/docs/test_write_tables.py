@@ -36,7 +36,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
 
 def test_every_page_says_what_the_records_say():
     differing = [str(path) for path, (old, new) in write_tables.pages(ROOT).items() if old != new]
-    assert differing == [], "run python docs/write_tables.py"
+    assert differing == [], "run python -m docs.write_tables"
 
 
 def test_every_page_has_its_tables():
@@ -56,7 +56,7 @@ def test_a_number_changed_by_hand_is_found_and_put_right(
     before = page.read_text()
     page.write_text(before.replace("| merge-v1 | varied | 50 |", "| merge-v1 | idle | 50 |"))
     assert page.read_text() != before
-    with pytest.raises(UserError, match=r"README.md differ from the records; run python docs/write_tables\.py"):
+    with pytest.raises(UserError, match=r"README.md differ from the records; run python -m docs\.write_tables"):
         run(monkeypatch, "--check")
     run(monkeypatch)
     assert page.read_text() == before and "1 pages rewritten" in capsys.readouterr().out
