@@ -1,4 +1,4 @@
-"""Measure a checkpoint on recorded data: `python -m predictor.evaluate --checkpoint NAME --data STORE`.
+"""Measures a checkpoint on recorded data: `python -m predictor.evaluate --checkpoint NAME --data STORE`.
 
 Prints minADE and minFDE (per agent and joint, with standard errors over subsets of the windows), miss rate, coverage,
 and RMSE and NLL by horizon, for K = 1 and K samples beside constant velocity (K = 1) and constant velocity with noise
@@ -37,7 +37,7 @@ from predictor.support.runtime import resolve_device, tune
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """Measure a predictor's accuracy on recorded episodes, beside constant velocity."""
+    """Measures a predictor's accuracy on recorded episodes, beside constant velocity."""
 
     checkpoint: str
     """Checkpoint to measure: shipped name, folder, run folder, or "constant-velocity"."""
@@ -59,7 +59,7 @@ class EvaluateConfig:
     """Device that runs the model: cpu, cuda or auto (cuda where there is one)."""
 
     def __post_init__(self) -> None:
-        """Check ranges; `device="auto"` becomes the device that is taken.
+        """Checks ranges; `device="auto"` becomes the device that is taken.
 
         Raises:
             UserError: a value that makes no sense, or a device that is not there.

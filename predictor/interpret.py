@@ -47,7 +47,7 @@ FILES = ("graph.png", "features.png", "trajectories.png", "scores.json", "scores
 
 @dataclass(frozen=True)
 class InterpretConfig:
-    """Draw and measure what a checkpoint's edges and edge features say."""
+    """Draws and measure what a checkpoint's edges and edge features say."""
 
     checkpoint: str
     """Checkpoint of a dG-VAE: shipped name, folder or run folder."""
@@ -69,7 +69,7 @@ class InterpretConfig:
     """Device that runs the model: cpu, cuda or auto (cuda where there is one)."""
 
     def __post_init__(self) -> None:
-        """Check ranges; `device="auto"` becomes the device that is taken.
+        """Checks ranges; `device="auto"` becomes the device that is taken.
 
         Raises:
             UserError: a value that makes no sense, or a device that is not there.
@@ -80,7 +80,7 @@ class InterpretConfig:
 
 
 def interpret(config: InterpretConfig) -> Findings:
-    """Measure, draw and write everything under `config.out`; nothing is written if anything is refused.
+    """Measures, draw and write everything under `config.out`; nothing is written if anything is refused.
 
     Raises:
         UserError: a file in the place of `out`, a model without edge features, a store that does not fit it, or no

@@ -39,7 +39,7 @@ TableName = Literal["springs", "recipe", "mocap", "nba", "sdd", "ind"]
 
 @dataclass(frozen=True)
 class SuiteConfig:
-    """Train and measure every row of one of the paper's tables."""
+    """Trains and measure every row of one of the paper's tables."""
 
     table: TableName
     """Table of the paper to rerun."""
@@ -66,7 +66,7 @@ class SuiteConfig:
     """Key of a row to run in this process; the suite starts its processes with it."""
 
     def __post_init__(self) -> None:
-        """Check choices and ranges; `device="auto"` becomes the device that is taken.
+        """Checks choices and ranges; `device="auto"` becomes the device that is taken.
 
         Raises:
             UserError: an unknown table or row, a number that makes no sense, or a device that is not there.
@@ -81,7 +81,7 @@ class SuiteConfig:
         check_precision(self.precision, self.device)
 
     def check_stores(self) -> None:
-        """Check that the stores of the table are there.
+        """Checks that the stores of the table are there.
 
         Raises:
             UserError: one is missing; the message has the commands that make them.
@@ -159,7 +159,7 @@ def row_folder(config: SuiteConfig, row: Row) -> Path:
 
 
 def run_row(config: SuiteConfig, row: Row) -> dict[str, Any]:
-    """Train (or resume) and measure one row; writes and returns its result."""
+    """Trains (or resume) and measure one row; writes and returns its result."""
     if read_info_of(config.data / TABLES[config.table].train).edge_attribute_names:
         sklearn("linear_model")  # known to be missing now, not after training
     folder = row_folder(config, row)
@@ -182,7 +182,7 @@ def run_row(config: SuiteConfig, row: Row) -> dict[str, Any]:
 
 
 def run_suite(config: SuiteConfig) -> dict[str, Any]:
-    """Run every row that has no result yet, then write the table; returns its content.
+    """Runs every row that has no result yet, then write the table; returns its content.
 
     Raises:
         UserError: a missing store.

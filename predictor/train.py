@@ -1,4 +1,4 @@
-"""Train a forecaster: `python -m predictor.train --data data/roundabout --out runs/roundabout`.
+"""Trains a forecaster: `python -m predictor.train --data data/roundabout --out runs/roundabout`.
 
 The best checkpoint is chosen by free-running minADE on held-out episodes, not by one-step error.
 """
@@ -24,7 +24,7 @@ from predictor.training.trainer import LOG_EVERY, Trainer, load_data
 
 
 def train(config: TrainConfig) -> Path:
-    """Train until done or stale; returns the folder of the best checkpoint."""
+    """Trains until done or stale; returns the folder of the best checkpoint."""
     state_file, config_file = config.out / "train_state.pt", config.out / "config.json"
     _check_run_folder(config, config_file)
     tune(config.device)

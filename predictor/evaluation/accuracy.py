@@ -128,7 +128,7 @@ class Tally:
         self._counts: dict[str, list[np.ndarray]] = {}
 
     def add(self, outcome: Outcome) -> None:
-        """Take in a batch of windows.
+        """Takes in a batch of windows.
 
         Raises:
             ValueError: another number of samples, steps or axes than before.
@@ -246,7 +246,7 @@ def summarise(
     std_m: Sequence[float] = (),
     miss_threshold_m: float = metrics.MISS_THRESHOLD_M,
 ) -> Accuracy:
-    """Average outcomes into one row.
+    """Averages outcomes into one row.
 
     Args:
         name: the forecaster's name.

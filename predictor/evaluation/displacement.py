@@ -1,4 +1,4 @@
-"""Forecast metrics as pure functions; each returns its value and which entries mean something.
+"""Forecasts metrics as pure functions; each returns its value and which entries mean something.
 
 Positions have two axes or three [m]. An agent with no valid step has no error: it is reported as invalid, not as a
 perfect 0, and so is a scene with no valid agent. Values where `valid` is not are meaningless.

@@ -45,7 +45,7 @@ class FactorScore:
 
 @dataclass(frozen=True)
 class Separation:
-    """Rank statistic: the chance that a pair with an edge has the larger value than a pair without (0.5: no use)."""
+    """Ranks statistic: the chance that a pair with an edge has the larger value than a pair without (0.5: no use)."""
 
     dimension: int
     """Feature dimension furthest from 0.5."""
@@ -220,7 +220,7 @@ class StillnessTally:
         self._sums: list[np.ndarray] = []  # count, Σ and Σ² of every batch
 
     def add(self, features: Float[np.ndarray, "edges time dims"]) -> None:
-        """Take in edges that are there at all of the steps."""
+        """Takes in edges that are there at all of the steps."""
         values = features.astype(np.float64)
         self._edges, self._steps = self._edges + len(values), values.shape[1]
         within = np.square(values - values.mean(axis=1, keepdims=True)).sum(axis=(0, 1))

@@ -89,7 +89,7 @@ class GraphTally:
         self._has_truth: bool | None = None
 
     def add(self, predicted: Predicted, true_types: PairTypes | None, valid: PairMask) -> None:
-        """Take in a batch of windows.
+        """Takes in a batch of windows.
 
         Args:
             predicted: probabilities of the types, or types.

@@ -1,4 +1,4 @@
-"""Measure one row of a table: accuracy in both views on every test store, the inferred graph, the edge features."""
+"""Measures one row of a table: accuracy in both views on every test store, the inferred graph, the edge features."""
 
 import resource
 import time

@@ -1,4 +1,4 @@
-"""Run a forecaster over windows and line up what then happened: forecasts, truths, masks.
+"""Runs a forecaster over windows and line up what then happened: forecasts, truths, masks.
 
 Two readings of "the error of a sequence" (docs/protocol.md): *horizon-only* compares the free run after the last
 observed step (`run_window_batch`); *whole-sequence* puts in front of it the one-step predictions that were made from
