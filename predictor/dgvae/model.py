@@ -33,7 +33,7 @@ from predictor.dgvae.packing import Packed, Padded
 from predictor.dgvae.pair_matching import running_mean, running_mean_step, window_mean
 from predictor.dgvae.single_step import Encoding, Internal, Layers, Modules, Past, Stepper, differentiable, unpacked
 from predictor.forecaster import Belief, Memory, WindowOutput
-from predictor.graph import NOBODY, among_nearest, nearest, off_diagonal, others, pair_mask, with_diagonal
+from predictor.graph import NO_AGENT, among_nearest, nearest, off_diagonal, others, pair_mask, with_diagonal
 from predictor.layers.rnn import masked_gru
 from predictor.layers.state_codec import StateCodec
 from predictor.noise import Noise, PairNoise, noise_of_pairs
@@ -116,7 +116,7 @@ class DGVAE(nn.Module):
         """Zeros on the model's device."""
         near = self.config.num_neighbours
         nodes, pairs = self._nothing_seen(batch, agents, near or agents)
-        senders = torch.full((batch, agents, near), NOBODY, device=nodes[0].device) if near else None
+        senders = torch.full((batch, agents, near), NO_AGENT, device=nodes[0].device) if near else None
         return Memory(nodes, pairs, senders)
 
     def observe(
