@@ -60,7 +60,7 @@ class Memory:
     def to_slots(
         self, senders: Int[Tensor, "batch agents slots"], present: Bool[Tensor, "batch agents slots"]
     ) -> "Memory":
-        """Moves pair memory to the slots of each receiver's current senders; a sender without a slot before starts from 0.
+        """Moves pair memory to the slots of each receiver's current senders; a sender that had none starts from zero.
 
         Args:
             senders: index of the agent in each slot.
