@@ -38,7 +38,7 @@ def test_every_learner_of_every_copy_is_a_row(learners: tuple[str, ...], expecte
     rows = make_multiagent_venv(Task(TAG, "none", learners=learners), 2)
     assert rows.num_envs == 2 * len(expected)
     assert rows.get_attr("possible_agents")[0] == ["adversary_0", "adversary_1", "adversary_2", "agent_0"]
-    assert rows.venv.row_agents == 2 * expected  # type: ignore[attr-defined]
+    assert rows.venv.agents_of_envs == 2 * expected  # type: ignore[attr-defined]
     rows.close()
 
 
