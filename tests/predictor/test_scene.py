@@ -123,7 +123,7 @@ def test_what_a_perception_system_sees_may_differ():
 
 
 def test_good_scene_passes_its_check():
-    scene(THREE, rows=5).check()
+    scene(THREE, size=5).check()
 
 
 @pytest.mark.parametrize(
@@ -208,17 +208,17 @@ def test_an_ego_that_sees_everything_sees_no_padding():
     assert order[seen].tolist() == [0, 2]
 
 
-def test_stacking_keeps_the_order_of_rows():
-    first, second = scene(THREE, rows=4), scene({0: (0.5,) * 4}, rows=4)
+def test_stacking_keeps_the_order_of_scenes():
+    first, second = scene(THREE, size=4), scene({0: (0.5,) * 4}, size=4)
     both = batch(first, second)
     assert len(both) == 2
-    for row, each in enumerate((first, second)):
-        np.testing.assert_array_equal(both.states[row], each.states)
-        np.testing.assert_array_equal(both.ids[row], each.ids)
-        np.testing.assert_array_equal(both.valid[row], each.valid)
+    for env, each in enumerate((first, second)):
+        np.testing.assert_array_equal(both.states[env], each.states)
+        np.testing.assert_array_equal(both.ids[env], each.ids)
+        np.testing.assert_array_equal(both.valid[env], each.valid)
 
 
-def test_rows_of_a_batch():
+def test_scenes_of_a_batch():
     scenes = [Scene(np.full((2, 4), float(i)), np.array([i, -1]), np.array([True, False]), float(i)) for i in range(4)]
     chosen = batch(*scenes)[np.array([3, 1])]
     assert chosen.heading_rad.tolist() == [3.0, 1.0]
@@ -235,16 +235,16 @@ BATCH, AGENTS, SLOTS, NO_EDGE = 2, 5, 3, (1.0, 0.0, 0.0)
 
 
 def forecast(seed: int, agents: int = AGENTS, slots: int = SLOTS) -> Forecast:
-    """With a list of senders; a slot that holds nobody has no edge, as a forecaster gives it."""
+    """With a list of senders; an empty slot has no edge, as a forecaster gives it."""
     generator = torch.Generator().manual_seed(seed)
     score = torch.rand(BATCH, agents, agents, generator=generator) + 9 * torch.eye(agents)
     senders = score.argsort(-1)[..., :slots]
     senders[torch.rand(senders.shape, generator=generator) > 0.7] = NO_AGENT
-    heard = (senders != NO_AGENT)[..., None]
+    received = (senders != NO_AGENT)[..., None]
     probs = torch.randn(BATCH, agents, slots, 3, generator=generator).softmax(-1)
     features = torch.randn(BATCH, agents, slots, 2, generator=generator)
     xy, valid = torch.zeros(BATCH, 1, agents, 4, 2), torch.ones(BATCH, agents).bool()
-    return Forecast(xy, torch.where(heard, probs, torch.tensor(NO_EDGE)), features * heard, valid, senders)
+    return Forecast(xy, torch.where(received, probs, torch.tensor(NO_EDGE)), features * received, valid, senders)
 
 
 def test_dense_edges_against_a_loop():

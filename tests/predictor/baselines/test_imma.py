@@ -76,15 +76,15 @@ def test_against_a_loop(kind: str, valid: Tensor, seed: int):
 def test_attention_hand_computed():
     scores = torch.tensor([[9.0, 0.0, 0.0], [1.0, 9.0, 1.0 + torch.log(torch.tensor(3.0)).item()], [5.0, 6.0, 7.0]])
     ours = masked_attention(scores, pair_mask(torch.ones(3).bool()))
-    last_row = torch.tensor([5.0, 6.0]).softmax(0).tolist()
-    expected = torch.tensor([[0.0, 0.5, 0.5], [0.25, 0.0, 0.75], [*last_row, 0.0]])
+    last_receiver = torch.tensor([5.0, 6.0]).softmax(0).tolist()
+    expected = torch.tensor([[0.0, 0.5, 0.5], [0.25, 0.0, 0.75], [*last_receiver, 0.0]])
     torch.testing.assert_close(ours, expected)
     assert masked_attention(scores, pair_mask(torch.tensor([True, False, True]))).tolist() == [
         [0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0],
     ]  # fmt: skip
 
 
-def test_attention_over_nobody_is_nothing_with_a_finite_gradient():
+def test_attention_without_senders_is_zero_with_a_finite_gradient():
     scores = torch.randn(2, 3, 3, generator=torch.Generator().manual_seed(0), requires_grad=True)
     weights = masked_attention(scores, pair_mask(torch.tensor([[False] * 3, [True, False, False]])))
     assert not weights.any()

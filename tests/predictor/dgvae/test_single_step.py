@@ -85,7 +85,7 @@ def run(
     """All that observing and rolling out give to the outside: memory and edges after each step, forecasts at the end.
 
     Samples go along graphs that are sharper than the expected ones, and the same each time: who is drawn for in which
-    order is not the same with the modules. Where an absent agent would go is nobody's business.
+    order is not the same with the modules. States of absent agents are not compared.
     """
     states, valid = shown or scenes(dtype=next(forecaster.parameters()).dtype)
     with context(), pytest.MonkeyPatch.context() as patch:
@@ -440,5 +440,5 @@ def test_layout_of_memory_changes_nothing(name: str):
 
 
 def test_expanded_presence():
-    states, everyone = scenes()[0], torch.ones(1, 1, AGENTS, dtype=torch.bool).expand(BATCH, TIME, AGENTS)
-    same(run(kept(FAST_LIKE), shown=(states, everyone)), run(kept(FAST_LIKE), shown=(states, everyone.clone())))
+    states, all_agents = scenes()[0], torch.ones(1, 1, AGENTS, dtype=torch.bool).expand(BATCH, TIME, AGENTS)
+    same(run(kept(FAST_LIKE), shown=(states, all_agents)), run(kept(FAST_LIKE), shown=(states, all_agents.clone())))

@@ -79,9 +79,9 @@ def made(settings: TrainConfig, recorder: FakeRecorder | None = None, padded: bo
     return trainer
 
 
-def batch(scale: float = 1.0, rows: int = 2) -> WindowBatch:
-    states = scale * torch.arange(rows * 3 * 2 * 4, dtype=torch.float32).view(rows, 3, 2, 4)
-    return WindowBatch(states, torch.ones(rows, 3, 2).bool(), torch.zeros(rows, dtype=torch.int64))
+def batch(scale: float = 1.0, windows: int = 2) -> WindowBatch:
+    states = scale * torch.arange(windows * 3 * 2 * 4, dtype=torch.float32).view(windows, 3, 2, 4)
+    return WindowBatch(states, torch.ones(windows, 3, 2).bool(), torch.zeros(windows, dtype=torch.int64))
 
 
 # --- The books --------------------------------------------------------------------------------------------------------
@@ -162,7 +162,7 @@ def test_another_shape_is_refused():
     with pytest.raises(
         ValueError, match=r"the step was recorded for .*\(2, 3, 2, 4\).*, got .*\(5, 3, 2, 4\).*another"
     ):
-        captured(batch(rows=5))
+        captured(batch(windows=5))
     labelled = replace(batch(), edge_types=torch.zeros(2, 3, 2, 2, dtype=torch.int8))
     with pytest.raises(ValueError, match="edge_types"):
         captured(labelled)
@@ -171,7 +171,7 @@ def test_another_shape_is_refused():
 
 def test_signatures_tell_what_a_recording_is_good_for():
     assert signature(batch()) == signature(batch(3.0))
-    assert signature(batch()) != signature(batch(rows=3))
+    assert signature(batch()) != signature(batch(windows=3))
 
 
 # --- In training ------------------------------------------------------------------------------------------------------
