@@ -1,7 +1,7 @@
 """Trains the paper-size dG-VAE on 5-Spring on one GPU with one command: `python -m benchmarks.gpu_springs --data data`.
 
 Makes the data if it is missing, trains the dG-VAE for 150 epochs of 50,000 sequences at batch 128, measures it as the
-table does (the line of `python -m predictor.suite --table springs --budget paper --rows dgvae`) and writes
+table does (the line of `python -m predictor.suite --table springs --budget paper --lines dgvae`) and writes
 summary.json: steps/s, minutes, accuracy. A run that was killed continues from its last checkpoint.
 
 Without a GPU, `--project` times a step of the same shapes on this machine, counts its products, bytes and kernels, and
@@ -26,7 +26,7 @@ from torch.utils.flop_counter import flop_registry
 
 from predictor.data.springs import SpringsConfig, make
 from predictor.evaluation.paper_tables import SPRINGS, Budget
-from predictor.suite import SuiteConfig, row_config, row_folder, run_row
+from predictor.suite import SuiteConfig, line_config, line_folder, run_line
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices, check_positive
 from predictor.support.errors import UserError, run_entry_point
@@ -39,7 +39,7 @@ from predictor.training.objective import window_loss
 from predictor.training.trainer import Trainer, load_data
 
 SPLITS = ("train", "val", "test", "ood")
-ROW = next(row for row in SPRINGS.rows if row.key == "dgvae")
+LINE = next(line for line in SPRINGS.lines if line.key == "dgvae")
 ATEN = torch.ops.aten
 NO_KERNEL = {
     ATEN.empty, ATEN.empty_like, ATEN.empty_strided, ATEN.new_empty, ATEN.new_empty_strided, ATEN.detach,
@@ -124,7 +124,7 @@ class GpuSpringsConfig:
         device = "cpu" if self.project else self.device
         precision: TrainPrecision = "float32" if self.project and self.precision == "tf32" else self.precision
         return SuiteConfig(
-            "springs", self.data, self.out, self.budget, (ROW.key,), self.steps, 1, self.seed, device, precision
+            "springs", self.data, self.out, self.budget, (LINE.key,), self.steps, 1, self.seed, device, precision
         )
 
 
@@ -143,9 +143,9 @@ def run(config: GpuSpringsConfig) -> dict[str, Any]:
     """Makes data, trains, measures and writes the summary; finished parts are not repeated."""
     made = make_missing(config)
     config.suite.check_stores()
-    folder = row_folder(config.suite, ROW)
+    folder = line_folder(config.suite, LINE)
     before, result = _steps_done(folder / "run"), folder / "result.json"
-    measured = json.loads(result.read_text()) if result.exists() else run_row(config.suite, ROW)
+    measured = json.loads(result.read_text()) if result.exists() else run_line(config.suite, LINE)
     steps = config.suite.sizes.steps
     minutes = measured["train_seconds"] / 60
     test = measured["tests"]["test"]
@@ -211,7 +211,7 @@ class Counter(TorchDispatchMode):
 
 def projected_config(config: GpuSpringsConfig, data: Path) -> TrainConfig:
     """Returns the config of the line's training at its mean history length, which gives the mean cost of a step."""
-    settings = row_config(replace(config.suite, data=data), ROW, config.out / "unused")
+    settings = line_config(replace(config.suite, data=data), LINE, config.out / "unused")
     shapes = Shapes(1, settings.history_steps, settings.horizon_steps)
     lengths = range(settings.min_history_steps, settings.history_steps + 1)
     mean = statistics.mean(shapes.time(n) for n in lengths) - settings.horizon_steps

@@ -22,7 +22,7 @@ from predictor.data.windows import Windows
 from predictor.dgvae import DGVAE
 from predictor.dgvae.networks import DGVAEConfig
 from predictor.evaluation.accuracy import Tally
-from predictor.evaluation.measure_row import protocol_indices
+from predictor.evaluation.measure_line import protocol_indices
 from predictor.evaluation.outcomes import run_windows
 from predictor.forecaster import Forecaster
 from predictor.support.command_line import Renamed, parse

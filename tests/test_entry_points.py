@@ -45,7 +45,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     ],
     "predictor.suite": [
         ("--table springs --data absent", "no store at absent/springs/train; make the stores of this table with"),
-        ("--table springs --data absent --only-row mlp", "no store at absent/springs/train"),
+        ("--table springs --data absent --only-line mlp", "no store at absent/springs/train"),
         ("--table spring", "invalid choice 'spring' for argument '--table'"),
         ("--table springs --workers -1", "workers must not be negative, got -1"),
         ("--table springs --precision tf32", "precision 'tf32' needs a CUDA device"),
@@ -144,7 +144,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
 
 RENAMED: dict[str, dict[str, str]] = {
     "predictor.evaluate": {"--samples": "--num-samples"},
-    "predictor.suite": {"--jobs": "--workers"},
+    "predictor.suite": {"--jobs": "--workers", "--rows": "--lines", "--only-row": "--only-line"},
     "predictor.interpret": {
         "--samples": "--num-samples",
         "--windows": "--max-windows",

@@ -53,7 +53,7 @@ def test_one_command_from_nothing_to_a_summary(
     assert "2 steps in " in said and f"written to {small.out / 'summary.json'}" in said
     # again: nothing is made, trained or measured anew
     monkeypatch.setattr(script, "make", lambda _: pytest.fail("the data is there"))
-    monkeypatch.setattr(script, "run_row", lambda *_: pytest.fail("the line is there"))
+    monkeypatch.setattr(script, "run_line", lambda *_: pytest.fail("the line is there"))
     script.main()
     again = json.loads((small.out / "summary.json").read_text())
     assert (again["tests"], again["data_seconds"]) == (summary["tests"], {})

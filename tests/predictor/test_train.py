@@ -93,9 +93,9 @@ def test_circles_are_learned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     trainer = learned(monkeypatch, tmp_path, episodes, steps=150, batch_size=16, horizon_steps=3, val_fraction=0.25)
     trainer.model.eval()
     seen = trainer.data.train[0]
-    row = summarise("model", list(run_windows(trainer.model, seen, np.arange(len(seen)), 3)))
+    found = summarise("model", list(run_windows(trainer.model, seen, np.arange(len(seen)), 3)))
     assert trainer.baseline_m > 2.0
-    assert row.min_ade_m < trainer.baseline_m / 5
+    assert found.min_ade_m < trainer.baseline_m / 5
     assert trainer.validate()[0].min_ade_m < trainer.baseline_m / 2
 
 
@@ -535,7 +535,7 @@ def test_typical_change_closed_form(residual: str, expected: list[float]):
 
 
 def test_loss_closed_form(tmp_path: Path):
-    """One row, two agents; the last one is absent at the last step. Scales 10, 10, 5, 5."""
+    """One window, two agents; the last one is absent at the last step. Scales 10, 10, 5, 5."""
     states = torch.zeros(1, 3, 2, 4)
     valid = torch.tensor([[[True, True], [True, True], [True, False]]])
     even = torch.zeros(1, 3, 2, 2, 2)
