@@ -228,7 +228,7 @@ def projected_config(config: GpuSpringsConfig, data: Path) -> TrainConfig:
 def count(trainer: Trainer) -> list[Kernel]:
     """Returns the kernels of forward, loss and backward of one step."""
     now = trainer.plan(0)
-    batch = trainer.feed.batch(now)
+    batch = trainer.batches.batch(now)
     with Counter() as counter:
         output = trainer.model.window(
             batch.states, batch.valid, batch.last_observed, now.rollout_steps, trainer.noise.manual_seed(0)

@@ -186,7 +186,7 @@ def check_multiagent_scene(shared: Any, spec: SceneSpec, source: str = "reader")
     """
     if not isinstance(shared, MultiagentScene):
         raise UserError(f"{source}: reading must give a MultiagentScene (envs.readers), got {type(shared).__name__}")
-    shared.scene.check(source, spec, rows=spec.max_agents)
+    shared.scene.check(source, spec, agents=spec.max_agents)
     heading = shared.heading_rad
     if heading.shape != (spec.max_agents,) or not np.isfinite(heading).all():
         raise UserError(

@@ -99,7 +99,7 @@ def test_every_id_makes_and_reads(env_id: str):
     steps = 0
     while env.agents:
         shared = reader.read(env)
-        shared.scene.check(env_id, reader.spec, rows=reader.spec.max_agents)
+        shared.scene.check(env_id, reader.spec, agents=reader.spec.max_agents)
         assert set(shared.rows) == set(env.agents)
         env.step(dict.fromkeys(env.agents, 0))
         steps += 1

@@ -82,7 +82,7 @@ def test_every_scenario_reads(env_id: str, landmarks: bool):
     assert reader.spec.max_agents == AGENTS[env_id] + still
     while env.agents:
         shared = reader.read(env)
-        shared.scene.check(env_id, reader.spec, rows=reader.spec.max_agents)
+        shared.scene.check(env_id, reader.spec, agents=reader.spec.max_agents)
         assert sorted(shared.rows) == sorted(env.agents)
         for name, row in shared.rows.items():
             body = named(env, name)

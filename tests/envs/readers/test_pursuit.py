@@ -47,7 +47,7 @@ def test_scene_is_what_stands_on_the_grid():
     reader = PursuitReader(env)
     assert isinstance(reader, MultiagentReader)
     shared = reader.read(env)
-    shared.scene.check("pursuit", reader.spec, rows=5)
+    shared.scene.check("pursuit", reader.spec, agents=5)
     expected = [[0, 0, 0, 0, 0], [3, 2, 0, 0, 0], [15, 15, 0, 0, 1], [1, 12, 0, 0, 1], [2, 2, 0, 0, 1]]
     assert shared.scene.states.tolist() == expected
     assert shared.scene.ids.tolist() == [0, 1, 2, 3, 4]
