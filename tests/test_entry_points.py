@@ -192,7 +192,11 @@ REQUIRED: dict[str, list[str]] = {
 }
 """Required options of a command."""
 
-VALUE_OF = {"--driver": "varied", "--out": "elsewhere", "--env-id": "merge-v1", "--checkpoint": "a", "--data": "b"}
+VALUE_OF = {
+    "--driver": "varied", "--out": "elsewhere", "--env-id": "merge-v1", "--checkpoint": "a", "--data": "b",
+    "--lines": "mlp", "--only-line": "mlp",
+}  # fmt: skip
+"""Value of an option that does not take the number 60."""
 
 
 def source_of(command: str) -> str:
