@@ -20,7 +20,7 @@ from agents.runs import FORECASTER, check_forecaster, load_model, open_run
 from agents.task import Backend, Observe, Task
 from agents.training import TrainingPlan, train
 from agents.video import film
-from envs.registry import entry_for, native_task_of
+from envs.registry import entry_for, envpool_task_of
 from envs.simulators.envpool import ONE_START
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_choices
@@ -137,7 +137,7 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
         )
     free = ("checkpoint_every", "eval_episodes", "video", "device", FORECASTER)  # the last is compared above
     open_run(config.folder, settings, provenance(PACKAGES) | {"seed": config.seed}, config.resume, free)
-    if config.backend == "envpool" and (copy := native_task_of(config.env_id)) in ONE_START:
+    if config.backend == "envpool" and (copy := envpool_task_of(config.env_id)) in ONE_START:
         console.print(f"note: EnvPool's {copy} begins every episode in the same state; the original does not")
     policy = train(plan, config.folder)
     model = load_model(policy, config.algorithm)

@@ -141,11 +141,11 @@ class MultiagentArena:
         self._venv.seed(seed)
         observations: Any = self._venv.reset()
         episode, steps = self._env.episodes, 0
-        returns = dict.fromkeys(self._venv.row_agents, 0.0)
+        returns = dict.fromkeys(self._venv.agents_of_envs, 0.0)
         while self._env.episodes == episode:
             actions = policy.predict(observations, deterministic=True)[0]
             observations, rewards, _, _ = self._venv.step(actions)
-            for agent, reward in zip(self._venv.row_agents, rewards.tolist(), strict=True):
+            for agent, reward in zip(self._venv.agents_of_envs, rewards.tolist(), strict=True):
                 returns[agent] += reward
             steps += 1
         return _result(seed, steps, returns)
@@ -154,7 +154,7 @@ class MultiagentArena:
         env = self._env
         observations, _ = env.reset(seed=seed)
         driver = make_driver(name, env, driver_rng(seed, group=1))  # group 0: agents that do not learn
-        returns = dict.fromkeys(self._venv.row_agents, 0.0)
+        returns = dict.fromkeys(self._venv.agents_of_envs, 0.0)
         steps, lived = 0, set(env.agents)
         while env.agents and not (lived.issuperset(returns) and returns.keys().isdisjoint(env.agents)):
             own = own_observations(observations)

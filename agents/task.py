@@ -11,10 +11,10 @@ from envs.drivers.all_agents import DRIVER_NAMES, make_driver
 from envs.parallel import ForecastParallelEnv
 from envs.registry import (
     checkpoint_for,
+    envpool_task_of,
     is_multiagent_id,
     make_env,
     make_multiagent_env,
-    native_task_of,
 )
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.sb3.padded_spaces import learners_named
@@ -63,7 +63,7 @@ class Task:
             raise UserError(f"learners are for PettingZoo environments, {self.env_id} has one ego; leave them out")
         check_choice("driver", self.driver, DRIVER_NAMES)
         if self.backend == "envpool":
-            native_task_of(self.env_id)
+            envpool_task_of(self.env_id)
             if importlib.util.find_spec("envpool") is None:
                 raise UserError("backend envpool needs the envpool package; pip install 'dgvae-rl[envpool]'")
         if self.checkpoint is not None and self.observe != "forecast":

@@ -23,7 +23,7 @@ from envs.drivers.all_agents import Driver, make_driver
 from envs.drivers.ego import make_ego_driver
 from envs.drivers.trained import EgoDriver
 from envs.parallel import ForecastParallelEnv
-from envs.registry import make_env, make_multiagent_env, native_task_of
+from envs.registry import envpool_task_of, make_env, make_multiagent_env
 from envs.sb3.agents_as_rows import AgentMonitor, ParallelVecEnv
 from envs.sb3.envpool import EnvPoolVecEnv
 from envs.sb3.forecast import VecForecast
@@ -152,7 +152,7 @@ def make_venv(task: Task, num_envs: int, seeded: bool = False) -> VecEnv:
     spec = task.scene_spec
     if task.backend == "envpool":
         venv = EnvPoolVecEnv(
-            native_task_of(task.env_id),
+            envpool_task_of(task.env_id),
             num_envs,
             scenes=spec is not None,
             perception_m=None if spec is None else spec.perception_m,

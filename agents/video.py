@@ -50,7 +50,7 @@ def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) ->
         for agent in observations:
             if agent in learners:
                 seen = own[agent] if task.observe == "none" else observations[agent]
-                chosen = policy.predict(venv.row_of(agent, seen), deterministic=True)[0]
+                chosen = policy.predict(venv.padded_observation(agent, seen), deterministic=True)[0]
                 actions[agent] = venv.own_action(agent, chosen)
         return actions
 

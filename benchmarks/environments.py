@@ -17,7 +17,7 @@ from benchmarks.results import Line, skipped
 from benchmarks.settings import Settings
 from benchmarks.timing import Meter, Timing, interpreter, rate_line, ratio_line
 from benchmarks.wrapper_overhead import blocks_of, make_venv, paper_sized
-from envs.registry import native_task_of
+from envs.registry import envpool_task_of
 from envs.sb3.envpool import EnvPoolVecEnv
 from envs.sb3.forecast import VecForecast
 
@@ -119,5 +119,5 @@ def _environments(case: Case, env_id: str) -> Iterator[dict[str, VecEnv]]:
 
 def _venv(case: Case, env_id: str, scenes: bool) -> VecEnv:
     if case.vec == "native":
-        return EnvPoolVecEnv(native_task_of(env_id), case.envs, seed=0, scenes=scenes)
+        return EnvPoolVecEnv(envpool_task_of(env_id), case.envs, seed=0, scenes=scenes)
     return make_venv(env_id, case.envs, case.vec, scenes)

@@ -16,7 +16,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from envs.readers.envpool import PoolIdentity, PoolReader, native_spec
+from envs.readers.envpool import PoolIdentity, PoolReader, envpool_spec
 from envs.readers.highway import HighwayReader
 from envs.registry import make_env
 from envs.simulators.envpool import HIGHWAY_ENV_OF, make_pool
@@ -85,7 +85,7 @@ def count_envpool(task_id: str, config: IdentityConfig) -> Count:
     rng = np.random.default_rng(config.seed)
     pool = make_pool(task_id, [config.seed + i for i in range(config.num_envs)])
     pool.reset()
-    reader = PoolReader(native_spec(task_id, pool.config), config.num_envs)
+    reader = PoolReader(envpool_spec(task_id, pool.config), config.num_envs)
     env_indices = np.arange(config.num_envs)
     states = pool.debug_states()
     agents = len(states[0].vehicles)

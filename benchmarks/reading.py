@@ -114,8 +114,8 @@ def _highway(settings: Settings) -> Iterator[tuple[Callable[[], float], int]]:
 @contextmanager
 def _pool(settings: Settings) -> Iterator[tuple[Callable[[], float], int]]:
     from benchmarks.wrapper_overhead import blocks_of
-    from envs.registry import native_task_of
+    from envs.registry import envpool_task_of
     from envs.sb3.envpool import EnvPoolVecEnv
 
-    with closing(EnvPoolVecEnv(native_task_of(settings.env_id), POOL_ENVS, seed=0, scenes=False)) as venv:
+    with closing(EnvPoolVecEnv(envpool_task_of(settings.env_id), POOL_ENVS, seed=0, scenes=False)) as venv:
         yield blocks_of(venv, STEPS[settings.mode]), POOL_ENVS

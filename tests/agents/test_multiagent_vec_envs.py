@@ -38,7 +38,7 @@ def test_every_learner_of_every_copy_is_an_environment(learners: tuple[str, ...]
     venv = make_multiagent_venv(Task(TAG, "none", learners=learners), 2)
     assert venv.num_envs == 2 * len(expected)
     assert venv.get_attr("possible_agents")[0] == ["adversary_0", "adversary_1", "adversary_2", "agent_0"]
-    assert venv.venv.row_agents == 2 * expected  # type: ignore[attr-defined]
+    assert venv.venv.agents_of_envs == 2 * expected  # type: ignore[attr-defined]
     venv.close()
 
 
