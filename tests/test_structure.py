@@ -199,3 +199,36 @@ def test_no_file_mentions_a_path_of_one_machine():
         if any(home in line for home in homes)
     ]
     assert found == []
+
+
+UNCLEAR_BEGINNINGS = ("Of ", "The same", "Likewise")
+"""A docstring begins with a verb or a noun that says what this is; these say it of something that stands elsewhere."""
+
+
+def docstrings(path: Path) -> Iterator[tuple[int, str]]:
+    """Line and text of every docstring of a file: of modules, classes, functions, and below fields and constants."""
+    for node in ast.walk(ast.parse(path.read_text(), str(path))):
+        if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        fields = zip(node.body, node.body[1:], strict=False)
+        below = [text for field, text in fields if isinstance(field, ast.Assign | ast.AnnAssign)]
+        for text in (*node.body[:1], *below):
+            if (
+                isinstance(text, ast.Expr)
+                and isinstance(text.value, ast.Constant)
+                and isinstance(text.value.value, str)
+            ):
+                yield text.lineno, text.value.value.strip()
+
+
+def test_docstrings_begin_with_what_they_describe():
+    """`--seed  Of the drawn windows` is a line of --help that says nothing; "Random seed for …" does."""
+    own = [path for path in sources() if relative(path).split("/")[0] != "tests"]
+    found = [
+        f"{relative(path)}:{line}: {text.splitlines()[0][:80]}"
+        for path in own
+        for line, text in docstrings(path)
+        if text.startswith(UNCLEAR_BEGINNINGS)
+    ]
+    assert sum(1 for path in own for _ in docstrings(path)) > 1000
+    assert found == []
