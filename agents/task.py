@@ -91,7 +91,7 @@ class Task:
 
     @property
     def note(self) -> PolicyNote:
-        """What a policy of this task needs beside its weights.
+        """Note of a policy of this task: its forecaster, learners and driver.
 
         Raises:
             UserError: see `scene_spec`.

@@ -190,9 +190,13 @@ REQUIRED: dict[str, list[str]] = {
     "benchmarks.graph_accuracy": ["--checkpoint", "highway", "--data", "store"],
     "benchmarks.gpu_springs": ["--device", "cpu"],
 }
-"""Words that a command does not do without."""
+"""Required options of a command."""
 
-VALUE_OF = {"--driver": "varied", "--out": "elsewhere", "--env-id": "merge-v1", "--checkpoint": "a", "--data": "b"}
+VALUE_OF = {
+    "--driver": "varied", "--out": "elsewhere", "--env-id": "merge-v1", "--checkpoint": "a", "--data": "b",
+    "--lines": "mlp", "--only-line": "mlp",
+}  # fmt: skip
+"""Value of an option that does not take the number 60."""
 
 
 def source_of(command: str) -> str:
@@ -200,7 +204,7 @@ def source_of(command: str) -> str:
 
 
 def config_of(command: str) -> type:
-    """The dataclass that a command's `main` reads."""
+    """Returns the dataclass that a command's `main` reads."""
     (name,) = re.findall(r"parse\((\w+), __doc__\)", source_of(command))
     found = getattr(importlib.import_module(command), name)
     assert is_dataclass(found)
@@ -208,7 +212,7 @@ def config_of(command: str) -> type:
 
 
 def all_configs() -> list[type]:
-    """The commands' dataclasses and those inside of them."""
+    """Returns the commands' dataclasses and those inside of them."""
     found = [config_of(command) for command in REFUSED]
     for config in found:
         found += [kind for kind in get_type_hints(config).values() if is_dataclass(kind)]

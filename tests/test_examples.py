@@ -40,7 +40,7 @@ COMMANDS = {
 
 @pytest.fixture(autouse=True)
 def examples_on_the_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """As with `export PYTHONPATH=docs/examples`; what the examples register is gone afterwards."""
+    """Puts the examples on the path like `export PYTHONPATH=docs/examples`; removes their registrations afterwards."""
     monkeypatch.syspath_prepend(EXAMPLES)
     monkeypatch.setattr(envs.readers, "_REGISTERED", {})
     yield
@@ -173,7 +173,7 @@ def test_the_table_tells_what_the_world_knows():
 
 
 def test_collect_train_wrap(tmp_path: Path):
-    """The commands' own functions, on a few episodes and with a tiny network."""
+    """Runs the commands' own functions on a few episodes, with a tiny network."""
     config = CollectConfig(CROSSING, tmp_path / "data", episodes=3, driver=("random",), max_steps=12, workers=1)
     episodes = list(collect(config))
     spec = reader_for(make_crossing()).spec

@@ -13,11 +13,11 @@ from importlinter.cli import lint_imports
 
 ROOT = Path(__file__).resolve().parents[1]
 LAYERS = ("predictor", "envs", "agents", "train_policy")
-"""From the bottom up; each may import those before it."""
+"""Layers from the bottom up; each may import those before it."""
 FOREIGN_TO_PREDICTOR = ("gymnasium", "pettingzoo", "stable_baselines3", "highway_env", "tqdm", "pygame")
 ROOMS = ("predictor", "envs", "agents", "tests", "benchmarks", "docs", ".ci")
 MAX_LINES = 400
-"""Of a module; longer ones are cut in two."""
+"""Largest number of lines of a module; longer ones are split."""
 TEXT_SUFFIXES = {".py", ".md", ".toml", ".json", ".txt", ".yml", ".yaml", ".cfg", ""}
 
 
@@ -29,14 +29,14 @@ def sources() -> list[Path]:
 
 
 def texts() -> list[Path]:
-    """Everything a clone holds that people read; runs, data and caches are not part of it."""
+    """Returns all texts of a clone; runs, data and caches are not part of it."""
     inside = [path for room in ROOMS for path in (ROOT / room).rglob("*") if "__pycache__" not in path.parts]
     top = [path for path in ROOT.iterdir() if not path.name.startswith(".")]
     return sorted(path for path in [*inside, *top] if path.is_file() and path.suffix in TEXT_SUFFIXES)
 
 
 def imported_modules(path: Path) -> Iterator[tuple[int, str]]:
-    """Every absolute import of a file, also inside functions and under TYPE_CHECKING."""
+    """Yields all absolute imports of a file, also inside functions and under TYPE_CHECKING."""
     for node in ast.walk(ast.parse(path.read_text(), str(path))):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
@@ -78,7 +78,7 @@ def module_name(path: Path, root: Path = ROOT) -> str:
 
 
 def imports_within(path: Path, known: Mapping[str, Path]) -> Iterator[str]:
-    """Modules among `known` that a file imports: at its top, in functions, under TYPE_CHECKING, or by import_module."""
+    """Yields the modules of `known` that a file imports, also in functions, under TYPE_CHECKING, by import_module."""
     for node in ast.walk(ast.parse(path.read_text(), str(path))):
         if isinstance(node, ast.Import):
             named = [alias.name for alias in node.names]

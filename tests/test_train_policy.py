@@ -39,11 +39,11 @@ ROLLOUT = 20
 PPO = (*TINY, "--steps", str(2 * ROLLOUT))
 DQN = (*TINY, "--algorithm", "dqn", "--steps", str(2 * ROLLOUT))  # learns from step 10 on
 TAG = (*TINY[2:], "--env-id", "simple_tag_v3", "--checkpoint", "constant-velocity", "--steps", str(6 * ROLLOUT))
-"""Two rollouts of three pursuers."""
+"""Arguments of a run with two rollouts of three pursuers."""
 
 
 def short_preset(env_id: str, algorithm: Algorithm, backend: Backend = "gymnasium") -> Preset:
-    """The preset with short rollouts and few gradient steps: what is tested is the command, not the learning."""
+    """Returns the preset with short rollouts and few gradient steps: the command is tested, not the learning."""
     preset = preset_for(env_id, algorithm, backend)
     if isinstance(preset, PPOPreset):
         return replace(preset, n_steps=ROLLOUT, batch_size=ROLLOUT, n_epochs=1)
@@ -71,7 +71,7 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 
 def trained(run: Path, *arguments: str, short: bool = True) -> tuple[Path, str]:
-    """A run and what it printed."""
+    """Returns a run and its output."""
     printed = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
         if short:
@@ -83,18 +83,18 @@ def trained(run: Path, *arguments: str, short: bool = True) -> tuple[Path, str]:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """On the highway."""
+    """Returns a finished run on the highway."""
     return trained(tmp_path_factory.mktemp("finished") / "run", *PPO)
 
 
 @pytest.fixture(scope="module")
 def chased(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """Of pursuers."""
+    """Returns a finished run of pursuers."""
     return trained(tmp_path_factory.mktemp("chased") / "run", *TAG[:-1], str(3 * ROLLOUT))
 
 
 def assert_video(path: Path, least_s: float) -> None:
-    """The file is a video that decodes."""
+    """Checks that the file is a video that decodes."""
     assert path.read_bytes()[4:8] == b"ftyp"
     frames, seconds = imageio_ffmpeg.count_frames_and_secs(path)
     assert frames > 10
@@ -147,7 +147,7 @@ def test_a_finished_policy_is_evaluated_again(finished: tuple[Path, str], monkey
 
 
 def with_note(run: Path, target: Path, change: Callable[[dict[str, Any]], None]) -> Path:
-    """A copy of a run whose policy has another note."""
+    """Copies a run and gives its policy another note."""
     shutil.copytree(run, target, ignore=shutil.ignore_patterns("evaluation"))
     with zipfile.ZipFile(run / "policy.zip") as whole, zipfile.ZipFile(target / "policy.zip", "w") as copy:
         for name in whole.namelist():

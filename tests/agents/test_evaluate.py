@@ -85,7 +85,7 @@ def test_written_summary_is_valid_json_and_a_table(tmp_path: Path):
 
 
 def herd(seed: int, ants: float, bees: float) -> EpisodeResult:
-    """An episode of several roles, without an ego."""
+    """Returns the result of an episode with several roles, without an ego."""
     return EpisodeResult(seed, (ants + bees) / 2, 5, None, math.nan, {"ant": ants, "bee": bees})
 
 

@@ -17,11 +17,11 @@ TAG, SPREAD = "simple_tag_v3", "simple_spread_v3"
 
 
 def facts(results: list[EpisodeResult]) -> list[tuple]:
-    """Without the speed, whose NaN equals nothing."""
+    """Returns the results without the speed, as NaN is not equal to NaN."""
     return [(r.seed, r.episode_return, r.length, r.crashed, r.returns_by_role) for r in results]
 
 
-# --- Rows -------------------------------------------------------------------------------------------------------------
+# --- Environments -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

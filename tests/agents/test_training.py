@@ -25,7 +25,7 @@ CONSTANT_VELOCITY = Task("highway-fast-v0", "constant-velocity")
 
 
 class Coin(gym.Env[np.ndarray, np.int64]):
-    """Three steps; pays for action 1."""
+    """Environment with episodes of three steps and a reward for action 1."""
 
     observation_space = gym.spaces.Box(0, 1, (1,), np.float32)
     action_space = gym.spaces.Discrete(2)
@@ -85,7 +85,7 @@ def test_there_is_always_a_selection_at_the_end(make_selection: Callable[[int], 
 
 
 class Scripted:
-    """An arena whose results are given: one list of returns per measurement."""
+    """Arena with given results: one list of returns per measurement."""
 
     baselines = ()
 

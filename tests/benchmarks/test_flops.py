@@ -28,7 +28,7 @@ def _linear(first: Any, second: Any, third: Any, *_: Any, out_shape: Any = None,
 
 
 def executed(call: Any) -> float:
-    """FLOP that torch counts; it counts products, but not those into one of their own inputs or by oneDNN."""
+    """Returns FLOP as counted by torch, which misses products into one of their own inputs and those of oneDNN."""
     others = {torch.ops.aten.addmm_: _addmm, torch.ops.aten.baddbmm_: _baddbmm}
     if torch.backends.mkldnn.is_available():
         others[torch.ops.mkldnn._linear_pointwise] = _linear
