@@ -11,10 +11,10 @@ from envs.drivers.all_agents import DRIVER_NAMES, make_driver
 from envs.parallel import ForecastParallelEnv
 from envs.registry import (
     checkpoint_for,
+    envpool_task_of,
     is_multiagent_id,
     make_env,
     make_multiagent_env,
-    envpool_task_of,
 )
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.sb3.padded_spaces import learners_named

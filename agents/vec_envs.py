@@ -23,7 +23,7 @@ from envs.drivers.all_agents import Driver, make_driver
 from envs.drivers.ego import make_ego_driver
 from envs.drivers.trained import EgoDriver
 from envs.parallel import ForecastParallelEnv
-from envs.registry import make_env, make_multiagent_env, envpool_task_of
+from envs.registry import envpool_task_of, make_env, make_multiagent_env
 from envs.sb3.agents_as_rows import AgentMonitor, ParallelVecEnv
 from envs.sb3.envpool import EnvPoolVecEnv
 from envs.sb3.forecast import VecForecast

@@ -17,10 +17,10 @@ from envs.registry import (
     EnvEntry,
     checkpoint_for,
     entry_for,
+    envpool_task_of,
     is_multiagent_id,
     make_env,
     make_multiagent_env,
-    envpool_task_of,
 )
 from envs.simulators.envpool import ENV_IDS as ENVPOOL_IDS
 from envs.simulators.envpool import HIGHWAY_ENV_OF

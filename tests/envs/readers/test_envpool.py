@@ -17,8 +17,8 @@ from envs.readers.envpool import (
     EnvPoolReader,
     PoolIdentity,
     PoolReader,
-    is_envpool_env,
     envpool_spec,
+    is_envpool_env,
     vehicles_of,
 )
 from envs.readers.highway import HighwayReader
