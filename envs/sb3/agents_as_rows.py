@@ -165,8 +165,9 @@ class ParallelVecEnv(VecEnv):
                 self._keep_infos(first, copy, copy.reset())
         rewards = np.array([turn.reward for turn in turns], dtype=np.float32)
         dones = np.array([turn.done for turn in turns], dtype=np.bool_)
+        observations = self._observe()  # before the infos, whose last observations it completes with forecasts
         infos = [self._info(agent, turn) for agent, turn in zip(self.agents_of_envs, turns, strict=True)]
-        return self._observe(), rewards, dones, infos
+        return observations, rewards, dones, infos
 
     def padded_observation(self, agent: str, observation: Any) -> Any:
         """Returns a learner's own observation in the VecEnv's space: padded, with the indicator."""

@@ -552,7 +552,7 @@ def test_a_reader_that_breaks_the_contract_is_named():
             return replace(super().read(env), index_of={"stays": 7})
 
     env = ForecastParallelEnv(Toy(), "constant-velocity", reader=Careless)
-    with pytest.raises(UserError, match="scene reader of env 'toy_v0': agent 'stays' should be in row 7"):
+    with pytest.raises(UserError, match="scene reader of env 'toy_v0': agent 'stays' has index 7"):
         env.reset(seed=0)
 
 

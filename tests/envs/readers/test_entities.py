@@ -335,7 +335,7 @@ def test_an_observation_that_is_no_table_is_named():
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ([[0, 0, 0, 0, 0]], "row 0 must hold the ego, but its presence is 0"),
+        ([[0, 0, 0, 0, 0]], "the first line must hold the ego, but its presence is 0"),
         ([[1, 0, 0, np.nan, 0]], "the observation must be finite"),
     ],
 )

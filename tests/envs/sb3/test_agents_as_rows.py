@@ -485,7 +485,7 @@ def test_spaces_that_one_policy_cannot_have(observations, actions, indicator, me
 
 def test_an_observation_of_another_shape_than_its_space_is_named():
     factory = with_spaces({"a": BOX2, "b": BOX3}, {"a": FIVE, "b": FIVE}, lambda agent, seen: seen[:1])
-    with pytest.raises(UserError, match=r"agent 'a' must see an array of shape \(2,\), it saw \(1,\)"):
+    with pytest.raises(UserError, match=r"the observation of agent 'a' must have shape \(2,\), got \(1,\)"):
         ParallelVecEnv([factory]).reset()
 
 
@@ -602,7 +602,7 @@ def test_agents_without_a_row_or_without_an_observation_are_named():
     venv = ParallelVecEnv([Scripted])
     venv.envs[0].possible_agents.remove("bee_0")
     venv.reset()
-    with pytest.raises(UserError, match=r"\['bee_0'\] are not in possible_agents"):
+    with pytest.raises(UserError, match=r"one of possible_agents, but \['bee_0'\] are not"):
         play(venv, 2)
 
     class Blind(Scripted):
@@ -622,7 +622,7 @@ def test_steps_out_of_order_are_refused():
     venv.reset()
     with pytest.raises(ProtocolError, match="call step_async"):
         venv.step_wait()
-    with pytest.raises(UserError, match=r"one action per row \(3\), got 2"):
+    with pytest.raises(UserError, match=r"one action per env \(3\), got 2"):
         venv.step(np.zeros(2, int))
     venv.step_async(np.zeros(3, int))
     venv.reset()

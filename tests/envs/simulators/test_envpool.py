@@ -422,7 +422,7 @@ def test_an_envpool_that_hides_its_vehicles_is_named(monkeypatch: pytest.MonkeyP
     import envpool
 
     monkeypatch.setattr(envpool, "make", lambda *args, **kwargs: object())
-    with pytest.raises(UserError, match="does not say where the vehicles are; 1.2.5 does"):
+    with pytest.raises(UserError, match="does not report the vehicles' positions; install 1.2.5"):
         make_pool("Merge-v0", [0])
 
 
@@ -470,7 +470,7 @@ def test_stepping_before_the_first_reset_is_named():
 def test_every_row_needs_an_action():
     venv = small_pool()
     venv.reset()
-    with pytest.raises(UserError, match="one action for each of 3 rows, got 2"):
+    with pytest.raises(UserError, match="one action for each of 3 envs, got 2"):
         venv.step(ACTIONS[0, :2])
 
 
