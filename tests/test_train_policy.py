@@ -139,7 +139,7 @@ def test_best_model_carries_its_result(finished: tuple[Path, str]):
 
 def test_a_finished_policy_is_evaluated_again(finished: tuple[Path, str], monkeypatch: pytest.MonkeyPatch):
     run, _ = finished
-    arguments = ["evaluate.py", "--out", str(run), "--episodes", "1", "--num-envs", "1"]
+    arguments = ["evaluate.py", "--run-dir", str(run), "--episodes", "1", "--num-envs", "1"]
     monkeypatch.setattr(sys, "argv", arguments)
     run_entry_point(evaluate.main)
     again = json.loads((run / "evaluation" / "summary.json").read_text())
@@ -177,7 +177,7 @@ def test_a_policy_is_not_evaluated_on_another_forecaster(
     finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     run = with_note(finished[0], tmp_path / "run", lambda note: note["policy"]["forecaster"].update(OTHER))
-    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--out", str(run), "--episodes", "1", "--workers", "1"])
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--run-dir", str(run), "--episodes", "1", "--num-envs", "1"])
     with pytest.raises(SystemExit) as exit_:
         run_entry_point(evaluate.main)
     assert exit_.value.code == 2
@@ -190,7 +190,7 @@ def test_a_policy_without_a_pin_is_evaluated_with_a_notice(
     finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     run = with_note(finished[0], tmp_path / "run", lambda note: note.pop("policy"))
-    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--out", str(run), "--episodes", "1", "--workers", "1"])
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--run-dir", str(run), "--episodes", "1", "--num-envs", "1"])
     run_entry_point(evaluate.main)
     assert "does not say which forecaster it was trained on" in " ".join(capsys.readouterr().err.split())
     assert (run / "evaluation" / "summary.json").exists()
@@ -244,7 +244,7 @@ def test_pursuers_are_trained_measured_and_filmed_against_a_prey_that_is_driven(
 
 def test_pursuers_are_evaluated_again(chased: tuple[Path, str], monkeypatch: pytest.MonkeyPatch):
     run, _ = chased
-    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--out", str(run), "--episodes", "1"])
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--run-dir", str(run), "--episodes", "1"])
     run_entry_point(evaluate.main)
     again = json.loads((run / "evaluation" / "summary.json").read_text())
     assert again["episodes"] == json.loads((run / "summary.json").read_text())["episodes"]
@@ -296,6 +296,7 @@ def test_who_learns(env_id: str, asked: tuple[str, ...] | None, learners: tuple[
     assert task.learners == learners
 
 
+@pytest.mark.usefixtures("short")
 @pytest.mark.parametrize(
     ("arguments", "interrupted_at"),
     [(PPO, ROLLOUT), (DQN, ROLLOUT), (TAG, 3 * ROLLOUT)],
@@ -448,7 +449,7 @@ def test_help_explains_every_field(command: Callable[..., None], capsys: pytest.
 def test_evaluating_no_run_is_one_clear_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--out", str(tmp_path)])
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--run-dir", str(tmp_path)])
     with pytest.raises(SystemExit) as exit_:
         run_entry_point(evaluate.main)
     assert exit_.value.code == 2

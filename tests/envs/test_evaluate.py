@@ -224,7 +224,7 @@ def test_a_learned_checkpoint_is_measured_among_many_learners(in_process: None, 
 
 def test_neighbours_have_a_row_where_there_is_data(in_process: None, tmp_path: Path):
     """A folder of stores, of which one is named by the env; it holds the very episode, six times."""
-    settings: dict[str, Any] = {"ego": "idle", "seed": 5, "episodes": 1}
+    settings: dict[str, Any] = {"driver": "idle", "seed": 5, "episodes": 1}
     (recorded,) = collect(CollectConfig(ROAD, tmp_path, 1, ("idle",), 5, 6, False, 1))
     write_store(tmp_path / ROAD, StoreInfo(HighwayReader(make_env(ROAD)).spec, ROAD), [recorded] * 6)
     for root in (tmp_path, tmp_path / ROAD):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from envs.drivers.all_agents import make_driver
-from envs.drivers.ego import make_ego
+from envs.drivers.ego import make_ego_driver
 from envs.readers.base import role_of
 from envs.registry import (
     CHECKPOINTS,
@@ -132,7 +132,7 @@ def test_every_listed_id_is_made_and_driven_by_its_default_drivers(env_id: str):
     if not entry.multiagent:
         env = make_env(env_id)
         for name in entry.drivers:
-            make_ego(name, SceneObservation(env), rng)
+            make_ego_driver(name, SceneObservation(env), rng)
         env.close()
         return
     multiagent = make_multiagent_env(env_id)

@@ -129,7 +129,7 @@ def test_failed_save_leaves_the_old_checkpoint_whole(
         case "config":
             monkeypatch.setattr(checkpoint, "asdict", crash)
         case "replace":
-            monkeypatch.setattr(checkpoint, "replace_folder", crash)
+            monkeypatch.setattr("predictor.support.files._replace_folder", crash)
     with pytest.raises(KeyboardInterrupt):
         save_checkpoint(path, made(1), INFO)
     monkeypatch.undo()
