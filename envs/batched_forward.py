@@ -1,8 +1,8 @@
-"""One forward for many copies of a PettingZoo environment, which would each make its own.
+"""Forecasts many copies of a PettingZoo environment in one batch.
 
-Copies step one after another and each wants its forecast at once. A vector environment needs none before the last copy
-has stepped: attached to a `BatchedForward`, the copies return observations whose forecast entries are missing, and
-`fill` puts them in, all copies in one batch. What each copy sees is what it would see by itself.
+A single environment forecasts at each step. A vector environment needs no forecast before its last copy has stepped:
+attached to a `BatchedForward`, the copies return observations without forecast entries, and `fill` adds these for all
+copies in one batch. Each copy's observations are those that it would return by itself.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,24 +22,24 @@ from predictor.scene import Forecast
 
 @dataclass(frozen=True)
 class _Moment:
-    """A scene of one environment, and what its agents' observations still lack."""
+    """Scene of one environment, and its agents' observations, to which forecast entries are to be added."""
 
     scene: MultiagentScene
     observations: Mapping[str, dict[str, Any]]
 
 
 class BatchedForward:
-    """Forecasts for several environments whose scenes arrive one by one.
+    """Forecasts the scenes of several environments, which arrive one by one, in one batch.
 
     Args:
-        streams: of the environments; equal but for their noise, which goes on here.
+        streams: stream of each environment, equal except for their noise, which is continued here.
 
     Attributes:
         stream: history and noise of all environments.
     """
 
     def __init__(self, streams: Sequence[MultiagentStream]) -> None:
-        """Start with empty memory."""
+        """Starts with empty memory."""
         first = streams[0]
         view = first.view_spec
         self.stream = MultiagentStream(
@@ -52,7 +52,7 @@ class BatchedForward:
     def begin(
         self, env: int, scene: MultiagentScene, observations: Mapping[str, dict[str, Any]], seed: int | None = None
     ) -> None:
-        """Note the first scene of an environment's episode; a seed restarts its noise."""
+        """Notes the first scene of an environment's episode; a seed restarts its noise."""
         if env in self._opened or seed is not None:
             self.fill()
         if seed is not None:
@@ -60,13 +60,13 @@ class BatchedForward:
         self._opened[env] = _Moment(scene, observations)
 
     def go_on(self, env: int, scene: MultiagentScene, observations: Mapping[str, dict[str, Any]]) -> None:
-        """Note the next scene of an environment's episode."""
+        """Notes the next scene of an environment's episode."""
         if env in self._stepped or env in self._opened:
             self.fill()
         self._stepped[env] = _Moment(scene, observations)
 
     def fill(self) -> None:
-        """Put the forecast entries into all observations that were noted; an agent that is not seen gets zeros."""
+        """Adds the forecast entries to all noted observations; zeros for an agent that is not in the scene."""
         stepped, opened = self._stepped, self._opened
         self._stepped, self._opened = {}, {}
         if opened.keys() <= stepped.keys() and len(stepped) == self.stream.num_envs:
@@ -99,7 +99,7 @@ class BatchedForward:
 
 
 def can_share(streams: Sequence[MultiagentStream]) -> bool:
-    """Whether one `BatchedForward` gives each of these what it gives by itself: equal views and equal networks."""
+    """Returns whether the streams can use one `BatchedForward`: equal views, settings and networks."""
     first = streams[0]
     return all(
         (one.scene_spec, one.view_spec, replace(one.config, seed=0))

@@ -1,4 +1,4 @@
-"""Record what the agents of an environment do: `python -m envs.collect --env-id roundabout-v1 --out data/roundabout`.
+"""Records the agents of an environment: `python -m envs.collect --env-id roundabout-v1 --out data/roundabout`.
 
 Each episode is a function of its seed alone, so the store is the same for any number of workers.
 """
@@ -26,7 +26,7 @@ PACKAGES = ("highway-env", "mpe2", "pettingzoo", "envpool", "gymnasium", "numpy"
 
 @dataclass(frozen=True)
 class CollectConfig:
-    """Record episodes of an environment into an episode store."""
+    """Records episodes of an environment into an episode store."""
 
     env_id: str
     """Environment to record: gymnasium id (highway-fast-v0, envpool/HighwayFast-v0) or PettingZoo parallel id
@@ -36,7 +36,7 @@ class CollectConfig:
     episodes: int = 400
     """Number of episodes to record."""
     driver: Annotated[tuple[str, ...], Renamed("ego")] = ()
-    """Who drives; episodes take several in turn. One ego: random, idle, varied, keep-lane, or the path of a policy
+    """Driver; several take turns, one per episode. One ego: random, idle, varied, keep-lane, or the path of a policy
     .zip. Many learners: random, idle, varied, heuristic, mixed. None given: varied random idle, or heuristic mixed
     varied."""
     seed: int = 0
@@ -44,30 +44,31 @@ class CollectConfig:
     max_steps: int = 200
     """Largest length of an episode; longer ones are cut there [policy steps]."""
     labels: bool = True
-    """Record who follows whom at each step, and with what gap: for training on known edges and for scores, never seen
-    by a policy. The recorded states are the same without; docs/datasets/env.md has the price in time and bytes."""
+    """Whether to record leaders and followers with their gaps at each step: for training on known edges and for scores,
+    never part of an observation. Recorded states do not depend on it; docs/datasets/env.md has its cost in time and
+    bytes."""
     workers: int = os.cpu_count() or 1
     """Number of parallel processes; the store does not depend on it."""
     overwrite: bool = False
-    """Replace an existing store."""
+    """Whether to replace an existing store."""
 
     def __post_init__(self) -> None:
-        """Check ranges.
+        """Checks ranges.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value out of range.
         """
         check_at_least(self, 1, "episodes", "max_steps", "workers")
         check_at_least(self, 0, "seed")
 
     @property
     def drivers(self) -> tuple[str, ...]:
-        """Who takes turns."""
+        """Drivers that take turns, one per episode."""
         return self.driver or default_drivers(self.env_id)
 
 
 def collect(config: CollectConfig) -> Iterator[Episode]:
-    """Record the episodes of a config, in the order of their seeds."""
+    """Records the episodes of a config, in the order of their seeds."""
     drivers = config.drivers
     tasks = [
         _Task(config.env_id, drivers[i % len(drivers)], config.seed + i, config.max_steps, config.labels)
@@ -82,7 +83,7 @@ def collect(config: CollectConfig) -> Iterator[Episode]:
 
 class _Task(NamedTuple):
     env_id: str
-    ego: str
+    driver: str
     seed: int
     max_steps: int
     labels: bool
@@ -98,9 +99,9 @@ def _limit_threads() -> None:
 
 
 def _record(task: _Task) -> Episode:
-    if (task.env_id, task.ego) not in _worlds:
-        _worlds[task.env_id, task.ego] = open_world(task.env_id, task.ego)
-    world = _worlds[task.env_id, task.ego]
+    if (task.env_id, task.driver) not in _worlds:
+        _worlds[task.env_id, task.driver] = open_world(task.env_id, task.driver)
+    world = _worlds[task.env_id, task.driver]
     world.reset(task.seed)
     scenes: list[Scene] = []
     labels: list[SceneLabels] = []
@@ -116,7 +117,7 @@ def _record(task: _Task) -> Episode:
         note()
         if ended:
             break
-    episode = Episode.from_scenes(scenes, label=task.ego, seed=task.seed)
+    episode = Episode.from_scenes(scenes, label=task.driver, seed=task.seed)
     return with_labels(episode, scenes, labels) if labels else episode
 
 

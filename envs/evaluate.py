@@ -1,9 +1,9 @@
-"""Accuracy where it is deployed: `python -m envs.evaluate --env-ids roundabout-v1 --episodes 50 --out runs/accuracy`.
+"""Measures forecasts in running environments: `python -m envs.evaluate --env-ids roundabout-v1 --out runs/accuracy`.
 
-Drives the live environment through the deployed wrapper, reads each step's forecast out of the policy's observation,
-and compares it with what then happened to those agents, seen again or not. Constant velocity forecasts the same scenes,
-and, given recorded data, so does a memoryless nearest-neighbour forecaster. An ego is not counted: its future is the
-policy's choice. Several checkpoints make a transfer matrix: trained on A, measured on B.
+Drives the environment through the deployed wrapper and compares each step's forecast with the true future positions of
+its agents, perceived again or not (`envs.rollouts.episode`). Constant velocity forecasts the same scenes, and, given
+recorded data, so does a memoryless nearest-neighbour forecaster. Counted are all agents but an ego, whose future is
+the policy's choice, and landmarks. Several checkpoints make a transfer matrix: trained on A, measured on B.
 """
 
 import math
@@ -44,12 +44,12 @@ from predictor.support.runtime import keep_freed_memory
 PACKAGES = ("highway-env", "mpe2", "pettingzoo", "envpool", "gymnasium", "torch", "numpy")
 
 GALLERY_CASES = 6
-"""Worst forecasts that are drawn, at most one per episode."""
+"""Number of worst forecasts that are drawn, at most one per episode."""
 
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """Measure forecasts inside live environments, through the deployed wrapper, beside constant velocity."""
+    """Measures forecasts in running environments, through the deployed wrapper, beside constant velocity."""
 
     env_ids: tuple[str, ...] = (*CHECKPOINTS, *MULTIAGENT_CHECKPOINTS)
     """Environments to measure in, gymnasium or PettingZoo parallel; by default all ids with a shipped checkpoint."""
@@ -59,8 +59,8 @@ class EvaluateConfig:
     episodes: int = 50
     """Number of episodes in each environment."""
     driver: Annotated[str | None, Renamed("ego")] = None
-    """Who drives. One ego: random, idle, varied (default), keep-lane, or the path of a policy .zip (which gets the
-    measured forecasts). Many learners: random, idle, varied, heuristic (default), mixed."""
+    """Driver. One ego: random, idle, varied (default), keep-lane, or the path of a policy .zip (which gets the measured
+    forecasts). Many learners: random, idle, varied, heuristic (default), mixed."""
     seed: int = 900_000
     """Random seed: episode i is reset with seed + i; the shipped checkpoints were trained on seeds from 100,000
     on."""
@@ -69,7 +69,7 @@ class EvaluateConfig:
     horizon_steps: int | None = None
     """Number of steps to forecast; None takes each checkpoint's."""
     memory_steps: Annotated[tuple[int, ...], Renamed("history_steps")] = ()
-    """Numbers of steps to which the model's memory is limited, each measured as well: what its memory is worth."""
+    """Numbers of steps to which the model's memory is limited, each measured as well: the value of its memory."""
     neighbours: tuple[Path, ...] = ()
     """Recorded data for the nearest-neighbour forecaster: stores, or folders of stores named by env id; stores of other
     environments are left out."""
@@ -83,10 +83,10 @@ class EvaluateConfig:
     """Folder for accuracy.json, accuracy.md, and per environment a figure by horizon and a gallery of worst cases."""
 
     def __post_init__(self) -> None:
-        """Check ranges.
+        """Checks ranges.
 
         Raises:
-            UserError: a value that makes no sense, or two checkpoints of one name.
+            UserError: a value out of range, or two checkpoints of one name.
         """
         check_at_least(self, 1, "episodes", "num_samples", "max_steps", "workers", "horizon_steps", "memory_steps")
         check_at_least(self, 0, "seed")
@@ -97,18 +97,18 @@ class EvaluateConfig:
 
 
 def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = None) -> tuple[EnvAccuracy, list[Case]]:
-    """Run the episodes of one environment and summarise them.
+    """Plays the episodes of one environment and summarises them.
 
     Args:
-        config: what to run.
-        env_id: the environment.
+        config: settings of the evaluation.
+        env_id: id of the environment.
         checkpoint: shipped name or folder; None takes the one that ships for the id.
 
     Returns:
-        The numbers, and the worst forecasts.
+        The accuracy, and the worst forecasts.
 
     Raises:
-        UserError: unknown env or checkpoint, or episodes too short to compare anything.
+        UserError: unknown env or checkpoint, or episodes shorter than the horizon.
     """
     checkpoint = checkpoint if checkpoint is not None else checkpoint_for(env_id)
     if checkpoint != CONSTANT_VELOCITY:
@@ -141,7 +141,7 @@ def _play_all(config: EvaluateConfig, env_id: str, checkpoint: str, driver: str,
 
 
 def _neighbour_stores(roots: Sequence[Path], env_id: str) -> tuple[str, ...]:
-    """Those of the given stores that were recorded in this environment."""
+    """Returns the stores that were recorded in this environment."""
     found = []
     for root in roots:
         store = root / env_id if (root / env_id).is_dir() else root
@@ -166,14 +166,14 @@ def _summary(
     std_m = read_info(Path(checkpoint)).std_m if learned else fitted_std_m(first)
     name = MODEL_NAMES.get(read_info(Path(checkpoint)).model, "model") if learned else "constant velocity (deployed)"
 
-    def row(title: str, found: Sequence[Outcome], spread: Sequence[float]) -> Accuracy:
+    def line(title: str, found: Sequence[Outcome], spread: Sequence[float]) -> Accuracy:
         tally = Tally(spread, miss_m)
         for outcome in found:
             tally.add(outcome)
         return tally.accuracy(title, batch_intervals=True)
 
     # The spread of the baselines is fitted on these very errors, in their favour: they have no validation data.
-    straight = row("constant velocity", outcomes[STRAIGHT], fitted_std_m(outcomes[STRAIGHT]))
+    straight = line("constant velocity", outcomes[STRAIGHT], fitted_std_m(outcomes[STRAIGHT]))
     near = outcomes.get(NEIGHBOURS)
     reduction, interval = _reduction(first, outcomes[STRAIGHT])
     latencies_ms = 1e3 * np.concatenate([e.latencies_s[1:] or e.latencies_s for e in episodes])  # the first warms up
@@ -182,14 +182,14 @@ def _summary(
         name_of_folder(checkpoint) if learned else checkpoint,
         driver,
         spec.dt_s,
-        row(name, first, std_m),
-        row(name, outcomes[MODEL], std_m),
+        line(name, first, std_m),
+        line(name, outcomes[MODEL], std_m),
         straight,
         reduction,
         interval,
-        None if near is None else row(NEIGHBOURS, near, fitted_std_m(near)),
+        None if near is None else line(NEIGHBOURS, near, fitted_std_m(near)),
         {
-            n: row(f"{name}, {n} step{'s' * (n > 1)} of history", outcomes[memory_key(n)], std_m)
+            n: line(f"{name}, {n} step{'s' * (n > 1)} of history", outcomes[memory_key(n)], std_m)
             for n in config.memory_steps
         },
         _graph(episodes) if learned else None,
@@ -199,7 +199,7 @@ def _summary(
 
 
 def _graph(episodes: Sequence[Episode]) -> GraphAccuracy | None:
-    """Believed against true edges over all scenes; None where the simulator knows none."""
+    """Returns the accuracy of inferred against true edges over all scenes; None where the simulator has none."""
     if not any(e.edge_types for e in episodes):
         return None
     tally = GraphTally(episodes[0].edge_probs[0].shape[-1])
@@ -211,7 +211,7 @@ def _graph(episodes: Sequence[Episode]) -> GraphAccuracy | None:
 
 
 def _reduction(model: Sequence[Outcome], baseline: Sequence[Outcome]) -> tuple[float, tuple[float, float]]:
-    """Relative reduction of ADE and its 95 % interval: bootstrap over episodes, the same for both."""
+    """Returns the relative reduction of ADE and its 95 % interval, by a bootstrap over paired episodes."""
     sums = np.zeros((len(model), 2))
     for i, outcomes in enumerate(zip(model, baseline, strict=True)):
         for j, outcome in enumerate(outcomes):
@@ -224,21 +224,21 @@ def _reduction(model: Sequence[Outcome], baseline: Sequence[Outcome]) -> tuple[f
 
 
 def _relative(totals: Float[np.ndarray, "*draws 2"]) -> Float[np.ndarray, "*draws"]:
-    """1 − first / second; nothing to improve on is no improvement."""
+    """Returns 1 − first / second; 0 where second is 0."""
     first, second = totals[..., 0], totals[..., 1]
     return np.where(second > 0, 1 - first / np.where(second > 0, second, 1.0), 0.0)
 
 
 def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy], dict[tuple[str, str], str]]:
-    """All environments with all checkpoints; files under `config.out` as they come.
+    """Evaluates all checkpoints in all environments; writes each one's files under `config.out`.
 
     Returns:
-        The results, and for each (env, checkpoint) of a transfer matrix that do not fit, why.
+        The results, and the reason for each (env, checkpoint) of a transfer matrix that does not fit.
     """
     results: list[EnvAccuracy] = []
     misfits: dict[tuple[str, str], str] = {}
     for env_id in config.env_ids:
-        _neighbour_stores(config.neighbours, env_id)  # what is missing for all checkpoints is no misfit of one
+        _neighbour_stores(config.neighbours, env_id)  # an error for all checkpoints is no misfit of one
         for checkpoint in config.checkpoint or (None,):
             try:
                 result, cases = evaluate_env(config, env_id, checkpoint)
@@ -248,7 +248,7 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
                 misfits[env_id, name_of_folder(checkpoint)] = str(error)
                 continue
             results.append(result)
-            console.print(accuracy_table(result.rows, result.dt_s, report.title(result)))
+            console.print(accuracy_table(result.lines, result.dt_s, report.title(result)))
             console.print(report.remarks(result))
             if config.out is not None:
                 report.write_pictures(config.out, result, cases)
@@ -256,7 +256,7 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
 
 
 def _finite(content: Any) -> Any:
-    """The same with null in place of NaN and infinity, which JSON does not have."""
+    """Returns the content with None in place of NaN and infinity, which JSON does not have."""
     if isinstance(content, dict):
         return {key: _finite(value) for key, value in content.items()}
     if isinstance(content, list | tuple):
@@ -269,7 +269,7 @@ def main() -> None:
     keep_freed_memory()
     config = parse(EvaluateConfig, __doc__)
     console = Console(width=170)
-    for env_id in config.env_ids:  # complain about any unknown id or driver before hours of work
+    for env_id in config.env_ids:  # unknown ids and drivers raise before hours of work
         policy = config.driver is not None and config.driver.endswith(".zip")
         open_world(env_id, "idle" if policy else config.driver or default_drivers(env_id)[0]).close()
     for checkpoint in config.checkpoint:

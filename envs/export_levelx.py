@@ -1,4 +1,4 @@
-"""Write rollouts in levelXData's CSV layout: `python -m envs.export_levelx --env-id roundabout-v1 --out exported`.
+"""Writes rollouts in levelXData's CSV layout: `python -m envs.export_levelx --env-id roundabout-v1 --out exported`.
 
 One episode becomes one recording XX of inD's layout (`XX_tracks.csv`, `XX_tracksMeta.csv`, `XX_recordingMeta.csv`), at
 25 frames per second: the simulation runs at that rate and every simulated frame is written, however long a policy step
@@ -29,7 +29,7 @@ from predictor.support.files import new_folder, write_json
 from predictor.support.provenance import provenance
 
 FRAMES_PER_S = 25
-"""As the datasets."""
+"""Frame rate of the datasets [Hz]."""
 TRACKS = (
     "recordingId,trackId,frame,trackLifetime,xCenter,yCenter,heading,width,length,xVelocity,yVelocity,"
     "xAcceleration,yAcceleration,lonVelocity,latVelocity,lonAcceleration,latAcceleration"
@@ -43,7 +43,7 @@ RECORDING_META = (
 
 @dataclass(frozen=True)
 class ExportConfig:
-    """Write highway-env rollouts in levelXData's CSV layout."""
+    """Writes highway-env rollouts in levelXData's CSV layout."""
 
     env_id: str
     """Environment to record: gymnasium id of a highway-env environment, for example roundabout-v1."""
@@ -52,25 +52,25 @@ class ExportConfig:
     episodes: int = 10
     """Number of episodes; each becomes a recording."""
     driver: Annotated[str, Renamed("ego")] = "varied"
-    """Who drives the ego: random, idle, varied, keep-lane."""
+    """Driver of the ego: random, idle, varied, keep-lane."""
     seed: int = 0
     """Random seed: episode i is reset with seed + i."""
     max_steps: int = 200
     """Largest length of an episode; longer ones are cut there [policy steps]."""
     overwrite: bool = False
-    """Replace an existing export."""
+    """Whether to replace an existing export."""
 
     def __post_init__(self) -> None:
-        """Check ranges.
+        """Checks ranges.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value out of range.
         """
         check_at_least(self, 1, "episodes", "max_steps")
         check_at_least(self, 0, "seed")
 
     def check_out(self) -> None:
-        """Check that `out` is free, or an export that may be replaced.
+        """Checks that `out` is free, or an export that may be replaced.
 
         Raises:
             UserError: it is neither.
@@ -82,7 +82,7 @@ class ExportConfig:
 
 
 def export_env(env_id: str) -> gym.Env:
-    """The environment, simulated at the datasets' frame rate; policy steps stay as long as they are.
+    """Makes the environment, simulated at the datasets' frame rate; the length of a policy step does not change.
 
     Raises:
         UserError: not a highway-env environment, or policy steps that are not whole frames.
@@ -101,7 +101,7 @@ def export_env(env_id: str) -> gym.Env:
 def roll_out(
     env: gym.Env, ego_name: str, seed: int, max_steps: int
 ) -> tuple[Episode, Float[np.ndarray, "time agents"]]:
-    """One episode, every simulated frame of it, and all headings [rad]; zeros where absent."""
+    """Plays one episode; returns all simulated frames and all headings [rad], zeros where an agent is absent."""
     reader = HighwayReader(env)
     obs: Any
     obs, _ = env.reset(seed=seed)
@@ -129,7 +129,7 @@ def roll_out(
 
 
 def _headings_rad(env: gym.Env) -> list[float]:
-    """In the order of `HighwayReader.read_all`: the ego, then the road's list."""
+    """Returns headings in the order of `HighwayReader.read_all`: the ego, then the road's list."""
     unwrapped: Any = env.unwrapped
     ego = unwrapped.vehicle
     return [float(vehicle.heading) for vehicle in [ego, *(v for v in unwrapped.road.vehicles if v is not ego)]]
@@ -142,13 +142,13 @@ def write_recording(
     heading_rad: Float[np.ndarray, "time agents"],
     size_m: tuple[float, float],
 ) -> None:
-    """Write the three files of one recording.
+    """Writes the three files of one recording.
 
     Args:
-        folder: where.
+        folder: folder of the files.
         number: recording id.
-        episode: every frame.
-        heading_rad: zeros where absent.
+        episode: all simulated frames.
+        heading_rad: headings, zeros where absent.
         size_m: length and width of every vehicle.
     """
     length_m, width_m = (f"{size:.3f}" for size in size_m)
@@ -172,7 +172,7 @@ def write_recording(
 def _motion(
     states: Float[np.ndarray, "frames 4"], heading_rad: Float[np.ndarray, " frames"], frames: np.ndarray
 ) -> Float[np.ndarray, "frames 7"]:
-    """Heading [deg], acceleration on both axes, velocity along and across the heading, acceleration likewise."""
+    """Returns heading [deg], acceleration on both axes, velocity and acceleration along and across the heading."""
     velocity = states[:, 2:]
     acceleration = np.zeros_like(velocity)
     acceleration[1:] = np.diff(velocity, axis=0) / (np.diff(frames) / FRAMES_PER_S)[:, None]
@@ -182,21 +182,21 @@ def _motion(
     return np.stack([np.degrees(heading_rad) % 360, *acceleration.T, *projected], axis=-1)
 
 
-def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+def _write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[Any]]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)
-        writer.writerows(rows)
+        writer.writerows(lines)
 
 
 def export(config: ExportConfig) -> int:
-    """Write all recordings; nothing appears under `out` until they are complete.
+    """Writes all recordings; nothing appears under `out` until they are complete.
 
     Returns:
         Number of frames.
 
     Raises:
-        UserError: the environment or the driver does not fit, or `out` is taken.
+        UserError: the environment or the driver does not fit, or `out` exists.
     """
     config.check_out()
     env = export_env(config.env_id)

@@ -1,4 +1,4 @@
-"""Shared parts of all wrappers with forecasts: the layout of an observation, the forecast behind it, and copies."""
+"""Common base of all wrappers with forecasts: the layout of an observation, the latest forecast, and copies."""
 
 from collections.abc import Mapping
 from copy import deepcopy
@@ -18,7 +18,7 @@ class ForecastWrapper:
     """Base of `ForecastObservation`, `ForecastParallelEnv`, `VecForecast` and `VectorForecast`.
 
     A deep copy continues exactly as the original would, and shares only the forecaster, which no step changes. A pickle
-    continues likewise and carries the forecaster's weights.
+    continues exactly too, and contains the forecaster's weights.
 
     Attributes:
         stream: history and noise of each environment.
@@ -28,12 +28,12 @@ class ForecastWrapper:
 
     @property
     def forecaster(self) -> Forecaster:
-        """Makes the forecasts."""
+        """Forecaster of all environments."""
         return self.stream.forecaster
 
     @property
     def forecast(self) -> Forecast:
-        """The forecast behind the latest observation: one entry per environment, agents as in `scene`, world axes."""
+        """Forecast of the latest observation: one entry per environment, agents as in `scene`, world axes."""
         if self.stream.forecast is None:
             raise ProtocolError("there is no forecast yet; call reset() first")
         return self.stream.forecast
@@ -48,37 +48,37 @@ class ForecastWrapper:
         return twin
 
     def __getstate__(self) -> dict[str, Any]:
-        """Returns what a copy or a pickle keeps."""
+        """Returns the state of a copy or a pickle."""
         state: Any = super().__getstate__()
         return dict(state)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a copy or a pickle; wrappers that look attributes up in what they wrap would look for this there."""
+        """Restores a copy or a pickle; defined here, because wrappers look missing attributes up in what they wrap."""
         restore = getattr(super(), "__setstate__", self.__dict__.update)
         restore(state)
 
     def _scenes(self) -> SceneBatch:
-        """The scenes of all environments behind the latest observation."""
+        """Returns the scenes of all environments of the latest observation."""
         if self.stream.scenes is None:
             raise ProtocolError("there is no scene yet; call reset() first")
         return self.stream.scenes
 
 
 class ObservationLayout:
-    """A policy's observation: the environment's own and the forecast entries, as a Dict or as one Box.
+    """Layout of a policy's observation: the environment's own and the forecast entries, as a Dict or as one Box.
 
     Args:
         own: space of the environment's own observation.
         entries: spaces of the forecast entries.
-        flatten: one Box, in the Dict's key order.
+        flatten: whether the observation is one Box, in the Dict's key order.
 
     Attributes:
-        space: of one observation.
-        dict_space: its space before it is flattened.
+        space: space of one observation.
+        dict_space: space of one observation before it is flattened.
     """
 
     def __init__(self, own: gym.Space, entries: Mapping[str, gym.Space], flatten: bool) -> None:
-        """Put the space together."""
+        """Builds the space."""
         self.dict_space = gym.spaces.Dict({"observation": own, **entries})
         self._flatten = flatten
         self.space: gym.Space = gym.spaces.flatten_space(self.dict_space) if flatten else self.dict_space
@@ -103,7 +103,7 @@ def _flattened(space: gym.Space, stacked: Any) -> NDArray[Any]:
 
 
 def refuse_reader(reader: Any, wrapper: str) -> None:
-    """Raise a `UserError` if a wrapper whose environments report their scenes is given a reader."""
+    """Raises a `UserError` if a wrapper whose environments report their scenes is given a reader."""
     if reader is not None:
         raise UserError(
             f"{wrapper} takes no reader: its environments report their scenes, possibly from other processes; give "

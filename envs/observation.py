@@ -1,4 +1,4 @@
-"""From scenes and a forecaster to what the policy sees; the same for one env, SB3 and gymnasium vector envs."""
+"""Makes observations of scenes and forecasts, for single environments and vector environments of gymnasium and SB3."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -25,7 +25,7 @@ FORECAST_KEYS = ("agents", "forecast", "edge_probs", "edge_features", "valid")
 
 
 def scene_spaces(spec: SceneSpec) -> dict[str, gym.Space]:
-    """Spaces of the entries that carry a scene; float64 because a highway's x has no bound."""
+    """Returns the spaces of the entries that carry a scene; float64 because x on a highway has no bound."""
     agents = spec.max_agents
     return {
         "scene_states": gym.spaces.Box(-np.inf, np.inf, (agents, spec.num_features), np.float64),
@@ -36,7 +36,7 @@ def scene_spaces(spec: SceneSpec) -> dict[str, gym.Space]:
 
 
 def scene_entries(scene: Scene) -> dict[str, NDArray[Any]]:
-    """A scene as observation entries."""
+    """Returns a scene as observation entries."""
     return {
         "scene_states": scene.states,
         "scene_ids": scene.ids,
@@ -46,7 +46,7 @@ def scene_entries(scene: Scene) -> dict[str, NDArray[Any]]:
 
 
 def scenes_from(observations: Mapping[str, NDArray[Any]]) -> SceneBatch:
-    """The scenes of a batch of observations that carry them."""
+    """Returns the scenes of a batch of observations that carry them."""
     return SceneBatch(
         observations["scene_states"],
         observations["scene_ids"],
@@ -56,15 +56,15 @@ def scenes_from(observations: Mapping[str, NDArray[Any]]) -> SceneBatch:
 
 
 def carries_scenes(space: gym.Space) -> bool:
-    """Whether observations of this space hold scenes."""
+    """Returns whether observations of this space hold scenes."""
     return isinstance(space, gym.spaces.Dict) and all(key in space.spaces for key in SCENE_KEYS)
 
 
 def require_scenes(space: gym.Space, wrapper: str) -> gym.spaces.Dict:
-    """The space as a Dict that carries scenes.
+    """Returns the space, which must be a Dict that carries scenes.
 
     Raises:
-        UserError: it does not; the message says how to add them.
+        UserError: it is not; the message says how to add scenes.
     """
     if not isinstance(space, gym.spaces.Dict) or not carries_scenes(space):
         raise UserError(
@@ -81,17 +81,17 @@ def open_forecaster(
     device: str = "cpu",
     forecaster: Forecaster | None = None,
 ) -> Forecaster:
-    """Returns the forecaster of a shipped name, a folder, or "constant-velocity"; or the given one, once it fits.
+    """Returns the forecaster of a checkpoint, or the given one, after checking that it fits the scenes.
 
     Args:
-        checkpoint: None takes the one that ships for `source`.
-        scene_spec: layout of the scenes that it has to take.
+        checkpoint: shipped name, folder, or "constant-velocity"; None takes the one that ships for `source`.
+        scene_spec: layout of the scenes that it will get.
         source: id of the environment.
-        device: where to put it.
-        forecaster: instead of a checkpoint; lives on `device` already.
+        device: device of the forecaster.
+        forecaster: forecaster on `device`, instead of a checkpoint.
 
     Raises:
-        UserError: there is none, two are given, or it is of another spec (features, dt).
+        UserError: no checkpoint ships, both are given, or the forecaster is of another spec (features, dt).
     """
     use_one_thread_after_fork()
     if forecaster is None:
@@ -104,22 +104,22 @@ def open_forecaster(
 
 
 class ForecastStream(SceneStream):
-    """Forecasts for parallel environments with one ego each, and the observations made of them.
+    """Forecasts the scenes of parallel environments with one ego each and makes their observation entries.
 
     Args:
-        forecaster: lives on `config.device`.
+        forecaster: forecaster on `config.device`.
         scene_spec: layout of the scenes that will arrive.
         envs: number of parallel environments.
-        config: how the forecast enters the observation.
+        config: settings of the forecast.
 
     Raises:
         UserError: scenes that do not lie in a plane.
     """
 
     def __init__(self, forecaster: Forecaster, scene_spec: SceneSpec, envs: int, config: ForecastConfig) -> None:
-        """Start with empty memory."""
+        """Starts with empty memory."""
         if scene_spec.position_dim != 2:
-            raise UserError(f"observations are of positions in a plane, got {scene_spec.position_dim} axes")
+            raise UserError(f"observations need positions in a plane, got {scene_spec.position_dim} axes")
         super().__init__(forecaster, envs, scene_spec.max_agents, config)
         self.scene_spec = scene_spec
 
@@ -130,24 +130,24 @@ class ForecastStream(SceneStream):
     def observe(
         self, scenes: SceneBatch, envs: Int[np.ndarray, " some"] | None = None
     ) -> dict[str, NDArray[np.float32]]:
-        """Take in one scene for each environment (of `envs`, if given); returns the forecast entries for each."""
+        """Takes in one scene for each environment (of `envs`, if given); returns the forecast entries for each."""
         return ego_entries(scenes, self.take(scenes, envs))
 
     def observe_boundary(
         self, scenes: SceneBatch, ended: Int[np.ndarray, " ended"], successors: SceneBatch
     ) -> dict[str, NDArray[np.float32]]:
-        """As `observe`, with the last scenes of ended episodes; entries of their successors follow at the end."""
+        """Takes in scenes like `observe`, ended episodes with their last; appends their successors' entries."""
         forecast = self.take_boundary(scenes, ended, successors)
         return ego_entries(SceneBatch.concatenate(scenes, successors), forecast)
 
 
 def entry_spaces(forecaster: Forecaster, view: SceneSpec, config: ForecastConfig) -> dict[str, gym.Space]:
-    """Returns spaces of the forecast entries, new at each call; m and m/s have no honest bound, probabilities do.
+    """Returns the spaces of the forecast entries, new objects at each call; only probabilities have finite bounds.
 
     Args:
-        forecaster: decides the sizes of edges and, unless `config` does, the horizon.
-        view: layout of what one policy sees.
-        config: how the forecast enters the observation.
+        forecaster: forecaster that sets the sizes of edges and, unless `config` does, the horizon.
+        view: layout of the view of one policy.
+        config: settings of the forecast.
     """
     others = view.max_agents - 1
     samples = (config.num_samples,) if config.num_samples > 1 else ()
@@ -165,32 +165,32 @@ def entry_spaces(forecaster: Forecaster, view: SceneSpec, config: ForecastConfig
 
 
 def ego_entries(scenes: SceneBatch, forecast: Forecast) -> dict[str, NDArray[np.float32]]:
-    """The ego's view of scenes and forecasts: origin at the ego, x along its heading, others sorted by distance.
+    """Returns the ego's view of scenes and forecasts: origin at the ego, x along its heading, others by distance.
 
     Returns:
-        agents: (B, A−1, F) relative states [m, m/s]; features beyond velocity are kept as they are.
+        agents: (B, A−1, F) relative states [m, m/s]; features beyond velocity are not changed.
         forecast: (B, A−1, [K,] H, 2) future positions relative to the ego's position now [m].
         edge_probs: (B, A−1, 2(E−1)) probability of each edge type but "no edge": agent → ego, then ego → agent.
         edge_features: (B, A−1, 2D) in the same order.
-        valid: (B, A−1) 1 where there is an agent; everything else is zero in the other rows.
+        valid: (B, A−1) 1 where there is an agent; all other entries are zero where it is 0.
     """
     order = others_by_distance(scenes)
-    present = scenes.valid[np.arange(len(order))[:, None], 1 + order]
-    row, place = present.nonzero()  # what follows is done for agents that are there, not for padding
-    agent = 1 + order[row, place]
-    cos, sin = np.cos(scenes.heading_rad)[row], np.sin(scenes.heading_rad)[row]
-    agents = scenes.states[row, agent]
-    agents[:, :4] -= scenes.states[row, 0, :4]
+    valid = scenes.valid[np.arange(len(order))[:, None], 1 + order]
+    env, place = valid.nonzero()  # the rest is computed for agents, not for padding
+    agent = 1 + order[env, place]
+    cos, sin = np.cos(scenes.heading_rad)[env], np.sin(scenes.heading_rad)[env]
+    agents = scenes.states[env, agent]
+    agents[:, :4] -= scenes.states[env, 0, :4]
     agents[:, :4] = _turned(agents[:, :4].reshape(-1, 2, 2), cos, sin).reshape(-1, 4)
-    xy = _turned(forecast.xy.cpu().numpy()[row, :, agent], cos, sin)
+    xy = _turned(forecast.xy.cpu().numpy()[env, :, agent], cos, sin)
 
     def of_edges(edges: Tensor) -> NDArray[np.float32]:
-        both: NDArray[np.float32] = edges.flatten(2).cpu().numpy()[row, agent]
+        both: NDArray[np.float32] = edges.flatten(2).cpu().numpy()[env, agent]
         return both
 
     def padded(values: NDArray[Any]) -> NDArray[np.float32]:
-        entries = np.zeros((*present.shape, *values.shape[1:]), dtype=np.float32)
-        entries[row, place] = values
+        entries = np.zeros((*valid.shape, *values.shape[1:]), dtype=np.float32)
+        entries[env, place] = values
         return entries
 
     probs, features = forecast.ego_edges()
@@ -199,14 +199,14 @@ def ego_entries(scenes: SceneBatch, forecast: Forecast) -> dict[str, NDArray[np.
         "forecast": padded(xy[:, 0] if xy.shape[1] == 1 else xy),
         "edge_probs": padded(of_edges(probs[..., 1:])),
         "edge_features": padded(of_edges(features)),
-        "valid": present.astype(np.float32),
+        "valid": valid.astype(np.float32),
     }
 
 
 def _turned(
     vectors: Float[np.ndarray, "agents *_ 2"], cos: Float[np.ndarray, " agents"], sin: Float[np.ndarray, " agents"]
 ) -> Float[np.ndarray, "agents *_ 2"]:
-    """Each agent's vectors in axes that are turned by the angle with this cosine and sine."""
+    """Returns each agent's vectors in axes that are turned by the angle with this cosine and sine."""
     cos, sin = (part.astype(vectors.dtype).reshape(-1, *(1,) * (vectors.ndim - 2)) for part in (cos, sin))
     x, y = vectors[..., 0], vectors[..., 1]
     turned = np.empty_like(vectors)
@@ -216,20 +216,20 @@ def _turned(
 
 
 def others_by_distance(scenes: SceneBatch) -> Int[np.ndarray, "batch others"]:
-    """For each row of the forecast entries, the index of its agent among the scene's rows after the ego's."""
+    """Returns the order of the forecast entries: indices into the scene's agents without the ego, nearest first."""
     offsets = scenes.states[:, 1:, :2] - scenes.states[:, :1, :2]
     distance_m = np.where(scenes.valid[:, 1:], np.hypot(offsets[..., 0], offsets[..., 1]), np.inf)
     return np.argsort(distance_m, axis=1, kind="stable")
 
 
 def into_ego_axes(heading_rad: Float[np.ndarray, " batch"]) -> Float[np.ndarray, "batch 2 2"]:
-    """Rotations from world axes to axes along each ego's heading; the transpose goes back."""
+    """Returns rotations from world axes to axes along each ego's heading; the transpose rotates back."""
     cos, sin = np.cos(heading_rad), np.sin(heading_rad)
     return np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], -2)
 
 
 def batch_entries(scenes: SceneBatch) -> dict[str, NDArray[Any]]:
-    """As `envs.observation.scene_entries`, for a batch."""
+    """Returns the scenes of a batch as observation entries (`scene_entries` for many)."""
     return {
         "scene_states": scenes.states,
         "scene_ids": scenes.ids,
@@ -241,7 +241,7 @@ def batch_entries(scenes: SceneBatch) -> dict[str, NDArray[Any]]:
 def observe_ended(
     stream: ForecastStream, observations: Observations, ended: NDArray[np.int64], closing: list[Observations]
 ) -> tuple[Observations, list[Observations]]:
-    """Returns forecast entries for each environment, and for each closing observation, from its episode's history."""
+    """Returns forecast entries of each environment, and of each closing observation with its own episode's history."""
     opening = scenes_from(observations)
     if not len(ended):
         return dict(stream.observe(opening)), []

@@ -1,13 +1,13 @@
-"""PettingZoo: `ForecastParallelEnv` shows every agent of a parallel environment what the others are about to do.
+"""PettingZoo wrapper `ForecastParallelEnv`: adds forecasts of the other agents to each agent's observation.
 
 One forecast per step serves all agents; each gets it in its own frame, with its own edges. For a gymnasium environment
-with one ego there is `envs.wrappers.ForecastObservation`.
+with one ego, use `envs.wrappers.ForecastObservation`.
 
 >>> from mpe2 import simple_tag_v3
 >>> from envs.parallel import ForecastParallelEnv
 >>> env = ForecastParallelEnv(simple_tag_v3.parallel_env(), "constant-velocity")
 >>> observations, infos = env.reset(seed=0)
->>> observations["agent_0"]["forecast"].shape[1:]  # for each other: horizon steps, xy in the agent's frame [m]
+>>> observations["agent_0"]["forecast"].shape[1:]  # for each other agent: horizon steps, xy in the agent's frame [m]
 (5, 2)
 """
 
@@ -34,33 +34,33 @@ _COMPOSED = (gym.spaces.Dict, gym.spaces.Tuple, gym.spaces.Graph, gym.spaces.Seq
 
 
 class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
-    """Shows every agent what the others are about to do.
+    """Adds forecasts of the other agents to each agent's observation.
 
     Observation of an agent: Dict with `observation` (its own, untouched) and, for the other agents sorted by distance
     from it, `agents` (relative current states), `forecast` (future positions in its frame [m]; a samples axis when
     num_samples > 1), `edge_probs` and `edge_features` (other → agent, then agent → other), `valid`.
     `envs.observation.ego_entries` gives the shapes. Agents may differ in their own spaces, die and join at any step. An
-    agent gets its last observation like any other; if the reader no longer sees it, all its entries are zero, `valid`
-    too. With `flatten=True` an observation is one Box, in the Dict's key order.
+    agent's last observation has forecasts too; if the reader no longer reports the agent, all its entries are zero,
+    `valid` too. With `flatten=True` an observation is one Box, in the Dict's key order.
 
-    The history is forgotten at reset only. After each step, `scene` and `forecast` hold the same in the world frame.
+    The history is cleared at reset only. After each step, `scene` and `forecast` hold all agents in the world frame.
 
     Args:
-        env: any parallel environment that a shared scene reader knows.
+        env: any parallel environment that a multiagent scene reader knows.
         checkpoint: shipped name, folder, or "constant-velocity"; None takes the one that ships for the env's id.
-        horizon_steps: steps to forecast; None takes the checkpoint's.
-        num_samples: sampled futures per agent.
-        flatten: one Box for each agent instead of a Dict.
-        perception_m: how far an agent sees [m]; None takes what the checkpoint was trained with.
-        max_agents: rows of an agent's view, itself included, the nearest are kept; None takes everyone.
-        device: where the forecaster runs.
-        forecaster: instead of a checkpoint; lives on `device`.
-        seed: of the samples' noise, until `reset(seed=…)` gives another.
-        reader: makes a reader for the env; None picks one by env family.
+        horizon_steps: number of steps to forecast; None takes the checkpoint's.
+        num_samples: number of sampled futures per agent.
+        flatten: whether an agent's observation is one Box instead of a Dict.
+        perception_m: range of an agent's perception [m]; None takes what the checkpoint was trained with.
+        max_agents: size of an agent's view, itself included; the nearest agents are kept. None takes all agents.
+        device: device of the forecaster.
+        forecaster: forecaster on `device`, instead of a checkpoint.
+        seed: random seed of the samples' noise, until `reset(seed=…)` gives another.
+        reader: function or class that makes a reader for the env; None picks one by env family.
 
     Raises:
-        UserError: not a parallel env, no reader, no checkpoint, one of another spec (features, dt) or relative to an
-            ego, or an agent whose own observation is a Dict or Tuple.
+        UserError: not a parallel env, no reader, no checkpoint, a forecaster of another spec (features, dt) or relative
+            to an ego, or an agent whose own observation is a Dict or Tuple.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         seed: int = 0,
         reader: MakeReader | None = None,
     ) -> None:
-        """Load the forecaster and extend the observation spaces."""
+        """Loads the forecaster and extends the observation spaces."""
         if not isinstance(env, ParallelEnv):
             raise UserError(
                 f"ForecastParallelEnv needs a PettingZoo parallel env, got {type(env).__name__}; make it with "
@@ -104,7 +104,7 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
 
     @property
     def reader(self) -> MultiagentReader:
-        """Who reads the scenes."""
+        """Reader of the scenes."""
         return self._reader
 
     @property
@@ -114,14 +114,14 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
 
     @property
     def scene(self) -> MultiagentScene:
-        """The latest scene, world frame."""
+        """Latest scene, world frame."""
         if self._scene is None:
             raise ProtocolError("there is no scene yet; call reset() first")
         return self._scene
 
     @property
     def forecast(self) -> Forecast:
-        """The forecast behind the latest observations: a batch of one, agents as in `scene.scene`, world axes."""
+        """Forecast of the latest observations: a batch of one, agents as in `scene.scene`, world axes."""
         if self._forward is None:
             return super().forecast
         forecast = self._forward.forecast_of(self._place)
@@ -130,7 +130,7 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         return forecast
 
     def observation_space(self, agent: str) -> gym.Space:
-        """Returns the space of its own observation and the forecast entries, always one object.
+        """Returns the space of the agent's own observation and the forecast entries, the same object at each call.
 
         Raises:
             UserError: the agent's own observation is a Dict or Tuple.
@@ -151,7 +151,7 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Reset the env and forget the history; a seed also restarts the samples' noise."""
+        """Resets the env and clears the history; a seed also restarts the samples' noise."""
         observations, infos = self.env.reset(seed=seed, options=options)
         self._reader.reset()
         scene, shown = self._read(), self._own(observations)
@@ -166,7 +166,7 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     def step(
         self, actions: dict[str, Any]
     ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any]]:
-        """Step the env, take in the scene, forecast."""
+        """Steps the env, takes in the scene and forecasts."""
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
         scene, shown = self._read(), self._own(observations)
         if self._forward is not None:
@@ -192,15 +192,15 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
 
 
 def batch_forwards(envs: Sequence[ParallelEnv]) -> BatchedForward | None:
-    """Let copies of one environment share their forecasts' forward, if they can and are more than one.
+    """Makes copies of one environment share one batched forward, if there are several and their wrappers are equal.
 
-    Their observations then lack forecasts until `BatchedForward.fill` is called. Histories start anew: reset them.
+    Their observations then lack forecasts until `BatchedForward.fill` is called. Their histories are empty: reset them.
 
     Args:
-        envs: copies with equal wrappers.
+        envs: copies of the environment.
 
     Returns:
-        What to `fill` after the last copy's step or reset; None if each copy forecasts by itself.
+        The forward, whose `fill` is called after the last copy's step or reset; None if each copy forecasts by itself.
     """
     copies = [env for env in envs if type(env) is ForecastParallelEnv and not env.stream.config.flatten]
     if len(copies) < len(envs) or len(copies) < 2 or not can_share([copy.stream for copy in copies]):

@@ -1,6 +1,6 @@
 """Environments that are known by id: how each is made, its shipped checkpoint, its drivers and its learners.
 
-An id that is not listed works too, where Gymnasium or PettingZoo knows it; it has no checkpoint then.
+Other ids that Gymnasium or PettingZoo has registered can be used too; no checkpoint ships for them.
 """
 
 import functools
@@ -25,7 +25,7 @@ HEURISTIC_DRIVERS = ("heuristic", "mixed", "varied")
 
 @dataclass(frozen=True)
 class EnvEntry:
-    """What belongs to one environment id."""
+    """Entry of one environment id."""
 
     factory: str | None = None
     """"module:function" that returns a PettingZoo ParallelEnv; None makes it with `gymnasium.make`."""
@@ -68,7 +68,7 @@ _HIGHWAY: dict[str, EnvEntry] = {
 
 
 def _original_of(env_id: str) -> EnvEntry:
-    """Returns the entry of the highway-env id, of any version, that an EnvPool id copies."""
+    """Returns the entry of the highway-env id, of any version, that an EnvPool id re-implements."""
     name = HIGHWAY_ENV_OF[ENVPOOL_IDS[env_id]].rpartition("-v")[0]
     return next((entry for known, entry in _HIGHWAY.items() if known.rpartition("-v")[0] == name), EnvEntry())
 
@@ -192,11 +192,11 @@ def checkpoint_for(env_id: str) -> str:
     return checkpoint
 
 
-def native_task_of(env_id: str) -> str:
-    """Returns the EnvPool task that copies a highway-env id: its own version, else the first one it has.
+def envpool_task_of(env_id: str) -> str:
+    """Returns the EnvPool task that re-implements a highway-env id: its own version, else the first that EnvPool has.
 
     Raises:
-        UserError: it has none.
+        UserError: EnvPool has none.
     """
     exact = [task for task, copied in HIGHWAY_ENV_OF.items() if copied == env_id]
     near = [task for task, copied in HIGHWAY_ENV_OF.items() if copied.rpartition("-v")[0] == env_id.rpartition("-v")[0]]
@@ -225,7 +225,7 @@ def _maker(env_id: str) -> Callable[..., Any]:
 
 
 def _load(path: str) -> Callable[..., Any]:
-    """Returns what "module:function" names."""
+    """Returns the function that "module:function" names."""
     module, _, name = path.partition(":")
     try:
         factory: Callable[..., Any] | None = getattr(importlib.import_module(module), name, None)

@@ -1,4 +1,4 @@
-"""Scenes of parallel environments through one forecaster: each environment with its own history and its own noise."""
+"""Forecasts the scenes of parallel environments with one forecaster; each environment has its own history and noise."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -16,26 +16,26 @@ from predictor.support.config_checks import check_at_least
 from predictor.support.runtime import resolve_device
 
 NOISE_STREAM = 0x6E6F697365
-"""Sets the samples' noise apart from what environment and drivers draw from the same seed."""
+"""Key that makes the samples' noise independent of what environment and drivers draw from the same seed."""
 
 
 @dataclass(frozen=True)
 class ForecastConfig:
-    """How a forecast enters the observation."""
+    """Settings of a forecast in the observation."""
 
     horizon_steps: int | None = None
-    """Steps to forecast; None takes what the checkpoint was trained for."""
+    """Number of steps to forecast; None takes what the checkpoint was trained for."""
     num_samples: int = 1
-    """Sampled futures per agent; 1 gives the most likely one and drops the axis."""
+    """Number of sampled futures per agent; 1 gives the most likely one, without a samples axis."""
     device: str = "cpu"
-    """Where the forecaster runs: cpu, cuda or auto."""
+    """Device of the forecaster: cpu, cuda or auto."""
     seed: int = 0
-    """Seeds the samples' noise of environment i with seed + i, until a reset gives another seed."""
+    """Random seed of the samples' noise: environment i gets seed + i, until a reset gives another seed."""
     flatten: bool = False
-    """One Box instead of a Dict, in the Dict's key order."""
+    """Whether an observation is one Box instead of a Dict, in the Dict's key order."""
 
     def __post_init__(self) -> None:
-        """Check ranges; `device="auto"` becomes the device that is taken."""
+        """Checks ranges, and replaces `device="auto"` by the device that it stands for."""
         check_at_least(self, 1, "num_samples", "horizon_steps")
         check_at_least(self, 0, "seed")
         object.__setattr__(self, "device", resolve_device(self.device))
@@ -47,21 +47,21 @@ class SceneStream:
     A deep copy or a pickle continues exactly; a deep copy shares the forecaster, which no step changes.
 
     Args:
-        forecaster: lives on `config.device`.
+        forecaster: forecaster on `config.device`.
         envs: number of parallel environments.
-        agents: agents of each scene, padding included.
-        config: how the forecast enters the observation.
+        agents: number of agents of each scene, padding included.
+        config: settings of the forecast.
 
     Attributes:
-        config: as given.
-        horizon_steps: steps of a forecast.
-        scenes: the latest scene of each environment; None before the first.
-        forecast: the forecast from it, in the same order: of environments whose episode just ended, the one that
-            opens the next episode, as `scenes`.
+        config: settings of the forecast.
+        horizon_steps: number of steps of a forecast.
+        scenes: latest scene of each environment; None before the first. Where an episode just ended, the one that
+            opens the next episode.
+        forecast: forecast of each of `scenes`.
     """
 
     def __init__(self, forecaster: Forecaster, envs: int, agents: int, config: ForecastConfig) -> None:
-        """Start with empty memory."""
+        """Starts with empty memory."""
         self.config = config
         self.horizon_steps = config.horizon_steps or forecaster.horizon_steps
         self.scenes: SceneBatch | None = None
@@ -71,7 +71,7 @@ class SceneStream:
 
     @property
     def forecaster(self) -> Forecaster:
-        """The network, or what stands in for it."""
+        """Forecaster of all environments."""
         return self._online.forecaster
 
     @property
@@ -84,22 +84,22 @@ class SceneStream:
         return None if self.forecast is None else _changed(lambda field: field[env : env + 1], self.forecast)
 
     def continue_noise(self, streams: "Sequence[SceneStream]") -> None:
-        """Let each environment draw on from where the stream that had it alone stands."""
+        """Takes over the noise generators of one stream per environment, in their current state."""
         self._noise = [stream._noise[0] for stream in streams]
 
     def seed(self, seed: int | Sequence[int | None]) -> None:
-        """Restart the samples' noise: of environment i from seed + i, or from its entry unless that is None."""
+        """Restarts the samples' noise: environment i from seed + i, or from entry i unless that is None."""
         seeds = [seed + env for env in range(len(self._noise))] if isinstance(seed, int | np.integer) else seed
         for env, own in enumerate(seeds):
             if own is not None:
                 self._noise[env] = _noise(own)
 
     def reset(self, envs: Int[np.ndarray, " some"] | None = None) -> None:
-        """Forget the history of some environments (all, if None)."""
+        """Forgets the history of some environments (all, if None)."""
         self._online.reset(envs)
 
     def take(self, scenes: SceneBatch, envs: Int[np.ndarray, " some"] | None = None) -> Forecast:
-        """Take in one scene for each environment (of `envs`, if given); returns their forecasts."""
+        """Takes in one scene for each environment (of `envs`, if given); returns their forecasts."""
         self._online.observe(self._given(scenes), envs)
         forecast = self._forecast_for(np.arange(len(self._noise)) if envs is None else envs)
         if envs is None:
@@ -109,7 +109,7 @@ class SceneStream:
         return forecast
 
     def take_boundary(self, scenes: SceneBatch, ended: Int[np.ndarray, " ended"], successors: SceneBatch) -> Forecast:
-        """As `take`, with the last scenes of ended episodes; forecasts of their successors follow at the end."""
+        """Takes in scenes like `take`, ended episodes with their last; appends their successors' forecasts."""
         self._online.observe_boundary(self._given(scenes), ended, self._given(successors))
         both = np.arange(len(scenes) + len(ended))
         both[len(scenes) :] = ended
@@ -122,16 +122,16 @@ class SceneStream:
         return forecast
 
     def _forecast_for(self, envs: Int[np.ndarray, " entries"]) -> Forecast:
-        """The forecasts of what was taken in last; an ended episode draws before its successor does."""
+        """Returns the forecasts of the latest scenes; an ended episode draws its noise before its successor does."""
         noise = [self._noise[env] for env in envs]
         return self._shown(self._online.forecast(self.horizon_steps, self.config.num_samples, noise))
 
     def _given(self, scenes: SceneBatch) -> SceneBatch:
-        """The scenes as the forecaster wants them."""
+        """Returns the scenes in the layout of the forecaster."""
         return scenes
 
     def _shown(self, forecast: Forecast) -> Forecast:
-        """The forecast as it belongs to the scenes that were given."""
+        """Returns the forecast in the layout of the scenes that were given."""
         return forecast
 
     def _keep_some(self, scenes: SceneBatch, forecast: Forecast, envs: Int[np.ndarray, " some"]) -> None:
@@ -152,7 +152,7 @@ def _noise(seed: int) -> np.random.Generator:
 
 
 def _changed(change: Callable[..., Tensor], *forecasts: Forecast) -> Forecast:
-    """A forecast whose every tensor is changed, together with those of other forecasts."""
+    """Returns a forecast of changed tensors: `change` of each tensor, with those of the other forecasts."""
     changed: dict[str, Any] = {}
     for field in fields(Forecast):
         tensors = [getattr(forecast, field.name) for forecast in forecasts]

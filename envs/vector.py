@@ -1,8 +1,8 @@
 """Forecasts for many environments of a Gymnasium vector environment, with one batched forward per step.
 
-Each environment keeps its own history; it is cleared when, and only when, its own episode ends. The observation that
-closes an episode carries the forecast made from that episode's history; the one that opens the next starts from one
-step. `envs.sb3.forecast` has the same for Stable-Baselines3, and needs it: this module does not.
+Each environment keeps its own history; the history is cleared when, and only when, its own episode ends. The
+observation that closes an episode carries the forecast made from that episode's history; the one that opens the next
+starts from one step. `envs.sb3.forecast` serves Stable-Baselines3, which this module does not import.
 """
 
 from importlib import import_module
@@ -40,24 +40,24 @@ def __getattr__(name: str) -> Any:
 class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
     """`ForecastObservation` for a gymnasium vector env whose environments are wrapped in `SceneObservation`.
 
-    Knows both autoreset modes and no autoreset: with NEXT_STEP the closing observation is the step's own and the next
+    Handles both autoreset modes and no autoreset: with NEXT_STEP the closing observation is the step's own and the next
     step opens the new episode; with SAME_STEP the closing observation is `infos["final_obs"]`; with DISABLED,
-    histories are forgotten when `reset(options={"reset_mask": …})` names their environments. After each step, `scene`
+    histories are cleared when `reset(options={"reset_mask": …})` names their environments. After each step, `scene`
     and `forecast` hold, in the world frame, what `observations[i]` shows of environment i.
 
     Args:
         env: Gymnasium vector environment, wrapped or not.
         checkpoint: shipped name, folder, or "constant-velocity"; None takes the one that ships for the env's id.
-        horizon_steps: steps to forecast; None takes the checkpoint's.
-        num_samples: sampled futures per agent.
-        flatten: one Box instead of a Dict.
-        device: where the forecaster runs.
-        forecaster: instead of a checkpoint; lives on `device`.
-        seed: of the samples' noise, environment i gets seed + i, until `reset(seed=…)` gives others.
+        horizon_steps: number of steps to forecast; None takes the checkpoint's.
+        num_samples: number of sampled futures per agent.
+        flatten: whether observations are one Box instead of a Dict.
+        device: device of the forecaster.
+        forecaster: forecaster on `device`, instead of a checkpoint.
+        seed: random seed of the samples' noise: environment i gets seed + i, until `reset(seed=…)` gives others.
         reader: refused, because the environments report their scenes; give it to `SceneObservation`.
 
     Raises:
-        UserError: the envs report no scenes, differ from each other, or do not fit the forecaster.
+        UserError: the environments report no scenes, differ from each other, or do not fit the forecaster.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         seed: int = 0,
         reader: MakeReader | None = None,
     ) -> None:
-        """Load the forecaster and extend the observation space."""
+        """Loads the forecaster and extends the observation space."""
         gym.vector.VectorWrapper.__init__(self, env)
         refuse_reader(reader, "VectorForecast")
         space = require_scenes(env.single_observation_space, "VectorForecast")
@@ -91,14 +91,14 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
 
     @property
     def scene(self) -> SceneBatch:
-        """The latest scene of each environment, world frame, ego first."""
+        """Latest scene of each environment, world frame, ego first."""
         return self._scenes()
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Reset all environments, or those of `options["reset_mask"]`, and forget their histories."""
-        chosen = (options or {}).get("reset_mask")  # wrappers below may take it out of the options
+        """Resets all environments, or those of `options["reset_mask"]`, and clears their histories."""
+        chosen = (options or {}).get("reset_mask")  # inner wrappers may remove it from the options
         observations, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         envs = np.arange(self.num_envs) if chosen is None else np.flatnonzero(chosen)
         self.stream.reset(envs)
@@ -114,7 +114,7 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         return self._layout.batch(observations["observation"], shown), infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step; one batched forward for all environments."""
+        """Steps all environments and forecasts them in one batch."""
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
         ended = np.asarray(terminations | truncations)
         if self._mode is AutoresetMode.SAME_STEP:
@@ -134,10 +134,10 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
 
 
 def _attribute_of_each(env: gym.vector.VectorEnv, name: str) -> Any:
-    """An attribute of each environment of a vector environment; its wrappers have no way to ask for it.
+    """Returns an attribute of each environment of a vector environment, since vector wrappers do not pass it on.
 
     Raises:
-        UserError: the vector environment has none either.
+        UserError: the vector environment has no `get_attr`.
     """
     base = env.unwrapped
     if not hasattr(base, "get_attr"):

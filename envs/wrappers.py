@@ -1,4 +1,4 @@
-"""Gymnasium wrappers for one environment: `SceneObservation` adds the scene, `ForecastObservation` what comes next.
+"""Gymnasium wrappers for one environment: `SceneObservation` adds the scene, `ForecastObservation` forecasts.
 
 >>> import gymnasium as gym
 >>> from envs.wrappers import ForecastObservation
@@ -25,7 +25,7 @@ from predictor.support.errors import ProtocolError, UserError
 
 
 def scene_source(env: gym.Env) -> str:
-    """What to call an env in messages, and where to look for its checkpoint: the id, else the class."""
+    """Returns the name of an env, for messages and for picking its checkpoint: its id, else its class."""
     spec = env.unwrapped.spec
     return spec.id if spec is not None else type(env.unwrapped).__name__
 
@@ -38,14 +38,14 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
     """Adds the scene around the ego to the observation.
 
     Observation: Dict with `observation` (the env's own, untouched), `scene_states` (max_agents, F) in the world frame,
-    `scene_ids`, `scene_valid`, `scene_heading_rad` (the ego's). Row 0 is the ego. This is what `VecForecast` needs from
-    each environment; a policy wants `ForecastObservation`.
+    `scene_ids`, `scene_valid`, `scene_heading_rad` (the ego's). The ego has index 0. `VecForecast` needs these entries
+    from each environment; for a policy use `ForecastObservation`.
 
     Args:
         env: any environment that a scene reader knows.
-        perception_m: how far the ego sees [m]; None takes the reader's default.
-        max_agents: rows of a scene, the ego included; None takes the reader's default.
-        reader: makes a reader for the env; None picks one by env family.
+        perception_m: range of the ego's perception [m]; None takes the reader's default.
+        max_agents: size of a scene, the ego included; None takes the reader's default.
+        reader: function or class that makes a reader for the env; None picks one by env family.
 
     Raises:
         UserError: no reader knows the env, or its observation is a Dict or Tuple.
@@ -58,7 +58,7 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         max_agents: int | None = None,
         reader: MakeReader | None = None,
     ) -> None:
-        """Pick the reader and extend the observation space."""
+        """Picks the reader and extends the observation space."""
         RecordConstructorArgs.__init__(self, perception_m=perception_m, max_agents=max_agents, reader=reader)
         gym.Wrapper.__init__(self, env)
         own = env.observation_space
@@ -78,24 +78,24 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
 
     @property
     def scene_source(self) -> str:
-        """The env id, for messages and for picking a checkpoint."""
+        """Name of the env, for messages and for picking its checkpoint: its id, else its class."""
         return scene_source(self.env)
 
     @property
     def scene(self) -> Scene:
-        """The latest scene."""
+        """Latest scene."""
         if self._scene is None:
             raise ProtocolError("there is no scene yet; call reset() first")
         return self._scene
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the env; identities start anew."""
+        """Resets the env; identities start anew."""
         obs, info = self.env.reset(seed=seed, options=options)
         self.reader.reset()
         return self._observe(obs), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the env and read the scene."""
+        """Steps the env and reads the scene."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         # some highway-env ids return NumPy's bool, which SB3 refuses
         return self._observe(obs), reward, bool(terminated), bool(truncated), info
@@ -104,33 +104,35 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         show(self.reader, obs)
         name, spec = f"scene reader of '{self.scene_source}'", self.reader.spec
         scene = require_scene(self.reader.read(self.env), name)
-        scene.check(name, spec, rows=spec.max_agents)
+        scene.check(name, spec, agents=spec.max_agents)
         self._scene = scene
         return {"observation": obs, **scene_entries(scene)}
 
 
 class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Shows the policy what the others are about to do.
+    """Adds forecasts of the other agents to the observation.
 
     Observation: Dict with `observation` (the env's own, untouched) and, for the other agents sorted by distance,
     `agents` (relative current states), `forecast` (future positions in the ego's frame [m]; a samples axis when
     num_samples > 1), `edge_probs` and `edge_features` (agent → ego, then ego → agent), `valid`.
     `envs.observation.ego_entries` gives the shapes. With `flatten=True` it is one Box, in the Dict's key order.
 
-    The history is forgotten at reset. After each step, `scene` and `forecast` hold the same in the world frame.
+    The history is cleared at reset. After each step, `scene` and `forecast` hold the observed scene and its forecast in
+    the world frame.
 
     Args:
         env: any environment that a scene reader knows, or one that is already a `SceneObservation`.
         checkpoint: shipped name, folder, or "constant-velocity"; None takes the one that ships for the env's id.
-        horizon_steps: steps to forecast; None takes the checkpoint's.
-        num_samples: sampled futures per agent.
-        flatten: one Box instead of a Dict, for MlpPolicy; combine with VecNormalize, the entries are in metres.
-        perception_m: how far the ego sees [m]; None takes what the checkpoint was trained with.
-        max_agents: rows of a scene, the ego included; None takes what the checkpoint was trained with.
-        device: where the forecaster runs.
-        forecaster: instead of a checkpoint; lives on `device`.
-        seed: of the samples' noise, until `reset(seed=…)` gives another.
-        reader: makes a reader for the env; None picks one by env family.
+        horizon_steps: number of steps to forecast; None takes the checkpoint's.
+        num_samples: number of sampled futures per agent.
+        flatten: whether the observation is one Box instead of a Dict, for MlpPolicy; combine it with VecNormalize,
+            since the entries are in metres.
+        perception_m: range of the ego's perception [m]; None takes what the checkpoint was trained with.
+        max_agents: size of a scene, the ego included; None takes what the checkpoint was trained with.
+        device: device of the forecaster.
+        forecaster: forecaster on `device`, instead of a checkpoint.
+        seed: random seed of the samples' noise, until `reset(seed=…)` gives another.
+        reader: function or class that makes a reader for the env; None picks one by env family.
 
     Raises:
         UserError: no reader, no checkpoint, or a forecaster of another spec (features, dt).
@@ -151,7 +153,7 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         seed: int = 0,
         reader: MakeReader | None = None,
     ) -> None:
-        """Load the forecaster and extend the observation space."""
+        """Loads the forecaster and extends the observation space."""
         RecordConstructorArgs.__init__(
             self, checkpoint=checkpoint, horizon_steps=horizon_steps, num_samples=num_samples, flatten=flatten,
             perception_m=perception_m, max_agents=max_agents, device=device, forecaster=forecaster, seed=seed,
@@ -182,12 +184,12 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
 
     @property
     def scene(self) -> Scene:
-        """The latest scene, world frame, ego in row 0."""
+        """Latest scene, world frame, the ego at index 0."""
         scene: Scene = self.env.get_wrapper_attr("scene")
         return scene
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the env and forget the history; a seed also restarts the samples' noise."""
+        """Resets the env and clears the history; a seed also restarts the samples' noise."""
         obs, info = self.env.reset(seed=seed, options=options)
         self.stream.reset()
         if seed is not None:
@@ -195,7 +197,7 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         return self._observe(obs), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the env, take in the scene, forecast."""
+        """Steps the env, takes in the scene and forecasts."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         return self._observe(obs), reward, terminated, truncated, info
 

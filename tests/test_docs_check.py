@@ -1,4 +1,4 @@
-"""The check of the documentation's blocks fails where a block is wrong, and says where and why."""
+"""The check of the documentation's blocks fails where a block is wrong, with its place and the reason."""
 
 import importlib.util
 import subprocess

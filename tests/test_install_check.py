@@ -57,9 +57,9 @@ def test_python_code_runs_in_an_empty_folder(this_python: Path, monkeypatch: pyt
     assert (this_python / "work" / "made").exists()
 
 
-def test_an_extra_that_brings_too_much_fails(this_python: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_extra_that_installs_too_much_fails(this_python: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(install_check.EXTRAS, "core", install_check.Extra((), absent=("no_such_module", "json")))
-    with pytest.raises(RuntimeError, match="'core' brings json, which it must not"):
+    with pytest.raises(RuntimeError, match="'core' installs json, which it must not"):
         install_check.try_extra("core", Path("some.whl"), this_python)
 
 

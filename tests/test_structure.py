@@ -1,4 +1,4 @@
-"""How the tree hangs together: who imports whom, and what no file may hold."""
+"""Imports between modules, and what no file may hold."""
 
 import ast
 import graphlib
@@ -187,7 +187,7 @@ def test_torch_never_unpickles():
     assert unsafe == []
 
 
-def test_no_file_mentions_a_path_of_somebodys_machine():
+def test_no_file_mentions_a_path_of_one_machine():
     """Also not in the provenance of shipped checkpoints: their commands must run on any machine."""
     homes = tuple("/" + name + "/" for name in ("work", "home", "root", "Users", "tmp", "mnt"))
     files = texts()

@@ -117,7 +117,7 @@ def test_one_command_trains_evaluates_and_films(finished: tuple[Path, str]):
         "summary.json", "summary.md", "video.mp4",
     }  # fmt: skip
     summary = json.loads((run / "summary.json").read_text())
-    assert [row["policy"] for row in summary["policies"]] == ["ppo (constant-velocity)", "random", "idle"]
+    assert [line["policy"] for line in summary["policies"]] == ["ppo (constant-velocity)", "random", "idle"]
     assert {e["seed"] for found in summary["episodes"].values() for e in found} == {evaluate.EVALUATION_SEED}
     config = json.loads((run / "config.json").read_text())
     assert config["config"]["steps"] == 2 * ROLLOUT
@@ -235,8 +235,8 @@ def test_pursuers_are_trained_measured_and_filmed_against_a_prey_that_is_driven(
     assert config["envs"] == 1
     assert load_model(run / "policy.zip", "ppo").num_timesteps == 3 * ROLLOUT
     summary = json.loads((run / "summary.json").read_text())
-    assert [row["policy"] for row in summary["policies"]] == ["ppo (forecast)", "random", "heuristic"]
-    assert all(row["crash_rate"] is None and row["length_mean"] == 25 for row in summary["policies"])
+    assert [line["policy"] for line in summary["policies"]] == ["ppo (forecast)", "random", "heuristic"]
+    assert all(line["crash_rate"] is None and line["length_mean"] == 25 for line in summary["policies"])
     assert (run / "summary.md").read_text().startswith("| policy | return | length |")
     assert "crash" not in printed
     assert_video(run / "video.mp4", least_s=1)
@@ -261,7 +261,7 @@ def test_agents_without_forecasts_are_trained_and_filmed(tmp_path: Path):
     assert_video(run / "video.mp4", least_s=1)
 
 
-def test_native_environments_train_what_is_measured_on_the_original(tmp_path: Path):
+def test_policies_trained_on_envpool_are_measured_on_the_original(tmp_path: Path):
     pytest.importorskip("envpool")
     arguments = ["--num-envs", "16", *TINY[4:], "--backend", "envpool", "--checkpoint", "constant-velocity"]
     run, _ = trained(tmp_path / "run", *arguments, "--steps", "512", "--no-video", short=False)
@@ -270,8 +270,8 @@ def test_native_environments_train_what_is_measured_on_the_original(tmp_path: Pa
     assert load_model(run / "policy.zip", "ppo").num_timesteps == 512
     summary = json.loads((run / "summary.json").read_text())
     assert summary["env_id"] == "highway-fast-v0"
-    assert [row["policy"] for row in summary["policies"]] == ["ppo (forecast)", "random", "idle"]
-    assert all(0 < row["return_mean"] <= 30 for row in summary["policies"])
+    assert [line["policy"] for line in summary["policies"]] == ["ppo (forecast)", "random", "idle"]
+    assert all(0 < line["return_mean"] <= 30 for line in summary["policies"])
     assert not (run / "video.mp4").exists()
 
 

@@ -1,1 +1,1 @@
-"""Drivers: they choose the actions while data is collected or accuracy is measured."""
+"""Drivers, which choose the actions in data collection and evaluation."""

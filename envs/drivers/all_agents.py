@@ -1,8 +1,8 @@
-"""Who drives all agents of a PettingZoo parallel environment while data is collected or accuracy is measured.
+"""Drivers of all agents of a PettingZoo parallel environment in data collection and evaluation.
 
 Every agent draws its own habits anew in each episode, from a random stream of its own that is independent of the
-environment's (`envs.seeding`): the start of an episode says nothing about the habits, only an agent's history does.
-Heuristics look into the simulator; what is recorded of them is what a scene reader sees.
+environment's (`envs.seeding`): the start of an episode carries no information on the habits, only an agent's history
+does. Heuristics use the simulator's state; recordings hold only what a scene reader reads.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,13 +20,13 @@ from envs.readers.pursuit import is_pursuit_env
 from predictor.support.errors import UserError
 
 Driver = Callable[[Mapping[str, Any]], dict[str, Any]]
-"""From the observations of a step, of all agents or of some, to the actions of those that live."""
+"""Maps the observations of a step, of all agents or of some, to actions of those that live."""
 
 AgentDriver = Callable[[Any], Any]
-"""From one agent's observation to its action."""
+"""Maps one agent's observation to its action."""
 
 DrawAgentDriver = Callable[[str, np.random.Generator], AgentDriver]
-"""From an agent's name and a generator of its own to its driver for one episode."""
+"""Maps an agent's name and a generator of its own to its driver for one episode."""
 
 WHO = "drivers"
 DRIVER_NAMES = ("random", "idle", "varied", "heuristic", "mixed")
@@ -35,16 +35,16 @@ _PURSUIT_STAY = 4
 _PURSUIT_STEPS = np.array([(-1, 0), (1, 0), (0, 1), (0, -1), (0, 0)])
 _PUSHES = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)], dtype=np.float64)  # mpe2's five discrete actions
 _DEFAULT_ACCEL = 5.0  # mpe2's sensitivity where an agent has no `accel`
-_NEAR_M = 0.1  # this close counts as being there
+_NEAR_M = 0.1  # an agent this close to its place has reached it
 _WALL_M = 0.7  # from here on, prey is driven back to the middle; the arena ends at 1
 
 
 def make_driver(name: str, env: Any, rng: np.random.Generator) -> Driver:
-    """A driver of all agents, for one episode.
+    """Returns a driver of all agents, for one episode.
 
     Args:
         name: "random" (uniform actions), "idle" (no action), "varied" (each agent draws its preferences and how long
-            it keeps to a choice), "heuristic" (each agent pursues what its scenario rewards, with its own `Habits`;
+            a choice is kept), "heuristic" (each agent pursues what its scenario rewards, with its own `Habits`;
             mpe2 and pursuit only), or "mixed" (each agent is one of random, varied and, where there is one,
             heuristic).
         env: the parallel environment that will be driven, wrapped or not; need not be reset yet.
@@ -70,7 +70,7 @@ def make_driver(name: str, env: Any, rng: np.random.Generator) -> Driver:
 
 
 def _agent_drivers(name: str, env: Any, rng: np.random.Generator) -> DrawAgentDriver:
-    """Returns what makes the driver of an agent; `rng` is for what the agents decide together."""
+    """Returns the function that makes the driver of an agent; `rng` is for the agents' common decisions."""
     if name == "random":
         return lambda agent, own: lambda seen: uniform_action(env.action_space(agent), own, WHO)
     if name == "idle":
@@ -87,7 +87,7 @@ def _agent_drivers(name: str, env: Any, rng: np.random.Generator) -> DrawAgentDr
 
 
 def idle_action(env: Any, agent: str) -> Any:
-    """The action that changes nothing: what the env's own `idle_action(agent)` says, or its family's, or zeros."""
+    """Returns the action that changes nothing: of the env's own `idle_action(agent)`, of its family, or zeros."""
     own = getattr(env.unwrapped, "idle_action", None)
     if own is not None:
         return own(agent)
@@ -99,22 +99,22 @@ def idle_action(env: Any, agent: str) -> Any:
 
 @dataclass(frozen=True)
 class Habits:
-    """How well and in what manner one agent drives in one episode."""
+    """Skill and manner of driving of one agent in one episode."""
 
     attention: float
-    """Probability that it looks up at a step; otherwise it repeats its last action."""
+    """Probability of a new decision at a step; otherwise the last action is repeated."""
     slip: float
     """Probability of a random action instead of the intended one."""
     lead_s: float
-    """How far ahead it thinks of others, whom it expects to keep their velocity [s]."""
+    """Time over which it extrapolates the others with constant velocity [s]."""
     pace: float
     """Share of its top speed that it uses."""
     lean_rad: float
-    """By how much it veers off the straight way."""
+    """Angle between its course and the straight line to its target [rad]."""
 
     @staticmethod
     def draw(rng: np.random.Generator) -> "Habits":
-        """Those of a new agent."""
+        """Draws the habits of one agent."""
         return Habits(
             attention=float(rng.uniform(0.5, 1.0)),
             slip=float(rng.uniform(0.0, 0.1)),
@@ -153,7 +153,7 @@ def _heuristic(env: Any, rng: np.random.Generator) -> DrawAgentDriver:
 
 
 class _PursuitIntentions:
-    """Each pursuer heads for its favourite side of the nearest evader, along its favourite axis first."""
+    """Makes each pursuer head for its preferred side of the nearest evader, along its preferred axis first."""
 
     def __init__(self, env: Any) -> None:
         self._env = env.unwrapped
@@ -183,7 +183,7 @@ class _PursuitIntentions:
 
 
 class _MpeIntentions:
-    """Each agent wants a velocity, which its scenario's aim gives; it pushes so that its own comes closest."""
+    """Makes each agent push so that its velocity comes closest to the target velocity of its scenario's aim."""
 
     def __init__(self, env: Any, rng: np.random.Generator) -> None:
         self.env = env.unwrapped
@@ -217,12 +217,12 @@ class _MpeIntentions:
         return np.array(moves + words, dtype=np.float32)
 
     def _coasting(self, body: Any) -> Float[np.ndarray, " axes"]:
-        """Its velocity after the next step without a push."""
+        """Returns its velocity after the next step without a push."""
         velocity: np.ndarray = body.state.p_vel * (1 - self.world.damping)
         return velocity
 
     def _push_mps(self, body: Any) -> float:
-        """By how much a full push changes its velocity in one step."""
+        """Returns the change of its velocity by a full push in one step [m/s]."""
         return float((body.accel or _DEFAULT_ACCEL) / body.mass * self.world.dt)
 
     def cruise_mps(self, body: Any, habits: Habits) -> float:
@@ -230,7 +230,7 @@ class _MpeIntentions:
         return habits.pace * min(terminal, body.max_speed or np.inf)
 
     def towards(self, body: Any, target: np.ndarray, habits: Habits, brake: bool = True) -> np.ndarray:
-        """The velocity that leads to a place, slower at its end if the agent is to stop there."""
+        """Returns the velocity that leads to a place; with `brake`, slower near it, to stop there."""
         gap = target - body.state.p_pos
         distance_m = float(np.linalg.norm(gap))
         cos, sin = np.cos(habits.lean_rad), np.sin(habits.lean_rad)
@@ -241,7 +241,7 @@ class _MpeIntentions:
         return way * (speed / max(distance_m, 1e-6))
 
     def place(self, body: Any, bodies: list[Any], places: np.ndarray) -> np.ndarray:
-        """Where the agent is to stand: nearest pairs first; all swap when everyone is there, or after a while."""
+        """Returns the agent's place: nearest pairs first; drawn anew when all places are reached, or after a while."""
         here = np.array([b.state.p_pos for b in bodies])
         if not self._places:
             self._assign(bodies, places, _nearest_pairs(here, places))
@@ -256,7 +256,7 @@ class _MpeIntentions:
 
 
 def _nearest_pairs(here: Float[np.ndarray, "agents axes"], places: Float[np.ndarray, "places axes"]) -> np.ndarray:
-    """Place of each agent: the nearest pair first, then the nearest of the rest."""
+    """Returns the place of each agent: the nearest pair first, then the nearest of the rest."""
     distance = np.linalg.norm(here[:, None] - places[None], axis=-1)
     order = np.arange(len(here)) % len(places)
     for _ in range(min(distance.shape)):
@@ -275,7 +275,7 @@ def _nearest(body: Any, others: list[Any]) -> Any:
 
 
 def _hunt(intentions: _MpeIntentions, body: Any, habits: Habits) -> np.ndarray:
-    """Adversaries make for where the nearest prey will be; prey flees, and looks for food while nobody is near."""
+    """Returns a velocity: adversaries intercept the nearest prey; prey flees, or seeks food if no adversary is near."""
     world = intentions.world
     if body.adversary:
         nearest = _nearest(body, _of_role(world, adversary=False) or [body])
@@ -298,7 +298,7 @@ def _hunt(intentions: _MpeIntentions, body: Any, habits: Habits) -> np.ndarray:
 
 
 def _stand(places: Callable[[Any], np.ndarray]) -> "Aim":
-    """Everyone (but adversaries) takes one of the places; adversaries guess where somebody is about to be."""
+    """Returns the aim to take one of the places; adversaries go to the landmark that the agents are nearest to."""
 
     def aim(intentions: _MpeIntentions, body: Any, habits: Habits) -> np.ndarray:
         world = intentions.world
@@ -330,20 +330,20 @@ def _line(world: Any) -> np.ndarray:
 
 
 def _push(intentions: _MpeIntentions, body: Any, habits: Habits) -> np.ndarray:
-    """The agent makes for its goal; the adversary for where the agent seems to go."""
+    """Returns a velocity: the agent goes to its goal, the adversary to the landmark that the agents are nearest to."""
     good = _of_role(intentions.world, adversary=False)
     goal = _likely_goal(good, intentions.world.landmarks) if body.adversary else body.goal_a
     return intentions.towards(body, goal.state.p_pos, habits)
 
 
 def _told(intentions: _MpeIntentions, body: Any, habits: Habits) -> np.ndarray:
-    """To the landmark that somebody else is to tell it."""
+    """Returns the velocity to the landmark that the other agent has to communicate."""
     speaker = next(other for other in intentions.world.agents if other is not body)
     return intentions.towards(body, speaker.goal_b.state.p_pos, habits)
 
 
 def _collect(intentions: _MpeIntentions, body: Any, habits: Habits) -> np.ndarray:
-    """Collectors fetch the nearest treasure and bring it to its deposit; a deposit comes to meet them."""
+    """Returns a velocity: collectors bring the nearest treasure to its deposit; deposits move towards collectors."""
     world = intentions.world
     collectors = [other for other in world.agents if other.collector]
     if not body.collector:

@@ -1,4 +1,4 @@
-"""Ways to drive the ego while data is collected or accuracy is measured."""
+"""Drivers of the ego in data collection and evaluation."""
 
 from typing import Any
 
@@ -15,17 +15,17 @@ EGO_DRIVER_NAMES = ("random", "idle", "varied", "keep-lane")
 
 
 def make_ego_driver(name: str, env: gym.Env, rng: np.random.Generator) -> EgoDriver:
-    """An ego for one episode.
+    """Returns a driver of the ego for one episode.
 
     Args:
         name: "random" (uniform actions), "idle" (no action), "varied" (each episode draws its own preferences and how
-            long it keeps to a choice), "keep-lane" (steers along its lane; continuous steering only), or the path of a
+            long a choice is kept), "keep-lane" (steers along its lane; continuous steering only), or the path of a
             Stable-Baselines3 ``.zip``.
         env: the environment that will be driven.
         rng: source of all randomness of this episode.
 
     Raises:
-        UserError: unknown name, or an ego that cannot drive this action space.
+        UserError: unknown name, or a driver that does not support this action space.
     """
     if name == "random":
         return lambda obs: uniform_action(env.action_space, rng, WHO)
@@ -42,7 +42,7 @@ def make_ego_driver(name: str, env: gym.Env, rng: np.random.Generator) -> EgoDri
 
 
 def idle_action(env: gym.Env) -> Any:
-    """The action that changes nothing: highway-env's IDLE, or zeros."""
+    """Returns the action that changes nothing: highway-env's IDLE, or zeros."""
     space = env.action_space
     if isinstance(space, gym.spaces.Discrete):
         indexes = getattr(getattr(env.unwrapped, "action_type", None), "actions_indexes", {})
@@ -53,7 +53,7 @@ def idle_action(env: gym.Env) -> Any:
 
 
 def _keep_lane(env: gym.Env, rng: np.random.Generator) -> EgoDriver:
-    """Follow the current lane with highway-env's own lane controller, with a little steering noise per episode."""
+    """Follows the current lane with highway-env's own lane controller, with a little steering noise per episode."""
     action_type: Any = getattr(env.unwrapped, "action_type", None)
     if not isinstance(env.action_space, gym.spaces.Box) or not hasattr(action_type, "steering_range"):
         raise UserError(f"keep-lane needs continuous steering, got {env.action_space}; use random, idle or varied")

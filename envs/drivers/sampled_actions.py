@@ -1,4 +1,4 @@
-"""Ways to act that know nothing of the environment: shared by egos (one driver) and drivers (one for each agent)."""
+"""Actions sampled from an action space alone, for drivers of an ego and drivers of all agents."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,15 +10,15 @@ from predictor.support.errors import UserError
 
 
 def uniform_action(space: gym.Space, rng: np.random.Generator, who: str) -> Any:
-    """An action drawn evenly.
+    """Returns an action drawn uniformly.
 
     Args:
         space: Discrete or a bounded Box.
         rng: source of the draw.
-        who: acts, for the message.
+        who: name of the drivers, for the message.
 
     Raises:
-        UserError: another space.
+        UserError: neither Discrete nor a bounded Box.
     """
     if isinstance(space, gym.spaces.Discrete):
         return int(space.start + rng.integers(space.n))
@@ -28,12 +28,12 @@ def uniform_action(space: gym.Space, rng: np.random.Generator, who: str) -> Any:
 
 
 def varied_actions(space: gym.Space, rng: np.random.Generator, who: str) -> Callable[[Any], Any]:
-    """Acts by preferences, and keeps to a choice for a while; both are drawn now, once for an episode.
+    """Returns a driver with preferences that repeats its choices for a while; both are drawn once, for an episode.
 
     Args:
         space: Discrete or a bounded Box.
         rng: source of all draws.
-        who: acts, for the message.
+        who: name of the drivers, for the message.
     """
     persistence = rng.uniform(0.0, 0.9)
     taste = rng.dirichlet(np.full(int(space.n), 0.7)) if isinstance(space, gym.spaces.Discrete) else None

@@ -1,7 +1,7 @@
-"""A trained policy drives a PettingZoo environment: what it learned on is rebuilt for one step of one environment.
+"""Trained policies as drivers: of the agents of a PettingZoo environment, and of an ego with its wrapper.
 
-Who learned, who drove the others, and on which forecaster, is read from the note inside the policy's zip
-(`envs.sb3.policy_file`); without one, all agents are the policy's.
+Learners, the driver of the others and the forecaster are read from the note inside the policy's zip
+(`envs.sb3.policy_file`); without a note, the policy drives all agents.
 """
 
 import functools
@@ -25,19 +25,19 @@ if TYPE_CHECKING:
     from envs.sb3.policy_file import PolicyNote
 
 EgoDriver = Callable[[Any], Any]
-"""From an observation to an action."""
+"""Maps an observation to an action."""
 
 
 def trained_driver(path: str, env: Any, rng: np.random.Generator) -> Driver:
-    """A driver of all agents for one episode: the policy for those that learned, by name for the others.
+    """Returns a driver of all agents for one episode: the policy drives the learners, the note's driver the others.
 
     Args:
-        path: of an SB3 ``.zip``. It holds pickled data: trust its source.
-        env: a `ForecastParallelEnv`, whose observations the driver gets; with several samples, the first one counts.
-        rng: of the drivers by name.
+        path: path of an SB3 ``.zip``. It holds pickled data: load only files whose source you trust.
+        env: a `ForecastParallelEnv`, whose observations the driver gets; of several samples, it gets the first.
+        rng: source of randomness of the note's driver.
 
     Raises:
-        UserError: no such policy, or one of other observations than the environment gives.
+        UserError: no such policy, or one that was trained on other observations.
     """
     policy, note = kept_policy(path), note_of(path)
     learners = learners_named(env.possible_agents, () if note is None else note.learners, path)
@@ -70,7 +70,7 @@ def _line(space: gym.Space) -> str:
 
 
 def _seen_space(space: gym.Space, sees_forecasts: bool) -> gym.Space:
-    """An agent's observation space with one forecast, or without any."""
+    """Returns an agent's observation space with one forecast, or without any."""
     assert isinstance(space, gym.spaces.Dict)
     if not sees_forecasts:
         return space["observation"]
@@ -81,7 +81,7 @@ def _seen_space(space: gym.Space, sees_forecasts: bool) -> gym.Space:
 
 
 def _seen(observation: Mapping[str, Any], sees_forecasts: bool) -> Any:
-    """The observation itself, in that space."""
+    """Returns the observation in the space of `_seen_space`."""
     if not sees_forecasts:
         return observation["observation"]
     forecast = observation["forecast"]
@@ -89,15 +89,15 @@ def _seen(observation: Mapping[str, Any], sees_forecasts: bool) -> Any:
 
 
 def env_for_driver(env: gym.Env, name: str) -> gym.Env:
-    """The env as the ego wants to see it: with forecasts for a policy that was trained on them, else as it is.
+    """Returns the env with the observations of a driver: with forecasts for a policy trained on them, else as it is.
 
     Raises:
-        UserError: no such policy, or one of other observations.
+        UserError: no such policy, or one that was trained on other observations.
     """
     if not name.endswith(".zip"):
         return env
     if sees_forecasts(name):
-        from envs.wrappers import ForecastObservation  # the wrappers need no egos; most egos need no wrappers
+        from envs.wrappers import ForecastObservation  # most drivers need no wrapper
 
         checkpoint = forecaster_of(name)
         env = ForecastObservation(env, checkpoint)
@@ -111,7 +111,7 @@ def env_for_driver(env: gym.Env, name: str) -> gym.Env:
 
 
 def require_view(env: gym.Env, name: str) -> None:
-    """Raise a `UserError` if the ego is a policy that was trained on other observations than the env gives."""
+    """Raises a `UserError` if the driver is a policy that was trained on other observations than the env's."""
     if not name.endswith(".zip"):
         return
     wanted = kept_policy(name).observation_space
@@ -120,20 +120,20 @@ def require_view(env: gym.Env, name: str) -> None:
 
 
 def sees_forecasts(name: str) -> bool:
-    """Whether the ego is a policy that was trained on forecasts."""
+    """Returns whether the driver is a policy that was trained on forecasts."""
     return name.endswith(".zip") and isinstance(kept_policy(name).observation_space, gym.spaces.Dict)
 
 
 @functools.cache
 def kept_policy(path: str) -> "BaseAlgorithm":
-    """Returns the policy of a zip, loaded once per process; errors as `envs.sb3.policy_file.load_policy`."""
+    """Returns the policy of a zip, loaded once per process; raises the errors of `envs.sb3.policy_file.load_policy`."""
     from envs.sb3.policy_file import load_policy  # most drivers need no SB3
 
     return load_policy(Path(path))
 
 
 def note_of(path: str) -> "PolicyNote | None":
-    """Returns what travels with a policy; None, with a warning, if nothing does (saved by SB3 alone or long ago)."""
+    """Returns the note of a policy; None, with a warning, if it has none (saved by SB3 alone or by an old version)."""
     from envs.sb3.policy_file import read_policy_note
 
     note = read_policy_note(Path(path))
@@ -147,18 +147,18 @@ def note_of(path: str) -> "PolicyNote | None":
 
 
 def forecaster_of(path: str) -> str | None:
-    """Returns the checkpoint that a policy was trained on; None if it does not say."""
+    """Returns the checkpoint that a policy was trained on; None if its note names none."""
     note = note_of(path)
     return None if note is None or note.forecaster is None else note.forecaster.checkpoint
 
 
 def require_forecaster(path: str, checkpoint: str, space: gym.spaces.Dict, spec: SceneSpec) -> None:
-    """Raise a `UserError` if a policy was trained on another forecaster, or with other options.
+    """Raises a `UserError` if a policy was trained on another forecaster, or with other options.
 
     Args:
-        path: of the policy's zip.
-        checkpoint: forecaster that it gets.
-        space: observation space with that forecaster's forecasts; of several samples the policy sees the first.
+        path: path of the policy's zip.
+        checkpoint: checkpoint whose forecasts it gets.
+        space: observation space with that forecaster's forecasts; of several samples the policy gets the first.
         spec: layout of the scenes.
     """
     from envs.sb3.policy_file import pin_forecaster

@@ -1,4 +1,4 @@
-"""Scene readers: which one reads an environment. One module per family; `envs.readers.base` has the rules.
+"""Scene readers, and which one reads an environment. One module per family; `envs.readers.base` has the interfaces.
 
 A `SceneReader` serves a Gymnasium environment with one ego, a `MultiagentReader` a PettingZoo environment. Both kinds
 are registered with `register_reader`, and checked alike when they are made.
@@ -66,7 +66,8 @@ def reader_for(env: gym.Env, perception_m: float | None = None, max_agents: int 
 
     Args:
         env: any Gymnasium environment, wrapped or not.
-        perception_m: how far the ego sees [m]; None takes the family's default. A registered reader sets its own.
+        perception_m: range of the ego's perception [m]; None takes the family's default. A registered reader sets its
+            own.
         max_agents: size of a scene, the ego included; None takes the family's default.
 
     Raises:
@@ -94,7 +95,8 @@ def multiagent_reader_for(
 
     Args:
         env: a parallel environment, wrapped or not.
-        perception_m: how far an agent sees [m]; None takes the family's default. A registered reader sets its own.
+        perception_m: range of an agent's perception [m]; None takes the family's default. A registered reader sets its
+            own.
         max_agents: size of a scene; None takes the family's default. A registered reader sets its own.
 
     Raises:
@@ -127,7 +129,7 @@ def multiagent_reader_for(
 
 
 def multiagent_env_id(env: Any) -> str:
-    """Returns what messages call a PettingZoo environment: its id where it is listed here, else its own name."""
+    """Returns the name of a PettingZoo environment for messages: its id where it is listed here, else its own name."""
     scenario = mpe_scenario(env)
     for env_id in MPE_IDS:
         if scenario and env_id.rpartition("_v")[0] == scenario:

@@ -1,6 +1,6 @@
 """Interfaces of scene readers, and what they have in common: how they are made, and what an ego perceives.
 
-A reader reports all agents (`read_all`): which they are, where, and how they move. What the ego perceives of them
+A reader reports all agents (`read_all`): their ids, positions and velocities. What the ego perceives of them
 (`read`) is decided by `predictor.scene.perceived_agents`: itself first, then the nearest within `perception_m`, at most
 `max_agents`, padded with zeros. A PettingZoo environment has many learners and no single ego: its reader returns a
 `MultiagentScene`, from which every agent's own view is cut.
@@ -42,9 +42,9 @@ class MultiagentScene:
 
     scene: Scene
     """All agents, padded to `max_agents`; an agent's index may change from step to step, its id does not."""
-    rows: Mapping[str, int]
-    """Index in `scene` of each agent that is observed now, by its name: those that live, and those that see their last
-    observation."""
+    index_of: Mapping[str, int]
+    """Index in `scene` of each agent that is observed now, by its name: agents that live, and agents that get their
+    last observation."""
     heading_rad: Float[np.ndarray, " agents"]
     """Heading of each agent, which turns world axes into its own; 0 where agents have none."""
 
@@ -90,7 +90,7 @@ class Reader(ABC):
     def see(self, observation: Any) -> None:  # noqa: B027
         """Takes in the env's own observation, once after each reset and step, before anything is read.
 
-        For readers of observations; a reader that looks into the environment ignores them.
+        For readers of observations; a reader of the simulator ignores them.
         """
 
     @abstractmethod
@@ -186,32 +186,32 @@ def show(reader: Any, observation: Any) -> None:
 
 
 def require_scene(scene: Any, source: str) -> Scene:
-    """Returns what a reader returned, which must be a `Scene`.
+    """Returns `scene`, which must be a `Scene`.
 
     Raises:
-        UserError: it is something else.
+        UserError: it is of another type.
     """
     if not isinstance(scene, Scene):
         raise UserError(f"{source}: reading must give a Scene (predictor.scene), got {type(scene).__name__}")
     return scene
 
 
-def perceive(everyone: Scene, spec: SceneSpec, source: str = "reader") -> Scene:
+def perceive(full: Scene, spec: SceneSpec, source: str = "reader") -> Scene:
     """Returns the ego and the nearest agents that it perceives, nearest first, padded to `max_agents`.
 
     Agents beyond the nearest `max_agents` are not perceived, which is no error. Entries that are not valid are dropped.
 
     Args:
-        everyone: ego first, any number of agents.
+        full: all agents, ego first, any number.
         spec: its `perception_m` and `max_agents` decide.
-        source: who read the scene, for messages.
+        source: name of the reader, for messages.
 
     Raises:
-        UserError: `everyone` breaks the contract of a scene.
+        UserError: `full` breaks the contract of a scene.
     """
-    everyone.check(source, spec)
-    order, seen = perceived_agents(everyone.states, everyone.valid, 0, spec)
-    return padded(everyone, order[seen], spec.max_agents)
+    full.check(source, spec)
+    order, seen = perceived_agents(full.states, full.valid, 0, spec)
+    return padded(full, order[seen], spec.max_agents)
 
 
 def padded(scene: Scene, indices: np.ndarray, max_agents: int) -> Scene:
@@ -226,27 +226,27 @@ def padded(scene: Scene, indices: np.ndarray, max_agents: int) -> Scene:
 
 
 def pad_multiagent_scene(
-    everyone: Scene, rows: Mapping[str, int], heading_rad: np.ndarray, spec: SceneSpec, source: str = "reader"
+    full: Scene, index_of: Mapping[str, int], heading_rad: np.ndarray, spec: SceneSpec, source: str = "reader"
 ) -> MultiagentScene:
     """Returns the `MultiagentScene` of an unpadded scene.
 
     Args:
-        everyone: all agents, all valid, in any order.
-        rows: index of each observed agent, by its name.
+        full: all agents, all valid, in any order.
+        index_of: index of each observed agent, by its name.
         heading_rad: heading of each agent [rad].
         spec: its `max_agents` is the size to pad to.
-        source: who read the scene, for messages.
+        source: name of the reader, for messages.
 
     Raises:
-        UserError: more agents than `max_agents`, or `everyone` breaks the contract of a scene.
+        UserError: more agents than `max_agents`, or `full` breaks the contract of a scene.
     """
-    everyone.check(source, spec)
-    count = len(everyone.ids)
+    full.check(source, spec)
+    count = len(full.ids)
     if count > spec.max_agents:
         raise UserError(f"{source}: {count} agents do not fit max_agents={spec.max_agents}; raise max_agents")
     headings = np.zeros(spec.max_agents)
     headings[:count] = heading_rad
-    return MultiagentScene(padded(everyone, np.arange(count), spec.max_agents), dict(rows), headings)
+    return MultiagentScene(padded(full, np.arange(count), spec.max_agents), dict(index_of), headings)
 
 
 def role_of(agent: str) -> str:
@@ -254,14 +254,14 @@ def role_of(agent: str) -> str:
     return agent.rstrip("0123456789").rstrip("_- ") or agent
 
 
-def perceive_batch(everyone: SceneBatch, spec: SceneSpec) -> SceneBatch:
+def perceive_batch(full: SceneBatch, spec: SceneSpec) -> SceneBatch:
     """Returns what each ego of a batch perceives: `perceive` for many scenes at once."""
-    order, seen = perceived_agents(everyone.states, everyone.valid, 0, spec)
+    order, seen = perceived_agents(full.states, full.valid, 0, spec)
     batch, nearest = order.shape
-    states = np.zeros((batch, spec.max_agents, everyone.states.shape[-1]))
+    states = np.zeros((batch, spec.max_agents, full.states.shape[-1]))
     ids = np.full((batch, spec.max_agents), PADDING_ID, dtype=np.int64)
     valid = np.zeros((batch, spec.max_agents), dtype=np.bool_)
-    states[:, :nearest] = np.where(seen[..., None], np.take_along_axis(everyone.states, order[..., None], axis=1), 0.0)
-    ids[:, :nearest] = np.where(seen, np.take_along_axis(everyone.ids, order, axis=1), PADDING_ID)
+    states[:, :nearest] = np.where(seen[..., None], np.take_along_axis(full.states, order[..., None], axis=1), 0.0)
+    ids[:, :nearest] = np.where(seen, np.take_along_axis(full.ids, order, axis=1), PADDING_ID)
     valid[:, :nearest] = seen
-    return SceneBatch(states, ids, valid, everyone.heading_rad)
+    return SceneBatch(states, ids, valid, full.heading_rad)

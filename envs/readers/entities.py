@@ -1,8 +1,8 @@
-"""Reads scenes out of observations whose rows are entities: `EntityRowsReader`, given the names of the columns.
+"""Reads scenes out of observations that are tables of entities: `EntityRowsReader`, given the names of the columns.
 
-Many environments show a table of agents, row 0 the ego (highway-env's Kinematics, crowds of robots and walkers). What
-is not in the observation is not in the scene: collection and evaluation then also know only what the ego saw. Where the
-environment itself can be asked, a `Reader` of its own sees more and knows its agents' names.
+The observation of many environments is a table with one line per agent, the ego's first (highway-env's Kinematics,
+crowds of robots and walkers). Agents that are not in the observation are not in the scene, in collection and evaluation
+too. Where the simulator's state is accessible, a `Reader` of your own reads all agents and their identities.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ _HEADINGS = ("heading", "cos_h", "sin_h")
 
 @dataclass(frozen=True)
 class EntityRowsReader:
-    """Makes readers of the env's own observation, a Box of entities × columns (or the same as one row of numbers).
+    """Makes readers of the env's own observation, a Box of entities × columns, or that table flattened.
 
         >>> from envs import ForecastObservation, make_env
         >>> columns = ("presence", "x", "y", "vx", "vy")
@@ -32,29 +32,29 @@ class EntityRowsReader:
         >>> reader = EntityRowsReader(columns, SceneSpec(dt_s=1.0))
         >>> env = ForecastObservation(env, "highway", reader=reader)
 
-    An observation that is clipped cannot be undone: take it without, or with bounds that are never met.
+    Clipping cannot be undone: switch it off in the environment, or choose bounds that are never reached.
     """
 
     columns: tuple[str, ...]
-    """What each column holds, in order: "x", "y", "vx" and "vy" ("z" and "vz" where the spec has three axes);
+    """Content of each column, in order: "x", "y", "vx" and "vy" ("z" and "vz" where the spec has three axes);
     "presence", more than 0.5 where there is an agent; "id"; the heading as "heading" or as "cos_h" and "sin_h", of
     which the ego's is used; further features by their names in the spec. Others ("") are skipped."""
     spec: SceneSpec
     """Layout of the scenes. Features beyond the kinematic ones need a column of that name."""
     gate_m: float = 10.0
-    """Without an "id" column: an agent found at this distance or more from where its motion led is a new one [m]; see
-    `envs.readers.identity`. The default is for cars at 1 s per step; less where agents are closer."""
+    """Without an "id" column: an agent observed at this distance or more from its extrapolated position is a new one
+    [m]; see `envs.readers.identity`. The default is for cars at 1 s per step; less where agents are closer."""
     scales: tuple[float, ...] | None = None
-    """What 1.0 is in SI units, for each column, where the observation is normalised; None takes SI units."""
+    """Value of 1.0 in SI units, for each column of a normalised observation; None: the observation is in SI units."""
     relative: bool = False
-    """Whether the rows after the first hold positions and velocities relative to the ego's; axes are the world's."""
+    """Whether the lines after the first hold positions and velocities relative to the ego's; axes are the world's."""
     dead_reckoning: bool = False
     """Whether the ego's position is summed up from its velocity, from 0 on, on axes that are not of frame "world": for
     relative observations in which the ego is always at the same place, or leaves the bounds."""
     padding: float | None = None
-    """Without a "presence" column: a row with nothing but this number holds no agent; None if every row holds one."""
+    """Without a "presence" column: a line of this number alone holds no agent; None if all lines hold one."""
     memory_steps: int = 0
-    """Without an "id" column: for how many steps an agent that is out of sight is remembered."""
+    """Without an "id" column: number of steps for which an agent that is out of sight is remembered."""
 
     def __post_init__(self) -> None:
         """Checks that columns, scales and spec fit together."""
@@ -73,8 +73,8 @@ class EntityRowsReader:
             raise UserError(f"scales needs one number for each of {len(self.columns)} columns, not 0, got {scales}")
         if self.dead_reckoning and not (self.relative and set(self.spec.frame) != {"world"}):
             raise UserError(
-                "dead_reckoning needs relative=True and an axis of another frame than 'world', since it knows no place "
-                f"on a map, got relative={self.relative} and frame={self.spec.frame}"
+                "dead_reckoning needs relative=True and an axis of another frame than 'world', since it gives no "
+                f"position on a map, got relative={self.relative} and frame={self.spec.frame}"
             )
 
     def __call__(self, env: gym.Env) -> Reader:
@@ -86,10 +86,10 @@ class EntityRowsReader:
         space = env.observation_space
         if not isinstance(space, gym.spaces.Box):
             raise UserError(f"EntityRowsReader needs a Box of entities × columns as observation, got {space}")
-        self.rows_of(np.zeros(space.shape))
+        self.table_of(np.zeros(space.shape))
         return _EntityRows(self)
 
-    def rows_of(self, observation: Any) -> Float[np.ndarray, "entities columns"]:
+    def table_of(self, observation: Any) -> Float[np.ndarray, "entities columns"]:
         """Returns the table of an observation, in SI units, float64.
 
         Raises:
@@ -100,14 +100,14 @@ class EntityRowsReader:
         fits = table.shape[-1:] == (width,) if table.ndim == 2 else table.ndim == 1 and table.size % width == 0
         if not fits or not table.size:
             raise UserError(
-                f"EntityRowsReader needs an observation of entities × {width} columns {self.columns}, or the same in "
-                f"one row, got shape {table.shape}"
+                f"EntityRowsReader needs an observation of entities × {width} columns {self.columns}, or that "
+                f"table flattened, got shape {table.shape}"
             )
         return table.reshape(-1, width) * (1.0 if self.scales is None else np.array(self.scales))
 
 
 class _EntityRows(Reader):
-    """Reader that `EntityRowsReader` makes; the work is done once per observation, in `see`."""
+    """Reader that `EntityRowsReader` makes; reads each observation once, in `see`."""
 
     def __init__(self, config: EntityRowsReader) -> None:
         super().__init__(config.spec)
@@ -133,27 +133,29 @@ class _EntityRows(Reader):
         return self._scene
 
     def see(self, observation: Any) -> None:
-        rows = self._config.rows_of(observation)
-        rows = rows[self._present(rows)]
-        if not np.isfinite(rows).all():
-            raise UserError(f"EntityRowsReader: the observation must be finite, got {rows.tolist()}")
-        states = rows[:, self._state]
+        table = self._config.table_of(observation)
+        table = table[self._valid(table)]
+        if not np.isfinite(table).all():
+            raise UserError(f"EntityRowsReader: the observation must be finite, got {table.tolist()}")
+        states = table[:, self._state]
         self._restore(states)
-        self._scene = Scene(states, self._identify(rows, states), np.ones(len(rows), np.bool_), self._heading(rows[0]))
+        self._scene = Scene(
+            states, self._identify(table, states), np.ones(len(table), np.bool_), self._heading(table[0])
+        )
 
-    def _present(self, rows: Float[np.ndarray, "entities columns"]) -> np.ndarray:
-        present = np.ones(len(rows), dtype=np.bool_)
+    def _valid(self, table: Float[np.ndarray, "entities columns"]) -> np.ndarray:
+        valid = np.ones(len(table), dtype=np.bool_)
         if "presence" in self._column:
-            present = rows[:, self._column["presence"]] > 0.5
-            if not present[0]:
-                raise UserError("EntityRowsReader: row 0 must hold the ego, but its presence is 0")
+            valid = table[:, self._column["presence"]] > 0.5
+            if not valid[0]:
+                raise UserError("EntityRowsReader: the first line must hold the ego, but its presence is 0")
         elif self._config.padding is not None:
             scales = 1.0 if self._config.scales is None else np.array(self._config.scales)
-            present[1:] = (rows[1:] != self._config.padding * scales).any(axis=1)
-        return present
+            valid[1:] = (table[1:] != self._config.padding * scales).any(axis=1)
+        return valid
 
     def _restore(self, states: Float[np.ndarray, "agents state"]) -> None:
-        """Makes positions and velocities those of the world, in place."""
+        """Converts positions and velocities to world coordinates, in place."""
         axes = self.spec.position_dim
         if self._config.dead_reckoning:
             velocity = states[0, axes : 2 * axes].copy()
@@ -165,10 +167,10 @@ class _EntityRows(Reader):
             states[1:, : 2 * axes] += states[0, : 2 * axes]
 
     def _identify(
-        self, rows: Float[np.ndarray, "agents columns"], states: Float[np.ndarray, "agents state"]
+        self, table: Float[np.ndarray, "agents columns"], states: Float[np.ndarray, "agents state"]
     ) -> Int[np.ndarray, " agents"]:
         if "id" in self._column:
-            given = rows[:, self._column["id"]]
+            given = table[:, self._column["id"]]
             ids = np.rint(given)
             if (np.abs(given - ids) > 1e-3).any():
                 raise UserError(f"EntityRowsReader: ids must be whole numbers, got {given.tolist()}")
@@ -176,7 +178,7 @@ class _EntityRows(Reader):
         axes = self.spec.position_dim
         others, keys = states[1:], states[1:, self._constant]
         found = self._tracker.update(others[:, :axes], others[:, axes : 2 * axes], keys=keys)
-        return np.concatenate([np.zeros(1, dtype=np.int64), found + 1])  # the ego is 0, whatever it does
+        return np.concatenate([np.zeros(1, dtype=np.int64), found + 1])  # the ego's id is always 0
 
     def _heading(self, ego: Float[np.ndarray, " columns"]) -> float:
         if "heading" in self._column:

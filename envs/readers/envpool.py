@@ -1,8 +1,8 @@
-"""Reads scenes out of EnvPool's native highway environments (EnvPool ≥ 1.2.5): of one environment, or of a whole pool.
+"""Reads scenes out of EnvPool's C++ highway environments (EnvPool ≥ 1.2.5): of one environment, or of a whole pool.
 
-Sees what a perception system could: position, speed and heading. Lanes, routes, driver parameters and the order of the
-simulator's list are not used; agents are re-identified between two steps by their motion alone. The ego is the list's
-first vehicle. Parking, lane keeping and the multi-agent intersection are not covered.
+Reads what a perception system could measure: position, speed and heading. Lanes, routes, driver parameters and the
+order of the simulator's list are not used; agents are re-identified between two steps by their motion alone. The ego is
+the list's first vehicle. Parking, lane keeping and the multi-agent intersection are not covered.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,11 +30,11 @@ _CHANGE_WEIGHT = 0.1  # as `IdentityTracker`
 _STATE = tuple(map(attrgetter, ("x", "y", "speed", "heading")))
 
 
-class NativeEnv(Protocol):
-    """Part of an environment that `EnvPoolReader` needs."""
+class EnvPoolLike(Protocol):
+    """Attributes of an environment that `EnvPoolReader` reads."""
 
     task_id: str
-    native_config: Mapping[str, Any]
+    envpool_config: Mapping[str, Any]
 
     def debug_states(self) -> Sequence[Any]:
         """Returns EnvPool's own description of the one environment."""
@@ -46,19 +46,19 @@ def is_envpool_env(env: gym.Env) -> bool:
     return getattr(inner, "task_id", None) in HIGHWAY_ENV_OF and hasattr(inner, "debug_states")
 
 
-def native_spec(
+def envpool_spec(
     task_id: str, config: Mapping[str, Any], perception_m: float | None = None, max_agents: int | None = None
 ) -> SceneSpec:
-    """Returns the layout of a task's scenes, as `HighwayReader` has it for the id that it copies.
+    """Returns the layout of a task's scenes, equal to `HighwayReader`'s for the highway-env id that it copies.
 
     Args:
         task_id: a key of `HIGHWAY_ENV_OF`.
-        config: EnvPool's, with `simulation_frequency` and `policy_frequency`.
-        perception_m: how far the ego sees [m]; None takes `SceneSpec`'s default.
+        config: EnvPool's settings, with `simulation_frequency` and `policy_frequency` [Hz].
+        perception_m: range of the ego's perception [m]; None takes `SceneSpec`'s default.
         max_agents: size of a scene, the ego included; None takes `SceneSpec`'s default.
 
     Raises:
-        UserError: a task that is not covered, or numbers that make no spec.
+        UserError: a task that is not covered, or numbers that `SceneSpec` refuses.
     """
     if task_id not in HIGHWAY_ENV_OF:
         raise UserError(f"no scene reader knows EnvPool's task '{task_id}'; known: {', '.join(HIGHWAY_ENV_OF)}")
@@ -99,45 +99,45 @@ class PoolIdentity:
         self,
         place: Float[np.ndarray, "some agents 2"],
         motion: Float[np.ndarray, "some agents 2"],
-        present: Bool[np.ndarray, "some agents"],
+        valid: Bool[np.ndarray, "some agents"],
         envs: Int[np.ndarray, " some"],
         passed_s: Float[np.ndarray, " some"],
     ) -> Int[np.ndarray, "some agents"]:
-        """Takes in one step of some environments; returns the number of each agent, -1 where none is present.
+        """Takes in one step of some environments; returns the number of each agent, -1 where there is none.
 
         Args:
             place: positions [m].
             motion: velocities [m/s].
-            present: which entries hold an agent.
-            envs: which environments these are.
+            valid: which entries hold an agent.
+            envs: index of each of these environments.
             passed_s: time since each environment's last update [s]; 0 repeats it.
         """
         if not place.shape[1]:
-            return np.zeros(present.shape, dtype=np.int64)
+            return np.zeros(valid.shape, dtype=np.int64)
         self._make_room(place.shape[1])
-        cost = self._costs(place, motion, present, envs, passed_s)
+        cost = self._costs(place, motion, valid, envs, passed_s)
         first = cost.argmin(axis=2)
         near = np.take_along_axis(cost, first[:, :, None], axis=2)[:, :, 0] < self._gate_m
-        found = np.full(present.shape, PADDING_ID, dtype=np.int64)
+        found = np.full(valid.shape, PADDING_ID, dtype=np.int64)
         some, known = np.nonzero(near)
         found[some, first[some, known]] = self._ids[envs[some], known]
         for i in np.flatnonzero((found != PADDING_ID).sum(axis=1) != near.sum(axis=1)):
             found[i] = PADDING_ID
             agents, seen = best_pairs(cost[i], self._gate_m)
             found[i, seen] = self._ids[envs[i], agents]
-        fresh = present & (found == PADDING_ID)
+        fresh = valid & (found == PADDING_ID)
         found[fresh] = (self._next_id[envs, None] + fresh.cumsum(axis=1) - 1)[fresh]
         self._next_id[envs] += fresh.sum(axis=1)
         width = place.shape[1]
         self._known[envs] = False
-        self._ids[envs, :width], self._known[envs, :width] = found, present
+        self._ids[envs, :width], self._known[envs, :width] = found, valid
         self._place[envs, :width], self._motion[envs, :width] = place, motion
         return found
 
     def _costs(
-        self, place: np.ndarray, motion: np.ndarray, present: np.ndarray, envs: np.ndarray, passed_s: np.ndarray
+        self, place: np.ndarray, motion: np.ndarray, valid: np.ndarray, envs: np.ndarray, passed_s: np.ndarray
     ) -> Float[np.ndarray, "some known agents"]:
-        # Both parts of the cost are differences between something of the old and something of the new alone.
+        # Both parts of the cost are differences between a term of the old state and a term of the new one.
         half_s, weight_s = 0.5 * passed_s[:, None, None], _CHANGE_WEIGHT * passed_s[:, None, None]
         old_motion = self._motion[envs]
         old = np.concatenate([self._place[envs] + old_motion * half_s, old_motion * weight_s], axis=-1)
@@ -145,7 +145,7 @@ class PoolIdentity:
         squares = np.zeros((len(envs), old.shape[1], new.shape[1]))
         for column in range(old.shape[-1]):
             squares += np.square(new[:, None, :, column] - old[:, :, None, column])
-        squares[~(self._known[envs][:, :, None] & present[:, None])] = np.inf
+        squares[~(self._known[envs][:, :, None] & valid[:, None])] = np.inf
         return np.sqrt(squares, out=squares)
 
     def _make_room(self, agents: int) -> None:
@@ -178,11 +178,11 @@ class PoolReader:
         self._step[envs] = 0
 
     def read(self, states: Sequence[Any], envs: Int[np.ndarray, " some"]) -> SceneBatch:
-        """Returns what each ego perceives, as `envs.readers.base.perceive` has it for one environment.
+        """Returns what each ego perceives: `envs.readers.base.perceive` for many environments.
 
         Args:
             states: `debug_states()` of these environments.
-            envs: which environments these are.
+            envs: index of each of these environments.
         """
         return perceive_batch(self.read_all(states, envs), self.spec)
 
@@ -232,7 +232,7 @@ class EnvPoolReader(Reader):
 
     Args:
         env: the environment; its frequencies give `dt_s`, its task the frame.
-        perception_m: how far the ego sees [m]; None takes `SceneSpec`'s default.
+        perception_m: range of the ego's perception [m]; None takes `SceneSpec`'s default.
         max_agents: size of a scene, the ego included; None takes `SceneSpec`'s default.
 
     Raises:
@@ -245,17 +245,17 @@ class EnvPoolReader(Reader):
             raise UserError(
                 f"EnvPoolReader needs an EnvPoolEnv (envs.simulators.envpool), got {type(env.unwrapped).__name__}"
             )
-        native: NativeEnv = env.unwrapped  # type: ignore[assignment]
-        super().__init__(native_spec(native.task_id, native.native_config, perception_m, max_agents))
-        self._rows = np.zeros(1, dtype=np.int64)
+        inner: EnvPoolLike = env.unwrapped  # type: ignore[assignment]
+        super().__init__(envpool_spec(inner.task_id, inner.envpool_config, perception_m, max_agents))
+        self._env = np.zeros(1, dtype=np.int64)
         self._pool = PoolReader(self._spec, 1)
 
     def reset(self) -> None:
         """Forgets all identities; numbering starts anew, so equal seeds give equal ids."""
-        self._pool.reset(self._rows)
+        self._pool.reset(self._env)
 
     def read_all(self, env: gym.Env) -> Scene:
         """Returns every vehicle on the road, ego first, unpadded: ground truth for collection and evaluation."""
-        native: NativeEnv = env.unwrapped  # type: ignore[assignment]
-        scenes = self._pool.read_all(native.debug_states(), self._rows)
+        inner: EnvPoolLike = env.unwrapped  # type: ignore[assignment]
+        scenes = self._pool.read_all(inner.debug_states(), self._env)
         return Scene(scenes.states[0], scenes.ids[0], scenes.valid[0], float(scenes.heading_rad[0]))

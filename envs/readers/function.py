@@ -11,7 +11,7 @@ from predictor.support.errors import UserError
 
 @dataclass(frozen=True)
 class FunctionReader:
-    """Makes readers of a function that reports all agents; what the ego perceives is decided as for every reader.
+    """Makes readers of a function that reports all agents; the ego's perception is applied as for every reader.
 
         >>> import numpy as np
         >>> from envs import ForecastObservation, make_env
@@ -24,12 +24,13 @@ class FunctionReader:
 
     After `register_reader(MyEnv, reader)` no wrapper and no command needs `reader=` for environments of that class.
 
-    It can be pickled, for environments in processes of their own, if the function can: one at the top of a module.
+    It can be pickled, for environments in processes of their own, if the function can be: one defined at the top of a
+    module.
     """
 
     read: Callable[[Any], Scene]
-    """Function of the environment (as it was wrapped; `env.unwrapped` is innermost) that returns all its agents: ego
-    first, any number of them, each with an id that stays with it."""
+    """Function of the environment (wrapped; `env.unwrapped` is the simulator) that returns all its agents: ego first,
+    any number of them, each with an id that does not change."""
     spec: SceneSpec
     """Layout of the scenes; `dt_s` has no default."""
 

@@ -1,8 +1,8 @@
 """Reads scenes out of highway-env: positions, velocities and identities of the vehicles around the ego.
 
 A vehicle's identity is the simulator's own object, never its place in a list: highway-env sorts and filters its lists.
-Sees what a perception system could: vehicles within `perception_m`, the nearest `max_agents`; no routes, no driver
-parameters.
+Reads what a perception system could measure: vehicles within `perception_m`, the nearest `max_agents`; no routes, no
+driver parameters.
 """
 
 from collections.abc import Sequence
@@ -58,7 +58,7 @@ class HighwayReader(Reader):
 
     Args:
         env: the environment; its `policy_frequency` gives `dt_s`, its id the frame.
-        perception_m: how far the ego sees [m]; None takes `SceneSpec`'s default.
+        perception_m: range of the ego's perception [m]; None takes `SceneSpec`'s default.
         max_agents: size of a scene, the ego included; None takes `SceneSpec`'s default.
     """
 

@@ -2,7 +2,7 @@
 
 A vehicle driven by the intelligent driver model (IDM) brakes for the vehicle in front of it on its lane, and while it
 changes lane for the one on the lane it changes to as well. Those are its leaders. highway-env's linear drivers, and the
-mixed ones of `envs.simulators.mixed_traffic`, look at the same vehicles. A perception system could not know this (nor
+mixed ones of `envs.simulators.mixed_traffic`, react to the same vehicles. A perception system could not know this (nor
 the driver's parameters), so labels never enter an observation; scenes are read in `envs.readers.highway`.
 
 Only the longitudinal driving is labelled. A lane change also weighs the gaps on the other lane, for one frame.
@@ -25,8 +25,9 @@ from predictor.scene import Scene
 UNKNOWN, NO_EDGE, LEADER = -1, 0, 1
 """Edge types: not known, the sender does not lead the receiver, the sender leads the receiver."""
 ATTRIBUTE_NAMES = ("time_gap_s", "desired_time_gap_s", "headway_m", "desired_speed_mps", "driver_kind")
-"""Attributes of a leader edge: headway over the receiver's speed; the driver's own TIME_WANTED; from centre to centre
-along the receiver's lane, as its driver measures it (see `leaders_of`); see `desired_speed_mps`; see `driver_kind`."""
+"""Attributes of a leader edge: headway over the receiver's speed [s]; the driver's own TIME_WANTED [s]; distance
+between centres along the receiver's lane, as its driver measures it [m] (`leaders_of`); `desired_speed_mps`;
+`driver_kind`."""
 OTHER_KIND = -1
 """Kind of a driver by a law that is not in `envs.simulators.mixed_traffic.DRIVER_KINDS`."""
 _LINEAR_KINDS = {
@@ -34,7 +35,7 @@ _LINEAR_KINDS = {
     DefensiveVehicle: DRIVER_KINDS.index("defensive"),
 }
 MAX_TIME_GAP_S = 10.0
-"""Longer time gaps are given as this; a receiver at rest has no other."""
+"""Largest time gap of a label [s]; longer ones, and that of a receiver at rest, are set to it."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ def read_labels(env: gym.Env) -> SceneLabels:
     Obstacles are no agents: a vehicle that follows one has no leader, since a driver does not react to what is beyond.
     """
     vehicles = vehicles_of(env)
-    row = {vehicle: i for i, vehicle in enumerate(vehicles)}
+    index = {vehicle: i for i, vehicle in enumerate(vehicles)}
     controlled = env.unwrapped.controlled_vehicles  # type: ignore[attr-defined]
     types = np.full((len(vehicles), len(vehicles)), UNKNOWN, dtype=np.int8)
     attributes = np.zeros((*types.shape, len(ATTRIBUTE_NAMES)), dtype=np.float32)
@@ -65,11 +66,11 @@ def read_labels(env: gym.Env) -> SceneLabels:
         if not getattr(vehicle, "is_yielding", False):
             types[receiver] = NO_EDGE
         for leader, headway_m in leaders_of(vehicle).items():
-            if leader in row:
+            if leader in index:
                 time_gap_s = min(headway_m / max(vehicle.speed, 1e-6), MAX_TIME_GAP_S)
-                types[receiver, row[leader]] = LEADER
+                types[receiver, index[leader]] = LEADER
                 driver = vehicle.TIME_WANTED, headway_m, desired_speed_mps(vehicle), driver_kind(vehicle)
-                attributes[receiver, row[leader]] = time_gap_s, *driver
+                attributes[receiver, index[leader]] = time_gap_s, *driver
     np.fill_diagonal(types, UNKNOWN)
     return SceneLabels(types, attributes)
 
@@ -77,10 +78,10 @@ def read_labels(env: gym.Env) -> SceneLabels:
 def leaders_of(vehicle: IDMVehicle) -> dict[RoadObject, float]:
     """Returns the vehicles that the driver brakes for, on its lane and on the one it changes to, with headways [m].
 
-    IDM reacts to its leader however far it is; a linear driver only to one that is slower, or nearer than it wishes.
-    A driver that has crashed does not react. The headway is the driver's own: its lane is extended past its end, and
-    the sign is lost in a square. So it is short of the road between two vehicles where the lane bends, and drivers who
-    leave intersection-v2 brake for oncoming ones, as near as they are: highway-env takes the lanes for connected.
+    IDM reacts to its leader at any distance; a linear driver only to one that is slower, or nearer than its wished gap.
+    A driver that has crashed does not react. The headway is the driver's own: its lane is extended straight past its
+    end, and the sign is lost in a square. Where the lane bends it is therefore less than the distance along the road;
+    and drivers that leave intersection-v2 brake for oncoming ones, since highway-env takes the two lanes for connected.
     """
     if vehicle.crashed:
         return {}

@@ -18,15 +18,15 @@ from predictor.support.errors import UserError
 class HighwayMultiagentReader:
     """Reads every vehicle on the road of a `HighwayParallelEnv`, learners and traffic; none is the ego.
 
-    An agent is named as long as it is observed, its last observation included; its vehicle stays in the scene.
+    `index_of` names an agent as long as it is observed, its last observation included; its vehicle stays in the scene.
 
     Args:
         env: the environment, wrapped or not.
-        perception_m: how far an agent sees [m]; None takes `SceneSpec`'s default.
+        perception_m: range of an agent's perception [m]; None takes `SceneSpec`'s default.
         max_agents: size of a scene; None takes as many as the config can bring into one episode.
 
     Raises:
-        UserError: another environment.
+        UserError: not a `HighwayParallelEnv`.
     """
 
     def __init__(self, env: ParallelEnv, perception_m: float | None = None, max_agents: int | None = None) -> None:
@@ -54,8 +54,8 @@ class HighwayMultiagentReader:
         index = {vehicle: i for i, vehicle in enumerate(vehicles)}
         indices = {agent: index[vehicle] for agent, vehicle in inner.vehicles.items()}
         headings = np.array([float(vehicle.heading) for vehicle in vehicles])
-        everyone = self._reader.read_vehicles(inner.highway, vehicles)
-        return pad_multiagent_scene(everyone, indices, headings, self._spec, type(self).__name__)
+        full = self._reader.read_vehicles(inner.highway, vehicles)
+        return pad_multiagent_scene(full, indices, headings, self._spec, type(self).__name__)
 
 
 def most_vehicles(config: Mapping[str, Any]) -> int:

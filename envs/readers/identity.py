@@ -1,9 +1,8 @@
 """Re-identifies agents between two steps, for environments that report agents without names: `IdentityTracker`.
 
-Each agent of the last step is matched to the observation that its motion explains best. Both velocities are known, so
-the position is predicted with their mean, which is exact under constant acceleration. The matching is the best one for
-all agents together. It is only as good as the motion is smooth: where the environment knows its agents' names, use
-those.
+Each agent of the last step is extrapolated with the mean of its old and new velocity, which is exact under constant
+acceleration, and matched to the nearest observation (optimal assignment over all agents). Matches are reliable only
+where motion is smooth: where the environment numbers or names its agents, use those.
 """
 
 import math
@@ -24,10 +23,10 @@ Known = TypeVar("Known")
 
 
 class IdentityDict(weakref.WeakKeyDictionary[Any, Known]):
-    """Dictionary of what is known of the simulator's own objects; an entry ends with its object.
+    """Dictionary whose keys are the simulator's own objects; an entry is removed with its object.
 
-    Keyed by the living object, since `id()` is reused after garbage collection and would join two agents. Unlike its
-    base, it follows its objects: in a copy (`copy.deepcopy`, `pickle`) of reader and environment together, the entries
+    Keyed by the living object, since `id()` is reused after garbage collection and would join two agents. Unlike in its
+    base, in a copy (`copy.deepcopy`, `pickle`) of reader and environment together, the entries
     belong to the copied objects.
     """
 
@@ -48,9 +47,9 @@ class IdentityTracker:
 
     Each known agent is extrapolated with the mean of its old and new velocity and matched to the observations by
     optimal assignment. A pair costs √(r² + c²) [m], with r its distance from the extrapolated position and c a tenth of
-    its change of velocity times the time between the steps; without c, two agents that meet head-on could as well have
-    turned round. A pair that costs `gate_m` or more, or whose `keys` differ, is no match. The assignment maximises the
-    sum of `gate_m` − cost over its pairs.
+    its change of velocity times the time between the steps; without c, two agents that pass each other head-on could
+    not be distinguished from two that turn round. A pair that costs `gate_m` or more, or whose `keys` differ, is no
+    match. The assignment maximises the sum of `gate_m` − cost over its pairs.
 
     Args:
         dt_s: time between two updates [s].
@@ -83,7 +82,7 @@ class IdentityTracker:
         self,
         positions: Float[np.ndarray, "agents axes"],
         velocities: Float[np.ndarray, "agents axes"],
-        present: Bool[np.ndarray, " agents"] | None = None,
+        valid: Bool[np.ndarray, " agents"] | None = None,
         keys: Shaped[np.ndarray, "agents ..."] | None = None,
     ) -> Int[np.ndarray, " agents"]:
         """Takes in one step and returns the number of each agent.
@@ -91,29 +90,29 @@ class IdentityTracker:
         Args:
             positions: one axis system for all steps [m].
             velocities: in the same axes [m/s].
-            present: which entries hold an agent; None means all.
-            keys: what an agent keeps for as long as it is there (its kind, a driver's parameter), in one column or
-                several; compared exactly. The same columns at every step.
+            valid: which entries hold an agent; None means all.
+            keys: constant properties of each agent (its kind, a driver's parameter), in one column or several; compared
+                exactly. Their columns do not change between steps.
 
         Returns:
-            Numbers from 0 on in the order of first sight; -1 where no agent is present.
+            Numbers from 0 on in the order of first sight; -1 where there is no agent.
 
         Raises:
             UserError: positions or velocities that are not finite, or axes or keys other than those of the last step.
         """
-        rows = np.arange(len(positions)) if present is None else np.flatnonzero(present)
-        place, motion = np.asarray(positions[rows], np.float64), np.asarray(velocities[rows], np.float64)
+        indices = np.arange(len(positions)) if valid is None else np.flatnonzero(valid)
+        place, motion = np.asarray(positions[indices], np.float64), np.asarray(velocities[indices], np.float64)
         if not (np.isfinite(place).all() and np.isfinite(motion).all()):
-            raise UserError("IdentityTracker needs finite positions and velocities of agents that are present")
-        kinds = np.zeros((len(rows), 0)) if keys is None else np.asarray(keys)[rows]
-        kinds = kinds.reshape(len(rows), math.prod(kinds.shape[1:]))
+            raise UserError("IdentityTracker needs finite positions and velocities of all valid agents")
+        kinds = np.zeros((len(indices), 0)) if keys is None else np.asarray(keys)[indices]
+        kinds = kinds.reshape(len(indices), math.prod(kinds.shape[1:]))
         found = self._recognise(place, motion, kinds)
         fresh = found == PADDING_ID
         found[fresh] = np.arange(self._next_id, self._next_id + fresh.sum())
         self._next_id += int(fresh.sum())
         self._remember(found, place, motion, kinds)
         ids = np.full(len(positions), PADDING_ID, dtype=np.int64)
-        ids[rows] = found
+        ids[indices] = found
         return ids
 
     def _recognise(self, place: np.ndarray, motion: np.ndarray, kinds: np.ndarray) -> np.ndarray:
@@ -146,7 +145,7 @@ class IdentityTracker:
         return np.sqrt(total)
 
     def _remember(self, ids: np.ndarray, place: np.ndarray, motion: np.ndarray, kinds: np.ndarray) -> None:
-        """Keep what was seen now, and who was seen lately."""
+        """Keeps the agents observed now, and those observed within the last `memory_steps` steps."""
         steps = np.ones(len(ids))
         if self._memory_steps and len(self._ids):
             lost = np.flatnonzero(~np.isin(self._ids, ids) & (self._steps <= self._memory_steps))
@@ -163,7 +162,7 @@ def best_pairs(
     """Returns the pairing with the largest sum of `gate` − cost, of pairs that cost less than `gate`.
 
     Args:
-        cost: not NaN; infinite where a pair is out of the question.
+        cost: not NaN; infinite where a pair is not allowed.
         gate: cost of leaving a row and a column unpaired.
 
     Returns:
@@ -178,7 +177,7 @@ def best_pairs(
     near = cost[rows, columns] < gate
     if _distinct(rows[near], cost.shape[0]):
         return rows[near], columns[near]
-    clipped = np.minimum(cost, gate)  # a pair at the gate brings as much as none
+    clipped = np.minimum(cost, gate)  # a pair at the gate gains nothing
     if cost.shape[0] <= cost.shape[1]:
         rows, columns = np.arange(cost.shape[0]), assign(clipped)
     else:

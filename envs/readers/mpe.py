@@ -1,8 +1,8 @@
 """Reads scenes out of mpe2, PettingZoo's particle worlds: every agent and, unless left out, every landmark.
 
-One layout for all scenarios, so that what was learned in one can be run in another. An agent's identity is the
-simulator's own object, never its place in a list. Goals, messages and what an agent carries are not read: they
-cannot be seen in the arena.
+All scenarios have one layout, so that a forecaster trained in one runs in another. An agent's identity is the
+simulator's own object, never its place in a list. Goals, messages and what an agent carries are not read: they are
+not visible in the arena.
 """
 
 from collections.abc import Sequence
@@ -39,14 +39,14 @@ _EVERYTHING_M = 1000.0  # the arena is 2 m wide; it has no walls, but no agent g
 
 
 def is_mpe_env(env: Any) -> bool:
-    """Returns whether the environment comes from mpe2; does not import it."""
+    """Returns whether the environment comes from mpe2, without importing it."""
     return any(_module_path(cls)[0] == "mpe2" for cls in type(env.unwrapped).__mro__)
 
 
 def mpe_scenario(env: Any) -> str:
-    """Returns the mpe2 scenario without its version ("simple_tag"); "" for an own one, or what is not from mpe2.
+    """Returns the mpe2 scenario without its version ("simple_tag"); "" for other environments.
 
-    Not `metadata["name"]`: mpe2's environments share one such dictionary, which names whichever was made last.
+    `metadata["name"]` is not used: mpe2's environments share one such dictionary, which names the one made last.
     """
     paths = (_module_path(cls) for cls in type(env.unwrapped).__mro__)
     return next((path[1] for path in paths if path[0] == "mpe2" and path[1] != "_mpe_utils"), "")
@@ -60,7 +60,7 @@ def _module_path(cls: type) -> tuple[str, str]:
 def agents_in_sight(env: Any) -> Sequence[str]:
     """Returns names of the agents that are observed: those that live, or all of them after an episode's last step.
 
-    The last observation of an agent shows it where it ended, although PettingZoo counts no agent as living by then.
+    The last observation of an agent shows its last position, although PettingZoo counts no agent as living by then.
 
     Raises:
         ProtocolError: before the first reset.
@@ -83,10 +83,10 @@ class MpeReader:
 
     Args:
         env: the environment, wrapped or not; its world gives `dt_s`.
-        landmarks: also read landmarks (obstacles, goals, treasures), as agents that stand still: they explain where
-            the others go. A treasure that is collected leaves the scene; the one that appears elsewhere is a new one.
-        max_agents: size of a scene; None takes as many as the world holds.
-        perception_m: how far an agent sees [m]; None sees the whole arena and far beyond.
+        landmarks: whether to read landmarks (obstacles, goals, treasures), as agents at rest: they explain the others'
+            motion. A collected treasure leaves the scene; one that appears elsewhere is a new agent.
+        max_agents: size of a scene; None takes the number of entities in the world.
+        perception_m: range of an agent's perception [m]; None covers the whole arena and far beyond.
 
     Raises:
         UserError: not from mpe2, or nothing can move in it (simple_crypto).
@@ -146,7 +146,7 @@ class MpeReader:
     def _identify(self, entity: Any) -> int:
         place = None if entity.movable else tuple(float(x) for x in entity.state.p_pos)
         known = self._known.get(entity)
-        if known is None or known.place != place:  # what cannot move but is elsewhere is another thing
+        if known is None or known.place != place:  # an immovable entity at another position is a new one
             known = self._known[entity] = _Known(self._next_id, place)
             self._next_id += 1
         return known.number

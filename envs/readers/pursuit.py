@@ -1,7 +1,7 @@
 """Reads scenes out of PettingZoo's pursuit: pursuers, and the evaders that are not caught yet, on their grid.
 
-A cell is one metre and a step one second: the grid has no other units. Velocities are differences of positions, for
-agents on a grid have none. The other SISL environment, multiwalker, is not read.
+A cell counts as one metre and a step as one second, since the grid has no units. Velocities are differences of
+positions, since the grid has none. The other SISL environment, multiwalker, is not read.
 """
 
 from dataclasses import dataclass
@@ -39,13 +39,13 @@ class _Track:
 class PursuitReader:
     """Reads pursuit's parallel environment; no agent is the ego, and only pursuers are learners.
 
-    An evader that is caught is gone from the next scene on; its id is not used again.
+    A caught evader is missing from the next scene on; its id is not used again.
 
     Args:
         env: the environment, wrapped or not.
-        max_agents: size of a scene; None takes pursuers and evaders at the start.
-        perception_m: how far an agent sees [cells]; None sees the whole grid, which is more than pursuit's own
-            observations show (`obs_range`).
+        max_agents: size of a scene; None takes the number of pursuers and evaders at the start.
+        perception_m: range of an agent's perception [cells]; None covers the whole grid, which is more than pursuit's
+            own observations show (`obs_range`).
 
     Raises:
         UserError: not pursuit.
@@ -73,14 +73,14 @@ class PursuitReader:
         return self._spec
 
     def reset(self) -> None:
-        """Forgets all identities and where they were."""
+        """Forgets all identities and positions."""
         self._tracks: IdentityDict[_Track] = IdentityDict()
         self._next_id = 0
 
     def read(self, env: Any) -> MultiagentScene:
         """Returns all bodies on the grid; reading twice at a step gives the same scene.
 
-        Velocities [cells/step] are zero when a body is first seen, and mean ones after a step that was not read.
+        Velocities [cells/step] are zero when a body is first read, and means over the steps since it was last read.
 
         Raises:
             ProtocolError: before the first reset.

@@ -1,7 +1,9 @@
-"""Play an episode with forecasts in the loop and line up what then happened: the raw material of `envs.evaluate`.
+"""Plays an episode with forecasts and pairs them with the true futures, for `envs.evaluate`, which aggregates them.
 
-The measured forecast is read out of the policy's own observation. Baselines and ablations get the same perceived
-scenes. Nothing is aggregated here.
+With one ego, the measured forecast is read from the policy's own observation; measured are the agents that the ego
+perceives, not the ego itself. In a PettingZoo environment it is the one forecast from which the views of all agents
+are cut; measured are all agents, since none is the ego. Landmarks are not measured. Baselines and ablations forecast
+the same scenes.
 """
 
 import functools
@@ -30,82 +32,82 @@ from predictor.online import OnlineForecaster
 from predictor.scene import Scene, SceneBatch, SceneSpec
 
 MODEL, STRAIGHT, NEIGHBOURS = "model", "constant velocity", "nearest neighbours"
-"""Keys of the forecasters of an episode; ablations of memory are `memory_key(steps)`."""
+"""Keys of the forecasters of an episode; `memory_key(steps)` gives those of the memory ablations."""
 LANDMARK = "landmark"
-"""Feature that marks what never moves."""
+"""Feature that marks agents that never move."""
 CASE_HISTORY_STEPS = 20
-"""Past shown of a worst case."""
+"""Number of past steps shown of a worst case."""
 
 
 def memory_key(steps: int) -> str:
-    """Key of the model with so many steps of history."""
+    """Returns the key of the model whose memory is limited to this number of steps."""
     return f"{MODEL}, history {steps}"
 
 
 @dataclass(frozen=True)
 class EpisodeTask:
-    """What to play; picklable."""
+    """Settings of one episode; can be pickled."""
 
     env_id: str
-    """Of the environment."""
+    """Id of the environment."""
     checkpoint: str
-    """Whose forecasts are in the observation."""
+    """Checkpoint of the forecasts."""
     driver: str
-    """Who drives."""
+    """Name of the driver."""
     seed: int
-    """Of the episode."""
+    """Seed of the episode."""
     samples: int
-    """K."""
+    """Number of forecasts per agent (K)."""
     horizon_steps: int
-    """Steps forecast."""
+    """Number of steps forecast."""
     max_steps: int
-    """Cut longer episodes here."""
+    """Largest length of an episode [policy steps]."""
     neighbours: tuple[str, ...] = ()
-    """Stores to fit the nearest-neighbour forecaster to; none leaves it out."""
+    """Stores to fit the nearest-neighbour forecaster to; empty leaves it out."""
     histories: tuple[int, ...] = ()
-    """Also forecast with memories of so many steps only."""
+    """Numbers of steps to which the model's memory is limited in ablations."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One forecast to look at, world coordinates [m]."""
+    """One forecast with its history and future, world coordinates [m]."""
 
     error_m: float
     """Mean displacement of the most likely forecast."""
     seed: int
-    """Of the episode."""
+    """Seed of the episode."""
     step: int
-    """Instant within the episode."""
+    """Step of the forecast within the episode."""
     agent: int
-    """Row of the agent that was forecast worst."""
+    """Index of the agent that was forecast worst."""
     history: Float[np.ndarray, "time agents 2"]
-    """Positions until now."""
+    """Positions up to the step of the forecast."""
     history_valid: Bool[np.ndarray, "time agents"]
-    """Who was there when."""
+    """Whether each agent was perceived."""
     forecasts: dict[str, Float[np.ndarray, "horizon 2"]]
-    """Of that agent, by forecaster."""
+    """Forecasts of that agent, by forecaster."""
     future: Float[np.ndarray, "horizon 2"]
-    """What it did."""
+    """True future of that agent."""
 
 
 @dataclass
 class Episode:
-    """What one episode gives."""
+    """Forecasts and true futures of one episode."""
 
     outcomes: dict[str, Outcome]
-    """By forecaster."""
+    """Forecasts and true futures, by forecaster."""
     latencies_s: list[float]
-    """Time to observe a scene and forecast it (K = 1) at each step."""
+    """Time to observe a scene and forecast it (K = 1) at each step [s]."""
     edge_probs: list[Float[np.ndarray, "agents agents types"]] = field(default_factory=list)
-    """Of the model at each step; rows of the perceived scene."""
+    """Edge probabilities of the model at each step; agents as in the perceived scene."""
     edge_types: list[Int[np.ndarray, "agents agents"]] = field(default_factory=list)
-    """The true ones, -1 where unknown; empty where the simulator knows none."""
+    """True edge types, -1 where unknown; empty where the simulator has none."""
     worst: Case | None = None
-    """The model's worst forecast with a whole future."""
+    """Worst forecast of the model among those with a whole future."""
 
 
 class _Baseline:
-    """A forecaster that stands beside the measured one: sees the same scenes, keeps all history or the last steps."""
+    """Forecaster of the same scenes as the measured one, with all history or the last `history_steps` only."""
 
     def __init__(self, forecaster: Forecaster, spec: SceneSpec, horizon_steps: int, history_steps: int = 0) -> None:
         self._front = int(forecaster.spec.has_ego and not spec.has_ego)
@@ -126,7 +128,7 @@ class _Baseline:
 
 
 def play(task: EpisodeTask) -> Episode:
-    """Play one episode; see `Episode`."""
+    """Plays one episode."""
     world = _world(task)
     world.reset(task.seed)
     others = _baselines(task, world.spec)
@@ -176,7 +178,7 @@ def _kept_neighbours(stores: tuple[str, ...], spec: SceneSpec, horizon_steps: in
 
 
 def _baselines(task: EpisodeTask, spec: SceneSpec) -> dict[str, _Baseline]:
-    """Fresh ones for an episode, by key."""
+    """Returns new baselines for an episode, by key."""
     found = {STRAIGHT: _Baseline(ConstantVelocity(spec), spec, task.horizon_steps)}
     if task.neighbours:
         fitted = _kept_neighbours(task.neighbours, spec, task.horizon_steps)
@@ -188,7 +190,7 @@ def _baselines(task: EpisodeTask, spec: SceneSpec) -> dict[str, _Baseline]:
 
 
 class _Probe:
-    """A second stream with one sample, timed: what the deployed wrapper adds to a step."""
+    """Measures the time that the deployed wrapper adds to a step, with a second stream of one sample."""
 
     def __init__(self, task: EpisodeTask, world: World) -> None:
         self._world = world
@@ -209,7 +211,7 @@ class _Probe:
 
 
 def _measured(world: World, samples: int) -> torch.Tensor:
-    """The deployed forecast (K, A, H, 2) in rows of the perceived scene, world axes, relative to the ego if any."""
+    """Returns the deployed forecast (K, A, H, 2): agents as in the perceived scene, world axes, relative to an ego."""
     if isinstance(world, MultiagentWorld):
         return world.env.forecast.xy[0, :samples].cpu()
     assert isinstance(world, EgoWorld)
@@ -217,27 +219,27 @@ def _measured(world: World, samples: int) -> torch.Tensor:
 
 
 def world_forecast(forecast: Float[np.ndarray, "others samples horizon 2"], scene: Scene) -> torch.Tensor:
-    """An observation's forecast, back in the rows of the scene and world axes, relative to the ego: (K, A, H, 2)."""
+    """Returns an observation's forecast (K, A, H, 2): agents as in the scene, world axes, relative to the ego."""
     batch = SceneBatch.stack([scene])
     world = forecast.astype(np.float64) @ into_ego_axes(batch.heading_rad)[0]
     samples, horizon = world.shape[1], world.shape[2]
-    rows = np.zeros((samples, len(scene.ids), horizon, 2))
-    rows[:, 1 + others_by_distance(batch)[0]] = world.swapaxes(0, 1)
-    return torch.from_numpy(rows).float()
+    xy = np.zeros((samples, len(scene.ids), horizon, 2))
+    xy[:, 1 + others_by_distance(batch)[0]] = world.swapaxes(0, 1)
+    return torch.from_numpy(xy).float()
 
 
 def futures(
     scenes: Sequence[Scene], truths: Sequence[Scene], horizon_steps: int, spec: SceneSpec
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where the agents of each scene then were, and whether they were.
+    """Returns the true future positions (T, A, H, 2) of the agents of each scene, and which of them are measured.
 
-    Relative to the ego's position at the scene's instant, or in world coordinates without an ego. Not counted are the
-    ego, whose future is the policy's choice, and landmarks, which have none.
+    Positions [m] are relative to the ego's at the scene's step, or in world coordinates without an ego. Not measured
+    are the ego, whose future is the policy's choice, landmarks, which do not move, and agents that are gone.
 
     Args:
-        scenes: as perceived, padded.
-        truths: all agents, at the same instants and beyond.
-        horizon_steps: steps ahead.
+        scenes: perceived scenes, padded.
+        truths: scenes of all agents, at the same steps and beyond.
+        horizon_steps: number of steps ahead.
         spec: layout of the scenes.
     """
     agents = len(scenes[0].ids)
@@ -248,20 +250,20 @@ def futures(
     for now, scene in enumerate(scenes):
         origin = scene.states[0, :2] if spec.has_ego else np.zeros(2)
         moving = scene.valid if fixed is None else scene.valid & (scene.states[:, fixed] == 0)
-        for row in range(int(spec.has_ego), agents):
+        for agent in range(int(spec.has_ego), agents):
             for ahead in range(horizon_steps):
                 later = now + ahead + 1
-                if not moving[row] or later >= len(positions):
+                if not moving[agent] or later >= len(positions):
                     continue
-                position = positions[later].get(int(scene.ids[row]))
+                position = positions[later].get(int(scene.ids[agent]))
                 if position is not None:
-                    future[now, row, ahead] = position - origin
-                    valid[now, row, ahead] = True
+                    future[now, agent, ahead] = position - origin
+                    valid[now, agent, ahead] = True
     return torch.from_numpy(future).float(), torch.from_numpy(valid)
 
 
 def _note_edges(episode: Episode, world: World, scene: Scene, full: Scene) -> None:
-    """The believed and the true graph of the perceived scene, where the simulator knows it."""
+    """Adds the inferred and the true edges of the perceived scene to the episode, where the simulator has them."""
     labels = world.labels()
     if labels is None or not isinstance(world, EgoWorld):
         return
@@ -271,16 +273,16 @@ def _note_edges(episode: Episode, world: World, scene: Scene, full: Scene) -> No
 
 
 def _types_of(scene: Scene, full: Scene, labels: SceneLabels) -> Int[np.ndarray, "agents agents"]:
-    row = {int(agent): i for i, agent in enumerate(full.ids)}
+    index = {int(agent): i for i, agent in enumerate(full.ids)}
     known = np.flatnonzero(scene.valid)
-    source = np.array([row[int(agent)] for agent in scene.ids[known]], dtype=np.int64)
+    source = np.array([index[int(agent)] for agent in scene.ids[known]], dtype=np.int64)
     types = np.full((len(scene.ids), len(scene.ids)), -1, dtype=np.int64)
     types[np.ix_(known, known)] = labels.edge_types[np.ix_(source, source)]
     return types
 
 
 def _worst(outcomes: dict[str, Outcome], scenes: Sequence[Scene], seed: int, has_ego: bool) -> Case | None:
-    """The model's worst most-likely forecast of the episode, among those whose whole future is known."""
+    """Returns the worst most-likely forecast of the model, among those whose whole future is known."""
     model = outcomes[MODEL]
     mean_m = displacement(model.forecast[:, :1], model.future)[:, 0].mean(-1)
     mean_m = mean_m.masked_fill(~model.valid.all(-1), -1.0)
@@ -293,9 +295,9 @@ def _worst(outcomes: dict[str, Outcome], scenes: Sequence[Scene], seed: int, has
     seen = np.zeros(history.shape[:2], dtype=np.bool_)
     for t, scene in enumerate(past):
         places = {int(i): p for i, p in zip(scene.ids[scene.valid], scene.states[scene.valid, :2], strict=True)}
-        for row in np.flatnonzero(scenes[step].valid):
-            if (position := places.get(int(scenes[step].ids[row]))) is not None:
-                history[t, row], seen[t, row] = position, True
+        for index in np.flatnonzero(scenes[step].valid):
+            if (position := places.get(int(scenes[step].ids[index]))) is not None:
+                history[t, index], seen[t, index] = position, True
     forecasts = {key: outcome.forecast[step, 0, agent].numpy() + origin for key, outcome in outcomes.items()}
     truth = model.future[step, agent].numpy() + origin
     return Case(float(mean_m[step, agent]), seed, step, agent, history, seen, forecasts, truth)

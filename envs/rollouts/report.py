@@ -1,4 +1,4 @@
-"""What `envs.evaluate` shows: tables for a terminal and for a page, a figure by horizon, a gallery of worst cases."""
+"""Reports of `envs.evaluate`: tables for a terminal and a page, a figure by horizon, a gallery of worst cases."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,37 +22,37 @@ class EnvAccuracy:
     """Accuracy of one checkpoint in one environment."""
 
     env_id: str
-    """The environment."""
+    """Id of the environment."""
     checkpoint: str
-    """The forecaster's name or folder."""
+    """Name of the checkpoint."""
     driver: str
-    """Who drove."""
+    """Name of the driver."""
     dt_s: float
     """Time step [s]."""
     model: Accuracy
-    """K = 1, the most likely forecast."""
+    """Accuracy of the most likely forecast (K = 1)."""
     model_samples: Accuracy
-    """Best of K."""
+    """Accuracy of the best of K forecasts."""
     constant_velocity: Accuracy
-    """The baseline on the same scenes."""
+    """Accuracy of constant velocity on the same scenes."""
     reduction: float
     """1 − minADE(K = 1) / ADE of constant velocity."""
     reduction_interval: tuple[float, float]
     """95 % bootstrap interval of the reduction over episodes."""
     nearest_neighbours: Accuracy | None = None
-    """The memoryless baseline on the same scenes, where data was given."""
+    """Accuracy of the memoryless nearest-neighbour forecaster on the same scenes, where recorded data was given."""
     histories: dict[int, Accuracy] = field(default_factory=dict)
-    """The model (K = 1) with so many steps of memory."""
+    """Accuracy of the model (K = 1) by the number of steps to which its memory is limited."""
     graph: GraphAccuracy | None = None
-    """Believed against true edges, where the simulator knows them."""
+    """Accuracy of the inferred against the true edges, where the simulator has them."""
     latency_median_ms: float = float("nan")
-    """Time to observe one scene and forecast it (K = 1), one thread, all workers busy."""
+    """Median time to observe one scene and forecast it (K = 1), one thread, all workers busy [ms]."""
     latency_p95_ms: float = float("nan")
-    """The same, 95th percentile."""
+    """95th percentile of that time [ms]."""
 
     @property
-    def rows(self) -> list[Accuracy]:
-        """All rows of its table."""
+    def lines(self) -> list[Accuracy]:
+        """All lines of its table."""
         extra = [] if self.nearest_neighbours is None else [self.nearest_neighbours]
         return [self.model, self.model_samples, *self.histories.values(), *extra, self.constant_velocity]
 
@@ -65,17 +65,17 @@ HEADS = (
 
 
 def title(result: "EnvAccuracy") -> str:
-    """Of one environment's table."""
+    """Returns the title of one environment's table."""
     return f"{result.env_id}, checkpoint {result.checkpoint}, driven {result.driver}"
 
 
 def remarks(result: "EnvAccuracy") -> str:
-    """What stands under the table: intervals, graph, latency."""
+    """Returns the remarks under the table: intervals, graph, latency."""
     low, high = result.model.intervals.get("min_ade_m", (np.nan, np.nan))
     lines = [f"minADE (K = 1) {result.model.min_ade_m:.3f} m, 95 % over episodes {low:.3f} to {high:.3f}"]
-    for steps, row in result.histories.items():
-        low, high = row.intervals.get("min_ade_m", (np.nan, np.nan))
-        lines.append(f"… with {steps} step(s) of history {row.min_ade_m:.3f} m, {low:.3f} to {high:.3f}")
+    for steps, line in result.histories.items():
+        low, high = line.intervals.get("min_ade_m", (np.nan, np.nan))
+        lines.append(f"… with {steps} step(s) of history {line.min_ade_m:.3f} m, {low:.3f} to {high:.3f}")
     graph = result.graph
     if graph is not None and graph.accuracy is not None:
         f1 = "–" if graph.f1 is None else f"{graph.f1:.2f}"
@@ -89,17 +89,17 @@ def remarks(result: "EnvAccuracy") -> str:
 
 
 def overview(results: Sequence["EnvAccuracy"]) -> Table:
-    """One line per environment."""
+    """Returns a table with one line per result."""
     shown = Table(title="in-env accuracy, held-out seeds")
     for i, heading in enumerate(HEADS):
         shown.add_column(heading.replace("[", r"\["), justify="left" if i < 4 else "right")
-    for row in results:
-        shown.add_row(*_cells(row))
+    for result in results:
+        shown.add_row(*_cells(result))
     return shown
 
 
 def markdown(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], str]) -> str:
-    """Overview, transfer matrix (with several checkpoints) and each environment's table as Markdown."""
+    """Returns overview, transfer matrix (with several checkpoints) and each environment's table as Markdown."""
     parts = [table(HEADS, [_cells(r) for r in results]) + "\n"]
     if len({r.checkpoint for r in results} | {c for _, c in misfits}) > 1:
         cells = _matrix(results, misfits)
@@ -109,19 +109,19 @@ def markdown(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str],
         parts.append("### Transfer: minADE₁ [m] (below constant velocity)\n\n" + "\n".join([matrix, "", *why]) + "\n")
     for result in results:
         text = remarks(result).replace("\n", "\n* ")
-        parts.append(f"### {title(result)}\n\n{markdown_table(result.rows, result.dt_s)}\n* {text}\n")
+        parts.append(f"### {title(result)}\n\n{markdown_table(result.lines, result.dt_s)}\n* {text}\n")
     return "\n".join(parts)
 
 
 def transfer(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], str]) -> Table:
-    """Checkpoints (columns) measured in environments (rows)."""
+    """Returns the transfer matrix: a column per checkpoint, a line per environment."""
     shown = Table(title=r"transfer: minADE₁ \[m] (below constant velocity)", caption="–: does not fit, see accuracy.md")
     cells = _matrix(results, misfits)
     shown.add_column("env")
     for name in next(iter(cells.values())):
         shown.add_column(name, justify="right")
-    for env_id, row in cells.items():
-        shown.add_row(env_id, *row.values())
+    for env_id, line in cells.items():
+        shown.add_row(env_id, *line.values())
     return shown
 
 
@@ -134,16 +134,18 @@ def _matrix(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], 
     return cells
 
 
-def _cells(row: "EnvAccuracy") -> list[str]:
-    low, high = row.reduction_interval
-    one, many, straight, near = row.model, row.model_samples, row.constant_velocity, row.nearest_neighbours
+def _cells(result: "EnvAccuracy") -> list[str]:
+    low, high = result.reduction_interval
+    one, many, straight, near = (
+        result.model, result.model_samples, result.constant_velocity, result.nearest_neighbours,
+    )  # fmt: skip
     return [
-        row.env_id, row.checkpoint, f"{row.dt_s:g}", str(len(one.by_step_m)),
+        result.env_id, result.checkpoint, f"{result.dt_s:g}", str(len(one.by_step_m)),
         _metres(one.min_ade_m), _metres(one.min_fde_m), _metres(many.min_ade_m),
         "–" if near is None else _metres(near.min_ade_m),
         f"{_metres(straight.min_ade_m)} / {_metres(straight.min_fde_m)}",
-        f"{100 * row.reduction:.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %", str(one.agents),
-        f"{row.latency_median_ms:.1f}",
+        f"{100 * result.reduction:.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %", str(one.agents),
+        f"{result.latency_median_ms:.1f}",
     ]  # fmt: skip
 
 
@@ -152,7 +154,7 @@ def _metres(value: float) -> str:
 
 
 def write_pictures(out: Path, result: "EnvAccuracy", cases: Sequence[Case]) -> None:
-    """`ENV.CHECKPOINT.by_horizon.png` and `….worst.png` under `out`."""
+    """Writes `ENV.CHECKPOINT.by_horizon.png` and `….worst.png` under `out`."""
     matplotlib.use("Agg")
     out.mkdir(parents=True, exist_ok=True)
     stem = f"{result.env_id.replace('/', '-')}.{result.checkpoint}"
@@ -164,7 +166,7 @@ def write_pictures(out: Path, result: "EnvAccuracy", cases: Sequence[Case]) -> N
         (axes[1, 0], "nll", "negative log-likelihood [nats]"),
         (axes[1, 1], "miss_by_step", f"share more than {threshold_m:g} m off"),
     ):
-        plot_by_horizon(ax, [r for r in result.rows if getattr(r, quantity)], result.dt_s, quantity, label)
+        plot_by_horizon(ax, [a for a in result.lines if getattr(a, quantity)], result.dt_s, quantity, label)
     figure.suptitle(f"{title(result)}; bands are 95 % intervals over episodes")
     figure.savefig(out / f"{stem}.by_horizon.png", dpi=130)
     plt.close(figure)
@@ -181,20 +183,20 @@ def write_pictures(out: Path, result: "EnvAccuracy", cases: Sequence[Case]) -> N
         plt.close(figure)
 
 
-def plot_by_horizon(ax: Axes, rows: Sequence[Accuracy], dt_s: float, quantity: str, label: str) -> Axes:
-    """A quantity against time ahead, a line per row with its 95 % band; constant velocity is grey."""
-    for row in rows:
-        values = np.array(getattr(row, quantity))
+def plot_by_horizon(ax: Axes, accuracies: Sequence[Accuracy], dt_s: float, quantity: str, label: str) -> Axes:
+    """Plots a quantity against time ahead, a curve per accuracy with its 95 % band; constant velocity is grey."""
+    for accuracy in accuracies:
+        values = np.array(getattr(accuracy, quantity))
         time_s = dt_s * np.arange(1, len(values) + 1)
-        baseline = row.name == STRAIGHT
-        (line,) = ax.plot(
+        name, baseline = accuracy.name, accuracy.name == STRAIGHT
+        (curve,) = ax.plot(
             time_s, values, color="grey" if baseline else None, marker="o", ms=3,
-            label=row.name if baseline or row.name == NEIGHBOURS else f"{row.name}, K = {row.num_samples}",
+            label=name if baseline or name == NEIGHBOURS else f"{name}, K = {accuracy.num_samples}",
         )  # fmt: skip
-        bounds = [b if b is not None else (np.nan, np.nan) for b in row.step_intervals.get(quantity, [])]
+        bounds = [b if b is not None else (np.nan, np.nan) for b in accuracy.step_intervals.get(quantity, [])]
         if bounds:
             low, high = np.array(bounds).T
-            ax.fill_between(time_s, low, high, color=line.get_color(), alpha=0.15, lw=0)
+            ax.fill_between(time_s, low, high, color=curve.get_color(), alpha=0.15, lw=0)
     ax.set_xlabel("time ahead [s]")
     ax.set_ylabel(label)
     ax.grid(alpha=0.3)
@@ -203,7 +205,7 @@ def plot_by_horizon(ax: Axes, rows: Sequence[Accuracy], dt_s: float, quantity: s
 
 
 def plot_case(ax: Axes, case: Case) -> Axes:
-    """One forecast [m]: the agent's history solid, its forecasts dashed, truth thin; the others grey."""
+    """Plots one forecast [m]: the agent's history solid, its forecasts dashed, truth thin; the others grey."""
     for agent in range(case.history.shape[1]):
         seen = case.history_valid[:, agent]
         if not seen.any():

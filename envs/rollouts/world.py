@@ -1,7 +1,7 @@
-"""A running environment, who drives it, and what is true in it: for collection and for evaluation.
+"""A running environment with its driver and its true scenes, for collection and evaluation.
 
-Hides whether there is one ego (gymnasium) or many learners (PettingZoo). Scenes come out of the same wrappers that a
-policy is trained with, so what is recorded and measured is what is deployed.
+`World` is one interface for environments with one ego (gymnasium) and with many learners (PettingZoo). Scenes come out
+of the wrappers that a policy is trained with, so that the deployed scenes are recorded and measured.
 """
 
 import functools
@@ -41,64 +41,64 @@ from predictor.support.errors import UserError
 
 @runtime_checkable
 class World(Protocol):
-    """One environment with its drivers."""
+    """Environment with its drivers."""
 
     @property
     def spec(self) -> SceneSpec:
-        """Layout of its scenes."""
+        """Layout of the scenes."""
 
     def reset(self, seed: int) -> None:
-        """Begin the episode of a seed: environment and drivers are a function of it."""
+        """Begins the episode of a seed: environment and drivers are a function of it."""
 
     def step(self) -> bool:
-        """Let all agents act once; returns whether the episode is over."""
+        """Lets all agents act once; returns whether the episode is over."""
 
     def perceived(self) -> Scene:
-        """The scene as forecasters get it, padded."""
+        """Returns the scene that forecasters get, padded."""
 
     def full_scene(self) -> Scene:
-        """Returns all agents that are there, unpadded: the truth."""
+        """Returns all agents, unpadded: the truth."""
 
     def labels(self) -> SceneLabels | None:
-        """True edges between the agents of `full_scene`, where the simulator knows them."""
+        """Returns the true edges between the agents of `full_scene`; None where the simulator has none."""
 
     def close(self) -> None:
-        """Close the environment."""
+        """Closes the environment."""
 
 
 class EgoWorld:
-    """A gymnasium environment with one ego.
+    """Gymnasium environment with one ego.
 
     Args:
-        env: wrapped in `SceneObservation` or `ForecastObservation`.
-        ego: name of an ego from `envs.drivers.ego`, or the path of a policy .zip.
+        env: environment in `SceneObservation` or `ForecastObservation`.
+        driver: name of a driver from `envs.drivers.ego`, or the path of a policy .zip.
     """
 
-    def __init__(self, env: SceneObservation | ForecastObservation, ego: str) -> None:
-        """Nothing is reset yet."""
+    def __init__(self, env: SceneObservation | ForecastObservation, driver: str) -> None:
+        """Keeps environment and driver; resets nothing."""
         self.env = env
-        self._name = ego
+        self._name = driver
         self._reader: SceneReader = env.get_wrapper_attr("reader")
-        self._whole = ego.endswith(".zip") and sees_forecasts(ego)
+        self._whole = driver.endswith(".zip") and sees_forecasts(driver)
         self.observation: dict[str, Any] = {}
 
     @property
     def spec(self) -> SceneSpec:
-        """Layout of its scenes."""
+        """Layout of the scenes."""
         return self._reader.spec
 
     def reset(self, seed: int) -> None:
-        """Begin the episode of a seed."""
+        """Begins the episode of a seed."""
         self.observation, _ = self.env.reset(seed=seed)
         self._ego = make_ego_driver(self._name, self.env, driver_rng(seed))
 
     def step(self) -> bool:
-        """Let the ego act."""
+        """Lets the ego act."""
         self.observation, _, terminated, truncated, _ = self.env.step(self._ego(self._seen()))
         return bool(terminated or truncated)
 
     def perceived(self) -> Scene:
-        """What the ego perceives."""
+        """Returns the ego's perceived scene."""
         scene: Scene = self.env.scene
         return scene
 
@@ -107,15 +107,15 @@ class EgoWorld:
         return self._reader.read_all(self.env)
 
     def labels(self) -> SceneLabels | None:
-        """Who follows whom, in highway-env."""
+        """Returns leaders and followers in highway-env; None elsewhere."""
         return read_labels(self.env) if is_highway_env(self.env) else None
 
     def close(self) -> None:
-        """Close the environment."""
+        """Closes the environment."""
         self.env.close()
 
     def _seen(self) -> Any:
-        """What the ego was trained on: the env's own observation, or forecasts (the most likely of several)."""
+        """Returns the driver's observation: the env's own, or with forecasts (the most likely of several)."""
         if not self._whole:
             return self.observation["observation"]
         forecast = self.observation["forecast"]
@@ -123,15 +123,15 @@ class EgoWorld:
 
 
 class MultiagentWorld:
-    """A PettingZoo parallel environment; all its agents are driven.
+    """PettingZoo parallel environment with a driver of all agents.
 
     Args:
-        env: wrapped in `ForecastParallelEnv`.
+        env: environment in `ForecastParallelEnv`.
         driver: name of a driver from `envs.drivers.all_agents`, or the path of a policy .zip.
     """
 
     def __init__(self, env: ForecastParallelEnv, driver: str) -> None:
-        """Nothing is reset yet; a driver that cannot drive this complains now."""
+        """Keeps the environment and checks that the driver fits; resets nothing."""
         self.env = env
         self._name = driver
         self._observations: dict[str, Any] = {}
@@ -139,16 +139,16 @@ class MultiagentWorld:
 
     @property
     def spec(self) -> SceneSpec:
-        """Layout of its scenes."""
+        """Layout of the scenes."""
         return self.env.scene_spec
 
     def reset(self, seed: int) -> None:
-        """Begin the episode of a seed."""
+        """Begins the episode of a seed."""
         self._observations, _ = self.env.reset(seed=seed)
         self._driver = self._make_driver(driver_rng(seed))
 
     def step(self) -> bool:
-        """Let all agents act."""
+        """Lets all agents act."""
         seen = self._observations
         if not self._name.endswith(".zip"):
             seen = {name: entries["observation"] for name, entries in seen.items()}
@@ -165,11 +165,11 @@ class MultiagentWorld:
         return Scene(scene.states[scene.valid], scene.ids[scene.valid], scene.valid[scene.valid])
 
     def labels(self) -> SceneLabels | None:
-        """No simulator with many learners knows its edges."""
+        """Returns None: no simulator with many learners has true edges."""
         return None
 
     def close(self) -> None:
-        """Close the environment."""
+        """Closes the environment."""
         self.env.close()
 
     def _make_driver(self, rng: np.random.Generator) -> Driver:
@@ -185,28 +185,29 @@ def open_world(
     horizon_steps: int | None = None,
     num_samples: int = 1,
 ) -> World:
-    """Make an environment, with forecasts if a checkpoint is given, and put a driver into it.
+    """Makes an environment with a driver, and with forecasts if a checkpoint is given.
 
     Args:
-        env_id: of a gymnasium or a PettingZoo parallel environment.
-        driver: an ego (`envs.drivers.ego`) or a driver of all agents (`envs.drivers.all_agents`); or the path of a
-            policy .zip.
-        checkpoint: of the forecasts; None makes none.
-        horizon_steps: of the forecasts.
-        num_samples: of the forecasts.
+        env_id: id of a gymnasium or a PettingZoo parallel environment.
+        driver: name of a driver of the ego (`envs.drivers.ego`) or of all agents (`envs.drivers.all_agents`); or the
+            path of a policy .zip.
+        checkpoint: checkpoint of the forecasts; None makes no forecasts for an ego, and for many learners those that
+            the driver was trained on, or constant velocity.
+        horizon_steps: number of steps to forecast.
+        num_samples: number of forecasts per agent.
 
     Raises:
-        UserError: unknown env, driver or checkpoint, or things that do not belong together.
+        UserError: unknown env, driver or checkpoint, or ones that do not fit together.
     """
     if is_multiagent_id(env_id):
         checkpoint = checkpoint or _forecaster_for(env_id, driver)
-        shared = ForecastParallelEnv(
+        wrapped = ForecastParallelEnv(
             make_multiagent_env(env_id), checkpoint, horizon_steps=horizon_steps, num_samples=num_samples
         )
-        multiagent = MultiagentWorld(shared, driver)
+        multiagent = MultiagentWorld(wrapped, driver)
         if sees_forecasts(driver):
-            space: Any = shared.observation_space(shared.possible_agents[0])
-            require_forecaster(driver, checkpoint, space, shared.scene_spec)
+            space: Any = wrapped.observation_space(wrapped.possible_agents[0])
+            require_forecaster(driver, checkpoint, space, wrapped.scene_spec)
         return multiagent
     env = make_env(env_id, disable_env_checker=True)
     if checkpoint is None:
@@ -228,17 +229,17 @@ def open_world(
 
 
 def _forecaster_for(env_id: str, driver: str) -> str:
-    """Whose forecasts a PettingZoo environment is recorded with: those that its driver was trained on, if any."""
+    """Returns the checkpoint for recording a PettingZoo environment: the driver's, or constant velocity."""
     if not sees_forecasts(driver):
         return CONSTANT_VELOCITY
     return forecaster_of(driver) or checkpoint_for(env_id)
 
 
 def default_drivers(env_id: str) -> tuple[str, ...]:
-    """Who takes turns in data collection if nobody is named; the first one drives where accuracy is measured.
+    """Returns the drivers that take turns in data collection by default; the first one drives in evaluation.
 
     Raises:
-        UserError: a parallel environment that cannot be made.
+        UserError: a parallel environment cannot be made.
     """
     if env_id in ENVS or not is_multiagent_id(env_id):
         return entry_for(env_id).drivers

@@ -1,1 +1,1 @@
-"""Vector environments for Stable-Baselines3; nothing outside this package imports it."""
+"""Vector environments and policy files for Stable-Baselines3, which other modules of `envs` do not need."""

@@ -1,8 +1,7 @@
-"""One policy for every agent: a PettingZoo parallel environment as an SB3 VecEnv whose rows are its agents.
+"""One policy for all agents: copies of a PettingZoo parallel environment as an SB3 VecEnv with an env for each learner.
 
-Each copy of the environment gives one row per learning agent; unequal spaces are padded to the largest, and agents may
-die and join mid-episode. All copies run in this process. For forecasts wrap the copies in `ForecastParallelEnv`: they
-then share one batched forward per step.
+Unequal spaces are padded to the largest, and agents may die and join mid-episode. All copies run in this process. For
+forecasts wrap the copies in `ForecastParallelEnv`: they then share one batched forward per step.
 
 >>> from mpe2 import simple_tag_v3
 >>> from stable_baselines3 import PPO
@@ -30,16 +29,16 @@ from envs.seeding import driver_rng
 from predictor.support.errors import ProtocolError, UserError
 
 Partner = Callable[[ParallelEnv, dict[str, Any], np.random.Generator], Mapping[str, Any]]
-"""Acts for the agents that do not learn: the env, their observations, a generator → an action for each of them."""
+"""Driver of the agents that do not learn: the env, their observations, a generator → an action for each of them."""
 
 
 def random_actions(
     env: ParallelEnv, observations: dict[str, Any], generator: np.random.Generator
 ) -> dict[str, NDArray[Any] | int]:
-    """The partner "random": uniform over each agent's Discrete or bounded Box.
+    """Returns actions drawn uniformly from each agent's Discrete or bounded Box space: the partner "random".
 
     Raises:
-        UserError: an agent's actions are of another kind.
+        UserError: an agent's action space is another one.
     """
     actions: dict[str, NDArray[Any] | int] = {}
     for agent in observations:
@@ -60,36 +59,38 @@ PARTNERS: dict[str, Partner] = {"random": random_actions}
 
 
 class ParallelVecEnv(VecEnv):
-    """Every agent of every copy is one row of a shared policy.
+    """Makes each learner of each copy of a PettingZoo environment one env of an SB3 VecEnv.
 
-    Rows are ordered by copy, then by agent. **Spaces** that differ are padded: Box observations (also within a Dict)
-    with zeros at the end of each axis; Discrete actions to the largest n, an action beyond the agent's own n counting
-    as its last; 1-D Box actions to the longest, cut and clipped to the agent's own bounds.
+    Its envs are ordered by copy, then by agent. **Spaces** that differ are padded: Box observations (also within a
+    Dict) with zeros at the end of each axis; Discrete actions to the largest n, an action beyond the agent's own n
+    counting as its last; 1-D Box actions to the longest, cut and clipped to the agent's own bounds.
 
     **Episodes.** A copy is reset at the step that leaves it without living agents, or without a living learner once
-    every learner has lived. When an agent dies, its row reports done=True with its last observation as
+    every learner has lived. When an agent dies, its env reports done=True with its last observation as
     `terminal_observation`, and `TimeLimit.truncated` if it was truncated (or dropped) and not terminated. Until its
-    next life the row waits: zero observation (a Discrete entry: its first value), reward 0, action ignored,
-    `info["alive"]` False. An agent that is not there at the reset waits likewise until it joins. Each wait is an
-    episode of its own, closed by done=True when the agent joins or the copy resets: so neither advantages nor
-    recurrent states cross between lives, and the value of waiting is a plain 0. SB3 does train on waits: they dilute
-    a batch and its normalisation of advantages, no more.
+    next life the env waits: zero observation (a Discrete entry: its first value), reward 0, action ignored,
+    `info["alive"]` False. An agent that is absent at the reset waits in the same way until it joins. Each wait is
+    an episode of its own, closed by done=True when the agent joins or the copy resets: so neither advantages nor
+    recurrent states cross between lives, and the value of waiting is 0. SB3 does train on waits; their only effect is
+    to dilute a batch and its normalisation of advantages.
 
     **Statistics.** VecMonitor counts each wait as an episode of return 0; `AgentMonitor` counts lives only. To drop
-    waits from own statistics, keep the transitions whose `info["alive"]` is True.
+    waits from your own statistics, keep the transitions whose `info["alive"]` is True.
 
     Args:
-        factories: each makes one copy.
-        agents: who learns; None takes all possible agents.
-        partner: drives the agents that do not learn; a callable or a name of `PARTNERS`.
-        agent_indicator: append the one-hot of the agent's role to the 1-D observation (of a Dict, to its entry
-            "observation"); zero while the row waits. None appends it if spaces are unequal and there is such a vector.
+        factories: functions that make one copy each.
+        agents: names of the learners; None takes all possible agents.
+        partner: driver of the agents that do not learn; a callable or a name of `PARTNERS`.
+        agent_indicator: whether to append the one-hot of the agent's role to the 1-D observation (of a Dict, to its
+            entry "observation"); zero while the env waits. None appends it if spaces are unequal and there is such a
+            vector.
 
     Attributes:
-        envs: the copies.
-        row_agents: name of each row's agent.
-        row_copies: index of each row's copy.
-        row_roles: role of each row: agents whose names differ in their number only and whose spaces are equal.
+        envs: copies of the PettingZoo environment, fewer than the VecEnv's `num_envs`.
+        agents_of_envs: name of the agent of each env of the VecEnv.
+        copies_of_envs: index of the copy of each env of the VecEnv.
+        roles_of_envs: number of the role of each env of the VecEnv; agents have equal roles if their names differ in
+            their number only and their spaces are equal.
 
     Raises:
         UserError: no copies, copies that differ, unknown agents, no partner where one is needed, or spaces that
@@ -104,7 +105,7 @@ class ParallelVecEnv(VecEnv):
         partner: Partner | str | None = None,
         agent_indicator: bool | None = None,
     ) -> None:
-        """Make the copies and find the spaces that hold every learner's."""
+        """Makes the copies and finds spaces that hold those of all learners."""
         self.envs = _make_copies(factories)
         self._forward = batch_forwards(self.envs)
         names = _choose_learners(self.envs[0].possible_agents, agents)
@@ -115,88 +116,89 @@ class ParallelVecEnv(VecEnv):
         roles = roles_of(observations, actions)
         self._observation = PaddedObservation(observations, roles, agent_indicator)
         self._own_actions = actions
-        self.row_agents = names * len(self.envs)
-        self.row_copies = [copy for copy in range(len(self.envs)) for _ in names]
-        self.row_roles = [roles[name] for name in self.row_agents]
+        self.agents_of_envs = names * len(self.envs)
+        self.copies_of_envs = [copy for copy in range(len(self.envs)) for _ in names]
+        self.roles_of_envs = [roles[name] for name in self.agents_of_envs]
         self._actions: NDArray[Any] | None = None
-        super().__init__(len(self.row_agents), self._observation.space, shared_action(actions))
+        super().__init__(len(self.agents_of_envs), self._observation.space, shared_action(actions))
         self.metadata = {**getattr(self.envs[0], "metadata", {}), **self.metadata}
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed copy i with seed + i at the next reset; later episodes go on from the copy's own generator."""
+        """Seeds copy i with seed + i at the next reset; later episodes go on from the copy's own generator."""
         first = int(np.random.default_rng().integers(2**31)) if seed is None else seed
-        self._seeds = [first + copy for copy in self.row_copies]
+        self._seeds = [first + copy for copy in self.copies_of_envs]
         return self._seeds
 
     def reset(self) -> VecEnvObs:
-        """Reset all copies."""
+        """Resets all copies."""
         for i, copy in enumerate(self._copies):
-            row = i * len(copy.learners)
-            self._keep_infos(row, copy, copy.reset(self._seeds[row], self._options[row]))
+            first = i * len(copy.learners)
+            self._keep_infos(first, copy, copy.reset(self._seeds[first], self._options[first]))
         self._reset_seeds()
         self._reset_options()
         self._actions = None
         return self._observe()
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take one action per row, in the padded space."""
+        """Takes one action per env, in the padded space."""
         if any(copy.living is None for copy in self._copies):
             raise ProtocolError("there is no episode to step; call reset() first")
         if len(actions) != self.num_envs:
-            raise UserError(f"step needs one action per row ({self.num_envs}), got {len(actions)}")
+            raise UserError(f"step needs one action per env ({self.num_envs}), got {len(actions)}")
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step every copy; reset those whose episode ended."""
+        """Steps all copies; resets those whose episode ended."""
         if self._actions is None:
             raise ProtocolError("step_wait() needs actions; call step_async() first")
         actions, self._actions = self._actions, None
         turns: list[_Turn] = []
         for copy in self._copies:
-            row = len(turns)
+            first = len(turns)
             own = {
-                agent: own_action(actions[row + i], self._own_actions[agent])
+                agent: own_action(actions[first + i], self._own_actions[agent])
                 for i, agent in enumerate(copy.learners)
                 if copy.lives(agent)
             }
             turns += copy.step(own)
             if copy.ended:
-                self._keep_infos(row, copy, copy.reset())
+                self._keep_infos(first, copy, copy.reset())
         rewards = np.array([turn.reward for turn in turns], dtype=np.float32)
         dones = np.array([turn.done for turn in turns], dtype=np.bool_)
-        return self._observe(), rewards, dones, [self._info(*row) for row in zip(self.row_agents, turns, strict=True)]
+        infos = [self._info(agent, turn) for agent, turn in zip(self.agents_of_envs, turns, strict=True)]
+        return self._observe(), rewards, dones, infos
 
-    def row_of(self, agent: str, observation: Any) -> Any:
-        """A learner's own observation as its row would show it: padded, with the indicator."""
+    def padded_observation(self, agent: str, observation: Any) -> Any:
+        """Returns a learner's own observation in the VecEnv's space: padded, with the indicator."""
         return self._observation.one(agent, observation)
 
     def own_action(self, agent: str, action: Any) -> Any:
-        """A learner's own action for one of the shared space."""
+        """Returns a learner's own action for one of the VecEnv's space."""
         return own_action(action, self._own_actions[agent])
 
     def close(self) -> None:
-        """Close all copies."""
+        """Closes all copies."""
         for env in self.envs:
             env.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """One frame per copy."""
+        """Returns one frame per copy."""
         return [env.render() for env in self.envs]
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """The attribute of each row's copy; a copy without `render_mode` has None."""
+        """Returns the attribute of each env's copy; None for a copy without `render_mode`."""
         default = (None,) if attr_name == "render_mode" else ()
         return [getattr(self.envs[copy], attr_name, *default) for copy in self._copies_of(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set the attribute on the copies of these rows."""
+        """Sets the attribute on the copies of these envs."""
         for copy in self._copies_of(indices):
             setattr(self.envs[copy], attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **kwargs: Any
     ) -> list[Any]:
-        """Call the method once per copy of these rows; each row gets its copy's result."""
+        """Calls the method once per copy of these envs; returns each env's result, which is its copy's."""
         copies = self._copies_of(indices)
         results = {
             copy: getattr(self.envs[copy], method_name)(*method_args, **kwargs) for copy in dict.fromkeys(copies)
@@ -204,23 +206,23 @@ class ParallelVecEnv(VecEnv):
         return [results[copy] for copy in copies]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """Whether each row's copy is wrapped in this class."""
+        """Returns whether each env's copy is wrapped in this class."""
         return [_is_wrapped(self.envs[copy], wrapper_class) for copy in self._copies_of(indices)]
 
     def _copies_of(self, indices: VecEnvIndices) -> list[int]:
-        return [self.row_copies[row] for row in self._get_indices(indices)]
+        return [self.copies_of_envs[env] for env in self._get_indices(indices)]
 
-    def _keep_infos(self, row: int, copy: "_Copy", infos: Mapping[str, Any]) -> None:
-        """Remember what the reset of a copy, whose first row this is, told its learners."""
+    def _keep_infos(self, first: int, copy: "_Copy", infos: Mapping[str, Any]) -> None:
+        """Keeps the infos that the reset of a copy returned for its learners; `first` is the copy's first env."""
         for i, agent in enumerate(copy.learners):
-            self.reset_infos[row + i] = {**infos.get(agent, {}), "alive": copy.lives(agent)}
+            self.reset_infos[first + i] = {**infos.get(agent, {}), "alive": copy.lives(agent)}
 
     def _observe(self) -> VecEnvObs:
-        """What each row's agent sees now."""
+        """Returns the observation of each env."""
         if self._forward is not None:
             self._forward.fill()
         seen = [(copy.living or {}).get(agent) for copy in self._copies for agent in copy.learners]
-        return self._observation.stack(list(zip(self.row_agents, seen, strict=True)))
+        return self._observation.stack(list(zip(self.agents_of_envs, seen, strict=True)))
 
     def _info(self, agent: str, turn: "_Turn") -> dict[str, Any]:
         info = {**turn.info, "alive": turn.alive, "TimeLimit.truncated": turn.truncated}
@@ -230,25 +232,25 @@ class ParallelVecEnv(VecEnv):
 
 
 class AgentMonitor(VecMonitor):
-    """VecMonitor that counts lives: a row's wait adds nothing to lengths and is no episode.
+    """VecMonitor that counts lives: an env's wait adds nothing to lengths and is no episode.
 
-    The arguments are VecMonitor's. `evaluate_policy` counts through it as well.
+    It takes VecMonitor's arguments, and `evaluate_policy` uses its counts.
     """
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step; each life that ended gets `info["episode"]` with its return r, length l and time t [s]."""
+        """Steps; each life that ended gets `info["episode"]` with its return r, length l and time t [s]."""
         obs, rewards, dones, step_infos = self.venv.step_wait()
         infos = list(step_infos)
         alive = np.array([info.get("alive", True) for info in infos], dtype=np.bool_)
         self.episode_returns += rewards * alive
         self.episode_lengths += alive
-        for row in np.flatnonzero(dones & alive):
-            episode = {"r": float(self.episode_returns[row]), "l": int(self.episode_lengths[row])}
+        for env in np.flatnonzero(dones & alive):
+            episode = {"r": float(self.episode_returns[env]), "l": int(self.episode_lengths[env])}
             episode["t"] = round(time.time() - self.t_start, 6)
-            episode.update({key: infos[row][key] for key in self.info_keywords})
-            infos[row] = {**infos[row], "episode": episode}
+            episode.update({key: infos[env][key] for key in self.info_keywords})
+            infos[env] = {**infos[env], "episode": episode}
             self.episode_count += 1
-            self.episode_returns[row], self.episode_lengths[row] = 0, 0
+            self.episode_returns[env], self.episode_lengths[env] = 0, 0
             if self.results_writer:
                 self.results_writer.write_row(episode)
         return obs, rewards, dones, infos
@@ -256,24 +258,24 @@ class AgentMonitor(VecMonitor):
 
 @dataclass
 class _Turn:
-    """What one step was for one row."""
+    """Outcome of one step for one learner."""
 
     alive: bool = False
-    """The agent was there to act."""
+    """Whether the agent lived and acted."""
     reward: float = 0.0
-    """Its reward; 0 while it waits."""
+    """Reward of the agent; 0 while it waits."""
     done: bool = False
-    """A life or a wait ended."""
+    """Whether a life or a wait ended."""
     truncated: bool = False
-    """The life ended, but not by termination."""
+    """Whether the life ended, but not by termination."""
     closing: Any = None
-    """The last observation of the life that ended; None ends a wait."""
+    """Last observation of the life that ended; None at the end of a wait."""
     info: dict[str, Any] = field(default_factory=dict)
-    """What the env told the agent."""
+    """Info of the agent from the environment."""
 
 
 class _Copy:
-    """One environment: who lives and what they saw last, and the generator of those who do not learn."""
+    """One copy of the environment, with the latest observations of the living agents and the partner's generator."""
 
     def __init__(self, env: ParallelEnv, learners: list[str], partner: Partner | None) -> None:
         self.env, self.learners, self.partner = env, learners, partner
@@ -283,7 +285,7 @@ class _Copy:
 
     @property
     def ended(self) -> bool:
-        """Nobody is left to wait for."""
+        """Whether the episode is over: no agent lives, or no learner does after all learners have lived."""
         return not self.living or (self._lived.issuperset(self.learners) and not any(map(self.lives, self.learners)))
 
     def lives(self, agent: str) -> bool:
@@ -300,7 +302,7 @@ class _Copy:
         return infos
 
     def step(self, actions: dict[str, Any]) -> list[_Turn]:
-        """Act for everyone who lives; one turn per learner."""
+        """Steps the environment with actions of all living agents; returns one turn per learner."""
         before = self.living or {}
         others = {agent: seen for agent, seen in before.items() if agent not in self.learners}
         observations, rewards, terminated, truncated, infos = self.env.step({**actions, **self._act_for(others)})
@@ -319,11 +321,11 @@ class _Copy:
         return turns
 
     def _enter(self, agents: Iterable[str], observations: Mapping[str, Any]) -> None:
-        """These live now."""
+        """Sets the living agents and their observations."""
         names = list(agents)
         unknown = [agent for agent in names if agent not in self.env.possible_agents]
         if unknown:
-            raise UserError(f"every agent needs a row, but {unknown} are not in possible_agents; add them there")
+            raise UserError(f"every agent must be one of possible_agents, but {unknown} are not; add them there")
         blind = [agent for agent in names if agent not in observations]
         if blind:
             raise UserError(f"every living agent needs an observation, the environment gave none for {blind}")
@@ -341,7 +343,7 @@ class _Copy:
 
 
 def _make_copies(factories: Sequence[Callable[[], ParallelEnv]]) -> list[ParallelEnv]:
-    """Distinct environments with the same agents and spaces."""
+    """Makes distinct environments with equal agents and spaces."""
     envs = [factory() for factory in factories]
     if not envs:
         raise UserError("at least one factory is needed, got none")
@@ -352,7 +354,7 @@ def _make_copies(factories: Sequence[Callable[[], ParallelEnv]]) -> list[Paralle
                 "pettingzoo.utils.aec_to_parallel converts an AECEnv"
             )
         if not getattr(env, "possible_agents", None):
-            raise UserError(f"every agent that may appear needs a row, but copy {i} has no possible_agents")
+            raise UserError(f"every copy must name all agents that may appear, but copy {i} has no possible_agents")
         if list(env.possible_agents) != list(envs[0].possible_agents):
             raise UserError(
                 f"copies must have the same possible_agents; copy 0 has {envs[0].possible_agents}, "
@@ -379,9 +381,9 @@ def _choose_learners(possible: Sequence[str], agents: Sequence[str] | None) -> l
 def _choose_partner(possible: Sequence[str], learners: list[str], partner: Partner | str | None) -> Partner | None:
     others = [name for name in possible if name not in learners]
     if others and partner is None:
-        raise UserError(f"{others} do not learn, so somebody must drive them; pass partner= ({', '.join(PARTNERS)})")
+        raise UserError(f"{others} do not learn and need a driver; pass partner= ({', '.join(PARTNERS)})")
     if partner is not None and not others:
-        raise UserError("a partner drives those who do not learn, but all agents learn; name the learners in agents=")
+        raise UserError("a partner drives agents that do not learn, but all agents learn; name the learners in agents=")
     if isinstance(partner, str):
         if partner not in PARTNERS:
             raise UserError(f"no partner is called '{partner}'; known: {', '.join(PARTNERS)}, or pass a callable")

@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from envs.observation import batch_entries, scene_spaces
-from envs.readers.envpool import PoolReader, native_spec
+from envs.readers.envpool import PoolReader, envpool_spec
 from envs.simulators.envpool import ENV_IDS, MAX_SEED, info_of, is_terminated, make_pool, meta_actions_of
 from predictor.scene import SceneSpec
 from predictor.support.errors import ProtocolError, UserError
@@ -24,22 +24,22 @@ class EnvPoolVecEnv(VecEnv):
         >>> venv = EnvPoolVecEnv("HighwayFast-v0", 64, seed=0)
         >>> venv = VecForecast(VecMonitor(venv), "highway")
 
-    Observations are those of SB3 over `SceneObservation` over `EnvPoolEnv`, row by row; with `scenes=False` they are
-    the task's own array, for a policy without foresight. Episodes restart within the step that ends them, as SB3 wants
-    it: `infos[i]["terminal_observation"]` closes the old one, scene included.
+    The observation of each env equals that of `SceneObservation` over `EnvPoolEnv`; with `scenes=False` it is the
+    task's own array, for a policy without forecasts. Episodes restart within the step that ends them, as in all of
+    SB3's VecEnvs: `infos[i]["terminal_observation"]` closes the old one, scene included.
 
     Args:
         task_id: a key of `HIGHWAY_ENV_OF`.
-        num_envs: rows.
-        seed: row i gets seed + i; None draws one.
-        num_threads: of the simulation; 0 leaves it to EnvPool.
+        num_envs: number of environments.
+        seed: random seed: env i gets seed + i; None draws one.
+        num_threads: number of threads of the simulation; 0 leaves it to EnvPool.
         scenes: whether observations carry scenes.
-        perception_m: how far the egos see [m]; None takes `SceneSpec`'s default.
-        max_agents: rows of a scene, the ego included; None takes `SceneSpec`'s default.
-        settings: of the task, see `make_pool`.
+        perception_m: range of the egos' perception [m]; None takes `SceneSpec`'s default.
+        max_agents: size of a scene, the ego included; None takes `SceneSpec`'s default.
+        settings: settings of the task, see `make_pool`.
 
     Raises:
-        UserError: no EnvPool, an unknown task or setting, no rows.
+        UserError: no EnvPool, an unknown task or setting, or num_envs below 1.
     """
 
     def __init__(
@@ -54,14 +54,14 @@ class EnvPoolVecEnv(VecEnv):
         max_agents: int | None = None,
         **settings: Any,
     ) -> None:
-        """Build the pool."""
+        """Builds the pool."""
         if num_envs < 1:
             raise UserError(f"num_envs must be at least 1, got {num_envs}")
         self.task_id, self._num_threads, self._settings = task_id, num_threads, settings
         first = int(np.random.default_rng().integers(MAX_SEED)) if seed is None else seed
         self._pool = make_pool(task_id, [first + i for i in range(num_envs)], num_threads, **settings)
         self.scene_source = next(env_id for env_id, task in ENV_IDS.items() if task == task_id)
-        self.scene_spec: SceneSpec = native_spec(task_id, self._pool.config, perception_m, max_agents)
+        self.scene_spec: SceneSpec = envpool_spec(task_id, self._pool.config, perception_m, max_agents)
         self._reader = PoolReader(self.scene_spec, num_envs) if scenes else None
         space: gym.Space = self._pool.observation_space
         if scenes:
@@ -74,7 +74,7 @@ class EnvPoolVecEnv(VecEnv):
     render_mode: str | None = None
 
     def reset(self) -> VecEnvObs:
-        """Begin an episode in every row; after `seed(…)`, with those seeds."""
+        """Begins an episode in every env; after `seed(…)`, with those seeds."""
         if any(self._options):
             raise UserError("EnvPool takes no options at reset; pass settings to EnvPoolVecEnv")
         if self._seeds[0] is not None:
@@ -86,17 +86,17 @@ class EnvPoolVecEnv(VecEnv):
         return observations if self._reader is not None else observations["observation"]
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Note the actions of the step to come.
+        """Keeps the actions of the next step.
 
         Raises:
-            UserError: not one action per row.
+            UserError: not one action per env.
         """
         if len(actions) != self.num_envs:
-            raise UserError(f"a step needs one action for each of {self.num_envs} rows, got {len(actions)}")
+            raise UserError(f"a step needs one action for each of {self.num_envs} envs, got {len(actions)}")
         self._actions = np.asarray(actions)
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all rows; those whose episode ended begin the next one.
+        """Steps all envs; those whose episode ended begin the next one.
 
         Raises:
             ProtocolError: before the first reset, or without actions.
@@ -123,43 +123,45 @@ class EnvPoolVecEnv(VecEnv):
                 observations[key][ended] = value
         return observations if self._reader is not None else observations["observation"], rewards, dones, infos
 
-    def _begin(self, rows: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
-        """Start the next episode of some rows; their first observations."""
-        own, info = self._pool.reset(rows.astype(np.int32))
-        for place, row in enumerate(rows):
-            self.reset_infos[row] = info_of(info, place)
-        return self._observe(own, rows)
+    def _begin(self, envs: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        """Begins the next episode of some envs; returns their first observations."""
+        own, info = self._pool.reset(envs.astype(np.int32))
+        for place, env in enumerate(envs):
+            self.reset_infos[env] = info_of(info, place)
+        return self._observe(own, envs)
 
-    def _observe(self, own: NDArray[Any], rows: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
-        """Observations of some rows, in arrays that nobody else holds."""
+    def _observe(self, own: NDArray[Any], envs: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        """Returns the observations of some envs, in new arrays."""
         observations = {"observation": np.array(own)}
         if self._reader is not None:
-            observations |= batch_entries(self._reader.read(self._pool.debug_states(rows.astype(np.int32)), rows))
+            observations |= batch_entries(self._reader.read(self._pool.debug_states(envs.astype(np.int32)), envs))
         return observations
 
     def close(self) -> None:
-        """Let the pool go."""
+        """Closes the pool."""
         self._pool.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of this class, which all rows share (`scene_spec`, `scene_source`, `task_id`, …)."""
+        """Returns an attribute of this object, which all envs share (`scene_spec`, `scene_source`, `task_id`, …)."""
         if attr_name.startswith("_") or not hasattr(self, attr_name):
-            raise AttributeError(f"the rows of EnvPoolVecEnv have no attribute '{attr_name}'")
+            raise AttributeError(f"the envs of EnvPoolVecEnv have no attribute '{attr_name}'")
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Not possible: the rows live in C++."""
-        raise AttributeError(f"cannot set '{attr_name}': the rows of EnvPoolVecEnv live in C++; build it anew")
+        """Raises an AttributeError: the envs' state is in C++."""
+        raise AttributeError(
+            f"cannot set '{attr_name}': the envs of EnvPoolVecEnv are in C++; make a new EnvPoolVecEnv"
+        )
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """`debug_states` is the only method that rows have: EnvPool's own description of each, for tests."""
+        """Calls `debug_states`, the only method of the envs: returns EnvPool's own description of each, for tests."""
         if method_name != "debug_states":
-            raise AttributeError(f"the rows of EnvPoolVecEnv have no method '{method_name}', only debug_states")
-        rows: Iterable[int] = self._get_indices(indices)
-        return [[state] for state in self._pool.debug_states(list(rows))]
+            raise AttributeError(f"the envs of EnvPoolVecEnv have no method '{method_name}', only debug_states")
+        envs: Iterable[int] = self._get_indices(indices)
+        return [[state] for state in self._pool.debug_states(list(envs))]
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """Rows are never wrapped."""
+        """Returns False for each env: they are never wrapped."""
         return [False for _ in self._get_indices(indices)]

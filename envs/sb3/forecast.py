@@ -2,7 +2,7 @@
 
 Each environment keeps its own history; the history is cleared when, and only when, its own episode ends. The
 observation that closes an episode carries the forecast made from that episode's history; the one that opens the next
-starts from one step. `envs.vector` has the same for gymnasium's vector environments.
+starts from one step. `envs.vector` serves gymnasium's vector environments.
 """
 
 import inspect
@@ -43,16 +43,16 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
     Args:
         venv: SB3 vector environment (Dummy or Subproc).
         checkpoint: shipped name, folder, or "constant-velocity"; None takes the one that ships for the env's id.
-        horizon_steps: steps to forecast; None takes the checkpoint's.
-        num_samples: sampled futures per agent.
-        flatten: one Box instead of a Dict.
-        device: where the forecaster runs.
-        forecaster: instead of a checkpoint; lives on `device`.
-        seed: of the samples' noise, environment i gets seed + i, until `seed(…)` gives others.
+        horizon_steps: number of steps to forecast; None takes the checkpoint's.
+        num_samples: number of sampled futures per agent.
+        flatten: whether observations are one Box instead of a Dict.
+        device: device of the forecaster.
+        forecaster: forecaster on `device`, instead of a checkpoint.
+        seed: random seed of the samples' noise: environment i gets seed + i, until `seed(…)` gives others.
         reader: refused, because the environments report their scenes; give it to `SceneObservation`.
 
     Raises:
-        UserError: the envs report no scenes, differ from each other, or do not fit the forecaster.
+        UserError: the environments report no scenes, differ from each other, or do not fit the forecaster.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         seed: int = 0,
         reader: MakeReader | None = None,
     ) -> None:
-        """Load the forecaster and extend the observation space."""
+        """Loads the forecaster and extends the observation space."""
         refuse_reader(reader, "VecForecast")
         space = require_scenes(venv.observation_space, "VecForecast")
         spec = common_value(venv.get_attr("scene_spec"), "scene spec")
@@ -80,26 +80,26 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         VecEnvWrapper.__init__(self, venv, observation_space=self._layout.space)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Returns what a copy or a pickle keeps; VecEnvWrapper's notes on its own class do not pickle."""
+        """Returns the state of a copy or a pickle, without VecEnvWrapper's notes on its class, which do not pickle."""
         return {name: value for name, value in super().__getstate__().items() if name != _CLASS_NOTES}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a copy or a pickle."""
+        """Restores a copy or a pickle."""
         super().__setstate__({**state, _CLASS_NOTES: dict(inspect.getmembers(type(self)))})
 
     @property
     def scene(self) -> SceneBatch:
-        """The latest scene of each environment, world frame, ego first."""
+        """Latest scene of each environment, world frame, ego first."""
         return self._scenes()
 
     def reset(self) -> Any:
-        """Reset all environments and forget all histories."""
+        """Resets all environments and clears all histories."""
         observations: Any = self.venv.reset()
         self.stream.reset()
         return self._layout.batch(observations["observation"], self.stream.observe(scenes_from(observations)))
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step; one batched forward serves running episodes, terminal observations and fresh episodes."""
+        """Steps; one batched forward serves running episodes, terminal observations and new episodes."""
         observations: Any
         observations, rewards, dones, step_infos = self.venv.step_wait()
         infos = list(step_infos)  # a tuple, with SubprocVecEnv
@@ -111,7 +111,7 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         return self._layout.batch(observations["observation"], entries), rewards, dones, infos
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed the environments and each one's samples with it; None leaves the samples' noise as it is."""
+        """Seeds the environments and their samples' noise; None leaves the noise as it is."""
         seeds = self.venv.seed(seed)
         if seed is not None:
             self.stream.seed(seeds)

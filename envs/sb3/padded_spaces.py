@@ -1,6 +1,6 @@
-"""One space for agents whose own differ: padded observations with the agent's role behind, and actions cut to size.
+"""One space for agents whose own spaces differ: padded observations with the agent's role appended, and cut actions.
 
-Serves `envs.sb3.agents_as_rows`; knows no environments and no episodes.
+Used by `envs.sb3.agents_as_rows` and `envs.drivers.trained`; independent of environments and episodes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,10 +17,22 @@ _COUNTED = (gym.spaces.Discrete, gym.spaces.MultiDiscrete, gym.spaces.MultiBinar
 
 
 class PaddedObservation:
-    """The observation space that holds every learner's, and observations put into it."""
+    """Pads the observations of all learners to one space.
+
+    Args:
+        own: observation space of each learner, by name.
+        roles: number of each learner's role, by name.
+        indicator: whether to append the one-hot of the role; None appends it if the spaces are unequal vectors.
+
+    Attributes:
+        space: padded space.
+
+    Raises:
+        UserError: spaces that cannot be padded, or an indicator without a 1-D Box.
+    """
 
     def __init__(self, own: dict[str, gym.Space], roles: dict[str, int], indicator: bool | None) -> None:
-        """Find the shared space, and where the roles go."""
+        """Finds the padded space and the columns of the roles."""
         first = next(iter(own.values()))
         self._is_dict = isinstance(first, gym.spaces.Dict)
         self._own = {agent: dict(s.spaces) if isinstance(s, gym.spaces.Dict) else {"": s} for agent, s in own.items()}
@@ -43,33 +55,33 @@ class PaddedObservation:
             self._entries[self._vector] = _with_one_hot(box, max(roles.values()) + 1)
         self.space = gym.spaces.Dict(self._entries) if self._is_dict else self._entries[""]
 
-    def stack(self, rows: Sequence[tuple[str, Any]]) -> Any:
-        """One padded observation per (agent, what it saw); zeros for None."""
+    def stack(self, observations: Sequence[tuple[str, Any]]) -> Any:
+        """Returns the padded observations of (agent, own observation) pairs, stacked; zeros for None."""
         arrays: dict[str, NDArray[Any]] = {}
         for key, space in self._entries.items():
-            arrays[key] = np.zeros((len(rows), *(space.shape or ())), space.dtype)
+            arrays[key] = np.zeros((len(observations), *(space.shape or ())), space.dtype)
             arrays[key] += getattr(space, "start", 0)
-        for i, (agent, seen) in enumerate(rows):
+        for i, (agent, seen) in enumerate(observations):
             if seen is None:
                 continue
             for key, array in arrays.items():
                 value = np.asarray(seen[key] if self._is_dict else seen)
                 shape = self._own[agent][key].shape
                 if value.shape != shape:
-                    raise UserError(f"agent '{agent}' must see an array of shape {shape}, it saw {value.shape}")
+                    raise UserError(f"the observation of agent '{agent}' must have shape {shape}, got {value.shape}")
                 array[i, ...][_corner(shape)] = value
             if self._role_column:
                 arrays[self._vector][i, self._role_column[agent]] = 1
         return arrays if self._is_dict else arrays[""]
 
     def one(self, agent: str, seen: Any) -> Any:
-        """A single padded observation."""
+        """Returns a single padded observation."""
         stacked = self.stack([(agent, seen)])
         return {key: value[0] for key, value in stacked.items()} if self._is_dict else stacked[0]
 
 
 def _shared_entry(own: list[gym.Space]) -> gym.Space:
-    """A Box that holds all of these Boxes, padded, and zero; or what they all are."""
+    """Returns a Box that holds all of these Boxes, padded, and zero; or the one space that they all equal."""
     boxes = [space for space in own if isinstance(space, gym.spaces.Box)]
     if len(boxes) == len(own) and len({len(box.shape) for box in boxes}) == 1:
         shape = tuple(np.max([box.shape for box in boxes], axis=0).astype(int)) if boxes[0].shape else ()
@@ -90,7 +102,7 @@ def _with_one_hot(box: gym.spaces.Box, count: int) -> gym.spaces.Box:
 
 
 def shared_action(own: Mapping[str, gym.Space]) -> gym.Space:
-    """The action space of every row."""
+    """Returns the action space that holds those of all learners."""
     spaces = list(own.values())
     discrete = [space for space in spaces if isinstance(space, gym.spaces.Discrete)]
     if len(discrete) == len(spaces):
@@ -108,7 +120,7 @@ def shared_action(own: Mapping[str, gym.Space]) -> gym.Space:
 
 
 def own_action(action: Any, space: gym.Space) -> Any:
-    """The agent's own action for one of the shared space."""
+    """Returns the agent's own action for one of the padded space."""
     if isinstance(space, gym.spaces.Discrete):
         return int(space.start) + min(int(action), int(space.n) - 1)
     if isinstance(space, gym.spaces.Box):
@@ -117,7 +129,7 @@ def own_action(action: Any, space: gym.Space) -> Any:
 
 
 def _union(boxes: list[gym.spaces.Box], low: NDArray[Any], high: NDArray[Any]) -> gym.spaces.Box:
-    """A Box that holds all of these, each in the first corner, and everything from `low` to `high`."""
+    """Returns a Box that holds all of these, each in the first corner, and all values from `low` to `high`."""
     for box in boxes:
         corner = _corner(box.shape)
         low[corner] = np.minimum(low[corner], box.low)
@@ -126,17 +138,17 @@ def _union(boxes: list[gym.spaces.Box], low: NDArray[Any], high: NDArray[Any]) -
 
 
 def _corner(shape: tuple[int, ...]) -> tuple[slice, ...]:
-    """Index of the first so many elements along each axis."""
+    """Returns the index of the first `shape[i]` elements along each axis i."""
     return tuple(slice(size) for size in shape)
 
 
 def learners_named(possible_agents: Sequence[str], names: Sequence[str], source: str) -> list[str]:
-    """The agents that names of agents or roles stand for; no name stands for all.
+    """Returns the agents that are named by themselves or by their role; no name stands for all.
 
     Args:
-        possible_agents: of the environment.
-        names: agents ("adversary_0") or roles ("adversary").
-        source: whose environment it is, for messages.
+        possible_agents: names of the environment's agents.
+        names: names of agents ("adversary_0") or roles ("adversary").
+        source: name of the environment or policy, for messages.
 
     Raises:
         UserError: a name is neither.
@@ -150,7 +162,7 @@ def learners_named(possible_agents: Sequence[str], names: Sequence[str], source:
 
 
 def roles_of(observations: Mapping[str, gym.Space], actions: Mapping[str, gym.Space]) -> dict[str, int]:
-    """Number of each agent's role, by first appearance."""
+    """Returns the number of each agent's role, in the order of first appearance."""
     kinds: list[tuple[str, gym.Space, gym.Space]] = []
     roles = {}
     for agent in observations:

@@ -1,9 +1,9 @@
 """Trained policies on disk: a Stable-Baselines3 zip with a note inside.
 
-The note (`note.json`) says what a policy needs beside its weights: the forecaster whose forecasts it was trained on,
-which agents learned, and who drove the others. It is written with the policy and travels inside the zip, so a policy
-drives elsewhere as it was trained. The zip itself stays readable by SB3's own ``load``, and holds pickled data: load
-only files whose source you trust.
+The note (`note.json`) holds what a policy needs beside its weights: the forecaster whose forecasts it was trained on,
+which agents learned, and the driver of the others. It is part of the zip, so that a policy drives
+everywhere as it was trained. SB3's own ``load`` still reads the zip. It holds pickled data: load only files whose
+source you trust.
 """
 
 import hashlib
@@ -28,28 +28,28 @@ NOTE_ENTRY = "note.json"
 _POLICY_KEY = "policy"
 _ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "dqn": DQN}
 _MARKS = {"ppo": "clip_range", "dqn": "exploration_rate"}
-"""Parameter in SB3's JSON that an algorithm alone has."""
+"""Parameter in SB3's JSON that only this algorithm has."""
 
 
 @dataclass(frozen=True)
 class ForecasterPin:
-    """Which forecaster a policy was trained on, and with which options of the wrapper."""
+    """Forecaster that a policy was trained on, and the wrapper's options."""
 
     checkpoint: str
     """Shipped name, folder, or "constant-velocity"."""
     sha256: str | None
     """SHA-256 of the weights (model.safetensors); None for constant velocity, which has none."""
     horizon_steps: int
-    """Steps forecast."""
+    """Number of steps forecast."""
     num_samples: int
-    """Sampled futures per agent."""
+    """Number of sampled futures per agent."""
     max_agents: int
-    """Agents of a view, the viewer included."""
+    """Number of agents of a view, the viewer included."""
     perception_m: float | None
-    """Range of perception [m]; None is unbounded, for which JSON has no number."""
+    """Range of perception [m]; None is unbounded, since JSON has no infinity."""
 
     def check(self, found: "ForecasterPin", policy: str) -> None:
-        """Raise a `UserError` if `found` forecasts otherwise; a folder that only moved does not."""
+        """Raises a `UserError` if `found` is another forecaster or has other options; its folder does not matter."""
         if self.sha256 != found.sha256 or (self.sha256 is None and self.checkpoint != found.checkpoint):
             raise UserError(
                 f"{policy} was trained on forecaster {self._named}, but gets {found._named}; pass the checkpoint it "
@@ -69,23 +69,23 @@ class ForecasterPin:
 
 @dataclass(frozen=True)
 class PolicyNote:
-    """What a policy needs beside its weights."""
+    """Everything that a policy needs beside its weights."""
 
     forecaster: ForecasterPin | None = None
-    """The forecaster it was trained on; None if it sees no forecasts."""
+    """Forecaster that it was trained on; None for a policy without forecasts."""
     learners: tuple[str, ...] = ()
-    """PettingZoo: agents or roles that learned; none named are all."""
+    """PettingZoo: agents or roles that learned; empty means all."""
     driver: str = "heuristic"
-    """PettingZoo: who drove the agents that did not learn."""
+    """PettingZoo: name of the driver of the agents that did not learn."""
 
 
 def pin_forecaster(checkpoint: str, space: gym.spaces.Dict, spec: SceneSpec) -> ForecasterPin:
-    """Returns the pin of a forecaster as a policy sees it.
+    """Returns the pin of a forecaster with the options of an observation space.
 
     Args:
         checkpoint: shipped name, folder, or "constant-velocity".
-        space: of an observation with forecasts.
-        spec: layout of the scenes behind it.
+        space: space of an observation with forecasts.
+        spec: layout of the scenes that are forecast.
 
     Raises:
         UserError: no such checkpoint.
@@ -101,11 +101,11 @@ def pin_forecaster(checkpoint: str, space: gym.spaces.Dict, spec: SceneSpec) -> 
 
 
 def write_note(path: Path, policy: PolicyNote | None, extra: Mapping[str, Any]) -> None:
-    """Put the note into a saved policy.
+    """Adds the note to a saved policy.
 
     Args:
-        path: a zip without a note.
-        policy: what to tell about the policy; None tells nothing.
+        path: path of a zip without a note.
+        policy: note on the policy; None writes none.
         extra: more JSON content, which `read_note` returns.
     """
     content = dict(extra) | ({} if policy is None else {_POLICY_KEY: asdict(policy)})
@@ -119,15 +119,15 @@ def read_note(path: Path) -> dict[str, Any]:
 
 
 def read_policy_note(path: Path) -> PolicyNote | None:
-    """Returns what a policy's note says about it; None for a zip that says nothing (saved by SB3 alone or long ago).
+    """Returns the note of a policy; None for a zip without one (saved by SB3 alone or by an old version).
 
     Raises:
-        UserError: the note cannot be understood.
+        UserError: the note is not valid.
     """
     try:
         content = _note(path).get(_POLICY_KEY)
     except zipfile.BadZipFile:
-        return None  # `load_policy` says what is wrong with it
+        return None  # `load_policy` has the message for it
     if content is None:
         return None
     try:
@@ -146,10 +146,10 @@ def _note(path: Path) -> dict[str, Any]:
 
 
 def algorithm_of(path: Path) -> str:
-    """Returns "ppo" or "dqn", told by the parameters inside the zip.
+    """Returns "ppo" or "dqn", decided by the parameters inside the zip.
 
     Raises:
-        UserError: not there, or neither.
+        UserError: no such file, or neither PPO nor DQN.
     """
     if not path.exists():
         raise UserError(f"no policy at {path}; train one with python train_policy.py")
@@ -165,15 +165,15 @@ def algorithm_of(path: Path) -> str:
 
 
 def load_policy(path: Path, venv: VecEnv | None = None, device: str = "cpu") -> BaseAlgorithm:
-    """Load a PPO or DQN policy. Its zip holds pickled data: trust its source.
+    """Loads a PPO or DQN policy. Its zip holds pickled data: load only files whose source you trust.
 
     Args:
-        path: of the zip.
-        venv: to go on training with; its spaces must be the policy's.
-        device: where the network runs.
+        path: path of the zip.
+        venv: environments to continue training in; their spaces must be the policy's.
+        device: device of the network.
 
     Raises:
-        UserError: not there, neither PPO nor DQN, or not made for these spaces.
+        UserError: no such file, neither PPO nor DQN, or not made for these spaces.
     """
     algorithm = algorithm_of(path)
     try:

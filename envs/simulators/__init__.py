@@ -1,1 +1,1 @@
-"""Simulators of our own, or adapted: they know no readers, forecasts or policies."""
+"""Simulators that are added or adapted here; they import no readers, forecasters or policies."""

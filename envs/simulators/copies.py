@@ -1,9 +1,9 @@
-"""Copies and pickles of running environments that continue where the original is.
+"""Copies and pickles of running environments that continue exactly as the original would.
 
 mpe2 and PettingZoo's pursuit derive from Gymnasium's `EzPickle`: by themselves they copy and pickle as the arguments of
-their constructor, and the copy is a new environment that was never reset. A wrapper that derives from `RunningCopy`
-carries the simulator's state along. Simulators in C++ that cannot give their state refuse, with Python's own error or,
-for EnvPool, one of ours.
+their constructor, so that the copy is a new environment that was never reset. A wrapper that derives from `RunningCopy`
+carries the simulator's state along. Simulators in C++ whose state cannot be read raise an error: Python's own,
+or for EnvPool a `UserError`.
 """
 
 from typing import Any
@@ -14,24 +14,24 @@ from gymnasium.utils import EzPickle
 class RunningCopy:
     """Makes `copy.deepcopy` and `pickle` of a wrapper continue exactly, whatever its simulator pickles by itself.
 
-    Derive a Gymnasium or PettingZoo wrapper from it, first. Identities, histories and generators that the wrapper
-    holds are copied in the same go, so that they keep pointing to the simulator's (copied) objects.
+    Derive a Gymnasium or PettingZoo wrapper from it, first. Identities, histories and generators of the wrapper
+    are copied together with the simulator, so that they refer to its copied objects.
     """
 
     def __getstate__(self) -> dict[str, Any]:
-        """Returns the wrapper's attributes and the state of a simulator that would not pickle its own."""
+        """Returns the wrapper's attributes and the state of a simulator that does not pickle its own."""
         return {"wrapper": self.__dict__.copy(), "simulator": _simulator_state(self.unwrapped)}  # type: ignore[attr-defined]
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Takes both back; the simulator has been constructed anew by then."""
+        """Restores both; the simulator has been constructed anew before."""
         self.__dict__.update(state["wrapper"])
         self.unwrapped.__dict__.update(state["simulator"])  # type: ignore[attr-defined]
 
 
 def _simulator_state(simulator: Any) -> dict[str, Any]:
-    """Returns what a constructor's arguments do not tell; empty for a simulator that pickles its own state.
+    """Returns the attributes of a simulator that pickles its constructor's arguments only; empty for all others.
 
-    Surfaces and fonts of pygame, which cannot be copied, are left to the constructor.
+    Surfaces and fonts of pygame, which cannot be copied, are made by the constructor.
     """
     if not isinstance(simulator, EzPickle):
         return {}

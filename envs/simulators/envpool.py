@@ -1,8 +1,7 @@
-"""EnvPool's native C++ highway environments: one as a gymnasium env, many as an SB3 VecEnv at native speed.
+"""EnvPool's C++ highway environments as gymnasium environments: `EnvPoolEnv`, which every wrapper and command takes.
 
-`EnvPoolEnv` is an ordinary environment for every wrapper and command here; `EnvPoolVecEnv` steps a whole pool at once
-and reports scenes as `SceneObservation` does, ready for `VecForecast`. EnvPool is an optional extra and is imported
-when the first environment is made. This module only adapts: what the simulation does is EnvPool's.
+`envs.sb3.envpool.EnvPoolVecEnv` steps many at once, as an SB3 VecEnv. EnvPool is an optional extra and is imported when
+the first environment is made. This module only adapts: the simulation itself is EnvPool's.
 """
 
 import functools
@@ -96,7 +95,9 @@ def make_pool(task_id: str, seeds: Sequence[int], num_threads: int = 0, **settin
         **settings,
     )
     if not hasattr(pool, "debug_states"):
-        raise UserError(f"EnvPool {envpool.__version__} does not say where the vehicles are; 1.2.5 does")
+        raise UserError(
+            f"EnvPool {envpool.__version__} does not report the vehicles' positions; install 1.2.5 or later"
+        )
     return pool
 
 
@@ -123,7 +124,7 @@ class EnvPoolEnv(gym.Env[NDArray[Any], Any]):
 
     Attributes:
         task_id: as given.
-        native_config: EnvPool's settings, defaults included.
+        envpool_config: EnvPool's settings, defaults included.
         action_type: names of the discrete actions; None where actions are continuous.
 
     Raises:
@@ -137,7 +138,7 @@ class EnvPoolEnv(gym.Env[NDArray[Any], Any]):
         self.task_id, self.render_mode = task_id, render_mode
         self._settings = settings if render_mode is None else {**settings, "render_mode": render_mode}
         self._pool = make_pool(task_id, [0], num_threads=1, **self._settings)
-        self.native_config: Mapping[str, Any] = self._pool.config
+        self.envpool_config: Mapping[str, Any] = self._pool.config
         self.observation_space = self._pool.observation_space
         self.action_space = self._pool.action_space
         self.action_type = meta_actions_of(self.action_space)
@@ -216,5 +217,5 @@ def meta_actions_of(space: gym.Space) -> MetaActions | None:
 
 
 def info_of(info: Mapping[str, Any], env: int) -> dict[str, Any]:
-    """Returns one environment's info out of the pool's."""
+    """Returns the info of one environment of a pool."""
     return {"speed": float(info["speed"][env]), "crashed": bool(info["crashed"][env])}

@@ -24,7 +24,7 @@ from pettingzoo import ParallelEnv
 from predictor.support.errors import ProtocolError, UserError
 
 INTERSECTION = "intersection-multi-agent-v2"
-"""Its drivers notice who drives on connected lanes, as on intersection-v2."""
+"""Id whose drivers react to vehicles on connected lanes, as on intersection-v2."""
 
 
 class HighwayParallelEnv(ParallelEnv):
@@ -38,16 +38,16 @@ class HighwayParallelEnv(ParallelEnv):
     Vehicle i comes from arm i mod 4; with more than four, two start on the same stretch of 20 m or so.
 
     Args:
-        env_id: "intersection-multi-agent-v2", or -v1 and -v0, which differ in whom drivers notice.
+        env_id: "intersection-multi-agent-v2", or -v1 and -v0, which differ in the vehicles that drivers react to.
         render_mode: "rgb_array", "human" or None.
-        config: highway-env's, for example `controlled_vehicles=4` or `duration=20`; nested entries replace the whole
-            default, as in highway-env.
+        config: settings of highway-env, for example `controlled_vehicles=4` or `duration=20`; nested entries replace
+            the whole default, as in highway-env.
 
     Attributes:
-        highway: the gymnasium environment inside.
+        highway: gymnasium environment that is adapted.
 
     Raises:
-        UserError: not an id of the intersection with several agents.
+        UserError: not an id of an intersection with several agents.
     """
 
     def __init__(self, env_id: str = INTERSECTION, *, render_mode: str | None = None, **config: Any) -> None:
@@ -73,7 +73,7 @@ class HighwayParallelEnv(ParallelEnv):
 
     @property
     def vehicles(self) -> dict[str, Vehicle]:
-        """Returns the vehicle of each agent that was observed last: those that live, and those that ended then."""
+        """Returns the vehicle of each agent of the last observations: agents that live or ended with them."""
         all_vehicles = dict(zip(self.possible_agents, self.highway.controlled_vehicles, strict=True))
         return {agent: all_vehicles[agent] for agent in self._observed}
 
@@ -149,10 +149,10 @@ class HighwayParallelEnv(ParallelEnv):
         return bool(info["agents_terminated"][index] or off_road)
 
     def _clear_abandoned(self) -> None:
-        """Takes vehicles without an agent off the end of the road; highway-env spares all that had one."""
+        """Removes vehicles without an agent at the end of the road; highway-env keeps all that had one."""
         alive = dict(zip(self.possible_agents, self.highway.controlled_vehicles, strict=True))
         for agent, vehicle in alive.items():
-            end_m = vehicle.lane.length - 4 * vehicle.LENGTH  # where highway-env takes traffic off
+            end_m = vehicle.lane.length - 4 * vehicle.LENGTH  # where highway-env removes traffic
             if agent not in self.agents and self.highway.has_arrived(vehicle, end_m):
                 self.highway.road.vehicles = [v for v in self.highway.road.vehicles if v is not vehicle]
 
@@ -168,7 +168,7 @@ class HighwayParallelEnv(ParallelEnv):
 
 
 def _make(env_id: str, **kwargs: Any) -> gym.Env:
-    """Returns `gym.make`'s unwrapped environment; what Gymnasium refuses is a `UserError`."""
+    """Returns `gym.make`'s unwrapped environment; turns Gymnasium's errors into a `UserError`."""
     try:
         return gym.make(env_id, disable_env_checker=True, **kwargs).unwrapped
     except (gym.error.Error, ModuleNotFoundError) as error:

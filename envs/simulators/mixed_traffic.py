@@ -1,9 +1,10 @@
-"""Driving scenarios whose traffic mixes drivers, as gymnasium ids: a driver's past motion tells how it drives.
+"""Driving scenarios with mixed drivers, as gymnasium ids: a driver's traits can be inferred from its past motion.
 
 Each driver of these environments has traits of its own (a law of driving, a wished speed, a time gap, ...), drawn from
-the environment's generator and kept for life. No observation shows them; labels do (`envs.readers.highway_labels`).
-Otherwise they are highway-env's environments, read, wrapped and drawn like those. Importing this module registers the
-ids; a process that has not imported it makes them by `gym.make("envs.simulators.mixed_traffic:highway-mixed-v0")`.
+the environment's generator and constant during the episode. No observation shows them; labels do
+(`envs.readers.highway_labels`). Otherwise they are highway-env's environments, read, wrapped and drawn like those.
+Importing this module registers the ids; a process that has not imported it makes them by
+`gym.make("envs.simulators.mixed_traffic:highway-mixed-v0")`.
 """
 
 from dataclasses import dataclass, fields
@@ -23,7 +24,7 @@ from predictor.support.errors import UserError
 
 DriverKind = Literal["idm", "aggressive", "defensive"]
 DRIVER_KINDS: tuple[DriverKind, ...] = ("idm", "aggressive", "defensive")
-"""The intelligent driver model, and highway-env's two linear laws; a label holds the place in this list."""
+"""The intelligent driver model, and highway-env's two linear laws; a label holds the index in this tuple."""
 Range = tuple[float, float]
 """Bounds of a uniform distribution."""
 _MAY_BE_ZERO = ("jam_gap_m", "politeness", "lane_change_gain_mps2")
@@ -46,9 +47,9 @@ class Traits:
     braking_mps2: float
     """Comfortable deceleration of IDM, positive (`-COMFORT_ACC_MIN`)."""
     exponent: float
-    """How late IDM stops accelerating below its wished speed (`DELTA`)."""
+    """IDM's exponent of acceleration (`DELTA`); larger accelerates longer up to the wished speed."""
     politeness: float
-    """How much the others' loss counts when it changes lane (MOBIL's `POLITENESS`)."""
+    """Weight of the others' loss of acceleration in a lane change (MOBIL's `POLITENESS`)."""
     lane_change_gain_mps2: float
     """Acceleration that a change of lane must gain (`LANE_CHANGE_MIN_ACC_GAIN`)."""
 
@@ -70,11 +71,11 @@ class DriverMix:
     """Distribution of traits; docs/datasets/mixed.md has the sources."""
 
     idm: KindMix = KindMix(1 / 3, speed_factor=(0.55, 1.0), time_gap_s=(0.8, 2.4))
-    """IDM heeds the lane's limit, so a factor above 1 would be cut."""
+    """IDM drivers; they keep to the lane's limit, so a factor above 1 would have no effect."""
     aggressive: KindMix = KindMix(1 / 3, speed_factor=(0.8, 1.1), time_gap_s=(1.2, 2.0))
-    """Linear and soft; fast and close."""
+    """Linear drivers with weak reactions; fast, at short gaps."""
     defensive: KindMix = KindMix(1 / 3, speed_factor=(0.55, 0.9), time_gap_s=(1.8, 2.8))
-    """Linear and stiff; slow and far."""
+    """Linear drivers with strong reactions; slow, at long gaps."""
     jam_gap_m: Range = (1.5, 4.0)
     """Range for all kinds."""
     acceleration_mps2: Range = (0.4, 1.5)
@@ -112,7 +113,7 @@ class DriverMix:
         return found
 
     def draw(self, rng: np.random.Generator) -> Traits:
-        """Draws one driver; takes as many numbers from the generator whatever its kind."""
+        """Draws one driver; every kind takes equally many numbers from the generator."""
         kind = DRIVER_KINDS[int(rng.choice(len(DRIVER_KINDS), p=[self.of(kind).share for kind in DRIVER_KINDS]))]
         own = self.of(kind)
         return Traits(
@@ -129,22 +130,22 @@ class DriverMix:
 
 
 class MixedDriver(LinearVehicle):
-    """Driver with traits of its own, whichever way highway-env creates it.
+    """Driver with traits of its own, in whatever way highway-env creates it.
 
-    All kinds steer alike, with highway-env's lane controller: its linear one tells nothing more about a driver. Another
+    All kinds steer alike, with highway-env's lane controller: its linear one reveals no more about a driver. Another
     mix is a subclass with another `mix`, named in the env's config as ``other_vehicles_type``.
 
     Args:
-        road: where it drives; its generator draws the traits.
-        position: [m].
-        heading: [rad].
-        speed: [m/s].
-        target_lane_index: the lane it steers for; None is the nearest.
-        target_speed: what the road asks for [m/s]; None is the limit of its lane.
+        road: road that it drives on; its generator draws the traits.
+        position: position [m].
+        heading: heading [rad].
+        speed: speed [m/s].
+        target_lane_index: lane that it steers for; None takes the nearest.
+        target_speed: speed that the road asks for [m/s]; None takes the limit of its lane.
         route: lanes to follow.
         enable_lane_change: whether it may change lane by its own choice.
-        timer: time since it last thought about a lane change [s].
-        traits: of a driver that exists already; None draws new ones.
+        timer: time since it last considered a lane change [s].
+        traits: traits of an existing driver; None draws new ones.
     """
 
     mix: ClassVar[DriverMix] = DriverMix()
@@ -170,7 +171,7 @@ class MixedDriver(LinearVehicle):
         )
         asked_mps = self.lane.speed_limit if target_speed is None else target_speed
         if asked_mps is not None:
-            self.target_speed = asked_mps  # also 0, which highway-env takes for none
+            self.target_speed = asked_mps  # also 0, which highway-env reads as None
         self.collecting_data = False  # highway-env would keep a growing list for each linear driver
         # On the instance: intersection environments write over constants of the class.
         self.TIME_WANTED = self.traits.time_gap_s
@@ -186,7 +187,7 @@ class MixedDriver(LinearVehicle):
 
     @property
     def target_speed(self) -> float:
-        """Wished speed [m/s]. Set it to what the road asks for; the driver scales that."""
+        """Wished speed [m/s]; set it to the speed that the road asks for, which the driver's factor scales."""
         return self.traits.speed_factor * self._asked_mps
 
     @target_speed.setter
@@ -195,7 +196,7 @@ class MixedDriver(LinearVehicle):
 
     @classmethod
     def create_from(cls, vehicle: ControlledVehicle) -> "MixedDriver":
-        """Returns a copy of the driver at its place; for another class of vehicle, a new driver at its place."""
+        """Returns a copy of the driver; for another class of vehicle, a new driver at that vehicle's place."""
         same = isinstance(vehicle, MixedDriver)
         return cls(
             vehicle.road,
@@ -214,8 +215,8 @@ class MixedDriver(LinearVehicle):
         """Does nothing: the traits are drawn already, and only some environments call this."""
 
     def acceleration(self, ego_vehicle: Any, front_vehicle: Any = None, rear_vehicle: Any = None) -> float:
-        """Returns the acceleration [m/s²] of this driver in the place of `ego_vehicle`; IDM's while it yields."""
-        # A linear driver who is told to yield at a crossing would roll on into it.
+        """Returns the acceleration [m/s²] of this driver in place of `ego_vehicle`, by IDM's law while it yields."""
+        # A linear driver that has to yield at a crossing would drive on into it.
         by_idm = self.traits.kind == "idm" or getattr(self, "is_yielding", False)
         law = IDMVehicle if by_idm else LinearVehicle
         return float(law.acceleration(self, ego_vehicle, front_vehicle, rear_vehicle))
@@ -236,7 +237,7 @@ class _Mixed(AbstractEnv):
 
 
 class MixedHighwayEnv(_Mixed, HighwayEnvFast):
-    """highway-fast-v0 among mixed drivers: they come in at much the same speed, and each makes for its own."""
+    """highway-fast-v0 among mixed drivers, which start at about equal speeds and change to their wished ones."""
 
 
 class MixedMergeEnv(_Mixed, ConnectedLaneMergeGenericEnv):
@@ -252,7 +253,8 @@ class MixedRoundaboutEnv(_Mixed, ConnectedLaneRoundaboutGenericEnv):
     """roundabout-generic-v1 among mixed drivers."""
 
     SPEED_LIMIT_MPS: ClassVar[float] = 14.0
-    """Speed at which highway-env starts its drivers; the lanes' default limit of 20 m/s would be twice gravity here."""
+    """Speed at which highway-env starts its drivers; at the lanes' default limit of 20 m/s the lateral acceleration
+    would be twice gravity here."""
 
     def _make_road(self) -> None:
         super()._make_road()
@@ -270,7 +272,7 @@ BASE_ID = {
     "roundabout-mixed-v0": "roundabout-generic-v1",
     "intersection-mixed-v0": "intersection-v2",
 }
-"""Our id → the id of highway-env that it varies."""
+"""Id defined here → the id of highway-env that it varies."""
 _CLASSES: dict[str, type[_Mixed]] = {
     "highway-mixed-v0": MixedHighwayEnv,
     "merge-mixed-v0": MixedMergeEnv,

@@ -1,1 +1,1 @@
-"""Drawings and films of environments with forecasts."""
+"""Pictures and videos of environments with forecasts."""

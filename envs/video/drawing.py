@@ -1,7 +1,6 @@
-"""How forecasts look in a picture: forecasts dashed, truth thin, edges as wide as they are likely; and how it is kept.
+"""Draws forecasts (dashed), true futures (thin) and edges (as wide as they are likely); writes PNG and MP4.
 
-Positions in, RGB out, pictures to PNG and MP4. `envs.video.highway` and `envs.video.multiagent` play the episodes and
-know where everything is.
+Takes positions and returns RGB arrays. `envs.video.highway` and `envs.video.multiagent` play the episodes.
 """
 
 import io
@@ -23,9 +22,9 @@ Color = tuple[int, int, int]
 Polyline = Float[np.ndarray, "_ 2"]
 
 SMOOTHING = 2
-"""Everything is drawn this much larger and scaled down."""
+"""Factor by which pictures are drawn larger before they are scaled down."""
 MARGIN_PX = 8.0
-"""Between what is drawn and the border of the picture, or of a box."""
+"""Distance between content and the border of the picture, or of a box [px]."""
 _SAMPLE_PX = 34.0
 _ARENA_MARGIN = 0.06  # of the longer side
 _MIN_ASPECT = 0.4
@@ -35,49 +34,49 @@ _GRID_LINES = 6  # at least, along the longer side
 
 @dataclass(frozen=True)
 class OverlayStyle:
-    """Colours [RGB] and widths [px of the picture]."""
+    """Colours [RGB] and widths [px of the picture] of an overlay."""
 
     forecast_color: Color = (255, 190, 40)
-    """Dashed line, a dot per step."""
+    """Colour of forecasts: a dashed line, a dot per step."""
     forecast_width_px: float = 2.0
-    """Width of the dashes."""
+    """Width of the dashes [px]."""
     dash_px: float = 7.0
-    """Length of a dash; the gap is as long."""
+    """Length of a dash and of a gap [px]."""
     truth_color: Color = (15, 15, 15)
-    """Solid line."""
+    """Colour of the true future: a solid line."""
     truth_width_px: float = 1.5
-    """Width of the truth."""
+    """Width of the line of the true future [px]."""
     edge_color: Color = (235, 90, 220)
-    """From the ego to an agent."""
+    """Colour of edges from the ego to an agent."""
     edge_width_px: float = 8.0
-    """Width of an edge of probability 1."""
+    """Width of an edge of probability 1 [px]."""
     edge_alpha: int = 150
     """Opacity of edges, 0–255."""
     min_edge_prob: float = 0.02
-    """Edges below are not drawn."""
+    """Smallest probability of an edge that is drawn."""
     text_px: int = 15
-    """Height of text."""
+    """Height of text [px]."""
     text_color: Color = (240, 240, 240)
-    """Of caption and legend."""
+    """Colour of caption and legend."""
 
 
 @dataclass(frozen=True)
 class AgentOverlay:
-    """What is drawn for one agent; world positions [m]."""
+    """Lines and edge of one agent; world positions [m]."""
 
     now_m: tuple[float, float]
-    """Where it is in this picture."""
+    """Position in this picture."""
     forecast_m: tuple[Polyline, ...]
-    """One line per sample, from where it was when the forecast was made."""
+    """One line per sample, from its position when the forecast was made."""
     truth_m: Polyline
-    """Where it then went."""
+    """True future positions."""
     edge_prob: float
     """Probability that it interacts with the ego."""
 
 
 @dataclass(frozen=True)
 class View:
-    """Maps world positions to pixels, as highway-env's surface does but without rounding."""
+    """Maps world positions to pixels like highway-env's surface, without rounding."""
 
     origin_m: tuple[float, float]
     """World position of the upper left corner."""
@@ -87,26 +86,26 @@ class View:
     """Whether the world's y axis points up in the picture."""
 
     def pixels(self, positions_m: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 2"]:
-        """Pixel positions (x to the right, y down)."""
+        """Returns pixel positions (x to the right, y down)."""
         return (positions_m - np.array(self.origin_m)) * self.scaling * (1.0, -1.0 if self.y_up else 1.0)
 
 
 @dataclass(frozen=True)
 class Arena:
-    """A part of the world that is shown whole, with a grid that tells the scale."""
+    """Part of the world that fills the picture, with a grid that shows the scale."""
 
     view: View
-    """To pixels of the arena."""
+    """Map from world positions to pixels of the arena."""
     size_px: tuple[int, int]
-    """Width and height, both even."""
+    """Width and height [px], both even."""
     grid_m: float
-    """Between two lines: 1, 2 or 5 times a power of ten."""
+    """Distance between two lines of the grid [m]: 1, 2 or 5 times a power of ten."""
 
     @classmethod
     def around(
         cls, places_m: Float[np.ndarray, "places 2"], radii_m: Float[np.ndarray, " places"], longest_px: int, y_up: bool
     ) -> "Arena":
-        """Holds discs of these radii at these places, at least one, with a margin; its longer side is `longest_px`."""
+        """Returns an arena that holds discs (at least one) with a margin; its longer side is `longest_px`."""
         low, high = (places_m - radii_m[:, None]).min(axis=0), (places_m + radii_m[:, None]).max(axis=0)
         longest_m = max(float((high - low).max()), _MIN_ARENA_M)
         spans_m = np.maximum(high - low, _MIN_ASPECT * longest_m) + 2 * _ARENA_MARGIN * longest_m
@@ -120,21 +119,21 @@ class Arena:
         return cls(View((float(corner_m[0]), float(corner_m[1])), scaling, y_up), (width, height), grid_m)
 
     def grid(self) -> list[Polyline]:
-        """Lines at multiples of `grid_m` [px]."""
+        """Returns lines at multiples of `grid_m` [px]."""
         width, height = self.size_px
         x_m, y_m = self.view.origin_m
         spans_m = np.array(self.size_px) / self.view.scaling
         xs_m = _multiples(self.grid_m, x_m, x_m + spans_m[0])
         low_m = y_m - spans_m[1] if self.view.y_up else y_m
         ys_m = _multiples(self.grid_m, low_m, low_m + spans_m[1])
-        columns = self.view.pixels(np.stack([xs_m, np.zeros_like(xs_m)], axis=-1))[:, 0]
-        rows = self.view.pixels(np.stack([np.zeros_like(ys_m), ys_m], axis=-1))[:, 1]
-        upright = [np.array([[x, 0.0], [x, height]]) for x in columns]
-        return upright + [np.array([[0.0, y], [width, y]]) for y in rows]
+        xs_px = self.view.pixels(np.stack([xs_m, np.zeros_like(xs_m)], axis=-1))[:, 0]
+        ys_px = self.view.pixels(np.stack([np.zeros_like(ys_m), ys_m], axis=-1))[:, 1]
+        upright = [np.array([[x, 0.0], [x, height]]) for x in xs_px]
+        return upright + [np.array([[0.0, y], [width, y]]) for y in ys_px]
 
 
 def _multiples(step: float, low: float, high: float) -> Float[np.ndarray, " multiples"]:
-    """Those of `step` between the two."""
+    """Returns the multiples of `step` between `low` and `high`."""
     return np.arange(math.ceil(low / step), math.floor(high / step) + 1) * step
 
 
@@ -146,7 +145,7 @@ def draw_overlay(
     caption: str,
     style: OverlayStyle,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """The picture with edges, truth, forecasts, caption and legend over it."""
+    """Draws edges, true futures, forecasts, caption and legend over a picture; returns the result."""
     size = (picture.width * SMOOTHING, picture.height * SMOOTHING)
     overlay = Image.new("RGBA", size, (0, 0, 0, 0))
     pen = Pen(ImageDraw.Draw(overlay), style)
@@ -167,24 +166,24 @@ def draw_overlay(
 
 
 def decode_png(data: bytes) -> Image.Image:
-    """A picture that was kept compressed."""
+    """Returns the picture in PNG data."""
     return Image.open(io.BytesIO(data))
 
 
 def encode_png(pixels: UInt8[np.ndarray, "height width 3"]) -> bytes:
-    """Compress a picture; highway-env's flat colours shrink about a hundredfold."""
+    """Returns a picture as PNG data, about a hundredth of its size for highway-env's flat colours."""
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, format="PNG", compress_level=1)
     return buffer.getvalue()
 
 
 def write_video(path: str | Path, pictures: Iterable[UInt8[np.ndarray, "height width 3"]], fps: int) -> None:
-    """Encode as MP4 (H.264, yuv420p); `path` is always a whole file.
+    """Writes a video as MP4 (H.264, yuv420p); `path` is never a partial file.
 
     Args:
-        path: where to.
-        pictures: at least one, all of one size; height and width are even, as H.264 needs them.
-        fps: pictures per second.
+        path: path of the video.
+        pictures: at least one, all of one size; height and width must be even for H.264.
+        fps: number of pictures per second.
     """
     path = Path(path)
     rest = iter(pictures)
@@ -201,12 +200,12 @@ def write_video(path: str | Path, pictures: Iterable[UInt8[np.ndarray, "height w
 
 
 def write_picture(path: str | Path, picture: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Save as PNG."""
+    """Writes a picture as PNG."""
     Image.fromarray(picture).save(path, format="PNG")
 
 
 def dashes(line: Polyline, dash: float) -> list[Polyline]:
-    """Cut a polyline into dashes of length `dash` with gaps of the same length; corners are kept."""
+    """Cuts a polyline into dashes of length `dash` with gaps of equal length; corners are kept."""
     lengths = np.hypot(*np.diff(line, axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(lengths)])
     pieces = []
@@ -223,20 +222,20 @@ class Pen:
     """Draws in pixels of the picture on a canvas `SMOOTHING` times larger."""
 
     canvas: ImageDraw.ImageDraw
-    """Of an RGBA picture, or one that blends."""
+    """Canvas of an RGBA picture, or one that blends."""
     style: OverlayStyle
-    """How it looks."""
+    """Colours and widths."""
 
     def edge(self, line: Polyline, prob: float) -> None:
-        """As wide as it is likely."""
+        """Draws an edge whose width is proportional to its probability."""
         self.line(line, max(1.0, prob * self.style.edge_width_px), (*self.style.edge_color, self.style.edge_alpha))
 
     def truth(self, line: Polyline) -> None:
-        """Thin."""
+        """Draws a true future: thin and solid."""
         self.line(line, self.style.truth_width_px, (*self.style.truth_color, 255))
 
     def forecast(self, line: Polyline, color: Color | None = None) -> None:
-        """Dashed, a dot at each point but the first; in the style's colour unless said."""
+        """Draws a forecast: dashed, with a dot at each point but the first; None takes the style's colour."""
         opaque = (*(color or self.style.forecast_color), 255)
         for piece in dashes(line, self.style.dash_px):
             self.line(piece, self.style.forecast_width_px, opaque)
@@ -244,56 +243,56 @@ class Pen:
             self.disc(point, 1.2 * self.style.forecast_width_px, opaque)
 
     def disc(self, center: Float[np.ndarray, "2"], radius: float, color: tuple[int, int, int, int]) -> None:
-        """Filled."""
+        """Draws a filled disc."""
         corners = np.concatenate([center - radius, center + radius]) * SMOOTHING
         self.canvas.ellipse(corners.tolist(), fill=color)
 
     def ring(
         self, center: Float[np.ndarray, "2"], radius: float, width: float, color: tuple[int, int, int, int]
     ) -> None:
-        """A circle; its width lies within the radius."""
+        """Draws a circle whose width lies within the radius."""
         corners = np.concatenate([center - radius, center + radius]) * SMOOTHING
         self.canvas.ellipse(corners.tolist(), outline=color, width=round(width * SMOOTHING))
 
     def box(self, left: float, top: float, right: float, bottom: float) -> None:
-        """A dark ground for text."""
+        """Draws a dark background for text."""
         corners = [value * SMOOTHING for value in (left, top, right, bottom)]
         self.canvas.rounded_rectangle(corners, radius=4 * SMOOTHING, fill=(25, 25, 25, 190))
 
     def text(self, x: float, y: float, text: str) -> float:
-        """Write with the vertical middle at y; returns where the text ends."""
+        """Draws text with the vertical middle at y; returns the x of its end."""
         font, fill = _font(self.style.text_px * SMOOTHING), (*self.style.text_color, 255)
         self.canvas.text((x * SMOOTHING, y * SMOOTHING), text, fill=fill, font=font, anchor="lm")
         return x + self.text_width(text)
 
     def text_width(self, text: str) -> float:
-        """How wide it would be."""
+        """Returns the width of a text [px]."""
         return self.canvas.textlength(text, font=_font(self.style.text_px * SMOOTHING)) / SMOOTHING
 
     def line(self, line: Polyline, width: float, color: tuple[int, int, int, int]) -> None:
-        """Solid; nothing if it is a single point."""
+        """Draws a solid line; nothing for a single point."""
         if len(line) < 2:
             return
         points = [(float(x), float(y)) for x, y in line * SMOOTHING]
         self.canvas.line(points, fill=color, width=max(1, round(width * SMOOTHING)), joint="curve")
 
     def legend(self, x: float, y: float, entries: "Legend") -> None:
-        """A sample of each entry and its name, in a row with the vertical middle at y."""
+        """Draws a sample of each entry and its name, side by side with the vertical middle at y."""
         for name, draw in entries:
             draw(self, np.array([[x, y], [x + _SAMPLE_PX, y]]))
             x = self.text(x + _SAMPLE_PX + MARGIN_PX, y, name) + 2 * MARGIN_PX
 
     def legend_width(self, entries: "Legend") -> float:
-        """How wide it would be."""
+        """Returns the width of a legend [px]."""
         return sum(_SAMPLE_PX + 3 * MARGIN_PX + self.text_width(name) for name, _ in entries) - 2 * MARGIN_PX
 
 
 Legend = Sequence[tuple[str, Callable[[Pen, Polyline], None]]]
-"""Names, and what draws a sample of each along a line [px]."""
+"""Names, each with a function that draws a sample along a line [px]."""
 
 
 def blank(size_px: tuple[int, int], color: Color, style: OverlayStyle) -> tuple[Image.Image, Pen]:
-    """An empty picture, `SMOOTHING` times larger than `size_px` (width, height), and a pen that blends on it."""
+    """Returns an empty picture, `SMOOTHING` times larger than `size_px` (width, height), and its blending pen."""
     picture = Image.new("RGB", (size_px[0] * SMOOTHING, size_px[1] * SMOOTHING), color)
     return picture, Pen(ImageDraw.Draw(picture, "RGBA"), style)
 
@@ -301,15 +300,15 @@ def blank(size_px: tuple[int, int], color: Color, style: OverlayStyle) -> tuple[
 def draw_page(
     body: Image.Image, caption: str, above: Legend, below: Legend, width_px: int, style: OverlayStyle
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """A picture on white, with the caption and a legend above it and another legend below; of even size.
+    """Draws a picture on white, with the caption and a legend above and another legend below; its size is even.
 
     Args:
-        body: `SMOOTHING` times larger than it will be.
-        caption: first line.
-        above: second line.
-        below: last line.
-        width_px: `page_width` of all this, or more.
-        style: of text and samples.
+        body: picture, `SMOOTHING` times larger than on the page.
+        caption: text of the first line.
+        above: legend of the second line.
+        below: legend of the last line.
+        width_px: width of the page, at least `page_width`.
+        style: style of text and samples.
     """
     line_px = style.text_px + MARGIN_PX
     top = round(2 * line_px + MARGIN_PX)
@@ -323,7 +322,7 @@ def draw_page(
 
 
 def page_width(body_px: int, caption: str, legends: Iterable[Legend], style: OverlayStyle) -> int:
-    """How wide a page must be for a body of this width, the caption and the widest legend [px]; even."""
+    """Returns the width of a page for a body of this width, the caption and the widest legend [px]; even."""
     _, pen = blank((1, 1), (255, 255, 255), style)
     inner = max(float(body_px), pen.text_width(caption), *(pen.legend_width(legend) for legend in legends))
     return 2 * math.ceil(inner / 2 + MARGIN_PX)
@@ -335,7 +334,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def _draw_captions(pen: Pen, size: tuple[int, int], caption: str) -> None:
-    """The caption in the upper left corner, the legend in the lower left one."""
+    """Draws the caption in the upper left corner, the legend in the lower left one."""
     height = pen.style.text_px + 8.0
     pen.box(MARGIN_PX, MARGIN_PX, 3 * MARGIN_PX + pen.text_width(caption), MARGIN_PX + height)
     pen.text(2 * MARGIN_PX, MARGIN_PX + height / 2, caption)

@@ -1,9 +1,9 @@
-"""Film an episode: highway-env's own picture with forecasts, edge weights and what then happened drawn into it.
+"""Films an episode: draws forecasts, edge probabilities and true futures into highway-env's own pictures.
 
-The episode is played first and drawn afterwards, when the truth is known. Forecasts stay where they were made (anchored
-in the world) until the next policy step replaces them. Pictures come from highway-env's viewer, made larger; its
-agent-display hook is not used, because every env of a process shares it. Knows nothing of policies: `act` is any
-function from an observation to an action.
+The episode is played first and drawn afterwards, when the true futures are known. Forecasts stay where they were made
+(anchored in the world) until the next policy step replaces them. Pictures come from highway-env's viewer, made larger;
+its agent-display hook is not used, because every env of a process shares it. `act` is any function from an observation
+to an action.
 """
 
 import os
@@ -33,12 +33,12 @@ from predictor.support.errors import UserError
 ENLARGE = 2.0
 """Size of the picture relative to highway-env's."""
 WIDEN = 1.25
-"""How much more road is shown than by highway-env: forecasts reach far ahead."""
+"""Length of road in the picture relative to highway-env's; larger, since forecasts reach far ahead."""
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """One picture, and what is needed to draw on it."""
+    """One picture and the simulator's state, to draw on it."""
 
     png: bytes
     view: View
@@ -49,7 +49,7 @@ class _Frame:
 
 @dataclass(frozen=True)
 class _Step:
-    """What was forecast at one policy step."""
+    """Forecasts of one policy step."""
 
     frame: int
     keys: tuple[int, ...]
@@ -59,18 +59,18 @@ class _Step:
 
 @dataclass
 class Recording:
-    """A played episode, ready to be drawn."""
+    """Played episode, which can be drawn."""
 
     env_id: str
     """Gymnasium id."""
     fps: int
-    """Pictures per second, as highway-env plays them: twice real time."""
+    """Number of pictures per second, as in highway-env: twice real time."""
     frames_per_step: int
-    """Pictures per policy step."""
+    """Number of pictures per policy step."""
     dt_s: float
     """Length of a policy step [s]."""
     style: OverlayStyle
-    """How it will look."""
+    """Colours and widths of the drawing."""
     total_reward: float = 0.0
     """Return of the episode."""
     crashed: bool = False
@@ -85,28 +85,28 @@ class Recording:
 
     @property
     def num_steps(self) -> int:
-        """Policy steps played."""
+        """Number of policy steps played."""
         return len(self._steps) - 1
 
     def frame_of_step(self, step: int) -> int:
-        """Index of the picture at the moment of a policy step."""
+        """Returns the index of the picture at a policy step."""
         if not 0 <= step < len(self._steps):
             raise UserError(f"step must lie in [0, {len(self._steps)}), got {step}")
         return self._steps[step].frame
 
     def draw(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
-        """The annotated picture."""
+        """Returns the annotated picture."""
         frame = self._frames[index]
         step = self._steps[frame.step]
         start = self._frames[step.frame]
         agents = [
             AgentOverlay(
                 now_m=frame.positions_m[key],
-                forecast_m=tuple(np.vstack([start.positions_m[key], sample]) for sample in step.forecast_m[row]),
+                forecast_m=tuple(np.vstack([start.positions_m[key], sample]) for sample in step.forecast_m[i]),
                 truth_m=self._truth(key, step),
-                edge_prob=float(step.edge_probs[row]),
+                edge_prob=float(step.edge_probs[i]),
             )
-            for row, key in enumerate(step.keys)
+            for i, key in enumerate(step.keys)
             if key in frame.positions_m
         ]
         caption = f"{self.env_id}   t = {index / self.frames_per_step * self.dt_s:.1f} s   {frame.speed_mps:.1f} m/s"
@@ -115,15 +115,15 @@ class Recording:
         )
 
     def write_video(self, path: str | Path) -> None:
-        """Encode as MP4 (H.264, yuv420p); `path` is always a whole file."""
+        """Writes the video as MP4 (H.264, yuv420p); `path` is never a partial file."""
         write_video(path, (self.draw(index) for index in range(len(self))), self.fps)
 
     def write_frame(self, path: str | Path, index: int) -> None:
-        """Save one annotated picture as PNG."""
+        """Writes one annotated picture as PNG."""
         write_picture(path, self.draw(index))
 
     def _truth(self, key: int, step: _Step) -> Float[np.ndarray, "points 2"]:
-        """Where an agent went within the horizon of a forecast, picture by picture, while it was on the road."""
+        """Returns an agent's positions within the horizon of a forecast, one per picture, while it was on the road."""
         last = step.frame + step.forecast_m.shape[2] * self.frames_per_step
         seen = [f.positions_m[key] for f in self._frames[step.frame : last + 1] if key in f.positions_m]
         return np.array(seen)
@@ -137,14 +137,14 @@ def record_episode(
     max_steps: int | None = None,
     style: OverlayStyle | None = None,
 ) -> Recording:
-    """Play one episode and keep what is needed to draw it.
+    """Plays one episode and records it for drawing.
 
     Args:
         env: a highway-env environment made with `render_mode="rgb_array"`, wrapped in `ForecastObservation`.
-        act: from its observation to an action.
-        seed: the episode is reset with it.
-        max_steps: stop after so many policy steps.
-        style: how it will look.
+        act: function from its observation to an action.
+        seed: seed of the reset.
+        max_steps: largest number of policy steps.
+        style: colours and widths of the drawing.
 
     Raises:
         UserError: not a highway-env environment, or one that cannot be rendered to arrays.
@@ -168,7 +168,7 @@ def record_episode(
 
 
 class _Recorder:
-    """Follows an episode; stands where highway-env expects a video wrapper, to see the pictures between two steps."""
+    """Records an episode; takes the place of highway-env's video wrapper, to get the pictures between two steps."""
 
     frames_per_sec: int = 0  # set by highway-env
 
@@ -186,7 +186,7 @@ class _Recorder:
         self._reader: HighwayReader = env.get_wrapper_attr("reader")
 
     def begin(self) -> None:
-        """The first picture, just after the reset."""
+        """Records the first picture, after the reset."""
         base = self._base
         config = dict(base.config)
         for name in ("screen_width", "screen_height"):
@@ -200,21 +200,21 @@ class _Recorder:
         self._capture_frame()
 
     def note_step(self, reward: float, crashed: bool) -> None:
-        """A policy step is over: its last picture shows the new forecast."""
+        """Records the end of a policy step: its last picture shows the new forecast."""
         self.recording.total_reward += reward
         self.recording.crashed |= crashed
         self._note_forecast()
         self._capture_frame()
 
     def end(self) -> None:
-        """Leave the env as it was."""
+        """Removes the recorder and its viewer from the env."""
         self._base._record_video_wrapper = None
         if self._base.viewer is not None:
             self._base.viewer.close()
             self._base.viewer = None
 
     def _capture_frame(self) -> None:
-        """Called by highway-env for every picture within a step, and by us for the one at its end."""
+        """Records a picture; called by highway-env for each picture within a step, by `note_step` for the last."""
         pixels = np.ascontiguousarray(self._base.render())
         surface = self._base.viewer.sim_surface
         full = self._reader.read_all(self._env)
@@ -227,19 +227,19 @@ class _Recorder:
 
     def _note_forecast(self) -> None:
         scene, forecast = self._env.scene, self._env.forecast
-        rows = np.flatnonzero(scene.valid)[1:]  # the ego needs no forecast of itself
-        keys = tuple(scene.ids[rows].tolist())
+        others = np.flatnonzero(scene.valid)[1:]  # without the ego
+        keys = tuple(scene.ids[others].tolist())
         xy_m = forecast.xy[0].double().cpu().numpy() + scene.states[0, :2]
-        probs = 1 - forecast.ego_edges()[0][0, :, 0, 0].double().cpu().numpy()  # who acts on the ego
-        step = _Step(len(self.recording._frames), keys, xy_m[:, rows].swapaxes(0, 1), probs[rows])
+        probs = 1 - forecast.ego_edges()[0][0, :, 0, 0].double().cpu().numpy()  # agent → ego
+        step = _Step(len(self.recording._frames), keys, xy_m[:, others].swapaxes(0, 1), probs[others])
         self.recording._steps.append(step)
 
 
 def _make_viewer(base: Any, config: dict[str, Any]) -> EnvViewer:
-    """A viewer that draws to memory and needs no display.
+    """Makes a viewer that draws to memory and needs no display.
 
-    SDL would look for a screen, and complain where there is none; its dummy driver does not. highway-env takes that
-    driver for a wish not to draw, so drawing is switched on again.
+    SDL fails without a screen unless its dummy driver is chosen. highway-env disables drawing for that driver, so it is
+    enabled again.
     """
     before = os.environ.get("SDL_VIDEODRIVER")
     os.environ["SDL_VIDEODRIVER"] = "dummy"

@@ -1,4 +1,4 @@
-"""What several test files of `agents` share: untrained policies, and an environment that nobody can read or drive."""
+"""Helpers of several test files of `agents`: untrained policies; an environment without reader and heuristic driver."""
 
 from typing import Any
 
@@ -54,9 +54,9 @@ _SEEN, _DONE = gym.spaces.Box(0, 10, (1,), np.float32), gym.spaces.Discrete(2)
 
 def policy_for(task: Task) -> PPO:
     """Untrained, with weights large enough that its actions depend on what it sees."""
-    rows = make_multiagent_venv(task, 1)
-    kind = "MultiInputPolicy" if isinstance(rows.observation_space, gym.spaces.Dict) else "MlpPolicy"
-    model = PPO(kind, rows, n_steps=4, batch_size=4 * rows.num_envs, policy_kwargs={"net_arch": [8]}, seed=0)
+    venv = make_multiagent_venv(task, 1)
+    kind = "MultiInputPolicy" if isinstance(venv.observation_space, gym.spaces.Dict) else "MlpPolicy"
+    model = PPO(kind, venv, n_steps=4, batch_size=4 * venv.num_envs, policy_kwargs={"net_arch": [8]}, seed=0)
     with torch.no_grad():
         for parameter in model.policy.parameters():
             parameter.mul_(5.0)

@@ -60,7 +60,7 @@ def test_one_command_from_nothing_to_a_summary(
 
 
 def test_a_run_that_was_stopped_goes_on(small: GpuSpringsConfig, monkeypatch: pytest.MonkeyPatch):
-    """The summary says how many steps the time is for."""
+    """The summary has the number of steps that the time is for."""
     sizes = replace(script.SPRINGS.budgets["smoke"], steps=3, eval_every=1, val_windows=4, test_windows=4)
     monkeypatch.setitem(script.SPRINGS.budgets, "smoke", sizes)
     whole = replace(small, steps=0)

@@ -107,7 +107,7 @@ def test_rows_and_intervals_closed_form():
     assert found.model.step_intervals["by_step_m"] == [pytest.approx((1.0, 3.0))] * HORIZON
     assert found.reduction == pytest.approx(0.5)
     assert found.reduction_interval == pytest.approx((0.5, 0.5))
-    assert [row.name for row in found.rows] == ["constant velocity (deployed)"] * 2 + ["constant velocity"]
+    assert [row.name for row in found.lines] == ["constant velocity (deployed)"] * 2 + ["constant velocity"]
 
 
 def test_an_episodes_first_scene_warms_up_and_is_not_timed():
@@ -177,7 +177,7 @@ def test_constant_velocity_is_its_own_baseline(env_id: str, in_process: None):
     assert (result.model.num_samples, result.model_samples.num_samples) == (1, 3)
     assert result.constant_velocity.min_ade_m > 0.01
     assert result.nearest_neighbours is None and result.graph is None and result.histories == {}
-    assert len(result.rows) == 3
+    assert len(result.lines) == 3
 
 
 def test_everyone_counts_in_an_arena_but_its_obstacles(in_process: None):
@@ -199,7 +199,7 @@ def test_a_learned_checkpoint_is_measured(in_process: None, tmp_path: Path):
     low, high = result.reduction_interval
     assert low <= result.reduction <= high
     assert all(np.isfinite(row.nll).all() and len(row.nll) == HORIZON for row in (result.model, result.model_samples))
-    assert [row.name for row in result.rows] == [
+    assert [row.name for row in result.lines] == [
         "dG-VAE", "dG-VAE", "dG-VAE, 1 step of history", "dG-VAE, 9 steps of history", "constant velocity",
     ]  # fmt: skip
     assert result.histories[9].by_step_m == pytest.approx(result.model.by_step_m, rel=1e-4)  # all of the episode
@@ -233,7 +233,7 @@ def test_neighbours_have_a_row_where_there_is_data(in_process: None, tmp_path: P
         assert found.nearest_neighbours.name == "nearest neighbours"
         assert found.nearest_neighbours.min_ade_m == pytest.approx(0.0, abs=1e-3)
         assert found.constant_velocity.min_ade_m > 0.1
-        assert found.nearest_neighbours in found.rows and len(found.rows) == 4
+        assert found.nearest_neighbours in found.lines and len(found.lines) == 4
 
 
 def test_a_policy_trained_on_forecasts_drives(in_process: None, tmp_path: Path, highway_checkpoint: str):

@@ -119,7 +119,7 @@ def reordered(shared: MultiagentScene, order: np.ndarray) -> MultiagentScene:
     """The same agents in other rows: row i holds what was in row order[i]."""
     scene = shared.scene
     place = np.argsort(order)
-    rows = {name: int(place[row]) for name, row in shared.rows.items()}
+    rows = {name: int(place[row]) for name, row in shared.index_of.items()}
     return MultiagentScene(
         Scene(scene.states[order], scene.ids[order], scene.valid[order]), rows, shared.heading_rad[order]
     )
@@ -151,8 +151,8 @@ def test_equals_a_plain_loop(seed: int, samples: int, types: int, perception_m: 
     forecast = random_world_forecast(rng, 6, samples, 3, types, 2)
     view = replace(WORLD, perception_m=perception_m, max_agents=max_agents)
     entries = agent_entries(shared, forecast, view)
-    assert list(entries) == list(shared.rows)
-    for name, row in shared.rows.items():
+    assert list(entries) == list(shared.index_of)
+    for name, row in shared.index_of.items():
         assert_same(entries[name], view_by_loops(shared, forecast, row, view), 1e-4)
         assert all(value.dtype == np.float32 for value in entries[name].values())
 
@@ -226,7 +226,7 @@ def test_views_wider_than_the_scene_are_padded():
 
 def test_nobody_who_learns_gets_nothing():
     rng = np.random.default_rng(0)
-    shared = replace(random_shared(rng), rows={})
+    shared = replace(random_shared(rng), index_of={})
     assert agent_entries(shared, random_world_forecast(rng, 6, 1, 2, 2, 1), WORLD) == {}
 
 
@@ -256,7 +256,7 @@ def test_every_agent_is_served_by_the_one_forecast(spec: SceneSpec, samples: int
         shared = moved(rng, shared)
         entries = made.observe(shared)
         assert made.forecast is not None
-        for name, row in shared.rows.items():
+        for name, row in shared.index_of.items():
             assert_same(entries[name], view_by_loops(shared, made.forecast, row, WORLD), 1e-4)
     assert len(entries) > 1
 
@@ -303,7 +303,7 @@ def test_reset_forgets():
     cut.reset()
     later = moved(rng, shared)
     remembered, actual, forgotten = kept.observe(later), cut.observe(later), fresh.observe(later)
-    name = next(iter(later.rows))
+    name = next(iter(later.index_of))
     assert_same(actual[name], forgotten[name])
     assert largest_difference(remembered[name], forgotten[name]) > 1e-3
 
@@ -315,7 +315,7 @@ def test_the_others_forecast_does_not_depend_on_who_learns(spec: SceneSpec):
     shared = shared_scene(*(tuple(rng.normal(size=4) * 20) for _ in range(4)))
     for _ in range(3):
         shared = moved(rng, shared)
-        expected, actual = all_learn.observe(shared), one_learns.observe(replace(shared, rows={"2": 2}))
+        expected, actual = all_learn.observe(shared), one_learns.observe(replace(shared, index_of={"2": 2}))
     assert list(actual) == ["2"]
     assert_same(actual["2"], expected["2"])
 
@@ -407,7 +407,7 @@ GOOD = shared_scene((1, 2, 3, 4), (5, 6, 7, 8))
 
 def test_a_good_scene_passes():
     assert check_multiagent_scene(GOOD, WORLD) is GOOD
-    assert check_multiagent_scene(shared_scene(), WORLD).rows == {}
+    assert check_multiagent_scene(shared_scene(), WORLD).index_of == {}
 
 
 @pytest.mark.parametrize(
@@ -415,14 +415,14 @@ def test_a_good_scene_passes():
     [
         (GOOD.scene, r"toy: reading must give a MultiagentScene .* got Scene"),
         (None, r"toy: reading must give a MultiagentScene .* got NoneType"),
-        (shared_scene((1, 2, 3, 4), rows=3), r"toy: a scene needs 6 rows \(max_agents\), padding included, got 3"),
+        (shared_scene((1, 2, 3, 4), rows=3), r"toy: a scene needs 6 agents \(max_agents\), padding included, got 3"),
         (shared_scene((1, 2, 3, 4), (5, 6, 7, 8), ids=(4, 4)), "toy: ids must be unique"),
         (replace(GOOD, heading_rad=np.zeros(5)), "toy: heading_rad must hold 6 finite numbers"),
         (replace(GOOD, heading_rad=np.full(6, np.nan)), "toy: heading_rad must hold 6 finite numbers"),
-        (replace(GOOD, rows={"a": 0, "b": 0}), "toy: every agent needs a row of its own, got {'a': 0, 'b': 0}"),
-        (replace(GOOD, rows={"a": 2}), "toy: agent 'a' should be in row 2, but the scene has nobody there"),
-        (replace(GOOD, rows={"a": 6}), "toy: agent 'a' should be in row 6"),
-        (replace(GOOD, rows={"a": -6}), "toy: agent 'a' should be in row -6"),
+        (replace(GOOD, index_of={"a": 0, "b": 0}), "toy: every agent needs an index of its own, got {'a': 0, 'b': 0}"),
+        (replace(GOOD, index_of={"a": 2}), "toy: agent 'a' has index 2, but the scene has no agent there"),
+        (replace(GOOD, index_of={"a": 6}), "toy: agent 'a' has index 6"),
+        (replace(GOOD, index_of={"a": -6}), "toy: agent 'a' has index -6"),
     ],
 )
 def test_a_bad_scene_is_named(shared: Any, message: str):

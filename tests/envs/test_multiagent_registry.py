@@ -99,8 +99,8 @@ def test_every_id_makes_and_reads(env_id: str):
     steps = 0
     while env.agents:
         shared = reader.read(env)
-        shared.scene.check(env_id, reader.spec, rows=reader.spec.max_agents)
-        assert set(shared.rows) == set(env.agents)
+        shared.scene.check(env_id, reader.spec, agents=reader.spec.max_agents)
+        assert set(shared.index_of) == set(env.agents)
         env.step(dict.fromkeys(env.agents, 0))
         steps += 1
     assert steps == 3
@@ -127,7 +127,7 @@ def test_the_intersection_reads():
     env.reset(seed=0)
     reader = multiagent_reader_for(env, perception_m=40.0)
     assert reader.spec.perception_m == 40.0
-    assert set(reader.read(env).rows) == set(env.agents)
+    assert set(reader.read(env).index_of) == set(env.agents)
 
 
 def test_arguments_reach_the_environment():

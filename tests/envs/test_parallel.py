@@ -421,11 +421,11 @@ def test_scene_and_forecast_are_of_the_latest_step():
     env = wrap(Toy({"a": Life(), "b": Life()}), forecaster=ConstantVelocity(WORLD, 2), perception_m=np.inf)
     env.reset(seed=0)
     observations, *_ = env.step(act(env))
-    scene, row = env.scene.scene, env.scene.rows["a"]
+    scene, row = env.scene.scene, env.scene.index_of["a"]
     np.testing.assert_array_equal(scene.states[row], env.unwrapped.tracks[1, 0])
     expected = scene.states[row, :2] + 2 * scene.states[row, 2:4]
     np.testing.assert_allclose(env.forecast.xy[0, 0, row, 1], expected, rtol=1e-5)
-    offset = env.forecast.xy[0, 0, env.scene.rows["b"], 1].numpy() - scene.states[row, :2]
+    offset = env.forecast.xy[0, 0, env.scene.index_of["b"], 1].numpy() - scene.states[row, :2]
     assert np.linalg.norm(observations["a"]["forecast"][0, 1]) == pytest.approx(np.linalg.norm(offset), rel=1e-4)
     assert env.scene_spec is env.reader.spec
 
@@ -549,7 +549,7 @@ def test_an_aec_env_is_told_how_to_convert(monkeypatch: pytest.MonkeyPatch):
 def test_a_reader_that_breaks_the_contract_is_named():
     class Careless(ToyReader):
         def read(self, env: Any) -> MultiagentScene:
-            return replace(super().read(env), rows={"stays": 7})
+            return replace(super().read(env), index_of={"stays": 7})
 
     env = ForecastParallelEnv(Toy(), "constant-velocity", reader=Careless)
     with pytest.raises(UserError, match="scene reader of env 'toy_v0': agent 'stays' should be in row 7"):

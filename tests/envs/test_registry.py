@@ -17,10 +17,10 @@ from envs.registry import (
     EnvEntry,
     checkpoint_for,
     entry_for,
+    envpool_task_of,
     is_multiagent_id,
     make_env,
     make_multiagent_env,
-    native_task_of,
 )
 from envs.simulators.envpool import ENV_IDS as ENVPOOL_IDS
 from envs.simulators.envpool import HIGHWAY_ENV_OF
@@ -61,7 +61,7 @@ def test_native_environments_are_made_by_id():
     pytest.importorskip("envpool")
     env = make_env("envpool/HighwayFast-v0", vehicles_count=7)
     assert env.unwrapped.task_id == "HighwayFast-v0"  # type: ignore[attr-defined]
-    assert env.unwrapped.native_config["vehicles_count"] == 7  # type: ignore[attr-defined]
+    assert env.unwrapped.envpool_config["vehicles_count"] == 7  # type: ignore[attr-defined]
     assert env.action_space == gym.spaces.Discrete(5)
     env.close()
 
@@ -77,17 +77,17 @@ def test_native_environments_are_made_by_id():
     ],
 )
 def test_the_native_copy_has_the_version_or_else_the_name(env_id: str, task: str):
-    assert native_task_of(env_id) == task
+    assert envpool_task_of(env_id) == task
 
 
 def test_every_copy_is_found():
-    assert {native_task_of(env_id) for env_id in HIGHWAY_ENV_OF.values()} == set(HIGHWAY_ENV_OF)
+    assert {envpool_task_of(env_id) for env_id in HIGHWAY_ENV_OF.values()} == set(HIGHWAY_ENV_OF)
 
 
 @pytest.mark.parametrize("env_id", ["merge-generic-v1", "roundabout-generic-v1", "nonsense", ""])
 def test_what_was_not_copied_is_named(env_id: str):
     with pytest.raises(UserError, match=f"EnvPool has no copy of '{env_id}'; it has highway-v0, .*without --backend"):
-        native_task_of(env_id)
+        envpool_task_of(env_id)
 
 
 @pytest.mark.parametrize(

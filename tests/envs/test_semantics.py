@@ -145,11 +145,11 @@ def test_an_id_is_a_body(name: str, take: Callable[[str], Take]):
 
 def sorted_anew(shared: MultiagentScene, rng: np.random.Generator) -> MultiagentScene:
     """The same scene with everyone in another row; a single ego keeps the first."""
-    fixed = int(EGO in shared.rows)
+    fixed = int(EGO in shared.index_of)
     order = np.r_[np.arange(fixed), fixed + rng.permutation(len(shared.scene.ids) - fixed)]
     place, scene = np.argsort(order), shared.scene
     moved = Scene(scene.states[order], scene.ids[order], scene.valid[order], scene.heading_rad)
-    rows = {name: int(place[row]) for name, row in shared.rows.items()}
+    rows = {name: int(place[row]) for name, row in shared.index_of.items()}
     return MultiagentScene(moved, rows, shared.heading_rad[order])
 
 
@@ -281,7 +281,7 @@ def test_views_turn_with_the_viewer_and_start_from_it(name: str, take: Callable[
     for moment in take(name).episodes[0][::2]:
         scene, xy = moment.shared.scene, moment.forecast.xy[0, 0].numpy()
         for viewer, view in moment.views.items():
-            row = moment.shared.rows[viewer]
+            row = moment.shared.index_of[viewer]
             heading_rad, own = moment.shared.heading_rad[row], scene.states[row]
             origin = 0.0 if session.spec.has_ego else own[:2]  # of the forecast behind the views
             cos, sin = np.cos(heading_rad), np.sin(heading_rad)
@@ -307,7 +307,7 @@ def test_views_hold_the_nearest_within_perception(name: str, rows: int | None, f
     for moment in session.play(subject.seed, steps=4):
         places = np.array([place for _, place in moment.bodies])
         for viewer, view in moment.views.items():
-            own = moment.shared.scene.states[moment.shared.rows[viewer], :2]
+            own = moment.shared.scene.states[moment.shared.index_of[viewer], :2]
             around_m = np.sort(np.linalg.norm(places - own, axis=1))[1:]  # the first is the viewer
             expected = around_m[around_m <= subject.near_m][: session.view.max_agents - 1]
             seen_m = np.linalg.norm(view["agents"][view["valid"] == 1, :2], axis=1)

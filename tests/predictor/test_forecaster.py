@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from predictor.forecaster import Belief, Memory, edgeless_belief
-from predictor.graph import NOBODY
+from predictor.graph import NO_AGENT
 
 BATCH, AGENTS, SLOTS = 3, 4, 2
 seeds = st.integers(0, 2**16)
@@ -54,10 +54,10 @@ def test_padding_adds_agents_without_memory():
     assert all(torch.equal(a, b) for a, b in zip(before.padded(AGENTS).pairs, before.pairs, strict=True))
 
 
-def test_select_and_replace_rows():
+def test_select_and_replace_envs():
     before, other = memory(0), memory(1, batch=2)
     rows = torch.tensor([2, 0])
-    after = before.replace_rows(rows, other)
+    after = before.replace_envs(rows, other)
     assert torch.equal(after.select(rows).nodes[0], other.nodes[0])
     for kind in (0, 1):
         assert torch.equal(after.pairs[kind][2], other.pairs[kind][0])
@@ -75,7 +75,7 @@ def test_concatenate_keeps_the_order_of_rows():
 def test_forecasters_without_memory_have_an_empty_one():
     empty, rows = Memory(), torch.tensor([0])
     assert empty.reorder(torch.zeros(1, 2).long(), torch.ones(1, 2).bool()) == empty
-    assert empty.select(rows) == empty.replace_rows(rows, empty) == Memory.concatenate(empty, empty) == empty
+    assert empty.select(rows) == empty.replace_envs(rows, empty) == Memory.concatenate(empty, empty) == empty
 
 
 # --- With a list of senders -------------------------------------------------------------------------------------------
@@ -86,8 +86,8 @@ def listed(seed: int, batch: int = BATCH, slots: int = SLOTS) -> Memory:
     generator = torch.Generator().manual_seed(seed)
     score = torch.rand(batch, AGENTS, AGENTS, generator=generator) + 9 * torch.eye(AGENTS)
     senders = score.argsort(-1)[..., :slots]
-    senders[torch.rand(senders.shape, generator=generator) > 0.6] = NOBODY
-    held = (senders != NOBODY)[..., None]
+    senders[torch.rand(senders.shape, generator=generator) > 0.6] = NO_AGENT
+    held = (senders != NO_AGENT)[..., None]
     pairs = tuple(torch.randn(batch, AGENTS, slots, width, generator=generator) * held for width in (2, 3))
     return Memory((torch.randn(batch, AGENTS, 5, generator=generator),), pairs, senders)
 
@@ -98,7 +98,7 @@ def heard(memory: Memory, kind: int, row: int) -> dict[tuple[int, int], list[flo
     found: dict[tuple[int, int], list[float]] = {}
     for i, senders in enumerate(memory.senders[row].tolist()):
         for slot, j in enumerate(senders):
-            if j != NOBODY:
+            if j != NO_AGENT:
                 assert (i, j) not in found
                 found[i, j] = memory.pairs[kind][row, i, slot].tolist()
     return found
@@ -137,7 +137,7 @@ def test_reorder_with_senders_against_a_loop(seed: int, move: tuple[Tensor, Tens
 def test_to_slots_against_a_loop(seed: int, slots: int):
     before, now = listed(seed), listed(seed + 1, slots=slots).senders
     assert now is not None
-    present = now != NOBODY
+    present = now != NO_AGENT
     place = now.clamp(min=0)  # as `nearest` gives it: an empty slot points at somebody
     after = before.to_slots(place, present)
     assert after.nodes is before.nodes and torch.equal(after.senders, now)
@@ -163,7 +163,7 @@ def test_padding_adds_agents_that_hear_nobody():
     before = listed(0)
     after = before.padded(AGENTS + 2)
     assert after.senders is not None and before.senders is not None
-    assert torch.equal(after.senders[:, :AGENTS], before.senders) and (after.senders[:, AGENTS:] == NOBODY).all()
+    assert torch.equal(after.senders[:, :AGENTS], before.senders) and (after.senders[:, AGENTS:] == NO_AGENT).all()
     for ours, expected in zip((*after.nodes, *after.pairs), (*before.nodes, *before.pairs), strict=True):
         assert ours.shape == (BATCH, AGENTS + 2, *expected.shape[2:])
         assert torch.equal(ours[:, :AGENTS], expected) and not ours[:, AGENTS:].any()
@@ -176,7 +176,7 @@ def tensors(memory: Memory) -> list[Tensor]:
 
 def test_rows_take_their_senders_with_them():
     before, other, rows = listed(0), listed(1, batch=2), torch.tensor([2, 0])
-    for ours, old, new in zip(tensors(before.replace_rows(rows, other)), tensors(before), tensors(other), strict=True):
+    for ours, old, new in zip(tensors(before.replace_envs(rows, other)), tensors(before), tensors(other), strict=True):
         assert [torch.equal(ours[b], e) for b, e in enumerate((new[1], old[1], new[0]))] == [True] * 3
     for ours, old in zip(tensors(before.select(rows)), tensors(before), strict=True):
         assert torch.equal(ours, torch.stack([old[2], old[0]]))

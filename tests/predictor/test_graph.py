@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from predictor.graph import NOBODY, among_nearest, nearest, off_diagonal, others, pair_mask, to_dense, with_diagonal
+from predictor.graph import NO_AGENT, among_nearest, nearest, off_diagonal, others, pair_mask, to_dense, with_diagonal
 from predictor.layers.pairs import PairLinear, folded, sum_over_senders, to_pairs
 from tests.predictor.helpers import random_presence, random_states
 
@@ -135,7 +135,7 @@ def test_to_dense_against_a_loop(seed: int):
     batch, agents, slots = 2, 4, 3
     pairs, absent = draw(seed, batch, agents, slots, 2), draw(seed + 1, 2)
     senders = draw(seed + 2, batch, agents, agents).argsort(-1)[..., :slots]  # nobody twice
-    senders[draw(seed + 3, batch, agents, slots) > 0.5] = NOBODY  # what such a slot holds is nobody's
+    senders[draw(seed + 3, batch, agents, slots) > 0.5] = NO_AGENT  # what such a slot holds is nobody's
     dense = to_dense(pairs, senders, absent)
     for b, i, j in product(range(batch), range(agents), range(agents)):
         slot = senders[b, i].tolist().index(j) if j in senders[b, i] else None

@@ -516,7 +516,7 @@ def test_stores_are_mixed_by_their_windows(tiny: None, circles: Path, tmp_path: 
     assert data.sources == ("circles", "short")
     assert [len(w) for w in data.train] == [4 * 9, 4 * 1]
     trainer = Trainer(settings, data)
-    batch = trainer.feed.batch(trainer.plan(0))
+    batch = trainer.batches.batch(trainer.plan(0))
     longest = batch.valid[..., 0].sum(dim=1)
     assert len(batch.states) == 400
     assert 20 < int((longest == 2).sum()) < 130  # 1 in 10 from the short store, and the last windows of the other

@@ -17,8 +17,8 @@ from envs.readers.envpool import (
     EnvPoolReader,
     PoolIdentity,
     PoolReader,
+    envpool_spec,
     is_envpool_env,
-    native_spec,
     vehicles_of,
 )
 from envs.readers.highway import HighwayReader
@@ -89,8 +89,8 @@ def test_a_spec_is_that_of_the_mirrored_env(task_id: str):
 
 def test_dt_counts_whole_simulation_frames():
     """As the simulation does: 15 Hz of frames at 4 Hz of decisions are 3 frames, not 3.75."""
-    assert native_spec("Merge-v0", {"simulation_frequency": 15, "policy_frequency": 4}).dt_s == pytest.approx(0.2)
-    assert native_spec("Merge-v0", {"simulation_frequency": 15, "policy_frequency": 1}).dt_s == 1.0
+    assert envpool_spec("Merge-v0", {"simulation_frequency": 15, "policy_frequency": 4}).dt_s == pytest.approx(0.2)
+    assert envpool_spec("Merge-v0", {"simulation_frequency": 15, "policy_frequency": 1}).dt_s == 1.0
 
 
 @pytest.mark.parametrize("task_id", HIGHWAY_ENV_OF)
@@ -133,7 +133,7 @@ def test_the_ego_is_in_row_0(task_id: str):
 def test_perception_is_that_of_one_env(task_id: str, perception_m: float, max_agents: int):
     """The whole pool at once sees what `perceive` sees row by row, bit for bit."""
     pool, rng, rows = started(task_id, 5), np.random.default_rng(0), np.arange(5)
-    spec = native_spec(task_id, pool.config, perception_m, max_agents)
+    spec = envpool_spec(task_id, pool.config, perception_m, max_agents)
     reader = PoolReader(spec, 5)
     for _ in range(4):
         batch, everyone = reader.read(pool.debug_states(), rows), reader.read_all(pool.debug_states(), rows)
@@ -165,7 +165,7 @@ def test_rows_of_different_length_are_padded():
 def test_identities_survive_a_hidden_order(task_id: str):
     """EnvPool's list keeps its order, so its index is the truth; the reader gets it shuffled, and kinematics only."""
     pool, rng, rows = started(task_id, 4, duration=12), np.random.default_rng(1), np.arange(4)
-    reader = PoolReader(native_spec(task_id, pool.config), 4)
+    reader = PoolReader(envpool_spec(task_id, pool.config), 4)
     count = len(pool.debug_states()[0].vehicles)
     before, clock, pairs = np.zeros((4, count), dtype=np.int64), np.full(4, 99), 0
     for _ in range(20):
@@ -229,7 +229,7 @@ def test_many_rows_at_once_are_as_one_by_one(seed: int, agents: int, gate_m: flo
 
 def test_a_skipped_step_is_part_of_the_motion():
     pool, rows, order = started("HighwayFast-v0", 2), np.arange(2), np.r_[0, 20:0:-1]
-    reader = PoolReader(native_spec("HighwayFast-v0", pool.config), 2)
+    reader = PoolReader(envpool_spec("HighwayFast-v0", pool.config), 2)
     reader.read_all(pool.debug_states(), rows)
     for _ in range(3):
         for _ in range(2):
@@ -282,7 +282,7 @@ def test_only_envpool_is_taken_for_envpool():
 
 def test_a_task_without_a_reader_is_named():
     with pytest.raises(UserError, match="no scene reader knows EnvPool's task 'Parking-v0'; known: Highway-v0"):
-        native_spec("Parking-v0", {"simulation_frequency": 15, "policy_frequency": 5})
+        envpool_spec("Parking-v0", {"simulation_frequency": 15, "policy_frequency": 5})
 
 
 def test_a_vehicle_that_is_nowhere_is_named():

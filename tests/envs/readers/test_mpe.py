@@ -82,9 +82,9 @@ def test_every_scenario_reads(env_id: str, landmarks: bool):
     assert reader.spec.max_agents == AGENTS[env_id] + still
     while env.agents:
         shared = reader.read(env)
-        shared.scene.check(env_id, reader.spec, rows=reader.spec.max_agents)
-        assert sorted(shared.rows) == sorted(env.agents)
-        for name, row in shared.rows.items():
+        shared.scene.check(env_id, reader.spec, agents=reader.spec.max_agents)
+        assert sorted(shared.index_of) == sorted(env.agents)
+        for name, row in shared.index_of.items():
             body = named(env, name)
             np.testing.assert_array_equal(shared.scene.states[row, :4], [*body.state.p_pos, *body.state.p_vel])
             assert shared.scene.states[row, RADIUS] == body.size
@@ -144,7 +144,7 @@ def test_wrapped_environments_read_alike(tag: ParallelEnv):
     wrapped = BaseParallelWrapper(tag)
     plain, seen = MpeReader(tag).read(tag), MpeReader(wrapped).read(wrapped)
     np.testing.assert_array_equal(seen.scene.states, plain.scene.states)
-    assert seen.rows == plain.rows
+    assert seen.index_of == plain.index_of
 
 
 @pytest.mark.parametrize("rows", [4, 7])
@@ -183,7 +183,7 @@ def test_an_id_stays_with_its_entity_when_lists_are_sorted_anew(tag: ParallelEnv
         rng.shuffle(world_of(tag).landmarks)
         shared = reader.read(tag)
         assert entity_of_id(tag, shared) == first
-        for name, row in shared.rows.items():
+        for name, row in shared.index_of.items():
             np.testing.assert_array_equal(shared.scene.states[row, :2], named(tag, name).state.p_pos)
         orders.add(tuple(shared.scene.ids.tolist()))
     assert len(orders) > 1
@@ -201,7 +201,7 @@ def test_who_leaves_takes_its_number_along_although_python_reuses_addresses(tag:
         shared = reader.read(tag)
         numbers.append(int(shared.scene.ids[4]))
         addresses.append(id(visitor))
-        assert "visitor" not in shared.rows
+        assert "visitor" not in shared.index_of
         world.agents.pop()
         del visitor
     assert len(set(addresses)) < len(addresses)
@@ -273,7 +273,7 @@ def test_who_dies_in_the_middle_of_an_episode_has_no_row_but_its_body_stays(tag:
     before = reader.read(tag)
     tag.agents = [name for name in tag.agents if name != "adversary_1"]
     after = reader.read(tag)
-    assert sorted(after.rows) == ["adversary_0", "adversary_2", "agent_0"]
+    assert sorted(after.index_of) == ["adversary_0", "adversary_2", "agent_0"]
     np.testing.assert_array_equal(after.scene.ids, before.scene.ids)
     assert after.scene.valid.all()
 
@@ -283,10 +283,10 @@ def test_last_observations_have_rows_although_nobody_lives_by_then():
     env.reset(seed=0)
     reader = MpeReader(env)
     random_step(env, np.random.default_rng(0))
-    rows = reader.read(env).rows
+    rows = reader.read(env).index_of
     observations, *_ = env.step(dict.fromkeys(env.agents, 1))
     assert env.agents == []
-    assert reader.read(env).rows == rows
+    assert reader.read(env).index_of == rows
     assert set(rows) == set(observations)
 
 
@@ -326,7 +326,7 @@ def test_own_scenarios_read_too():
     assert is_mpe_env(env)
     assert mpe_scenario(env) == ""
     env.reset(seed=0)
-    assert MpeReader(env).read(env).rows == {"agent_0": 0}
+    assert MpeReader(env).read(env).index_of == {"agent_0": 0}
 
 
 def test_other_families_are_named():

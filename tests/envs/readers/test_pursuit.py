@@ -47,11 +47,11 @@ def test_scene_is_what_stands_on_the_grid():
     reader = PursuitReader(env)
     assert isinstance(reader, MultiagentReader)
     shared = reader.read(env)
-    shared.scene.check("pursuit", reader.spec, rows=5)
+    shared.scene.check("pursuit", reader.spec, agents=5)
     expected = [[0, 0, 0, 0, 0], [3, 2, 0, 0, 0], [15, 15, 0, 0, 1], [1, 12, 0, 0, 1], [2, 2, 0, 0, 1]]
     assert shared.scene.states.tolist() == expected
     assert shared.scene.ids.tolist() == [0, 1, 2, 3, 4]
-    assert shared.rows == {"pursuer_0": 0, "pursuer_1": 1}
+    assert shared.index_of == {"pursuer_0": 0, "pursuer_1": 1}
     assert not shared.heading_rad.any()
 
 
@@ -155,8 +155,8 @@ def test_the_last_scene_has_rows_for_everyone():
     assert all(terminations.values())
     assert env.agents == []
     shared = reader.read(env)
-    assert shared.rows == {"pursuer_0": 0, "pursuer_1": 1}
-    assert set(shared.rows) == set(observations)
+    assert shared.index_of == {"pursuer_0": 0, "pursuer_1": 1}
+    assert set(shared.index_of) == set(observations)
     assert shared.scene.valid.tolist() == [True, True, False]
 
 
@@ -164,7 +164,7 @@ def test_who_dies_in_the_middle_of_an_episode_has_no_row_but_its_body_stays():
     env = placed([(4, 2), (6, 2)], [(9, 9)])
     env.agents = ["pursuer_1"]
     shared = PursuitReader(env).read(env)
-    assert shared.rows == {"pursuer_1": 1}
+    assert shared.index_of == {"pursuer_1": 1}
     assert shared.scene.valid.all()
 
 

@@ -108,7 +108,7 @@ def test_tables_of_a_terminal_have_units_and_dashes():
 
 def test_lines_by_horizon_carry_the_numbers():
     figure, ax = plt.subplots()
-    report.plot_by_horizon(ax, full().rows, 0.1, "by_step_m", "displacement [m]")
+    report.plot_by_horizon(ax, full().lines, 0.1, "by_step_m", "displacement [m]")
     lines = {str(line.get_label()): line for line in ax.get_lines()}
     assert list(lines) == [
         "dG-VAE, K = 1", "dG-VAE, K = 20", "dG-VAE, 1 step of history, K = 1", "nearest neighbours",

@@ -32,7 +32,7 @@ def world(request: pytest.FixtureRequest) -> World:
 
 def test_who_is_perceived_is_among_everyone(world: World):
     for perceived, everyone in watched(world, seed=0):
-        perceived.check("perceived", world.spec, rows=world.spec.max_agents)
+        perceived.check("perceived", world.spec, agents=world.spec.max_agents)
         everyone.check("everyone", world.spec)
         assert everyone.valid.all()
         truth = dict(zip(everyone.ids.tolist(), everyone.states, strict=True))

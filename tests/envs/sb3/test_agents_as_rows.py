@@ -179,9 +179,9 @@ def test_copies_do_not_touch_each_other():
 
 def test_rows_name_their_agent_copy_and_role():
     venv = ParallelVecEnv([Scripted, Scripted])
-    assert venv.row_agents == [*SIZES, *SIZES]
-    assert venv.row_copies == [0, 0, 0, 1, 1, 1]
-    assert venv.row_roles == [0, 0, 1, 0, 0, 1]
+    assert venv.agents_of_envs == [*SIZES, *SIZES]
+    assert venv.copies_of_envs == [0, 0, 0, 1, 1, 1]
+    assert venv.roles_of_envs == [0, 0, 1, 0, 0, 1]
 
 
 def test_an_agent_dropped_without_a_flag_counts_as_truncated_at_what_it_saw_last():

@@ -237,9 +237,9 @@ def test_reader_sees_every_vehicle_as_it_is():
             velocity = vehicle.speed * np.array([np.cos(vehicle.heading), np.sin(vehicle.heading)])
             np.testing.assert_allclose(shared.scene.states[i], [*vehicle.position, *velocity])
             assert shared.heading_rad[i] == vehicle.heading
-        assert list(shared.rows) == env.agents
+        assert list(shared.index_of) == env.agents
         for agent, vehicle in env.vehicles.items():
-            assert vehicles[shared.rows[agent]] is vehicle
+            assert vehicles[shared.index_of[agent]] is vehicle
             assert vehicle is env.highway.controlled_vehicles[int(agent[-1])]
         env.step(all_idle(env))
 
@@ -271,10 +271,10 @@ def test_an_agent_has_a_row_for_its_last_observation_and_no_longer():
     wreck.crashed = True
     env.step(all_idle(env))
     assert env.agents == ["vehicle_1"]
-    assert set(reader.read(env).rows) == {"vehicle_0", "vehicle_1"}
+    assert set(reader.read(env).index_of) == {"vehicle_0", "vehicle_1"}
     env.step(all_idle(env))
     shared = reader.read(env)
-    assert list(shared.rows) == ["vehicle_1"]
+    assert list(shared.index_of) == ["vehicle_1"]
     assert shared.scene.ids[0] == number  # it is still there, for others to see
 
 
@@ -284,7 +284,7 @@ def test_an_empty_road_can_be_read():
     env._observed = []
     shared = multiagent_reader_for(env).read(env)
     assert not shared.scene.valid.any()
-    assert shared.rows == {}
+    assert shared.index_of == {}
 
 
 def test_spec_follows_the_config():

@@ -141,7 +141,7 @@ class OneEdge(ForecastParallelEnv):
     def forecast(self) -> Forecast:
         probs = np.zeros((1, 6, 6, 2), np.float32)
         probs[..., 0] = 1.0
-        rows = self.scene.rows
+        rows = self.scene.index_of
         if {"agent_0", "adversary_0"} <= set(rows):
             probs[0, rows["agent_0"], rows["adversary_0"]] = 1 - self.prob, self.prob
         forecast = super().forecast

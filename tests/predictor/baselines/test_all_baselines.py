@@ -349,7 +349,7 @@ def test_rows_of_memory_are_selected_replaced_and_joined(kind: str):
     empty = forecaster.empty_memory(1, AGENTS)
     shuffled = memory.select(torch.tensor([2, 0]))
     joined = Memory.concatenate(shuffled, empty)  # rows: third, first, nobody's
-    replaced = joined.replace_rows(torch.tensor([0]), empty)
+    replaced = joined.replace_envs(torch.tensor([0]), empty)
     now = states[torch.tensor([2, 0, 1]), -1]
 
     def forecast(from_memory: Memory) -> Tensor:

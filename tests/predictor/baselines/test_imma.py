@@ -148,19 +148,19 @@ def test_layers_are_added_one_by_one():
     assert gradients(forecaster) == [True, True, True]
 
 
-def test_volume_fades_a_layer_in():
+def test_weight_of_an_added_layer_is_raised_from_0_to_1():
     forecaster = fresh("imma").requires_grad_(False)
     states, valid = random_states(0, BATCH, TIME, AGENTS, 4), torch.ones(BATCH, TIME, AGENTS).bool()
 
-    def forecast(layer: int | None, volume: float) -> Tensor:
-        forecaster.train_layer(layer, volume)
+    def forecast(layer: int | None, weight: float) -> Tensor:
+        forecaster.train_layer(layer, weight)
         return forecaster.rollout(last(forecaster, states, valid), HORIZON)
 
     everything = forecast(None, 1.0)
     torch.testing.assert_close(forecast(0, 1.0), everything, **TOLERANCE)
     torch.testing.assert_close(forecast(0, 0.0), forecast(1, 1.0), **TOLERANCE)
     assert not torch.allclose(forecast(0, 0.5), everything, atol=1e-4)
-    assert "volume" not in forecaster.state_dict()  # a trained model speaks with all layers
+    assert "_layer_weights" not in forecaster.state_dict()  # a trained model uses all layers
 
 
 @pytest.mark.parametrize("layer", [-1, 2])

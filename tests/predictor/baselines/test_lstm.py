@@ -153,7 +153,7 @@ def test_joint_takes_no_more_agents_than_it_has_columns():
     memory, states = forecaster.empty_memory(1, 5), random_states(0, 1, 5, 4)
     three, four = torch.tensor([[True, True, True, False, False]]), torch.tensor([[True, False, False, True, False]])
     assert forecaster.rollout(forecaster.observe(memory, states, three)[1], 2).shape == (1, 1, 5, 2, 4)
-    with pytest.raises(UserError, match="takes 3 agents in fixed rows, but row 3 holds one too; .* num_agents=4 or"):
+    with pytest.raises(UserError, match="agents at fixed places, but place 3 holds one too; .* num_agents=4 or"):
         forecaster.observe(memory, states, four)
     with pytest.raises(UserError, match="takes 3 agents"):
         forecaster.window(states[:, None], four[:, None], torch.tensor([0]), 1)

@@ -22,7 +22,7 @@ from predictor.dgvae import model as dgvae
 from predictor.dgvae.networks import Decoder, DGVAEConfig
 from predictor.dgvae.packing import Packed
 from predictor.forecaster import Belief, Memory, WindowOutput
-from predictor.graph import NOBODY, others, pair_mask
+from predictor.graph import NO_AGENT, others, pair_mask
 from predictor.online import OnlineForecaster
 from predictor.scene import PADDING_ID, Forecast, Scene
 from predictor.support.errors import UserError
@@ -273,7 +273,7 @@ def test_without_others_there_are_no_edges(present: int):
     valid = torch.zeros(BATCH, TIME, AGENTS).bool()
     valid[..., :present] = True
     memory, belief = list(stream(forecaster, states, valid))[-1]
-    assert (memory.senders == NOBODY).all() and torch.equal(belief.senders, memory.senders)
+    assert (memory.senders == NO_AGENT).all() and torch.equal(belief.senders, memory.senders)
     assert torch.equal(belief.edge_probs[..., 0], torch.ones(BATCH, AGENTS, 2).double())
     assert not belief.edge_features.any() and not any(m.any() for m in memory.pairs)
     assert not memory.nodes[0][:, present:].any()
@@ -436,7 +436,7 @@ def test_empty_columns_hear_nobody():
     pairs = (t[:, at][:, :, at] for t in (dense.edge_probs, dense.edge_features))
     assert_same(Forecast(ours.xy[:, :, at], *pairs, ours.valid[:, at]), expected.dense())
     for empty in (1, 4, 5):
-        assert (ours.senders[:, empty] == NOBODY).all() and not ours.edge_features[:, empty].any()
+        assert (ours.senders[:, empty] == NO_AGENT).all() and not ours.edge_features[:, empty].any()
         assert torch.equal(ours.edge_probs[:, empty, :, 0], torch.ones(1, 2))
 
 
@@ -453,7 +453,7 @@ def test_ego_alone_and_then_not():
     """Memory with no agents but the ego takes in others, and they leave again."""
     alone, crowd = scene(states_of(0, 0), 4), scene(states_of(1, 0, 3, 7, 11), 4)
     forecast = online(2, alone, crowd, alone)
-    assert (forecast.senders == NOBODY).all() and torch.isfinite(forecast.xy).all()
+    assert (forecast.senders == NO_AGENT).all() and torch.isfinite(forecast.xy).all()
     assert_same(online(2, alone, crowd, crowd).dense(), reference(near_road(2), [alone, crowd, crowd]))
 
 

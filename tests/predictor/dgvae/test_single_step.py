@@ -154,7 +154,7 @@ def test_both_ways_of_doing_without_gradients(name: str):
 @pytest.mark.parametrize("context", WITHOUT_GRADIENTS.values(), ids=WITHOUT_GRADIENTS)
 def test_it_is_used_where_there_are_no_gradients(context: Any, monkeypatch: pytest.MonkeyPatch):
     """Folded once, then one encoder step for each observation and each fed-back prediction."""
-    counts = {"folded": 0, "encode": 0, "drive": 0}
+    counts = {"folded": 0, "encode": 0, "decode": 0}
 
     class Counting(Stepper):
         def __init__(self, *parts: Any) -> None:
@@ -165,17 +165,17 @@ def test_it_is_used_where_there_are_no_gradients(context: Any, monkeypatch: pyte
             counts["encode"] += 1
             return super().encode(*args)
 
-        def drive(self, *args: Any) -> Any:
-            counts["drive"] += 1
-            return super().drive(*args)
+        def decode(self, *args: Any) -> Any:
+            counts["decode"] += 1
+            return super().decode(*args)
 
     monkeypatch.setattr(dgvae, "Stepper", Counting)
     forecaster = made(FAST_LIKE)
     run(forecaster, torch.enable_grad)
-    assert counts == {"folded": 0, "encode": 0, "drive": 0}
+    assert counts == {"folded": 0, "encode": 0, "decode": 0}
     run(forecaster, context)
     fed_back = 2 * (HORIZON - 1)  # along the expected graph, and along drawn ones
-    assert counts == {"folded": 1, "encode": TIME + fed_back, "drive": TIME + fed_back + 1}
+    assert counts == {"folded": 1, "encode": TIME + fed_back, "decode": TIME + fed_back + 1}
 
 
 def test_where_every_slot_is_taken_the_same_graphs_are_drawn():
