@@ -193,10 +193,21 @@ REQUIRED: dict[str, list[str]] = {
 """Required options of a command."""
 
 VALUE_OF = {
+<<<<<<< HEAD
     "--driver": "varied", "--out": "elsewhere", "--env-id": "merge-v1", "--checkpoint": "a", "--data": "b",
     "--lines": "mlp", "--only-line": "mlp",
 }  # fmt: skip
 """Value of an option that does not take the number 60."""
+=======
+    "--driver": "varied",
+    "--out": "elsewhere",
+    "--env-id": "merge-v1",
+    "--checkpoint": "a",
+    "--data": "b",
+    "--lines": "mlp",
+    "--only-line": "mlp",
+}
+>>>>>>> wordsa
 
 
 def source_of(command: str) -> str:
@@ -280,7 +291,8 @@ def test_an_old_option_is_the_new_one_and_says_so(command: str, old: str, new: s
 
 def test_no_option_has_a_name_that_was_given_up():
     """One word for one thing; `run_dir` is the folder that `agents.evaluate` reads."""
-    given_up = {"jobs", "envs", "samples", "ego", "egos", "partner", "rows_at_once", "stores", "checkpoints"}
+    given_up = {"jobs", "envs", "samples", "ego", "egos", "partner", "rows", "only_row", "rows_at_once", "stores"}
+    given_up |= {"checkpoints"}
     for config in all_configs():
         assert not given_up & {field.name for field in fields(config)}, config
     with_history = {c for c in REFUSED if "history_steps" in {f.name for f in fields(config_of(c))}}
