@@ -193,21 +193,10 @@ REQUIRED: dict[str, list[str]] = {
 """Required options of a command."""
 
 VALUE_OF = {
-<<<<<<< HEAD
     "--driver": "varied", "--out": "elsewhere", "--env-id": "merge-v1", "--checkpoint": "a", "--data": "b",
     "--lines": "mlp", "--only-line": "mlp",
 }  # fmt: skip
 """Value of an option that does not take the number 60."""
-=======
-    "--driver": "varied",
-    "--out": "elsewhere",
-    "--env-id": "merge-v1",
-    "--checkpoint": "a",
-    "--data": "b",
-    "--lines": "mlp",
-    "--only-line": "mlp",
-}
->>>>>>> wordsa
 
 
 def source_of(command: str) -> str:
