@@ -1,8 +1,9 @@
-"""Train a policy that sees what the others are about to do: `python train_policy.py --out runs/highway`.
+"""Trains a policy that sees forecasts of the other agents: `python train_policy.py --out runs/highway`.
 
-Ends with a table over held-out seeds (trained, random and idle egos on the same seeds) and a video with the forecasts
-drawn in. The run folder holds config.json, tb/ (TensorBoard), checkpoint.zip (the latest), best_model.zip (best on the
-selection seeds), policy.zip (the final policy: the best), summary.json, summary.md and video.mp4.
+Ends with a table over held-out seeds (trained policy, random and idle drivers on the same seeds) and a video with the
+forecasts drawn in. The run folder holds config.json, tb/ (TensorBoard), checkpoint.zip (the latest model),
+best_model.zip (the model selected so far), policy.zip (the final policy: the selected model), summary.json, summary.md
+and video.mp4.
 """
 
 import os
@@ -28,15 +29,15 @@ from predictor.support.provenance import provenance
 from predictor.support.runtime import keep_freed_memory
 
 ENVS = {"gymnasium": 6, "envpool": 64}
-"""Number of parallel environments by default."""
+"""Default number of parallel environments, by backend."""
 
 
 @dataclass(frozen=True)
 class TrainPolicyConfig:
-    """Train a policy on forecasts, evaluate it and film it."""
+    """Trains a policy on forecasts, evaluates it and films it."""
 
     env_id: Annotated[str, Renamed("env")] = "highway-fast-v0"
-    """Environment to train on: gymnasium id (highway-fast-v0) or PettingZoo parallel id (simple_tag_v3)."""
+    """Environment to train on: Gymnasium id (highway-fast-v0) or PettingZoo parallel id (simple_tag_v3)."""
     algorithm: Algorithm = "ppo"
     """Learning algorithm; its hyperparameters are in agents/presets.py."""
     observe: Observe = "forecast"
@@ -46,22 +47,22 @@ class TrainPolicyConfig:
     steps: int = 20_000
     """Number of environment steps to train for, over all environments."""
     num_envs: Annotated[int | None, Renamed("envs")] = None
-    """Number of parallel environments: processes, native ones with EnvPool, copies of a PettingZoo environment. None
+    """Number of parallel environments: processes, environments of EnvPool, or copies of a PettingZoo environment. None
     takes 6, with EnvPool 64."""
     backend: Backend = "gymnasium"
     """Simulator in training; the policy is measured and filmed on the gymnasium environment in any case."""
     learners: tuple[str, ...] | None = None
     """PettingZoo: agents or roles that learn, for example adversary; None takes all, in simple_tag the adversaries."""
     driver: Annotated[str, Renamed("partner")] = "heuristic"
-    """PettingZoo: who drives the agents that do not learn: random, idle, varied, heuristic or mixed."""
+    """PettingZoo: driver of the agents that do not learn: random, idle, varied, heuristic or mixed."""
     seed: int = 0
     """Random seed for torch, NumPy and the environments; evaluation seeds do not depend on it."""
     out: Annotated[Path | None, Renamed("run_dir")] = None
     """Run folder to write; None takes runs/ENV_ID-ALGORITHM-OBSERVE-SEED."""
     resume: bool = False
-    """Continue the run in `out` (or start it, if nothing is there yet)."""
+    """Continue the run in `out`, or start it if the folder holds none."""
     selections: int = 8
-    """Number of times, evenly spread, that the policy is measured to find the best one."""
+    """Number of times, evenly spread, that the policy is measured for model selection."""
     selection_episodes: int = 20
     """Number of episodes per such measurement, on seeds that neither training nor the final table uses."""
     checkpoint_every: int = 2_000
@@ -74,10 +75,10 @@ class TrainPolicyConfig:
     """Device that runs forecaster and policy: cpu, cuda or auto (cuda where there is one)."""
 
     def __post_init__(self) -> None:
-        """Check choices and ranges; the parts check what belongs together.
+        """Checks choices and ranges; `plan` checks that the values fit together.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value is out of range or does not fit the others.
         """
         check_choices(self)
         check_at_least(
@@ -87,12 +88,12 @@ class TrainPolicyConfig:
 
     @property
     def folder(self) -> Path:
-        """The run folder."""
+        """Path of the run folder."""
         return self.out or Path("runs") / f"{self.env_id}-{self.algorithm}-{self.observe}-{self.seed}"
 
     @property
     def plan(self) -> TrainingPlan:
-        """The training."""
+        """Plan of the training."""
         learners = entry_for(self.env_id).learners if self.learners is None else self.learners
         task = Task(self.env_id, self.observe, self.checkpoint, self.device, self.backend, tuple(learners), self.driver)
         return TrainingPlan(
@@ -120,11 +121,11 @@ class TrainPolicyConfig:
 
 
 def run(config: TrainPolicyConfig, console: Console) -> None:
-    """Train, evaluate, film. Nothing is written before the input has been checked."""
+    """Trains, evaluates and films; nothing is written before the input has been checked."""
     plan = config.plan
     plan.check_action_space(plan.task.check())
     settings = asdict(config) | {"preset": asdict(plan.preset), "attention": asdict(plan.attention)}
-    # config.json keeps the names that runs had when their options were called so: they can be read and resumed
+    # config.json keeps the older names of two options, so that earlier runs can be read and resumed
     settings |= {"learners": plan.task.learners, "envs": config.parallel_envs, "partner": config.driver}
     pin = plan.task.note.forecaster
     settings[FORECASTER] = None if pin is None else asdict(pin)
@@ -152,10 +153,10 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
 
 
 def main() -> None:
-    """Entry point."""
+    """Runs the command."""
     keep_freed_memory()
     config = parse(TrainPolicyConfig, __doc__)
-    if config.backend != "envpool":  # its environments wait while networks compute
+    if config.backend != "envpool":  # EnvPool's environments wait while networks compute
         torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
     run(config, Console())
 

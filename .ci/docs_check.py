@@ -31,7 +31,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMIT_S = 300.0
-"""Seconds a block may take; longer ones need a short form."""
+"""Longest time of a block [s]; longer ones need a short form."""
 TAIL_LINES = 25
 OTHER_LANGUAGES = ("text", "json", "toml", "yaml", "bibtex", "mermaid", "markdown", "diff", "make", "csv")
 """Languages of blocks that are not run."""
@@ -57,16 +57,16 @@ for line in sys.stdin:
         error = traceback.format_exc()
     print(json.dumps(error), file=answers, flush=True)
 """
-"""Executes Python blocks in one namespace; what they print goes to standard error, the answers to standard output."""
+"""Code of the process that runs Python blocks in one namespace: their output goes to stderr, the answers to stdout."""
 
 
 class DocsError(Exception):
-    """A block that fails, or an annotation that cannot be obeyed."""
+    """Raised for a block or an annotation that cannot be understood."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block of a page."""
+    """Fenced block of a page."""
 
     page: str
     """Path of the page."""
@@ -81,7 +81,7 @@ class Block:
 
     @property
     def where(self) -> str:
-        """Page and line."""
+        """Page and line of the block, as "page:line"."""
         return f"{self.page}:{self.line}"
 
     @property
@@ -113,15 +113,17 @@ class Block:
 
 @dataclass(frozen=True)
 class Result:
-    """How a block fared."""
+    """Result of a block."""
 
     block: Block
+    """Block that was run or skipped."""
     seconds: float
+    """Time that it took [s]."""
     error: str = ""
-    """Empty if the block ran to its end."""
+    """Error message; empty if the block ran to its end."""
 
     def __str__(self) -> str:
-        """One line; for a failure, the end of its output besides."""
+        """Returns one line; for a failure, the end of its output as well."""
         if self.block.skipped:
             return f"{self.block.where:32} {self.block.language:6}   skipped because {self.block.skipped}"
         short = ", short form" if self.block.note else ""
@@ -171,10 +173,10 @@ def blocks_of(page: Path, root: Path = ROOT) -> list[Block]:
 
 
 class Page:
-    """The state that the blocks of a page share: a folder, exported variables, Python's names."""
+    """Keeps the state that the blocks of a page share: a folder, exported variables, Python's names."""
 
     def __init__(self, folder: Path, limit_s: float = LIMIT_S) -> None:
-        """Start Python in the folder; `python` on the path is the interpreter that runs this check."""
+        """Takes the folder to run in; `python` on the path is the interpreter that runs this check."""
         path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
         self.folder, self.limit_s = folder, limit_s
         self.environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"PATH": path}
@@ -195,7 +197,7 @@ class Page:
         return Result(block, time.monotonic() - began, f"{code}{tail}" if error else "")
 
     def close(self) -> None:
-        """End Python."""
+        """Ends Python."""
         self._stop_python()
         self._printed.close()
 
@@ -247,14 +249,14 @@ class Page:
 
 
 def _stop(process: subprocess.Popen[str]) -> None:
-    """Ends a process and all that it started."""
+    """Ends a process and all processes that it started."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.communicate()
 
 
 def copy_tree(target: Path, root: Path = ROOT) -> None:
-    """Copies what a clone would hold, uncommitted changes included."""
+    """Copies the files that a clone would hold, uncommitted changes included."""
     listed = ["git", "-C", str(root), "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     for name in filter(None, subprocess.check_output(listed, text=True).split("\0")):
         if (root / name).is_file():  # a file may be deleted and not committed yet
@@ -268,7 +270,7 @@ def check(pages: Sequence[Path], limit_s: float = LIMIT_S) -> Iterator[Result]:
     Raises:
         DocsError: a page has a block that cannot be understood.
     """
-    every = {page: blocks_of(page) for page in pages}  # a block that cannot be understood is said before anything runs
+    every = {page: blocks_of(page) for page in pages}  # errors of the pages are raised before any block runs
     for blocks in every.values():
         if not blocks:
             continue
@@ -282,7 +284,7 @@ def check(pages: Sequence[Path], limit_s: float = LIMIT_S) -> Iterator[Result]:
 
 
 def main() -> int:
-    """Entry point; returns the exit status."""
+    """Runs the command; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pages", nargs="*", type=Path, help="pages to check; all of README.md and docs/ if left out")
     parser.add_argument("--limit-s", type=float, default=LIMIT_S, help="seconds that a block may take")

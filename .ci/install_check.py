@@ -1,8 +1,8 @@
 """Builds the wheel and tries each extra in a fresh virtual environment: `python .ci/install_check.py`.
 
 Every environment gets the wheel with one extra, at the versions of constraints.txt, and runs that extra's commands in
-an empty folder, where the repository is out of sight. What an extra must not bring is checked as well: otherwise a
-command could need it without saying so. `--only core envs` tries some of them.
+an empty folder, where the repository cannot be imported. It also checks that an extra does not install certain modules,
+which a command could otherwise use without declaring them. `--only core envs` tries some of them.
 """
 
 import argparse
@@ -39,12 +39,12 @@ else:
 
 @dataclass(frozen=True)
 class Extra:
-    """One way to install the package, and what must work then."""
+    """Extra of the package, with the commands that must work after installing it."""
 
     commands: Sequence[str]
     """Commands to run one after the other in one folder: "module --option", or Python code if it has several lines."""
     absent: Sequence[str] = ()
-    """Modules that this extra must not bring."""
+    """Modules that this extra must not install."""
 
 
 EXTRAS: dict[str, Extra] = {
@@ -79,14 +79,14 @@ EXTRAS: dict[str, Extra] = {
     ),
     "envpool": Extra((WRAPPED.format(env_id="envpool/HighwayFast-v0"), "\nfrom envs import EnvPoolVecEnv\n")),
 }
-"""Name of an extra → what it must be able to do; "core" is the package alone."""
+"""Extras by name; "core" is the package alone."""
 
 
 def run(command: Sequence[str | Path], folder: Path) -> None:
     """Runs a command in a folder.
 
     Raises:
-        RuntimeError: it failed; the message ends with the last lines of its output.
+        RuntimeError: the command failed; the message ends with the last lines of its output.
     """
     done = subprocess.run(
         [str(part) for part in command], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -97,7 +97,7 @@ def run(command: Sequence[str | Path], folder: Path) -> None:
 
 
 def build_wheel(folder: Path) -> Path:
-    """Builds the wheel of this tree into a folder, from a copy: an old build/ here would add modules that are gone."""
+    """Builds the wheel of this tree into a folder, from a copy: an old build/ would add modules that were deleted."""
     listed = ["git", "-C", str(ROOT), "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     for name in filter(None, subprocess.check_output(listed, text=True).split("\0")):
         if (ROOT / name).is_file():  # a file may be deleted and not committed yet
@@ -114,7 +114,7 @@ def try_extra(name: str, wheel: Path, folder: Path) -> None:
     """Installs the wheel with an extra into a new environment below `folder` and runs the extra's commands.
 
     Raises:
-        RuntimeError: it cannot be installed, a command fails, or a module is there that must be absent.
+        RuntimeError: the installation or a command fails, or a module is installed that must be absent.
     """
     extra, python, work = EXTRAS[name], folder / "venv" / "bin" / "python", folder / "work"
     work.mkdir()
@@ -126,13 +126,13 @@ def try_extra(name: str, wheel: Path, folder: Path) -> None:
         try:
             run([python, "-c", code], work)
         except RuntimeError:
-            raise RuntimeError(f"'{name}' brings {module}, which it must not") from None
+            raise RuntimeError(f"'{name}' installs {module}, which it must not") from None
     for command in extra.commands:
         run([python, "-c", command] if "\n" in command else [python, "-m", *command.split()], work)
 
 
 def main() -> int:
-    """Entry point; returns the number of extras that failed."""
+    """Runs the command; returns the number of extras that failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=list(EXTRAS), default=list(EXTRAS), help="extras to try")
     names, failed = parser.parse_args().only, 0

@@ -1,4 +1,4 @@
-"""Policies that learn from forecasts, with Stable-Baselines3: features, training, evaluation.
+"""Policies that learn from forecasts, with Stable-Baselines3: features extractor, training, evaluation.
 
     >>> from agents import ForecastAttention, Task, TrainingPlan, train
 

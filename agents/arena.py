@@ -1,4 +1,4 @@
-"""Where policies are measured: plays given seeds with a trained policy or with a named driver in its place."""
+"""Measures policies: plays given seeds with a trained policy or with a named driver in its place."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
@@ -24,46 +24,46 @@ class Arena(Protocol):
 
     @property
     def baselines(self) -> tuple[str, ...]:
-        """Drivers to stand beside a trained policy."""
+        """Names of the drivers that a trained policy is compared with."""
 
     def play(
         self, policy: BaseAlgorithm | str, seeds: Sequence[int], on_episode: Callable[[], None] = lambda: None
     ) -> list[EpisodeResult]:
-        """One episode per seed, in their order; a policy takes its most likely actions."""
+        """Plays one episode per seed, in the order of the seeds; a policy takes its most likely actions."""
 
     def close(self) -> None:
-        """Close the environments."""
+        """Closes the environments."""
 
 
 class EgoArena:
-    """Plays seeds in parallel copies of an environment with one ego, always the Gymnasium one: the original counts.
+    """Plays seeds in parallel copies of an environment with one ego, always in the original (Gymnasium) simulator.
 
     Args:
-        task: what is driven.
-        num_envs: parallel environments.
+        task: environment and what the policy sees.
+        num_envs: number of parallel environments.
     """
 
     baselines = ("random", "idle")
 
     def __init__(self, task: Task, num_envs: int) -> None:
-        """Start the environments."""
+        """Starts the environments."""
         self._venv = make_venv(replace(task, backend="gymnasium"), num_envs, seeded=True)
 
     def play(
         self, policy: BaseAlgorithm | str, seeds: Sequence[int], on_episode: Callable[[], None] = lambda: None
     ) -> list[EpisodeResult]:
-        """As `Arena`."""
+        """Plays one episode per seed, as `Arena.play` describes."""
         if isinstance(policy, str):
             return run_episodes(self._venv, policy, seeds, on_episode)
         return run_episodes(self._venv, lambda obs: policy.predict(obs, deterministic=True)[0], seeds, on_episode)
 
     def close(self) -> None:
-        """Stop the environments."""
+        """Stops the environments."""
         self._venv.close()
 
 
 def open_arena(task: Task, num_envs: int) -> Arena:
-    """An arena for a task."""
+    """Returns the arena that fits a task."""
     return MultiagentArena(task) if task.is_multiagent else EgoArena(task, num_envs)
 
 
@@ -73,16 +73,17 @@ def run_episodes(
     seeds: Sequence[int],
     on_episode: Callable[[], None] = lambda: None,
 ) -> list[EpisodeResult]:
-    """Play one episode per seed, all environments in parallel.
+    """Plays one episode per seed, all environments in parallel.
 
     Args:
-        venv: from `make_venv(..., seeded=True)`.
-        policy: from a batch of observations to a batch of actions, or the name of a driver from `envs.drivers.ego`.
-        seeds: one per episode, all different.
+        venv: environments from `make_venv(..., seeded=True)`.
+        policy: function from a batch of observations to a batch of actions, or the name of a driver of
+            `envs.drivers.ego`.
+        seeds: one seed per episode, all different.
         on_episode: called after each episode (progress bars).
 
     Returns:
-        Results in the order of the seeds.
+        The results, in the order of the seeds.
     """
     driver = policy if isinstance(policy, str) else None
     if driver is not None:
@@ -104,17 +105,17 @@ def run_episodes(
 
 
 class MultiagentArena:
-    """Plays seeds with a policy or with a driver in the learners' place; see `agents.arena.Arena`.
+    """Plays seeds of a PettingZoo environment with a policy, or with a driver in place of the learners; see `Arena`.
 
     Args:
         task: a PettingZoo task.
 
     Attributes:
-        baselines: random and heuristic; idle where no heuristic drives the environment.
+        baselines: random and heuristic; idle where the environment has no heuristic driver.
     """
 
     def __init__(self, task: Task) -> None:
-        """One copy; results do not depend on how many there are."""
+        """Makes one copy of the environment; results do not depend on the number of copies."""
         self._monitor = make_multiagent_venv(task, 1)
         venv = self._monitor.venv
         assert isinstance(venv, ParallelVecEnv)
@@ -125,7 +126,7 @@ class MultiagentArena:
     def play(
         self, policy: BaseAlgorithm | str, seeds: Sequence[int], on_episode: Callable[[], None] = lambda: None
     ) -> list[EpisodeResult]:
-        """One episode per seed; the return is the mean over the learners."""
+        """Plays one episode per seed; the return is the mean over the learners."""
         results = []
         for seed in seeds:
             results.append(self._driven(policy, seed) if isinstance(policy, str) else self._learned(policy, seed))
@@ -133,7 +134,7 @@ class MultiagentArena:
         return results
 
     def close(self) -> None:
-        """Close the environment."""
+        """Closes the environment."""
         self._venv.close()
 
     def _learned(self, policy: BaseAlgorithm, seed: int) -> EpisodeResult:
@@ -152,13 +153,13 @@ class MultiagentArena:
     def _driven(self, name: str, seed: int) -> EpisodeResult:
         env = self._env
         observations, _ = env.reset(seed=seed)
-        driver = make_driver(name, env, driver_rng(seed, group=1))  # partners are group 0
+        driver = make_driver(name, env, driver_rng(seed, group=1))  # group 0: agents that do not learn
         returns = dict.fromkeys(self._venv.agents_of_envs, 0.0)
         steps, lived = 0, set(env.agents)
         while env.agents and not (lived.issuperset(returns) and returns.keys().isdisjoint(env.agents)):
             own = own_observations(observations)
             actions = driver({agent: seen for agent, seen in own.items() if agent in returns})
-            observations, rewards, *_ = env.step(partner_actions(env, own, returns) | actions)
+            observations, rewards, *_ = env.step(actions_of_others(env, own, returns) | actions)
             lived.update(env.agents)
             for agent in returns:
                 returns[agent] += float(rewards.get(agent, 0.0))
@@ -166,8 +167,14 @@ class MultiagentArena:
         return _result(seed, steps, returns)
 
 
-def partner_actions(env: Any, own: Mapping[str, Any], learners: Collection[str]) -> dict[str, Any]:
-    """Actions of those who do not learn."""
+def actions_of_others(env: Any, own: Mapping[str, Any], learners: Collection[str]) -> dict[str, Any]:
+    """Returns the actions of the agents that do not learn, chosen by the environment's driver.
+
+    Args:
+        env: environment with a `DrivenEnv` inside.
+        own: the environment's own observation of each living agent.
+        learners: names of the agents that learn.
+    """
     others = {agent: seen for agent, seen in own.items() if agent not in learners}
     return env.driver(others) if others else {}
 

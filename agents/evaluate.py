@@ -1,7 +1,7 @@
-"""Closed-loop results of a policy on held-out seeds: `python -m agents.evaluate --run-dir runs/highway`.
+"""Evaluates a policy in closed loop on held-out seeds: `python -m agents.evaluate --run-dir runs/highway`.
 
-Every policy drives the same seeds; random and idle egos stand beside the trained one. Evaluation seeds are apart from
-those of training and of model selection (`agents.training`).
+Every policy drives the same seeds; the table compares the trained policy with random and idle drivers. Evaluation seeds
+are disjoint from those of training and of model selection (`agents.task`).
 """
 
 import math
@@ -33,7 +33,7 @@ from predictor.support.provenance import provenance
 from predictor.support.runtime import keep_freed_memory, resolve_device
 
 NUM_POLICIES = 3
-"""The trained one and an arena's two baselines."""
+"""Number of policies of a table: the trained one and an arena's two baselines."""
 
 _WILSON_Z = 1.959963984540054  # two-sided 95 %
 NOT_PINNED = "note: {} does not say which forecaster it was trained on; it gets the one of its run's config"
@@ -45,27 +45,27 @@ class PolicySummary:
     """Results of one policy over all episodes: a line of the table."""
 
     policy: str
-    """Who drove."""
+    """Name of the policy or driver."""
     episodes: int
     """Number of episodes."""
     return_mean: float
     """Mean undiscounted return."""
     return_se: float
-    """Its standard error; NaN for a single episode."""
+    """Standard error of `return_mean`; NaN for a single episode."""
     length_mean: float
     """Mean length [policy steps]."""
     length_se: float
-    """Its standard error."""
+    """Standard error of `length_mean`; NaN for a single episode."""
     crash_rate: float | None
-    """Share of episodes with a crash; None where the env reports none."""
+    """Share of episodes with a crash; None if the env does not report crashes."""
     crash_low: float | None
-    """Lower end of its 95 % Wilson interval."""
+    """Lower end of the 95 % Wilson interval of `crash_rate`."""
     crash_high: float | None
-    """Upper end."""
+    """Upper end of the 95 % Wilson interval of `crash_rate`."""
     mean_speed_mps: float
-    """Mean over episodes of the mean speed [m/s]; NaN where the env reports none."""
+    """Mean over episodes of the mean speed [m/s]; NaN if the env does not report speeds."""
     role_returns: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Mean return and its standard error of the learners of each role, where there are several."""
+    """Mean return of the learners of each role, with its standard error; empty if there is one role."""
 
 
 @dataclass(frozen=True)
@@ -73,21 +73,21 @@ class Evaluation:
     """Results of several policies on the same seeds."""
 
     env_id: str
-    """Gymnasium id."""
+    """Gymnasium or PettingZoo id."""
     first_seed: int
-    """Episode i was reset with first_seed + i."""
+    """Seed of the first episode; episode i was reset with first_seed + i."""
     results: dict[str, list[EpisodeResult]]
-    """Episodes by policy."""
+    """Results of the episodes, by policy."""
     has_ego: bool = True
-    """Whether one agent is driven: the table then has its crash rate and speed, "–" where the env reports none."""
+    """Whether one agent is driven: the table then has its crash rate and speed, "–" if the env does not report them."""
 
     @property
     def summaries(self) -> list[PolicySummary]:
-        """One summary per policy."""
+        """Summaries, one per policy."""
         return [summarize(policy, episodes) for policy, episodes in self.results.items()]
 
     def write(self, folder: Path, **extra: Any) -> None:
-        """Write ``summary.json`` (with every episode and where it came from) and ``summary.md``."""
+        """Writes ``summary.json`` (with every episode and the provenance) and ``summary.md``."""
         content = {
             "env_id": self.env_id,
             "first_seed": self.first_seed,
@@ -100,12 +100,12 @@ class Evaluation:
         write_text(folder / "summary.md", self.markdown())
 
     def markdown(self) -> str:
-        """The table for a README."""
+        """Returns the table as Markdown."""
         header, cells = self._cells()
         return f"{markdown.table(header, cells)}\n\n{self.env_id}: {self._caption()}\n"
 
     def table(self) -> Table:
-        """The table for a terminal."""
+        """Returns the table for a terminal."""
         header, lines = self._cells()
         table = Table(title=self.env_id, caption=self._caption())
         for i, name in enumerate(header):
@@ -136,12 +136,15 @@ class Evaluation:
 
 
 def wilson_interval(successes: int, trials: int, z: float = _WILSON_Z) -> tuple[float, float]:
-    """Wilson score interval of a rate; never outside [0, 1] and never of zero width.
+    """Computes the Wilson score interval of a rate, which lies within [0, 1] and never has zero width.
 
     Args:
-        successes: events seen.
-        trials: chances; at least 1.
+        successes: number of events.
+        trials: number of trials; at least 1.
         z: normal quantile; the default gives 95 %.
+
+    Raises:
+        UserError: `successes` or `trials` is out of range.
     """
     if not 0 <= successes <= trials or trials < 1:
         raise UserError(f"need 0 <= successes <= trials and trials >= 1, got {successes} of {trials}")
@@ -154,14 +157,14 @@ def wilson_interval(successes: int, trials: int, z: float = _WILSON_Z) -> tuple[
 
 
 def mean_and_standard_error(values: Sequence[float]) -> tuple[float, float]:
-    """Mean and its standard error (sample standard deviation / √n; NaN for a single value)."""
+    """Returns the mean and its standard error (sample standard deviation / √n; NaN for a single value)."""
     array = np.asarray(values, dtype=np.float64)
     error = float(array.std(ddof=1) / math.sqrt(len(array))) if len(array) > 1 else math.nan
     return float(array.mean()), error
 
 
 def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
-    """Summary of one policy's episodes."""
+    """Computes the summary of one policy's episodes."""
     return_mean, return_se = mean_and_standard_error([e.episode_return for e in episodes])
     length_mean, length_se = mean_and_standard_error([float(e.length) for e in episodes])
     crashes = [e.crashed for e in episodes if e.crashed is not None]
@@ -191,15 +194,15 @@ def evaluate_policy_on_seeds(
     first_seed: int = EVALUATION_SEED,
     on_episode: Callable[[], None] = lambda: None,
 ) -> Evaluation:
-    """Let the trained policy (most likely action) and the arena's baselines drive the same episodes.
+    """Evaluates the trained policy (most likely actions) and the arena's baselines on the same seeds.
 
     Args:
-        task: what the model was trained on.
+        task: task that the model was trained on.
         model: the trained policy.
-        name: what to call it in the table.
-        num_episodes: episodes per policy.
-        num_envs: parallel environments; the results do not depend on it.
-        first_seed: episode i is reset with first_seed + i.
+        name: name of the policy in the table.
+        num_episodes: number of episodes per policy.
+        num_envs: number of parallel environments; the results do not depend on it.
+        first_seed: seed of the first episode; episode i is reset with first_seed + i.
         on_episode: called after each episode.
     """
     seeds = range(first_seed, first_seed + num_episodes)
@@ -221,7 +224,7 @@ def evaluate_with_progress(
     num_envs: int,
     first_seed: int = EVALUATION_SEED,
 ) -> Evaluation:
-    """`evaluate_policy_on_seeds` under a progress bar."""
+    """Runs `evaluate_policy_on_seeds` with a progress bar."""
     columns = (TextColumn(f"evaluate {task.env_id}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns) as progress:
         bar = progress.add_task("", total=num_episodes * NUM_POLICIES)
@@ -253,20 +256,20 @@ def _plus_minus(error: float, digits: int) -> str:
 
 
 def _finite(fields: dict[str, Any]) -> dict[str, Any]:
-    """JSON knows no NaN."""
+    """Replaces NaN by None, as JSON has no NaN."""
     return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in fields.items()}
 
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """Evaluate the policy of a training run on held-out seeds, beside random and idle."""
+    """Evaluates the policy of a training run on held-out seeds, beside random and idle drivers."""
 
     run_dir: Path
     """Folder of the training run, as train_policy.py wrote it."""
     episodes: int = 50
     """Number of episodes per policy."""
     seed: int = EVALUATION_SEED
-    """Random seed: episode i is reset with seed + i; the default is apart from all training seeds."""
+    """Random seed: episode i is reset with seed + i; the default is disjoint from all training seeds."""
     out: Path | None = None
     """Folder for summary.json and summary.md; None takes RUN_DIR/evaluation."""
     num_envs: Annotated[int, Renamed("workers")] = os.cpu_count() or 1
@@ -275,10 +278,10 @@ class EvaluateConfig:
     """Device that runs forecaster and policy: cpu, cuda or auto (cuda where there is one)."""
 
     def __post_init__(self) -> None:
-        """Check ranges; `device="auto"` becomes the device that is taken.
+        """Checks ranges; replaces `device="auto"` by the device that is taken.
 
         Raises:
-            UserError: a value that makes no sense, or a device that is not there.
+            UserError: a value is out of range, or the device is not available.
         """
         check_at_least(self, 1, "episodes", "num_envs")
         check_at_least(self, 0, "seed")
@@ -286,7 +289,7 @@ class EvaluateConfig:
 
 
 def main() -> None:
-    """Entry point."""
+    """Runs the command."""
     keep_freed_memory()
     torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
     config = parse(EvaluateConfig, __doc__)

@@ -1,9 +1,9 @@
-"""What the policy's network sees first: the ego attends over the agents around it.
+"""Features extractor of the policy's network: the ego attends over the agents around it.
 
 Reads the Dict observation of `ForecastObservation` / `VecForecast`: the env's own observation becomes the ego's
 embedding (the query); each agent's state, forecast, edge probabilities and edge features become a token (key, value).
 The result does not depend on the order of agents, and padded agents (`valid` = 0) change nothing. A learned null token
-is always present, so an empty scene works. Not recurrent: memory lives in the forecaster.
+is always present, so an empty scene works. It is not recurrent: only the forecaster keeps a history.
 """
 
 import math
@@ -25,35 +25,39 @@ VALID_KEY = "valid"
 TOKEN_KEYS = ("agents", "forecast", "edge_probs", "edge_features")
 
 NEAR, FAR, SPEED = 0.1, 0.5, 1.0
-"""Scales of near and far positions and of velocities, as fractions of a scene's `feature_scales`."""
+"""Scales for near positions, far positions and velocities, as fractions of a scene's `feature_scales`."""
 
 
 @dataclass(frozen=True)
 class AttentionConfig:
-    """Size and input scaling of `ForecastAttention`."""
+    """Sizes and input scales of `ForecastAttention`."""
 
     width: int = 64
     """Size of the ego's embedding, of a token and of the attended summary; the output has twice this size."""
     hidden: int = 128
-    """Hidden units of the embeddings."""
+    """Number of hidden units of the embeddings."""
     heads: int = 4
-    """Attention heads; must divide `width`."""
+    """Number of attention heads; must divide `width`."""
     near_m: float = 10.0
-    """Positions enter once as tanh(x / near_m): resolves lanes and gaps, saturates far away [m]; default: on a road."""
+    """Scale of tanh(x / near_m), which resolves lanes and gaps and saturates far away [m]; default: for roads."""
     far_m: float = 50.0
-    """… and once as x / far_m: keeps what is far in order of distance [m]."""
+    """Divisor of positions as second input, x / far_m, which does not saturate [m]."""
     speed_mps: float = 30.0
-    """Divisor of relative velocities [m/s]; highway-env's top speed by default."""
+    """Divisor of relative velocities [m/s]; default: highway-env's top speed."""
 
     @classmethod
     def for_scenes(cls, spec: SceneSpec) -> "AttentionConfig":
-        """Returns the scaling that fits scenes of this layout: 10 m, 50 m and 30 m/s on roads, less in small arenas."""
+        """Returns the scales that fit scenes of this layout: 10 m, 50 m and 30 m/s on roads, less in small arenas."""
         axes = spec.position_dim
         position_m, velocity_mps = max(spec.feature_scales[:axes]), max(spec.feature_scales[axes : 2 * axes])
         return cls(near_m=NEAR * position_m, far_m=FAR * position_m, speed_mps=SPEED * velocity_mps)
 
     def __post_init__(self) -> None:
-        """Check that the fields fit together."""
+        """Checks that the fields fit together.
+
+        Raises:
+            UserError: sizes or scales are not positive, or `heads` does not divide `width`.
+        """
         if min(self.width, self.hidden, self.heads) < 1 or self.width % self.heads:
             raise UserError(f"width must be a multiple of heads, both positive, got {self.width} and {self.heads}")
         if min(self.near_m, self.far_m, self.speed_mps) <= 0:
@@ -61,7 +65,7 @@ class AttentionConfig:
 
 
 class ForecastAttention(BaseFeaturesExtractor):
-    """SB3 features extractor for forecast observations; works with any subset of the token keys.
+    """SB3 features extractor for observations with forecasts; works with any subset of the token keys.
 
     Example:
         >>> from stable_baselines3 import PPO
@@ -70,13 +74,17 @@ class ForecastAttention(BaseFeaturesExtractor):
         >>> model = PPO("MultiInputPolicy", env, policy_kwargs={"features_extractor_class": ForecastAttention})
 
     Args:
-        observation_space: Dict space with `observation` and some of `agents`, `forecast`, `edge_probs`,
+        observation_space: Dict space with the keys `observation` and some of `agents`, `forecast`, `edge_probs`,
             `edge_features`, `valid`.
         config: sizes and scales.
     """
 
     def __init__(self, observation_space: gym.Space, config: AttentionConfig | None = None) -> None:
-        """Size the layers from the space."""
+        """Makes the layers in the sizes of the space.
+
+        Raises:
+            UserError: the space is not a Dict with the key `observation`.
+        """
         config = config or AttentionConfig()
         super().__init__(observation_space, features_dim=2 * config.width)
         if not isinstance(observation_space, gym.spaces.Dict) or EGO_KEY not in observation_space.spaces:
@@ -88,7 +96,7 @@ class ForecastAttention(BaseFeaturesExtractor):
         self.ego = nn.Sequential(
             nn.Linear(ego_dim, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.width), nn.ReLU()
         )
-        # A token is read in the light of the ego: its first layer also gets the ego's embedding.
+        # A token depends on the ego: its first layer also gets the ego's embedding.
         token_dim = self._token_dim(shapes)
         self.token_in = nn.Linear(token_dim, config.hidden) if token_dim else None
         self.token_ego = nn.Linear(config.width, config.hidden, bias=False)
@@ -100,7 +108,7 @@ class ForecastAttention(BaseFeaturesExtractor):
         self.attended = nn.Sequential(nn.Linear(config.width, config.width), nn.ReLU())
 
     def forward(self, observations: dict[str, Tensor]) -> Float[Tensor, "batch features"]:
-        """The ego's embedding beside what it attends to."""
+        """Returns the ego's embedding, concatenated with the weighted mean of what it attends to."""
         ego = self.ego(observations[EGO_KEY].flatten(1))
         tokens, slots = self._tokens(ego, observations)
         return torch.cat([ego, self.attended(self._attend(ego, tokens, slots))], dim=-1)
@@ -108,7 +116,7 @@ class ForecastAttention(BaseFeaturesExtractor):
     def _tokens(
         self, ego: Float[Tensor, "batch width"], observations: dict[str, Tensor]
     ) -> tuple[Float[Tensor, "tokens width"], Int[Tensor, "batch slots"]]:
-        """A token for each agent that is there, the null token last; and for each ego, which ones it attends to.
+        """Returns a token for each valid agent, the null token last; and for each ego, the tokens it attends to.
 
         Padding, which can be most of a scene, is left out before any layer.
         """
@@ -132,7 +140,7 @@ class ForecastAttention(BaseFeaturesExtractor):
         return torch.ones(agents.shape[:2], dtype=torch.bool, device=agents.device)
 
     def _token_inputs(self, present: dict[str, Tensor]) -> Float[Tensor, "agents feature"]:
-        """The token keys of some agents, scaled to order one and concatenated."""
+        """Returns the token keys of some agents, scaled to order one and concatenated."""
         parts: list[Tensor] = []
         if "agents" in self._keys:
             agents = present["agents"]
@@ -151,7 +159,7 @@ class ForecastAttention(BaseFeaturesExtractor):
         return torch.cat([torch.tanh(metres / self.config.near_m), metres / self.config.far_m], dim=-1)
 
     def _token_dim(self, shapes: dict[str, tuple[int, ...]]) -> int:
-        """Size of `_token_inputs`, by running it on zeros."""
+        """Returns the size of `_token_inputs`, measured on zeros."""
         if not self._keys:
             return 0
         return self._token_inputs({k: torch.zeros(1, *shapes[k][1:]) for k in self._keys}).shape[-1]
@@ -162,10 +170,10 @@ class ForecastAttention(BaseFeaturesExtractor):
         tokens: Float[Tensor, "tokens width"],
         slots: Int[Tensor, "batch slots"],
     ) -> Float[Tensor, "batch width"]:
-        """Multi-head attention with one query, the ego.
+        """Computes multi-head attention with one query, the ego.
 
         With one query, keys and values need not be made for each token: q · (K t) = (Kᵀ q) · t, and the mean of V t is
-        V times the mean of t. The key's bias adds the same to all logits, which is nothing.
+        V times the mean of t. The key's bias adds the same constant to all logits, which softmax cancels.
         """
         heads = self.config.heads
         query = self.query(ego).unflatten(-1, (heads, -1))

@@ -1,7 +1,7 @@
-"""The folder of a training run: its config, and model files that a kill at any moment cannot corrupt.
+"""Folder of a training run: its config, and model files that stay whole when the process is killed at any moment.
 
-Every file is written under a temporary name, flushed to disk and renamed. A DQN checkpoint carries its replay buffer in
-the same zip, so the two can never disagree. SB3 zips hold pickled data: load only files you trust.
+Every file is written under a temporary name, flushed to disk and renamed. A DQN checkpoint holds its replay buffer in
+the same zip, so that model and buffer always belong together. SB3 zips hold pickled data: load only files you trust.
 """
 
 import io
@@ -26,20 +26,20 @@ CHECKPOINT_FILE = "checkpoint.zip"
 BEST_FILE = "best_model.zip"
 POLICY_FILE = "policy.zip"
 FORECASTER = "forecaster"
-"""Field of a run's config: the pin of its forecaster."""
+"""Key of a run's config under which the pin (name and hash) of its forecaster stands."""
 _BUFFER_ENTRY = "replay_buffer.pkl"
 
 
 def open_run(
     run_dir: Path, config: dict[str, Any], provenance: dict[str, Any], resume: bool, free: Sequence[str] = ()
 ) -> None:
-    """Create a run folder with its config, or check that an existing one may be continued.
+    """Creates a run folder with its config, or checks that an existing run may be continued.
 
     Args:
-        run_dir: the folder.
-        config: what makes the run; must be the same when it is resumed.
-        provenance: of this start; each start is kept.
-        resume: continue what is there (a folder without a run in it is started anew).
+        run_dir: path of the folder.
+        config: settings of the run; must be equal when the run is resumed.
+        provenance: provenance of this start; the file keeps one entry per start.
+        resume: whether to continue the run in the folder (a folder without a run gets a new one).
         free: fields of `config` that may differ on resume, as they do not change the training.
 
     Raises:
@@ -61,7 +61,7 @@ def open_run(
 
 
 def read_config(run_dir: Path) -> dict[str, Any]:
-    """The config of a run.
+    """Reads the config of a run.
 
     Raises:
         UserError: the folder holds no run.
@@ -76,14 +76,14 @@ def save_model(
     note: PolicyNote | None = None,
     buffer: bool = False,
 ) -> None:
-    """Save a model so that `path` is always a whole file.
+    """Saves a model so that `path` is always a whole file.
 
     Args:
-        model: what to save.
-        path: a ``.zip``; readable by SB3's own ``load``.
-        extra: small JSON content that travels inside; `envs.sb3.policy_file.read_note` returns it.
+        model: model to save.
+        path: path of the ``.zip``, which SB3's own ``load`` also reads.
+        extra: small JSON content stored inside; `envs.sb3.policy_file.read_note` returns it.
         note: what the policy needs beside its weights.
-        buffer: put the replay buffer inside as well, if the algorithm has one.
+        buffer: whether to store the replay buffer inside as well, if the algorithm has one.
     """
     with new_file(path) as partial:
         with partial.open("wb") as file:
@@ -95,10 +95,10 @@ def save_model(
 
 
 def load_model(path: Path, algorithm: Algorithm, venv: VecEnv | None = None, device: str = "cpu") -> BaseAlgorithm:
-    """Load a model, with the replay buffer if it is inside.
+    """Loads a model, with the replay buffer if the file holds one.
 
     Raises:
-        UserError: no such file, not a model of this algorithm, or not made for these spaces.
+        UserError: the file is missing, holds a model of another algorithm, or a model for other spaces.
     """
     found = algorithm_of(path)
     if found != algorithm:
@@ -111,13 +111,13 @@ def load_model(path: Path, algorithm: Algorithm, venv: VecEnv | None = None, dev
 
 
 def check_forecaster(run_dir: Path, found: ForecasterPin | None) -> bool:
-    """Compare the forecaster of a run that is continued with the one it would get now.
+    """Compares the forecaster of a run that is continued with the one it would get now.
 
     Returns:
-        False if there is a run that does not say what it was trained on (started before forecasters were pinned).
+        False if the run does not record its forecaster (started before forecasters were pinned).
 
     Raises:
-        UserError: it was trained on another one.
+        UserError: the run was trained on another forecaster.
     """
     if not (run_dir / CONFIG_FILE).exists():
         return True
@@ -140,7 +140,7 @@ def _read(file: Path) -> dict[str, Any]:
 
 
 def _check_same(file: Path, config: dict[str, Any], free: Sequence[str]) -> list[Any]:
-    """Compare with the stored config; returns the provenance of earlier starts."""
+    """Compares with the stored config; returns the provenance of earlier starts."""
     stored = _read(file)
     before = stored.get("config", {})
     for name in config:

@@ -1,4 +1,4 @@
-"""What is driven and what the policy sees of it; the one description that training, evaluation and video share."""
+"""Task of a policy (environment, observation, forecaster, drivers), shared by training, evaluation and video."""
 
 import importlib.util
 from dataclasses import dataclass
@@ -26,10 +26,10 @@ from predictor.support.errors import UserError
 from predictor.support.runtime import resolve_device
 
 EVALUATION_SEED = 2_000_000_000
-"""First seed of the final evaluation; training stays below 1e9, model selection between 1e9 and 2e9."""
+"""First seed of the final evaluation; training seeds are below 1e9, those of model selection between 1e9 and 2e9."""
 
 SELECTION_SEED = 1_000_000_000
-"""First seed of model selection; training seeds stay below it, those of the final evaluation start at 2e9."""
+"""First seed of model selection; training seeds are below it, those of the final evaluation start at 2e9."""
 
 Observe = Literal["forecast", "none", "constant-velocity"]
 Backend = Literal["gymnasium", "envpool"]
@@ -37,25 +37,25 @@ Backend = Literal["gymnasium", "envpool"]
 
 @dataclass(frozen=True)
 class Task:
-    """What is driven and what the policy sees of it."""
+    """Describes the environment, what the policy sees of it and who drives the agents that do not learn."""
 
     env_id: str
     """Gymnasium id (highway-fast-v0) or PettingZoo parallel id (simple_tag_v3)."""
     observe: Observe = "forecast"
-    """Learned forecasts, the env's own observation alone, or constant-velocity forecasts in the same shape."""
+    """What the policy sees: learned forecasts, the env's own observation alone, or constant-velocity forecasts."""
     checkpoint: str | None = None
     """Forecaster for `observe="forecast"`: shipped name or path; None takes the one that ships for the id."""
     device: str = "cpu"
-    """Where the forecaster runs: cpu, cuda or auto."""
+    """Device that runs the forecaster: cpu, cuda or auto."""
     backend: Backend = "gymnasium"
-    """Who simulates in training: the gymnasium environment itself, or EnvPool's native copy of it."""
+    """Simulator in training: the gymnasium environment itself, or EnvPool's copy of it in C++."""
     learners: tuple[str, ...] = ()
-    """PettingZoo: agents or roles ("adversary") that learn; none named are all."""
+    """PettingZoo: agents or roles ("adversary") that learn; () takes all agents."""
     driver: str = "heuristic"
-    """PettingZoo: who drives the agents that do not learn (`envs.drivers.all_agents`)."""
+    """PettingZoo: driver of the agents that do not learn (`envs.drivers.all_agents`)."""
 
     def __post_init__(self) -> None:
-        """Check choices, and that the fields fit together; `device="auto"` becomes the device that is taken."""
+        """Checks choices, and that the fields fit together; replaces `device="auto"` by the device that is taken."""
         check_choices(self)
         if self.is_multiagent and self.backend != "gymnasium":
             raise UserError(f"backend {self.backend} has no {self.env_id}; leave it out")
@@ -72,17 +72,17 @@ class Task:
 
     @property
     def is_multiagent(self) -> bool:
-        """Whether it is a PettingZoo environment with many learners."""
+        """Whether this is a PettingZoo environment, with several learners."""
         return is_multiagent_id(self.env_id)
 
     @property
     def forecaster(self) -> str | None:
-        """What to pass as `checkpoint` to the wrappers."""
+        """Value for the argument `checkpoint` of the wrappers."""
         return "constant-velocity" if self.observe == "constant-velocity" else self.checkpoint
 
     @property
     def scene_spec(self) -> SceneSpec | None:
-        """Layout of the scenes behind the forecasts; None if the policy sees none.
+        """Layout of the scenes behind the forecasts; None if the policy sees no forecasts.
 
         Raises:
             UserError: unknown env, missing checkpoint, or a checkpoint that does not fit the env.
@@ -91,10 +91,10 @@ class Task:
 
     @property
     def note(self) -> PolicyNote:
-        """What a policy of this task needs beside its weights.
+        """Note of a policy of this task: its forecaster, learners and driver.
 
         Raises:
-            UserError: as `scene_spec`.
+            UserError: see `scene_spec`.
         """
         pin = None
         if self.observe != "none":
@@ -115,26 +115,26 @@ class Task:
         return space, spec
 
     def check(self) -> gym.Space:
-        """Make the environment, with its forecaster, and return its action space.
+        """Makes the environment, with its forecaster, and returns its action space.
 
         Raises:
-            UserError: as `scene_spec`; unknown learners, or a driver that cannot drive the others.
+            UserError: see `scene_spec`; unknown learners, or a driver that cannot drive the other agents.
         """
         if self.is_multiagent:
-            return self._check_parallel()
+            return self._check_multiagent()
         env = make_env(self.env_id)
         env.close()
         _ = self.scene_spec
         return env.action_space
 
-    def _check_parallel(self) -> gym.Space:
+    def _check_multiagent(self) -> gym.Space:
         env = make_multiagent_env(self.env_id)
         if self.observe != "none":
             env = ForecastParallelEnv(env, self.forecaster, device=self.device)
         learners = learners_named(env.possible_agents, self.learners, self.env_id)
-        partnered = len(learners) < len(env.possible_agents)
-        if partnered:
+        has_others = len(learners) < len(env.possible_agents)
+        if has_others:
             make_driver(self.driver, env, np.random.default_rng(0))
-        space = ParallelVecEnv([lambda: env], agents=learners, partner="random" if partnered else None).action_space
+        space = ParallelVecEnv([lambda: env], agents=learners, partner="random" if has_others else None).action_space
         env.close()
         return space

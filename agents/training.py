@@ -1,7 +1,7 @@
-"""Train an SB3 policy: preset, parallel environments, selection on its own seeds, checkpoints that survive a kill.
+"""Trains an SB3 policy: preset, parallel environments, model selection on separate seeds, resumable checkpoints.
 
 `policy.zip` is the latest model that is not significantly worse on the selection seeds than the best one measured.
-Those seeds are disjoint from training and from the final evaluation, so the final numbers are not selected for.
+Those seeds are disjoint from training and from the final evaluation, so selection does not bias the final numbers.
 """
 
 import zipfile
@@ -34,31 +34,31 @@ _NORMAL_95 = 1.959963984540054  # two-sided 95 % quantile of the normal distribu
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """What to train and for how long."""
+    """Settings of a training run."""
 
     task: Task
     """Environment and what the policy sees."""
     algorithm: Algorithm
-    """ppo or dqn."""
+    """Learning algorithm: ppo or dqn."""
     steps: int
-    """Environment steps over all environments."""
+    """Number of environment steps, over all environments."""
     num_envs: int
-    """Parallel environments."""
+    """Number of parallel environments."""
     seed: int
-    """Drives torch, NumPy and the environments."""
+    """Random seed for torch, NumPy and the environments."""
     device: str = "cpu"
-    """Where the policy's network runs: cpu, cuda or auto."""
+    """Device that runs the policy's network: cpu, cuda or auto."""
     selections: int = 8
-    """How often, evenly spread, the policy is measured on the selection seeds."""
+    """Number of times, evenly spread, that the policy is measured on the selection seeds."""
     selection_episodes: int = 20
-    """Episodes per measurement; always the same seeds."""
+    """Number of episodes per measurement; all measurements use the same seeds."""
     selection_envs: int = 2
-    """Parallel environments of the measurement."""
+    """Number of parallel environments that measure the policy."""
     checkpoint_every: int = 2_000
-    """Environment steps between checkpoints."""
+    """Number of environment steps between checkpoints."""
 
     def __post_init__(self) -> None:
-        """Check choices and ranges; `device="auto"` becomes the device that is taken."""
+        """Checks choices and ranges; replaces `device="auto"` by the device that is taken."""
         check_choices(self)
         check_at_least(
             self, 1, "steps", "num_envs", "selections", "selection_episodes", "selection_envs", "checkpoint_every"
@@ -69,26 +69,30 @@ class TrainingPlan:
 
     @property
     def preset(self) -> Preset:
-        """Hyperparameters."""
+        """Hyperparameters of the algorithm for the task's environment."""
         return preset_for(self.task.env_id, self.algorithm, self.task.backend)
 
     @property
     def attention(self) -> AttentionConfig:
-        """Sizes and scales of the features extractor; the scales are those of the task's scenes."""
+        """Sizes and scales of the features extractor; the scales fit the task's scenes."""
         spec = self.task.scene_spec
         return AttentionConfig() if spec is None else AttentionConfig.for_scenes(spec)
 
     def check_action_space(self, space: spaces.Space) -> None:
-        """Raise if the algorithm cannot drive this action space."""
+        """Checks that the algorithm supports an action space.
+
+        Raises:
+            UserError: dqn for an action space that is not discrete.
+        """
         if self.algorithm == "dqn" and not isinstance(space, spaces.Discrete):
             raise UserError(f"dqn needs a discrete action space, {self.task.env_id} has {space}; use ppo")
 
 
 def train(plan: TrainingPlan, run_dir: Path) -> Path:
-    """Train until `plan.steps`, from the checkpoint in `run_dir` if there is one.
+    """Trains until `plan.steps`, from the checkpoint in `run_dir` if there is one.
 
     Returns:
-        The final policy, `run_dir/policy.zip`.
+        Path of the final policy, `run_dir/policy.zip`.
     """
     note = plan.task.note  # loads the forecaster, which draws random numbers: before the model is seeded
     venv = make_venv(plan.task, plan.num_envs)
@@ -106,7 +110,7 @@ def train(plan: TrainingPlan, run_dir: Path) -> Path:
 
 
 def _learn(plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: Path, note: PolicyNote) -> None:
-    """The remaining steps, under SB3's progress bar."""
+    """Trains for the remaining steps, with SB3's progress bar."""
     every = max(plan.steps // plan.selections, 1)
     progress = ProgressBarCallback()
     callbacks = [
@@ -128,7 +132,7 @@ def _learn(plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: 
 
 
 def make_model(plan: TrainingPlan, venv: VecEnv, tensorboard_log: str | None = None) -> BaseAlgorithm:
-    """A new model with the plan's preset; the ego attends over agents where the observation has any."""
+    """Makes a new model with the plan's preset; Dict observations get a `ForecastAttention` in front."""
     preset = plan.preset
     options = asdict(preset)
     layers = list(options.pop("net_arch"))
@@ -175,7 +179,7 @@ class SaveCheckpoint(BaseCallback):
     """Keeps the latest model on disk, taken between updates so that no collected step is lost or counted twice."""
 
     def __init__(self, path: Path, every_steps: int, note: PolicyNote | None = None) -> None:
-        """Save to `path` about every `every_steps` environment steps, with the note inside."""
+        """Saves to `path` about every `every_steps` environment steps, with the note inside."""
         super().__init__()
         self._note = note
         self._path, self._every = path, every_steps
@@ -196,22 +200,22 @@ class SaveCheckpoint(BaseCallback):
 class SelectBest(BaseCallback):
     """Keeps the latest model that is not significantly worse than the best one measured, with its result inside.
 
-    Few episodes cannot tell two similar models apart, and the highest of several noisy means belongs to a lucky one. A
-    later model, which has learned longer, therefore replaces the kept one unless it is `significantly_worse` than the
-    model with the highest mean so far; comparing with that one keeps a chain of small losses from adding up.
+    With few episodes the highest of several means is mostly noise. A later model, which was trained for longer,
+    therefore replaces the kept one unless it is `significantly_worse` than the model with the highest mean so far.
+    Comparing with that one, not with the kept one, prevents that small losses add up.
 
     Args:
-        arena: where the seeds are played, the same ones each time.
-        path: where the selected model goes, atomically.
-        num_episodes: episodes per measurement.
-        every_steps: environment steps between measurements; there is always one at the end.
+        arena: arena that plays the same seeds at each measurement.
+        path: path of the selected model, written atomically.
+        num_episodes: number of episodes per measurement.
+        every_steps: number of environment steps between measurements; there is always one at the end.
         note: what the policy needs beside its weights.
     """
 
     def __init__(
         self, arena: Arena, path: Path, num_episodes: int, every_steps: int, note: PolicyNote | None = None
     ) -> None:
-        """Nothing is measured yet."""
+        """Prepares the measurements; none is made yet."""
         super().__init__()
         self._note = note
         self._arena, self._path, self._every = arena, path, every_steps
@@ -220,7 +224,7 @@ class SelectBest(BaseCallback):
         self._highest: list[float] = []
 
     def _on_training_start(self) -> None:
-        """Continue from the results inside an existing file."""
+        """Continues from the results inside an existing file."""
         self._measured_at = self.model.num_timesteps
         try:
             self._highest = list(read_note(self._path).get("highest_returns", []))
@@ -255,13 +259,13 @@ class SelectBest(BaseCallback):
 
 
 def significantly_worse(returns: Sequence[float], best: Sequence[float]) -> bool:
-    """Returns whether `returns` are lower than `best` beyond what so few episodes leave open.
+    """Returns whether `returns` are significantly lower than `best`.
 
-    The 95 % normal interval of the mean paired difference must lie below zero; a single episode decides nothing.
+    They are if the 95 % normal interval of the mean paired difference lies below zero; with one episode, never.
 
     Args:
-        returns: of a model, by seed.
-        best: of another model, by the same seeds in the same order.
+        returns: returns of a model, one per seed.
+        best: returns of another model on the same seeds, in the same order.
     """
     difference = np.subtract(returns, best)
     if len(difference) < 2:

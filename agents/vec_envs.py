@@ -1,9 +1,9 @@
 """Vector environments for training and evaluation.
 
-Environments with one ego run in spawned processes with one torch thread each, or natively in EnvPool; the forecaster
-runs once per step for all of them, in the main process. In PettingZoo tasks every learner is an environment of the
-vector, and agents that do not learn are driven by name (`envs.drivers.all_agents`). What a policy sees is decided by
-the task (`agents.task`), so that training, evaluation and video cannot differ.
+Environments with one ego run in spawned processes with one torch thread each, or in EnvPool; the forecaster runs once
+per step for all of them, in the main process. In PettingZoo tasks every learner is an environment of the vector, and a
+named driver (`envs.drivers.all_agents`) drives the agents that do not learn. The task (`agents.task`) determines what a
+policy sees, so that training, evaluation and video agree.
 """
 
 import multiprocessing
@@ -33,40 +33,40 @@ from envs.wrappers import SceneObservation
 from predictor.scene import SceneSpec
 
 EPISODE_INFO = "seeded_episode"
-"""Key under which `SeededEpisodes` leaves the result of an episode in its last info."""
+"""Key of the last info of an episode under which `SeededEpisodes` puts its result."""
 
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """What happened in one episode."""
+    """Result of one episode."""
 
     seed: int
-    """Seed it was reset with."""
+    """Seed that the episode was reset with."""
     episode_return: float
     """Undiscounted sum of rewards; the mean over the learners where there are several."""
     length: int
-    """Policy steps."""
+    """Number of policy steps."""
     crashed: bool | None
-    """Whether the env reported a crash of the ego at any step; None where it never says (or there is no ego)."""
+    """Whether the env reported a crash of the ego at any step; None if it never reports crashes or has no ego."""
     mean_speed_mps: float
-    """Mean over steps of the ego's speed [m/s]; NaN where the env reports none."""
+    """Mean over steps of the ego's speed [m/s]; NaN if the env does not report it."""
     returns_by_role: dict[str, float] = field(default_factory=dict)
-    """Mean return of the learners of each role, where there are several roles."""
+    """Mean return of the learners of each role; empty if there is one role."""
 
 
 class DrivenEnv(BaseParallelWrapper):
-    """Has a fresh driver in each episode, for the agents that do not learn.
+    """Makes a new driver in each episode, for the agents that do not learn.
 
     Args:
-        env: what is driven.
-        driver: its name in `envs.drivers.all_agents`.
+        env: a PettingZoo environment.
+        driver: name of the driver in `envs.drivers.all_agents`.
 
     Attributes:
-        episodes: resets so far.
+        episodes: number of resets so far.
     """
 
     def __init__(self, env: ParallelEnv, driver: str) -> None:
-        """Nothing is reset yet."""
+        """Wraps the environment; the first driver is made after the first reset."""
         super().__init__(env)
         self._name = driver
         self._rng = driver_rng(0)
@@ -75,17 +75,17 @@ class DrivenEnv(BaseParallelWrapper):
 
     @property
     def driver(self) -> Driver:
-        """Of this episode; made when somebody first needs it, as not every name can drive every environment.
+        """Driver of this episode, made at the first access, as some names cannot drive some environments.
 
         Raises:
-            UserError: as `envs.drivers.all_agents.make_driver`.
+            UserError: see `envs.drivers.all_agents.make_driver`.
         """
         if self._driver is None:
             self._driver = make_driver(self._name, self.env, self._rng)
         return self._driver
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], Any]:
-        """Reset; a seed also fixes the drivers of this and the following episodes."""
+        """Resets the environment; a seed also fixes the drivers of this and the following episodes."""
         observations, infos = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._rng = driver_rng(seed)
@@ -95,12 +95,12 @@ class DrivenEnv(BaseParallelWrapper):
 
 
 def drive(env: Any, observations: Mapping[str, Any], generator: np.random.Generator) -> dict[str, Any]:
-    """The partner of `ParallelVecEnv`: the episode's driver acts on the agents' own observations."""
+    """Returns the actions of the agents that do not learn, for `ParallelVecEnv`: those of the episode's driver."""
     return env.driver(own_observations(observations))
 
 
 def own_observations(observations: Mapping[str, Any]) -> dict[str, Any]:
-    """What the environment itself gave each agent, without forecasts."""
+    """Returns the environment's own observation of each agent, without forecasts."""
     return {name: seen["observation"] if isinstance(seen, dict) else seen for name, seen in observations.items()}
 
 
@@ -109,12 +109,12 @@ class MakeCopy:
     """Picklable constructor of one copy of a task's environment."""
 
     task: Task
-    """What to make."""
+    """Task whose environment is made."""
     render_mode: str | None = None
-    """Passed on to the environment."""
+    """Render mode of the environment."""
 
     def __call__(self) -> ParallelEnv:
-        """The environment in a `DrivenEnv`, with forecasts around it unless the task observes none."""
+        """Makes the environment in a `DrivenEnv`, with forecasts around it unless the task observes none."""
         options = {} if self.render_mode is None else {"render_mode": self.render_mode}
         env = DrivenEnv(make_multiagent_env(self.task.env_id, **options), self.task.driver)
         if self.task.observe == "none":
@@ -123,12 +123,12 @@ class MakeCopy:
 
 
 def learners_of(task: Task, env: ParallelEnv) -> list[str]:
-    """The agents that learn."""
+    """Returns the names of the agents that learn."""
     return learners_named(env.possible_agents, task.learners, task.env_id)
 
 
 def make_multiagent_venv(task: Task, copies: int) -> AgentMonitor:
-    """All learners of some copies of a task's environment, with statistics over lives."""
+    """Makes a vector of all learners of some copies of a task's environment, with statistics of each learner's life."""
     make = MakeCopy(task)
     env = make()
     learners = learners_of(task, env)
@@ -141,10 +141,10 @@ def make_venv(task: Task, num_envs: int, seeded: bool = False) -> VecEnv:
     """Makes the parallel environments of a task, with episode statistics and (unless `observe` is none) forecasts.
 
     Args:
-        task: what to make.
-        num_envs: number of environments; one runs in this process, more in spawned ones. Copies of a PettingZoo
-            environment, each with one environment of the vector per learner. Environments of EnvPool.
-        seeded: wrap each environment in `SeededEpisodes`, for evaluation (gymnasium backend only).
+        task: environment and what the policy sees.
+        num_envs: number of environments. With Gymnasium, one runs in this process and several run in spawned ones; of a
+            PettingZoo environment it is the number of copies, each with one environment of the vector per learner.
+        seeded: whether to wrap each environment in `SeededEpisodes`, for evaluation (gymnasium backend only).
     """
     if task.is_multiagent:
         return make_multiagent_venv(task, num_envs)
@@ -184,17 +184,17 @@ class _MakeEnv:
 
 
 class SeededEpisodes(gym.Wrapper):
-    """Plays queued seeds one after another and leaves an `EpisodeResult` in the last info of each episode.
+    """Plays queued seeds one after another and puts an `EpisodeResult` into the last info of each episode.
 
-    Episodes beyond the queue go on unseeded and leave no result. A driver from `envs.drivers.ego` may replace the
-    actions that arrive, with its own generator per seed, so its episodes do not depend on the number of environments.
+    Episodes beyond the queue are unseeded and have no result. A driver of `envs.drivers.ego` can replace the received
+    actions; it has its own generator per seed, so its episodes do not depend on the number of environments.
 
     Args:
         env: one environment.
     """
 
     def __init__(self, env: gym.Env) -> None:
-        """Nothing is queued yet."""
+        """Wraps the environment with an empty queue."""
         super().__init__(env)
         self._seeds: list[int] = []
         self._driver_name: str | None = None
@@ -202,11 +202,11 @@ class SeededEpisodes(gym.Wrapper):
         self._seed: int | None = None
 
     def queue(self, seeds: Sequence[int], driver: str | None = None) -> None:
-        """Seeds of the next episodes, from the next reset on; `driver` drives them if given."""
+        """Sets the seeds of the next episodes, from the next reset on, and the driver that drives them, if any."""
         self._seeds, self._driver_name = list(seeds), driver
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start the next queued episode."""
+        """Starts the next queued episode."""
         self._seed = self._seeds.pop(0) if self._seeds else None
         obs, info = self.env.reset(seed=seed if self._seed is None else self._seed, options=options)
         self._driver = None
@@ -219,7 +219,7 @@ class SeededEpisodes(gym.Wrapper):
         return obs, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step, and note what the result needs."""
+        """Makes a step and records what the result needs."""
         if self._driver is not None:
             action = self._driver(self._obs)
         obs, reward, terminated, truncated, info = self.env.step(action)

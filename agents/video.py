@@ -1,4 +1,4 @@
-"""Films one episode of a trained policy, with the forecasts drawn in."""
+"""Films an episode of a trained policy, with the forecasts drawn in."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,7 +7,7 @@ from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from agents.arena import partner_actions
+from agents.arena import actions_of_others
 from agents.features import EGO_KEY
 from agents.task import EVALUATION_SEED, Task
 from agents.vec_envs import MakeCopy, learners_of, make_multiagent_venv, own_observations
@@ -23,14 +23,14 @@ from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.support.errors import UserError
 
 MAX_VIDEO_STEPS = 200
-"""Longest video [policy steps]; racetracks go on for 1500."""
+"""Maximum length of a video [policy steps]; a racetrack episode has 1500."""
 
 
 def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) -> MultiagentRecording | None:
-    """Play one episode for a film; forecasts are drawn also for a policy that sees none.
+    """Plays one episode for a film; forecasts are drawn also for a policy that sees none.
 
     Returns:
-        The recording; None if no reader knows the environment.
+        The recording; None if no reader is registered for the environment.
     """
     filmed = task
     if task.observe == "none":
@@ -41,12 +41,12 @@ def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) ->
     env = MakeCopy(filmed)()
     assert isinstance(env, ForecastParallelEnv)
     learners = learners_of(task, env)
-    venv = make_multiagent_venv(task, 1).venv  # knows how spaces are padded
+    venv = make_multiagent_venv(task, 1).venv  # pads observations as in training
     assert isinstance(venv, ParallelVecEnv)
 
     def act(observations: dict[str, Any]) -> dict[str, Any]:
         own = own_observations(observations)
-        actions = partner_actions(env, own, learners)
+        actions = actions_of_others(env, own, learners)
         for agent in observations:
             if agent in learners:
                 seen = own[agent] if task.observe == "none" else observations[agent]
@@ -73,15 +73,15 @@ def _has_reader(env_id: str) -> bool:
 
 
 def film(task: Task, model: BaseAlgorithm, path: Path) -> Path | None:
-    """Film the first evaluation episode with the forecasts drawn in, also for a policy that sees none.
+    """Films the first evaluation episode with the forecasts drawn in, also for a policy that sees none.
 
     Args:
-        task: what is driven.
+        task: environment and what the policy sees.
         model: the policy.
-        path: of the video.
+        path: path of the video to write.
 
     Returns:
-        The video; None for an environment that cannot be drawn.
+        `path`; None if the environment cannot be drawn.
     """
     if task.is_multiagent:
         recording = record_task(task, model, EVALUATION_SEED, MAX_VIDEO_STEPS)

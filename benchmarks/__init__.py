@@ -1,1 +1,1 @@
-"""Speed, measured: `python -m benchmarks` runs every section and prints one table (docs/speed.md)."""
+"""Benchmarks of speed: `python -m benchmarks` runs every section and prints one table (docs/speed.md)."""

@@ -1,8 +1,8 @@
-"""Measures the speed of everything and prints one table.
+"""Measures the speed of forecasts, training, wrappers and readers, and prints one table.
 
 `python -m benchmarks` runs every section, `--only forecast streaming` some, `--quick` a short version. With
 `--baseline benchmarks/baseline.json` the run is compared with an earlier one by ratios alone, and the exit status is 1
-if anything got slower. docs/speed.md says how to read the table.
+if anything got slower. docs/speed.md explains the table.
 """
 
 import sys
@@ -22,13 +22,13 @@ from predictor.support.runtime import keep_freed_memory, processor, tune
 
 
 def main() -> None:
-    """Entry point."""
+    """Runs the command."""
     settings = parse(Settings, __doc__)
     settings.check_files()
     if settings.reference is not None:
         from benchmarks.reference import load
 
-        load(settings.reference)  # a wrong path is said now, not in half an hour
+        load(settings.reference)  # a wrong path is reported now, not after half an hour
     baseline = None if settings.baseline is None else read_baseline(settings.baseline, settings)
     began = time.perf_counter()
     tune()
@@ -44,7 +44,7 @@ def main() -> None:
     if baseline is not None:
         lines, comparison = settle(settings, baseline, lines, say)
     result = report(settings, lines, keeps_memory, began)
-    kept = "kept" if keeps_memory else "handed back"
+    kept = "kept" if keeps_memory else "returned to the system"
     versions = ", ".join(f"{name} {version}" for name, version in result["provenance"]["versions"].items())
     print(f"{result['machine']}; {settings.threads} torch threads; freed memory is {kept}; {settings.mode} run")
     print(f"commit {result['provenance']['commit']}; {versions}")

@@ -1,7 +1,8 @@
-"""Does `VecForecast` leak? Agents come and go at every step; resident memory, slots and values are watched.
+"""Checks `VecForecast` for memory leaks and invalid values while agents appear and vanish at every step.
 
-`python -m benchmarks.churn` steps a synthetic traffic of which a share is replaced at each step, with episodes that end
-at different times, and reports the slope of the resident memory [bytes per vector step], measured after a warm-up.
+`python -m benchmarks.churn` steps synthetic traffic in which a share of the agents is replaced at each step, with
+episodes that end at different times, and reports the slope of the resident memory [bytes per vector step] after a
+warm-up.
 """
 
 import gc
@@ -30,7 +31,7 @@ from predictor.support.provenance import provenance
 
 @dataclass(frozen=True)
 class ChurnConfig:
-    """Step `VecForecast` under constant coming and going."""
+    """Measures the memory of `VecForecast` while agents are replaced at every step."""
 
     steps: int = 200_000
     """Number of environment steps, over all environments."""
@@ -43,17 +44,17 @@ class ChurnConfig:
     checkpoint: str = "highway"
     """Forecaster: shipped name, folder or run folder."""
     horizon_steps: int = 2
-    """Number of steps to forecast; memory is kept by observing, and short forecasts leave more steps for that."""
+    """Number of steps to forecast; only observing keeps memory, and short forecasts leave more time for it."""
     measurements: Annotated[int, Renamed("samples")] = 200
     """Number of measurements of memory over the run."""
     out: Path | None = None
     """JSON file to write the result to."""
 
     def __post_init__(self) -> None:
-        """Check ranges.
+        """Checks ranges.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value is out of range.
         """
         check_at_least(self, 1, "steps", "num_envs", "num_agents", "horizon_steps", "measurements")
         if not 0 <= self.replaced <= 1:
@@ -64,25 +65,25 @@ class ChurnConfig:
 
 
 class Churning(gym.Env):
-    """Agents drift along a road; at each step some vanish and others appear, under ids never used before."""
+    """Road on which some agents vanish at each step and others appear, with ids never used before."""
 
     observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
     action_space = gym.spaces.Discrete(2)
 
     def __init__(self, agents: int, replaced: float) -> None:
-        """Nothing is there yet."""
+        """Sets the mean number of agents around the ego and the share that is replaced at each step."""
         self._mean, self._replaced = agents, replaced
         self._next = 1
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """A fresh crowd."""
+        """Starts an episode with new agents."""
         super().reset(seed=seed)
         self.states, self.ids = np.array([[0.0, 4.0, 25.0, 0.0]]), np.array([0])
         self._enter(self._mean)
         return np.zeros(1, np.float32), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Everyone moves; some are replaced; the episode ends now and then."""
+        """Moves all agents, replaces some, and ends the episode with probability 0.03."""
         self.states[:, :2] += self.states[:, 2:]
         stays = self.np_random.random(len(self.ids)) > self._replaced
         stays[0] = True
@@ -99,18 +100,18 @@ class Churning(gym.Env):
 
 
 def read(env: gym.Env) -> Scene:
-    """Everyone on the road."""
+    """Returns the scene of all agents on the road."""
     inner: Any = env.unwrapped
     return Scene(inner.states.copy(), inner.ids.astype(np.int64), np.ones(len(inner.ids), dtype=np.bool_))
 
 
 def resident_bytes() -> int:
-    """Resident memory of this process."""
+    """Returns the resident memory of this process [bytes]."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 
 def main() -> None:
-    """Entry point."""
+    """Runs the command."""
     config = parse(ChurnConfig, __doc__)
     torch.set_num_threads(1)
     _, info = load_checkpoint(config.checkpoint)
@@ -144,7 +145,7 @@ def main() -> None:
     online = venv.stream._online
     seen = sum(env.unwrapped._next for env in venv.unwrapped.envs)  # type: ignore[attr-defined]
     print(
-        f"{config.steps} steps in {config.num_envs} rows, {seen} agents, "
+        f"{config.steps} steps in {config.num_envs} environments, {seen} agents, "
         f"{config.steps / (time.perf_counter() - began):.0f} steps/s: resident memory {late[0][1] / 2**20:.1f} to "
         f"{late[-1][1] / 2**20:.1f} MiB after a quarter of the run, slope {slope:.3f} bytes per vector step; "
         f"tensors alive {tensors[0]} then {tensors[-1]}; slots {online._ids.shape}, all observations finite"

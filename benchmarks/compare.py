@@ -1,7 +1,7 @@
-"""Baselines: what a run is compared with, what got slower, and by how much.
+"""Compares a run with a baseline, an earlier run, and reports what got slower and by how much.
 
-Only numbers that mean the same in another run are kept: ratios within the run, and times divided by a yardstick's in
-the same run. Absolute times are neither stored nor compared.
+A baseline holds only numbers that are comparable between runs: ratios within the run, and times divided by a
+yardstick's (`benchmarks.timing`) in the same run. Absolute times are neither stored nor compared.
 """
 
 import json
@@ -18,53 +18,53 @@ from predictor.support.files import write_json
 FORMAT = "dgvae-rl benchmark baseline"
 VERSION = 1
 OTHER_PROCESSOR = 2.0
-"""On another processor than the baseline's, multiples of a yardstick may be worse by this factor besides."""
+"""Extra factor on the tolerance of multiples of a yardstick, on another processor than the baseline's."""
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """What to compare with."""
+    """Comparable numbers of an earlier run."""
 
     mode: str
-    """"quick" or "full"."""
+    """Mode of that run: "quick" or "full"."""
     threads: int
-    """torch threads."""
+    """Number of torch threads."""
     processor: str
-    """Where it was measured."""
+    """Name of the processor."""
     lines: Mapping[str, Compared]
-    """By key."""
+    """Compared numbers, by the key of their line."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """One line, then and now."""
+    """Change of one line against the baseline."""
 
     key: str
-    """Of the line."""
+    """Key of the line."""
     before: Compared
-    """In the baseline."""
+    """Number in the baseline."""
     now: float
-    """The same number in this run."""
+    """Number in this run."""
     tolerance: float
-    """Factor up to which it does not count."""
+    """Factor up to which a difference does not count."""
 
     @property
     def slowdown(self) -> float:
-        """By which factor it got slower; below 1 it got faster."""
+        """Factor by which the line got slower; below 1 it got faster."""
         return self.before.slowdown(self.now)
 
     @property
     def slower(self) -> bool:
-        """Beyond the tolerance."""
+        """Whether the line got slower by more than the tolerance."""
         return self.slowdown > self.tolerance
 
     @property
     def faster(self) -> bool:
-        """Beyond the tolerance."""
+        """Whether the line got faster by more than the tolerance."""
         return self.slowdown < 1 / self.tolerance
 
     def text(self) -> str:
-        """For people."""
+        """Returns the change as one line of text."""
         factor = f"{self.slowdown:.2f}× slower" if self.slowdown >= 1 else f"{1 / self.slowdown:.2f}× faster"
         unit = {"ratio": "", "matmul": " matmul-equivalents", "interpreter": " interpreter-equivalents"}
         values = f"{self.before.value:.4g} → {self.now:.4g}{unit[self.before.kind]}"
@@ -73,10 +73,10 @@ class Change:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A run against a baseline."""
+    """Result of comparing a run with a baseline."""
 
     changes: tuple[Change, ...]
-    """Lines that both have."""
+    """Changes of the lines that both have."""
     missing: tuple[str, ...]
     """Keys of the baseline that were not measured although their section ran."""
     new: tuple[str, ...]
@@ -84,16 +84,16 @@ class Comparison:
 
     @property
     def slower(self) -> list[Change]:
-        """Worst first."""
+        """Lines that got slower, the worst first."""
         return sorted((c for c in self.changes if c.slower), key=lambda change: -change.slowdown)
 
     @property
     def faster(self) -> list[Change]:
-        """Best first."""
+        """Lines that got faster, the best first."""
         return sorted((c for c in self.changes if c.faster), key=lambda change: change.slowdown)
 
     def report(self) -> list[str]:
-        """For people."""
+        """Returns the comparison as lines of text."""
         parts = [f"SLOWER  {change.text()}" for change in self.slower]
         parts += [f"faster  {change.text()}" for change in self.faster]
         parts += [f"missing {key}" for key in self.missing] + [f"new     {key}" for key in self.new]
@@ -104,7 +104,7 @@ class Comparison:
 def write_baseline(
     path: Path, settings: Settings, lines: Sequence[Line], machine: str, made: Mapping[str, Any]
 ) -> None:
-    """Write the comparable numbers of a run; a reader finds the old file or the new one."""
+    """Writes the comparable numbers of a run; the file is replaced atomically."""
     compared = {line.key: asdict(line.compared) for line in lines if line.compared is not None}
     path.parent.mkdir(parents=True, exist_ok=True)
     head = {"format": FORMAT, "version": VERSION, "mode": settings.mode, "threads": settings.threads}
@@ -112,10 +112,10 @@ def write_baseline(
 
 
 def read_baseline(path: Path, settings: Settings) -> Baseline:
-    """A baseline that fits the run to come.
+    """Reads a baseline and checks that it fits these settings.
 
     Raises:
-        UserError: unreadable, or made with other settings.
+        UserError: the file is missing, unreadable, or was made with other settings.
     """
     again = f"make one with python -m benchmarks{' --quick' if settings.quick else ''} --write-baseline {path}"
     if not path.is_file():
@@ -136,13 +136,13 @@ def read_baseline(path: Path, settings: Settings) -> Baseline:
 
 
 def compare(baseline: Baseline, lines: Iterable[Line], sections: Sequence[str], machine: str) -> Comparison:
-    """Hold a run's lines against the baseline's.
+    """Compares a run's lines with the baseline's.
 
     Args:
-        baseline: what to compare with.
-        lines: what was measured.
-        sections: which sections ran; lines of others are not missing.
-        machine: the processor's name.
+        baseline: numbers of the earlier run.
+        lines: lines of this run.
+        sections: names of the sections that ran; lines of other sections do not count as missing.
+        machine: name of this machine's processor.
     """
     now = {line.key: line.compared for line in lines if line.compared is not None}
     widened = 1.0 if machine == baseline.processor else OTHER_PROCESSOR
@@ -158,7 +158,7 @@ def compare(baseline: Baseline, lines: Iterable[Line], sections: Sequence[str], 
 
 
 def better_of(lines: Sequence[Line], again: Iterable[Line], keys: Iterable[str]) -> list[Line]:
-    """The lines, with those of these keys replaced where the second measurement was better."""
+    """Returns the lines; those with one of the keys are replaced where the second measurement was better."""
     wanted = set(keys)
     second = {line.key: line for line in again if line.key in wanted and line.compared is not None}
 

@@ -1,6 +1,6 @@
-"""What forecasts cost an environment: plain steps against the same steps under `VecForecast`, highway-env and EnvPool.
+"""Measures the cost of forecasts: plain steps against steps under `VecForecast`, for highway-env and EnvPool.
 
-The default checkpoint and an untrained network of the paper's size, on the same seeds and actions, in turns
+The default checkpoint and an untrained network of the paper's size take turns on the same seeds and actions
 (`benchmarks.wrapper_overhead` measures one such pair at length).
 """
 
@@ -23,7 +23,7 @@ from envs.sb3.forecast import VecForecast
 
 
 class Case(NamedTuple):
-    """One kind of vector environment."""
+    """Kind and size of a vector environment."""
 
     simulator: Literal["highway-env", "EnvPool"]
     envs: int
@@ -52,13 +52,13 @@ CASES: dict[str, tuple[Case, ...]] = {
     ),
 }
 FEW = 16
-"""Environments up to which the forecaster gets one thread: scenes so few are done before a second one is awake."""
+"""Number of environments up to which the forecaster gets one thread; for so few scenes a second one does not pay."""
 TOLERANCES = {"highway-env": 1.15, "EnvPool": 1.6}
-"""Of (with forecasts / plain): highway-env itself takes most of the time; EnvPool takes so little that it is noise."""
+"""Tolerance of the ratio with forecasts / plain: wide for EnvPool, whose plain steps are too short to be steady."""
 
 
 def run(settings: Settings) -> list[Line]:
-    """Every case that has its simulator."""
+    """Measures every case whose simulator is installed."""
     lines = []
     for case in CASES[settings.mode]:
         absent = missing("envpool") if case.simulator == "EnvPool" else ""
@@ -80,7 +80,7 @@ def _overhead(case: Case, settings: Settings) -> list[Line]:
         timings = meter.time_blocks(blocks, interpreter())
     what, count = _what(case, settings), case.steps * case.envs
     rates = [rate_line("wrappers", name, what, timing, count, "steps/s") for name, timing in timings.items()]
-    # A plain simulator is not ours to compare.
+    # The speed of a plain simulator does not depend on this project.
     rates = [replace(line, compared=None) if line.name == "plain" else line for line in rates]
     plain = timings.pop("plain")
     return rates + [_ratio(name, what, timing, plain) for name, timing in timings.items()]
@@ -104,7 +104,7 @@ def _ratio(name: str, what: dict[str, Any], timing: Timing, plain: Timing) -> Li
 
 @contextmanager
 def _environments(case: Case, env_id: str) -> Iterator[dict[str, VecEnv]]:
-    """Plain, with the default checkpoint, and where asked for with the paper's size; closed at the end."""
+    """Yields the environments plain, with the default checkpoint and, if asked for, with a paper-size network."""
     with ExitStack() as opened:
 
         def opening(scenes: bool) -> VecEnv:

@@ -1,9 +1,9 @@
-"""How often EnvPool's vehicles keep their identity from step to step, when only their motion tells who is who.
+"""Measures how often EnvPool's vehicles keep their identity from step to step, when it is inferred from their motion.
 
 `python -m benchmarks.envpool_identity` drives each task with random actions, hides the order of the vehicles from the
-reader by shuffling it anew at each step, and compares the identities with the true ones: EnvPool 1.2.5 never reorders
-or removes a vehicle, which is checked in the same run where each driver has an exponent of its own. `--replay` does the
-same to scenes of highway-env, where vehicles also come and go and the simulator names them.
+reader by shuffling it at each step, and compares the identities with the true ones: EnvPool 1.2.5 never reorders or
+removes a vehicle, which the same run checks by the vehicles' individual IDM exponents. `--replay` tracks scenes of
+highway-env as well, where vehicles also appear and vanish and the simulator gives their identity.
 """
 
 from collections.abc import Sequence
@@ -27,12 +27,12 @@ from predictor.support.errors import UserError, run_entry_point
 
 @dataclass(frozen=True)
 class IdentityConfig:
-    """Count kept and lost identities of EnvPool's vehicles."""
+    """Counts kept and lost identities of EnvPool's vehicles."""
 
     task_ids: tuple[str, ...] = tuple(HIGHWAY_ENV_OF)
     """EnvPool tasks to drive."""
     vehicle_steps: int = 100_000
-    """Number of pairs of a vehicle and a step to count per task, the ego not among them."""
+    """Number of pairs of a vehicle and a step to count per task, without the ego."""
     num_envs: Annotated[int, Renamed("envs")] = 32
     """Number of parallel environments."""
     seed: int = 0
@@ -43,10 +43,10 @@ class IdentityConfig:
     """Number of such pairs per replayed id; highway-env makes about a thousand per second."""
 
     def __post_init__(self) -> None:
-        """Check ranges.
+        """Checks ranges.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value is out of range.
         """
         check_at_least(self, 1, "vehicle_steps", "num_envs", "replay_vehicle_steps")
         check_at_least(self, 0, "seed")
@@ -54,24 +54,24 @@ class IdentityConfig:
 
 @dataclass
 class Count:
-    """What became of the vehicles that were there at the step before."""
+    """Counts what happened to the identities of vehicles from one step to the next."""
 
     kept: int = 0
-    """Still have their number."""
+    """Number of vehicle steps after which a vehicle has the same number."""
     split: int = 0
-    """Got a new number."""
+    """Number of vehicle steps after which a vehicle has a new number."""
     wrong: int = 0
-    """Got the number of another vehicle."""
+    """Number of vehicle steps after which a vehicle has the number of another one."""
     resets: int = 0
-    """Episodes that ended meanwhile."""
+    """Number of episodes that ended."""
 
     @property
     def pairs(self) -> int:
-        """Vehicle steps."""
+        """Number of vehicle steps."""
         return self.kept + self.split + self.wrong
 
     def add(self, before: np.ndarray, now: np.ndarray) -> None:
-        """Count the vehicles of one environment: their numbers before and now, -1 where a vehicle is not there."""
+        """Adds the vehicles of one environment, given their numbers before and now; -1 marks an absent vehicle."""
         there = (before >= 0) & (now >= 0)
         same = there & (before == now)
         taken = (now[:, None] == before[before >= 0]).any(axis=1)
@@ -81,34 +81,34 @@ class Count:
 
 
 def count_envpool(task_id: str, config: IdentityConfig) -> Count:
-    """Drive a task until enough vehicle steps are counted; no count where nobody but the ego drives."""
+    """Drives a task until enough vehicle steps are counted; the count is 0 where the ego is the only vehicle."""
     rng = np.random.default_rng(config.seed)
     pool = make_pool(task_id, [config.seed + i for i in range(config.num_envs)])
     pool.reset()
     reader = PoolReader(envpool_spec(task_id, pool.config), config.num_envs)
-    rows = np.arange(config.num_envs)
+    env_indices = np.arange(config.num_envs)
     states = pool.debug_states()
     agents = len(states[0].vehicles)
     count = Count()
-    before, drivers = _numbers(reader, states, rows, rng), _drivers(states)
+    before, drivers = _numbers(reader, states, env_indices, rng), _drivers(states)
     while agents > 1 and count.pairs < config.vehicle_steps:
         clock = [state.elapsed_step for state in states]
         pool.step(_actions(pool.action_space, config.num_envs, rng))
         states = pool.debug_states()
-        now, after = _numbers(reader, states, rows, rng), _drivers(states)
-        for i in rows:
+        now, after = _numbers(reader, states, env_indices, rng), _drivers(states)
+        for i in env_indices:
             if states[i].elapsed_step <= clock[i]:
                 count.resets += 1
                 continue
             if not np.array_equal(drivers[i], after[i]):
-                raise UserError(f"EnvPool's list of vehicles changed its order in {task_id}; this truth holds no more")
+                raise UserError(f"EnvPool's list of vehicles must keep its order, but changed it in {task_id}")
             count.add(before[i], now[i])
         before, drivers = now, after
     return count
 
 
-def _numbers(reader: PoolReader, states: Sequence[Any], rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The reader's numbers of the other vehicles in the simulator's order, which it is not shown: (rows, others)."""
+def _numbers(reader: PoolReader, states: Sequence[Any], envs: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Returns the reader's numbers of the other vehicles (envs, others) in the simulator's order, hidden from it."""
     order = 1 + rng.permutation(len(states[0].vehicles) - 1)
     lists = [state.vehicles for state in states]
     shown = [
@@ -116,7 +116,7 @@ def _numbers(reader: PoolReader, states: Sequence[Any], rows: np.ndarray, rng: n
         for state, own in zip(states, lists, strict=True)
     ]
     numbers = np.empty((len(states), len(order)), dtype=np.int64)
-    numbers[:, order - 1] = reader.read_all(shown, rows).ids[:, 1:]
+    numbers[:, order - 1] = reader.read_all(shown, envs).ids[:, 1:]
     return numbers
 
 
@@ -132,25 +132,25 @@ def _actions(space: gym.Space, count: int, rng: np.random.Generator) -> np.ndarr
 
 
 def count_replay(env_id: str, config: IdentityConfig) -> Count:
-    """The same for scenes of highway-env, whose vehicles have names, come and go."""
+    """Counts identities in scenes of highway-env, whose vehicles have known ids, appear and vanish."""
     rng = np.random.default_rng(config.seed)
     env = make_env(env_id, disable_env_checker=True)
     reader, tracker, count = HighwayReader(env), PoolIdentity(1), Count()
-    row, passed_s = np.zeros(1, dtype=np.int64), np.array([reader.spec.dt_s])
+    first, passed_s = np.zeros(1, dtype=np.int64), np.array([reader.spec.dt_s])
     ended, episode = True, 0
     numbers: dict[int, int] = {}
     while count.pairs < config.replay_vehicle_steps:
         if ended:
             env.reset(seed=config.seed + episode)
             reader.reset()
-            tracker.reset(row)
+            tracker.reset(first)
             numbers, episode = {}, episode + 1
         else:
             _, _, terminated, truncated, _ = env.step(_actions(env.action_space, 1, rng)[0])
         scene = reader.read_all(env)
         order = 1 + rng.permutation(len(scene.ids) - 1)
         states, present = scene.states[None, order], np.ones((1, len(order)), dtype=np.bool_)
-        found = tracker.update(states[..., :2], states[..., 2:4], present, row, passed_s)[0]
+        found = tracker.update(states[..., :2], states[..., 2:4], present, first, passed_s)[0]
         now = dict(zip(scene.ids[order].tolist(), found.tolist(), strict=True))
         if not ended:
             names = [*now, *(name for name in numbers if name not in now)]
@@ -162,14 +162,14 @@ def count_replay(env_id: str, config: IdentityConfig) -> Count:
 
 
 def main() -> None:
-    """Entry point."""
+    """Runs the command."""
     config = parse(IdentityConfig, __doc__)
     table = Table(title=f"identity from motion, random ego, seed {config.seed}")
     for heading in ("env", "vehicle steps", "correct", "id switches", "split", "wrong", "episodes"):
         table.add_column(heading, justify="left" if heading == "env" else "right")
-    rows = [(f"envpool {task_id}", count_envpool(task_id, config)) for task_id in config.task_ids]
-    rows += [(f"highway-env {env_id}", count_replay(env_id, config)) for env_id in config.replay]
-    for name, count in rows:
+    counts = [(f"envpool {task_id}", count_envpool(task_id, config)) for task_id in config.task_ids]
+    counts += [(f"highway-env {env_id}", count_replay(env_id, config)) for env_id in config.replay]
+    for name, count in counts:
         share = f"{100 * count.kept / count.pairs:.3f} %" if count.pairs else "no other vehicles"
         switches = count.split + count.wrong
         table.add_row(name, *map(str, (count.pairs, share, switches, count.split, count.wrong, count.resets)))

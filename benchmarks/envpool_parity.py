@@ -1,9 +1,9 @@
-"""How far EnvPool's highway environments are from highway-env's: the same state in both, and episodes of each.
+"""Compares EnvPool's highway environments with highway-env's, step by step from equal states and by whole episodes.
 
 `python -m benchmarks.envpool_parity` copies the states that EnvPool's episodes begin in (positions, speeds, lanes,
-routes, target speeds, drivers' exponents and timers) into the mirrored highway-env id, steps both with the same random
-actions, and reports by how much vehicles differ in position. Then it compares what episodes of each are like on their
-own terms, and with `--policy` how one trained policy fares in both.
+routes, target speeds, drivers' exponents and timers) into the highway-env id that EnvPool mirrors, steps both with the
+same random actions, and reports by how much vehicles differ in position. Then it compares independent episodes of both
+simulators and, with `--policy`, the results of one trained policy in both.
 """
 
 from collections.abc import Iterator, Sequence
@@ -32,24 +32,24 @@ from predictor.support.files import write_json
 from predictor.support.provenance import provenance
 
 _SAME_M = 1e-6
-"""Vehicles closer than this are in the same place."""
+"""Largest distance of two vehicles that count as being in the same place [m]."""
 _DRIVER = ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN")
 
 
 @dataclass(frozen=True)
 class ParityConfig:
-    """Compare EnvPool's highway environments with highway-env's."""
+    """Compares EnvPool's highway environments with highway-env's."""
 
     task_ids: tuple[str, ...] = ("HighwayFast-v0", "Intersection-v0")
     """EnvPool tasks to compare; they have discrete actions."""
     starts: int = 20
     """Number of copied initial states per task."""
     steps: int = 10
-    """Number of steps from each of them [policy steps]."""
+    """Number of policy steps from each initial state."""
     episodes: int = 30
     """Number of episodes per task, simulator and driver; 0 leaves these tables out."""
     driver: Annotated[tuple[str, ...], Renamed("egos")] = ("random", "idle")
-    """Who drives: random, idle or varied."""
+    """Drivers of the ego: random, idle or varied."""
     policy: Path | None = None
     """Policy .zip of Stable-Baselines3 that drives as well, in both simulators."""
     checkpoint: str | None = None
@@ -60,10 +60,10 @@ class ParityConfig:
     """JSON file to write the results to."""
 
     def __post_init__(self) -> None:
-        """Check ranges.
+        """Checks ranges.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value is out of range, or a task cannot be compared.
         """
         check_at_least(self, 1, "starts", "steps")
         check_at_least(self, 0, "episodes", "seed")
@@ -80,7 +80,7 @@ def _index(start: str, end: str, lane: int) -> tuple[str, str, int | None]:
 
 
 def copy_state(state: Any, env: gym.Env) -> list[Any]:
-    """Put EnvPool's vehicles on highway-env's road; the vehicles there, in the same order, ego first."""
+    """Puts EnvPool's vehicles on highway-env's road and returns the copies, in the same order, ego first."""
     inner: Any = env.unwrapped
     road, vehicles = inner.road, []
     for i, source in enumerate(state.vehicles):
@@ -108,7 +108,7 @@ def copy_state(state: Any, env: gym.Env) -> list[Any]:
 
 @contextmanager
 def untouched_drivers() -> Iterator[None]:
-    """highway-env's intersection changes every IDM driver of the process; put them back afterwards."""
+    """Restores the parameters of IDM drivers, which highway-env's intersection changes for the whole process."""
     kept = {name: getattr(IDMVehicle, name) for name in _DRIVER}
     try:
         yield
@@ -119,37 +119,37 @@ def untouched_drivers() -> Iterator[None]:
 
 @dataclass
 class Apart:
-    """By how much the two differ from the same states."""
+    """Differences between the two simulators after equal initial states."""
 
     distance_m: list[list[float]]
-    """By step: distances between the copies of each vehicle [m], all starts together."""
+    """Distances between the copies of each vehicle [m], by step, all starts together."""
     observation: list[float] = field(default_factory=list)
-    """Largest difference of an entry, by step in which all vehicles still agree."""
+    """Largest difference of an observation's entries, for each step in which all vehicles still agree."""
     reward: list[float] = field(default_factory=list)
-    """Of the same steps."""
+    """Difference of the rewards, for the same steps."""
     ends: list[bool] = field(default_factory=list)
-    """Whether terminated and truncated were the same, of the same steps."""
+    """Whether terminated and truncated were equal, for the same steps."""
 
 
 def step_both(task_id: str, config: ParityConfig) -> Apart:
-    """Differences over the config's starts and steps."""
-    native: Any = make_env(_env_id(task_id), disable_env_checker=True).unwrapped
-    # vehicles come and go in highway-env alone
+    """Measures the differences over the config's starts and steps."""
+    pool: Any = make_env(_env_id(task_id), disable_env_checker=True).unwrapped
+    # vehicles appear and vanish in highway-env alone
     still = {"spawn_probability": 0.0} if task_id.startswith("Intersection") else None
     mirrored = make_env(HIGHWAY_ENV_OF[task_id], disable_env_checker=True, config=still)
     rng = np.random.default_rng(config.seed)
     apart = Apart([[] for _ in range(config.steps)])
     for start in range(config.starts):
-        native.reset(seed=config.seed + start)
+        pool.reset(seed=config.seed + start)
         mirrored.reset(seed=config.seed + start)
-        copies = copy_state(native.debug_states()[0], mirrored)
+        copies = copy_state(pool.debug_states()[0], mirrored)
         for step in range(config.steps):
-            action = int(rng.integers(native.action_space.n))
-            ours, theirs = native.step(action), mirrored.step(action)
+            action = int(rng.integers(pool.action_space.n))
+            ours, theirs = pool.step(action), mirrored.step(action)
             present = {id(vehicle) for vehicle in mirrored.unwrapped.road.vehicles}  # type: ignore[attr-defined]
             distances = [
                 float(np.hypot(*(np.array([source.x, source.y]) - copy.position)))
-                for source, copy in zip(native.debug_states()[0].vehicles, copies, strict=True)
+                for source, copy in zip(pool.debug_states()[0].vehicles, copies, strict=True)
                 if id(copy) in present
             ]
             apart.distance_m[step] += distances
@@ -168,34 +168,34 @@ def step_both(task_id: str, config: ParityConfig) -> Apart:
 
 @dataclass
 class Episodes:
-    """What the episodes of one simulator are like."""
+    """Statistics of the episodes of one simulator."""
 
     returns: list[float]
-    """Sum of rewards."""
+    """Sum of rewards, by episode."""
     lengths: list[float]
-    """Policy steps."""
+    """Number of policy steps, by episode."""
     crashed: list[float]
-    """1 where the ego crashed."""
+    """1 if the ego crashed, else 0, by episode."""
     vehicles: list[float]
-    """Others on the road, by scene."""
+    """Number of other vehicles on the road, by scene."""
     near: list[float]
-    """Others within `SceneSpec`'s perception, by scene."""
+    """Number of other vehicles within the perception range of the reader's `SceneSpec`, by scene."""
     nearest_m: list[float]
-    """Distance from the ego to the nearest other [m], by scene."""
+    """Distance from the ego to the nearest other vehicle [m], by scene."""
     speed_mps: list[float]
-    """Speed of the others [m/s], by scene and vehicle."""
+    """Speed of the other vehicles [m/s], by scene and vehicle."""
     starts: int
-    """Different initial scenes."""
+    """Number of different initial scenes."""
 
 
-def play(env: gym.Env, ego: str, config: ParityConfig) -> Episodes:
-    """Episodes of the config's seeds."""
+def play(env: gym.Env, driver: str, config: ParityConfig) -> Episodes:
+    """Plays the episodes of the config's seeds with a driver (a name, or the path of a policy)."""
     reader = reader_for(env)
     seen = Episodes([], [], [], [], [], [], [], 0)
     starts = set()
     for seed in range(config.seed, config.seed + config.episodes):
         obs, _ = env.reset(seed=seed)
-        act = make_ego_driver(ego, env, driver_rng(seed))
+        act = make_ego_driver(driver, env, driver_rng(seed))
         reader.reset()
         scene = reader.read_all(env)
         starts.add(scene.states.round(6).tobytes())
@@ -226,7 +226,7 @@ def _env_id(task_id: str) -> str:
 
 
 def _for_policy(env: gym.Env, config: ParityConfig) -> gym.Env:
-    """The env as the policy wants to see it."""
+    """Returns the environment with forecasts if the policy was trained on them."""
     return ForecastObservation(env, config.checkpoint) if sees_forecasts(str(config.policy)) else env
 
 
@@ -234,7 +234,7 @@ def _for_policy(env: gym.Env, config: ParityConfig) -> gym.Env:
 
 
 def distances_table(task_id: str, apart: Apart) -> Table:
-    """Differences of position by step; below, those of what the ego gets."""
+    """Returns a table of the differences of position by step; its caption has those of observations and rewards."""
     table = Table(title=f"{task_id} and {HIGHWAY_ENV_OF[task_id]} from the same states, difference of position \\[m]")
     for heading in ("step", "vehicles", "median", "95 %", "max", "within 0.01 m"):
         table.add_column(heading, justify="right")
@@ -251,9 +251,9 @@ def distances_table(task_id: str, apart: Apart) -> Table:
     return table
 
 
-def episodes_table(task_id: str, ego: str, both: Sequence[tuple[str, Episodes]]) -> Table:
-    """Episodes of both simulators, mean ± standard deviation (of returns and crashes: standard error)."""
-    table = Table(title=f"{task_id}, ego {ego}, {len(both[0][1].returns)} episodes each")
+def episodes_table(task_id: str, driver: str, both: Sequence[tuple[str, Episodes]]) -> Table:
+    """Returns a table of both simulators' episodes, mean ± standard deviation (returns, crashes: standard error)."""
+    table = Table(title=f"{task_id}, driver {driver}, {len(both[0][1].returns)} episodes each")
     heads = (
         "simulator",
         "return",
@@ -277,7 +277,7 @@ def episodes_table(task_id: str, ego: str, both: Sequence[tuple[str, Episodes]])
 
 
 def main() -> None:
-    """Entry point."""
+    """Runs the command."""
     config = parse(ParityConfig, __doc__)
     console = Console(width=140)
     results: dict[str, Any] = {}
@@ -286,16 +286,16 @@ def main() -> None:
             apart = step_both(task_id, config)
         console.print(distances_table(task_id, apart))
         results[task_id] = {"apart": asdict(apart)}
-        egos = [*config.driver, *([str(config.policy)] if config.policy else [])] if config.episodes else []
-        for ego in egos:
+        drivers = [*config.driver, *([str(config.policy)] if config.policy else [])] if config.episodes else []
+        for driver in drivers:
             with untouched_drivers():
                 made = [("envpool", _env_id(task_id)), ("highway-env", HIGHWAY_ENV_OF[task_id])]
                 envs = [(name, make_env(env_id, disable_env_checker=True)) for name, env_id in made]
-                if ego == str(config.policy):
+                if driver == str(config.policy):
                     envs = [(name, _for_policy(env, config)) for name, env in envs]
-                both = [(name, play(env, ego, config)) for name, env in envs]
-            console.print(episodes_table(task_id, ego, both))
-            results[task_id][ego] = {name: asdict(seen) for name, seen in both}
+                both = [(name, play(env, driver, config)) for name, env in envs]
+            console.print(episodes_table(task_id, driver, both))
+            results[task_id][driver] = {name: asdict(seen) for name, seen in both}
     if config.out is not None:
         made_with = provenance(("envpool", "highway-env", "gymnasium", "numpy"))
         write_json(config.out, {"config": asdict(config), "results": results, "provenance": made_with})

@@ -1,7 +1,7 @@
-"""PPO with forecasts on EnvPool against plain PPO on highway-env: steps/s of whole training loops, in one run.
+"""Compares PPO with forecasts on EnvPool and plain PPO on highway-env: steps/s of whole training loops, in one run.
 
 `python -m benchmarks.envpool_training` trains both in turn, block by block (rollouts and updates, no evaluation), each
-with the preset that `train_policy.py` uses for it, and prints the median ratio and where the time of the first goes.
+with the preset that `train_policy.py` uses for it, and prints the median ratio and the shares of time of the first.
 Absolute numbers depend on the machine; the ratio is the result.
 """
 
@@ -31,14 +31,14 @@ from predictor.support.runtime import keep_freed_memory
 
 @dataclass(frozen=True)
 class TrainingSpeedConfig:
-    """Compare steps/s of two PPO trainings."""
+    """Compares steps/s of two PPO trainings."""
 
     env_id: str = "highway-fast-v0"
-    """Environment by highway-env's id; EnvPool trains on its native copy."""
+    """Environment by highway-env's id; EnvPool trains on its own copy of it."""
     num_envpool_envs: Annotated[int, Renamed("native_envs")] = 64
     """Number of parallel environments in EnvPool."""
     num_plain_envs: Annotated[int, Renamed("plain_envs")] = 6
-    """Number of parallel environments of highway-env, as many as train_policy.py takes."""
+    """Number of parallel environments of highway-env; the default is that of train_policy.py."""
     blocks: int = 5
     """Number of pairs of blocks; the median of their ratios is reported."""
     plain_steps: int = 768
@@ -51,10 +51,10 @@ class TrainingSpeedConfig:
     """JSON file to write the result to."""
 
     def __post_init__(self) -> None:
-        """Check ranges.
+        """Checks ranges.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value is out of range.
         """
         check_at_least(
             self, 1, "num_envpool_envs", "num_plain_envs", "blocks", "plain_steps", "envpool_steps", "threads"
@@ -62,14 +62,18 @@ class TrainingSpeedConfig:
 
 
 class Timed:
-    """Adds up the time spent in some methods, innermost last."""
+    """Adds up the time spent in chosen methods.
+
+    Attributes:
+        seconds: time by name; that of a method includes the methods it calls.
+    """
 
     def __init__(self) -> None:
-        """Nothing is timed yet."""
+        """Starts with no method."""
         self.seconds: dict[str, float] = {}
 
     def watch(self, owner: Any, method: str, name: str) -> None:
-        """Time a method of an object under a name."""
+        """Times a method of an object from now on, under a name."""
         call = getattr(owner, method)
 
         def timed(*args: Any, **kwargs: Any) -> Any:
@@ -87,20 +91,20 @@ class _Quiet(BaseCallback):
         return True
 
 
-def make(task: Task, rows: int, seed: int) -> BaseAlgorithm:
-    """A model with its environments, as train_policy.py makes them."""
-    return make_model(TrainingPlan(task, "ppo", 1_000_000, rows, seed), make_venv(task, rows))
+def make(task: Task, num_envs: int, seed: int) -> BaseAlgorithm:
+    """Makes a model with its environments, as train_policy.py does."""
+    return make_model(TrainingPlan(task, "ppo", 1_000_000, num_envs, seed), make_venv(task, num_envs))
 
 
 def run_block(model: BaseAlgorithm, steps: int) -> float:
-    """Environment steps per second over whole rollouts and updates."""
+    """Measures environment steps per second over whole rollouts and updates."""
     before, began = model.num_timesteps, time.perf_counter()
     model.learn(steps, callback=_Quiet(), reset_num_timesteps=False)
     return (model.num_timesteps - before) / (time.perf_counter() - began)
 
 
 def profile(model: BaseAlgorithm, steps: int) -> dict[str, float]:
-    """Share of a block's time by part."""
+    """Measures the share of a block's time by part."""
     timed = Timed()
     forecast = model.env.venv  # type: ignore[union-attr]
     timed.watch(forecast.venv, "step_wait", "simulation and scenes")
@@ -117,29 +121,29 @@ def profile(model: BaseAlgorithm, steps: int) -> dict[str, float]:
 
 
 def measure(config: TrainingSpeedConfig, report: Callable[[str], None]) -> dict[str, Any]:
-    """Steps/s of both, the ratio, and where the time of the one with forecasts goes.
+    """Measures steps/s of both, their ratio, and the shares of time of the training with forecasts.
 
     Args:
         config: shapes and repetitions.
-        report: is told what each pair of blocks gave.
+        report: receives a line of text after each pair of blocks.
     """
     plain = make(Task(config.env_id, "none"), config.num_plain_envs, 0)
-    native = make(Task(config.env_id, "forecast", backend="envpool"), config.num_envpool_envs, 0)
+    envpool = make(Task(config.env_id, "forecast", backend="envpool"), config.num_envpool_envs, 0)
     try:
         run_block(plain, config.plain_steps)
-        run_block(native, config.envpool_steps)
+        run_block(envpool, config.envpool_steps)
         pairs = []
         for _ in range(config.blocks):
-            pairs.append((run_block(plain, config.plain_steps), run_block(native, config.envpool_steps)))
+            pairs.append((run_block(plain, config.plain_steps), run_block(envpool, config.envpool_steps)))
             report(f"plain {pairs[-1][0]:.0f} steps/s, EnvPool with forecasts {pairs[-1][1]:.0f}")
-        shares = profile(native, config.envpool_steps)
+        shares = profile(envpool, config.envpool_steps)
     finally:
-        for model in (plain, native):
+        for model in (plain, envpool):
             model.env.close()  # type: ignore[union-attr]
     ratios = [fast / slow for slow, fast in pairs]
     return {
         "plain_steps_per_s": statistics.median(slow for slow, _ in pairs),
-        "native_forecast_steps_per_s": statistics.median(fast for _, fast in pairs),
+        "envpool_forecast_steps_per_s": statistics.median(fast for _, fast in pairs),
         "ratio": statistics.median(ratios),
         "ratios": ratios,
         "shares": shares,
@@ -148,7 +152,7 @@ def measure(config: TrainingSpeedConfig, report: Callable[[str], None]) -> dict[
 
 
 def main() -> None:
-    """Entry point."""
+    """Runs the command."""
     config = parse(TrainingSpeedConfig, __doc__)
     keep_freed_memory()
     torch.set_num_threads(config.threads)
@@ -157,11 +161,11 @@ def main() -> None:
     print(
         f"{config.env_id}: plain PPO on highway-env ({config.num_plain_envs} processes) "
         f"{result['plain_steps_per_s']:.0f} steps/s, PPO with forecasts on EnvPool "
-        f"({config.num_envpool_envs} environments) {result['native_forecast_steps_per_s']:.0f} steps/s, "
+        f"({config.num_envpool_envs} environments) {result['envpool_forecast_steps_per_s']:.0f} steps/s, "
         f"ratio {result['ratio']:.1f} ({min(ratios):.1f} to {max(ratios):.1f})"
     )
     shares = result["shares"].items()
-    print("where its time goes: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares))
+    print("shares of its time: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares))
     if config.out is not None:
         made = provenance(("envpool", "highway-env", "stable-baselines3", "torch"))
         write_json(config.out, result | {"provenance": made})

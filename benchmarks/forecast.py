@@ -1,4 +1,4 @@
-"""Latency and throughput of a forecast: observing and rolling out apart, over batch × agents × horizon × samples."""
+"""Measures latency and throughput of observing and of rolling out, over batch × agents × horizon × samples."""
 
 from collections.abc import Callable
 from functools import partial
@@ -15,7 +15,7 @@ from predictor.dgvae import DGVAE
 
 
 class Case(NamedTuple):
-    """One shape."""
+    """Shape of a forecast."""
 
     batch: int
     agents: int
@@ -41,7 +41,7 @@ EVOLVING = "evolving graph, float32"
 
 
 def run(settings: Settings) -> list[Line]:
-    """Both presets at every shape."""
+    """Measures both presets at every shape."""
     meter = Meter.of(settings)
     return [line for preset in SIZES for case in CASES[settings.mode] for line in _case(preset, case, meter)]
 
@@ -92,7 +92,7 @@ def _calls(model: DGVAE, case: Case) -> dict[str, Callable[[], Any]]:
 
 
 def _half(model: DGVAE, case: Case) -> Any:
-    """The same with every other agent absent, as where scenes differ in size."""
+    """Observes and rolls out scenes in which every second agent is absent, as in batches of unequal scenes."""
     states, valid = scenes(case.batch, case.agents)
     valid[:, 1::2] = False
     _, belief = model.observe(model.empty_memory(*valid.shape), states * valid[..., None], valid)

@@ -1,11 +1,11 @@
-"""Paper-size training of 5-Spring on one GPU, as one command: `python -m benchmarks.gpu_springs --data data`.
+"""Trains the paper-size dG-VAE on 5-Spring on one GPU with one command: `python -m benchmarks.gpu_springs --data data`.
 
-Makes the data where it is missing, trains the dG-VAE for 150 epochs of 50,000 sequences at batch 128, measures it as
-the table does (`python -m predictor.suite --table springs --budget paper --rows dgvae`, whose row this is) and writes
-summary.json: steps/s, minutes, accuracy. Killed, it goes on where it was.
+Makes the data if it is missing, trains the dG-VAE for 150 epochs of 50,000 sequences at batch 128, measures it as the
+table does (the line of `python -m predictor.suite --table springs --budget paper --lines dgvae`) and writes
+summary.json: steps/s, minutes, accuracy. A run that was killed continues from its last checkpoint.
 
-Where there is no GPU, `--project` times a step of the same shapes here, counts what it is made of (products, bytes,
-kernels), and says what that would come to on a card. That is arithmetic on assumptions, not a measurement.
+Without a GPU, `--project` times a step of the same shapes on this machine, counts its products, bytes and kernels, and
+computes the time on a card from them. That is arithmetic on assumptions, not a measurement.
 """
 
 import json
@@ -26,7 +26,7 @@ from torch.utils.flop_counter import flop_registry
 
 from predictor.data.springs import SpringsConfig, make
 from predictor.evaluation.paper_tables import SPRINGS, Budget
-from predictor.suite import SuiteConfig, row_config, row_folder, run_row
+from predictor.suite import SuiteConfig, line_config, line_folder, run_line
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices, check_positive
 from predictor.support.errors import UserError, run_entry_point
@@ -39,50 +39,50 @@ from predictor.training.objective import window_loss
 from predictor.training.trainer import Trainer, load_data
 
 SPLITS = ("train", "val", "test", "ood")
-ROW = next(row for row in SPRINGS.rows if row.key == "dgvae")
+LINE = next(line for line in SPRINGS.lines if line.key == "dgvae")
 ATEN = torch.ops.aten
 NO_KERNEL = {
     ATEN.empty, ATEN.empty_like, ATEN.empty_strided, ATEN.new_empty, ATEN.new_empty_strided, ATEN.detach,
     ATEN._unsafe_view, ATEN.lift_fresh, ATEN.is_same_size, ATEN._local_scalar_dense, ATEN.resize_,
 }  # fmt: skip
-"""They move no data; views are left out besides."""
+"""Operations that move no data; views are not counted either."""
 FLOP = {packet: flop_registry[packet] for packet in (ATEN.mm, ATEN.addmm, ATEN.bmm, ATEN.baddbmm)} | {
     ATEN.addmm_: flop_registry[ATEN.addmm],
     ATEN.baddbmm_: flop_registry[ATEN.baddbmm],
 }
-"""Only products count."""
+"""Functions that count the FLOP of matrix products, by operation; other operations count 0."""
 H200_TFLOPS = {"float32": 67.0, "tf32": 494.0, "bfloat16": 989.0}
-"""Dense products, from the vendor's data sheet."""
+"""Peak rate of an H200 for dense products [TFLOP/s], by precision, from the vendor's data sheet."""
 OTHER_KERNEL_US = (1.5, 2.0, 2.5, 3.0)
-"""The projection is repeated for these."""
+"""Least times of a kernel [µs] for which the projection is repeated."""
 UPDATE_KERNELS = 10
-"""Of clipping and fused Adam on a GPU; here they are hundreds, and are not counted."""
+"""Number of kernels of clipping and fused Adam on a GPU; the hundreds that a CPU needs for them are not counted."""
 
 
 @dataclass(frozen=True)
 class GpuSpringsConfig:
-    """Train the paper-size dG-VAE on 5-Spring, measure it, and write down how long it took."""
+    """Trains the paper-size dG-VAE on 5-Spring, measures it, and writes how long it took."""
 
     data: Path = Path("data")
-    """Folder of the episode stores; springs/ below it is made where it is missing (a few minutes)."""
+    """Folder of the episode stores; springs/ below it is made if it is missing (a few minutes)."""
     out: Path = Path("runs/gpu_springs")
-    """Folder to write: the suite's row, and summary.json (or projection.json)."""
+    """Folder to write: the suite's line of the table, and summary.json (or projection.json)."""
     device: str = "cuda"
     """Device that trains and measures: cpu, cuda or auto; `--project` takes the CPU."""
     precision: TrainPrecision = "float32"
     """Precision of matrix products in training, see `python -m predictor.train --help`."""
     budget: Budget = "paper"
-    """Sizes of network and training: "paper" is 150 epochs at batch 128, "smoke" a minute on a CPU."""
+    """Sizes of network and training: "paper" is 150 epochs at batch 128, "smoke" takes a minute on a CPU."""
     steps: int = 0
     """Number of optimiser steps; 0 takes the budget's."""
     seed: int = 0
     """Random seed for data, training and forecasts."""
     sequences: int = 50_000
-    """Number of training sequences to make where there are none (paper: 50,000)."""
+    """Number of training sequences to make if there are none (paper: 50,000)."""
     held_out: int = 10_000
     """Number of sequences of each of the other splits (paper: 10,000)."""
     project: bool = False
-    """Time and count a step here, and project it onto a card."""
+    """Time and count a step on this machine, and project it onto a card."""
     timed_steps: int = 3
     """Number of steps to time for the projection, after one to warm up."""
     batch_size: int = 0
@@ -95,15 +95,15 @@ class GpuSpringsConfig:
     share: float = 0.0
     """Share of the peak that products of these shapes reach; 0 takes the share of this machine's own rate."""
     kernel_us: float = 2.0
-    """Least time of a kernel in a replayed graph, start included: the assumption that matters most."""
+    """Least time of a kernel in a replayed graph, start included [µs]: the assumption that matters most."""
     target_minutes: float = 30.0
-    """Time that the run is to stay below."""
+    """Time that the training should stay below [minutes]."""
 
     def __post_init__(self) -> None:
-        """Check choices and ranges; `device="auto"` becomes the device that is taken.
+        """Checks choices and ranges; replaces `device="auto"` by the device that is taken.
 
         Raises:
-            UserError: a value that makes no sense, or, without `project`, a device that is not there.
+            UserError: a value is out of range, or, without `project`, the device is not available.
         """
         check_choices(self)
         check_at_least(self, 1, "sequences", "held_out", "timed_steps")
@@ -120,11 +120,11 @@ class GpuSpringsConfig:
 
     @property
     def suite(self) -> SuiteConfig:
-        """The table's row that is run; a projection computes on the CPU, which has no TF32."""
+        """Config of the suite for this line of the table; a projection computes on the CPU, which has no TF32."""
         device = "cpu" if self.project else self.device
         precision: TrainPrecision = "float32" if self.project and self.precision == "tf32" else self.precision
         return SuiteConfig(
-            "springs", self.data, self.out, self.budget, (ROW.key,), self.steps, 1, self.seed, device, precision
+            "springs", self.data, self.out, self.budget, (LINE.key,), self.steps, 1, self.seed, device, precision
         )
 
 
@@ -132,7 +132,7 @@ class GpuSpringsConfig:
 
 
 def make_missing(config: GpuSpringsConfig) -> dict[str, float]:
-    """Simulate the splits that are not there; the seconds each took."""
+    """Simulates the missing splits and returns the seconds that each took."""
     folder = config.data / "springs"
     sizes = {name: config.sequences if name == "train" else config.held_out for name in SPLITS}
     train, val, test, ood = (0 if (folder / name).exists() else size for name, size in sizes.items())
@@ -140,12 +140,12 @@ def make_missing(config: GpuSpringsConfig) -> dict[str, float]:
 
 
 def run(config: GpuSpringsConfig) -> dict[str, Any]:
-    """Data, training, measuring, summary; what is there already is not done again."""
+    """Makes data, trains, measures and writes the summary; finished parts are not repeated."""
     made = make_missing(config)
     config.suite.check_stores()
-    folder = row_folder(config.suite, ROW)
+    folder = line_folder(config.suite, LINE)
     before, result = _steps_done(folder / "run"), folder / "result.json"
-    measured = json.loads(result.read_text()) if result.exists() else run_row(config.suite, ROW)
+    measured = json.loads(result.read_text()) if result.exists() else run_line(config.suite, LINE)
     steps = config.suite.sizes.steps
     minutes = measured["train_seconds"] / 60
     test = measured["tests"]["test"]
@@ -178,26 +178,26 @@ def _steps_done(folder: Path) -> int:
 
 @dataclass(frozen=True)
 class Kernel:
-    """One operation that moves data."""
+    """Operation that moves data."""
 
     name: str
-    """Of the operation."""
+    """Name of the operation."""
     flop: float
-    """Of a matrix product, else 0."""
+    """FLOP of a matrix product; 0 for other operations."""
     moved_bytes: float
-    """Inputs and outputs."""
+    """Number of bytes of inputs and outputs."""
 
 
 class Counter(TorchDispatchMode):
-    """Notes every operation, those of the backward pass included."""
+    """Records every operation, those of the backward pass included."""
 
     def __init__(self) -> None:
-        """Nothing yet."""
+        """Starts with no kernels."""
         super().__init__()
         self.kernels: list[Kernel] = []
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Run it, and note it unless it is a view."""
+        """Runs the operation and records it unless it is a view."""
         kwargs = kwargs or {}
         out = func(*args, **kwargs)
         packet = func._overloadpacket
@@ -210,8 +210,8 @@ class Counter(TorchDispatchMode):
 
 
 def projected_config(config: GpuSpringsConfig, data: Path) -> TrainConfig:
-    """The row's training, at the mean of its history lengths: what a step costs on average."""
-    settings = row_config(replace(config.suite, data=data), ROW, config.out / "unused")
+    """Returns the config of the line's training at its mean history length, which gives the mean cost of a step."""
+    settings = line_config(replace(config.suite, data=data), LINE, config.out / "unused")
     shapes = Shapes(1, settings.history_steps, settings.horizon_steps)
     lengths = range(settings.min_history_steps, settings.history_steps + 1)
     mean = statistics.mean(shapes.time(n) for n in lengths) - settings.horizon_steps
@@ -226,9 +226,9 @@ def projected_config(config: GpuSpringsConfig, data: Path) -> TrainConfig:
 
 
 def count(trainer: Trainer) -> list[Kernel]:
-    """What forward, loss and backward of one step are made of."""
+    """Returns the kernels of forward, loss and backward of one step."""
     now = trainer.plan(0)
-    batch = trainer.feed.batch(now)
+    batch = trainer.batches.batch(now)
     with Counter() as counter:
         output = trainer.model.window(
             batch.states, batch.valid, batch.last_observed, now.rollout_steps, trainer.noise.manual_seed(0)
@@ -240,7 +240,7 @@ def count(trainer: Trainer) -> list[Kernel]:
 
 
 def time_steps(trainer: Trainer, steps: int) -> list[float]:
-    """Seconds of each step, after one to warm up."""
+    """Measures the seconds of each step, after one to warm up."""
     trainer.read(trainer.train_step())
     seconds = []
     for _ in range(steps):
@@ -251,7 +251,7 @@ def time_steps(trainer: Trainer, steps: int) -> list[float]:
 
 
 def matmul_rate(size: int = 1024, repeats: int = 5) -> float:
-    """FLOP/s of a plain float32 product on this machine, the best of a few."""
+    """Measures FLOP/s of a plain float32 product on this machine, the best of a few."""
     left, right, out = torch.randn(size, size), torch.randn(size, size), torch.empty(size, size)
     seconds = []
     for _ in range(repeats + 1):
@@ -262,11 +262,11 @@ def matmul_rate(size: int = 1024, repeats: int = 5) -> float:
 
 
 def project(config: GpuSpringsConfig) -> dict[str, Any]:
-    """Time and count a step here, and say what it would take on the card."""
+    """Times and counts a step on this machine, and projects its time on the card."""
     tune()
     with tempfile.TemporaryDirectory() as folder:
-        data, rows = Path(folder), config.batch_size or config.suite.sizes.batch_size
-        make(SpringsConfig(data / "springs", train=2 * rows, val=8, test=0, ood=0, seed=config.seed))
+        data, batch = Path(folder), config.batch_size or config.suite.sizes.batch_size
+        make(SpringsConfig(data / "springs", train=2 * batch, val=8, test=0, ood=0, seed=config.seed))
         settings = projected_config(config, data)
         trainer = Trainer(settings, load_data(settings))
     kernels, seconds, rate = count(trainer), time_steps(trainer, config.timed_steps), matmul_rate()
@@ -289,7 +289,7 @@ def project(config: GpuSpringsConfig) -> dict[str, Any]:
 
 
 def measured_here(kernels: list[Kernel], seconds: list[float], matmul_flop_per_s: float) -> dict[str, Any]:
-    """What a step is made of and how fast this machine does it."""
+    """Returns the counts of a step and its speed on this machine."""
     flop, step_s = sum(k.flop for k in kernels), statistics.median(seconds)
     return {
         "machine": processor(),
@@ -307,13 +307,16 @@ def measured_here(kernels: list[Kernel], seconds: list[float], matmul_flop_per_s
 
 
 def on_card(config: GpuSpringsConfig, kernels: list[Kernel], here: Mapping[str, Any], steps: int) -> dict[str, float]:
-    """Seconds of a step on the card, by each of its limits and with every kernel at its own limit; minutes of all.
+    """Computes the seconds of a step on the card, by each limit alone and with every kernel at its own limit.
 
     Args:
-        config: the card.
-        kernels: of a step.
-        here: of `measured_here`; its share of the matmul rate is taken where the config has none.
-        steps: of the run.
+        config: rates of the card.
+        kernels: kernels of a step.
+        here: result of `measured_here`; its share of the matmul rate is taken if the config has none.
+        steps: number of steps of the run.
+
+    Returns:
+        The seconds by name, the assumptions behind them, and the minutes of the whole run.
     """
     share = config.share or min(1.0, here["share_of_matmul_rate"])
     peak = config.peak_tflops or H200_TFLOPS[config.precision]
@@ -337,7 +340,7 @@ def _plain(config: GpuSpringsConfig) -> dict[str, Any]:
 
 
 def describe(content: dict[str, Any]) -> str:
-    """The projection in words."""
+    """Returns the projection as text."""
     here, card = content["here"], content["card"]
     verdict = "below" if card["minutes"] <= card["target_minutes"] else "ABOVE"
     other = ", ".join(f"{us} µs: {minutes:.1f} minutes" for us, minutes in content["minutes_by_kernel_us"].items())
@@ -361,7 +364,7 @@ def describe(content: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Entry point."""
+    """Runs the command."""
     config = parse(GpuSpringsConfig, __doc__)
     if config.project:
         print(describe(project(config)))

@@ -1,8 +1,8 @@
-"""What cheaper graphs cost in accuracy: `python -m benchmarks.graph_accuracy --checkpoint A B --data C D`.
+"""Measures accuracy and time with cheaper graphs: `python -m benchmarks.graph_accuracy --checkpoint A B --data C D`.
 
 Each checkpoint is measured on the same windows of each store with all pairs, with the nearest k, and with a graph that
-stays as it is when the roll-out begins, whatever it was trained with. minADE of the most likely forecast, beside
-constant velocity; the time is of streaming the histories and forecasting, one window at a time.
+is frozen when the roll-out begins, whatever it was trained with. The table shows minADE of the most likely forecast,
+also for constant velocity; the time includes streaming the history and forecasting, one window at a time.
 """
 
 import time
@@ -22,7 +22,7 @@ from predictor.data.windows import Windows
 from predictor.dgvae import DGVAE
 from predictor.dgvae.networks import DGVAEConfig
 from predictor.evaluation.accuracy import Tally
-from predictor.evaluation.measure_row import protocol_indices
+from predictor.evaluation.measure_line import protocol_indices
 from predictor.evaluation.outcomes import run_windows
 from predictor.forecaster import Forecaster
 from predictor.support.command_line import Renamed, parse
@@ -35,7 +35,7 @@ from predictor.support.runtime import tune
 
 @dataclass(frozen=True)
 class GraphConfig:
-    """Measure checkpoints with several graphs."""
+    """Measures checkpoints with several graphs."""
 
     checkpoint: Annotated[tuple[Path, ...], Renamed("checkpoints")]
     """Checkpoints of dG-VAEs to measure: shipped names, folders or run folders."""
@@ -57,10 +57,10 @@ class GraphConfig:
     """JSON file to write the result to."""
 
     def __post_init__(self) -> None:
-        """Check ranges.
+        """Checks ranges.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value is out of range.
         """
         if not self.checkpoint or not self.data:
             raise UserError("give at least one of --checkpoint and one of --data")
@@ -68,7 +68,7 @@ class GraphConfig:
 
 
 def measure(forecaster: Forecaster, windows: Windows, config: GraphConfig) -> dict[str, float]:
-    """Errors [m] over the windows, and seconds for all of them."""
+    """Measures errors [m] over the windows, and the seconds for all of them."""
     chosen = protocol_indices(windows, config.stride, config.max_windows, seed=0)
     tally, began = Tally(), time.perf_counter()
     for outcome in run_windows(forecaster, windows, chosen, config.horizon_steps, batch_size=1):
@@ -83,10 +83,10 @@ def measure(forecaster: Forecaster, windows: Windows, config: GraphConfig) -> di
 
 
 def variants(checkpoint: Path, config: GraphConfig) -> list[DGVAE]:
-    """The checkpoint's network with each graph; all pairs first.
+    """Returns the checkpoint's network with each graph; all pairs first.
 
     Raises:
-        UserError: the checkpoint is of another model.
+        UserError: the checkpoint holds another model.
     """
     forecaster, _ = load_checkpoint(checkpoint)
     if not isinstance(forecaster, DGVAE):
@@ -96,12 +96,12 @@ def variants(checkpoint: Path, config: GraphConfig) -> list[DGVAE]:
 
 
 def main() -> None:
-    """Entry point."""
+    """Runs the command."""
     config = parse(GraphConfig, __doc__)
     tune()
     torch.set_num_threads(config.threads)
     table = Table("store", "agents", "trained on", "graph", "minADE [m]", "minFDE [m]", "s per window")
-    rows: list[dict[str, Any]] = []
+    lines: list[dict[str, Any]] = []
     for path in config.data:
         store = read_store(path)
         spec, history, horizon = store.info.spec, config.burn_in_steps, config.horizon_steps
@@ -112,14 +112,14 @@ def main() -> None:
             trained = load_checkpoint(checkpoint)[1].config
             cases += [(_graph(trained), _graph(other.config), other) for other in variants(checkpoint, config)]
         for trained_on, graph, forecaster in cases:
-            row = measure(forecaster, windows, config)
-            rows.append({"store": path.name, "agents": agents, "trained_on": trained_on, "graph": graph} | row)
-            errors = (f"{row[key]:.3f}" for key in ("min_ade_m", "min_fde_m"))
-            seconds = f"{row['seconds'] / row['windows']:.3f}"
+            measured = measure(forecaster, windows, config)
+            lines.append({"store": path.name, "agents": agents, "trained_on": trained_on, "graph": graph} | measured)
+            errors = (f"{measured[key]:.3f}" for key in ("min_ade_m", "min_fde_m"))
+            seconds = f"{measured['seconds'] / measured['windows']:.3f}"
             table.add_row(path.name, f"{agents:.0f}", trained_on, graph, *errors, seconds)
     Console(width=120).print(table)
     if config.out is not None:
-        write_json(config.out, {"rows": rows, "provenance": provenance(("torch",))})
+        write_json(config.out, {"rows": lines, "provenance": provenance(("torch",))})
 
 
 def _graph(config: DGVAEConfig) -> str:

@@ -1,15 +1,15 @@
-"""What plain matrix products reach here: the rate that other lines are held against."""
+"""Measures the rate of plain matrix products on this machine, which other lines are compared with."""
 
 from benchmarks.results import Line
 from benchmarks.settings import Settings
 from benchmarks.timing import REFERENCE_PRODUCTS, Meter, Product, products, quartiles
 
 SQUARE: Product = (1024, 1024, 1024)
-"""Large and square: the most a product reaches, which thin ones do not."""
+"""Shape of a large square product, which reaches the highest rate; thin products are slower."""
 
 
 def run(settings: Settings) -> list[Line]:
-    """GFLOP/s of each reference product, of all of them together, and of a large square one."""
+    """Measures GFLOP/s of each reference product, of all of them together, and of a large square one."""
     shapes = [*((shape,) for shape in REFERENCE_PRODUCTS), (SQUARE,), REFERENCE_PRODUCTS]
     yards = {_name(s): products(tuple(s)) for s in shapes}
     timings = Meter.of(settings).measure({name: yard.call for name, yard in yards.items()})

@@ -1,7 +1,7 @@
-"""Time and memory of a forecast against the number of agents: all pairs, and the nearest neighbours only.
+"""Measures time and memory of a forecast against the number of agents, for all pairs and for the nearest neighbours.
 
 Exponents are the slopes of straight lines through log time and log memory over log agents. Memory is the rise of the
-resident size of another process whose allocator hands every larger block back at once.
+resident size of another process whose allocator returns every larger block to the system at once.
 """
 
 from collections.abc import Sequence
@@ -25,29 +25,29 @@ NEIGHBOURS = 8
 HORIZON = 20
 COUNTS: dict[str, tuple[int, ...]] = {"quick": (20, 50, 100, 200), "full": (10, 20, 50, 100, 200, 500)}
 MOST_DENSE = {"quick": 100, "full": 500}
-"""All pairs up to so many agents, where they fit into memory."""
+"""Largest number of agents for which all pairs are measured, if they fit into memory."""
 MEMORY_COUNTS: dict[str, tuple[int, ...]] = {"quick": (50, 200), "full": (50, 100, 200, 500)}
 FIT_FROM = 50
-"""Exponents are fitted from so many agents on: below, the cost of calls hides that of agents."""
+"""Smallest number of agents that exponents are fitted to; below it the fixed cost of calls dominates."""
 MOST_BYTES = 4 * 2**30
 EXPONENT_TOLERANCE = 1.25
 Costs = dict[int, float]
 
 
 def exponent(costs: Costs) -> float:
-    """Slope of log cost over log count, least squares."""
+    """Computes the slope of log cost over log count by least squares."""
     counts, values = np.array(list(costs), dtype=np.float64), np.array(list(costs.values()))
     return float(np.polyfit(np.log(counts), np.log(values), 1)[0])
 
 
 def dense_bytes(config: DGVAEConfig, agents: int) -> float:
-    """About how much all pairs take at once: embedding, gates, memory before and after, heads, messages."""
+    """Estimates the bytes that all pairs take: embedding, gates, memory before and after, heads, messages."""
     width = 2 * config.hidden_dim + 8 * config.rnn_dim + 2 * config.head_dim + 2 * config.message_dim
     return 4.0 * agents**2 * width
 
 
 def run(settings: Settings) -> list[Line]:
-    """Both presets, both graphs."""
+    """Measures both presets with both graphs."""
     lines = []
     with WorkerProcess(settings.threads, exact_memory()) as worker:
         for preset in SIZES:
@@ -65,7 +65,7 @@ def _what(preset: str, neighbours: int) -> dict[str, Any]:
 
 
 def _counts(counts: Sequence[int], preset: str, neighbours: int, settings: Settings) -> tuple[list[int], list[Line]]:
-    """Which numbers of agents to measure, and lines for those that do not fit."""
+    """Returns the numbers of agents to measure, and lines for those that do not fit into memory."""
     if neighbours:
         return list(counts), []
     chosen = [count for count in counts if count <= MOST_DENSE[settings.mode]]
@@ -89,7 +89,7 @@ def _times(preset: str, neighbours: int, settings: Settings) -> tuple[Costs, lis
         lines.append(
             timed_line("agents", "forecast", _what(preset, neighbours) | {"agents": agents}, timing, flop=flop)
         )
-        times[agents] = timing.equivalents  # the machine may drift between two counts
+        times[agents] = timing.equivalents  # the machine's speed may change between two counts
     return times, lines + absent
 
 

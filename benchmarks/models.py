@@ -1,4 +1,4 @@
-"""The models and inputs that the sections share."""
+"""Models and inputs that the sections share."""
 
 import time
 from collections.abc import Callable
@@ -19,34 +19,34 @@ from predictor.training.config import TrainConfig
 from predictor.training.objective import window_loss
 
 SIZES = ("fast", "paper")
-"""Presets."""
+"""Names of the presets that are measured."""
 
 
 def road(agents: int) -> SceneSpec:
-    """Kinematic scenes around an ego, as on highway-env's roads."""
+    """Returns the layout of kinematic scenes around an ego, as on highway-env's roads."""
     frame: tuple[AxisFrame, AxisFrame] = ("ego", "world")
     return SceneSpec(1.0, frame, max_agents=agents)
 
 
 def box(agents: int) -> SceneSpec:
-    """Kinematic scenes without an ego, as of springs."""
+    """Returns the layout of kinematic scenes without an ego, as for springs."""
     scales = (1.0, 1.0, 1.0, 1.0)
     return SceneSpec(0.1, feature_scales=scales, has_ego=False, perception_m=1e6, max_agents=agents)
 
 
 def sized(preset: str) -> DGVAEConfig:
-    """A preset whose free run stays finite without training: fresh weights predict no change."""
+    """Returns a preset whose roll-out stays finite without training: initial weights predict no change."""
     return replace(PRESETS[preset], zero_start=True)
 
 
 def forecaster(config: DGVAEConfig, spec: SceneSpec, horizon_steps: int) -> DGVAE:
-    """An untrained model, ready to forecast."""
+    """Makes an untrained model, ready to forecast."""
     torch.manual_seed(0)
     return DGVAE(spec, config, horizon_steps).eval().requires_grad_(False)
 
 
 def scenes(batch: int, agents: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """States [SI] of a road full of cars, everybody present, and who is present."""
+    """Returns states [m, m/s] of cars on a road, (batch, agents, 4), and `valid`, true for all of them."""
     generator = torch.Generator().manual_seed(seed)
     spread, mean = torch.tensor([50.0, 4.0, 3.0, 0.3]), torch.tensor([0.0, 0.0, 25.0, 0.0])
     states = torch.randn(batch, agents, 4, generator=generator) * spread + mean
@@ -54,27 +54,27 @@ def scenes(batch: int, agents: int, seed: int = 0) -> tuple[Tensor, Tensor]:
 
 
 def observed(model: DGVAE, states: Tensor, valid: Tensor) -> tuple[Memory, Belief]:
-    """Memory and belief after two equal scenes."""
+    """Returns memory and belief after two equal scenes."""
     with torch.inference_mode():
         memory, _ = model.observe(model.empty_memory(*valid.shape), states, valid)
         return model.observe(memory, states, valid)
 
 
 def inference(call: Callable[[], Any]) -> Callable[[], Any]:
-    """The same without gradients."""
+    """Returns a function that makes the call without gradients."""
     return torch.inference_mode()(call)
 
 
 class TrainingStep:
-    """Window, loss, backward, Adam: one step on one batch of full windows.
+    """Makes training steps (window, loss, backward, Adam) on one batch of full windows.
 
     Args:
-        config: sizes.
-        agents: of each window, all present throughout.
-        steps: of each window.
-        batch: windows.
-        rollout_steps: of the free run at the window's end; 0 trains teacher-forced only.
-        kind: precision of products.
+        config: sizes of the network.
+        agents: number of agents of each window, all present throughout.
+        steps: number of steps of each window.
+        batch: number of windows.
+        rollout_steps: number of steps of the roll-out at the window's end; 0 trains teacher-forced only.
+        kind: precision of matrix products.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class TrainingStep:
         rollout_steps: int = 0,
         kind: Precision = "float32",
     ) -> None:
-        """Build model, optimiser and windows."""
+        """Makes model, optimiser and windows."""
         torch.manual_seed(0)
         self.model = DGVAE(box(agents), config, max(1, rollout_steps)).train()
         self.rollout_steps = rollout_steps
@@ -102,13 +102,13 @@ class TrainingStep:
         self._generator = torch.Generator().manual_seed(0)
 
     def timed(self) -> float:
-        """Make one step and return its seconds."""
+        """Makes one step and returns its seconds."""
         began = time.perf_counter()
         self()
         return time.perf_counter() - began
 
     def __call__(self) -> None:
-        """Make one step."""
+        """Makes one step."""
         batch = self._batch
         with precision(self._kind, "cpu"):
             output = self.model.window(

@@ -1,4 +1,4 @@
-"""Data: reading an episode store, cutting windows, simulating springs, and simulators without forecasts."""
+"""Measures reading an episode store, cutting windows, simulating springs, and simulators without forecasts."""
 
 import tempfile
 from collections.abc import Callable, Iterator
@@ -23,11 +23,11 @@ EPISODES: dict[str, int] = {"quick": 300, "full": 3000}
 BATCH = 128
 POOL_ENVS = 64
 STEPS: dict[str, int] = {"quick": 10, "full": 60}
-"""Simulator steps in a block."""
+"""Number of simulator steps in a block, by mode."""
 
 
 def run(settings: Settings) -> list[Line]:
-    """Stores and windows, then simulators."""
+    """Measures stores and windows, then simulators."""
     meter = Meter.of(settings)
     count = EPISODES[settings.mode]
     with tempfile.TemporaryDirectory() as folder:
@@ -64,7 +64,7 @@ def _bytes(store: EpisodeStore) -> float:
 
 
 def _traffic(count: int, steps: int = 40, agents: int = 24) -> list[Episode]:
-    """Cars that come into being and vanish, around an ego that stays."""
+    """Returns episodes of cars that appear and vanish, around an ego that stays."""
     rng = np.random.default_rng(0)
     episodes = []
     for seed in range(count):
@@ -99,7 +99,7 @@ def _simulators(settings: Settings) -> list[Line]:
             timing = Meter.of(settings).time_blocks({name: block}, interpreter())[name]
         what = {"env": settings.env_id, "envs": envs}
         line = rate_line("data", name, what, timing, STEPS[settings.mode] * envs, "steps/s")
-        lines.append(replace(line, compared=None))  # not ours
+        lines.append(replace(line, compared=None))  # its speed does not depend on this project
     return lines
 
 

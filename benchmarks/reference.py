@@ -1,8 +1,8 @@
-"""The published dNRI (Graber & Schwing, github.com/cgraber/cvpr_dNRI) beside our dG-VAE at equal sizes, in turns.
+"""Compares the published dNRI (Graber & Schwing, github.com/cgraber/cvpr_dNRI) with our dG-VAE at equal sizes.
 
-Nothing of it is part of this project: its classes are imported from a checkout that the user names. Its
-`predict_future` encodes the whole history anew, which is its interface; so that nobody is misled, its free run alone
-stands against our step and free run, and our encoding of the whole history against its whole prediction.
+No part of dNRI belongs to this project: its classes are imported from a checkout that the user names. Its
+`predict_future` encodes the whole history at each call. For a fair comparison its roll-out alone is also compared with
+our step and roll-out, and its whole prediction with ours when we encode the whole history, too.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ from predictor.support.errors import UserError
 EQUAL = DGVAEConfig(
     hidden_dim=256, rnn_dim=64, head_dim=128, message_dim=256, decoder_dim=256, edge_feature_dim=32, zero_start=True
 )
-"""Our widths where the reference has one of its own; it has no edge features."""
+"""Our config with the reference's widths; the reference has no edge features."""
 REFERENCE: dict[str, Any] = {
     "input_size": 4, "gpu": False, "num_edge_types": 2, "encoder_hidden": 256, "encoder_mlp_num_layers": 3,
     "encoder_mlp_hidden": 128, "encoder_rnn_hidden": 64, "rnn_hidden": 64, "encoder_rnn_type": "lstm",
@@ -36,10 +36,10 @@ REFERENCE: dict[str, Any] = {
     "nll_loss_type": "gaussian", "prior_variance": 5e-5, "no_encoder_bn": True, "encoder_no_bn": True,
     "graph_type": "dynamic", "encoder_save_eval_memory": False, "rnn_type": "lstm",
 }  # fmt: skip
-"""Its settings, as its own scripts set them for a dynamic graph."""
+"""Settings of the reference, as its own scripts set them for a dynamic graph."""
 
 AS_SHIPPED = "the reference with torch's own choice of library"
-"""`predictor.support.runtime.tune` chooses the library for the whole process; for this line it is undone."""
+"""Name of the lines measured without `predictor.support.runtime.tune`, which sets the library for the whole process."""
 
 
 class Training(NamedTuple):
@@ -64,10 +64,10 @@ ROUNDS = {"quick": 5, "full": 11}
 
 
 def load(path: Path) -> Any:
-    """The reference's model class.
+    """Imports the reference's model class.
 
     Raises:
-        UserError: no such folder, or another repository.
+        UserError: the folder is missing or holds another repository.
     """
     where = f"--reference {path}"
     if not path.is_dir():
@@ -84,19 +84,19 @@ def load(path: Path) -> Any:
 
 
 def build(model_class: Any, agents: int) -> Any:
-    """The reference's model for so many agents; what it prints meanwhile is dropped."""
+    """Makes the reference's model for a number of agents; what it prints meanwhile is dropped."""
     torch.manual_seed(0)
     with contextlib.redirect_stdout(io.StringIO()):
         return model_class(REFERENCE | {"num_vars": agents})
 
 
 def parameters(model: torch.nn.Module) -> int:
-    """Learned numbers."""
+    """Returns the number of learned parameters."""
     return sum(p.numel() for p in model.parameters() if p.requires_grad)
 
 
 def run(settings: Settings) -> list[Line]:
-    """Training, three views of prediction, and both models' sizes."""
+    """Measures training and prediction (three comparisons), and both models' sizes."""
     assert settings.reference is not None  # `Settings.sections`
     model_class = load(settings.reference)
     meter = Meter(ROUNDS[settings.mode], block_s=0.05, budget_s=120.0)
@@ -166,7 +166,7 @@ def _prediction(model_class: Any, meter: Meter) -> list[Line]:
 
 
 def _our_predictions(states: torch.Tensor, future: int) -> tuple[Callable[[], Any], Callable[[], Any]]:
-    """Ours after a streamed history (the last scene and the free run), and with the history encoded anew."""
+    """Returns our prediction after a streamed history (last scene and roll-out), and with the history encoded anew."""
     batch, history, agents, _ = states.shape
     model = forecaster(EQUAL, box(agents), future)
     valid = torch.ones(batch, agents, dtype=torch.bool)
@@ -188,7 +188,7 @@ def _our_predictions(states: torch.Tensor, future: int) -> tuple[Callable[[], An
 
 
 def free_run_seconds(model: Any, states: torch.Tensor, future: int) -> float:
-    """Seconds of the reference's single steps after its own encoding of the history, which is not timed."""
+    """Measures the seconds of the reference's single steps; its encoding of the history before is not timed."""
     prior_logits, _, prior_hidden = model.encoder(states[:, :-1])
     hidden = model.decoder.get_initial_hidden(states)
     for step in range(states.shape[1] - 1):
@@ -202,7 +202,7 @@ def free_run_seconds(model: Any, states: torch.Tensor, future: int) -> float:
 
 
 def as_shipped(call: Callable[[], Any]) -> Callable[[], Any]:
-    """The same with products as torch does them by default."""
+    """Returns a function that makes the call with torch's default precision of matrix products."""
 
     def untuned() -> Any:
         before = torch.get_float32_matmul_precision()

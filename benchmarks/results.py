@@ -1,4 +1,4 @@
-"""One measured number (`Line`), and the number of it that means the same in another run (`Compared`)."""
+"""Measured line of the table (`Line`), and its number that is comparable with another run (`Compared`)."""
 
 import math
 from collections.abc import Mapping
@@ -6,66 +6,66 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 Kind = Literal["ratio", "matmul", "interpreter"]
-"""A ratio of two things in one run, or a time divided by that of a yardstick (`benchmarks.timing`) in the same run."""
+"""Kind of a number: ratio of two things in one run, or time divided by a yardstick's (`benchmarks.timing`)."""
 Better = Literal["lower", "higher"]
 
 TOLERANCE = 1.35
-"""By which factor a line may get worse before it counts as slower, where the line says nothing else."""
+"""Default factor by which a line may get worse before it counts as slower."""
 
 
 @dataclass(frozen=True)
 class Compared:
-    """What a later run is compared with."""
+    """Number that a later run is compared with."""
 
     value: float
-    """The ratio."""
+    """Value of the ratio."""
     kind: Kind
-    """What it is a ratio of."""
+    """Kind of the ratio."""
     better: Better = "lower"
-    """Which direction is faster."""
+    """Direction that is faster."""
     tolerance: float = TOLERANCE
-    """Factor by which it may get worse."""
+    """Factor by which the number may get worse."""
 
     def slowdown(self, now: float) -> float:
-        """By which factor `now` is slower; below 1 it is faster."""
+        """Returns the factor by which `now` is slower; below 1 it is faster."""
         worse, than = (now, self.value) if self.better == "lower" else (self.value, now)
         return worse / than if than else math.inf
 
 
 @dataclass(frozen=True)
 class Line:
-    """One line of the table."""
+    """Line of the table."""
 
     section: str
-    """Which section measured it."""
+    """Name of the section that measured it."""
     name: str
-    """What was measured."""
+    """Name of what was measured."""
     what: Mapping[str, Any] = field(default_factory=dict)
     """Shape and settings."""
     value: float | None = None
-    """Median; None if it was not measured."""
+    """Median of the value; None if it was not measured."""
     unit: str = ""
-    """Of the value."""
+    """Unit of the value."""
     quartiles: tuple[float, float] | None = None
-    """Of the value, over blocks."""
+    """First and third quartile of the value, over blocks."""
     ratio: float | None = None
-    """Median over blocks of this time divided by another one's."""
+    """Median over blocks of this time divided by another line's."""
     ratio_to: str = ""
-    """Whose; for a line whose value is a ratio, what it is a ratio of."""
+    """Name of that other line; if the value itself is a ratio, what it is a ratio of."""
     flop: float | None = None
-    """Products that one call mathematically needs (`benchmarks.flops`)."""
+    """FLOP of the products that one call mathematically needs (`benchmarks.flops`)."""
     flops_per_s: float | None = None
-    """The same divided by the time."""
+    """Value of `flop` divided by the time of a call [1/s]."""
     matmul_share: float | None = None
-    """The same divided by the rate of plain float32 matrix products, measured around this line."""
+    """Value of `flops_per_s` divided by the rate of plain float32 matrix products, measured around this line."""
     compared: Compared | None = None
-    """What a later run is compared with; None if nothing is."""
+    """Number that a later run is compared with; None if the line is not compared."""
     note: str = ""
-    """What a reader should know, or why there is no value."""
+    """Remark for the reader, or the reason why there is no value."""
 
     @property
     def key(self) -> str:
-        """Names the line across runs."""
+        """Identifier of the line across runs."""
         return " | ".join([self.section, self.name, self.shape])
 
     @property
@@ -74,14 +74,14 @@ class Line:
         return ", ".join(f"{name} {value}" for name, value in self.what.items())
 
     def noted(self, note: str) -> "Line":
-        """The same with a note."""
+        """Returns this line with a note."""
         return replace(self, note=note)
 
     def json(self) -> dict[str, Any]:
-        """As JSON values."""
+        """Returns the line as JSON values."""
         return {"key": self.key} | asdict(self)
 
 
 def skipped(section: str, name: str, why: str, what: Mapping[str, Any] | None = None) -> Line:
-    """A line that says why nothing was measured."""
+    """Returns a line with the reason why nothing was measured."""
     return Line(section, name, what or {}, note=f"skipped: {why}")

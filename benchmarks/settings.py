@@ -1,4 +1,4 @@
-"""What can be set in a run of the benchmarks, and which sections there are."""
+"""Settings of a run of the benchmarks, and the list of sections."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +22,7 @@ SECTIONS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class Settings:
-    """Measure the speed of everything, print one table, write it as JSON; compare it with a baseline if asked to."""
+    """Measures speed, prints one table, writes it as JSON and, if asked to, compares it with a baseline."""
 
     only: tuple[str, ...] = ()
     """Sections to run; none given runs all of them (machine, forecast, streaming, training, wrappers, ppo, agents,
@@ -34,7 +34,7 @@ class Settings:
     reference: Path | None = None
     """Checkout of github.com/cgraber/cvpr_dNRI, whose model is timed beside ours."""
     env_id: str = "highway-fast-v0"
-    """Environment of the wrappers and of PPO; needs a shipped checkpoint and a copy in EnvPool."""
+    """Environment for the wrappers and PPO; needs a shipped checkpoint and a copy in EnvPool."""
     out: Path = Path("runs/benchmarks.json")
     """JSON file for machine, versions and all lines."""
     baseline: Path | None = None
@@ -44,20 +44,20 @@ class Settings:
 
     @property
     def mode(self) -> str:
-        """Either "quick" or "full"."""
+        """Mode of the run: "quick" or "full"."""
         return "quick" if self.quick else "full"
 
     @property
     def sections(self) -> tuple[str, ...]:
-        """What to run, in order; the reference only where there is one."""
+        """Names of the sections to run, in order; the reference only if its path is given."""
         chosen = self.only or tuple(SECTIONS)
         return tuple(s for s in SECTIONS if s in chosen and (s != "reference" or self.reference is not None))
 
     def __post_init__(self) -> None:
-        """Check names of sections and ranges.
+        """Checks names of sections and ranges.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value is out of range, or a section is unknown or lacks its option.
         """
         check_at_least(self, 1, "threads")
         unknown = [name for name in self.only if name not in SECTIONS]
@@ -69,10 +69,10 @@ class Settings:
             raise UserError("a baseline holds every section; leave --only out")
 
     def check_files(self) -> None:
-        """Check that what is written can be files.
+        """Checks that the paths to write are no folders.
 
         Raises:
-            UserError: a folder has the name.
+            UserError: one of them is a folder.
         """
         for path in (self.out, self.write_baseline):
             if path is not None and path.is_dir():

@@ -1,7 +1,7 @@
-"""Does a step cost more after a long history? Three forecasters, each with another history, take turns.
+"""Measures whether a step costs more after a long history: three forecasters with different histories take turns.
 
-All of them see the same scenes. One whose history has grown a fifth beyond its mark is reset and streams anew, outside
-the clock, so the marks hold. Beside them stands what encoding the history anew would cost at every step.
+All of them see the same scenes. A forecaster whose history has grown by more than a fifth is reset and observes a new
+history, which is not timed, so that the lengths hold. The table also shows the cost of encoding the whole history anew.
 """
 
 import time
@@ -20,9 +20,9 @@ from predictor.online import OnlineForecaster
 from predictor.scene import SceneBatch
 
 HISTORIES = (10, 100, 1000)
-"""Steps."""
+"""Lengths of the histories [steps]."""
 ANEW = (10, 100)
-"""Histories to encode anew."""
+"""Lengths of the histories that are encoded anew [steps]."""
 BATCH, AGENTS, HORIZON = 8, 12, 5
 STEPS_PER_BLOCK = 3
 MOST_GROWTH = 1.2
@@ -31,23 +31,23 @@ TOLERANCE = 1.2
 
 
 class Streamed:
-    """A forecaster that is kept near one length of history.
+    """Keeps a forecaster near one length of history.
 
     Args:
-        model: whose forecasts.
-        history: steps.
-        stream: scenes, used over and over.
+        model: model that forecasts.
+        history: length of the history [steps].
+        stream: scenes to observe, repeated from the start when they end.
     """
 
     def __init__(self, model: DGVAE, history: int, stream: list[SceneBatch]) -> None:
-        """Stream the history."""
+        """Observes the history."""
         self.history, self.seen = history, 0
         self._online = OnlineForecaster(model, len(stream[0]), stream[0].valid.shape[1])
         self._stream = stream
         self._refill()
 
     def block(self) -> float:
-        """Seconds of one observation and forecast; the first one is not timed, as it fetches the model into cache."""
+        """Measures the seconds of one observation and forecast, after one that loads the model into the cache."""
         if self.seen > MOST_GROWTH * self.history:
             self._refill()
         self._step()
@@ -72,7 +72,7 @@ class Streamed:
 
 
 def run(settings: Settings) -> list[Line]:
-    """Cost of a step by history, its ratio, and what encoding anew would cost."""
+    """Measures the cost of a step by history, its ratio, and the cost of encoding the history anew."""
     presets = ("fast",) if settings.quick else ("fast", "paper")
     return [line for preset in presets for line in _measure(preset, settings)]
 
@@ -113,7 +113,7 @@ def _encoding_anew(model: DGVAE, what: dict[str, Any], meter: Meter) -> list[Lin
 
 
 def _stream(length: int = 64) -> list[SceneBatch]:
-    """Scenes of a steady cast that drifts along."""
+    """Returns scenes of agents that all stay and move with constant velocity."""
     states, valid = (tensor.numpy() for tensor in scenes(BATCH, AGENTS))
     ids = np.tile(np.arange(AGENTS), (BATCH, 1))
     move = np.array([1.0, 0.0, 0.0, 0.0])

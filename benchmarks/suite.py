@@ -1,4 +1,4 @@
-"""Runs sections, and what a run leaves behind: lines, machine, versions."""
+"""Runs sections and reports a run: lines, machine, versions."""
 
 import importlib
 import time
@@ -23,12 +23,12 @@ PACKAGES = ("torch", "numpy", "zarr", "gymnasium", "highway-env", "envpool", "st
 
 
 def measure(settings: Settings, sections: Sequence[str], began: Callable[[str], None]) -> list[Line]:
-    """Run sections one after the other.
+    """Runs sections one after the other.
 
     Args:
-        settings: what to run.
-        sections: which.
-        began: is told the name of each section as it begins.
+        settings: settings of the run.
+        sections: names of the sections.
+        began: receives the name of each section when it begins.
     """
     lines: list[Line] = []
     for section in sections:
@@ -39,7 +39,7 @@ def measure(settings: Settings, sections: Sequence[str], began: Callable[[str], 
 
 
 WITH_POLICIES = {"wrappers", "ppo"}
-"""Sections that leave products to torch's own library, as `train_policy.py` does."""
+"""Sections that keep torch's default library for matrix products, as `train_policy.py` does."""
 
 
 def _run(section: str, settings: Settings) -> list[Line]:
@@ -59,7 +59,7 @@ def _run(section: str, settings: Settings) -> list[Line]:
 def settle(
     settings: Settings, baseline: Baseline, lines: list[Line], began: Callable[[str], None]
 ) -> tuple[list[Line], Comparison]:
-    """Compare with a baseline; what looks slower is measured once more and the better of both counts."""
+    """Compares with a baseline; lines that look slower are measured once more, and the better result counts."""
     comparison = compare(baseline, lines, settings.sections, processor())
     failing = [change.key for change in comparison.slower]
     if failing:
@@ -71,13 +71,13 @@ def settle(
 
 
 def report(settings: Settings, lines: Sequence[Line], keeps_memory: bool, began: float) -> dict[str, Any]:
-    """Everything about a run, as JSON values.
+    """Returns all results of a run as JSON values.
 
     Args:
-        settings: of the run.
-        lines: what was measured.
+        settings: settings of the run.
+        lines: measured lines.
         keeps_memory: whether glibc keeps freed memory.
-        began: when, by `time.perf_counter`.
+        began: start of the run, by `time.perf_counter` [s].
     """
     return {
         "machine": processor(),

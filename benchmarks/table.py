@@ -1,4 +1,4 @@
-"""The one table: with lines on a terminal, as plain aligned text elsewhere."""
+"""Formats the table: with rules on a terminal, as plain aligned text elsewhere."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ _RIGHT = ("median", "quartiles", "GFLOP/s", "% of matmul")
 
 
 def cells(line: Line) -> tuple[str, ...]:
-    """One line of the table."""
+    """Returns the cells of a line of the table."""
     ratio = "" if line.ratio is None else f"{line.ratio:.2f} "
     return (
         line.section,
@@ -27,12 +27,12 @@ def cells(line: Line) -> tuple[str, ...]:
 
 
 def number(value: float) -> str:
-    """Three significant digits, thousands with commas."""
+    """Formats a number with three significant digits, thousands with commas."""
     return f"{value:,.0f}" if abs(value) >= 999.5 else f"{value:.3g}"
 
 
 def plain(lines: Sequence[Line]) -> str:
-    """Aligned text without lines."""
+    """Formats the table as aligned text without rules."""
     table = [HEADINGS, *(cells(line) for line in lines)]
     widths = [max(len(texts[column]) for texts in table) for column in range(len(HEADINGS))]
 
@@ -43,7 +43,7 @@ def plain(lines: Sequence[Line]) -> str:
 
 
 def rich_table(lines: Sequence[Line]) -> Table:
-    """For a terminal."""
+    """Formats the table for a terminal."""
     table = Table(*HEADINGS, title="benchmarks")
     for column in table.columns:
         if column.header in _RIGHT:

@@ -1,8 +1,8 @@
-"""Where the time of a step goes: `python -m benchmarks.time_shares`.
+"""Measures the shares of time of a step by kind of operation: `python -m benchmarks.time_shares`.
 
-torch's profiler over three calls: a prediction at the shape that is compared with the published dNRI, a batch of
+torch's profiler runs over three calls: a prediction at the shape that is compared with the published dNRI, a batch of
 forecasts and a training step of the paper's size. Shares are of the processor time that torch's operations report
-themselves; the interpreter between them is not in it.
+themselves, without the time of the interpreter between them.
 """
 
 from collections.abc import Callable
@@ -26,34 +26,34 @@ KINDS: dict[str, tuple[str, ...]] = {
     "ELU, gates": ("elu", "sigmoid", "tanh", "reciprocal", "clamp", "neg", "lerp"),
     "lookups, sums over senders": ("index", "embedding_bag", "aten::sum", "gather", "scatter"),
 }
-"""Parts of operations' names; what matches none is the rest."""
+"""Parts of operations' names, by kind; operations that match none are "rest"."""
 
 
 @dataclass(frozen=True)
 class ProfileConfig:
-    """Say where the time goes."""
+    """Measures the shares of time by kind of operation."""
 
     threads: int = 2
     """Number of CPU threads of torch."""
     calls: int = 10
-    """Number of profiled calls of each subject, after three that do not count; a training step has a fifth."""
+    """Number of profiled calls, after three that do not count; of the training step a fifth as many."""
 
     def __post_init__(self) -> None:
-        """Check ranges.
+        """Checks ranges.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value is out of range.
         """
         check_at_least(self, 1, "threads", "calls")
 
 
 def kind_of(operation: str) -> str:
-    """The kind of an operation by its name."""
+    """Returns the kind of an operation, by its name."""
     return next((kind for kind, parts in KINDS.items() if any(part in operation for part in parts)), "rest")
 
 
 def shares(call: Callable[[], Any], calls: int) -> tuple[dict[str, float], float]:
-    """Share of each kind, and operations per call."""
+    """Measures the share of each kind, and the number of operations per call."""
     for _ in range(3):
         call()
     with profile(activities=[ProfilerActivity.CPU]) as seen:
@@ -68,7 +68,7 @@ def shares(call: Callable[[], Any], calls: int) -> tuple[dict[str, float], float
 
 
 def subjects() -> dict[str, tuple[Callable[[], Any], int]]:
-    """What is profiled, and by how much it is called less often."""
+    """Returns the calls to profile by name, each with the divisor of its number of calls."""
     shape = PREDICTION
     equal = forecaster(EQUAL, box(shape.agents), shape.future)
     _, belief = observed(equal, *scenes(shape.batch, shape.agents))
@@ -85,7 +85,7 @@ def subjects() -> dict[str, tuple[Callable[[], Any], int]]:
 
 
 def main() -> None:
-    """Entry point."""
+    """Runs the command."""
     config = parse(ProfileConfig, __doc__)
     tune()
     torch.set_num_threads(config.threads)

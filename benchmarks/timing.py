@@ -1,9 +1,9 @@
-"""How things are timed: warm-up, blocks of calls that take turns, medians and quartiles, and two yardsticks.
+"""Times calls: warm-up, blocks of calls that take turns, medians and quartiles, and two yardsticks.
 
-A machine that is shared drifts by tens of per cent within a minute, so what is compared is measured in turns, in
-alternating order, and divided block by block. In the same turns runs a yardstick: plain float32 matrix products for
-what is made of products, or a fixed loop of Python for what the interpreter spends its time on. A time divided by the
-yardstick's means about the same on another day.
+The speed of a shared machine varies by tens of per cent within a minute, so calls that are compared are measured in
+turns, in alternating order, and divided block by block. In the same turns runs a yardstick, a fixed computation: plain
+float32 matrix products for code that consists of products, or a fixed loop of Python for code in which the interpreter
+takes most of the time. A time divided by the yardstick's is about equal on another day.
 """
 
 import math
@@ -21,7 +21,7 @@ from benchmarks.settings import Settings
 
 Product = tuple[int, int, int]
 REFERENCE_PRODUCTS: tuple[Product, ...] = ((9216, 48, 96), (12800, 64, 256), (4096, 128, 256), (1024, 256, 768))
-"""Rows, inner, columns: the recurrent and input products of pairs, and those of agents, at both sizes of the model."""
+"""Shapes (m, k, n) of reference products: recurrent and input products of pairs and of agents, for both presets."""
 _LEAST_ROUNDS = 3
 _MOST_REPEATS = 1000
 _SLOW_S = 0.5
@@ -30,19 +30,19 @@ _PYTHON_TURNS = 2000
 
 @dataclass(frozen=True)
 class Yardstick:
-    """Something fixed to divide times by."""
+    """Fixed computation whose time other times are divided by."""
 
     kind: Kind
-    """Which."""
+    """Kind of the numbers that it gives."""
     call: Callable[[], Any]
-    """Runs it once, some milliseconds."""
+    """Function that runs it once, some milliseconds."""
     flop: float = 0.0
-    """Of one call; 0 where that has no meaning."""
+    """FLOP of one call; 0 if they are not counted."""
 
 
 @cache
 def products(shapes: Sequence[Product] = REFERENCE_PRODUCTS) -> Yardstick:
-    """Matrix products of these shapes into existing memory, float32."""
+    """Returns the yardstick of float32 matrix products of these shapes into existing memory."""
     generator = torch.Generator().manual_seed(0)
     operands = [
         (torch.randn(m, k, generator=generator), torch.randn(k, n, generator=generator), torch.empty(m, n))
@@ -58,7 +58,7 @@ def products(shapes: Sequence[Product] = REFERENCE_PRODUCTS) -> Yardstick:
 
 @cache
 def interpreter() -> Yardstick:
-    """A loop of Python over small arrays, which is what simulators and loaders are made of."""
+    """Returns the yardstick of a Python loop over small arrays, which resembles simulators and loaders."""
 
     def loop() -> float:
         states, total = np.zeros((16, 4)), 0.0
@@ -72,31 +72,31 @@ def interpreter() -> Yardstick:
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds of one call in each block, and of the yardstick in the same turns."""
+    """Times of one call in each block, and of the yardstick in the same turns."""
 
     seconds: np.ndarray
-    """Of the call."""
+    """Seconds of the call, by block."""
     yard: np.ndarray
-    """Of the yardstick."""
+    """Seconds of the yardstick, by block."""
     yardstick: Yardstick
-    """Which."""
+    """Yardstick that was timed."""
 
     @property
     def median(self) -> float:
-        """Seconds."""
+        """Median of the seconds of the call."""
         return float(np.median(self.seconds))
 
     @property
     def equivalents(self) -> float:
-        """How many runs of the yardstick one call takes."""
+        """Number of runs of the yardstick that take as long as one call."""
         return float(np.median(self.seconds / self.yard))
 
     def plus(self, other: "Timing") -> "Timing":
-        """One call of each."""
+        """Returns the timing of both calls, one after the other."""
         return Timing(self.seconds + other.seconds, self.yard, self.yardstick)
 
     def matmul_share(self, flop: float) -> float | None:
-        """Rate of the call over the rate of plain products."""
+        """Returns the rate of a call with this many FLOP, divided by the rate of plain products."""
         if not self.yardstick.flop:
             return None
         return float(np.median(flop / self.seconds * self.yard / self.yardstick.flop))
@@ -105,12 +105,15 @@ class Timing:
 def alternate(
     blocks: Mapping[str, Callable[[], float]], rounds: int, budget_s: float = math.inf
 ) -> dict[str, np.ndarray]:
-    """Run all blocks in turns, every other round in reverse; what each returned, round by round.
+    """Runs all blocks in turns, every second round in reverse order.
 
     Args:
-        blocks: each times itself and returns seconds.
-        rounds: at most so many.
-        budget_s: no further round begins after so many seconds, once there are three.
+        blocks: functions by name; each times itself and returns seconds.
+        rounds: largest number of rounds.
+        budget_s: time after which no further round begins, once there are three [s].
+
+    Returns:
+        The seconds of each block by name, round by round.
     """
     names, began = list(blocks), time.perf_counter()
     taken: dict[str, list[float]] = {name: [] for name in names}
@@ -124,28 +127,28 @@ def alternate(
 
 @dataclass(frozen=True)
 class Meter:
-    """How long and how often to measure."""
+    """Measures times with a given number and length of blocks."""
 
     rounds: int = 15
-    """Blocks of each call."""
+    """Number of blocks of each call."""
     block_s: float = 0.03
-    """A block repeats its call for at least so long."""
+    """Least time for which a block repeats its call [s]."""
     budget_s: float = 20.0
-    """For all blocks of one comparison; at least three rounds are made."""
+    """Time for all blocks of one comparison; at least three rounds are made [s]."""
 
     @staticmethod
     def of(settings: Settings) -> "Meter":
-        """For a quick or a full run."""
+        """Returns the meter of a quick or a full run."""
         return Meter(7, 0.01, 2.0) if settings.quick else Meter()
 
     def measure(self, calls: Mapping[str, Callable[[], Any]], yardstick: Yardstick | None = None) -> dict[str, Timing]:
-        """Time calls in turns, after a warm-up, the yardstick among them."""
+        """Times calls and the yardstick in turns, after a warm-up."""
         return self.time_blocks({name: self._block(call) for name, call in calls.items()}, yardstick)
 
     def time_blocks(
         self, blocks: Mapping[str, Callable[[], float]], yardstick: Yardstick | None = None
     ) -> dict[str, Timing]:
-        """The same for blocks that time themselves."""
+        """Times blocks that measure their own seconds, and the yardstick, in turns."""
         yardstick = yardstick or products()
         yardstick.call()
         seconds = alternate({"": partial(_repeat, yardstick.call, 1), **blocks}, self.rounds, self.budget_s)
@@ -168,7 +171,7 @@ def _repeat(call: Callable[[], Any], repeats: int) -> float:
 
 
 def quartiles(values: np.ndarray) -> tuple[float, float]:
-    """First and third."""
+    """Returns the first and third quartile."""
     low, high = np.quantile(values, (0.25, 0.75))
     return float(low), float(high)
 
@@ -184,7 +187,7 @@ def timed_line(
     ratio_to: str = "",
     tolerance: float = TOLERANCE,
 ) -> Line:
-    """Milliseconds of a call."""
+    """Returns a line with the milliseconds of a call."""
     ms = 1e3 * timing.seconds
     return Line(
         section,
@@ -213,7 +216,7 @@ def rate_line(
     flop: float | None = None,
     tolerance: float = TOLERANCE,
 ) -> Line:
-    """So many things per second, `count` of them in one call."""
+    """Returns a line with a rate per second, of `count` things in one call."""
     rates = count / timing.seconds
     line = timed_line(section, name, what, timing, flop=flop, tolerance=tolerance)
     return Line(
@@ -232,7 +235,7 @@ def ratio_line(
     better: str = "lower",
     tolerance: float = TOLERANCE,
 ) -> Line:
-    """A ratio of two things of the same run, block by block."""
+    """Returns a line with the ratio of two things of the same run, block by block."""
     median = float(np.median(ratios))
     direction: Any = better
     compared = Compared(median, "ratio", direction, tolerance)

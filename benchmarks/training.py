@@ -1,4 +1,4 @@
-"""A training step: windows per second, share of the matmul rate, peak memory, and what the allocator's setting brings.
+"""Measures a training step: windows per second, share of the matmul rate, peak memory, gain from allocator settings.
 
 The step is window, loss, backward and Adam on full windows. glibc's handling of freed memory can only be set once per
 process, so the default is timed in another process, which takes turns with this one.
@@ -17,7 +17,7 @@ from predictor.support.runtime import keep_freed_memory
 
 
 class Case(NamedTuple):
-    """One shape."""
+    """Shape of a training step."""
 
     preset: str
     agents: int
@@ -47,7 +47,7 @@ ALLOCATOR_ROUNDS = {"quick": 5, "full": 15}
 
 
 def run(settings: Settings) -> list[Line]:
-    """Every shape; then memory, then the allocator."""
+    """Measures every shape, then memory, then the allocator."""
     cases = CASES[settings.mode]
     lines = [line for case in cases for line in _speed(case, Meter.of(settings))]
     lines.append(_bfloat16(cases[-1], Meter.of(settings)))
@@ -71,7 +71,7 @@ def _speed(case: Case, meter: Meter) -> list[Line]:
     what = case._asdict()
     steps = rate_line("training", _name(case), what, timing, 1, "steps/s", flop=flop)
     windows = rate_line("training", f"{_name(case)}, windows", what, timing, case.batch, "windows/s")
-    return [steps, replace(windows, compared=None)]  # the same number twice
+    return [steps, replace(windows, compared=None)]  # compared once, as steps/s
 
 
 def _bfloat16(case: Case, meter: Meter) -> Line:
@@ -80,7 +80,7 @@ def _bfloat16(case: Case, meter: Meter) -> Line:
     timings = meter.measure(steps)
     ratios = timings["float32"].seconds / timings["bfloat16"].seconds
     line = ratio_line("training", f"{_name(case)}, float32 / bfloat16", case._asdict(), ratios, "--precision bfloat16")
-    return replace(line, compared=None)  # says something about the processor
+    return replace(line, compared=None)  # depends on the processor
 
 
 def _memory(cases: tuple[Case, ...], threads: int) -> list[Line]:
@@ -113,4 +113,4 @@ def _allocator(settings: Settings) -> Line:
         timings = meter.time_blocks({"default": default, "kept": step.timed})
     ratios = timings["default"].seconds / timings["kept"].seconds
     line = ratio_line("training", name, case._asdict(), ratios, "predictor.support.runtime.keep_freed_memory()")
-    return replace(line, compared=None)  # says something about glibc, not about us
+    return replace(line, compared=None)  # depends on glibc, not on this project

@@ -1,6 +1,6 @@
-"""Another process of this interpreter, for what a process can only be asked once: its allocator and its peak memory.
+"""Worker process for measurements that need a process of their own: allocator settings and peak memory.
 
-`WorkerProcess(...).ask("training", preset="fast", …)` sends one line of JSON and gets one back.
+`WorkerProcess(...).ask("training", preset="fast", …)` sends one line of JSON and receives one line back.
 """
 
 import contextlib
@@ -20,20 +20,20 @@ _MALLOC = "MALLOC_"
 
 
 def exact_memory() -> dict[str, str]:
-    """Environment in which glibc hands every larger block back at once, so that resident memory is memory in use."""
+    """Returns environment variables that make glibc release larger blocks at once: resident memory is memory in use."""
     return {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536", "MALLOC_TOP_PAD_": "0"}
 
 
 class WorkerProcess:
-    """A process that answers requests until it is left; glibc's allocator is at its defaults.
+    """Process that answers requests until its `with` block ends; glibc's allocator has its default settings.
 
     Args:
-        threads: of torch.
-        environment: what to add to the environment.
+        threads: number of torch threads.
+        environment: environment variables to add.
     """
 
     def __init__(self, threads: int, environment: Mapping[str, str] | None = None) -> None:
-        """Start it."""
+        """Starts the process."""
         root = str(Path(__file__).resolve().parents[1])
         clean = {name: value for name, value in os.environ.items() if not name.startswith(_MALLOC)}
         path = os.pathsep.join([root, *filter(None, [clean.get("PYTHONPATH")])])
@@ -47,10 +47,10 @@ class WorkerProcess:
         )
 
     def ask(self, task: str, **arguments: Any) -> dict[str, Any]:
-        """Have a task of `TASKS` done.
+        """Runs a task of `TASKS` in the process and returns its answer.
 
         Raises:
-            RuntimeError: the process died or could not do it.
+            RuntimeError: the process died or the task failed.
         """
         streams = self._process
         assert streams.stdin is not None and streams.stdout is not None
@@ -64,13 +64,13 @@ class WorkerProcess:
         return answer
 
     def __enter__(self) -> "WorkerProcess":
-        """Itself."""
+        """Returns itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the process."""
+        """Ends the process."""
         if self._process.stdin is not None:
             with contextlib.suppress(BrokenPipeError):
                 self._process.stdin.close()
@@ -82,12 +82,12 @@ class WorkerProcess:
 
 
 def peak_rise(call: Callable[[], Any]) -> int | None:
-    """By how many bytes the resident memory of this process rises at most during a call; None where nobody says."""
+    """Measures the highest rise of this process's resident memory during a call [bytes]; None where /proc lacks it."""
     gc.collect()
     try:
-        Path("/proc/self/clear_refs").write_text("5")  # the high-water mark starts again from here
+        Path("/proc/self/clear_refs").write_text("5")  # resets the peak
         before = _status_bytes("VmRSS")
-        kept = call()  # the result is alive until the mark is read
+        kept = call()  # the result is kept until the peak is read
         peak = _status_bytes("VmHWM")
     except OSError:
         return None
@@ -112,7 +112,7 @@ def _training_step(preset: str, agents: int, steps: int, batch: int, rollout: in
 
 
 def training(preset: str, agents: int, steps: int, batch: int, rollout: int) -> dict[str, Any]:
-    """Seconds and peak memory of one training step."""
+    """Measures seconds and peak memory of one training step."""
     step = _training_step(preset, agents, steps, batch, rollout)
     seconds: list[float] = []
     peak = peak_rise(lambda: seconds.append(step.timed()))
@@ -120,7 +120,7 @@ def training(preset: str, agents: int, steps: int, batch: int, rollout: int) -> 
 
 
 def forecast(preset: str, agents: int, neighbours: int, horizon: int) -> dict[str, Any]:
-    """Peak memory of observing a scene and forecasting it, memory and belief included."""
+    """Measures the peak memory of observing a scene and forecasting it, memory and belief included."""
     import torch
 
     from benchmarks.models import forecaster, road, scenes, sized
@@ -139,11 +139,11 @@ def forecast(preset: str, agents: int, neighbours: int, horizon: int) -> dict[st
 
 
 TASKS: dict[str, Callable[..., dict[str, Any]]] = {"training": training, "forecast": forecast}
-"""Tasks that a worker can be asked for."""
+"""Tasks of a worker, by name."""
 
 
 def main() -> None:
-    """Answer requests until there are no more."""
+    """Answers requests until the input ends."""
     import torch
 
     torch.set_num_threads(int(sys.argv[1]))
@@ -151,7 +151,7 @@ def main() -> None:
         request = json.loads(line)
         try:
             answer = TASKS[request["task"]](**request["arguments"])
-        except Exception as error:  # whatever it is, the parent is the one to say it
+        except Exception as error:  # the parent process reports it, whatever it is
             answer = {"error": f"{type(error).__name__}: {error}"}
         print(json.dumps(answer), flush=True)
 

@@ -1,4 +1,4 @@
-"""What foresight costs: steps/s of plain environments against the same ones under `VecForecast`, in one run.
+"""Measures the cost of forecasts: steps/s of plain environments against environments under `VecForecast`, in one run.
 
 `python -m benchmarks.wrapper_overhead` times both in turn, block by block, on the same seeds and actions, and prints
 the median ratio. Absolute numbers depend on the machine; the ratio is the result.
@@ -37,7 +37,7 @@ from predictor.support.runtime import keep_freed_memory
 
 @dataclass(frozen=True)
 class OverheadConfig:
-    """Compare steps/s without and with forecasts."""
+    """Compares steps/s without and with forecasts."""
 
     env_id: str = "highway-fast-v0"
     """Environment to time."""
@@ -59,10 +59,10 @@ class OverheadConfig:
     """JSON file to write the result to."""
 
     def __post_init__(self) -> None:
-        """Check choices and ranges.
+        """Checks choices and ranges.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value is out of range or does not fit the others.
         """
         check_choices(self)
         check_at_least(self, 1, "num_envs", "steps", "blocks", "threads")
@@ -71,7 +71,7 @@ class OverheadConfig:
 
 
 def run_block(venv: VecEnv, steps: int, seed: int) -> float:
-    """Seconds for one block, from a seeded reset; the reset itself is not timed."""
+    """Measures the seconds of one block, from a seeded reset; the reset itself is not timed."""
     rng = np.random.default_rng(seed)
     venv.seed(seed)
     venv.reset()
@@ -84,29 +84,29 @@ def run_block(venv: VecEnv, steps: int, seed: int) -> float:
 
 
 def blocks_of(venv: VecEnv, steps: int) -> Callable[[], float]:
-    """Blocks one after the other, the n-th always from the same seed and with the same actions; a warm one is made."""
+    """Returns a function that runs the next block, after a warm-up; the n-th block always has the same seed."""
     seeds = iter(range(1, 2**31))
     run_block(venv, steps, 0)
     return lambda: run_block(venv, steps, next(seeds))
 
 
 def make_venv(env_id: str, envs: int, vec: Literal["dummy", "subproc"], scenes: bool) -> VecEnv:
-    """Environments as they are, or reporting scenes for `VecForecast`."""
+    """Makes plain environments, or environments that report scenes for `VecForecast`."""
     vec_class = DummyVecEnv if vec == "dummy" else SubprocVecEnv
-    # a function of ours: a worker that unpickles it has the ids registered
+    # a function of this project: a worker process that unpickles it has the ids registered
     made, wrapper = partial(make_env, env_id), SceneObservation if scenes else None
     return make_vec_env(made, envs, vec_env_cls=vec_class, wrapper_class=wrapper)
 
 
 def paper_sized(scenes: VecEnv, horizon_steps: int = 5) -> Forecaster:
-    """An untrained network of the paper's size for these scenes; what it costs does not depend on its weights."""
+    """Makes an untrained network of the paper's size for these scenes; its cost does not depend on its weights."""
     spec: SceneSpec = scenes.get_attr("scene_spec")[0]
     torch.manual_seed(0)
     return DGVAE(spec, PRESETS["paper"], horizon_steps).eval().requires_grad_(False)
 
 
 def main() -> None:
-    """Entry point."""
+    """Runs the command."""
     config = parse(OverheadConfig, __doc__)
     keep_freed_memory()
     torch.set_num_threads(config.threads)
@@ -114,7 +114,7 @@ def main() -> None:
     paper = paper_sized(scenes) if config.paper_size else None
     forecast = VecForecast(scenes, config.checkpoint, forecaster=paper)
     made = {name: blocks_of(venv, config.steps) for name, venv in (("plain", plain), ("forecast", forecast))}
-    seconds = alternate(made, config.blocks)  # a drifting machine favours neither
+    seconds = alternate(made, config.blocks)  # changes of the machine's speed affect both
     plain.close()
     forecast.close()
     steps = config.steps * config.num_envs

@@ -21,7 +21,7 @@ PAGES = (Path("README.md"), Path("docs/in_env.md"))
 SERVED_BY = CHECKPOINTS | MULTIAGENT_CHECKPOINTS
 """Id → checkpoint that ships for it, in the order of the tables."""
 SAMPLES = 20
-"""K of the tables by environment; the transfer matrix has the most likely forecast alone, K = 1."""
+"""Number of samples K of the tables by environment; the transfer matrix has K = 1, the most likely forecast alone."""
 
 SHORT = (
     "env", "driver", "episodes", "horizon", "minADE₁ / minFDE₁ [m]", "nearest neighbours ADE [m]",
@@ -101,7 +101,7 @@ def _transfer(records: Records) -> str:
 
 
 def main() -> None:
-    """Entry point."""
+    """Runs the command."""
     arguments = sys.argv[1:]
     if arguments not in ([], ["--check"]):
         raise UserError(f"write_tables takes --check or nothing, got {' '.join(arguments)}")

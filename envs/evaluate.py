@@ -32,7 +32,7 @@ from predictor.evaluation.displacement import MISS_THRESHOLD_M, min_ade
 from predictor.evaluation.graph_accuracy import GraphAccuracy, GraphTally
 from predictor.evaluation.outcomes import Outcome
 from predictor.graph import pair_mask
-from predictor.reports.tables import ROW_NAMES, accuracy_table
+from predictor.reports.tables import MODEL_NAMES, accuracy_table
 from predictor.scene import SceneSpec
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_positive
@@ -164,7 +164,7 @@ def _summary(
     first = [Outcome(o.forecast[:, :1], o.future, o.valid) for o in outcomes[MODEL]]
     learned = checkpoint != CONSTANT_VELOCITY
     std_m = read_info(Path(checkpoint)).std_m if learned else fitted_std_m(first)
-    name = ROW_NAMES.get(read_info(Path(checkpoint)).model, "model") if learned else "constant velocity (deployed)"
+    name = MODEL_NAMES.get(read_info(Path(checkpoint)).model, "model") if learned else "constant velocity (deployed)"
 
     def line(title: str, found: Sequence[Outcome], spread: Sequence[float]) -> Accuracy:
         tally = Tally(spread, miss_m)

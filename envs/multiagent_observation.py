@@ -186,7 +186,7 @@ def check_multiagent_scene(scene: Any, spec: SceneSpec, source: str = "reader") 
     """
     if not isinstance(scene, MultiagentScene):
         raise UserError(f"{source}: reading must give a MultiagentScene (envs.readers), got {type(scene).__name__}")
-    scene.scene.check(source, spec, rows=spec.max_agents)
+    scene.scene.check(source, spec, agents=spec.max_agents)
     heading = scene.heading_rad
     if heading.shape != (spec.max_agents,) or not np.isfinite(heading).all():
         raise UserError(

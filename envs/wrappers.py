@@ -104,7 +104,7 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         show(self.reader, obs)
         name, spec = f"scene reader of '{self.scene_source}'", self.reader.spec
         scene = require_scene(self.reader.read(self.env), name)
-        scene.check(name, spec, rows=spec.max_agents)
+        scene.check(name, spec, agents=spec.max_agents)
         self._scene = scene
         return {"observation": obs, **scene_entries(scene)}
 

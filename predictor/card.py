@@ -1,8 +1,7 @@
 """Writes a checkpoint's model card: `python -m predictor.card --checkpoint DIR --data STORES --accuracy JSON`.
 
-The card is made from what the files say of themselves (config, stores, measured accuracy); nothing is typed in by hand.
-What was measured is also put into `in_env.json` beside the weights, from which `docs/write_tables.py` writes the tables
-of README.md and docs/in_env.md.
+The card is made from files only (config, stores, measured accuracy). The measurements are also written to `in_env.json`
+beside the weights, from which `docs/write_tables.py` writes the tables of README.md and docs/in_env.md.
 """
 
 import json
@@ -34,7 +33,7 @@ def write_card(config: CardConfig) -> Path:
     """Writes the card and the record of measurements; returns the card's path.
 
     Raises:
-        UserError: unreadable input, or no accuracy row for this checkpoint.
+        UserError: an input is unreadable, or the accuracy has no result for this checkpoint.
     """
     model, info = load_checkpoint(config.checkpoint)
     folder, name = resolve(config.checkpoint), name_of_folder(config.checkpoint)
@@ -47,7 +46,7 @@ def write_card(config: CardConfig) -> Path:
     if not found:
         raise UserError(f"{config.accuracy} has no result of checkpoint '{name}'; run envs.evaluate on it")
     measured = [m for m in update_record(folder, found) if m.samples == found[0].samples]
-    who = "the ego included" if info.spec.has_ego else "no ego"
+    ego = "the ego included" if info.spec.has_ego else "no ego"
     left_out = "the ego itself is not counted" if info.spec.has_ego else "what never moves is not counted"
     parameters = sum(p.numel() for p in model.parameters())
     size_kb = (folder / WEIGHTS).stat().st_size / 1000
@@ -56,7 +55,7 @@ def write_card(config: CardConfig) -> Path:
             f"# Predictor checkpoint `{name}`",
             f"dG-VAE, {parameters:,} parameters, {size_kb:.0f} kB of safetensors. Trained on recorded "
             f"{', '.join(info.sources)}; forecasts {info.horizon_steps} steps of {info.spec.dt_s:g} s. Sees at most "
-            f"{info.spec.max_agents} agents ({who}) within {info.spec.perception_m:g} m.",
+            f"{info.spec.max_agents} agents ({ego}) within {info.spec.perception_m:g} m.",
             "## Accuracy in the live environment",
             f"Held-out seeds from {first_seed:,}; {left_out}. minADE₁ is the most likely forecast (K = 1); neighbours: "
             "memoryless nearest neighbours on the training data. Intervals: bootstrap over episodes.",

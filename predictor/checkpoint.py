@@ -1,6 +1,6 @@
-"""Predictor checkpoints: a folder with `config.json` and `model.safetensors`. Never pickle: safe to load from others.
+"""Predictor checkpoints: a folder with `config.json` and `model.safetensors`; no pickle, so safe to load from others.
 
-A checkpoint carries everything needed to run it (spec, sizes, horizon, residual spread) and how it was made.
+A checkpoint holds everything needed to run it (spec, sizes, horizon, residual spread) and how it was made.
 """
 
 import dataclasses
@@ -33,26 +33,26 @@ PRETRAINED = Path(__file__).resolve().parent / "pretrained"
 
 @dataclass(frozen=True)
 class CheckpointInfo:
-    """What stands beside the weights."""
+    """Content of `config.json`, beside the weights."""
 
     spec: SceneSpec
-    """Scenes it takes."""
+    """Layout of the scenes that it observes."""
     config: Any
     """Sizes of the network: the model's config dataclass."""
     horizon_steps: int
-    """Steps it was trained to forecast."""
+    """Number of steps that it was trained to forecast."""
     std_m: tuple[float, ...] = ()
     """Standard deviation per axis of the validation error at each horizon step [m]; the spread that NLL uses."""
     sources: tuple[str, ...] = ()
-    """What it was trained on (env ids or dataset names)."""
+    """Training data (env ids or dataset names)."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Command, commit, versions, seeds, validation results."""
     model: str = "dgvae"
-    """Which network, by its name in `predictor.models`."""
+    """Name of the network in `predictor.models`."""
 
 
 def save_checkpoint(path: Path, model: nn.Module, info: CheckpointInfo) -> None:
-    """Write a checkpoint folder; an existing one is replaced only when the new one is complete."""
+    """Writes a checkpoint folder; an existing one is replaced only when the new one is complete."""
     if name_of(model) != info.model:
         raise UserError(f"the checkpoint says model '{info.model}' but the network is '{name_of(model)}'")
     with new_folder(Path(path)) as partial:
@@ -65,7 +65,7 @@ def resolve(name: str | Path) -> Path:
     """Returns the folder of a checkpoint: a shipped one by its name, a folder itself, or the best one of a run folder.
 
     Raises:
-        UserError: neither exists.
+        UserError: none of them exists.
     """
     path = Path(name)
     if path.is_dir():
@@ -79,22 +79,23 @@ def resolve(name: str | Path) -> Path:
 
 
 def name_of_folder(path: str | Path) -> str:
-    """Returns what to call a checkpoint in a table: its folder's name, or the run folder's for its best checkpoint."""
+    """Returns the name of a checkpoint in tables: its folder's, or the run folder's for its best checkpoint."""
     path = Path(path)
     named = path.resolve() if path.name in ("", ".", "..") else path
     return named.resolve().parent.name if named.name == BEST_OF_RUN else named.name
 
 
 def shipped() -> list[str]:
-    """Names of the checkpoints that ship with the package."""
+    """Returns the names of the checkpoints that ship with the package."""
     return sorted(p.parent.name for p in PRETRAINED.glob("[!.]*/config.json"))
 
 
 def load_checkpoint(name: str | Path, device: str = "cpu") -> tuple[Any, CheckpointInfo]:
-    """Load a model for inference from a shipped name or a folder.
+    """Loads a model for inference, by a shipped name or a folder.
 
     Raises:
-        UserError: not there, not a predictor checkpoint, of another version, truncated, or not fitting its own config.
+        UserError: the folder is not there, is not a predictor checkpoint, has another version, is truncated, or does
+            not fit its own config.
     """
     path = resolve(name)
     info = read_info(path)
@@ -118,7 +119,7 @@ def load_checkpoint(name: str | Path, device: str = "cpu") -> tuple[Any, Checkpo
 
 
 def read_info(path: Path) -> CheckpointInfo:
-    """Read and check `config.json`."""
+    """Reads and checks `config.json`."""
     file = Path(path) / "config.json"
     try:
         content = json.loads(file.read_text())
@@ -131,7 +132,7 @@ def read_info(path: Path) -> CheckpointInfo:
     try:
         if int(content["horizon_steps"]) < 1:
             raise ValueError(f"horizon_steps must be at least 1, got {content['horizon_steps']}")
-        model = str(content.get("model", "dgvae"))  # checkpoints before version 0.2 knew one model only
+        model = str(content.get("model", "dgvae"))  # before version 0.2 there was one model only
         return CheckpointInfo(
             spec=_build(SceneSpec, content["spec"]),
             config=config_from_json(model, content["config"]),
@@ -148,10 +149,10 @@ def read_info(path: Path) -> CheckpointInfo:
 def load_forecaster(
     name: str | Path, scene_spec: SceneSpec, source: str, device: str = "cpu"
 ) -> TrainableForecaster | ConstantVelocity:
-    """A forecaster for scenes of `scene_spec`: a shipped name, a folder, or "constant-velocity".
+    """Loads a forecaster for scenes of `scene_spec`, by a shipped name, a folder, or "constant-velocity".
 
     Raises:
-        UserError: as `load_checkpoint`, or the checkpoint is of another spec (features, dt).
+        UserError: when `load_checkpoint` raises, or the checkpoint has another spec (features, dt).
     """
     if str(name) == CONSTANT_VELOCITY:
         return ConstantVelocity(scene_spec)

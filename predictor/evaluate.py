@@ -1,8 +1,9 @@
-"""Measure a checkpoint on recorded data: `python -m predictor.evaluate --checkpoint NAME --data STORE`.
+"""Measures a checkpoint on recorded data: `python -m predictor.evaluate --checkpoint NAME --data STORE`.
 
 Prints minADE and minFDE (per agent and joint, with standard errors over subsets of the windows), miss rate, coverage,
 and RMSE and NLL by horizon, for K = 1 and K samples beside constant velocity (K = 1) and constant velocity with noise
-(K samples); writes JSON, Markdown and plots. Accuracy in the loop that a policy drives is `python -m envs.evaluate`'s.
+(K samples); writes JSON, Markdown and plots. For accuracy in live environments, run
+`python -m envs.evaluate`.
 """
 
 from collections.abc import Sequence
@@ -25,7 +26,7 @@ from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import Outcome, run_window_batch, run_windows
 from predictor.forecaster import Forecaster
 from predictor.reports.plots import plot_error_by_horizon, plot_scene
-from predictor.reports.tables import ROW_NAMES, accuracy_table, markdown_table
+from predictor.reports.tables import MODEL_NAMES, accuracy_table, markdown_table
 from predictor.scene import SceneSpec
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least
@@ -37,7 +38,7 @@ from predictor.support.runtime import resolve_device, tune
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """Measure a predictor's accuracy on recorded episodes, beside constant velocity."""
+    """Measures a predictor's accuracy on recorded episodes, beside constant velocity."""
 
     checkpoint: str
     """Checkpoint to measure: shipped name, folder, run folder, or "constant-velocity"."""
@@ -48,7 +49,7 @@ class EvaluateConfig:
     num_samples: Annotated[int, Renamed("samples")] = 20
     """Number of forecasts drawn (K) for the second line; the first is always K = 1, the most likely forecast."""
     history_steps: int = 10
-    """Number of observed steps fed to the model before each forecast (fewer where the episode has just begun)."""
+    """Number of observed steps that the model gets before each forecast (fewer where the episode has just begun)."""
     horizon_steps: int | None = None
     """Number of steps to forecast; None takes the checkpoint's (5 for constant velocity)."""
     max_windows: int = 4000
@@ -59,10 +60,10 @@ class EvaluateConfig:
     """Device that runs the model: cpu, cuda or auto (cuda where there is one)."""
 
     def __post_init__(self) -> None:
-        """Check ranges; `device="auto"` becomes the device that is taken.
+        """Checks ranges; `device="auto"` becomes the device that is taken.
 
         Raises:
-            UserError: a value that makes no sense, or a device that is not there.
+            UserError: a value out of range, or a device that is not there.
         """
         check_at_least(self, 1, "num_samples", "history_steps", "horizon_steps", "max_windows")
         check_at_least(self, 0, "seed")
@@ -80,10 +81,10 @@ class _Subject:
 
 
 def evaluate(config: EvaluateConfig) -> list[Accuracy]:
-    """Returns the model at K = 1 and K = `num_samples`, constant velocity, and that with noise at K = `num_samples`.
+    """Returns the accuracy of the model (K = 1 and `num_samples`) and of constant velocity without and with noise.
 
     Raises:
-        UserError: checkpoint or store unreadable or of different specs, or no episode as long as the horizon.
+        UserError: checkpoint or store is unreadable, their specs differ, or no episode is as long as the horizon.
     """
     return _evaluate(config, _load(config))
 
@@ -96,7 +97,7 @@ def _load(config: EvaluateConfig) -> _Subject:
     model, info = load_checkpoint(config.checkpoint, config.device)
     store = read_store(config.data)
     info.spec.check_compatible(store.info.spec, f"checkpoint '{config.checkpoint}'", f"store {config.data}")
-    name = ROW_NAMES.get(info.model, info.model)
+    name = MODEL_NAMES.get(info.model, info.model)
     return _Subject(store, info.spec, config.horizon_steps or info.horizon_steps, model, info.std_m, name)
 
 
@@ -110,7 +111,7 @@ def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:
         )
     windows = Windows(subject.store.episodes, subject.spec, config.history_steps, horizon)
     chosen = np.random.default_rng(config.seed).permutation(len(windows))[: config.max_windows]
-    # No training data is given here: the spread of both baselines is fitted to these very errors, in their favour.
+    # Without training data, the spread of both baselines is fitted to the test errors, in their favour.
     std_m = fitted_std_m(run_windows(baseline, windows, chosen, horizon))
     straight = summarise("constant velocity", run_windows(baseline, windows, chosen, horizon), std_m)
     if not straight.agents:
@@ -119,34 +120,34 @@ def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:
             f"for all {horizon} steps of the horizon; lower --horizon-steps, raise --max-windows or record longer "
             "episodes"
         )
-    rows = []
+    accuracies = []
     if subject.model is not None:
         for samples in track(sorted({1, config.num_samples}), description="evaluate"):
             made = run_windows(subject.model, windows, chosen, horizon, samples, config.seed, device=config.device)
-            rows.append(summarise(subject.name, made, subject.std_m))
-    rows.append(straight)
+            accuracies.append(summarise(subject.name, made, subject.std_m))
+    accuracies.append(straight)
     if config.num_samples > 1:
         noisy = NoisyConstantVelocity.fit(subject.spec, std_m)
         made = run_windows(noisy, windows, chosen, horizon, config.num_samples, config.seed)
-        rows.append(summarise("constant velocity + noise", made, std_m))
+        accuracies.append(summarise("constant velocity + noise", made, std_m))
     if config.out is not None:
-        _write(config, rows, subject.store.info.source, subject.spec.dt_s)
-        _plot(config, rows, windows, chosen, subject.model or baseline, horizon)
-    return rows
+        _write(config, accuracies, subject.store.info.source, subject.spec.dt_s)
+        _plot(config, accuracies, windows, chosen, subject.model or baseline, horizon)
+    return accuracies
 
 
-def _write(config: EvaluateConfig, rows: Sequence[Accuracy], source: str, dt_s: float) -> None:
+def _write(config: EvaluateConfig, accuracies: Sequence[Accuracy], source: str, dt_s: float) -> None:
     assert config.out is not None
     config.out.mkdir(parents=True, exist_ok=True)
     made = provenance(("torch", "numpy"))
-    content = {"source": source, "dt_s": dt_s, "config": asdict(config), "rows": [asdict(r) for r in rows]}
+    content = {"source": source, "dt_s": dt_s, "config": asdict(config), "rows": [asdict(a) for a in accuracies]}
     write_json(config.out / "accuracy.json", content | {"provenance": made})
-    write_text(config.out / "accuracy.md", markdown_table(rows, dt_s))
+    write_text(config.out / "accuracy.md", markdown_table(accuracies, dt_s))
 
 
 def _plot(
     config: EvaluateConfig,
-    rows: Sequence[Accuracy],
+    accuracies: Sequence[Accuracy],
     windows: Windows,
     chosen: np.ndarray,
     model: Forecaster,
@@ -155,7 +156,7 @@ def _plot(
     assert config.out is not None
     matplotlib.use("Agg")
     figure, ax = plt.subplots(figsize=(6, 4), layout="constrained")
-    plot_error_by_horizon(ax, rows, windows.spec.dt_s)
+    plot_error_by_horizon(ax, accuracies, windows.spec.dt_s)
     figure.savefig(config.out / "error_by_horizon.png", dpi=130)
     plt.close(figure)
     batch = windows.batch(chosen[:200])
@@ -165,15 +166,15 @@ def _plot(
     )
     busiest = torch.argsort(outcome.valid.cpu().all(-1).sum(-1), descending=True)[:4].tolist()
     figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
-    for ax, row in zip(axes.flat, busiest, strict=False):
-        past = slice(0, int(batch.last_observed[row]) + 1)
+    for ax, window in zip(axes.flat, busiest, strict=False):
+        past = slice(0, int(batch.last_observed[window]) + 1)
         plot_scene(
             ax,
-            batch.states[row, past, :, :2].numpy(),
-            batch.valid[row, past].numpy(),
-            outcome.forecast[row, ..., :2].cpu().numpy(),
-            outcome.future[row, ..., :2].cpu().numpy(),
-            outcome.valid[row].cpu().numpy(),
+            batch.states[window, past, :, :2].numpy(),
+            batch.valid[window, past].numpy(),
+            outcome.forecast[window, ..., :2].cpu().numpy(),
+            outcome.future[window, ..., :2].cpu().numpy(),
+            outcome.valid[window].cpu().numpy(),
         )
     figure.suptitle("history solid, forecast dashed, truth thin black")
     figure.savefig(config.out / "scenes.png", dpi=110)
@@ -185,9 +186,9 @@ def main() -> None:
     config = parse(EvaluateConfig, __doc__)
     tune(config.device)
     subject = _load(config)
-    rows = _evaluate(config, subject)
+    accuracies = _evaluate(config, subject)
     title = f"{config.checkpoint} on {config.data}"
-    Console(width=160).print(accuracy_table(rows, subject.spec.dt_s, title))
+    Console(width=160).print(accuracy_table(accuracies, subject.spec.dt_s, title))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """The interface of everything that forecasts: memory in, memory and belief out; roll-out from a belief.
 
-Forecasters are stateless functions of an explicit `Memory`, so that a batch may hold rows of different age, rows may be
-forgotten one by one, and agents may be re-sorted. `predictor.online` keeps the memory for an environment.
+Forecasters are stateless functions of an explicit `Memory`, so that a batch may hold environments of different age,
+each can be cleared alone, and agents may be re-sorted. `predictor.online` keeps the memory for an environment.
 """
 
 from collections.abc import Callable
@@ -13,67 +13,67 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from predictor.graph import NOBODY
+from predictor.graph import NO_AGENT
 from predictor.noise import Noise
 from predictor.scene import SceneSpec, dense_edges
 
 
 @dataclass(frozen=True)
 class Memory:
-    """What is remembered of the past, per agent and per pair; zero means "nothing yet"."""
+    """Keeps the past of each agent and each pair; zero means "nothing yet"."""
 
     nodes: tuple[Float[Tensor, "batch agents _"], ...] = ()
     """One tensor per kind of agent memory."""
     pairs: tuple[Float[Tensor, "batch agents slots _"], ...] = ()
     """One tensor per kind of pair memory, receiver first."""
     senders: Int[Tensor, "batch agents slots"] | None = None
-    """Whose each slot is (`NOBODY` where empty); None if slot j is agent j's."""
+    """Index of the sender in each slot (`NO_AGENT` where empty); None if slot j is agent j's."""
 
     def reorder(self, source: Int[Tensor, "batch agents"], known: Bool[Tensor, "batch agents"]) -> "Memory":
-        """Move memory along with agents that changed rows.
+        """Moves memory along with agents that changed places.
 
         Args:
-            source: for each new row, the old row of the same agent.
-            known: which new rows had an old one; the others start from zero.
+            source: for each new place, the old place of its agent.
+            known: which new places had an old one; the others start from zero.
         """
-        rows = torch.arange(len(source), device=source.device)
-        nodes = tuple(m[rows[:, None], source] * known[..., None] for m in self.nodes)
+        envs = torch.arange(len(source), device=source.device)[:, None]
+        nodes = tuple(m[envs, source] * known[..., None] for m in self.nodes)
         if self.senders is None:
             both = (known[:, :, None] & known[:, None, :])[..., None]
-            pairs = tuple(m[rows[:, None, None], source[:, :, None], source[:, None, :]] * both for m in self.pairs)
+            pairs = tuple(m[envs[..., None], source[:, :, None], source[:, None, :]] * both for m in self.pairs)
             return Memory(nodes, pairs)
-        pairs = tuple(m[rows[:, None], source] * known[..., None, None] for m in self.pairs)
+        pairs = tuple(m[envs, source] * known[..., None, None] for m in self.pairs)
         return Memory(nodes, pairs, self._moved_senders(source, known))
 
     def _moved_senders(self, source: Tensor, known: Tensor) -> Tensor:
-        """The senders of `reorder`: their agents' new rows, in the receivers' new rows."""
+        """Returns the senders after `reorder`: the new places of senders, in the new places of receivers."""
         assert self.senders is not None
         agents = self.senders.shape[1]
-        # where each agent went; one more entry for nobody, and one for the writes of rows without a past
-        went = source.new_full((len(source), agents + 2), NOBODY)
+        # where each agent went; one more entry for empty slots, and one for the writes of places without a past
+        went = source.new_full((len(source), agents + 2), NO_AGENT)
         new = torch.arange(source.shape[1], device=source.device).expand_as(source)
         went.scatter_(1, torch.where(known, source, agents + 1), new)
         old = self.senders.gather(1, source[..., None].expand(-1, -1, self.senders.shape[2]))
-        old = torch.where((old == NOBODY) | ~known[..., None], agents, old)
+        old = torch.where((old == NO_AGENT) | ~known[..., None], agents, old)
         return went.gather(1, old.flatten(1)).view_as(old)
 
     def to_slots(
         self, senders: Int[Tensor, "batch agents slots"], present: Bool[Tensor, "batch agents slots"]
     ) -> "Memory":
-        """Move pair memory to where each receiver's senders now stand; who was not heard before starts from zero.
+        """Moves pair memory to the slots of each receiver's current senders; a sender that had none starts from zero.
 
         Args:
-            senders: who is in each slot.
-            present: which slots hold somebody.
+            senders: index of the agent in each slot.
+            present: which slots hold an agent.
         """
-        assert self.senders is not None  # dense memory has a place for everyone
+        assert self.senders is not None  # dense memory has a place for every agent
         same = (senders[..., :, None] == self.senders[..., None, :]) & present[..., :, None]
         place, known = same.to(torch.uint8).argmax(-1), same.any(-1)[..., None]
         pairs = tuple(m.gather(2, place[..., None].expand(-1, -1, -1, m.shape[-1])) * known for m in self.pairs)
-        return Memory(self.nodes, pairs, senders.masked_fill(~present, NOBODY))
+        return Memory(self.nodes, pairs, senders.masked_fill(~present, NO_AGENT))
 
     def padded(self, agents: int) -> "Memory":
-        """The same with room for `agents` agents; the new ones have no memory."""
+        """Returns the memory with room for `agents` agents; the new ones have no memory."""
 
         def pad(memory: Tensor, axes: int, value: int = 0) -> Tensor:
             missing = agents - memory.shape[1]
@@ -82,24 +82,24 @@ class Memory:
 
         dense = self.senders is None
         pairs = tuple(pad(m, 2 if dense else 1) for m in self.pairs)
-        senders = None if self.senders is None else pad(self.senders, 1, NOBODY)
+        senders = None if self.senders is None else pad(self.senders, 1, NO_AGENT)
         return Memory(tuple(pad(m, 1) for m in self.nodes), pairs, senders)
 
-    def select(self, rows: Int[Tensor, " rows"]) -> "Memory":
-        """The memory of some batch rows."""
-        return self._map(lambda m: m[rows])
+    def select(self, envs: Int[Tensor, " envs"]) -> "Memory":
+        """Returns the memory of the given environments."""
+        return self._map(lambda m: m[envs])
 
-    def replace_rows(self, rows: Int[Tensor, " rows"], other: "Memory") -> "Memory":
-        """A copy in which `rows` are those of `other`."""
-        return self._map(lambda m, o: m.index_copy(0, rows, o), other)
+    def replace_envs(self, envs: Int[Tensor, " envs"], other: "Memory") -> "Memory":
+        """Returns a copy in which the memory of `envs` is that of `other`."""
+        return self._map(lambda m, o: m.index_copy(0, envs, o), other)
 
     @staticmethod
     def concatenate(first: "Memory", second: "Memory") -> "Memory":
-        """The batch rows of `first`, then those of `second`."""
+        """Returns the memory of the environments of `first`, then of those of `second`."""
         return first._map(lambda m, o: torch.cat([m, o]), second)
 
     def _map(self, change: Callable[..., Tensor], *others: "Memory") -> "Memory":
-        """The same change to every tensor, with the tensors of other memories that belong to it."""
+        """Applies `change` to every tensor, together with the corresponding tensors of other memories."""
         memories = (self, *others)
         listed = [m.senders for m in memories if m.senders is not None]
         return Memory(
@@ -111,23 +111,23 @@ class Memory:
 
 @dataclass(frozen=True)
 class Belief:
-    """What a forecaster thinks after the latest observation."""
+    """State of a forecaster after the latest observation."""
 
     states: Float[Tensor, "batch agents state"]
-    """The observation itself, SI units."""
+    """Observed states [SI]."""
     valid: Bool[Tensor, "batch agents"]
-    """Who is present."""
+    """Which agents are present."""
     edge_probs: Float[Tensor, "batch agents slots types"]
     """Prior over edge types, receiver first; [1, 0, …] where there is no pair."""
     edge_features: Float[Tensor, "batch agents slots feature"]
     """Edge features from the past only; zero where there is no pair."""
     internal: Any = None
-    """What the forecaster itself needs to roll out."""
+    """Data that this forecaster needs to roll out."""
     senders: Int[Tensor, "batch agents slots"] | None = None
-    """Whose each slot is (`NOBODY` where empty); None if slot j is agent j's."""
+    """Index of the sender in each slot (`NO_AGENT` where empty); None if slot j is agent j's."""
 
     def dense(self) -> "Belief":
-        """The same with slot j for agent j; of use where scenes are small."""
+        """Returns the belief with slot j for agent j; of use where scenes are small."""
         if self.senders is None:
             return self
         probs, features = dense_edges(self.edge_probs, self.edge_features, self.senders)
@@ -140,7 +140,7 @@ def edgeless_belief(
     num_edge_types: int,
     edge_feature_dim: int,
 ) -> Belief:
-    """The belief of who knows no interactions: every pair has "no edge"."""
+    """Returns the belief of a forecaster without interactions: every pair has "no edge"."""
     batch, agents, _ = states.shape
     probs = states.new_zeros(batch, agents, agents, num_edge_types)
     probs[..., 0] = 1.0
@@ -149,26 +149,26 @@ def edgeless_belief(
 
 @runtime_checkable
 class Forecaster(Protocol):
-    """Anything that forecasts scenes step by step."""
+    """Interface of models that forecast scenes step by step."""
 
     @property
     def spec(self) -> SceneSpec:
-        """Layout of the scenes it takes."""
+        """Layout of the scenes that it observes."""
 
     @property
     def horizon_steps(self) -> int:
-        """Steps it was trained to forecast."""
+        """Number of steps that it was trained to forecast."""
 
     @property
     def num_edge_types(self) -> int:
-        """Edge types, "no edge" included."""
+        """Number of edge types, "no edge" included."""
 
     @property
     def edge_feature_dim(self) -> int:
-        """Size of an edge's features."""
+        """Number of features of an edge."""
 
     def empty_memory(self, batch: int, agents: int) -> Memory:
-        """The memory before any observation."""
+        """Returns the memory before any observation."""
 
     def observe(
         self,
@@ -176,39 +176,39 @@ class Forecaster(Protocol):
         states: Float[Tensor, "batch agents state"],
         valid: Bool[Tensor, "batch agents"],
     ) -> tuple[Memory, Belief]:
-        """Take in one instant [SI units]; cost does not depend on how much was seen before."""
+        """Updates the memory with the states of one instant [SI], at a cost that does not depend on its past."""
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
-        """Future states [SI units]: sample 0 follows the most likely graph, the others draw theirs.
+        """Computes future states [SI]: sample 0 follows the most likely graph, the others draw theirs.
 
         With one generator per scene of the batch, a scene's samples depend on no other scene.
         """
 
 
 class WindowOutput(NamedTuple):
-    """What the losses need from one batch of training windows; graph entries are None for models without a graph."""
+    """Inputs of the losses for one batch of training windows; graph entries are None for models without a graph."""
 
     one_step: Float[Tensor, "batch time agents state"]
-    """Teacher-forced prediction of the next state, for each step [SI]; under the posterior graph where there is one."""
+    """Teacher-forced predictions of the next state at each step [SI]; under the posterior graph where there is one."""
     rollout: Float[Tensor, "batch agents horizon state"]
     """Free-running states after `last_observed` [SI]; under the prior graph where there is one."""
     prior_logits: Float[Tensor, "batch time agents agents types"] | None = None
-    """Edge types from the past."""
+    """Logits of edge types from the past."""
     posterior_logits: Float[Tensor, "batch time agents agents types"] | None = None
-    """Edge types from past and future."""
+    """Logits of edge types from past and future."""
     features: Float[Tensor, "batch time agents agents feature"] | None = None
     """Edge features from the past."""
 
 
 @runtime_checkable
 class TrainableForecaster(Forecaster, Protocol):
-    """A forecaster that `predictor.train` can fit; an `nn.Module` besides."""
+    """Interface of forecasters that `predictor.train` can fit; each is also an `nn.Module`."""
 
     @property
     def config(self) -> Any:
-        """Its sizes: a frozen dataclass of JSON values."""
+        """Sizes of the network: a frozen dataclass of JSON values."""
 
     def window(
         self,
@@ -218,12 +218,12 @@ class TrainableForecaster(Forecaster, Protocol):
         rollout_steps: int,
         generator: torch.Generator | None = None,
     ) -> WindowOutput:
-        """Teacher-forced pass over all steps, and a free roll-out of `rollout_steps` after each `last_observed`.
+        """Runs a teacher-forced pass over all steps and a free roll-out of `rollout_steps` after each `last_observed`.
 
         Args:
             states: true states [SI], zeros where not valid.
-            valid: who is present.
-            last_observed: index of the last step that the roll-out of a row has seen.
-            rollout_steps: steps to roll out; 0 skips it (`rollout` then has no steps).
+            valid: which agents are present.
+            last_observed: index of the last observed step of each window, after which the roll-out starts.
+            rollout_steps: number of steps to roll out; 0 skips it (`rollout` then has no steps).
             generator: source of all noise.
         """

@@ -1,4 +1,4 @@
-"""Graphs: who is paired with whom, and layers on pairs that work on nodes first.
+"""Graphs: which agents are paired, as dense arrays, as lists of senders, and conversions between the two.
 
 A pair is always (receiver, sender), in this axis order. Pairs of a scene lie in an array of agents × slots. Without a
 list of senders, slot j is agent j ("dense"). With one, slot s of receiver i is agent `senders[i, s]`: all others, which
@@ -10,27 +10,27 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 from torch.nn import functional
 
-NOBODY = -1
+NO_AGENT = -1
 """Sender of an empty slot."""
 
 
 def pair_mask(valid: Bool[Tensor, "*batch agents"]) -> Bool[Tensor, "*batch agents agents"]:
-    """Pairs of two different, present agents."""
+    """Returns the pairs of two different, present agents."""
     agents = valid.shape[-1]
     distinct = ~torch.eye(agents, dtype=torch.bool, device=valid.device)
     return valid[..., :, None] & valid[..., None, :] & distinct
 
 
 def others(agents: int, device: torch.device | None = None) -> Int[Tensor, "agents slots"]:
-    """Senders of a graph in which everyone hears everyone else, in order."""
-    every = torch.arange(agents, device=device)
-    return off_diagonal(every.expand(agents, agents))
+    """Returns the senders of a graph in which each agent receives from all others, in order."""
+    indices = torch.arange(agents, device=device)
+    return off_diagonal(indices.expand(agents, agents))
 
 
 def off_diagonal(dense: Shaped[Tensor, "*batch agents agents"]) -> Shaped[Tensor, "*batch agents slots"]:
-    """From dense pairs to those with `others`."""
+    """Converts dense pairs to pairs with the senders of `others`, which leaves the diagonal out."""
     agents = dense.shape[-1]
-    # row by row, the entries between two diagonal ones are as many as there are agents
+    # in the flattened array, the entries between two diagonal ones are as many as there are agents
     between = dense.flatten(-2)[..., 1:].unflatten(-1, (agents - 1, agents + 1))[..., :-1]
     return between.reshape(*dense.shape[:-2], agents, agents - 1)
 
@@ -38,7 +38,7 @@ def off_diagonal(dense: Shaped[Tensor, "*batch agents agents"]) -> Shaped[Tensor
 def with_diagonal(
     pairs: Shaped[Tensor, "*batch agents slots feature"], diagonal: Shaped[Tensor, " feature"]
 ) -> Shaped[Tensor, "*batch agents agents feature"]:
-    """From pairs with `others` to dense ones, every diagonal entry as given."""
+    """Converts pairs with the senders of `others` to dense ones, with `diagonal` in every diagonal entry."""
     agents = pairs.shape[-3]
     between = pairs.reshape(*pairs.shape[:-3], agents - 1, agents, pairs.shape[-1])
     first = diagonal.expand(*between.shape[:-2], 1, -1)
@@ -50,9 +50,9 @@ def with_diagonal(
 def nearest(
     positions: Float[Tensor, "batch agents axes"], valid: Bool[Tensor, "batch agents"], count: int
 ) -> tuple[Int[Tensor, "batch agents slots"], Bool[Tensor, "batch agents slots"]]:
-    """The nearest others of each agent in `count` slots, and which of the slots hold one.
+    """Finds the nearest others of each agent, in `count` slots, and which of the slots hold one.
 
-    Everyone is compared with everyone, by distance alone; that square is small beside what pairs cost.
+    All agents are compared with all, by distance alone; these squared costs are small beside those of layers on pairs.
     """
     agents = positions.shape[1]
     # exact: the fast way squares coordinates, and 10 km down a road nothing is left of a metre
@@ -66,7 +66,7 @@ def nearest(
 def among_nearest(
     positions: Float[Tensor, "*batch agents axes"], valid: Bool[Tensor, "*batch agents"], count: int
 ) -> Bool[Tensor, "*batch agents agents"]:
-    """The dense mask of the pairs that `nearest` finds."""
+    """Returns the dense mask of the pairs that `nearest` finds."""
     agents, axes = positions.shape[-2:]
     senders, present = nearest(positions.reshape(-1, agents, axes), valid.reshape(-1, agents), min(count, agents))
     mask = torch.zeros(*senders.shape[:2], senders.shape[1], dtype=torch.bool, device=valid.device)
@@ -78,9 +78,9 @@ def to_dense(
     senders: Int[Tensor, "batch agents slots"],
     absent: Float[Tensor, " feature"],
 ) -> Float[Tensor, "batch agents agents feature"]:
-    """Slots put where their senders stand, `absent` everywhere else."""
+    """Converts pairs in slots to dense ones, with `absent` where no slot holds the pair."""
     batch, agents, _, width = pairs.shape
     # one more column takes what the empty slots hold
     dense = absent.expand(batch, agents, agents + 1, width).clone()
-    place = torch.where(senders == NOBODY, agents, senders)
+    place = torch.where(senders == NO_AGENT, agents, senders)
     return dense.scatter_(2, place[..., None].expand_as(pairs), pairs)[:, :, :agents]

@@ -1,12 +1,12 @@
-"""What a dG-VAE's edges mean, in pictures and numbers: `python -m predictor.interpret --checkpoint DIR --data STORE`.
+"""Draws and scores the edges of a dG-VAE: `python -m predictor.interpret --checkpoint DIR --data STORE`.
 
-Watches windows with a trained model and writes `graph.png` (inferred graph beside the truth), `features.png` (edge
-features as matrices), `trajectories.png` (samples beside the truth), `scores.json` and `scores.md`: which feature
-dimension goes with which known property of an edge, beside what chance and a ruler would give, how disentangled the
-features are (DCI, MIG), how still they stand over time. Stores without labels get what needs none.
+Runs a trained model on windows and writes `graph.png` (inferred graph beside the truth), `features.png` (edge
+features as matrices), `trajectories.png` (samples beside the truth), `scores.json` and `scores.md`: the correlation of
+feature dimensions with known properties of edges, beside chance and the distance between agents; disentanglement of the
+features (DCI, MIG); their change over time. Stores without labels get the parts that need none.
 
-Everything is read off at the last observed step, from the past alone. A correlation says that the number is there, not
-that the decoder uses it (docs/interpretability.md).
+Features are those of the last observed step, from the past alone. A correlation shows that a feature contains the
+property, not that the decoder uses it (docs/interpretability.md).
 """
 
 import os
@@ -26,7 +26,7 @@ from predictor.checkpoint import CONSTANT_VELOCITY, CheckpointInfo, load_checkpo
 from predictor.data.store import StoreInfo, read_store
 from predictor.data.windows import Windows
 from predictor.evaluation.disentanglement import sklearn
-from predictor.evaluation.edge_findings import Findings, measure, watch
+from predictor.evaluation.edge_findings import Findings, infer_edges, measure
 from predictor.evaluation.outcomes import run_window_batch
 from predictor.reports import edge_plots as pictures
 from predictor.reports.tables import scores_markdown
@@ -39,15 +39,15 @@ from predictor.support.provenance import provenance
 from predictor.support.runtime import resolve_device
 
 BATCH_BYTES = 64_000_000
-"""Of a batch's features over time."""
+"""Largest size of the edge features of a batch over time [bytes]."""
 FEATURED = ("dgvae",)
-"""Models whose edge features mean something; the others fill in zeros."""
+"""Models with edge features; the others return zeros."""
 FILES = ("graph.png", "features.png", "trajectories.png", "scores.json", "scores.md")
 
 
 @dataclass(frozen=True)
 class InterpretConfig:
-    """Draw and measure what a checkpoint's edges and edge features say."""
+    """Draws and scores the edges and edge features of a checkpoint."""
 
     checkpoint: str
     """Checkpoint of a dG-VAE: shipped name, folder or run folder."""
@@ -69,10 +69,10 @@ class InterpretConfig:
     """Device that runs the model: cpu, cuda or auto (cuda where there is one)."""
 
     def __post_init__(self) -> None:
-        """Check ranges; `device="auto"` becomes the device that is taken.
+        """Checks ranges; `device="auto"` becomes the device that is taken.
 
         Raises:
-            UserError: a value that makes no sense, or a device that is not there.
+            UserError: a value out of range, or a device that is not there.
         """
         check_at_least(self, 1, "max_windows", "burn_in_steps", "horizon_steps", "num_samples")
         check_at_least(self, 0, "seed")
@@ -80,11 +80,11 @@ class InterpretConfig:
 
 
 def interpret(config: InterpretConfig) -> Findings:
-    """Measure, draw and write everything under `config.out`; nothing is written if anything is refused.
+    """Measures, draws and writes all files below `config.out`; writes nothing after an error.
 
     Raises:
-        UserError: a file in the place of `out`, a model without edge features, a store that does not fit it, or no
-            window that is long enough.
+        UserError: `out` is a file, the model has no edge features, the store does not fit it, or no window is long
+            enough.
     """
     if config.out.exists() and not config.out.is_dir():
         raise UserError(f"out must be a folder, but {config.out} is a file; choose another path")
@@ -92,7 +92,7 @@ def interpret(config: InterpretConfig) -> Findings:
     store = read_store(config.data)
     info.spec.check_compatible(store.info.spec, f"checkpoint '{config.checkpoint}'", f"store {config.data}")
     if any(e.edge_types is not None or e.edge_attributes is not None for e in store.episodes):
-        sklearn("metrics")  # known to be missing now, not after everything was measured
+        sklearn("metrics")  # raises before measuring, not after it
     try:
         lengths = (config.burn_in_steps, config.horizon_steps)
         windows = Windows(
@@ -103,12 +103,19 @@ def interpret(config: InterpretConfig) -> Findings:
     drawn = np.random.default_rng(config.seed).permutation(len(windows))[: config.max_windows]
     first = _with_pairs(windows, drawn)
     if not first:
-        raise UserError(f"store {config.data}: in {len(drawn)} windows there are never two agents at once, so no edges")
+        raise UserError(
+            f"store {config.data}: none of {len(drawn)} windows has two agents at once, so there are no edges"
+        )
     columns = max(e.states.shape[1] for e in store.episodes)
     size = max(1, BATCH_BYTES // (4 * config.burn_in_steps * columns**2 * model.edge_feature_dim))
     parts = np.array_split(np.sort(drawn), -(-len(drawn) // size))
     findings, accuracies = measure(
-        model, windows, track(parts, description="watch"), store.info.edge_attribute_names, config.seed, config.device
+        model,
+        windows,
+        track(parts, description="infer edges"),
+        store.info.edge_attribute_names,
+        config.seed,
+        config.device,
     )
     content = _content(config, info, store.info, findings)
     out = config.out.resolve()
@@ -122,7 +129,7 @@ def interpret(config: InterpretConfig) -> Findings:
         for name in FILES:
             if (partial / name).exists():
                 os.replace(partial / name, out / name)
-            else:  # of an earlier run; it would mislead beside the new ones
+            else:  # of an earlier run, which does not belong to the new files
                 (out / name).unlink(missing_ok=True)
     return findings
 
@@ -140,7 +147,7 @@ def _load_model(name: str, device: str) -> tuple[Any, CheckpointInfo]:
 
 
 def _with_pairs(windows: Windows, drawn: Int[np.ndarray, " drawn"]) -> list[int]:
-    """The first few drawn windows in which there is a pair at the last observed step."""
+    """Returns the first `NUM_TRAJECTORIES` drawn windows with a pair at the last observed step."""
     found: list[int] = []
     for index in drawn.tolist():
         batch = windows.batch(np.array([index]))
@@ -152,7 +159,7 @@ def _with_pairs(windows: Windows, drawn: Int[np.ndarray, " drawn"]) -> list[int]
 
 
 def _by_accuracy(indices: Int[np.ndarray, " windows"], accuracies: Float[np.ndarray, " known"]) -> list[int]:
-    """Windows at the quantiles of graph accuracy that are drawn; none where no truth is known."""
+    """Returns the windows at the drawn quantiles of graph accuracy; none without a known truth."""
     if not len(accuracies):
         return []
     order = indices[np.argsort(accuracies, kind="stable")][: int((~np.isnan(accuracies)).sum())]  # NaN is last
@@ -160,7 +167,7 @@ def _by_accuracy(indices: Int[np.ndarray, " windows"], accuracies: Float[np.ndar
 
 
 def _content(config: InterpretConfig, info: CheckpointInfo, store: StoreInfo, findings: Findings) -> dict[str, Any]:
-    """What scores.json holds and scores.md is made of."""
+    """Returns the content of scores.json, from which scores.md is written."""
     return {
         "source": store.source,
         "dt_s": info.spec.dt_s,
@@ -175,11 +182,11 @@ def _content(config: InterpretConfig, info: CheckpointInfo, store: StoreInfo, fi
 def _shown(
     config: InterpretConfig, model: Any, windows: Windows, indices: Iterable[int], store: StoreInfo
 ) -> list[pictures.WindowShown]:
-    """Some windows with all that the pictures need."""
+    """Returns windows with the arrays of all pictures."""
     device, made = torch.device(config.device), []
     for index in indices:
         batch = windows.batch(np.array([index]))
-        watched = watch(model, batch.to(device))
+        inferred = infer_edges(model, batch.to(device))
         generator = torch.Generator(device).manual_seed(config.seed)
         outcome = run_window_batch(model, batch.to(device), config.horizon_steps, config.num_samples, generator)
         episode, last = windows.index[index].tolist()
@@ -190,9 +197,9 @@ def _shown(
                 _agent_names(batch.states.shape[2], store),
                 batch.states[0, : now + 1, :, : windows.spec.position_dim].numpy(),
                 batch.valid[0, : now + 1].numpy(),
-                watched.features[0],
-                1 - watched.edge_probs[0, -1, ..., 0],
-                watched.pairs[0],
+                inferred.features[0],
+                1 - inferred.edge_probs[0, -1, ..., 0],
+                inferred.pairs[0],
                 outcome.forecast[0].cpu().numpy(),
                 outcome.future[0].cpu().numpy(),
                 outcome.valid[0].cpu().numpy(),
@@ -204,7 +211,7 @@ def _shown(
 
 
 def _agent_names(agents: int, store: StoreInfo) -> list[str]:
-    """Joint names where the store has them (and everybody is there), else numbers."""
+    """Returns the joint names if the store has them and all joints are present, else numbers."""
     joints = store.provenance.get("joints", ())
     if len(joints) == agents:
         return [str(joint) for joint in joints]
@@ -220,7 +227,7 @@ def _draw(
     graphs: Sequence[pictures.WindowShown],
     spec: SceneSpec,
 ) -> None:
-    """The pictures."""
+    """Draws and writes the pictures."""
     where = f"{config.checkpoint} on {content['source']}"
     names = [score.name for score in findings.attributes]
     figures = {

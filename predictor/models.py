@@ -1,6 +1,6 @@
 """Every trainable forecaster by name: its config class, its network, and how a config is put together.
 
-Checkpoints, training and the suite of tables go through here, so that a new model is one line.
+Checkpoints, training and the suite of tables build models here, so that a new model is one line.
 """
 
 import dataclasses
@@ -39,7 +39,7 @@ KINDS: dict[str, _Kind] = {
 
 
 def name_of(model: nn.Module) -> str:
-    """The name under which a model can be built again.
+    """Returns the name under which a model can be built again.
 
     Raises:
         UserError: not a model that can be trained.
@@ -51,7 +51,7 @@ def name_of(model: nn.Module) -> str:
 
 
 def build(name: str, spec: SceneSpec, config: Any, horizon_steps: int) -> nn.Module:
-    """A network with fresh weights from torch's generator.
+    """Builds a network with fresh weights from torch's generator.
 
     Raises:
         UserError: no model of this name.
@@ -61,7 +61,7 @@ def build(name: str, spec: SceneSpec, config: Any, horizon_steps: int) -> nn.Mod
 
 
 def config_from_json(name: str, values: Mapping[str, Any]) -> Any:
-    """The config of a checkpoint.
+    """Returns the config of a checkpoint.
 
     Raises:
         UserError: no model of this name, or a value out of range.
@@ -75,13 +75,13 @@ def config_from_json(name: str, values: Mapping[str, Any]) -> Any:
 
 
 def configure(name: str, preset: str, overrides: Sequence[str] = (), **fitted: Any) -> Any:
-    """A config from a preset, `field=value` overrides, and values fitted to the data.
+    """Builds a config from a preset, `field=value` overrides, and values fitted to the data.
 
     Args:
-        name: of the model.
+        name: name of the model.
         preset: "paper" or "fast"; models other than the dG-VAE have their published sizes, halved for "fast".
-        overrides: such as "hidden_dim=64".
-        fitted: fields such as `delta_scales`; an override wins.
+        overrides: texts such as "hidden_dim=64".
+        fitted: values of fields such as `delta_scales`; an override wins.
 
     Raises:
         UserError: an unknown field, or a value that does not fit it.

@@ -1,8 +1,8 @@
 """Noise for samples of a batch of scenes in which each scene draws from a generator of its own.
 
 What a scene draws depends on its own generator, on its own present pairs and on the number of samples; other scenes of
-the batch, their order and padding have no say. All numbers of a roll-out are drawn at once, scene by scene, so that a
-scene whose forecast stands twice in a batch draws for the first one before it draws for the second.
+the batch, their order and padding change nothing. All numbers of a roll-out are drawn at once, scene by scene: a
+generator that is listed for two scenes of a batch draws for the first one before it draws for the second.
 """
 
 from collections.abc import Sequence
@@ -23,13 +23,13 @@ class PairNoise:
 
     Args:
         generators: one per scene; a generator may be listed more than once.
-        present: which pairs are there.
-        draws: samples per scene.
-        steps: times that the roll-out draws.
-        types: numbers per pair.
+        present: which slots hold a pair.
+        draws: number of samples per scene.
+        steps: number of draws in the roll-out.
+        types: number of values per pair.
 
     Raises:
-        UserError: not one generator per scene.
+        UserError: the number of generators is not the number of scenes.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class PairNoise:
         steps: int,
         types: int,
     ) -> None:
-        """Draw for all steps; listed by scene, sample, receiver and slot."""
+        """Draws the numbers for all steps, listed by scene, sample, receiver and slot."""
         if len(generators) != len(present):
             raise UserError(
                 f"samples need one generator per scene, got {len(generators)} generators for {len(present)} scenes"

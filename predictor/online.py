@@ -1,8 +1,8 @@
-"""Streaming: one forecaster for many parallel environments, whose memory follows agents by id.
+"""Streaming forecasts: one forecaster for many parallel environments, whose memory follows agents by id.
 
-Between two observations agents may be re-sorted and may come and go: memory is moved to where an agent's id now
-stands, newcomers start from zero, and the memory of leavers is dropped with the old arrangement. The cost of a step
-does not depend on how much was seen before.
+Between two observations agents may be re-sorted and may come and go: memory moves with an agent's id,
+new agents start from zero, and the memory of agents that left is dropped. The cost of a step does not depend on the
+length of the history.
 """
 
 import copy
@@ -15,7 +15,7 @@ from jaxtyping import Bool, Int
 from torch.nn import functional
 
 from predictor.forecaster import Belief, Forecaster, Memory
-from predictor.graph import NOBODY
+from predictor.graph import NO_AGENT
 from predictor.noise import Noise
 from predictor.scene import PADDING_ID, Forecast, SceneBatch
 from predictor.support.errors import ProtocolError
@@ -28,8 +28,8 @@ def use_one_thread_after_fork() -> None:
     """Limits torch to one thread in a process that was forked from the one that imported this module.
 
     A forked worker (SubprocVecEnv or AsyncVectorEnv with "fork") inherits OpenMP's state without its threads and would
-    wait for them forever; with one thread it never asks for them. torch's DataLoader workers do likewise. Call it
-    before a worker's first operation on tensors; from the second call on it changes nothing.
+    wait for them forever; with one thread it does not use them. torch's DataLoader workers are limited the same way.
+    Call it before a worker's first operation on tensors; from the second call on it changes nothing.
     """
     global _process
     if os.getpid() != _process:
@@ -44,13 +44,13 @@ class OnlineForecaster:
 
     Args:
         forecaster: any `Forecaster`.
-        envs: parallel scenes, one for each environment.
-        agents: agents of each scene, padding included.
-        device: where the forecaster lives: cpu, cuda or auto.
+        envs: number of parallel scenes, one for each environment.
+        agents: number of agents of each scene, padding included.
+        device: device of the forecaster: cpu, cuda or auto.
     """
 
     def __init__(self, forecaster: Forecaster, envs: int, agents: int, device: str = "cpu") -> None:
-        """Start with empty memory for every environment."""
+        """Starts with empty memory for every environment."""
         use_one_thread_after_fork()
         self.forecaster = forecaster
         self.device = torch.device(resolve_device(device))
@@ -68,7 +68,7 @@ class OnlineForecaster:
         return twin
 
     def reset(self, envs: Int[np.ndarray, " some"] | None = None) -> None:
-        """Forget the history of some environments (all, if None); the others keep theirs."""
+        """Clears the history of some environments (all, if None); the others keep theirs."""
         use_one_thread_after_fork()
         chosen = np.arange(len(self._ids)) if envs is None else np.asarray(envs, dtype=np.int64)
         if not len(chosen):
@@ -77,25 +77,25 @@ class OnlineForecaster:
         self._ids[chosen] = PADDING_ID
         index = torch.from_numpy(chosen).to(self.device)
         fresh = self._fresh.select(torch.zeros(len(chosen), dtype=torch.long, device=self.device))
-        self._memory = self._memory.replace_rows(index, fresh)
+        self._memory = self._memory.replace_envs(index, fresh)
 
     @torch.inference_mode()
     def observe(self, scenes: SceneBatch, envs: Int[np.ndarray, " some"] | None = None) -> None:
-        """Take in one scene per environment, or one for each of `envs`; a `forecast` that follows has as many."""
+        """Observes one scene per environment, or one for each of `envs`; the next `forecast` has as many entries."""
         use_one_thread_after_fork()
         if envs is None:
             self._memory, self._ids = self._take(scenes, self._ids, self._memory)
             return
         index = torch.from_numpy(np.asarray(envs, dtype=np.int64)).to(self.device)
         memory, self._ids[envs] = self._take(scenes, self._ids[envs], self._memory.select(index))
-        self._memory = self._memory.replace_rows(index, memory)
+        self._memory = self._memory.replace_envs(index, memory)
 
     @torch.inference_mode()
     def observe_boundary(self, scenes: SceneBatch, ended: Int[np.ndarray, " ended"], successors: SceneBatch) -> None:
-        """Take in one scene per environment, some the last of their episode, together with their successors.
+        """Observes one scene per environment, some the last of their episode, together with their successors.
 
         One batched step serves both: `scenes` continue their histories; for each environment in `ended`, the first
-        scene of its next episode enters with an empty history and is what stays in memory. A `forecast` that follows
+        scene of its next episode starts with an empty history and is what stays in memory. The next `forecast`
         has `len(scenes) + len(ended)` entries, the successors last.
         """
         use_one_thread_after_fork()
@@ -120,12 +120,12 @@ class OnlineForecaster:
         num_samples: int = 1,
         generator: Noise | None = None,
     ) -> Forecast:
-        """Forecast from the latest observation; sample 0 is the most likely graph's.
+        """Forecasts from the latest observation; sample 0 follows the most likely graph.
 
         Args:
-            horizon_steps: None takes the forecaster's.
-            num_samples: futures per agent.
-            generator: of the samples; one for all scenes of the latest observation, or one for each of them.
+            horizon_steps: number of steps; None takes the forecaster's.
+            num_samples: number of futures per agent.
+            generator: source of the samples' noise; one for all scenes of the latest observation, or one for each.
 
         Raises:
             ProtocolError: nothing was observed yet.
@@ -151,7 +151,7 @@ class OnlineForecaster:
             probs,
             functional.pad(belief.edge_features, pairs),
             functional.pad(belief.valid, (0, missing)),
-            None if senders is None else functional.pad(senders, (0, 0, 0, missing), value=NOBODY),
+            None if senders is None else functional.pad(senders, (0, 0, 0, missing), value=NO_AGENT),
         )
 
     def _take(
@@ -164,8 +164,8 @@ class OnlineForecaster:
         if agents < ids.shape[1] or not np.array_equal(old_ids, ids):
             source, known = _match(old_ids, ids[:, :agents])
             memory = memory.reorder(torch.from_numpy(source).to(self.device), torch.from_numpy(known).to(self.device))
-        # float64 until the ego's position is off: a scene 10 km down the road loses no precision
-        # what stands in padding, not-a-number for example, must not reach any agent
+        # float64 until the ego's position is subtracted: a scene 10 km down the road loses no precision
+        # values in padding, not-a-number for example, must not reach any agent
         local = np.where(valid[..., None], scenes.states[:, :agents], 0.0)
         axes = len(self._ego_axes)
         local[..., :axes] -= local[:, :1, :axes] * self._ego_axes
@@ -177,6 +177,6 @@ class OnlineForecaster:
 def _match(
     old_ids: Int[np.ndarray, "envs before"], new_ids: Int[np.ndarray, "envs agents"]
 ) -> tuple[Int[np.ndarray, "envs agents"], Bool[np.ndarray, "envs agents"]]:
-    """Returns, for each place of each new scene, where its id stood before, and whether it did."""
+    """Returns, for each place of each new scene, the previous place of its id, and whether there was one."""
     same = (new_ids[:, :, None] == old_ids[:, None, :]) & (new_ids[:, :, None] != PADDING_ID)
     return same.argmax(axis=2), same.any(axis=2)

@@ -30,16 +30,17 @@ class SceneSpec:
     dt_s: float
     """Time between two scenes [s]."""
     frame: tuple[AxisFrame, ...] = ("world", "world")
-    """Per axis, what is subtracted from positions at each step: "ego" the ego's (unbounded roads), "centroid" the mean
-    of all agents that are present (no agent is special, the place does not matter), "world" nothing (fixed maps)."""
+    """Origin that is subtracted from positions at each step, per axis: "ego" the ego's position (unbounded roads),
+    "centroid" the mean of all present agents (no agent is special, the place does not matter), "world" nothing (fixed
+    maps)."""
     feature_names: tuple[str, ...] = KINEMATIC_FEATURES
     """Columns of a state; position and velocity come first, on two or three axes."""
     feature_scales: tuple[float, ...] = (100.0, 100.0, 30.0, 30.0)
     """Divisors that bring each feature to order one for the network."""
     has_ego: bool = True
-    """Whether agent 0 is the learner; tells the network which agent does not drive like the others."""
+    """Whether agent 0 is the learner; marks for the network the agent that does not drive like the others."""
     perception_m: float = 100.0
-    """Distance to which the ego sees [m]; agents beyond are not in the scene."""
+    """Largest distance at which the ego perceives an agent [m]; agents beyond are not in the scene."""
     max_agents: int = 12
     """Largest number of agents in a scene, the ego included; the nearest are kept."""
     constant_features: tuple[str, ...] = ()
@@ -77,7 +78,7 @@ class SceneSpec:
 
     @property
     def position_dim(self) -> int:
-        """Number of axes of a position, which is the first columns of a state; as many columns of velocity follow."""
+        """Number of axes of a position, which fills the first columns of a state; velocity fills as many after it."""
         return 3 if self.feature_names[:6] == KINEMATIC_FEATURES_3D else 2
 
     @property
@@ -86,12 +87,12 @@ class SceneSpec:
         return len(self.feature_names)
 
     def check_compatible(self, other: "SceneSpec", name: str, source: str) -> None:
-        """Raises unless scenes of `other` can be fed to a forecaster of this spec.
+        """Raises unless a forecaster of this spec can observe scenes of `other`.
 
         Args:
-            other: the spec of the scenes that arrive.
-            name: what this spec belongs to, for the message (``checkpoint 'highway'``).
-            source: what the scenes come from, for the message (``env 'racetrack-v1'``).
+            other: spec of the observed scenes.
+            name: owner of this spec, for the message (``checkpoint 'highway'``).
+            source: origin of the scenes, for the message (``env 'racetrack-v1'``).
 
         Raises:
             UserError: features or time step differ.
@@ -113,37 +114,37 @@ class Scene:
     """All agents at one instant, padded to a fixed number."""
 
     states: Float[np.ndarray, "agents state"]
-    """World frame, SI units, float64; agent 0 is the ego. Finite, padded agents included."""
+    """States in the world frame, SI units, float64; agent 0 is the ego. Finite, padded agents included."""
     ids: Int[np.ndarray, " agents"]
-    """Identity that stays with an agent from step to step; -1 for padded agents."""
+    """Identity of each agent, constant from step to step; -1 for padded agents."""
     valid: Bool[np.ndarray, " agents"]
     """Which entries hold an agent."""
     heading_rad: float = 0.0
     """Heading of the ego, which turns world axes into ego axes; 0 where agents have none."""
 
-    def behind_absent(self, rows: int) -> "Scene":
-        """Returns the scene behind `rows` absent agents, for a forecaster with an ego where no agent is the ego."""
+    def behind_absent(self, agents: int) -> "Scene":
+        """Returns the scene behind `agents` absent ones, for a forecaster with an ego where no agent is the ego."""
         return Scene(
-            np.pad(self.states, ((rows, 0), (0, 0))),
-            np.pad(self.ids, (rows, 0), constant_values=PADDING_ID),
-            np.pad(self.valid, (rows, 0)),
+            np.pad(self.states, ((agents, 0), (0, 0))),
+            np.pad(self.ids, (agents, 0), constant_values=PADDING_ID),
+            np.pad(self.valid, (agents, 0)),
             self.heading_rad,
         )
 
-    def check(self, source: str = "reader", spec: SceneSpec | None = None, rows: int | None = None) -> None:
-        """Raises unless the scene keeps the contract.
+    def check(self, source: str = "reader", spec: SceneSpec | None = None, agents: int | None = None) -> None:
+        """Raises unless the scene is well-formed.
 
         Args:
-            source: who read it, for messages.
-            spec: features and ego are checked against it; None expects an ego and any features.
-            rows: required number of agents, padding included; None takes any.
+            source: name of its reader, for messages.
+            spec: required features and ego; None requires an ego and takes any features.
+            agents: required number of agents, padding included; None takes any.
 
         Raises:
             UserError: wrong types or shapes, no ego, duplicate or negative ids, non-finite values.
         """
-        self._check_arrays(source, spec, rows)
+        self._check_arrays(source, spec, agents)
         if (spec is None or spec.has_ego) and not (len(self.valid) and self.valid[0]):
-            raise UserError(f"{source}: row 0 must hold the ego, but it is not valid")
+            raise UserError(f"{source}: agent 0 must be the ego, but it is not valid")
         live = self.ids[self.valid].tolist()
         if len(set(live)) != len(live):
             raise UserError(f"{source}: ids must be unique within a scene, got {live}")
@@ -157,7 +158,7 @@ class Scene:
                 f"{source}: states must be finite, those of padded agents too (zeros), got {self.states.tolist()}"
             )
 
-    def _check_arrays(self, source: str, spec: SceneSpec | None, rows: int | None) -> None:
+    def _check_arrays(self, source: str, spec: SceneSpec | None, agents: int | None) -> None:
         for name, array, kind, wanted, axes in (
             ("states", self.states, "f", "floating point", 2),
             ("ids", self.ids, "iu", "integers", 1),
@@ -168,15 +169,17 @@ class Scene:
                 raise UserError(f"{source}: {name} must be a NumPy array of {wanted} with {axes} axes, got {got}")
         if not len(self.states) == len(self.ids) == len(self.valid):
             raise UserError(
-                f"{source}: states, ids and valid need one row per agent, got {len(self.states)}, {len(self.ids)} and "
-                f"{len(self.valid)}"
+                f"{source}: states, ids and valid need one entry per agent, got {len(self.states)}, "
+                f"{len(self.ids)} and {len(self.valid)}"
             )
         if spec is not None and self.states.shape[1] != spec.num_features:
             raise UserError(
                 f"{source}: states need {spec.num_features} features {spec.feature_names}, got {self.states.shape[1]}"
             )
-        if rows is not None and len(self.ids) != rows:
-            raise UserError(f"{source}: a scene needs {rows} rows (max_agents), padding included, got {len(self.ids)}")
+        if agents is not None and len(self.ids) != agents:
+            raise UserError(
+                f"{source}: a scene needs {agents} agents (max_agents), padding included, got {len(self.ids)}"
+            )
 
 
 @dataclass(frozen=True)
@@ -184,13 +187,13 @@ class SceneBatch:
     """Scenes of many environments at one instant."""
 
     states: Float[np.ndarray, "batch agents state"]
-    """World frame, SI units, float64."""
+    """States in the world frame, SI units, float64."""
     ids: Int[np.ndarray, "batch agents"]
-    """As in `Scene`."""
+    """Identity of each agent; -1 for padded agents."""
     valid: Bool[np.ndarray, "batch agents"]
-    """As in `Scene`."""
+    """Which entries hold an agent."""
     heading_rad: Float[np.ndarray, " batch"]
-    """As in `Scene`."""
+    """Heading of each ego; 0 where agents have none."""
 
     @staticmethod
     def stack(scenes: Sequence[Scene]) -> "SceneBatch":
@@ -206,9 +209,9 @@ class SceneBatch:
         """Number of scenes in the batch."""
         return len(self.states)
 
-    def __getitem__(self, rows: Int[np.ndarray, " rows"]) -> "SceneBatch":
+    def __getitem__(self, envs: Int[np.ndarray, " envs"]) -> "SceneBatch":
         """Returns the scenes of the given environments, as a batch."""
-        return SceneBatch(self.states[rows], self.ids[rows], self.valid[rows], self.heading_rad[rows])
+        return SceneBatch(self.states[envs], self.ids[envs], self.valid[envs], self.heading_rad[envs])
 
     @staticmethod
     def concatenate(first: "SceneBatch", second: "SceneBatch") -> "SceneBatch":
@@ -232,10 +235,10 @@ def perceived_agents(
     Agents at equal distances keep their order; the ego comes first also when another agent is at the same position.
 
     Args:
-        states: world frame; entries of agents that are not valid are ignored.
+        states: states in the world frame; entries of agents that are not valid are ignored.
         valid: which entries hold an agent.
-        ego: index of the ego: one for all scenes, or one for each.
-        spec: its `perception_m`, `max_agents` and `position_dim` decide.
+        ego: index of the ego, one for all scenes or one for each.
+        spec: source of `perception_m`, `max_agents` and `position_dim`.
 
     Returns:
         Indices of agents in this order, as many as there are, at most `max_agents`; and which of them are perceived:
@@ -257,19 +260,19 @@ def perceived_agents(
 
 @dataclass(frozen=True)
 class Forecast:
-    """Forecast at one instant of the steps that follow it."""
+    """Forecast of the steps that follow one instant."""
 
     xy: Float[Tensor, "batch samples agents horizon axes"]
     """Predicted positions [m], world axes; relative to the ego's position now, or to the world's origin where there is
     no ego (a spec without one, or an absent agent 0). Zeros where `valid` is not."""
     edge_probs: Float[Tensor, "batch agents slots types"]
-    """Prior over edge types now, receiver first; type 0 is "no edge"."""
+    """Prior probabilities of edge types now, receiver first; type 0 is "no edge"."""
     edge_features: Float[Tensor, "batch agents slots feature"]
     """Edge features now, receiver first."""
     valid: Bool[Tensor, "batch agents"]
     """Which agents are forecast."""
     senders: Int[Tensor, "batch agents slots"] | None = None
-    """Index of the sender in each slot (`predictor.graph.NOBODY` where empty); None if slot j is agent j's."""
+    """Index of the sender in each slot (`predictor.graph.NO_AGENT` where empty); None if slot j is agent j's."""
 
     def dense(self) -> "Forecast":
         """Returns the forecast with slot j for agent j; of use where scenes are small."""
@@ -285,9 +288,9 @@ class Forecast:
         agents = torch.arange(self.senders.shape[1], device=self.senders.device)
         to_ego = (self.senders[:, 0, :, None] == agents).transpose(1, 2)
         from_ego = self.senders == 0
-        heard = torch.stack([to_ego, from_ego], 2).to(self.xy.dtype)
+        found = torch.stack([to_ego, from_ego], 2).to(self.xy.dtype)
         slots = [torch.stack([t[:, :1].expand_as(t), t], 2) for t in (self.edge_probs, self.edge_features)]
-        probs, features = (torch.matmul(heard[..., None, :], t)[..., 0, :] for t in slots)
+        probs, features = (torch.matmul(found[..., None, :], t)[..., 0, :] for t in slots)
         probs[..., 0] = 1 - probs[..., 1:].sum(-1)  # an agent without a slot has no edge
         return probs, features
 
@@ -297,7 +300,7 @@ def dense_edges(
     features: Float[Tensor, "batch agents slots feature"],
     senders: Int[Tensor, "batch agents slots"],
 ) -> tuple[Float[Tensor, "batch agents agents types"], Float[Tensor, "batch agents agents feature"]]:
-    """Returns edge probabilities and features with slot j for agent j: "no edge", and zeros, where there is no slot."""
+    """Returns edge probabilities and features with slot j for agent j; "no edge" and zeros where there is no slot."""
     no_edge = probs.new_zeros(probs.shape[-1])
     no_edge[0] = 1.0
     return to_dense(probs, senders, no_edge), to_dense(features, senders, features.new_zeros(features.shape[-1]))

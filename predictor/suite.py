@@ -1,7 +1,7 @@
-"""Rerun the paper's tables: `python -m predictor.suite --table springs --budget cpu --data data --out runs/suite`.
+"""Reruns the paper's tables: `python -m predictor.suite --table springs --budget cpu --data data --out runs/suite`.
 
-Trains every row (each in its own process, resumable, cached by a hash of its config and data), measures it in both
-views of docs/protocol.md, and prints the table as Markdown, with JSON and LaTeX beside it.
+Trains each line (in its own process, resumable, cached by a hash of its config and data), measures it in both views
+of docs/protocol.md, and prints the table as Markdown, with JSON and LaTeX beside it.
 """
 
 import hashlib
@@ -21,9 +21,9 @@ from rich.progress import Progress
 
 from predictor.data.store import read_info_of
 from predictor.evaluation.disentanglement import sklearn
-from predictor.evaluation.measure_row import measure_row
-from predictor.evaluation.paper_tables import BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, TABLES, Budget, Row, Sizes
-from predictor.reports.plots import plot_rows_by_step
+from predictor.evaluation.measure_line import measure_line
+from predictor.evaluation.paper_tables import BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, TABLES, Budget, Line, Sizes
+from predictor.reports.plots import plot_results_by_step
 from predictor.reports.tables import latex_table, markdown_report
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_choices
@@ -39,7 +39,7 @@ TableName = Literal["springs", "recipe", "mocap", "nba", "sdd", "ind"]
 
 @dataclass(frozen=True)
 class SuiteConfig:
-    """Train and measure every row of one of the paper's tables."""
+    """Trains and measures all lines of one of the paper's tables."""
 
     table: TableName
     """Table of the paper to rerun."""
@@ -50,41 +50,41 @@ class SuiteConfig:
     budget: Budget = "cpu"
     """Sizes of networks and training: "smoke" takes minutes, "cpu" hours on two cores with smaller networks,
     "paper" needs a GPU for the paper's sizes."""
-    rows: tuple[str, ...] = ()
-    """Keys of the rows to run; none runs all."""
+    lines: Annotated[tuple[str, ...], Renamed("rows")] = ()
+    """Keys of the lines to run; none runs all."""
     steps: int = 0
-    """Number of optimiser steps of every row; 0 takes the budget's."""
+    """Number of optimiser steps of every line; 0 takes that of the budget."""
     workers: Annotated[int, Renamed("jobs")] = 0
-    """Number of parallel processes, a row in each; 0 is one per core (one in all on a GPU)."""
+    """Number of parallel processes, a line in each; 0 is one per core (one in all on a GPU)."""
     seed: int = 0
     """Random seed for training and forecasts."""
     device: str = "cpu"
     """Device that trains and measures: cpu, cuda or auto (cuda where there is one)."""
     precision: TrainPrecision = "float32"
     """Precision of matrix products in training (see `python -m predictor.train --help`); measuring is in float32."""
-    only_row: str = ""
-    """Key of a row to run in this process; the suite starts its processes with it."""
+    only_line: Annotated[str, Renamed("only_row")] = ""
+    """Key of a line to run in this process; the suite starts its processes with it."""
 
     def __post_init__(self) -> None:
-        """Check choices and ranges; `device="auto"` becomes the device that is taken.
+        """Checks choices and ranges; `device="auto"` becomes the device that is taken.
 
         Raises:
-            UserError: an unknown table or row, a number that makes no sense, or a device that is not there.
+            UserError: an unknown table or line, a number out of range, or a device that is not there.
         """
         check_choices(self)
         check_at_least(self, 0, "steps", "workers", "seed")
-        keys = [row.key for row in TABLES[self.table].rows]
-        for key in (*self.rows, *filter(None, [self.only_row])):
+        keys = [line.key for line in TABLES[self.table].lines]
+        for key in (*self.lines, *filter(None, [self.only_line])):
             if key not in keys:
-                raise UserError(f"table '{self.table}' has no row '{key}'; there are {', '.join(keys)}")
+                raise UserError(f"table '{self.table}' has no line '{key}'; there are {', '.join(keys)}")
         object.__setattr__(self, "device", resolve_device(self.device))
         check_precision(self.precision, self.device)
 
     def check_stores(self) -> None:
-        """Check that the stores of the table are there.
+        """Checks that the stores of the table are there.
 
         Raises:
-            UserError: one is missing; the message has the commands that make them.
+            UserError: a store is missing; the message has the commands that make it.
         """
         table = TABLES[self.table]
         missing = [s for s in (table.train, table.val, *table.tests.values()) if s and not (self.data / s).exists()]
@@ -94,7 +94,7 @@ class SuiteConfig:
 
     @property
     def sizes(self) -> Sizes:
-        """The budget, with `steps` in its place."""
+        """Sizes of the budget, with `steps` if it is given."""
         sizes = TABLES[self.table].budgets[self.budget]
         return replace(sizes, steps=self.steps, eval_every=min(sizes.eval_every, self.steps)) if self.steps else sizes
 
@@ -105,19 +105,19 @@ class SuiteConfig:
 
     @property
     def num_processes(self) -> int:
-        """Number of parallel processes, a row in each."""
+        """Number of parallel processes, a line in each."""
         return self.workers or (1 if self.device.startswith("cuda") else os.cpu_count() or 1)
 
 
-def row_config(config: SuiteConfig, row: Row, out: Path) -> TrainConfig:
-    """What the row is trained with."""
+def line_config(config: SuiteConfig, line: Line, out: Path) -> TrainConfig:
+    """Returns the training config of a line."""
     table, sizes = TABLES[config.table], config.sizes
-    sets = (*sizes.widths.get(row.model, ()), *row.set)
+    sets = (*sizes.widths.get(line.model, ()), *line.set)
     base = TrainConfig(
         data=(config.data / table.train,),
         val_data=(config.data / table.val,) if table.val else (),
         out=out,
-        model=row.model,  # type: ignore[arg-type]  # rows without training do not come here
+        model=line.model,  # type: ignore[arg-type]  # lines without training do not come here
         preset="paper",
         set=sets,
         max_episodes=sizes.max_episodes,
@@ -136,44 +136,44 @@ def row_config(config: SuiteConfig, row: Row, out: Path) -> TrainConfig:
         threads=0 if config.device != "cpu" else max(1, (os.cpu_count() or 1) // config.num_processes),
         resume=True,
     )
-    return replace(base, **row.train)
+    return replace(base, **line.train)
 
 
-def row_folder(config: SuiteConfig, row: Row) -> Path:
-    """Where the row's run and result lie: a new folder whenever its config or data change."""
+def line_folder(config: SuiteConfig, line: Line) -> Path:
+    """Returns the folder of a line's run and result; another config or other data give another folder."""
     table, sizes = TABLES[config.table], config.sizes
     content: dict[str, Any] = {
-        "row": {"model": row.model},
+        "row": {"model": line.model},
         "protocol": [BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, table.test_stride, sizes.test_windows, config.seed],
         "stores": [_fingerprint(config.data / s) for s in (table.train, table.val, *table.tests.values()) if s],
     }
-    if row.is_trained:
-        values = asdict(row_config(config, row, Path()))
+    if line.is_trained:
+        values = asdict(line_config(config, line, Path()))
         for name in ("data", "val_data", "out", "threads", "device", "data_device", "capture", "resume"):
             del values[name]
         if values["precision"] == "float32":
-            del values["precision"]  # rows that were trained before there was a choice keep their folder
+            del values["precision"]  # lines trained before the option existed keep their folder
         content["train"] = values
     digest = hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:10]
-    return config.folder / "rows" / f"{row.key}-{digest}"
+    return config.folder / "rows" / f"{line.key}-{digest}"
 
 
-def run_row(config: SuiteConfig, row: Row) -> dict[str, Any]:
-    """Train (or resume) and measure one row; writes and returns its result."""
+def run_line(config: SuiteConfig, line: Line) -> dict[str, Any]:
+    """Trains (or resumes) and measures one line; writes and returns its result."""
     if read_info_of(config.data / TABLES[config.table].train).edge_attribute_names:
-        sklearn("linear_model")  # known to be missing now, not after training
-    folder = row_folder(config, row)
+        sklearn("linear_model")  # raises before training, not after it
+    folder = line_folder(config, line)
     folder.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()
     checkpoint = None
-    if row.is_trained:
-        checkpoint = train(row_config(config, row, folder / "run"))
+    if line.is_trained:
+        checkpoint = train(line_config(config, line, folder / "run"))
     trained = time.perf_counter()
     result = {
-        "key": row.key,
-        "name": row.name,
+        "key": line.key,
+        "name": line.name,
         "train_seconds": trained - began,
-        **measure_row(TABLES[config.table], row, config.data, config.sizes, checkpoint, config.seed, config.device),
+        **measure_line(TABLES[config.table], line, config.data, config.sizes, checkpoint, config.seed, config.device),
         "measure_seconds": time.perf_counter() - trained,
         "provenance": provenance(("torch", "numpy", "zarr")),
     }
@@ -182,21 +182,21 @@ def run_row(config: SuiteConfig, row: Row) -> dict[str, Any]:
 
 
 def run_suite(config: SuiteConfig) -> dict[str, Any]:
-    """Run every row that has no result yet, then write the table; returns its content.
+    """Runs all lines without a result, then writes the table; returns its content.
 
     Raises:
-        UserError: a missing store.
+        UserError: a store is missing.
     """
     config.check_stores()
     table = TABLES[config.table]
-    chosen = [r for r in table.rows if not config.rows or r.key in config.rows]
-    pending = [r for r in chosen if not (row_folder(config, r) / "result.json").exists()]
+    chosen = [r for r in table.lines if not config.lines or r.key in config.lines]
+    pending = [r for r in chosen if not (line_folder(config, r) / "result.json").exists()]
     began = time.perf_counter()
     failed = _run_in_processes(config, pending)
     results = {
-        r.key: json.loads((row_folder(config, r) / "result.json").read_text())
+        r.key: json.loads((line_folder(config, r) / "result.json").read_text())
         for r in chosen
-        if (row_folder(config, r) / "result.json").exists()
+        if (line_folder(config, r) / "result.json").exists()
     }
     content = {
         "table": config.table,
@@ -219,36 +219,36 @@ def run_suite(config: SuiteConfig) -> dict[str, Any]:
     return content
 
 
-def _plot(config: SuiteConfig, rows: Sequence[dict[str, Any]], title: str) -> None:
+def _plot(config: SuiteConfig, results: Sequence[dict[str, Any]], title: str) -> None:
     matplotlib.use("Agg")
-    kinds = list(rows[0]["tests"])
+    kinds = list(results[0]["tests"])
     dt_s = read_info_of(config.data / TABLES[config.table].tests[kinds[0]]).spec.dt_s
     figure, axes = plt.subplots(
         1, len(kinds), figsize=(1 + 5 * len(kinds), 5.2), sharey=True, squeeze=False, layout="constrained"
     )
     for ax, kind in zip(axes[0], kinds, strict=True):
-        plot_rows_by_step(ax, rows, kind, dt_s).set_title(kind)
+        plot_results_by_step(ax, results, kind, dt_s).set_title(kind)
     axes[0, 0].set_ylabel("displacement of the best sample [m]")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2 * len(kinds), fontsize=7.5, frameon=False)
     figure.suptitle(
-        f"{title}, budget {config.budget}, one seed per row; bars: standard error over 20 subsets", fontsize=9
+        f"{title}, budget {config.budget}, one seed per line; bars: standard error over 20 subsets", fontsize=9
     )
     figure.savefig(config.folder / "by_step.png", dpi=110)
     plt.close(figure)
 
 
-def _run_in_processes(config: SuiteConfig, pending: Sequence[Row]) -> dict[str, str]:
-    """Rows in parallel; the ones that fail, with their last line."""
+def _run_in_processes(config: SuiteConfig, pending: Sequence[Line]) -> dict[str, str]:
+    """Runs lines in parallel; returns the last line of output of those that failed, by key."""
     waiting, failed = list(pending), {}
     running: dict[str, tuple[subprocess.Popen[bytes], Path]] = {}
     with Progress() as progress:
-        task = progress.add_task(f"{config.table}: {len(pending)} rows to run", total=len(pending))
+        task = progress.add_task(f"{config.table}: {len(pending)} lines to run", total=len(pending))
         try:
             while waiting or running:
                 while waiting and len(running) < config.num_processes:
-                    row = waiting.pop(0)
-                    running[row.key] = _start(config, row)
+                    line = waiting.pop(0)
+                    running[line.key] = _start(config, line)
                 time.sleep(0.5)
                 for key, (process, log) in list(running.items()):
                     if process.poll() is None:
@@ -264,22 +264,22 @@ def _run_in_processes(config: SuiteConfig, pending: Sequence[Row]) -> dict[str, 
     return failed
 
 
-def _start(config: SuiteConfig, row: Row) -> "tuple[subprocess.Popen[bytes], Path]":
-    folder = row_folder(config, row)
+def _start(config: SuiteConfig, line: Line) -> "tuple[subprocess.Popen[bytes], Path]":
+    folder = line_folder(config, line)
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / "log.txt"
     command = [
         sys.executable, "-m", "predictor.suite", "--table", config.table, "--data", str(config.data),
         "--out", str(config.out), "--budget", config.budget, "--steps", str(config.steps), "--workers",
         str(config.num_processes), "--seed", str(config.seed), "--device", config.device,
-        "--precision", config.precision, "--only-row", row.key,
+        "--precision", config.precision, "--only-line", line.key,
     ]  # fmt: skip
     with log.open("wb") as stream:
         return subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT), log
 
 
 def _fingerprint(path: Path) -> str:
-    """Of a store, without reading its arrays: what it was made from and how."""
+    """Returns a hash of a store's layout, source, provenance and length, without reading its arrays."""
     info = read_info_of(path)
     made = {k: v for k, v in info.provenance.items() if k not in ("time", "machine", "versions", "commit", "command")}
     content = json.dumps([asdict(info.spec), info.source, made, info.num_steps], sort_keys=True, default=str)
@@ -290,16 +290,16 @@ def main() -> None:
     """Entry point."""
     config = parse(SuiteConfig, __doc__)
     tune(config.device)
-    if config.only_row:
+    if config.only_line:
         config.check_stores()
-        run_row(config, next(r for r in TABLES[config.table].rows if r.key == config.only_row))
+        run_line(config, next(r for r in TABLES[config.table].lines if r.key == config.only_line))
         return
     content = run_suite(config)
     print((config.folder / "table.md").read_text())
     print(f"written to {config.folder}: table.md, table.json, table.tex, by_step.png")
     if content["failed"]:
         raise UserError(
-            "; ".join(f"row '{key}' failed: {reason}" for key, reason in content["failed"].items())
+            "; ".join(f"line '{key}' failed: {reason}" for key, reason in content["failed"].items())
             + f"; its log is in {config.folder / 'rows'}, and running the same command again retries it"
         )
 

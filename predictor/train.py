@@ -1,4 +1,4 @@
-"""Train a forecaster: `python -m predictor.train --data data/roundabout --out runs/roundabout`.
+"""Trains a forecaster: `python -m predictor.train --data data/roundabout --out runs/roundabout`.
 
 The best checkpoint is chosen by free-running minADE on held-out episodes, not by one-step error.
 """
@@ -24,7 +24,7 @@ from predictor.training.trainer import LOG_EVERY, Trainer, load_data
 
 
 def train(config: TrainConfig) -> Path:
-    """Train until done or stale; returns the folder of the best checkpoint."""
+    """Trains until all steps are done or validation stops improving; returns the folder of the best checkpoint."""
     state_file, config_file = config.out / "train_state.pt", config.out / "config.json"
     _check_run_folder(config, config_file)
     tune(config.device)
@@ -50,9 +50,9 @@ def train(config: TrainConfig) -> Path:
 
 
 def _run(trainer: Trainer, state_file: Path, made: dict[str, Any]) -> None:
-    """Step, look, validate and save, until the run is finished."""
+    """Trains, logs, validates and saves until the run is finished."""
     config, columns = trainer.config, (TextColumn("train"), BarColumn(20), MofNCompleteColumn(), TimeRemainingColumn())
-    note, said = "", 0
+    note, printed = "", 0
     with (
         SummaryWriter(str(config.out / "tb"), purge_step=trainer.step) as writer,
         Progress(*columns, TextColumn("{task.fields[note]}")) as progress,
@@ -61,9 +61,9 @@ def _run(trainer: Trainer, state_file: Path, made: dict[str, Any]) -> None:
         began, since = time.perf_counter(), trainer.step
         while not trainer.finished:
             terms = trainer.train_step()
-            for line in trainer.notes[said:]:
+            for line in trainer.notes[printed:]:
                 progress.console.print(line, highlight=False)
-            said = len(trainer.notes)
+            printed = len(trainer.notes)
             due = trainer.step % config.eval_every == 0 or trainer.step == config.steps
             if not due and trainer.step % trainer.read_every:
                 continue
@@ -132,7 +132,7 @@ def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
         before, now = json.loads(config_file.read_text())["config"], _comparable(config)
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{config_file} cannot be read ({error}); train anew into another --out") from error
-    defaults = {f.name: f.default for f in fields(TrainConfig)}  # of fields that a run begun earlier did not know
+    defaults = {f.name: f.default for f in fields(TrainConfig)}  # of fields that did not exist when the run began
     for name, value in now.items():
         known = before.get(name, defaults[name])
         if name != "steps" and known != value:

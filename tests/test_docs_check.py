@@ -1,4 +1,4 @@
-"""The check of the documentation's blocks fails where a block is wrong, and says where and why."""
+"""The check of the documentation's blocks fails where a block is wrong, with its place and the reason."""
 
 import importlib.util
 import subprocess
@@ -161,7 +161,7 @@ def test_every_page_of_this_repository_is_understood():
 
 
 def test_the_command_fails_with_the_block(tmp_path: Path):
-    """As `make docs-check` runs it: on a repository of its own, with status 1 and the place."""
+    """Runs it like `make docs-check`, on a repository of its own: status 1, and the place of the block."""
     (tmp_path / ".ci").mkdir()
     (tmp_path / ".ci" / "docs_check.py").write_text(FILE.read_text())
     (tmp_path / "README.md").write_text("```bash\ntest -f README.md && touch left\n```\n")

@@ -45,7 +45,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     ],
     "predictor.suite": [
         ("--table springs --data absent", "no store at absent/springs/train; make the stores of this table with"),
-        ("--table springs --data absent --only-row mlp", "no store at absent/springs/train"),
+        ("--table springs --data absent --only-line mlp", "no store at absent/springs/train"),
         ("--table spring", "invalid choice 'spring' for argument '--table'"),
         ("--table springs --workers -1", "workers must not be negative, got -1"),
         ("--table springs --precision tf32", "precision 'tf32' needs a CUDA device"),
@@ -144,7 +144,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
 
 RENAMED: dict[str, dict[str, str]] = {
     "predictor.evaluate": {"--samples": "--num-samples"},
-    "predictor.suite": {"--jobs": "--workers"},
+    "predictor.suite": {"--jobs": "--workers", "--rows": "--lines", "--only-row": "--only-line"},
     "predictor.interpret": {
         "--samples": "--num-samples",
         "--windows": "--max-windows",
@@ -190,9 +190,13 @@ REQUIRED: dict[str, list[str]] = {
     "benchmarks.graph_accuracy": ["--checkpoint", "highway", "--data", "store"],
     "benchmarks.gpu_springs": ["--device", "cpu"],
 }
-"""Words that a command does not do without."""
+"""Required options of a command."""
 
-VALUE_OF = {"--driver": "varied", "--out": "elsewhere", "--env-id": "merge-v1", "--checkpoint": "a", "--data": "b"}
+VALUE_OF = {
+    "--driver": "varied", "--out": "elsewhere", "--env-id": "merge-v1", "--checkpoint": "a", "--data": "b",
+    "--lines": "mlp", "--only-line": "mlp",
+}  # fmt: skip
+"""Value of an option that does not take the number 60."""
 
 
 def source_of(command: str) -> str:
@@ -200,7 +204,7 @@ def source_of(command: str) -> str:
 
 
 def config_of(command: str) -> type:
-    """The dataclass that a command's `main` reads."""
+    """Returns the dataclass that a command's `main` reads."""
     (name,) = re.findall(r"parse\((\w+), __doc__\)", source_of(command))
     found = getattr(importlib.import_module(command), name)
     assert is_dataclass(found)
@@ -208,7 +212,7 @@ def config_of(command: str) -> type:
 
 
 def all_configs() -> list[type]:
-    """The commands' dataclasses and those inside of them."""
+    """Returns the commands' dataclasses and those inside of them."""
     found = [config_of(command) for command in REFUSED]
     for config in found:
         found += [kind for kind in get_type_hints(config).values() if is_dataclass(kind)]

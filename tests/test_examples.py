@@ -40,7 +40,7 @@ COMMANDS = {
 
 @pytest.fixture(autouse=True)
 def examples_on_the_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """As with `export PYTHONPATH=docs/examples`; what the examples register is gone afterwards."""
+    """Puts the examples on the path like `export PYTHONPATH=docs/examples`; removes their registrations afterwards."""
     monkeypatch.syspath_prepend(EXAMPLES)
     monkeypatch.setattr(envs.readers, "_REGISTERED", {})
     yield
@@ -134,9 +134,9 @@ def test_walkers_enter_leave_and_make_way():
         present.append(set(world.numbers.tolist()))
         turns = max(turns, float(np.abs(world.walkers[:, 3]).max()))
     assert truncated and not terminated
-    everyone = set.union(*present)
-    assert everyone - present[0]
-    assert everyone - present[-1]
+    all_ids = set.union(*present)
+    assert all_ids - present[0]
+    assert all_ids - present[-1]
     assert turns > 0.3  # they wish to walk straight along x
 
 
@@ -159,9 +159,9 @@ def test_the_table_tells_what_the_world_knows():
     for _ in range(30):
         table.see(obs["observation"])
         scene, truth = table.read_all(env), env.reader.read_all(env)
-        row = np.linalg.norm(scene.states[:, None] - truth.states, axis=-1).argmin(axis=1)
-        np.testing.assert_allclose(scene.states, truth.states[row], atol=1e-5)
-        now = dict(zip(truth.ids[row].tolist(), scene.ids.tolist(), strict=True))
+        places = np.linalg.norm(scene.states[:, None] - truth.states, axis=-1).argmin(axis=1)
+        np.testing.assert_allclose(scene.states, truth.states[places], atol=1e-5)
+        now = dict(zip(truth.ids[places].tolist(), scene.ids.tolist(), strict=True))
         for agent, number in now.items():
             assert before.get(agent, number) == number
             assert number_of.setdefault(number, agent) == agent
@@ -173,7 +173,7 @@ def test_the_table_tells_what_the_world_knows():
 
 
 def test_collect_train_wrap(tmp_path: Path):
-    """The commands' own functions, on a few episodes and with a tiny network."""
+    """Runs the commands' own functions on a few episodes, with a tiny network."""
     config = CollectConfig(CROSSING, tmp_path / "data", episodes=3, driver=("random",), max_steps=12, workers=1)
     episodes = list(collect(config))
     spec = reader_for(make_crossing()).spec

@@ -19,7 +19,7 @@ EVERYTHING, TOOLS, EMPTY = "all", "dev", "training"
 
 @pytest.fixture
 def this_python(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """Fresh environments are this interpreter, into which nothing is installed; returns a folder to work in."""
+    """Replaces fresh environments by this interpreter, without installing; returns a folder to work in."""
 
     def create(folder: Path, with_pip: bool) -> None:
         assert with_pip
@@ -57,14 +57,14 @@ def test_python_code_runs_in_an_empty_folder(this_python: Path, monkeypatch: pyt
     assert (this_python / "work" / "made").exists()
 
 
-def test_an_extra_that_brings_too_much_fails(this_python: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_extra_that_installs_too_much_fails(this_python: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(install_check.EXTRAS, "core", install_check.Extra((), absent=("no_such_module", "json")))
-    with pytest.raises(RuntimeError, match="'core' brings json, which it must not"):
+    with pytest.raises(RuntimeError, match="'core' installs json, which it must not"):
         install_check.try_extra("core", Path("some.whl"), this_python)
 
 
 def test_the_wheel_is_built_from_a_clean_copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """What an earlier build left in build/ must not get into the wheel."""
+    """Files that an earlier build left in build/ must not get into the wheel."""
 
     def build(command: list[Any], folder: Path) -> None:
         source = Path(command[-1])

@@ -1,4 +1,4 @@
-"""How the tree hangs together: who imports whom, and what no file may hold."""
+"""Imports between modules, and what no file may hold."""
 
 import ast
 import graphlib
@@ -13,11 +13,11 @@ from importlinter.cli import lint_imports
 
 ROOT = Path(__file__).resolve().parents[1]
 LAYERS = ("predictor", "envs", "agents", "train_policy")
-"""From the bottom up; each may import those before it."""
+"""Layers from the bottom up; each may import those before it."""
 FOREIGN_TO_PREDICTOR = ("gymnasium", "pettingzoo", "stable_baselines3", "highway_env", "tqdm", "pygame")
 ROOMS = ("predictor", "envs", "agents", "tests", "benchmarks", "docs", ".ci")
 MAX_LINES = 400
-"""Of a module; longer ones are cut in two."""
+"""Largest number of lines of a module; longer ones are split."""
 TEXT_SUFFIXES = {".py", ".md", ".toml", ".json", ".txt", ".yml", ".yaml", ".cfg", ""}
 
 
@@ -29,14 +29,14 @@ def sources() -> list[Path]:
 
 
 def texts() -> list[Path]:
-    """Everything a clone holds that people read; runs, data and caches are not part of it."""
+    """Returns all texts of a clone; runs, data and caches are not part of it."""
     inside = [path for room in ROOMS for path in (ROOT / room).rglob("*") if "__pycache__" not in path.parts]
     top = [path for path in ROOT.iterdir() if not path.name.startswith(".")]
     return sorted(path for path in [*inside, *top] if path.is_file() and path.suffix in TEXT_SUFFIXES)
 
 
 def imported_modules(path: Path) -> Iterator[tuple[int, str]]:
-    """Every absolute import of a file, also inside functions and under TYPE_CHECKING."""
+    """Yields all absolute imports of a file, also inside functions and under TYPE_CHECKING."""
     for node in ast.walk(ast.parse(path.read_text(), str(path))):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
@@ -78,7 +78,7 @@ def module_name(path: Path, root: Path = ROOT) -> str:
 
 
 def imports_within(path: Path, known: Mapping[str, Path]) -> Iterator[str]:
-    """Modules among `known` that a file imports: at its top, in functions, under TYPE_CHECKING, or by import_module."""
+    """Yields the modules of `known` that a file imports, also in functions, under TYPE_CHECKING, by import_module."""
     for node in ast.walk(ast.parse(path.read_text(), str(path))):
         if isinstance(node, ast.Import):
             named = [alias.name for alias in node.names]
@@ -187,7 +187,7 @@ def test_torch_never_unpickles():
     assert unsafe == []
 
 
-def test_no_file_mentions_a_path_of_somebodys_machine():
+def test_no_file_mentions_a_path_of_one_machine():
     """Also not in the provenance of shipped checkpoints: their commands must run on any machine."""
     homes = tuple("/" + name + "/" for name in ("work", "home", "root", "Users", "tmp", "mnt"))
     files = texts()
@@ -198,4 +198,37 @@ def test_no_file_mentions_a_path_of_somebodys_machine():
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1)
         if any(home in line for home in homes)
     ]
+    assert found == []
+
+
+UNCLEAR_BEGINNINGS = ("Of ", "The same", "Likewise")
+"""A docstring begins with a verb or a noun that says what this is; these say it of something that stands elsewhere."""
+
+
+def docstrings(path: Path) -> Iterator[tuple[int, str]]:
+    """Line and text of every docstring of a file: of modules, classes, functions, and below fields and constants."""
+    for node in ast.walk(ast.parse(path.read_text(), str(path))):
+        if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        fields = zip(node.body, node.body[1:], strict=False)
+        below = [text for field, text in fields if isinstance(field, ast.Assign | ast.AnnAssign)]
+        for text in (*node.body[:1], *below):
+            if (
+                isinstance(text, ast.Expr)
+                and isinstance(text.value, ast.Constant)
+                and isinstance(text.value.value, str)
+            ):
+                yield text.lineno, text.value.value.strip()
+
+
+def test_docstrings_begin_with_what_they_describe():
+    """`--seed  Of the drawn windows` is a line of --help that says nothing; "Random seed for …" does."""
+    own = [path for path in sources() if relative(path).split("/")[0] != "tests"]
+    found = [
+        f"{relative(path)}:{line}: {text.splitlines()[0][:80]}"
+        for path in own
+        for line, text in docstrings(path)
+        if text.startswith(UNCLEAR_BEGINNINGS)
+    ]
+    assert sum(1 for path in own for _ in docstrings(path)) > 1000
     assert found == []

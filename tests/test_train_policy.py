@@ -39,11 +39,11 @@ ROLLOUT = 20
 PPO = (*TINY, "--steps", str(2 * ROLLOUT))
 DQN = (*TINY, "--algorithm", "dqn", "--steps", str(2 * ROLLOUT))  # learns from step 10 on
 TAG = (*TINY[2:], "--env-id", "simple_tag_v3", "--checkpoint", "constant-velocity", "--steps", str(6 * ROLLOUT))
-"""Two rollouts of three pursuers."""
+"""Arguments of a run with two rollouts of three pursuers."""
 
 
 def short_preset(env_id: str, algorithm: Algorithm, backend: Backend = "gymnasium") -> Preset:
-    """The preset with short rollouts and few gradient steps: what is tested is the command, not the learning."""
+    """Returns the preset with short rollouts and few gradient steps: the command is tested, not the learning."""
     preset = preset_for(env_id, algorithm, backend)
     if isinstance(preset, PPOPreset):
         return replace(preset, n_steps=ROLLOUT, batch_size=ROLLOUT, n_epochs=1)
@@ -71,7 +71,7 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 
 def trained(run: Path, *arguments: str, short: bool = True) -> tuple[Path, str]:
-    """A run and what it printed."""
+    """Returns a run and its output."""
     printed = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
         if short:
@@ -83,18 +83,18 @@ def trained(run: Path, *arguments: str, short: bool = True) -> tuple[Path, str]:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """On the highway."""
+    """Returns a finished run on the highway."""
     return trained(tmp_path_factory.mktemp("finished") / "run", *PPO)
 
 
 @pytest.fixture(scope="module")
 def chased(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """Of pursuers."""
+    """Returns a finished run of pursuers."""
     return trained(tmp_path_factory.mktemp("chased") / "run", *TAG[:-1], str(3 * ROLLOUT))
 
 
 def assert_video(path: Path, least_s: float) -> None:
-    """The file is a video that decodes."""
+    """Checks that the file is a video that decodes."""
     assert path.read_bytes()[4:8] == b"ftyp"
     frames, seconds = imageio_ffmpeg.count_frames_and_secs(path)
     assert frames > 10
@@ -117,7 +117,7 @@ def test_one_command_trains_evaluates_and_films(finished: tuple[Path, str]):
         "summary.json", "summary.md", "video.mp4",
     }  # fmt: skip
     summary = json.loads((run / "summary.json").read_text())
-    assert [row["policy"] for row in summary["policies"]] == ["ppo (constant-velocity)", "random", "idle"]
+    assert [line["policy"] for line in summary["policies"]] == ["ppo (constant-velocity)", "random", "idle"]
     assert {e["seed"] for found in summary["episodes"].values() for e in found} == {evaluate.EVALUATION_SEED}
     config = json.loads((run / "config.json").read_text())
     assert config["config"]["steps"] == 2 * ROLLOUT
@@ -147,7 +147,7 @@ def test_a_finished_policy_is_evaluated_again(finished: tuple[Path, str], monkey
 
 
 def with_note(run: Path, target: Path, change: Callable[[dict[str, Any]], None]) -> Path:
-    """A copy of a run whose policy has another note."""
+    """Copies a run and gives its policy another note."""
     shutil.copytree(run, target, ignore=shutil.ignore_patterns("evaluation"))
     with zipfile.ZipFile(run / "policy.zip") as whole, zipfile.ZipFile(target / "policy.zip", "w") as copy:
         for name in whole.namelist():
@@ -235,8 +235,8 @@ def test_pursuers_are_trained_measured_and_filmed_against_a_prey_that_is_driven(
     assert config["envs"] == 1
     assert load_model(run / "policy.zip", "ppo").num_timesteps == 3 * ROLLOUT
     summary = json.loads((run / "summary.json").read_text())
-    assert [row["policy"] for row in summary["policies"]] == ["ppo (forecast)", "random", "heuristic"]
-    assert all(row["crash_rate"] is None and row["length_mean"] == 25 for row in summary["policies"])
+    assert [line["policy"] for line in summary["policies"]] == ["ppo (forecast)", "random", "heuristic"]
+    assert all(line["crash_rate"] is None and line["length_mean"] == 25 for line in summary["policies"])
     assert (run / "summary.md").read_text().startswith("| policy | return | length |")
     assert "crash" not in printed
     assert_video(run / "video.mp4", least_s=1)
@@ -261,7 +261,7 @@ def test_agents_without_forecasts_are_trained_and_filmed(tmp_path: Path):
     assert_video(run / "video.mp4", least_s=1)
 
 
-def test_native_environments_train_what_is_measured_on_the_original(tmp_path: Path):
+def test_policies_trained_on_envpool_are_measured_on_the_original(tmp_path: Path):
     pytest.importorskip("envpool")
     arguments = ["--num-envs", "16", *TINY[4:], "--backend", "envpool", "--checkpoint", "constant-velocity"]
     run, _ = trained(tmp_path / "run", *arguments, "--steps", "512", "--no-video", short=False)
@@ -270,8 +270,8 @@ def test_native_environments_train_what_is_measured_on_the_original(tmp_path: Pa
     assert load_model(run / "policy.zip", "ppo").num_timesteps == 512
     summary = json.loads((run / "summary.json").read_text())
     assert summary["env_id"] == "highway-fast-v0"
-    assert [row["policy"] for row in summary["policies"]] == ["ppo (forecast)", "random", "idle"]
-    assert all(0 < row["return_mean"] <= 30 for row in summary["policies"])
+    assert [line["policy"] for line in summary["policies"]] == ["ppo (forecast)", "random", "idle"]
+    assert all(0 < line["return_mean"] <= 30 for line in summary["policies"])
     assert not (run / "video.mp4").exists()
 
 

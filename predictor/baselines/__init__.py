@@ -1,1 +1,1 @@
-"""Forecasters to compare with, behind the same interface as the dG-VAE."""
+"""Baseline forecasters, with the interface of the dG-VAE."""

@@ -1,7 +1,7 @@
-"""What the learned baselines share: streaming, teacher forcing and free roll-out, all from the same few pieces.
+"""Base of the learned baselines: streaming, teacher forcing and roll-out, made of a few functions.
 
-A model says what it carries from step to step (`node_sizes`, `pair_sizes`), how its graph comes from the past
-(`encode`, `expected`), how an agent's memory moves on (`recur`) and which change of state follows (`change`). A window
+A model defines the sizes of its memory (`node_sizes`, `pair_sizes`), how edge weights follow from the past (`encode`,
+`expected`), how an agent's memory is updated (`recur`) and which change of state follows (`change`). A window
 runs `encode` and `change` on all steps at once and `recur` step by step; streaming runs all three on one step.
 """
 
@@ -21,37 +21,37 @@ from predictor.scene import SceneSpec
 from predictor.support.config_checks import check_at_least, check_choices
 
 Tensors = tuple[Tensor, ...]
-GraphRule = Callable[[Tensor], Tensor]
-"""From scores to the graph that messages follow: an expectation or a draw."""
+WeightRule = Callable[[Tensor], Tensor]
+"""Function from scores to the edge weights of messages: probabilities or a draw."""
 
 
 class Encoded(NamedTuple):
-    """What the past says about pairs, for a stretch of time."""
+    """Encoder outputs for several steps, from the past alone."""
 
     memory: Tensors
     """Pair memory after each step, [batch time agents agents _]."""
     scores: Float[Tensor, "batch time agents agents scores"]
-    """What the graph is made from; no columns without a graph."""
+    """Scores from which edge weights are computed; no columns without edges."""
 
 
 class Internal(NamedTuple):
-    """What a belief keeps to roll out from."""
+    """Data of a belief from which it is rolled out."""
 
     pairs: Tensors
     scores: Tensor
     before: Tensors  # node memory without the latest observation
-    nodes: Tensors  # … and with it, under the expected graph
+    nodes: Tensors  # … and with it, along expected edge weights
     next_states: Tensor
 
 
 class UnrolledForecaster(nn.Module, ABC):
-    """A `TrainableForecaster` made of steps; without the optional pieces it has neither memory nor graph.
+    """Base class of a `TrainableForecaster` made of steps; without the optional functions it has no memory, no edges.
 
     Args:
         spec: layout of the scenes.
-        residual: what the predicted change of position is added to.
+        residual: position to which the predicted change is added; see `predictor.layers.state_codec`.
         delta_scales: typical one-step change of each feature [SI]; empty takes the spec's feature scales.
-        horizon_steps: steps it is trained to forecast.
+        horizon_steps: number of steps that it is trained to forecast.
     """
 
     node_sizes: tuple[int, ...] = ()
@@ -59,20 +59,20 @@ class UnrolledForecaster(nn.Module, ABC):
     pair_sizes: tuple[int, ...] = ()
     """Width of each kind of pair memory."""
     num_edge_types: int = 2
-    """Edge types, "no edge" included."""
+    """Number of edge types, "no edge" included."""
     edge_feature_dim: int = 1
-    """Size of an edge's features, which are all zero here; observations have a place for them."""
+    """Number of features of an edge; all are zero here, but observations have a place for them."""
 
     def __init__(
         self, spec: SceneSpec, residual: Residual, delta_scales: tuple[float, ...], horizon_steps: int
     ) -> None:
-        """Keep the layout; weights are the subclass's."""
+        """Stores the layout; weights are the subclass's."""
         super().__init__()
         self.spec = spec
         self.horizon_steps = horizon_steps
         self.codec = StateCodec(spec, delta_scales, residual)
 
-    # --- Pieces -------------------------------------------------------------------------------------------------
+    # --- Functions of a model -----------------------------------------------------------------------------------
 
     def encode(
         self,
@@ -80,18 +80,18 @@ class UnrolledForecaster(nn.Module, ABC):
         valid: Bool[Tensor, "batch time agents"],
         pairs: Tensors,
     ) -> Encoded:
-        """Pair memory and graph scores for all steps, given the pair memory before them."""
+        """Computes pair memory and scores for all steps, given the pair memory before them."""
         return Encoded((), inputs.new_zeros(*valid.shape, valid.shape[-1], 0))
 
-    def expected(self, scores: Float[Tensor, "*batch scores"]) -> Float[Tensor, "*batch graph"]:
-        """The graph that is followed when nothing is drawn."""
+    def expected(self, scores: Float[Tensor, "*batch scores"]) -> Float[Tensor, "*batch weights"]:
+        """Computes the edge weights that are used when nothing is drawn."""
         return scores
 
     def edge_probs(
-        self, graph: Float[Tensor, "batch agents agents graph"], valid: Bool[Tensor, "batch agents"]
+        self, weights: Float[Tensor, "batch agents agents weights"], valid: Bool[Tensor, "batch agents"]
     ) -> Float[Tensor, "batch agents agents types"]:
-        """The graph as a distribution over edge types; "no edge" everywhere without a graph."""
-        probs = graph.new_zeros(*graph.shape[:-1], self.num_edge_types)
+        """Returns edge weights as probabilities of edge types; certainty of "no edge" for models without edges."""
+        probs = weights.new_zeros(*weights.shape[:-1], self.num_edge_types)
         probs[..., 0] = 1.0
         return probs
 
@@ -102,7 +102,7 @@ class UnrolledForecaster(nn.Module, ABC):
         pairs: Tensors,
         scores: Float[Tensor, "batch agents agents scores"],
     ) -> tuple[Tensors, Float[Tensor, "batch agents agents scores"]]:
-        """Pair memory and scores at a predicted step: predictions pass through the encoder like observations."""
+        """Computes pair memory and scores at a predicted step: predictions are encoded like observations."""
         encoded = self.encode(inputs[:, None], valid[:, None], pairs)
         return tuple(m[:, 0] for m in encoded.memory), encoded.scores[:, 0]
 
@@ -110,10 +110,10 @@ class UnrolledForecaster(nn.Module, ABC):
         self,
         inputs: Float[Tensor, "batch agents inputs"],
         valid: Bool[Tensor, "batch agents"],
-        graph: Float[Tensor, "batch agents agents graph"],
+        weights: Float[Tensor, "batch agents agents weights"],
         nodes: Tensors,
     ) -> Tensors:
-        """Node memory one step on; absent agents keep none."""
+        """Computes node memory one step later; that of absent agents is zero."""
         return ()
 
     @abstractmethod
@@ -123,12 +123,12 @@ class UnrolledForecaster(nn.Module, ABC):
         valid: Bool[Tensor, "*batch agents"],
         nodes: Tensors,
     ) -> Float[Tensor, "*batch agents state"]:
-        """Change of state, in units of `delta_scales`, given the node memory after the step."""
+        """Computes the change of state, in units of `delta_scales`, from the node memory after the step."""
 
     # --- Forecaster ---------------------------------------------------------------------------------------------
 
     def empty_memory(self, batch: int, agents: int) -> Memory:
-        """Zeros on the model's device."""
+        """Returns zeros on the model's device."""
         zeros = self.codec.scales.new_zeros
         return Memory(
             tuple(zeros(batch, agents, size) for size in self.node_sizes),
@@ -138,21 +138,21 @@ class UnrolledForecaster(nn.Module, ABC):
     def observe(
         self, memory: Memory, states: Float[Tensor, "batch agents state"], valid: Bool[Tensor, "batch agents"]
     ) -> tuple[Memory, Belief]:
-        """One step of everything, under the expected graph."""
+        """Computes one step of encoder and decoder, along expected edge weights."""
         inputs = self.codec.inputs(states, valid)
         encoded = self.encode(inputs[:, None], valid[:, None], memory.pairs)
         pairs, scores = tuple(m[:, 0] for m in encoded.memory), encoded.scores[:, 0]
-        graph = self.expected(scores)
-        nodes = self.recur(inputs, valid, graph, memory.nodes)
+        weights = self.expected(scores)
+        nodes = self.recur(inputs, valid, weights, memory.nodes)
         next_states = self.codec.advance(states, self.change(inputs, valid, nodes))
-        features = states.new_zeros(*graph.shape[:-1], self.edge_feature_dim)
+        features = states.new_zeros(*weights.shape[:-1], self.edge_feature_dim)
         internal = Internal(pairs, scores, memory.nodes, nodes, next_states)
-        return Memory(nodes, pairs), Belief(states, valid, self.edge_probs(graph, valid), features, internal)
+        return Memory(nodes, pairs), Belief(states, valid, self.edge_probs(weights, valid), features, internal)
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
-        """Feed predictions back; all samples are the same."""
+        """Rolls out from the belief; all samples are equal."""
         now: Internal = belief.internal
         future = self.continue_from(
             now.next_states, belief.valid, now.pairs, now.scores, now.nodes, horizon_steps, self.expected
@@ -169,7 +169,7 @@ class UnrolledForecaster(nn.Module, ABC):
         rollout_steps: int,
         generator: torch.Generator | None = None,
     ) -> WindowOutput:
-        """Teacher-forced pass and free roll-out of the same memory; see `TrainableForecaster.window`."""
+        """Runs the teacher-forced pass and the roll-out from its memory; see `TrainableForecaster.window`."""
         inputs = self.codec.inputs(states, valid)
         empty = self.empty_memory(states.shape[0], states.shape[2])
         encoded = self.encode(inputs, valid, empty.pairs)
@@ -194,13 +194,13 @@ class UnrolledForecaster(nn.Module, ABC):
         self,
         inputs: Float[Tensor, "batch time agents inputs"],
         valid: Bool[Tensor, "batch time agents"],
-        graph: Float[Tensor, "batch time agents agents graph"],
+        weights: Float[Tensor, "batch time agents agents weights"],
         nodes: Tensors,
     ) -> Tensors:
-        """Node memory before the first step and after each one, [batch time+1 agents _]."""
+        """Computes node memory before the first step and after each one, [batch time+1 agents _]."""
         kept = [nodes]
         # unbind, not [:, t]: the gradient of an index is a full-size tensor of zeros for every step
-        for now, present, edges in zip(inputs.unbind(1), valid.unbind(1), graph.unbind(1), strict=True):
+        for now, present, edges in zip(inputs.unbind(1), valid.unbind(1), weights.unbind(1), strict=True):
             nodes = self.recur(now, present, edges, nodes)
             kept.append(nodes)
         return tuple(torch.stack(memory, dim=1) for memory in zip(*kept, strict=True))
@@ -213,26 +213,30 @@ class UnrolledForecaster(nn.Module, ABC):
         scores: Float[Tensor, "batch agents agents scores"],
         nodes: Tensors,
         horizon_steps: int,
-        graph: GraphRule,
+        rule: WeightRule,
     ) -> Float[Tensor, "batch agents horizon state"]:
-        """Roll out from the states predicted for the first step; whoever is present stays."""
+        """Rolls out from the states predicted for the first step; all present agents stay."""
         future = [states]
         for _ in range(horizon_steps - 1):
             inputs = self.codec.inputs(states, valid)
             pairs, scores = self.evolve(inputs, valid, pairs, scores)
-            nodes = self.recur(inputs, valid, graph(scores), nodes)
+            nodes = self.recur(inputs, valid, rule(scores), nodes)
             states = self.codec.advance(states, self.change(inputs, valid, nodes))
             future.append(states)
         return torch.stack(future, dim=2)[:, :, :horizon_steps]
 
 
 def mean_weight(valid: Bool[Tensor, "*batch agents"], dtype: torch.dtype) -> Float[Tensor, "*batch agents agents"]:
-    """1 / (number of others present) for each pair of present agents: Σ_j w_ij x_ij is a mean, 0 for who is alone."""
+    """Returns 1 / (number of other present agents) per present pair: Σ_j w_ij x_ij is a mean, 0 if there are none."""
     pairs = pair_mask(valid).to(dtype)
     return pairs / pairs.sum(-1, keepdim=True).clamp(min=1)
 
 
 def check_sizes(config: object, *names: str) -> None:
-    """Raise a `UserError` unless closed choices are among their values, and these fields at least 1."""
+    """Checks that fields with closed choices have one of them and that the named fields are at least 1.
+
+    Raises:
+        UserError: a field is out of range.
+    """
     check_choices(config)
     check_at_least(config, 1, *names)

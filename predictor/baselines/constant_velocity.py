@@ -1,7 +1,7 @@
-"""Constant velocity, without and with Gaussian noise: the baselines that every learned forecaster stands beside.
+"""Constant velocity, without and with Gaussian noise: the baselines of every learned forecaster.
 
-`ConstantVelocity` is the control of a single forecast, `NoisyConstantVelocity` that of best-of-K errors and coverage: a
-stochastic model has to beat both.
+`ConstantVelocity` is the baseline of a single forecast, `NoisyConstantVelocity` that of best-of-K errors and coverage;
+a stochastic model should be better than both.
 """
 
 from collections.abc import Sequence
@@ -18,31 +18,31 @@ from predictor.support.errors import UserError
 
 
 class ConstantVelocity:
-    """A `Forecaster` without memory, without edges, without parameters."""
+    """Forecaster without memory, edges and parameters."""
 
     def __init__(
         self, spec: SceneSpec, horizon_steps: int = 5, num_edge_types: int = 2, edge_feature_dim: int = 1
     ) -> None:
-        """Edge sizes only shape the (empty) edge outputs, so that observations can match a learned forecaster's."""
+        """Stores the sizes; edge sizes only shape the (empty) edge outputs, to match a learned forecaster's."""
         self.spec = spec
         self.horizon_steps = horizon_steps
         self.num_edge_types = num_edge_types
         self.edge_feature_dim = edge_feature_dim
 
     def empty_memory(self, batch: int, agents: int) -> Memory:
-        """Nothing is remembered."""
+        """Returns a memory without content."""
         return Memory()
 
     def observe(
         self, memory: Memory, states: Float[Tensor, "batch agents state"], valid: Bool[Tensor, "batch agents"]
     ) -> tuple[Memory, Belief]:
-        """Keep the states; every pair has "no edge"."""
+        """Returns the states as belief; every pair has "no edge"."""
         return memory, edgeless_belief(states, valid, self.num_edge_types, self.edge_feature_dim)
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
-        """X + v·t; all samples are the same."""
+        """Computes x + v·t; all samples are equal."""
         states = belief.states
         time_s = self.spec.dt_s * torch.arange(1, horizon_steps + 1, dtype=states.dtype, device=states.device)
         future = states[:, :, None].repeat(1, 1, horizon_steps, 1)
@@ -52,20 +52,20 @@ class ConstantVelocity:
 
 
 class NoisyConstantVelocity(ConstantVelocity):
-    """A `Forecaster` whose samples scatter around constant velocity, by two parameters that `fit` takes from data.
+    """Forecaster whose samples scatter around constant velocity, by two parameters that `fit` estimates from data.
 
-    Sample 0 is constant velocity. Every other one draws one offset per agent and axis, n ~ N(0, 1), and holds it: the
-    position t seconds ahead is x + v·t + n·`noise_m`·t^`growth`. With `growth` 1 the velocity is noisy.
+    Sample 0 is constant velocity. Each other sample draws one number per agent and axis, n ~ N(0, 1): its position
+    t seconds ahead is x + v·t + n·`noise_m`·t^`growth`. With `growth` 1 the velocity is noisy.
     """
 
     def __init__(self, spec: SceneSpec, noise_m: float, growth: float, horizon_steps: int = 5) -> None:
-        """Store the two parameters.
+        """Stores the two parameters.
 
         Args:
             spec: layout of the scenes.
             noise_m: standard deviation per axis one second ahead [m].
             growth: exponent of the standard deviation in time.
-            horizon_steps: steps to forecast by default.
+            horizon_steps: default number of steps to forecast.
         """
         super().__init__(spec, horizon_steps)
         self.noise_m = noise_m
@@ -77,7 +77,7 @@ class NoisyConstantVelocity(ConstantVelocity):
 
         Args:
             spec: layout of the scenes.
-            std_m: standard deviation per axis of the errors at each step of the horizon [m], of training data.
+            std_m: standard deviation per axis of the errors on training data, at each step of the horizon [m].
         """
         time_s = spec.dt_s * np.arange(1, len(std_m) + 1)
         found = np.asarray(std_m, dtype=np.float64)
@@ -100,7 +100,7 @@ class NoisyConstantVelocity(ConstantVelocity):
         With one generator per scene of the batch, a scene's samples depend on no other scene.
 
         Raises:
-            UserError: a sequence of generators that has not one for each scene.
+            UserError: the number of generators is not the number of scenes.
         """
         future = super().rollout(belief, horizon_steps, num_samples).clone()
         axes = self.spec.position_dim
@@ -119,7 +119,7 @@ def _normal(
     axes: int,
     generator: torch.Generator | Sequence[np.random.Generator] | None,
 ) -> Float[Tensor, "batch samples agents axes"]:
-    """Draws standard normal numbers; a scene with a generator of its own draws for its present agents only."""
+    """Draws standard normal numbers; with one generator per scene, only for present agents."""
     shape = (len(valid), samples, valid.shape[1], axes)
     if generator is None or isinstance(generator, torch.Generator):
         return torch.randn(shape, device=valid.device, generator=generator)

@@ -1,13 +1,14 @@
 """dNRI (Graber & Schwing, "Dynamic Neural Relational Inference", CVPR 2020) for scenes whose agents come and go.
 
-Encoder per frame: agent → pair → agent → pair; then a forward LSTM per pair for the learned prior and a reverse one
-that the posterior sees besides (training only). Decoder: messages from its own hidden states along sampled edges, type
-0 silent; gated update; change of state. The loss is `predictor.training.objective`.
+Encoder per frame: agent → pair → agent → pair; then a forward LSTM per pair for the learned prior, and a reverse one
+for the posterior (training only). Decoder: messages from its own hidden states along sampled edges, none along type 0;
+gated update; change of state. The loss is `predictor.training.objective`.
 
-Unlike the public code for a varying number of agents: the forward memory of a pair is carried on and the reverse LSTM
-does run, in training as in prediction; nobody's future presence is known when forecasting; a frame without agents is a
-frame. Batch normalisation is left out (see `predictor.baselines.nri_blocks`). While true states are fed, the graph is
-the prior's expectation rather than a draw, as in `predictor.dgvae`, and samples branch off at the first forecast step.
+Unlike the public code for a varying number of agents: the forward memory of a pair is kept from step to step, in
+training as in prediction, and the reverse LSTM is run; future presence is not used when forecasting; a frame without
+agents counts as a frame. Batch normalisation is left out (see `predictor.baselines.nri_blocks`). During the observed
+history the edge weights are the prior's probabilities and not a draw, as in `predictor.dgvae`; samples are drawn from
+the first forecast step on.
 """
 
 from dataclasses import dataclass
@@ -17,7 +18,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from predictor.baselines.base import Encoded, GraphRule, Internal, Tensors, UnrolledForecaster, check_sizes, mean_weight
+from predictor.baselines.base import (
+    Encoded,
+    Internal,
+    Tensors,
+    UnrolledForecaster,
+    WeightRule,
+    check_sizes,
+    mean_weight,
+)
 from predictor.baselines.nri_blocks import FrameEncoder, HiddenDecoder, PairLSTM, elu_head
 from predictor.dgvae.networks import concrete_sample, no_edge_where_absent
 from predictor.forecaster import Belief, WindowOutput
@@ -30,7 +39,7 @@ from predictor.support.errors import UserError
 
 @dataclass(frozen=True)
 class DNRIConfig:
-    """Sizes; the defaults are those of the public run scripts."""
+    """Sizes of the network; the defaults are those of the public run scripts."""
 
     hidden_dim: int = 256
     """Width of the encoder's frame embedding."""
@@ -43,18 +52,18 @@ class DNRIConfig:
     message_dim: int = 256
     """Width of the decoder's messages."""
     num_edge_types: int = 2
-    """Edge types; the first one is "no edge" and sends no message."""
+    """Number of edge types; the first one is "no edge" and sends no message."""
     temperature: float = 0.5
-    """Of the concrete distribution."""
+    """Temperature of the concrete distribution."""
     hard_samples: bool = False
-    """Draw one type per pair instead of a mixture, with the gradient of the mixture (straight-through)."""
+    """Whether one type per pair is drawn instead of a mixture, with the gradient of the mixture (straight-through)."""
     residual: Residual = "state"
-    """What the predicted change of position is added to; see `predictor.layers.state_codec`."""
+    """Position to which the predicted change is added; see `predictor.layers.state_codec`."""
     delta_scales: tuple[float, ...] = ()
     """Typical one-step change of each feature [SI]; empty takes the spec's feature scales."""
 
     def __post_init__(self) -> None:
-        """Check ranges."""
+        """Checks ranges."""
         check_sizes(self, "hidden_dim", "rnn_dim", "head_dim", "decoder_dim", "message_dim")
         if self.num_edge_types < 2:
             raise UserError(f"num_edge_types must be at least 2 (the first is 'no edge'), got {self.num_edge_types}")
@@ -63,7 +72,7 @@ class DNRIConfig:
 
 
 class Edges(NamedTuple):
-    """Encoder outputs for a stretch of time; time axis second."""
+    """Encoder outputs for several steps."""
 
     hidden: Float[Tensor, "batch time agents agents rnn"]
     cell: Float[Tensor, "batch time agents agents rnn"]
@@ -72,10 +81,10 @@ class Edges(NamedTuple):
 
 
 class DNRIEncoder(nn.Module):
-    """Edge-type logits from states."""
+    """Computes logits of edge types from states."""
 
     def __init__(self, config: DNRIConfig, inputs: int) -> None:
-        """Layers in the order in which data passes."""
+        """Creates the layers, in the order in which data passes them."""
         super().__init__()
         self.frames = FrameEncoder(inputs, config.hidden_dim)
         self.forward_rnn = PairLSTM(config.hidden_dim, config.rnn_dim)
@@ -90,7 +99,7 @@ class DNRIEncoder(nn.Module):
         hidden: Float[Tensor, "batch agents agents rnn"],
         cell: Float[Tensor, "batch agents agents rnn"],
     ) -> Edges:
-        """Run the forward LSTM from a given memory."""
+        """Runs the forward LSTM from a given memory."""
         embedding = self.frames(inputs, valid)
         hiddens, cells = self.forward_rnn(embedding, valid, hidden, cell)
         logits = no_edge_where_absent(self.prior_head(hiddens), pair_mask(valid)[..., None])
@@ -99,7 +108,7 @@ class DNRIEncoder(nn.Module):
     def posterior_logits(
         self, edges: Edges, valid: Bool[Tensor, "batch time agents"]
     ) -> Float[Tensor, "batch time agents agents types"]:
-        """Logits that have seen the future; training only."""
+        """Computes the posterior logits, from past and future; training only."""
         zeros = torch.zeros_like(edges.hidden[:, 0])
         reverse, _ = self.reverse_rnn(edges.embedding, valid, zeros, zeros, reverse=True)
         logits = self.posterior_head(torch.cat([edges.hidden, reverse], dim=-1))
@@ -107,16 +116,16 @@ class DNRIEncoder(nn.Module):
 
 
 class DNRI(UnrolledForecaster):
-    """The model, as a `TrainableForecaster`.
+    """The dNRI model, as a `TrainableForecaster`.
 
     Args:
         spec: layout of the scenes.
-        config: sizes.
-        horizon_steps: steps it is trained to forecast.
+        config: sizes of the network.
+        horizon_steps: number of steps that it is trained to forecast.
     """
 
     def __init__(self, spec: SceneSpec, config: DNRIConfig | None = None, horizon_steps: int = 5) -> None:
-        """Build the network; weights come from torch's generator, so seed it first."""
+        """Builds the network; weights are drawn from torch's generator, so seed it first."""
         config = config or DNRIConfig()
         super().__init__(spec, config.residual, config.delta_scales, horizon_steps)
         self.config = config
@@ -125,10 +134,10 @@ class DNRI(UnrolledForecaster):
         self.pair_sizes = (config.rnn_dim, config.rnn_dim)
         inputs = self.codec.num_inputs
         self.encoder = DNRIEncoder(config, inputs)
-        speaking = config.num_edge_types - 1
-        self.decoder = HiddenDecoder(inputs, config.decoder_dim, config.message_dim, speaking, spec.num_features)
+        sending = config.num_edge_types - 1
+        self.decoder = HiddenDecoder(inputs, config.decoder_dim, config.message_dim, sending, spec.num_features)
 
-    # --- Pieces -------------------------------------------------------------------------------------------------
+    # --- Functions of a model -----------------------------------------------------------------------------------
 
     def encode(
         self,
@@ -136,16 +145,16 @@ class DNRI(UnrolledForecaster):
         valid: Bool[Tensor, "batch time agents"],
         pairs: Tensors,
     ) -> Encoded:
-        """Prior logits and the forward LSTM's memory."""
+        """Computes prior logits and the forward LSTM's memory."""
         edges = self.encoder(inputs, valid, *pairs)
         return Encoded((edges.hidden, edges.cell), edges.prior_logits)
 
     def expected(self, scores: Float[Tensor, "*batch types"]) -> Float[Tensor, "*batch types"]:
-        """The prior's probabilities."""
+        """Computes the prior's probabilities."""
         return torch.softmax(scores, dim=-1)
 
-    def drawn(self, generator: torch.Generator | PairNoise | None) -> GraphRule:
-        """A rule that draws graphs."""
+    def drawn(self, generator: torch.Generator | PairNoise | None) -> WeightRule:
+        """Returns a rule that draws edge weights."""
 
         def draw(logits: Tensor) -> Tensor:
             return concrete_sample(logits, self.config.temperature, generator, self.config.hard_samples)
@@ -153,26 +162,26 @@ class DNRI(UnrolledForecaster):
         return draw
 
     def edge_probs(
-        self, graph: Float[Tensor, "batch agents agents types"], valid: Bool[Tensor, "batch agents"]
+        self, weights: Float[Tensor, "batch agents agents types"], valid: Bool[Tensor, "batch agents"]
     ) -> Float[Tensor, "batch agents agents types"]:
-        """The expected graph is the distribution."""
-        return graph
+        """Returns the weights, which are probabilities of edge types."""
+        return weights
 
     def recur(
         self,
         inputs: Float[Tensor, "batch agents inputs"],
         valid: Bool[Tensor, "batch agents"],
-        graph: Float[Tensor, "batch agents agents types"],
+        weights: Float[Tensor, "batch agents agents types"],
         nodes: Tensors,
     ) -> Tensors:
-        """Messages are averaged over the other agents and over the types that speak."""
-        weights = graph[..., 1:] * mean_weight(valid, inputs.dtype)[..., None] / (self.num_edge_types - 1)
-        return (self.decoder.step(inputs, valid, weights, nodes[0]),)
+        """Updates agents by messages averaged over the other agents and over the types that send messages."""
+        shares = weights[..., 1:] * mean_weight(valid, inputs.dtype)[..., None] / (self.num_edge_types - 1)
+        return (self.decoder.step(inputs, valid, shares, nodes[0]),)
 
     def change(
         self, inputs: Float[Tensor, "*batch agents inputs"], valid: Bool[Tensor, "*batch agents"], nodes: Tensors
     ) -> Float[Tensor, "*batch agents state"]:
-        """Read off the decoder's memory."""
+        """Computes the change of state from the decoder's memory."""
         change: Tensor = self.decoder.readout(nodes[0])
         return change
 
@@ -181,7 +190,7 @@ class DNRI(UnrolledForecaster):
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
-        """Feed predictions back through the encoder; sample 0 takes expected graphs, the others draw theirs."""
+        """Rolls out, encoding the predictions; sample 0 uses edge probabilities, the others draw edge types."""
         expected = super().rollout(belief, horizon_steps)
         if num_samples == 1:
             return expected
@@ -207,7 +216,7 @@ class DNRI(UnrolledForecaster):
         rollout_steps: int,
         generator: torch.Generator | None = None,
     ) -> WindowOutput:
-        """Teacher-forced pass along posterior draws, and a free roll-out along prior draws, from the same encoding."""
+        """Runs a teacher-forced pass along posterior draws and a roll-out along prior draws, from the same encoding."""
         inputs = self.codec.inputs(states, valid)
         empty = self.empty_memory(states.shape[0], states.shape[2])
         edges = self.encoder(inputs, valid, *empty.pairs)
@@ -217,7 +226,7 @@ class DNRI(UnrolledForecaster):
         one_step = self.codec.advance(states, self.change(inputs, valid, (nodes[:, 1:],)))
         rollout = one_step.new_zeros(*states[:, 0].shape[:2], 0, states.shape[-1])
         if rollout_steps:
-            # the longest history; asking a GPU for it would make it wait
+            # the longest history; reading it from a GPU would wait for the device
             past = slice(states.shape[1] if last_observed.is_cuda else int(last_observed.max()))
             expected = self.expected(edges.prior_logits[:, past])
             (before,) = self.remember(inputs[:, past], valid[:, past], expected, empty.nodes)
@@ -236,9 +245,9 @@ class DNRI(UnrolledForecaster):
         scores: Tensor,
         before: Tensors,
         horizon_steps: int,
-        rule: GraphRule,
+        rule: WeightRule,
     ) -> Float[Tensor, "batch agents horizon state"]:
-        """Roll out from an observation that the decoder has yet to take in, along graphs of its own."""
+        """Rolls out from an observation before its decoder step, with edge weights of a given rule."""
         inputs = self.codec.inputs(states, valid)
         nodes = self.recur(inputs, valid, rule(scores), before)
         states = self.codec.advance(states, self.change(inputs, valid, nodes))

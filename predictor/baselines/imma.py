@@ -1,14 +1,14 @@
 """IMMA (Sun et al., "Interaction Modeling with Multiplex Attention", NeurIPS 2022) in streaming form.
 
-A multiplex graph: several layers of soft edges, each layer with an encoder of its own and attention that sums to one
-over an agent's senders. The decoder sends one kind of message per layer, weighted by attention, and is otherwise NRI's.
+A multiplex graph: several layers of soft edges, each with its own encoder and attention that sums to one over an
+agent's senders. The decoder sends one kind of message per layer, weighted by attention, and is otherwise NRI's.
 Forecasts are deterministic.
 
 The public code flattens 24 observed steps of a fixed number of agents into the encoder's input, decodes from an empty
-memory and feeds the decoder its own output layer. Here the encoder embeds each frame and remembers pairs in an LSTM, so
-that histories of any length and agents that come and go have a meaning; the decoder takes in states, observed ones and
-then its own predictions. As there, the graph stands still while forecasting (`dynamic_graph=True` infers it anew).
-Messages are not divided by the width of the hidden state, as they are there and in NRI where an average is meant.
+memory, and the decoder's input is its own output layer. Here the encoder embeds each frame and an LSTM per pair keeps
+its history, so that histories may have any length and agents may come and go; the decoder's inputs are states, observed
+ones and then predicted ones. As there, edge weights are constant while forecasting (`dynamic_graph=True` infers them
+anew). Messages are not divided by the width of the hidden state, as there and in NRI, where an average is meant.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ from predictor.support.errors import UserError
 
 @dataclass(frozen=True)
 class IMMAConfig:
-    """Sizes; the widths are those of the public basketball run."""
+    """Sizes of the network; the widths are those of the public basketball run."""
 
     hidden_dim: int = 256
     """Width of each layer's frame embedding."""
@@ -38,24 +38,24 @@ class IMMAConfig:
     message_dim: int = 256
     """Width of the decoder's messages."""
     num_layers: int = 2
-    """Layers of the multiplex graph (public code: 2 by default, 5 for basketball)."""
+    """Number of layers of the multiplex graph (public code: 2 by default, 5 for basketball)."""
     dynamic_graph: bool = False
-    """Infer attention anew from predicted states, rather than keep the last observed graph (public code)."""
+    """Whether attention is inferred anew from predicted states, or kept from the last observed step (public code)."""
     residual: Residual = "state"
-    """What the predicted change of position is added to; see `predictor.layers.state_codec`."""
+    """Position to which the predicted change is added; see `predictor.layers.state_codec`."""
     delta_scales: tuple[float, ...] = ()
     """Typical one-step change of each feature [SI]; empty takes the spec's feature scales."""
 
     def __post_init__(self) -> None:
-        """Check ranges."""
+        """Checks ranges."""
         check_sizes(self, "hidden_dim", "rnn_dim", "decoder_dim", "message_dim", "num_layers")
 
 
 class AttentionLayer(nn.Module):
-    """One layer of the multiplex graph: from states to attention over senders."""
+    """Computes one layer of the multiplex graph: from states to attention over senders."""
 
     def __init__(self, config: IMMAConfig, inputs: int) -> None:
-        """Layers in the order in which data passes."""
+        """Creates the layers, in the order in which data passes them."""
         super().__init__()
         self.frames = FrameEncoder(inputs, config.hidden_dim)
         self.rnn = PairLSTM(config.hidden_dim, config.rnn_dim)
@@ -68,22 +68,22 @@ class AttentionLayer(nn.Module):
         hidden: Float[Tensor, "batch agents agents rnn"],
         cell: Float[Tensor, "batch agents agents rnn"],
     ) -> tuple[Tensors, Float[Tensor, "batch time agents agents"]]:
-        """Memory after each step and attention, receiver first."""
+        """Computes memory after each step and attention, receiver first."""
         hiddens, cells = self.rnn(self.frames(inputs, valid), valid, hidden, cell)
         return (hiddens, cells), masked_attention(self.score(hiddens)[..., 0], pair_mask(valid))
 
 
 class IMMA(UnrolledForecaster):
-    """The model, as a `TrainableForecaster`.
+    """The IMMA model, as a `TrainableForecaster`.
 
     Args:
         spec: layout of the scenes.
-        config: sizes.
-        horizon_steps: steps it is trained to forecast.
+        config: sizes of the network.
+        horizon_steps: number of steps that it is trained to forecast.
     """
 
     def __init__(self, spec: SceneSpec, config: IMMAConfig | None = None, horizon_steps: int = 5) -> None:
-        """Build the network; weights come from torch's generator, so seed it first."""
+        """Builds the network; weights are drawn from torch's generator, so seed it first."""
         config = config or IMMAConfig()
         super().__init__(spec, config.residual, config.delta_scales, horizon_steps)
         self.config = config
@@ -93,26 +93,29 @@ class IMMA(UnrolledForecaster):
         inputs, kinds = self.codec.num_inputs, config.num_layers
         self.layers = nn.ModuleList(AttentionLayer(config, inputs) for _ in range(kinds))
         self.decoder = HiddenDecoder(inputs, config.decoder_dim, config.message_dim, kinds, spec.num_features)
-        self.volume: Tensor
-        self.register_buffer("volume", torch.ones(kinds), persistent=False)
+        self._layer_weights: Tensor
+        self.register_buffer("_layer_weights", torch.ones(kinds), persistent=False)
 
-    def train_layer(self, layer: int | None, volume: float = 1.0) -> None:
-        """A stage of the paper's Progressive Layer Training, which adds layers one by one, the last one first.
+    def train_layer(self, layer: int | None, weight: float = 1.0) -> None:
+        """Sets a stage of the paper's Progressive Layer Training, which adds layers one by one, the last one first.
 
         Args:
-            layer: the one that is added: those before it are silent, the encoders of those after it no longer learn.
-                None ends the progress: every layer speaks and learns.
-            volume: factor on the added layer's attention, raised from 0 to 1 during its stage.
+            layer: index of the added layer: those before it send no messages, the encoders of those after it are not
+                trained. None ends the stages: every layer sends messages and is trained.
+            weight: factor on the added layer's attention, raised from 0 to 1 during its stage.
+
+        Raises:
+            UserError: there is no such layer.
         """
         if layer is not None and not 0 <= layer < self.config.num_layers:
             raise UserError(f"layer must be from 0 to {self.config.num_layers - 1}, or None; got {layer}")
-        self.volume.fill_(1.0)
+        self._layer_weights.fill_(1.0)
         if layer is not None:
-            self.volume[:layer], self.volume[layer] = 0.0, volume
+            self._layer_weights[:layer], self._layer_weights[layer] = 0.0, weight
         for index, encoder in enumerate(self.layers):
             encoder.requires_grad_(layer is None or index <= layer)
 
-    # --- Pieces -------------------------------------------------------------------------------------------------
+    # --- Functions of a model -----------------------------------------------------------------------------------
 
     def encode(
         self,
@@ -120,23 +123,23 @@ class IMMA(UnrolledForecaster):
         valid: Bool[Tensor, "batch time agents"],
         pairs: Tensors,
     ) -> Encoded:
-        """Attention of each layer, and the memory of its LSTM."""
+        """Computes the attention of each layer, and the memory of its LSTM."""
         memory: Tensors = ()
         attention = []
         for index, layer in enumerate(self.layers):
-            after, weights = layer(inputs, valid, *pairs[2 * index : 2 * index + 2])
+            after, attended = layer(inputs, valid, *pairs[2 * index : 2 * index + 2])
             memory += after
-            attention.append(weights)
+            attention.append(attended)
         return Encoded(memory, torch.stack(attention, dim=-1))
 
     def edge_probs(
-        self, graph: Float[Tensor, "batch agents agents layers"], valid: Bool[Tensor, "batch agents"]
+        self, weights: Float[Tensor, "batch agents agents layers"], valid: Bool[Tensor, "batch agents"]
     ) -> Float[Tensor, "batch agents agents types"]:
-        """Type k is layer k's attention divided by the number of layers; type 0 is what is left of 1.
+        """Converts attention to probabilities: type k is layer k's attention divided by the number of layers.
 
-        A pair's share of "no edge" is thus one minus its attention averaged over layers, and 1 where there is no pair.
+        Type 0 ("no edge") is one minus the attention averaged over layers, and 1 where there is no pair.
         """
-        shares = graph / self.config.num_layers
+        shares = weights / self.config.num_layers
         return torch.cat([(1 - shares.sum(-1, keepdim=True)).clamp(min=0), shares], dim=-1)
 
     def evolve(
@@ -146,23 +149,23 @@ class IMMA(UnrolledForecaster):
         pairs: Tensors,
         scores: Float[Tensor, "batch agents agents layers"],
     ) -> tuple[Tensors, Float[Tensor, "batch agents agents layers"]]:
-        """The graph stands still, unless the config says otherwise."""
+        """Keeps memory and attention, unless `dynamic_graph` is set."""
         return super().evolve(inputs, valid, pairs, scores) if self.config.dynamic_graph else (pairs, scores)
 
     def recur(
         self,
         inputs: Float[Tensor, "batch agents inputs"],
         valid: Bool[Tensor, "batch agents"],
-        graph: Float[Tensor, "batch agents agents layers"],
+        weights: Float[Tensor, "batch agents agents layers"],
         nodes: Tensors,
     ) -> Tensors:
-        """Messages of all layers are added; within a layer attention sums to one."""
-        return (self.decoder.step(inputs, valid, graph * self.volume, nodes[0]),)
+        """Updates agents by the sum of all layers' messages; within a layer attention sums to one."""
+        return (self.decoder.step(inputs, valid, weights * self._layer_weights, nodes[0]),)
 
     def change(
         self, inputs: Float[Tensor, "*batch agents inputs"], valid: Bool[Tensor, "*batch agents"], nodes: Tensors
     ) -> Float[Tensor, "*batch agents state"]:
-        """Read off the decoder's memory."""
+        """Computes the change of state from the decoder's memory."""
         change: Tensor = self.decoder.readout(nodes[0])
         return change
 
@@ -170,7 +173,7 @@ class IMMA(UnrolledForecaster):
 def masked_attention(
     scores: Float[Tensor, "*batch agents agents"], pairs: Bool[Tensor, "*batch agents agents"]
 ) -> Float[Tensor, "*batch agents agents"]:
-    """Softmax over the senders of each receiver; all zero for who has none."""
+    """Computes the softmax over the senders of each receiver; zeros if there are none."""
     # a finite stand-in for -inf, whose softmax over nothing would be NaN
     scores = scores.masked_fill(~pairs, torch.finfo(scores.dtype).min)
     return torch.softmax(scores, dim=-1) * pairs

@@ -1,9 +1,9 @@
-"""The limit for springs: knows the law, infers the constants by least squares, integrates the law. Not a competitor.
+"""Upper bound for springs: given their law, infers the constants by least squares and integrates it. No competitor.
 
 Springs are linear in their constants: over a step, Δv_i = Σ_j k_ij ∫(r_j − r_i) dt. The integral follows from positions
 and velocities at both ends (Hermite, exact to fourth order in dt). Each receiver keeps its normal equations over
 senders, so streaming is exact; the two estimates of a spring are averaged. Steps in which an agent may have touched a
-wall do not count. Columns of the equations are agents, so a cast must keep its columns.
+wall are left out. Columns of the equations are agents, so agents must keep their places.
 """
 
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
 LEAST_CONSTANT = 0.25
-"""A pair whose estimate is below half of the smallest constant of the paper (0.5) has no spring [N/m]."""
+"""Smallest estimate of a spring constant [N/m]: half of the paper's smallest (0.5); pairs below have no spring."""
 RIDGE = 1e-9
 
 
@@ -29,35 +29,35 @@ class _Internal(NamedTuple):
 
 
 class SpringLeastSquares:
-    """A `Forecaster` of springs with known law and unknown constants; its one edge feature is the spring constant.
+    """Forecaster of springs with known law and unknown constants; its one edge feature is the spring constant.
 
     Args:
-        spec: of the springs' store.
-        horizon_steps: default horizon.
-        physics: of the box, the published one if left out; only springs.
+        spec: layout of the springs' store.
+        horizon_steps: default number of steps to forecast.
+        physics: physics of the box, springs only; None takes the published one.
     """
 
     num_edge_types = 2
     edge_feature_dim = 1
 
     def __init__(self, spec: SceneSpec, horizon_steps: int = 10, physics: Physics | None = None) -> None:
-        """Nothing is learned."""
+        """Stores the arguments; nothing is learned."""
         physics = physics or Physics()
         if physics.kind != "springs" or spec.position_dim != 2 or spec.has_ego:
-            raise UserError("least squares knows springs in a plane without an ego; use another model")
+            raise UserError("least squares needs springs in a plane without an ego; use another model")
         self.spec = spec
         self.horizon_steps = horizon_steps
         self.physics = physics
 
     def empty_memory(self, batch: int, agents: int) -> Memory:
-        """The latest state with a mark, and for each receiver normal matrix and right-hand side."""
+        """Returns zeros for the latest state with a mark, and each receiver's normal matrix and right-hand side."""
         zeros = torch.zeros(batch, agents, agents, agents + 1, dtype=torch.float64)
         return Memory((torch.zeros(batch, agents, 5, dtype=torch.float64),), (zeros,))
 
     def observe(
         self, memory: Memory, states: Float[Tensor, "batch agents state"], valid: Bool[Tensor, "batch agents"]
     ) -> tuple[Memory, Belief]:
-        """Add the latest step's two equations per receiver, and solve."""
+        """Adds the latest step's two equations per receiver, and solves for the constants."""
         (before,), (equations,) = memory.nodes, memory.pairs
         now = torch.cat([states.double(), torch.ones_like(states[..., :1], dtype=torch.float64)], dim=-1)
         now = now * valid[..., None]
@@ -79,7 +79,7 @@ class SpringLeastSquares:
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
-        """Integrate the law; all samples are the same."""
+        """Integrates the law; all samples are equal."""
         physics = Physics(
             num_agents=belief.states.shape[1],
             box_m=self.physics.box_m,

@@ -1,8 +1,8 @@
 """An LSTM between two linear layers (64–128–64), as in the paper's comparison (Sec. V): one per scene, or per agent.
 
 The paper's processes all agents at once (`joint=True`): its input is the states of a fixed number of agents side by
-side, so it knows agents by their column, permuting them changes its forecast, and it fits fixed casts only (a team, a
-skeleton). `joint=False` runs the same network on every agent by itself and takes any number of them.
+side, so agents are identified by their column, permuting them changes the forecast, and it fits fixed groups only (a
+team, a skeleton). `joint=False` runs the same network on every agent by itself and takes any number of them.
 """
 
 from dataclasses import dataclass
@@ -20,43 +20,43 @@ from predictor.support.errors import UserError
 
 @dataclass(frozen=True)
 class LSTMConfig:
-    """Sizes; the defaults are the paper's (Sec. V)."""
+    """Sizes of the network; the defaults are the paper's (Sec. V)."""
 
     joint: bool = False
-    """One LSTM for the whole scene, as in the paper, rather than one per agent."""
+    """Whether there is one LSTM for the whole scene, as in the paper, rather than one per agent."""
     num_agents: int = 0
-    """Columns of the joint variant; 0 takes the spec's `max_agents`. Not used otherwise."""
+    """Number of agents of the joint variant; 0 takes the spec's `max_agents`. Not used otherwise."""
     embed_dim: int = 64
     """Width of the linear layers before and after the LSTM."""
     rnn_dim: int = 128
     """Width of the LSTM."""
     residual: Residual = "state"
-    """What the predicted change of position is added to; see `predictor.layers.state_codec`."""
+    """Position to which the predicted change is added; see `predictor.layers.state_codec`."""
     delta_scales: tuple[float, ...] = ()
     """Typical one-step change of each feature [SI]; empty takes the spec's feature scales."""
 
     def __post_init__(self) -> None:
-        """Check ranges."""
+        """Checks ranges."""
         check_sizes(self, "embed_dim", "rnn_dim")
         if self.num_agents < 0:
             raise UserError(f"num_agents must be positive, or 0 for the spec's max_agents; got {self.num_agents}")
 
 
 class LSTM(UnrolledForecaster):
-    """Linear → ReLU → LSTM → linear → ReLU → linear.
+    """Network of linear → ReLU → LSTM → linear → ReLU → linear.
 
-    The joint variant has one memory for the scene. It lies on the row of every present agent, with a mark beside it, so
-    that it moves through `Memory` like any agent's; it is read back from an agent who was there and still is. A scene
-    is thus remembered for as long as somebody stays, and forgotten when everyone was replaced.
+    The joint variant has one memory for the scene. Every present agent has a copy of it, with a mark, so that `Memory`
+    moves it like any agent's; it is taken from an agent that was present before and still is. A scene's memory is thus
+    kept as long as one agent stays, and starts anew when all agents were replaced.
 
     Args:
         spec: layout of the scenes.
-        config: sizes.
-        horizon_steps: steps it is trained to forecast.
+        config: sizes of the network.
+        horizon_steps: number of steps that it is trained to forecast.
     """
 
     def __init__(self, spec: SceneSpec, config: LSTMConfig | None = None, horizon_steps: int = 5) -> None:
-        """Build the network; weights come from torch's generator, so seed it first."""
+        """Builds the network; weights are drawn from torch's generator, so seed it first."""
         config = config or LSTMConfig()
         super().__init__(spec, config.residual, config.delta_scales, horizon_steps)
         self.config = config
@@ -71,10 +71,10 @@ class LSTM(UnrolledForecaster):
         self,
         inputs: Float[Tensor, "batch agents inputs"],
         valid: Bool[Tensor, "batch agents"],
-        graph: Float[Tensor, "batch agents agents graph"],
+        weights: Float[Tensor, "batch agents agents weights"],
         nodes: Tensors,
     ) -> Tensors:
-        """One LSTM step per agent, or one per scene."""
+        """Computes one LSTM step per agent, or one per scene."""
         present = valid[..., None]
         if not self.config.joint:
             flat = [t.flatten(0, 1) for t in (inputs, *nodes)]
@@ -91,7 +91,7 @@ class LSTM(UnrolledForecaster):
         valid: Bool[Tensor, "*batch agents"],
         nodes: Tensors,
     ) -> Float[Tensor, "*batch agents state"]:
-        """Read off the hidden state; in the joint variant each column has its own."""
+        """Computes the change of state from the hidden state; in the joint variant each agent has its own columns."""
         hidden = _of_first(nodes[0], valid) if self.config.joint else nodes[0]
         change: Tensor = self.readout(torch.relu(self.hidden(hidden)))
         if self.config.joint:
@@ -106,7 +106,7 @@ class LSTM(UnrolledForecaster):
         if extra > 0 and valid[:, self.columns :].any():
             needed = 1 + int(valid.any(0).nonzero().max())
             raise UserError(
-                f"this joint LSTM takes {self.columns} agents in fixed rows, but row {needed - 1} holds one too; "
+                f"this joint LSTM takes {self.columns} agents at fixed places, but place {needed - 1} holds one too; "
                 f"train with num_agents={needed} or joint=False"
             )
         return functional.pad(inputs, (0, 0, 0, -extra)).flatten(1)
@@ -115,6 +115,6 @@ class LSTM(UnrolledForecaster):
 def _of_first(
     memory: Float[Tensor, "*batch agents hidden"], chosen: Bool[Tensor, "*batch agents"]
 ) -> Float[Tensor, "*batch hidden"]:
-    """The row of the first chosen agent; zeros if there is none."""
+    """Returns the memory of the first chosen agent; zeros if there is none."""
     first = chosen.to(torch.uint8).argmax(-1)[..., None, None].expand(*chosen.shape[:-1], 1, memory.shape[-1])
     return memory.gather(-2, first).squeeze(-2) * chosen.any(-1, keepdim=True)

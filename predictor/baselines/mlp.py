@@ -1,6 +1,6 @@
-"""Two layers from an agent's state to its change of state, without memory and without others: the paper's "Linear" row.
+"""Two layers from an agent's state to its change of state: "Linear" in the paper's tables.
 
-What it cannot know is the point of it: the past, and everybody else.
+The past and the other agents are no inputs, so the difference to other models shows what these are worth.
 """
 
 from dataclasses import dataclass
@@ -16,31 +16,31 @@ from predictor.scene import SceneSpec
 
 @dataclass(frozen=True)
 class MLPConfig:
-    """Sizes; the default is the paper's (Sec. V)."""
+    """Sizes of the network; the default is the paper's (Sec. V)."""
 
     hidden_dim: int = 256
     """Width of the hidden layer."""
     residual: Residual = "state"
-    """What the predicted change of position is added to; see `predictor.layers.state_codec`."""
+    """Position to which the predicted change is added; see `predictor.layers.state_codec`."""
     delta_scales: tuple[float, ...] = ()
     """Typical one-step change of each feature [SI]; empty takes the spec's feature scales."""
 
     def __post_init__(self) -> None:
-        """Check ranges."""
+        """Checks ranges."""
         check_sizes(self, "hidden_dim")
 
 
 class MLP(UnrolledForecaster):
-    """The same two layers for every agent and every step.
+    """Network of two layers, with the same weights for every agent and every step.
 
     Args:
         spec: layout of the scenes.
-        config: sizes.
-        horizon_steps: steps it is trained to forecast.
+        config: sizes of the network.
+        horizon_steps: number of steps that it is trained to forecast.
     """
 
     def __init__(self, spec: SceneSpec, config: MLPConfig | None = None, horizon_steps: int = 5) -> None:
-        """Build the network; weights come from torch's generator, so seed it first."""
+        """Builds the network; weights are drawn from torch's generator, so seed it first."""
         config = config or MLPConfig()
         super().__init__(spec, config.residual, config.delta_scales, horizon_steps)
         self.config = config
@@ -53,6 +53,6 @@ class MLP(UnrolledForecaster):
         valid: Bool[Tensor, "*batch agents"],
         nodes: Tensors,
     ) -> Float[Tensor, "*batch agents state"]:
-        """W₂ relu(W₁ x)."""
+        """Computes W₂ relu(W₁ x)."""
         change: Tensor = self.readout(torch.relu(self.hidden(inputs)))
         return change

@@ -1,8 +1,8 @@
-"""Everyone moves as the k most similar recorded agents did: what knowing the place, without interaction, already gives.
+"""Nearest neighbours: each agent moves as the k most similar recorded agents did, without interaction.
 
-Similar means: like position, velocity, position relative to the ego, and role. Nothing is trained and nothing is
-remembered; examples are kept as they are. It is no dG-VAE baseline of the paper, and it is not saved as a checkpoint:
-it is fitted to an episode store when it is needed, which takes seconds.
+Similarity is that of position, velocity, position relative to the ego, and role. Nothing is trained and there is no
+memory; examples are kept as they are. It is no baseline of the paper, and it is not saved as a checkpoint: it is fitted
+to an episode store when it is needed, which takes seconds.
 """
 
 from collections.abc import Sequence
@@ -22,48 +22,48 @@ from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
 K = 5
-"""Neighbours that a forecast averages."""
+"""Number of neighbours that a forecast averages."""
 MAX_EXAMPLES = 200_000
-"""Examples that are kept: a live step then takes a few milliseconds on a CPU core."""
+"""Largest number of examples: a step then takes a few milliseconds on a CPU core."""
 ROLE_WEIGHT = 10.0
 """Weight of constant features, so that an agent of another role is far away."""
 LEAST_SPREAD = 1e-3
-"""Smallest spread that a feature is divided by, in units of its `feature_scales`: noise is not to be magnified."""
+"""Smallest spread that a feature is divided by, in units of its `feature_scales`, so that noise is not magnified."""
 BLOCK = 64
-"""Examples that share a first look."""
+"""Number of examples in a block; the search compares blocks first."""
 MAX_QUERIES = 64
-"""Queries that are looked up at once."""
+"""Largest number of queries that are searched at once."""
 MAX_DISTANCES = 2**17
-"""Distances that are in memory at once: 1 MB, which a cache holds."""
+"""Largest number of distances in memory at once: 1 MB, which fits into a cache."""
 
 
 class Examples(NamedTuple):
-    """What was seen of agents at some instant, and how they then moved."""
+    """Features of recorded agents at some instant, and their motion after it."""
 
     features: Float[Tensor, "examples features"]
-    """`query_features` of each."""
+    """Features of each example, by `query_features`."""
     displacements: Float[Tensor, "examples horizon axes"]
-    """Position at each of the next steps, minus the position then [m]."""
+    """Position at each of the next steps, minus the position at the instant [m]."""
 
 
 class NearestNeighbour(nn.Module):
-    """A `Forecaster` without memory and without edges, made of examples; `fit` collects them.
+    """Forecaster without memory and without edges, made of examples; `fit` collects them.
 
     Args:
         spec: layout of the scenes.
-        examples: at least one; with fewer than `k`, all of them are averaged.
-        k: neighbours to average.
-        num_edge_types: only shapes the (empty) edge output, so that observations can match a learned forecaster's.
-        edge_feature_dim: likewise.
+        examples: examples, at least one; if fewer than `k`, all of them are averaged.
+        k: number of neighbours to average.
+        num_edge_types: number of edge types of the (empty) edge output, to match a learned forecaster's.
+        edge_feature_dim: number of edge features of the (empty) edge output.
 
     Raises:
-        UserError: no examples, no steps, or `k` below 1.
+        UserError: there are no examples or no steps, or `k` is below 1.
     """
 
     def __init__(
         self, spec: SceneSpec, examples: Examples, k: int = K, num_edge_types: int = 2, edge_feature_dim: int = 1
     ) -> None:
-        """Scale the examples and lay them out in blocks."""
+        """Scales the examples and arranges them in blocks."""
         super().__init__()
         count, horizon_steps, _ = examples.displacements.shape
         if count < 1 or horizon_steps < 1 or k < 1:
@@ -108,34 +108,34 @@ class NearestNeighbour(nn.Module):
         num_edge_types: int = 2,
         edge_feature_dim: int = 1,
     ) -> "NearestNeighbour":
-        """A forecaster of up to `horizon_steps` steps from recorded episodes; see `collect_examples`.
+        """Fits a forecaster of up to `horizon_steps` steps to recorded episodes; see `collect_examples`.
 
         Raises:
-            UserError: nobody in the episodes has a future of that length, or a number is below 1.
+            UserError: no agent of the episodes has a future of that length, or a number is below 1.
         """
         examples = collect_examples(episodes, spec, horizon_steps, max_examples, seed)
         return cls(spec, examples, k, num_edge_types, edge_feature_dim)
 
     def empty_memory(self, batch: int, agents: int) -> Memory:
-        """Nothing is remembered."""
+        """Returns a memory without content."""
         return Memory()
 
     def observe(
         self, memory: Memory, states: Float[Tensor, "batch agents state"], valid: Bool[Tensor, "batch agents"]
     ) -> tuple[Memory, Belief]:
-        """Keep the states; every pair has "no edge"."""
+        """Returns the states as belief; every pair has "no edge"."""
         return memory, edgeless_belief(states, valid, self.num_edge_types, self.edge_feature_dim)
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
-        """Sample 0 moves like the mean of the neighbours; sample s like the s-th nearest one alone, over and over.
+        """Computes sample 0 from the mean motion of the neighbours, sample s from the s-th nearest one, cyclically.
 
-        Velocities are finite differences of positions; other features stay as they are. Nothing is drawn. Absent
-        agents are zeros.
+        Velocities are finite differences of positions; other features are constant. Nothing is drawn. Absent agents
+        are zeros.
 
         Raises:
-            UserError: more steps than were fitted.
+            UserError: `horizon_steps` is larger than the fitted one.
         """
         if horizon_steps > self.horizon_steps:
             raise UserError(
@@ -152,19 +152,19 @@ class NearestNeighbour(nn.Module):
         future = now[:, None, None].repeat(1, num_samples, horizon_steps, 1)
         future[..., :axes] += moved[:, :, :horizon_steps]
         future[..., axes : 2 * axes] = steps / self.spec.dt_s
-        everyone = states.new_zeros(*valid.shape, num_samples, horizon_steps, states.shape[-1])
-        everyone[valid] = future
-        return everyone.transpose(1, 2)
+        all_agents = states.new_zeros(*valid.shape, num_samples, horizon_steps, states.shape[-1])
+        all_agents[valid] = future
+        return all_agents.transpose(1, 2)
 
     def nearest(
         self, features: Float[Tensor, "queries features"]
     ) -> tuple[Int[Tensor, "queries k"], Float[Tensor, "queries k"]]:
-        """Indices of the k nearest examples, nearest first, and their distances in spreads; of equals, any.
+        """Finds the indices of the k nearest examples, nearest first, and their distances in spreads.
 
         The k nearest lie in the k blocks of examples whose nearest member is nearest, so only those are sorted.
 
         Args:
-            features: as `query_features` gives them.
+            features: features by `query_features`.
         """
         queries = (features.to(self.points.dtype) - self.centre) / self.scales
         found = [self._nearest(part) for part in queries.split(MAX_QUERIES)]
@@ -187,11 +187,11 @@ class NearestNeighbour(nn.Module):
 def query_features(
     spec: SceneSpec, states: Float[Tensor, "*batch agents state"], valid: Bool[Tensor, "*batch agents"]
 ) -> Float[Tensor, "*batch agents features"]:
-    """What agents are compared by: position, velocity, position relative to the ego, constant features [SI].
+    """Computes the compared features: position, velocity, position relative to the ego, constant features [SI].
 
-    Positions are in the world on "world" axes, relative to everyone's mean on "centroid" axes, and left out on "ego"
-    axes. Positions relative to the ego are there where the spec has an ego, and zero while row 0 is absent. Zeros for
-    absent agents.
+    Positions are in the world on "world" axes, relative to the mean of all agents on "centroid" axes, and left out on
+    "ego" axes. Positions relative to the ego are included if the spec has an ego, and zero while the ego is absent.
+    Absent agents are zeros.
     """
     axes = spec.position_dim
     positions, present = states[..., :axes], valid[..., None]
@@ -207,10 +207,11 @@ def query_features(
 
 
 def feature_scales(spec: SceneSpec, features: Float[Tensor, "examples features"]) -> Float[Tensor, " features"]:
-    """What each feature is divided by: its mean absolute deviation from the median over the examples.
+    """Computes the divisor of each feature: its mean absolute deviation from the median over the examples.
 
-    Far-off examples count little, and the few that differ in a feature that hardly ever varies stand apart. Constant
-    features are divided by a tenth of that (`ROLE_WEIGHT`). No spread is below `LEAST_SPREAD` of the spec's scale.
+    Outliers thus have little weight, and the few examples that differ in a nearly constant feature are far from the
+    others. Constant features are divided by a tenth of that (`ROLE_WEIGHT`). No spread is below `LEAST_SPREAD` of the
+    spec's scale.
     """
     axes, scales = spec.position_dim, spec.feature_scales
     least = [scales[axis] for axis, f in enumerate(spec.frame) if f != "ego"]
@@ -229,20 +230,20 @@ def collect_examples(
     max_examples: int = MAX_EXAMPLES,
     seed: int = 0,
 ) -> Examples:
-    """Every agent at every step at which it is perceived and after which it is there for the whole horizon.
+    """Collects each agent at each step at which it is perceived and after which it is present for the whole horizon.
 
-    The ego (column 0, where there is one) is no example: its future is the policy's choice. Nor is anyone while the ego
-    is absent, for then nobody perceives them.
+    The ego (agent 0, if the spec has one) is no example: its future is the policy's choice. While the ego is absent
+    there are no examples, since no agent is perceived.
 
     Args:
-        episodes: recorded, all agents.
-        spec: decides who is perceived, and what agents are compared by.
-        horizon_steps: steps of the future.
-        max_examples: if there are more, as many are drawn.
-        seed: of that draw.
+        episodes: recorded episodes, with all agents.
+        spec: layout that decides which agents are perceived and which features are compared.
+        horizon_steps: number of steps of the future.
+        max_examples: largest number of examples; of more, this many are drawn.
+        seed: random seed of that draw.
 
     Raises:
-        UserError: there is none, or a number is below 1.
+        UserError: there is no example, or a number is below 1.
     """
     if horizon_steps < 1 or max_examples < 1:
         raise UserError(f"horizon_steps and max_examples must be at least 1, got {horizon_steps} and {max_examples}")
@@ -278,21 +279,21 @@ def fit_from_stores(
     num_edge_types: int = 2,
     edge_feature_dim: int = 1,
 ) -> NearestNeighbour:
-    """Nearest neighbours for scenes of `spec`, from episode stores.
+    """Fits nearest neighbours for scenes of `spec` to episode stores.
 
     Args:
-        paths: of the stores.
-        spec: of the scenes to forecast; its perception and frame hold for the examples too.
-        horizon_steps: steps to forecast.
-        source: what the scenes come from, for messages (``env 'merge-v1'``).
-        k: neighbours to average.
-        max_examples: if the stores have more, as many are drawn.
-        seed: of that draw.
-        num_edge_types: as in `NearestNeighbour`.
-        edge_feature_dim: as in `NearestNeighbour`.
+        paths: paths of the stores.
+        spec: layout of the scenes to forecast; its perception and frame hold for the examples too.
+        horizon_steps: number of steps to forecast.
+        source: origin of the scenes, for messages (``env 'merge-v1'``).
+        k: number of neighbours to average.
+        max_examples: largest number of examples; of more, this many are drawn.
+        seed: random seed of that draw.
+        num_edge_types: number of edge types of the (empty) edge output.
+        edge_feature_dim: number of edge features of the (empty) edge output.
 
     Raises:
-        UserError: no readable store, one of other features, time step or ego, or no example.
+        UserError: a store cannot be read, has other features, time step or ego, or there is no example.
     """
     episodes: list[Episode] = []
     for path in paths:
@@ -311,7 +312,7 @@ def fit_from_stores(
 def _complete(
     episode: Episode, seen: Bool[np.ndarray, "time agents"], spec: SceneSpec, horizon_steps: int
 ) -> Bool[np.ndarray, "time agents"]:
-    """Who is an example when."""
+    """Returns which agents are examples at which steps."""
     steps = len(seen) - horizon_steps
     complete = np.zeros_like(seen)
     if steps < 1 or not seen.shape[1]:

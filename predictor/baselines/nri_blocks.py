@@ -1,6 +1,6 @@
 """Blocks that the NRI family shares (NRI, dNRI, IMMA): embedding of a frame's pairs, LSTM per pair, recurrent decoder.
 
-Everything is masked, so agents may come and go. Means are over the others who are present. The batch normalisation of
+Everything is masked, so agents may come and go. Means are over the other present agents. The batch normalisation of
 the originals is left out: its statistics would depend on padding, and differ between a window and a stream.
 """
 
@@ -16,15 +16,15 @@ from predictor.layers.rnn import masked_lstm
 
 
 class FrameEncoder(nn.Module):
-    """Agent → pair → agent → pair, each arrow a two-layer ELU MLP; the second pair MLP sees the first one's result.
+    """Embedding agent → pair → agent → pair, each arrow a two-layer ELU MLP, with a skip from the first pair MLP.
 
     Args:
-        inputs: size of an agent's input.
-        hidden_dim: width of everything else.
+        inputs: number of an agent's inputs.
+        hidden_dim: width of all layers.
     """
 
     def __init__(self, inputs: int, hidden_dim: int) -> None:
-        """Layers in the order in which data passes; initial weights are those of the originals."""
+        """Creates the layers, in the order in which data passes them; initial weights are those of the originals."""
         super().__init__()
         self.node = _elu_mlp(inputs, hidden_dim)
         self.pair = PairLinear(hidden_dim, hidden_dim)
@@ -41,7 +41,7 @@ class FrameEncoder(nn.Module):
     def forward(
         self, inputs: Float[Tensor, "*batch agents inputs"], valid: Bool[Tensor, "*batch agents"]
     ) -> Float[Tensor, "*batch agents agents hidden"]:
-        """Embed all pairs; any number of frames at once."""
+        """Embeds all pairs of any number of frames at once."""
         first = functional.elu(self.pair_out(functional.elu(self.pair(self.node(inputs)))))
         mean = sum_over_senders(first, mean_weight(valid, inputs.dtype))
         second = self.again_pair(self.again_node(mean)) + self.again_skip(first)
@@ -49,10 +49,10 @@ class FrameEncoder(nn.Module):
 
 
 class PairLSTM(nn.Module):
-    """One LSTM with the same weights for every pair; a pair that is not present has its memory set to zero."""
+    """LSTM with the same weights for every pair; the memory of an absent pair is set to zero."""
 
     def __init__(self, inputs: int, hidden_dim: int) -> None:
-        """Initial weights as in `nn.LSTM`."""
+        """Creates the layers, with initial weights as in `nn.LSTM`."""
         super().__init__()
         self.inputs = nn.Linear(inputs, 4 * hidden_dim)
         self.hidden = nn.Linear(hidden_dim, 4 * hidden_dim, bias=False)
@@ -67,26 +67,26 @@ class PairLSTM(nn.Module):
         cell: Float[Tensor, "batch agents agents rnn"],
         reverse: bool = False,
     ) -> tuple[Float[Tensor, "batch time agents agents rnn"], Float[Tensor, "batch time agents agents rnn"]]:
-        """Hidden and cell state after each step, from the memory before the first (with `reverse`, after the last)."""
+        """Computes hidden and cell state after each step, from the memory before the first (last, if reversed)."""
         return masked_lstm(self.inputs(embedding), self.hidden, pair_mask(valid), hidden, cell, reverse)
 
 
 class HiddenDecoder(nn.Module):
-    """Messages from the decoder's own hidden states, a gated update from messages and input, a readout.
+    """Decoder with messages from its own hidden states, a gated update from messages and input, and a readout.
 
-    Each kind of message has its own two-layer tanh MLP on h_i ‖ h_j. The gates see the messages, not the agent's own
-    hidden state, which only the update gate carries on: that is how NRI writes its GRU.
+    Each kind of message has its own two-layer tanh MLP on h_i ‖ h_j. Inputs of the gates are the messages, not the
+    agent's own hidden state, which is kept by the update gate only: this is NRI's form of a GRU.
 
     Args:
-        inputs: size of an agent's input.
+        inputs: number of an agent's inputs.
         hidden_dim: width of the memory.
         message_dim: width of the messages.
-        kinds: kinds of messages.
-        outputs: size of the readout.
+        kinds: number of kinds of messages.
+        outputs: number of outputs of the readout.
     """
 
     def __init__(self, inputs: int, hidden_dim: int, message_dim: int, kinds: int, outputs: int) -> None:
-        """Layers in the order in which data passes."""
+        """Creates the layers, in the order in which data passes them."""
         super().__init__()
         self.message_pair = PairLinear(hidden_dim, kinds * message_dim)
         self.message_out = nn.ModuleList(nn.Linear(message_dim, message_dim) for _ in range(kinds))
@@ -103,7 +103,7 @@ class HiddenDecoder(nn.Module):
     def messages(
         self, hidden: Float[Tensor, "*batch agents hidden"], weights: Float[Tensor, "*batch agents agents kinds"]
     ) -> Float[Tensor, "*batch agents message"]:
-        """Σ_k Σ_j w_ijk · tanh(W_k tanh(V_k (h_i ‖ h_j)))."""
+        """Computes Σ_k Σ_j w_ijk · tanh(W_k tanh(V_k (h_i ‖ h_j)))."""
         first = torch.tanh(self.message_pair(hidden)).chunk(len(self.message_out), dim=-1)
         kinds = zip(first, self.message_out, weights.unbind(-1), strict=True)
         return torch.stack([sum_over_senders(torch.tanh(out(part)), w) for part, out, w in kinds]).sum(0)
@@ -115,7 +115,7 @@ class HiddenDecoder(nn.Module):
         weights: Float[Tensor, "*batch agents agents kinds"],
         hidden: Float[Tensor, "*batch agents hidden"],
     ) -> Float[Tensor, "*batch agents hidden"]:
-        """Memory one step on; absent agents keep none."""
+        """Computes the memory one step later; that of absent agents is zero."""
         reset_x, keep_x, new_x = self.input_gates(inputs).chunk(3, dim=-1)
         reset_m, keep_m, new_m = self.message_gates(self.messages(hidden, weights)).chunk(3, dim=-1)
         keep = torch.sigmoid(keep_x + keep_m)
@@ -125,7 +125,7 @@ class HiddenDecoder(nn.Module):
 
 
 def initialise(*parts: nn.Linear) -> None:
-    """Xavier weights and biases of 0.1 for one linear layer whose input is split over `parts`."""
+    """Sets Xavier weights and biases of 0.1 for one linear layer whose input is split over `parts`."""
     widths = [part.in_features for part in parts]
     joined = torch.empty(parts[0].out_features, sum(widths))
     nn.init.xavier_normal_(joined)
@@ -137,7 +137,7 @@ def initialise(*parts: nn.Linear) -> None:
 
 
 def elu_head(inputs: int, hidden_dim: int, outputs: int) -> nn.Sequential:
-    """Three linear layers with ELU between them, initialised as the originals."""
+    """Creates three linear layers with ELU between them, initialised as the originals."""
     layers = [nn.Linear(inputs, hidden_dim), nn.Linear(hidden_dim, hidden_dim), nn.Linear(hidden_dim, outputs)]
     for layer in layers:
         initialise(layer)

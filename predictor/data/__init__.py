@@ -1,1 +1,1 @@
-"""Datasets: the episode store and what is read from it."""
+"""Datasets: the episode store, the loaders that write it and the training windows cut from it."""

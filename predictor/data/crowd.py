@@ -1,8 +1,8 @@
-"""Overlay recorded scenes until they hold a given number of agents: `python -m predictor.data.crowd --source STORE`.
+"""Overlays recorded scenes until they hold a given number of agents: `python -m predictor.data.crowd --source STORE`.
 
-Public recordings of crowds are small or short. An overlay has as many agents as wanted, each of which really moved so;
-agents of different recordings ignore each other, so it tests what a forecaster does with many who do not matter to one
-another (and its time and memory), not how crowds behave.
+Public recordings of crowds are small or short. An overlay has as many agents as wanted, each with a recorded motion.
+Agents of different recordings do not interact, so an overlay tests a forecaster (and its time and memory) on many
+agents without influence on each other, not how crowds behave.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from predictor.support.provenance import provenance
 
 @dataclass(frozen=True)
 class CrowdConfig:
-    """Overlay the scenes of a store."""
+    """Overlays the scenes of a store."""
 
     source: Path
     """Episode store whose scenes are overlaid; it has no ego."""
@@ -40,10 +40,10 @@ class CrowdConfig:
     """Replace an existing store."""
 
     def __post_init__(self) -> None:
-        """Check ranges.
+        """Checks ranges.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value out of range.
         """
         check_at_least(self, 1, "num_agents", "episodes")
         check_at_least(self, 0, "seed")
@@ -54,7 +54,7 @@ class CrowdConfig:
 
 
 def overlay(episodes: list[Episode], axes: int, seed: int) -> Episode:
-    """One episode with everybody of several, each recording centred on its own mean position."""
+    """Returns one episode with all agents of several, each recording centred on its own mean position."""
     steps = min(len(e.states) for e in episodes)
     parts, presence = [], []
     for episode in episodes:
@@ -69,14 +69,14 @@ def overlay(episodes: list[Episode], axes: int, seed: int) -> Episode:
 
 
 def make_crowds(config: CrowdConfig) -> list[Episode]:
-    """Draw scenes until each crowd is large enough.
+    """Draws scenes until each crowd is large enough.
 
     Raises:
-        UserError: no scene of the source is long enough, or all are empty at the step that counts.
+        UserError: no scene of the source is long enough, or no agent is present at `at_step`.
     """
     store = read_store(config.source)
     if store.info.spec.has_ego:
-        raise UserError(f"{config.source} has an ego, and there can be only one; overlay stores without")
+        raise UserError(f"{config.source} has an ego, and an episode has at most one; pass a store without an ego")
     usable = [e for e in store.episodes if len(e.states) >= config.episode_steps and e.valid[config.at_step].any()]
     if not usable:
         raise UserError(

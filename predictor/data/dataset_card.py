@@ -1,4 +1,4 @@
-"""Store and data card of a dataset, written together; the card holds only what was measured on the episodes."""
+"""Writes the store and the data card of a dataset together; the card holds what was measured on the episodes."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,18 +17,18 @@ from predictor.support.provenance import provenance
 
 @dataclass(frozen=True)
 class DatasetNotes:
-    """What a loader knows about its dataset and cannot be measured."""
+    """Facts about a dataset that cannot be measured on its episodes; its loader gives them."""
 
     title: str
     """Name of the dataset."""
     about: str
-    """One paragraph."""
+    """Description of the dataset, one paragraph."""
     rights: str
-    """Who may do what."""
+    """Licence and terms of use."""
     choices: tuple[str, ...]
-    """What the loader decided: units, axes, what is dropped."""
+    """Decisions of the loader: units, axes, what is dropped."""
     counts: Mapping[str, int] = field(default_factory=dict)
-    """What was read, skipped or dropped, and how often."""
+    """Number of things read, skipped or dropped, by name."""
 
 
 def save_dataset(
@@ -39,18 +39,18 @@ def save_dataset(
     files: Iterable[Path],
     extra: Mapping[str, object] | None = None,
 ) -> None:
-    """Write the store and, beside it, its data card; either both are complete or nothing is left.
+    """Writes the store and, beside it, its data card; either both are complete or nothing is left.
 
     Args:
-        config: where to write.
+        config: paths of the source and the output.
         spec: layout of the states.
         episodes: at least one.
-        notes: for the card.
-        files: what was read, for the checksum.
-        extra: more provenance.
+        notes: facts for the card.
+        files: files that were read, for the checksum.
+        extra: additional provenance.
 
     Raises:
-        UserError: no episodes, or the output is in the way.
+        UserError: no episodes, or the output exists and may not be replaced.
     """
     if not episodes:
         raise UserError(f"{config.source} gives no episode for split '{config.split}'; {_counted(notes) or 'no data'}")
@@ -71,18 +71,18 @@ def save_dataset(
 
 
 def summary(config: LoaderConfig, episodes: Sequence[Episode]) -> str:
-    """One line for the terminal."""
+    """Returns one line for the terminal."""
     steps = sum(len(e.states) for e in episodes)
     return f"{config.out}: {len(episodes)} episodes, {steps} steps, split '{config.split}'; card {config.card_path}"
 
 
 def most_present(episodes: Iterable[Episode]) -> int:
-    """Most agents present at once."""
+    """Returns the largest number of agents present at one step."""
     return max((int(e.valid.sum(axis=1).max(initial=0)) for e in episodes), default=0)
 
 
 def card_text(split: Split, info: StoreInfo, episodes: Sequence[Episode], notes: DatasetNotes) -> str:
-    """The data card, in Markdown."""
+    """Returns the data card as Markdown."""
     facts = info.provenance
     parts = [
         f"# {notes.title}",
@@ -134,7 +134,7 @@ def _columns(spec: SceneSpec, episodes: Sequence[Episode]) -> list[tuple[str, st
 
 
 def _deviations(spec: SceneSpec, episodes: Sequence[Episode]) -> list[float]:
-    """Standard deviation of each column over all present agents, positions in the spec's frame."""
+    """Returns the standard deviation of each column over all present agents, positions in the spec's frame."""
     count, total, squares = 0, np.zeros(spec.num_features), np.zeros(spec.num_features)
     centred = np.array([frame == "centroid" for frame in spec.frame])
     for episode in episodes:
@@ -145,8 +145,8 @@ def _deviations(spec: SceneSpec, episodes: Sequence[Episode]) -> list[float]:
             present.sum(axis=1, keepdims=True), 1
         )
         states[..., :axes] -= centre * centred
-        rows = states[episode.valid]
-        count, total, squares = count + len(rows), total + rows.sum(axis=0), squares + (rows**2).sum(axis=0)
+        points = states[episode.valid]
+        count, total, squares = count + len(points), total + points.sum(axis=0), squares + (points**2).sum(axis=0)
     mean = total / max(count, 1)
     return [float(v) for v in np.sqrt(np.maximum(squares / max(count, 1) - mean**2, 0.0))]
 

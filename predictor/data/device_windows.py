@@ -1,4 +1,4 @@
-"""Windows whose episodes live on a device: batches are cut there, in shapes that never vary, and nothing is read back.
+"""Windows whose episodes are kept on a device: batches are cut there in fixed shapes, without reading anything back.
 
 A batch holds what `Windows.batch` gives, padded to the longest history and the widest window of all, so that a training
 step on it can be captured once and replayed (`predictor.training.cuda_graph`).
@@ -17,17 +17,17 @@ from predictor.data.windows import WindowBatch, Windows, window_batch
 from predictor.support.errors import UserError
 
 _CHUNK = 1 << 22
-"""Entries looked at in one go when the widest window is searched."""
+"""Number of entries examined at once when the widest window is searched."""
 
 
 class ResidentWindows:
-    """All windows of some stores on one device; rows are numbered store by store.
+    """Keeps all windows of some stores on one device, numbered store by store.
 
     Args:
-        windows: one per store, alike in spec, history and horizon.
-        device: where they go.
-        agents: columns of every batch; None takes those of the widest window.
-        budget_bytes: largest size there; None sets no limit.
+        windows: one `Windows` per store, with equal spec, history and horizon.
+        device: device that keeps them.
+        agents: number of agent columns of every batch; None takes that of the widest window.
+        budget_bytes: largest size on the device; None sets no limit.
 
     Raises:
         UserError: they do not fit, or an ego is missing at an observed step.
@@ -40,7 +40,7 @@ class ResidentWindows:
         agents: int | None = None,
         budget_bytes: int | None = None,
     ) -> None:
-        """Copy everything to the device."""
+        """Copies everything to the device."""
         needed = bytes_needed(windows)
         if budget_bytes is not None and needed > budget_bytes:
             raise UserError(
@@ -62,18 +62,18 @@ class ResidentWindows:
         self._flat = flat.to(device)
 
     def __len__(self) -> int:
-        """Number of windows."""
+        """Returns the number of windows."""
         return len(self._episode)
 
     def batch(
         self, indices: Int[Tensor, " batch"], history_steps: int | None = None, time: int | None = None
     ) -> WindowBatch:
-        """The given windows as `Windows.batch` cuts them, on the device, padded to a shape that is known beforehand.
+        """Cuts the given windows on the device like `Windows.batch`, padded to a shape that is known beforehand.
 
         Args:
-            indices: which windows, on the device.
+            indices: numbers of the windows, on the device.
             history_steps: a shorter history than the longest one.
-            time: steps of the result; None is history and horizon.
+            time: number of steps of the result; None takes history plus horizon.
         """
         history = history_steps or self.history_steps
         episode, now = self._episode.index_select(0, indices), self._now.index_select(0, indices)
@@ -83,12 +83,12 @@ class ResidentWindows:
 
 
 def bytes_needed(windows: Sequence[Windows]) -> int:
-    """What `ResidentWindows` takes on its device, batches aside."""
+    """Returns the memory of `ResidentWindows` on its device, without batches [bytes]."""
     return sum(w.flat.num_bytes + w.index.nbytes for w in windows)
 
 
 def window_sizes(windows: Windows) -> Int[np.ndarray, " windows"]:
-    """Agents of each window, with the longest history.
+    """Returns the number of agents of each window, with the longest history.
 
     Raises:
         UserError: an ego is missing at an observed step.

@@ -4,9 +4,9 @@ Reads recordings in the CSV layouts of levelXData (see `predictor.data.levelx_fi
 from levelxdata.com. `python -m envs.export_levelx` writes highway-env rollouts in the same layout.
 
 States (`--features full`): position, velocity [m, m/s], heading as cosine and sine, acceleration along and across the
-heading [m/s²], and four columns of which one is 1: car (vans, too), truck or bus (trailers, too), pedestrian, bicycle
-(motorcycles, too). `--features kinematic` keeps position and velocity. Velocities and accelerations are the dataset's
-own, which were smoothed over the whole track, so they hold a little of the future.
+heading [m/s²], and four columns of which one is 1: car (also vans), truck or bus (also trailers), pedestrian, bicycle
+(also motorcycles). `--features kinematic` keeps position and velocity. Velocities and accelerations are the dataset's
+own; they were smoothed over the whole track and therefore contain some information about the future.
 
 The number of agents varies from step to step. Splits are by recording: the position of SHA-256("360:<recording>") in
 [0, 1) decides, below 0.1 test, below 0.2 validation, else training; for inD 01, 14, 24 are for testing, 03, 11, 22 for
@@ -29,15 +29,15 @@ from predictor.support.config_checks import check_at_least, check_positive
 from predictor.support.errors import UserError, run_entry_point
 
 SPLIT_SEED = 360
-"""Gives shares near 80/10/10 of the recordings of all four datasets, and different places in inD."""
+"""Seed of the split: gives shares near 80/10/10 in all four datasets, and different locations of inD in each split."""
 MOTION_FEATURES = ("heading_cos", "heading_sin", "lon_acceleration_mps2", "lat_acceleration_mps2")
 KINEMATIC_SCALES: dict[Layout, tuple[float, ...]] = {
     "centre": (50.0, 50.0, 10.0, 10.0),
     "corner": (100.0, 10.0, 30.0, 1.0),
 }
-"""Size of a junction and town speeds; a stretch of motorway and its speeds [m, m/s]."""
+"""Scales of position and velocity [m, m/s]: a junction and town speeds; a section of motorway and its speeds."""
 MAX_AGENTS = 128
-"""At least; more where a store has more at once."""
+"""Least `max_agents` of a store; larger where more agents are present at once."""
 RIGHTS = (
     "inD, rounD, highD and exiD: free for research that is not commercial, on application at levelxdata.com; not to be "
     "passed on. A store made from them falls under the same terms."
@@ -46,12 +46,12 @@ RIGHTS = (
 
 @dataclass(frozen=True)
 class LevelxConfig(LoaderConfig):
-    """Turn recordings in levelXData's CSV layouts into an episode store."""
+    """Turns recordings in levelXData's CSV layouts into an episode store."""
 
     features: Features = "full"
-    """Features of a state: kinematic (position and velocity) or full (heading, acceleration and class, too)."""
+    """Features of a state: kinematic (position and velocity) or full (also heading, acceleration and class)."""
     frame: Literal["world", "centroid"] = "world"
-    """Origin of the positions that networks see: world keeps the map (one location), centroid forgets it."""
+    """Origin of the positions that networks see: world keeps the map (one location), centroid removes it."""
     dt_s: float = 0.2
     """Time between steps [s]; whole frames of the recordings (25 Hz). 0.2 as in the dG-VAE paper."""
     episode_steps: int = 50
@@ -61,10 +61,10 @@ class LevelxConfig(LoaderConfig):
     own coordinates."""
 
     def __post_init__(self) -> None:
-        """Check choices and ranges.
+        """Checks choices and ranges.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value out of range.
         """
         super().__post_init__()
         check_positive(self, "dt_s")
@@ -72,7 +72,7 @@ class LevelxConfig(LoaderConfig):
 
 
 def scene_spec(config: LevelxConfig, layout: Layout, agents: int = 0) -> SceneSpec:
-    """Layout of the states."""
+    """Returns the layout of the states."""
     names: tuple[str, ...] = KINEMATIC_FEATURES
     scales = KINEMATIC_SCALES[layout]
     if config.features == "full":
@@ -92,10 +92,10 @@ def scene_spec(config: LevelxConfig, layout: Layout, agents: int = 0) -> SceneSp
 
 
 def load(config: LevelxConfig) -> tuple[Layout, list[Episode], DatasetNotes, list[Path]]:
-    """Read all recordings of the source.
+    """Reads all recordings of the source.
 
     Returns:
-        The layout, episodes of the wanted split, notes for the card, and the files that were read.
+        The layout, the episodes of the wanted split, notes for the card, and the files that were read.
 
     Raises:
         UserError: broken or missing files, or both layouts in one folder.
@@ -113,9 +113,9 @@ def load(config: LevelxConfig) -> tuple[Layout, list[Episode], DatasetNotes, lis
     episodes: list[Episode] = []
     for recording in progressed(chosen, "levelx"):
         stride = steps_per_frame(config.dt_s, recording.frames_per_s, f"recording {recording.name}")
-        rows = read_tracks(recording, config.features, stride)
-        counts["rows kept"] += len(rows)
-        episodes += cut_episodes(rows, config.episode_steps, f"{recording.location}/{recording.name}", counts)
+        points = read_tracks(recording, config.features, stride)
+        counts["points kept"] += len(points)
+        episodes += cut_episodes(points, config.episode_steps, f"{recording.location}/{recording.name}", counts)
     numbered = [replace(episode, seed=i) for i, episode in enumerate(episodes)]
     files = [path for r in recordings for path in (r.tracks, r.tracks_meta, r.meta)]
     return next(iter(layouts)), numbered, _notes(config, next(iter(layouts)), counts), files

@@ -1,7 +1,7 @@
 """Reads recordings in the CSV layouts of levelXData: inD, rounD, exiD (one layout) and highD (another).
 
 Three files per recording XX: `XX_tracks.csv`, `XX_tracksMeta.csv`, `XX_recordingMeta.csv`. Columns that are not used
-are not looked at. Both layouts come out alike: centre of the vehicle [m], velocity [m/s], heading, acceleration along
+are not read. Both layouts give equal columns: centre of the vehicle [m], velocity [m/s], heading, acceleration along
 and across the heading [m/s²], class.
 
 highD gives the upper left corner of a box in the image, whose y points down, and no heading: its y, vy and ay change
@@ -18,11 +18,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from predictor.data.loading import bad_line, finite, read_lines, whole
-from predictor.data.tracks import TrackRows
+from predictor.data.tracks import TrackPoints
 from predictor.support.errors import UserError
 
 Layout = Literal["centre", "corner"]
-"""inD, rounD, exiD; highD."""
+"""Column layout of a recording: "centre" is that of inD, rounD and exiD, "corner" that of highD."""
 Features = Literal["kinematic", "full"]
 
 CLASS_FEATURES = ("is_car", "is_truck_bus", "is_pedestrian", "is_bicycle")
@@ -57,17 +57,17 @@ class Recording:
     """Names and files of one recording, and what its meta file says."""
 
     name: str
-    """As in the file names, such as "00"."""
+    """Name as in the file names, such as "00"."""
     location: str
-    """Recordings of one location share a map."""
+    """Key of the location; recordings of one location share a map."""
     frames_per_s: float
     """Frame rate [Hz]."""
     tracks: Path
-    """XX_tracks.csv."""
+    """Path of XX_tracks.csv."""
     tracks_meta: Path
-    """XX_tracksMeta.csv."""
+    """Path of XX_tracksMeta.csv."""
     meta: Path
-    """XX_recordingMeta.csv."""
+    """Path of XX_recordingMeta.csv."""
 
 
 @dataclass(frozen=True)
@@ -75,13 +75,13 @@ class TrackInfo:
     """One line of tracksMeta."""
 
     kind: int
-    """Column of `CLASS_FEATURES`."""
+    """Index of the class in `CLASS_FEATURES`."""
     towards_left: bool
-    """highD: drives on the upper road, against x."""
+    """Whether the vehicle drives on the upper road, against x (highD)."""
 
 
 def open_recording(tracks: Path) -> Recording:
-    """Find the files that belong to XX_tracks.csv and read the recording's meta file.
+    """Finds the files that belong to XX_tracks.csv and reads the recording's meta file.
 
     Raises:
         UserError: a file is missing or broken.
@@ -91,21 +91,21 @@ def open_recording(tracks: Path) -> Recording:
     for path in (tracks_meta, meta):
         if not path.exists():
             raise UserError(f"{tracks} needs {path.name} beside it, which is missing; copy all three files")
-    rows = _read_meta(meta, ("frameRate", "locationId"))
-    if len(rows) != 1:
-        raise bad_line(meta, len(rows) + 1, f"expected one recording, got {len(rows)}")
-    line, row = rows[0]
-    rate = finite(row["frameRate"], "frameRate", meta, line)
+    lines = _read_meta(meta, ("frameRate", "locationId"))
+    if len(lines) != 1:
+        raise bad_line(meta, len(lines) + 1, f"expected one recording, got {len(lines)}")
+    line, values = lines[0]
+    rate = finite(values["frameRate"], "frameRate", meta, line)
     if rate <= 0:
         raise bad_line(meta, line, f"frameRate must be positive, got {rate:g}")
-    return Recording(name, row["locationId"], rate, tracks, tracks_meta, meta)
+    return Recording(name, values["locationId"], rate, tracks, tracks_meta, meta)
 
 
 def layout_of(tracks: Path) -> Layout:
-    """Which layout the header shows.
+    """Returns the layout that the header shows.
 
     Raises:
-        UserError: neither.
+        UserError: the header has neither layout.
     """
     header = _header(tracks)
     if "xCenter" in header or "trackId" in header:
@@ -121,8 +121,8 @@ def layout_of(tracks: Path) -> Layout:
     )
 
 
-def read_tracks(recording: Recording, features: Features, stride: int) -> TrackRows:
-    """States of every stride-th frame; columns as `predictor.data.levelx` names them.
+def read_tracks(recording: Recording, features: Features, stride: int) -> TrackPoints:
+    """Reads the states of every stride-th frame; columns as `predictor.data.levelx` names them.
 
     Raises:
         UserError: a missing column, a broken or repeated line, a track without meta data; names file and line.
@@ -137,17 +137,17 @@ def read_tracks(recording: Recording, features: Features, stride: int) -> TrackR
     kept = frames % stride == 0
     frames, tracks, values = frames[kept], tracks[kept], {name: column[kept] for name, column in values.items()}
     if features == "full":
-        rows = np.flatnonzero(kept)
-        for row in np.unique(tracks, return_index=True)[1].tolist():
-            if int(tracks[row]) not in info:
-                line = _line_of(path, int(rows[row]))
-                raise bad_line(path, line, f"track {tracks[row]} is not in {recording.tracks_meta.name}")
+        places = np.flatnonzero(kept)
+        for i in np.unique(tracks, return_index=True)[1].tolist():
+            if int(tracks[i]) not in info:
+                line = _line_of(path, int(places[i]))
+                raise bad_line(path, line, f"track {tracks[i]} is not in {recording.tracks_meta.name}")
     known = [info[track] for track in tracks.tolist()] if features == "full" else []
-    return TrackRows(frames // stride, tracks, _states(layout, values, known))
+    return TrackPoints(frames // stride, tracks, _states(layout, values, known))
 
 
-def _states(layout: Layout, values: dict[str, np.ndarray], known: list[TrackInfo]) -> Float[np.ndarray, "rows state"]:
-    """Kinematic columns; with `known` (one entry per row) all columns."""
+def _states(layout: Layout, values: dict[str, np.ndarray], known: list[TrackInfo]) -> Float[np.ndarray, "points state"]:
+    """Returns the kinematic columns; with `known` (one entry per point) all columns."""
     vx, vy = values["xVelocity"], values["yVelocity"]
     if layout == "centre":
         columns = [values["xCenter"], values["yCenter"], vx, vy]
@@ -171,12 +171,12 @@ def _states(layout: Layout, values: dict[str, np.ndarray], known: list[TrackInfo
 def _read_tracks_meta(path: Path, layout: Layout) -> dict[int, TrackInfo]:
     extra = ("drivingDirection",) if layout == "corner" else ()
     info = {}
-    for line, row in _read_meta(path, (_ID[layout], "class", *extra)):
-        kind = row["class"].strip().lower()
+    for line, values in _read_meta(path, (_ID[layout], "class", *extra)):
+        kind = values["class"].strip().lower()
         if kind not in CLASSES:
-            raise bad_line(path, line, f"class must be one of {', '.join(CLASSES)}, got '{row['class']}'")
-        direction = whole(row["drivingDirection"], "drivingDirection", path, line) if extra else 0
-        track = whole(row[_ID[layout]], _ID[layout], path, line)
+            raise bad_line(path, line, f"class must be one of {', '.join(CLASSES)}, got '{values['class']}'")
+        direction = whole(values["drivingDirection"], "drivingDirection", path, line) if extra else 0
+        track = whole(values[_ID[layout]], _ID[layout], path, line)
         info[track] = TrackInfo(CLASSES[kind], direction == _LEFT_DIRECTION)
     return info
 
@@ -198,19 +198,19 @@ def _check_columns(path: Path, header: list[str], names: tuple[str, ...]) -> Non
 
 
 def _read_meta(path: Path, names: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
-    """Rows of a small table with their line numbers."""
+    """Returns the lines of a small table by column name, with their line numbers."""
     _check_columns(path, _header(path), names)
     reader = csv.DictReader(read_lines(path), skipinitialspace=True)
-    rows = []
-    for row in reader:
-        if any(row.get(name) is None for name in names):
+    lines = []
+    for values in reader:
+        if any(values.get(name) is None for name in names):
             raise bad_line(path, reader.line_num, "the line has too few columns")
-        rows.append((reader.line_num, row))
-    return rows
+        lines.append((reader.line_num, values))
+    return lines
 
 
-def _read_table(path: Path, names: tuple[str, ...]) -> Float[np.ndarray, "rows columns"]:
-    """Columns of a large table of numbers: read fast, and line by line only to find what is wrong."""
+def _read_table(path: Path, names: tuple[str, ...]) -> Float[np.ndarray, "lines columns"]:
+    """Reads columns of a large table of numbers at once, and line by line only to find a fault."""
     header = _header(path)
     _check_columns(path, header, names)
     columns = [header.index(name) for name in names]
@@ -227,7 +227,7 @@ def _read_table(path: Path, names: tuple[str, ...]) -> Float[np.ndarray, "rows c
 
 
 def _find_fault(path: Path, header: list[str], names: tuple[str, ...], columns: list[int]) -> UserError:
-    """The first line of a table that is not numbers throughout."""
+    """Returns the error that names the first line of a table with something other than numbers."""
     filled = 0
     for number, text in enumerate(read_lines(path)[1:], start=2):
         words = text.split(",")
@@ -243,13 +243,13 @@ def _find_fault(path: Path, header: list[str], names: tuple[str, ...], columns: 
     return UserError(f"{path} is not a table of numbers separated by commas; get the file anew")
 
 
-def _line_of(path: Path, row: int) -> int:
-    """Line number of a row of the table; blank lines are no rows."""
+def _line_of(path: Path, place: int) -> int:
+    """Returns the line number in the file of an entry of the table; blank lines are not entries."""
     filled = [number for number, text in enumerate(read_lines(path)[1:], start=2) if text.strip()]
-    return filled[row]
+    return filled[place]
 
 
-def _whole_column(path: Path, column: Float[np.ndarray, " rows"], name: str) -> Int[np.ndarray, " rows"]:
+def _whole_column(path: Path, column: Float[np.ndarray, " lines"], name: str) -> Int[np.ndarray, " lines"]:
     with np.errstate(invalid="ignore"):  # too large for an integer: caught as not whole
         numbers = column.astype(np.int64)
     wrong = np.flatnonzero((numbers != column) | (numbers < 0))
@@ -259,7 +259,7 @@ def _whole_column(path: Path, column: Float[np.ndarray, " rows"], name: str) -> 
     return numbers
 
 
-def _check_unique(path: Path, frames: Int[np.ndarray, " rows"], tracks: Int[np.ndarray, " rows"]) -> None:
+def _check_unique(path: Path, frames: Int[np.ndarray, " lines"], tracks: Int[np.ndarray, " lines"]) -> None:
     order = np.lexsort((frames, tracks))
     again = np.flatnonzero((np.diff(tracks[order]) == 0) & (np.diff(frames[order]) == 0))
     if len(again):

@@ -1,6 +1,6 @@
-"""What the dataset loaders share: strict reading, splits by name, checksums, progress.
+"""Parts common to the dataset loaders: strict reading, splits by name, checksums, progress.
 
-A loader reads a published file format, refuses what it cannot trust with one line that names file and line number, and
+A loader reads a published file format, refuses broken input with one sentence that names file and line number, and
 writes one episode store with a data card beside it (`predictor.data.dataset_card`).
 """
 
@@ -18,9 +18,9 @@ from predictor.support.errors import UserError
 
 Split = Literal["train", "val", "test", "all"]
 SPLIT_SHARES = {"test": 0.1, "val": 0.1}
-"""What is left after these is for training."""
+"""Shares of the splits; the rest is for training."""
 NO_LIMIT_M = 1e6
-"""Perception range of scenes that nobody in particular sees [m]."""
+"""Perception range of scenes without an ego [m]."""
 
 Item = TypeVar("Item")
 
@@ -40,11 +40,11 @@ class LoaderConfig:
 
     @property
     def card_path(self) -> Path:
-        """Where the data card goes."""
+        """Path of the data card."""
         return self.out.with_name(f"{self.out.name}.md")
 
     def __post_init__(self) -> None:
-        """Check choices.
+        """Checks choices.
 
         Raises:
             UserError: an unknown split.
@@ -52,7 +52,7 @@ class LoaderConfig:
         check_choices(self)
 
     def check_paths(self) -> None:
-        """Check, before any work is done, that the source is there and nothing is in the way of the output.
+        """Checks, before any work is done, that the source is there and the output does not exist yet.
 
         Raises:
             UserError: no source, or an existing output that may not be replaced.
@@ -65,12 +65,12 @@ class LoaderConfig:
 
 
 def bad_line(path: Path, line: int, problem: str, advice: str = "repair the line or get the file anew") -> UserError:
-    """An error that names file and line."""
+    """Returns an error that names file and line."""
     return UserError(f"{path}, line {line}: {problem}; {advice}")
 
 
 def read_lines(path: Path) -> list[str]:
-    """Lines of a text file, without their ends.
+    """Reads the lines of a text file, without line ends.
 
     Raises:
         UserError: the file is not text or cannot be read.
@@ -85,10 +85,10 @@ def read_lines(path: Path) -> list[str]:
 
 
 def finite(text: str, name: str, path: Path, line: int) -> float:
-    """A finite number from text.
+    """Returns a finite number from text.
 
     Raises:
-        UserError: anything else, NaN included.
+        UserError: the text is anything else, NaN included.
     """
     try:
         value = float(text)
@@ -100,10 +100,10 @@ def finite(text: str, name: str, path: Path, line: int) -> float:
 
 
 def whole(text: str, name: str, path: Path, line: int, least: int | None = None) -> int:
-    """A whole number from text, not below `least`.
+    """Returns a whole number from text, at least `least`.
 
     Raises:
-        UserError: anything else.
+        UserError: the text is anything else.
     """
     try:
         number = int(text)
@@ -115,15 +115,15 @@ def whole(text: str, name: str, path: Path, line: int, least: int | None = None)
 
 
 def steps_per_frame(dt_s: float, frames_per_s: float, source: str) -> int:
-    """How many recorded frames make one step.
+    """Returns the number of recorded frames in one step.
 
     Args:
         dt_s: wanted time between steps [s].
         frames_per_s: rate of the recording [Hz].
-        source: what was recorded, for the message.
+        source: name of the recording, for the message.
 
     Raises:
-        UserError: not a whole number of frames.
+        UserError: a step is not a whole number of frames.
     """
     frames = dt_s * frames_per_s
     if not math.isfinite(frames) or round(frames) < 1 or abs(frames - round(frames)) > 1e-6:
@@ -135,7 +135,7 @@ def steps_per_frame(dt_s: float, frames_per_s: float, source: str) -> int:
 
 
 def split_of(name: str, seed: int) -> str:
-    """The split that a name belongs to: a hash of seed and name, so adding files moves nothing."""
+    """Returns the split of a name by a hash of seed and name, so adding files changes no other split."""
     digest = hashlib.sha256(f"{seed}:{name}".encode()).digest()
     position = int.from_bytes(digest[:8], "big") / 2**64
     for split, share in SPLIT_SHARES.items():
@@ -146,15 +146,15 @@ def split_of(name: str, seed: int) -> str:
 
 
 def in_split(name: str, split: Split, seed: int) -> bool:
-    """Whether a name belongs to the wanted split."""
+    """Returns whether a name belongs to the wanted split."""
     return split == "all" or split_of(name, seed) == split
 
 
 def find_files(source: Path, pattern: str, what: str) -> list[Path]:
-    """Files under a folder, sorted by their path; a file given as source stands for itself.
+    """Returns the files under a folder, sorted by path; a source that is a file gives that file.
 
     Raises:
-        UserError: none.
+        UserError: no file matches.
     """
     files = [source] if source.is_file() else sorted(p for p in source.glob(pattern) if p.is_file())
     if not files:
@@ -163,9 +163,9 @@ def find_files(source: Path, pattern: str, what: str) -> list[Path]:
 
 
 def checksum(root: Path, files: Iterable[Path]) -> str:
-    """SHA-256 over the files' paths (relative to `root`, sorted) and contents.
+    """Computes the SHA-256 over the files' paths (relative to `root`, sorted) and contents.
 
-    For each file the digest is fed with the path in UTF-8, a zero byte and the SHA-256 of the content.
+    For each file the digest takes the path in UTF-8, a zero byte and the SHA-256 of the content.
     """
     root = root.parent if root.is_file() else root
     total = hashlib.sha256()
@@ -177,7 +177,7 @@ def checksum(root: Path, files: Iterable[Path]) -> str:
 
 
 def progressed(items: Sequence[Item], label: str) -> Iterator[Item]:
-    """The items, with a progress bar on the terminal."""
+    """Yields the items, with a progress bar on the terminal."""
     columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns) as progress:
         yield from progress.track(items)

@@ -3,7 +3,7 @@
 Reads one subject's folder (one .asf skeleton, one .amc file per trial, 120 Hz) and gives the 31 joints as agents with
 position and velocity on three axes [m, m/s]; y is up, as in the files. One unit of the files is 0.0254 / 0.45 m (see
 `predictor.data.mocap_files`). Velocity is the backward difference over one step, so the first step of a trial is
-dropped and nothing of the future is in a state.
+dropped and no state depends on the future.
 
 Splits are by trial: the position of SHA-256("12:<trial>") in [0, 1) decides, below 0.1 test, below 0.2 validation, else
 training. Of the 23 walking trials of subject 35 that are usually used (01–16, 28–34), 35_12 and 35_34 are for testing,
@@ -26,11 +26,12 @@ from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 
 FRAMES_PER_S = 120.0
-"""Of the database."""
+"""Frame rate of the database [Hz]."""
 SPLIT_SEED = 12
-"""The first seed that gives shares near 80/10/10 on subject 35."""
+"""Seed of the split: the first one that gives shares near 80/10/10 on subject 35."""
 FEATURE_SCALES = (0.2, 0.5, 0.2, 1.0, 0.5, 1.0)
-"""About the standard deviations of subject 35 around the centroid, alike on both level axes [m, m/s]."""
+"""Scales of the states: about the standard deviations of subject 35 around the centroid, equal on both level axes
+[m, m/s]."""
 RIGHTS = (
     "CMU Graphics Lab Motion Capture Database: free for use in research, may be part of products, may not be resold "
     "directly, even converted. It asks for this acknowledgment: 'The data used in this project was obtained from "
@@ -40,7 +41,7 @@ RIGHTS = (
 
 @dataclass(frozen=True)
 class MocapConfig(LoaderConfig):
-    """Turn one subject of the CMU motion capture database into an episode store."""
+    """Turns one subject of the CMU motion capture database into an episode store."""
 
     stride: int = 4
     """Number of frames from one kept frame to the next; 4 gives 30 Hz."""
@@ -50,20 +51,20 @@ class MocapConfig(LoaderConfig):
     """Least length of an episode; shorter ones are skipped [steps]."""
 
     def __post_init__(self) -> None:
-        """Check choices and ranges.
+        """Checks choices and ranges.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value out of range.
         """
         super().__post_init__()
         check_at_least(self, 1, "stride")
         check_at_least(self, 2, "min_steps")
 
     def check_paths(self) -> None:
-        """Check the paths of every loader, and that the source is a folder.
+        """Checks the paths of every loader, and that the source is a folder.
 
         Raises:
-            UserError: one does not fit.
+            UserError: a path is missing, exists already or is not a folder.
         """
         super().check_paths()
         if not self.source.is_dir():
@@ -76,7 +77,7 @@ class MocapConfig(LoaderConfig):
 
 
 def scene_spec(config: MocapConfig, joints: int) -> SceneSpec:
-    """Layout of the states."""
+    """Returns the layout of the states."""
     return SceneSpec(
         config.dt_s,
         ("centroid", "centroid", "centroid"),
@@ -91,16 +92,16 @@ def scene_spec(config: MocapConfig, joints: int) -> SceneSpec:
 def moving_states(
     positions_m: Float[np.ndarray, "frames joints 3"], dt_s: float
 ) -> Float[np.ndarray, "frames-1 joints 6"]:
-    """Positions and backward differences; the first frame has none and is dropped."""
+    """Returns positions and backward differences; the first frame has no difference and is dropped."""
     velocities_mps = np.diff(positions_m, axis=0) / dt_s
     return np.concatenate([positions_m[1:], velocities_mps], axis=-1).astype(np.float32)
 
 
 def read_trial(path: Path, skeleton: Skeleton, config: MocapConfig) -> list[Episode]:
-    """Episodes of one trial; those shorter than `min_steps` are left out.
+    """Reads the episodes of one trial; those shorter than `min_steps` are left out.
 
     Raises:
-        UserError: broken file; names file and line.
+        UserError: the file is broken; names file and line.
     """
     positions_m = joint_positions(skeleton, read_motion(path, skeleton).values)
     episodes = []
@@ -114,7 +115,7 @@ def read_trial(path: Path, skeleton: Skeleton, config: MocapConfig) -> list[Epis
 
 
 def load(config: MocapConfig) -> tuple[Skeleton, list[Episode], DatasetNotes, list[Path]]:
-    """Read a subject's folder.
+    """Reads a subject's folder.
 
     Returns:
         The skeleton, the episodes of the wanted split, notes for the card, and the files that were read.

@@ -1,7 +1,7 @@
-"""Skeletons in Acclaim's text format (ASF): bones, how they may turn, and who hangs on whom.
+"""Reads skeletons (ASF) and motions (AMC) in Acclaim's text formats, and computes joint positions from them.
 
 Lengths are in the file's unit. Its `:units length` u means that one unit is 1/u inches; the CMU motion capture database
-publishes u = 0.45, so one unit is 0.0254 / 0.45 = 0.0564 m. Motions of a skeleton: `predictor.data.mocap_files`.
+publishes u = 0.45, so one unit is 0.0254 / 0.45 = 0.0564 m.
 """
 
 from dataclasses import dataclass
@@ -25,35 +25,35 @@ class Bone:
     """One segment; its end is a joint. The root is a bone of length zero."""
 
     name: str
-    """As in the files."""
+    """Name as in the files."""
     direction: tuple[float, float, float]
-    """Of unit length, global frame, rest pose."""
+    """Unit vector along the bone in the rest pose, global frame."""
     length: float
-    """In the file's unit."""
+    """Length in the file's unit."""
     axis_deg: tuple[float, float, float]
-    """How the local frame is turned, one angle per letter of `order`."""
+    """Rotation of the local frame [deg], one angle per letter of `order`."""
     order: str
-    """Letters X, Y, Z: which turn comes first."""
+    """Letters X, Y, Z in the order of the rotations."""
     channels: tuple[str, ...]
-    """What the motion gives for it, in this order: RX, RY, RZ, for the root TX, TY, TZ, too."""
+    """Channels in the motion file, in its order: some of RX, RY, RZ, and for the root TX, TY, TZ."""
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Joints (the root, then the end of each bone in the file's order) and who hangs on whom."""
+    """Joints (the root, then the end of each bone in the file's order) and the parent of each."""
 
     bones: tuple[Bone, ...]
-    """The root first."""
+    """Bones, the root first."""
     parents: tuple[int, ...]
     """Index of each joint's parent; -1 for the root."""
     position: tuple[float, float, float]
-    """Of the root in the rest pose, in the file's unit."""
+    """Position of the root in the rest pose, in the file's unit."""
     metres_per_unit: float
     """Length of the file's unit [m]."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """One per joint."""
+        """Names of the joints."""
         return tuple(bone.name for bone in self.bones)
 
     @property
@@ -63,7 +63,7 @@ class Skeleton:
 
     @property
     def parents_first(self) -> list[int]:
-        """Joint indices such that parents come before their children."""
+        """Indices of the joints, each parent before its children."""
         order = [0]
         for joint in order:
             order += [child for child, parent in enumerate(self.parents) if parent == joint]
@@ -71,7 +71,7 @@ class Skeleton:
 
 
 def read_skeleton(path: Path) -> Skeleton:
-    """Read an .asf file.
+    """Reads an .asf file.
 
     Raises:
         UserError: a part is missing, broken or of a kind that is not supported; names file and line.
@@ -179,7 +179,7 @@ def _read_hierarchy(path: Path, lines: list[Line], names: list[str]) -> tuple[in
             if word not in index:
                 raise bad_line(path, number, f"bone '{word}' is not in :bonedata")
         if index[words[0]] not in parents:
-            raise bad_line(path, number, f"bone '{words[0]}' must hang on a parent before it has children")
+            raise bad_line(path, number, f"bone '{words[0]}' must have a parent before it has children")
         for child in words[1:]:
             if index[child] in parents:
                 raise bad_line(path, number, f"bone '{child}' has two parents")
@@ -210,20 +210,20 @@ def _three(values: list[float]) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class Motion:
-    """Recorded channels, bone by bone in the skeleton's order."""
+    """Recorded channels of all bones, in the skeleton's order."""
 
     values: Float[np.ndarray, "time channels"]
-    """Degrees; root translations in the file's unit."""
+    """Angles [deg]; root translations in the file's unit."""
     first_frame: int
-    """Number of the first frame; trials may begin late."""
+    """Number of the first frame; a trial may begin after frame 1."""
 
 
 def read_motion(path: Path, skeleton: Skeleton) -> Motion:
-    """Read an .amc file that was recorded with the skeleton.
+    """Reads an .amc file that was recorded with the skeleton.
 
     Raises:
-        UserError: frames that are not consecutive, bones that are unknown, missing or have too few values; names file
-            and line.
+        UserError: frames are not consecutive, or bones are unknown, missing or have too few values; names file and
+            line.
     """
     columns = _columns(skeleton)
     flags: set[str] = set()
@@ -255,7 +255,7 @@ def read_motion(path: Path, skeleton: Skeleton) -> Motion:
 
 
 def _columns(skeleton: Skeleton) -> dict[str, slice]:
-    """Where the channels of each moving bone are."""
+    """Returns the columns of the channels of each moving bone."""
     columns, begin = {}, 0
     for bone in skeleton.bones:
         if bone.channels:
@@ -290,7 +290,7 @@ def _fill(
 def joint_positions(
     skeleton: Skeleton, values: Float[np.ndarray, "time channels"]
 ) -> Float[np.ndarray, "time joints 3"]:
-    """Where the joints are in each frame [m], in the axes of the files (y is up)."""
+    """Computes the positions of the joints in each frame [m], in the axes of the files (y is up)."""
     columns = _columns(skeleton)
     positions = np.zeros((len(values), len(skeleton.bones), 3))
     turns: dict[int, np.ndarray] = {}
@@ -312,7 +312,7 @@ def joint_positions(
 
 
 def rotation(angles_deg: Float[np.ndarray, "time 3"], order: str) -> Float[np.ndarray, "time 3 3"]:
-    """Turn about fixed axes, the first letter of `order` first; one angle per letter."""
+    """Computes rotations about fixed axes, the first letter of `order` first; one angle per letter."""
     total = np.broadcast_to(np.eye(3), (len(angles_deg), 3, 3))
     for angle, axis in zip(np.radians(angles_deg).T, order, strict=True):
         a, b = [(i + "XYZ".index(axis)) % 3 for i in (1, 2)]

@@ -4,7 +4,7 @@ Ball and ten players as eleven agents, always in the same order: the ball first,
 Position and velocity [m, m/s] from the middle of the court, x along it, and a column that is 1 for the ball. Formats:
 
 * `score`: one text file per possession with lines of frame, id, x, y, kind, in feet, a frame every 0.12 s;
-* `sportvu`: raw JSON of one game per file, in feet, 25 Hz; every third moment is kept, so a step is 0.12 s, too.
+* `sportvu`: raw JSON of one game per file, in feet, 25 Hz; every third moment is kept, so a step is 0.12 s as well.
 
 Velocity is the backward difference over one step, so the first frame of a passage is dropped. Passages are cut into
 non-overlapping windows of `--window-steps` steps. Splits are by game: the position of SHA-256("3:<game>") in [0, 1)
@@ -45,28 +45,28 @@ from predictor.support.errors import UserError, run_entry_point
 METRES_PER_FOOT = 0.3048
 
 COURT_FEET = (94.0, 50.0)
-"""Length and width of an NBA court; both formats count from one corner."""
+"""Length and width of an NBA court [ft]; both formats count from one corner."""
 
 ENTITIES = 11
-"""Ball and ten players."""
+"""Number of agents: the ball and ten players."""
 
 BALL_ID = 0
-"""In the store; both formats write -1, which the store keeps for padding."""
+"""Identity of the ball in the store; both formats write -1, which the store uses for padding."""
 
 DT_S = 0.12
-"""Three frames of SportVU's 25 Hz."""
+"""Time between steps [s]: three frames of SportVU's 25 Hz."""
 
 SCORE_FRAME_STEP = 12
-"""Frame numbers of the text layout count hundredths of a second."""
+"""Difference of consecutive frame numbers in the text layout, which count hundredths of a second."""
 
 SPORTVU_MS = 40
-"""Between two moments [ms]."""
+"""Time between two moments [ms]."""
 
 SPORTVU_JITTER_MS = 15
-"""A moment this much too early or late still follows the one before [ms]."""
+"""Largest deviation from `SPORTVU_MS` between two moments of one passage [ms]."""
 
 SPORTVU_STRIDE = 3
-"""Keep every third moment."""
+"""Number of moments from one kept moment to the next."""
 
 _KINDS = ("BALL", "PLAYER")
 
@@ -76,26 +76,26 @@ Entities = dict[tuple[int, int], tuple[float, float]]
 
 @dataclass(frozen=True)
 class Passage:
-    """Uninterrupted play: the same ball and ten players throughout."""
+    """Uninterrupted play with the ball and an unchanged set of ten players."""
 
     positions_m: Float[np.ndarray, "time 11 2"]
-    """From the middle of the court; x along it."""
+    """Positions from the middle of the court [m]; x along it."""
     ids: Int[np.ndarray, "11"]
-    """Ball first, then five players of each team."""
+    """Identities: ball first, then five players of each team."""
     label: str
-    """File, and for SportVU the number of the passage in it."""
+    """Name of the file, and for SportVU the number of the passage in it."""
 
 
 def court_metres(feet: Float[np.ndarray, "*shape 2"]) -> Float[np.ndarray, "*shape 2"]:
-    """From feet off a corner to metres off the middle."""
+    """Converts feet from a corner to metres from the middle."""
     return (feet - np.array(COURT_FEET) / 2) * METRES_PER_FOOT
 
 
 def read_score(path: Path) -> Passage:
-    """Read one possession: lines of frame, id, x, y, kind; eleven lines per frame, a frame every 0.12 s.
+    """Reads one possession: lines of frame, id, x, y, kind; eleven lines per frame, a frame every 0.12 s.
 
     Raises:
-        UserError: a broken line, a gap, an entity that is missing; names file and line.
+        UserError: a line is broken, or a frame or an entity is missing; names file and line.
     """
     frames: list[dict[tuple[str, int], tuple[float, float]]] = []
     current, number = 0, 0
@@ -138,27 +138,28 @@ def _score_line(path: Path, number: int, words: list[str]) -> tuple[int, tuple[s
 
 
 def _check_score_frame(path: Path, number: int, frame: int, frames: list[dict[tuple[str, int], Any]]) -> None:
-    """Check the frame that ends at line `number`."""
+    """Checks the frame that ends at line `number`."""
     present = frames[-1]
     balls = sum(kind == "BALL" for kind, _ in present)
     if len(present) != ENTITIES or balls != 1:
         players = len(present) - balls
         raise bad_line(path, number, f"frame {frame} must hold 1 ball and 10 players, got {balls} and {players}")
-    strangers = sorted(player for _, player in present.keys() - frames[0].keys())
-    if strangers:
-        raise bad_line(path, number, f"frame {frame} holds ids that the first frame does not: {strangers}")
+    unknown = sorted(player for _, player in present.keys() - frames[0].keys())
+    if unknown:
+        raise bad_line(path, number, f"frame {frame} holds ids that the first frame does not: {unknown}")
 
 
 def read_sportvu(path: Path) -> tuple[list[Passage], Counter[str]]:
-    """Read one game of raw SportVU JSON; cut where play is interrupted; keep every third moment.
+    """Reads one game of raw SportVU JSON, cuts it where play is interrupted and keeps every third moment.
 
-    Events overlap: a moment that an earlier event held already is dropped.
+    Events overlap: a moment that an earlier event holds already is dropped.
 
     Returns:
-        The passages, and how many moments were read and dropped.
+        The passages, and the numbers of moments read and dropped.
 
     Raises:
-        UserError: no JSON of this layout, or a number that is not finite; names file and line, or event and moment.
+        UserError: the file is not JSON of this layout or a number is not finite; names file and line, or event
+            and moment.
     """
     counts: Counter[str] = Counter()
     moments: dict[int, tuple[int, Entities]] = {}
@@ -183,7 +184,7 @@ def read_sportvu(path: Path) -> tuple[list[Passage], Counter[str]]:
 
 
 def _moments(path: Path) -> Iterator[tuple[str, Any]]:
-    """Every moment of a file, with its place."""
+    """Yields all moments of a file, each with its path in the JSON."""
     content = _read_json(path)
     events = content.get("events") if isinstance(content, dict) else None
     if not isinstance(events, list):
@@ -211,10 +212,10 @@ def _read_json(path: Path) -> Any:
 
 
 def _moment(path: Path, where: str, moment: Any) -> tuple[int, int, Entities]:
-    """Time [ms], quarter, and position [feet] by team and player."""
+    """Returns time [ms], quarter, and positions [ft] by team and player."""
     try:
-        quarter, time_ms, rows = int(moment[0]), int(moment[1]), moment[5]
-        entities = {(int(row[0]), int(row[1])): (float(row[2]), float(row[3])) for row in rows}
+        quarter, time_ms, points = int(moment[0]), int(moment[1]), moment[5]
+        entities = {(int(point[0]), int(point[1])): (float(point[2]), float(point[3])) for point in points}
     except (TypeError, ValueError, IndexError, KeyError) as error:
         raise UserError(
             f"{path}, {where}: expected [quarter, ms, clock, shot clock, null, [[team, player, x, y, z], …]], "
@@ -228,7 +229,7 @@ def _moment(path: Path, where: str, moment: Any) -> tuple[int, int, Entities]:
 
 
 def _uninterrupted(moments: dict[int, tuple[int, Entities]]) -> Iterator[list[int]]:
-    """Times of moments that follow each other in one quarter with the same players."""
+    """Yields the times [ms] of consecutive moments in one quarter with unchanged players, passage by passage."""
     passage: list[int] = []
     for time_ms in sorted(moments):
         if passage:
@@ -243,12 +244,12 @@ def _uninterrupted(moments: dict[int, tuple[int, Entities]]) -> Iterator[list[in
 
 
 SPLIT_SEED = 3
-"""Any number would do: there are hundreds of games."""
+"""Seed of the split; any number would do, since there are hundreds of games."""
 
 FEATURES = (*KINEMATIC_FEATURES, "is_ball")
 
 FEATURE_SCALES = (8.0, 4.0, 2.0, 2.0, 1.0)
-"""About the standard deviations of the text files' training folder [m, m/s]."""
+"""Scales of the states: about the standard deviations of the text files' training folder [m, m/s]."""
 
 PATTERNS = {"score": "*.txt", "sportvu": "*.json"}
 RIGHTS = (
@@ -260,7 +261,7 @@ RIGHTS = (
 
 @dataclass(frozen=True)
 class NbaConfig(LoaderConfig):
-    """Turn basketball tracking data into an episode store."""
+    """Turns basketball tracking data into an episode store."""
 
     format: Literal["score", "sportvu"] = "score"
     """Format of the files: score (text files of possessions) or sportvu (raw JSON of games)."""
@@ -270,17 +271,17 @@ class NbaConfig(LoaderConfig):
     """Leave broken files out and count them, instead of stopping at the first."""
 
     def __post_init__(self) -> None:
-        """Check choices and ranges.
+        """Checks choices and ranges.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value out of range.
         """
         super().__post_init__()
         check_at_least(self, 2, "episode_steps")
 
 
 def scene_spec() -> SceneSpec:
-    """Layout of the states."""
+    """Returns the layout of the states."""
     return SceneSpec(
         DT_S,
         ("world", "world"),
@@ -293,12 +294,12 @@ def scene_spec() -> SceneSpec:
 
 
 def game_of(path: Path, format: str) -> str:
-    """The game a file belongs to: text files are named HOME_VISITOR_GAME_QUARTER_START_END."""
+    """Returns the game of a file; text files are named HOME_VISITOR_GAME_QUARTER_START_END."""
     return "_".join(path.stem.split("_")[:3]) if format == "score" else path.stem
 
 
 def windows_of(passage: Passage, window_steps: int) -> list[Episode]:
-    """Non-overlapping windows; the first frame of the passage serves for the first velocity only."""
+    """Cuts windows that do not overlap; the first frame of the passage is used for the first velocity only."""
     velocities_mps = np.diff(passage.positions_m, axis=0) / DT_S
     is_ball = np.zeros((*velocities_mps.shape[:2], 1))
     is_ball[:, 0] = 1.0
@@ -311,13 +312,13 @@ def windows_of(passage: Passage, window_steps: int) -> list[Episode]:
 
 
 def load(config: NbaConfig) -> tuple[list[Episode], DatasetNotes, list[Path]]:
-    """Read all files of the source.
+    """Reads all files of the source.
 
     Returns:
         Episodes of the wanted split, notes for the card, and the files that were read.
 
     Raises:
-        UserError: a broken file, unless `skip_broken`.
+        UserError: a file is broken, unless `skip_broken`.
     """
     files = find_files(config.source, PATTERNS[config.format], f"files of format '{config.format}'")
     chosen = [path for path in files if in_split(game_of(path, config.format), config.split, SPLIT_SEED)]

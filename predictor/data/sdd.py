@@ -1,13 +1,13 @@
 """Stanford Drone Dataset as an episode store: `python -m predictor.data.sdd --source SDD --out data/sdd`.
 
 Reads `<scene>/<video>/annotations.txt` (track, xmin, ymin, xmax, ymax, frame, lost, occluded, generated, "label";
-pixels, 30 Hz) and `estimated_scales.yaml` (metres per pixel). An agent is where its box's centre is; x to the right and
-y down, as in the image. The number of agents varies from step to step.
+pixels, 30 Hz) and `estimated_scales.yaml` (metres per pixel). The position of an agent is the centre of its box; x to
+the right and y down, as in the image. The number of agents varies from step to step.
 
-States: position and velocity [m, m/s], and three columns of which one is 1: pedestrian; biker (skateboarders, too:
+States: position and velocity [m, m/s], and three columns of which one is 1: pedestrian; biker (also skateboarders:
 small wheels, no engine, faster than people on foot); vehicle (cars, buses, golf carts).
 
-Rows that are marked lost are dropped. Every 12th frame is kept (0.4 s). Velocity is the backward difference over one
+Lines that are marked lost are dropped. Every 12th frame is kept (0.4 s). Velocity is the backward difference over one
 step, so a track's first step is dropped, and the first after a gap. Splits are by video: the position of
 SHA-256("405:<scene>/<video>") in [0, 1) decides, below 0.1 test, below 0.2 validation, else training.
 """
@@ -32,23 +32,23 @@ from predictor.data.loading import (
     whole,
 )
 from predictor.data.store import Episode
-from predictor.data.tracks import TrackRows, cut_episodes, with_velocities
+from predictor.data.tracks import TrackPoints, cut_episodes, with_velocities
 from predictor.scene import KINEMATIC_FEATURES, SceneSpec
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 
 FRAMES_PER_S = 30.0
-"""Of the videos."""
+"""Frame rate of the videos [Hz]."""
 SPLIT_SEED = 405
-"""Gives shares near 80/10/10 of all 60 videos, and several scenes to validation and test."""
+"""Seed of the split: gives shares near 80/10/10 of all 60 videos, and several scenes in validation and test."""
 CLASSES = {"Pedestrian": 0, "Biker": 1, "Skater": 1, "Cart": 2, "Car": 2, "Bus": 2}
-"""Label → column after the kinematic ones."""
+"""Class by label: index of its column after the kinematic ones."""
 FEATURES = (*KINEMATIC_FEATURES, "is_pedestrian", "is_biker", "is_vehicle")
 FEATURE_SCALES = (15.0, 15.0, 1.5, 1.5, 1.0, 1.0, 1.0)
-"""About the standard deviations around the centroid [m, m/s]."""
+"""Scales of the states: about the standard deviations around the centroid [m, m/s]."""
 MAX_AGENTS = 128
-"""At least; more where a store has more at once."""
+"""Least `max_agents` of a store; larger where more agents are present at once."""
 SCALES_FILE = "estimated_scales.yaml"
 RIGHTS = (
     "Creative Commons Attribution-NonCommercial-ShareAlike 3.0 (CC BY-NC-SA 3.0). Cite Robicquet, Sadeghian, Alahi, "
@@ -59,7 +59,7 @@ RIGHTS = (
 
 @dataclass(frozen=True)
 class SddConfig(LoaderConfig):
-    """Turn the annotations of the Stanford Drone Dataset into an episode store."""
+    """Turns the annotations of the Stanford Drone Dataset into an episode store."""
 
     dt_s: float = 0.4
     """Time between steps [s]; whole frames of 1/30 s. 0.4 is customary for this dataset."""
@@ -67,10 +67,10 @@ class SddConfig(LoaderConfig):
     """Length of the episodes into which videos are cut [steps]."""
 
     def __post_init__(self) -> None:
-        """Check choices and ranges.
+        """Checks choices and ranges.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value out of range.
         """
         super().__post_init__()
         steps_per_frame(self.dt_s, FRAMES_PER_S, "the dataset")
@@ -78,7 +78,7 @@ class SddConfig(LoaderConfig):
 
 
 def scene_spec(dt_s: float, agents: int = 0) -> SceneSpec:
-    """Layout of the states."""
+    """Returns the layout of the states."""
     return SceneSpec(
         dt_s,
         ("centroid", "centroid"),
@@ -91,12 +91,12 @@ def scene_spec(dt_s: float, agents: int = 0) -> SceneSpec:
 
 
 def read_scales(path: Path) -> dict[str, float]:
-    """Metres per pixel by "scene/video".
+    """Reads metres per pixel by "scene/video".
 
     The file has three levels of indentation (scene, video, `scale` and `certainty`); nothing else of YAML is read.
 
     Raises:
-        UserError: any other line, or a scale that is not positive; names file and line.
+        UserError: a line of another kind, or a scale that is not positive; names file and line.
     """
     scales: dict[str, float] = {}
     scene, video = "", ""
@@ -122,11 +122,11 @@ def read_scales(path: Path) -> dict[str, float]:
     return scales
 
 
-def read_annotations(path: Path, scale: float, config: SddConfig, counts: Counter[str]) -> TrackRows:
-    """Rows of one video: states are in metres, at whole steps, lost rows left out.
+def read_annotations(path: Path, scale: float, config: SddConfig, counts: Counter[str]) -> TrackPoints:
+    """Reads the points of one video: states in metres, at whole steps, without lost points.
 
     Raises:
-        UserError: a broken line or one that repeats a track and frame; names file and line.
+        UserError: a line is broken or repeats a track and frame; names file and line.
     """
     stride = steps_per_frame(config.dt_s, FRAMES_PER_S, "the dataset")
     steps, tracks, positions, classes = [], [], [], []
@@ -135,30 +135,30 @@ def read_annotations(path: Path, scale: float, config: SddConfig, counts: Counte
         words = text.split()
         if not words:
             continue
-        track, frame, centre, lost, kind = _row(path, number, words)
-        counts["rows read"] += 1
+        track, frame, centre, lost, kind = _read_line(path, number, words)
+        counts["lines read"] += 1
         if seen.setdefault((track, frame), number) != number:
             first = seen[track, frame]
             raise bad_line(path, number, f"track {track} has frame {frame} in line {first} already")
         if lost:
-            counts["rows dropped: lost"] += 1
+            counts["lines dropped: lost"] += 1
         elif frame % stride:
-            counts["rows dropped: between steps"] += 1
+            counts["lines dropped: between steps"] += 1
         else:
             steps.append(frame // stride)
             tracks.append(track)
             positions.append(centre)
             classes.append(kind)
     centres_m = np.array(positions).reshape(-1, 2) * scale
-    rows = TrackRows(np.array(steps, dtype=np.int64), np.array(tracks, dtype=np.int64), centres_m)
-    moving, velocities_mps, origin = with_velocities(rows, config.dt_s)
-    counts["rows dropped: no velocity (first of a track or after a gap)"] += len(rows) - len(moving)
+    points = TrackPoints(np.array(steps, dtype=np.int64), np.array(tracks, dtype=np.int64), centres_m)
+    moving, velocities_mps, origin = with_velocities(points, config.dt_s)
+    counts["lines dropped: no velocity (first of a track or after a gap)"] += len(points) - len(moving)
     one_hot = np.eye(3)[np.array(classes, dtype=np.int64)[origin]]
-    return TrackRows(moving.steps, moving.tracks, np.concatenate([moving.states, velocities_mps, one_hot], axis=-1))
+    return TrackPoints(moving.steps, moving.tracks, np.concatenate([moving.states, velocities_mps, one_hot], axis=-1))
 
 
-def _row(path: Path, number: int, words: list[str]) -> tuple[int, int, tuple[float, float], bool, int]:
-    """Track, frame, centre of the box [pixels], whether it is lost, class."""
+def _read_line(path: Path, number: int, words: list[str]) -> tuple[int, int, tuple[float, float], bool, int]:
+    """Returns track, frame, centre of the box [pixels], whether it is lost, and class."""
     if len(words) != 10:
         raise bad_line(path, number, f"expected 10 columns, got {len(words)}")
     left, top, right, bottom = (
@@ -176,7 +176,7 @@ def _row(path: Path, number: int, words: list[str]) -> tuple[int, int, tuple[flo
 
 
 def load(config: SddConfig) -> tuple[list[Episode], DatasetNotes, list[Path]]:
-    """Read all videos of the source.
+    """Reads all videos of the source.
 
     Returns:
         Episodes of the wanted split, notes for the card, and the files that were read.
@@ -197,8 +197,8 @@ def load(config: SddConfig) -> tuple[list[Episode], DatasetNotes, list[Path]]:
     counts: Counter[str] = Counter({"videos": len(files), f"videos of split '{config.split}'": len(chosen)})
     episodes: list[Episode] = []
     for path in progressed(chosen, "sdd"):
-        rows = read_annotations(path, scales[names[path]], config, counts)
-        episodes += cut_episodes(rows, config.episode_steps, names[path], counts)
+        points = read_annotations(path, scales[names[path]], config, counts)
+        episodes += cut_episodes(points, config.episode_steps, names[path], counts)
     numbered = [replace(episode, seed=i) for i, episode in enumerate(episodes)]
     return numbered, _notes(config, counts), [scales_path, *files]
 
@@ -212,7 +212,7 @@ def _notes(config: SddConfig, counts: Counter[str]) -> DatasetNotes:
         (
             "Centre of the box in pixels times the video's estimated scale; x to the right, y down.",
             f"A step is {config.dt_s:g} s: every {steps_per_frame(config.dt_s, FRAMES_PER_S, '')}th frame is kept.",
-            "Rows marked lost are dropped; occluded and interpolated ones are kept.",
+            "Lines marked lost are dropped; occluded and interpolated ones are kept.",
             "Velocity is the backward difference over one step; a track's first step is dropped, and the first after "
             "a gap.",
             "Skaters count as bikers; cars, buses and carts as vehicles.",

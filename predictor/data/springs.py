@@ -1,4 +1,4 @@
-"""k-Spring (paper Sec. V-B): particles in a box, some pairs joined by springs of different stiffness; and charges.
+"""Simulates k-Spring (paper Sec. V-B): particles in a box, some pairs joined by springs, or charged particles.
 
 `python -m predictor.data.springs --out data/springs` writes train, val, test and ood stores with the true graph and
 spring constants. F_ij = −k (r_i − r_j) for joined pairs, elastic walls. Where the paper is silent (box, initial spread,
@@ -54,10 +54,10 @@ class Physics:
     """Least distance of two charges in the force law, in place of NRI's cap on the force."""
 
     def __post_init__(self) -> None:
-        """Check choices and ranges.
+        """Checks choices and ranges.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value out of range.
         """
         check_choices(self)
         check_positive(self, "num_agents", "box_m", "position_std_m", "speed_mps", "dt_s", "substeps", "softening_m")
@@ -66,7 +66,7 @@ class Physics:
 
 @dataclass(frozen=True)
 class SpringsConfig:
-    """Simulate the k-Spring dataset (or charged particles) into train/, val/, test/ and ood/ under one folder."""
+    """Simulates the k-Spring dataset (or charged particles) into train/, val/, test/ and ood/ under one folder."""
 
     out: Path
     """Folder for the four stores."""
@@ -88,10 +88,10 @@ class SpringsConfig:
     """Constants of the simulated box."""
 
     def __post_init__(self) -> None:
-        """Check ranges.
+        """Checks ranges.
 
         Raises:
-            UserError: a value that makes no sense.
+            UserError: a value out of range.
         """
         check_at_least(self, 0, "train", "val", "test", "ood", "seed")
         if not 0 <= self.edge_probability <= 1:
@@ -101,7 +101,7 @@ class SpringsConfig:
 def draw_springs(
     count: int, agents: int, probability: float, generator: torch.Generator, constants: tuple[float, ...] = ()
 ) -> Float[Tensor, "count agents agents"]:
-    """Symmetric spring constants, 0 where there is no spring; k ~ U(0.5, 2), or one of `constants`."""
+    """Draws symmetric spring constants, 0 where there is no spring; k ~ U(0.5, 2), or one of `constants`."""
     shape = (count, agents, agents)
     joined = torch.rand(shape, generator=generator) < probability
     if constants:
@@ -116,7 +116,7 @@ def draw_springs(
 def draw_charges(
     count: int, agents: int, strength: float, generator: torch.Generator
 ) -> Float[Tensor, "count agents agents"]:
-    """Products of random charges ±1, times the strength; positive repels."""
+    """Draws products of random charges ±1, times the strength; a positive one repels."""
     charge = torch.randint(2, (count, agents), generator=generator) * 2.0 - 1.0
     products = strength * charge[:, :, None] * charge[:, None, :]
     return products * (1 - torch.eye(agents))
@@ -125,7 +125,7 @@ def draw_charges(
 def draw_start(
     count: int, physics: Physics, generator: torch.Generator
 ) -> tuple[Float[Tensor, "count agents 2"], Float[Tensor, "count agents 2"]]:
-    """Initial positions [m] and velocities [m/s]."""
+    """Draws initial positions [m] and velocities [m/s]."""
     shape = (count, physics.num_agents, 2)
     positions = physics.position_std_m * torch.randn(shape, generator=generator)
     velocities = torch.randn(shape, generator=generator)
@@ -139,13 +139,13 @@ def simulate(
     positions: Float[Tensor, "count agents 2"],
     velocities: Float[Tensor, "count agents 2"],
 ) -> Float[Tensor, "count frames agents 4"]:
-    """Roll the box out: positions [m] and velocities [m/s] at every frame, the given ones first.
+    """Computes positions [m] and velocities [m/s] at every frame, the given ones first.
 
     Args:
-        physics: constants.
+        physics: constants of the box.
         couplings: spring constants [N/m at unit mass], or charge products.
-        positions: initial [m], float64.
-        velocities: initial [m/s], float64.
+        positions: initial positions [m], float64.
+        velocities: initial velocities [m/s], float64.
     """
     couplings = couplings.double()
     substeps = physics.substeps * (1 if physics.kind == "springs" else 4)
@@ -164,7 +164,7 @@ def simulate(
         for substep in range(substeps):
             positions = positions + velocities * step_s
             positions, velocities = _reflect(positions, velocities, physics.box_m)
-            # Two half kicks in a row are one whole kick.
+            # Two consecutive half kicks are one whole kick.
             velocities = kicked(velocities, 1.0 if substep < substeps - 1 else 0.5)
         frames.append(torch.cat([positions, velocities], dim=-1))
     return torch.stack(frames, dim=1)
@@ -173,7 +173,7 @@ def simulate(
 def energy(
     couplings: Float[Tensor, "count agents agents"], states: Float[Tensor, "count frames agents 4"]
 ) -> Float[Tensor, "count frames"]:
-    """Kinetic and elastic energy of springs [J at unit mass]."""
+    """Computes kinetic plus elastic energy of springs [J at unit mass]."""
     kinetic = 0.5 * states[..., 2:].square().sum((-1, -2))
     distance = states[..., None, :2] - states[..., None, :, :2]
     elastic = 0.25 * (couplings.double()[:, None] * distance.square().sum(-1)).sum((-1, -2))
@@ -195,7 +195,7 @@ def _reflect(positions: Tensor, velocities: Tensor, box_m: float) -> tuple[Tenso
 
 
 def make_episodes(config: SpringsConfig, split: str, count: int) -> list[Episode]:
-    """Simulate one split."""
+    """Simulates one split."""
     physics = config.physics
     stream = ("train", "val", "test", "ood").index(split)
     generator = torch.Generator().manual_seed(int(np.random.default_rng([config.seed, stream]).integers(2**62)))
@@ -222,7 +222,7 @@ def make_episodes(config: SpringsConfig, split: str, count: int) -> list[Episode
 
 
 def spring_spec(physics: Physics) -> SceneSpec:
-    """World frame, since the walls are in it; scales bring positions and velocities to order one."""
+    """Returns the layout of the states: world frame, since the walls stand in it; scales of order one."""
     return SceneSpec(
         physics.dt_s,
         feature_scales=(1.0, 1.0, 1.0, 1.0),
@@ -233,7 +233,7 @@ def spring_spec(physics: Physics) -> SceneSpec:
 
 
 def make(config: SpringsConfig) -> dict[str, float]:
-    """Simulate and write every split that has rollouts; returns the seconds each took."""
+    """Simulates and writes every split that has rollouts; returns the time of each [s]."""
     took: dict[str, float] = {}
     attribute = "spring_constant" if config.physics.kind == "springs" else "charge_product"
     made = provenance(("torch", "numpy", "zarr"))

@@ -1,8 +1,8 @@
 """The episode store: ragged episodes of scenes in one Zarr group, written once, atomically.
 
-Within an episode an agent keeps its column from its first step to its last, so a window is a plain slice; agents that
-are absent have `valid=False`. All agents of the simulator are stored; what an ego could see of them is decided when
-windows are cut (`predictor.data.windows`).
+Within an episode an agent keeps its column from its first step to its last, so a window is a slice; absent agents have
+`valid=False`. All agents of the simulator are stored; which of them the ego perceives is decided when windows are cut
+(`predictor.data.windows`).
 """
 
 import json
@@ -29,23 +29,23 @@ class Episode:
     """One episode with every agent that ever appeared; column 0 is the ego where there is one."""
 
     states: Float[np.ndarray, "time agents state"]
-    """World frame, SI units, float32; zeros where not valid."""
+    """States, world frame, SI units, float32; zeros where not valid."""
     valid: Bool[np.ndarray, "time agents"]
-    """Who is present when."""
+    """Whether the agent is present at the step."""
     ids: Int[np.ndarray, " agents"]
-    """Identity of each column."""
+    """Identity of the agent in each column."""
     label: str = ""
-    """How the ego was driven, or any other tag."""
+    """Name of the ego's driver, or any other tag."""
     seed: int = 0
-    """The seed that reproduces the episode."""
+    """Seed that reproduces the episode."""
     edge_types: Int[np.ndarray, "label_time agents agents"] | None = None
-    """True type of each edge, receiver first, where known; -1 where not. One step if it never changes."""
+    """True type of each edge, receiver first; -1 where unknown. One step if it never changes."""
     edge_attributes: Float[np.ndarray, "label_time agents agents attributes"] | None = None
     """Known properties of each edge (a spring's constant), named in `StoreInfo`; one step if they never change."""
 
     @staticmethod
     def from_scenes(scenes: Sequence[Scene], label: str = "", seed: int = 0) -> "Episode":
-        """Join scenes by identity; each id gets one column, in order of appearance."""
+        """Joins scenes by identity; each id gets one column, in order of appearance."""
         column: dict[int, int] = {}
         for scene in scenes:
             for agent in scene.ids[scene.valid]:
@@ -61,37 +61,37 @@ class Episode:
 
 @dataclass(frozen=True)
 class StoreInfo:
-    """What a store holds and how it was made."""
+    """Content and provenance of a store."""
 
     spec: SceneSpec
-    """Layout of the states; the frame is the reader's suggestion."""
+    """Layout of the states; its frame is the default of the reader that recorded them."""
     source: str
-    """What was recorded: an env id or a dataset's name."""
+    """Env id or dataset name of the recording."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Command, versions, commit, seeds."""
     edge_attribute_names: tuple[str, ...] = ()
-    """Columns of the episodes' `edge_attributes`."""
+    """Names of the columns of the episodes' `edge_attributes`."""
     num_steps: int = 0
-    """Scenes over all episodes; filled in when a store is read."""
+    """Number of scenes over all episodes; set when a store is read."""
 
 
 @dataclass(frozen=True)
 class EpisodeStore:
-    """A store in memory."""
+    """Store in memory."""
 
     info: StoreInfo
-    """What it holds."""
+    """Content and provenance."""
     episodes: list[Episode]
-    """In the order of their seeds."""
+    """Episodes in the order in which they were written."""
 
     @property
     def num_steps(self) -> int:
-        """Scenes over all episodes."""
+        """Number of scenes over all episodes."""
         return sum(len(e.states) for e in self.episodes)
 
 
 def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwrite: bool = False) -> None:
-    """Write a store; nothing appears under `path` until it is complete.
+    """Writes a store; nothing appears under `path` until it is complete.
 
     Raises:
         UserError: no episodes, non-finite states, or `path` exists and `overwrite` is not set.
@@ -113,9 +113,9 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
     valid = np.zeros((starts[-1], columns), dtype=np.bool_)
     ids = np.full((len(episodes), columns), PADDING_ID, dtype=np.int64)
     for i, episode in enumerate(episodes):
-        rows = slice(starts[i], starts[i + 1])
-        states[rows, : episode.states.shape[1]] = episode.states
-        valid[rows, : episode.states.shape[1]] = episode.valid
+        steps = slice(starts[i], starts[i + 1])
+        states[steps, : episode.states.shape[1]] = episode.states
+        valid[steps, : episode.states.shape[1]] = episode.valid
         ids[i, : len(episode.ids)] = episode.ids
     with new_folder(path) as partial:
         group = zarr.open_group(partial, mode="w")
@@ -142,10 +142,10 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
 
 
 def read_store(path: Path) -> EpisodeStore:
-    """Read a whole store into memory.
+    """Reads a whole store into memory.
 
     Raises:
-        UserError: the path holds no store, one of another version, or non-finite states.
+        UserError: the path holds no store, a store of another version, or non-finite states.
     """
     path = Path(path)
     if not path.exists():
@@ -188,7 +188,7 @@ def read_store(path: Path) -> EpisodeStore:
 
 
 def read_info_of(path: Path) -> StoreInfo:
-    """What a store holds and how it was made, without reading its arrays.
+    """Reads content and provenance of a store, without its arrays.
 
     Raises:
         UserError: the path holds no store.
@@ -208,7 +208,7 @@ def _info(attrs: dict[str, Any], num_steps: int) -> StoreInfo:
 
 
 def _padded_labels(episodes: Sequence[Episode], columns: int, where: str) -> dict[str, np.ndarray]:
-    """The episodes' edge labels end to end, with where each begins; nothing if they have none."""
+    """Returns the edge labels of all episodes end to end, and where each episode begins; empty without labels."""
     given = {name: [getattr(e, name) for e in episodes] for name in EDGE_LABELS}
     given = {name: labels for name, labels in given.items() if any(x is not None for x in labels)}
     if not given:
@@ -237,8 +237,8 @@ def _labels_of(
 ) -> dict[str, np.ndarray]:
     if starts is None:
         return {}
-    rows = slice(starts[episode], starts[episode + 1])
-    return {name: labels[rows][:, present][:, :, present] for name, labels in edge_labels.items()}
+    steps = slice(starts[episode], starts[episode + 1])
+    return {name: labels[steps][:, present][:, :, present] for name, labels in edge_labels.items()}
 
 
 def _check_finite(episode: Episode, where: str) -> None:

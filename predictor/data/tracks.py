@@ -1,4 +1,4 @@
-"""From rows of (step, track, state) to episodes: for recordings in which agents come and go."""
+"""Cuts points (step, track, state) of a recording into episodes; agents may appear and disappear."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -10,57 +10,57 @@ from predictor.data.store import Episode
 
 
 @dataclass(frozen=True)
-class TrackRows:
-    """One row per track and step of a recording, in any order; no pair of step and track occurs twice."""
+class TrackPoints:
+    """Points of a recording, one per track and step, in any order; no pair of step and track occurs twice."""
 
-    steps: Int[np.ndarray, " rows"]
-    """Time, counted in steps from anywhere."""
-    tracks: Int[np.ndarray, " rows"]
-    """Identity within the recording."""
-    states: Float[np.ndarray, "rows state"]
-    """SI units."""
+    steps: Int[np.ndarray, " points"]
+    """Number of the step, counted from any origin."""
+    tracks: Int[np.ndarray, " points"]
+    """Identity of the agent within the recording."""
+    states: Float[np.ndarray, "points state"]
+    """State of the agent, SI units."""
 
     def __len__(self) -> int:
-        """Number of rows."""
+        """Returns the number of points."""
         return len(self.steps)
 
-    def where(self, keep: Bool[np.ndarray, " rows"]) -> "TrackRows":
-        """The rows to keep."""
-        return TrackRows(self.steps[keep], self.tracks[keep], self.states[keep])
+    def where(self, keep: Bool[np.ndarray, " points"]) -> "TrackPoints":
+        """Returns the points to keep."""
+        return TrackPoints(self.steps[keep], self.tracks[keep], self.states[keep])
 
 
 def with_velocities(
-    positions: TrackRows, dt_s: float
-) -> tuple[TrackRows, Float[np.ndarray, "moving 2"], Int[np.ndarray, " moving"]]:
-    """Rows whose track was present one step before, with the backward difference as their velocity.
+    positions: TrackPoints, dt_s: float
+) -> tuple[TrackPoints, Float[np.ndarray, "moving 2"], Int[np.ndarray, " moving"]]:
+    """Returns the points whose track was present one step before, with the backward difference as their velocity.
 
-    A track's first row has no velocity, nor has the first after a gap: both are left out, rather than made up.
+    The first point of a track and the first after a gap have no velocity and are left out.
 
     Args:
         positions: states are positions [m].
         dt_s: time between steps [s].
 
     Returns:
-        The rows that are kept, sorted by track and step; their velocities [m/s]; which of the given rows they are.
+        The points that are kept, sorted by track and step; their velocities [m/s]; their places among the given points.
     """
     order = np.lexsort((positions.steps, positions.tracks))
     steps, tracks, states = positions.steps[order], positions.tracks[order], positions.states[order]
     follows = np.flatnonzero((np.diff(tracks) == 0) & (np.diff(steps) == 1)) + 1
     velocities_mps = (states[follows] - states[follows - 1]) / dt_s
-    return TrackRows(steps[follows], tracks[follows], states[follows]), velocities_mps, order[follows]
+    return TrackPoints(steps[follows], tracks[follows], states[follows]), velocities_mps, order[follows]
 
 
-def cut_episodes(rows: TrackRows, episode_steps: int, label: str, counts: Counter[str]) -> list[Episode]:
-    """Cut a recording into episodes that do not overlap, from its first step with an agent to its last.
+def cut_episodes(points: TrackPoints, episode_steps: int, label: str, counts: Counter[str]) -> list[Episode]:
+    """Cuts a recording into episodes that do not overlap, from its first step with an agent to its last.
 
-    Within an episode each track has a column; steps without any agent stay, all invalid. The last episode may be
-    shorter. Left out and counted are episodes without any agent and those of one step.
+    Within an episode each track has a column; steps without any agent are kept, all invalid. The last episode may be
+    shorter. Episodes without any agent and those of one step are left out and counted.
     """
     episodes = []
-    first, last = (int(rows.steps.min()), int(rows.steps.max())) if len(rows) else (0, -1)
+    first, last = (int(points.steps.min()), int(points.steps.max())) if len(points) else (0, -1)
     for begin in range(first, last + 1, episode_steps):
         length = min(episode_steps, last + 1 - begin)
-        inside = rows.where((rows.steps >= begin) & (rows.steps < begin + length))
+        inside = points.where((points.steps >= begin) & (points.steps < begin + length))
         if not len(inside):
             counts["episodes left out: no agent"] += 1
         elif length < 2:
@@ -70,10 +70,10 @@ def cut_episodes(rows: TrackRows, episode_steps: int, label: str, counts: Counte
     return episodes
 
 
-def _episode(rows: TrackRows, begin: int, length: int, label: str) -> Episode:
-    ids, columns = np.unique(rows.tracks, return_inverse=True)
-    states = np.zeros((length, len(ids), rows.states.shape[1]), dtype=np.float32)
+def _episode(points: TrackPoints, begin: int, length: int, label: str) -> Episode:
+    ids, columns = np.unique(points.tracks, return_inverse=True)
+    states = np.zeros((length, len(ids), points.states.shape[1]), dtype=np.float32)
     valid = np.zeros((length, len(ids)), dtype=np.bool_)
-    states[rows.steps - begin, columns] = rows.states
-    valid[rows.steps - begin, columns] = True
+    states[points.steps - begin, columns] = points.states
+    valid[points.steps - begin, columns] = True
     return Episode(states, valid, ids.astype(np.int64), label)

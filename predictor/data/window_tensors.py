@@ -1,7 +1,7 @@
-"""Episodes end to end in flat tensors, and windows cut from them by index arithmetic alone.
+"""Keeps episodes end to end in flat tensors and cuts windows from them by index arithmetic alone.
 
 No loop runs over windows, and nothing is read back: where the caller gives the sizes, every shape is known beforehand,
-so the same code cuts windows on a CPU and on an accelerator. `predictor.data.windows` says what a window is;
+so the same code cuts windows on a CPU and on an accelerator. `predictor.data.windows` defines a window;
 `predictor.data.device_windows` keeps windows on a device.
 """
 
@@ -19,7 +19,7 @@ from predictor.graph import pair_mask
 UNKNOWN_TYPE = -1
 """Edge type where none is known."""
 _VISIBLE_NOW, _EGO = 1000, 1_000_000
-"""Weights that put who is visible now in front of who was visible before, and the ego in front of everyone."""
+"""Weights that sort agents visible now before those visible earlier, and the ego before all agents."""
 
 
 @dataclass(frozen=True)
@@ -27,18 +27,18 @@ class FlatLabels:
     """Edge labels of all episodes, end to end.
 
     Entry (step, receiver, sender) of an episode with `a` columns lies at first + (step · a + receiver) · a + sender.
-    The last entry says that nothing is known.
+    The last entry means unknown.
     """
 
     values: Tensor
-    """One entry per pair and labelled step, [entries] or [entries, attributes]."""
+    """Labels, one entry per pair and labelled step, [entries] or [entries, attributes]."""
     first: Int[Tensor, " episodes"]
-    """Where each episode begins."""
+    """Index of the first entry of each episode."""
     fixed: Bool[Tensor, " episodes"]
-    """Which episodes have one label for all their steps."""
+    """Whether an episode has one label for all its steps."""
 
     def to(self, device: torch.device) -> "FlatLabels":
-        """The same on another device."""
+        """Returns the labels on another device."""
         return FlatLabels(self.values.to(device), self.first.to(device), self.fixed.to(device))
 
 
@@ -46,36 +46,36 @@ class FlatLabels:
 class FlatEpisodes:
     """Episodes without padding: entry (step, column) of an episode lies at first + step · columns + column.
 
-    The last entry is nobody: it stands for all padding.
+    The last entry is no agent: it stands for all padding.
     """
 
     states: Float[Tensor, "entries state"]
-    """World frame [SI]."""
+    """States, world frame [SI]."""
     present: Bool[Tensor, " entries"]
-    """Who is there."""
+    """Whether the agent is present."""
     visible: Bool[Tensor, " entries"]
-    """Whom the ego perceives."""
+    """Whether the ego perceives the agent."""
     first: Int[Tensor, " episodes"]
-    """Where each episode begins."""
+    """Index of the first entry of each episode."""
     steps: Int[Tensor, " episodes"]
-    """Scenes of each episode."""
+    """Number of steps of each episode."""
     columns: Int[Tensor, " episodes"]
-    """Agents that ever appear in each episode."""
+    """Number of agents that ever appear in each episode."""
     edge_types: FlatLabels | None = None
-    """Where every episode has them."""
+    """True types of the edges, if every episode has them."""
     edge_attributes: FlatLabels | None = None
-    """Where every episode has them."""
+    """Known properties of the edges, if every episode has them."""
 
     @property
     def num_bytes(self) -> int:
-        """Memory of all tensors."""
+        """Memory of all tensors [bytes]."""
         tensors = [self.states, self.present, self.visible, self.first, self.steps, self.columns]
         for labels in (self.edge_types, self.edge_attributes):
             tensors += [] if labels is None else [labels.values, labels.first, labels.fixed]
         return sum(t.numel() * t.element_size() for t in tensors)
 
     def to(self, device: torch.device) -> "FlatEpisodes":
-        """The same on another device."""
+        """Returns the episodes on another device."""
         parts = {f.name: getattr(self, f.name) for f in fields(self)}
         moved: dict[str, Any] = {name: None if part is None else part.to(device) for name, part in parts.items()}
         return FlatEpisodes(**moved)
@@ -99,7 +99,7 @@ def flatten(
     edge_types: Sequence[np.ndarray | None],
     edge_attributes: Sequence[np.ndarray | None],
 ) -> FlatEpisodes:
-    """Join at least one episode; labels are kept where every episode has them."""
+    """Joins at least one episode; labels are kept if every episode has them."""
     sizes = np.array([s.shape[:2] for s in states], dtype=np.int64)
     return FlatEpisodes(
         _end_to_end([s.reshape(-1, s.shape[2]) for s in states], 0).float(),
@@ -114,7 +114,7 @@ def flatten(
 
 
 def join(parts: Sequence[FlatEpisodes]) -> FlatEpisodes:
-    """Episodes of several stores; labels are kept where every store has them."""
+    """Joins the episodes of several stores; labels are kept if every store has them."""
     if len(parts) == 1:
         return parts[0]
     entries = {n: _without_padding([getattr(p, n) for p in parts]) for n in ("states", "present", "visible")}
@@ -126,14 +126,14 @@ def join(parts: Sequence[FlatEpisodes]) -> FlatEpisodes:
 
 @dataclass(frozen=True)
 class Casts:
-    """Who takes part in each window, and in which column."""
+    """Agents of each window and their columns."""
 
     order: Int[Tensor, "batch width"]
-    """The episode's column that stands in each column of the window; meaningless from `size` on."""
+    """Column of the episode for each column of the window; meaningless from `size` on."""
     size: Int[Tensor, " batch"]
-    """Agents of each window."""
+    """Number of agents of each window."""
     ego_stays: Bool[Tensor, " batch"]
-    """Whether the episode's first column is there at every observed step."""
+    """Whether the agent of the episode's first column is present at every observed step."""
 
 
 def cast(
@@ -144,25 +144,26 @@ def cast(
     width: int,
     has_ego: bool,
 ) -> Casts:
-    """Order agents: the ego, who is visible now, who was visible before (it sent messages then); nobody else matters.
+    """Orders the agents of each window: the ego, those visible now, those visible earlier (they sent messages then).
 
-    Without an ego the order is the episode's, so that a fixed cast keeps its columns.
+    Other agents are left out. Without an ego the order is that of the episode, so a fixed set of agents keeps its
+    columns.
 
     Args:
         flat: all episodes.
-        episode: of each window.
+        episode: index of the episode of each window.
         now: last observed step of each window.
         history_steps: longest history.
-        width: at least the largest number of columns among these episodes.
-        has_ego: whether column 0 is the learner.
+        width: number of columns, at least the largest among these episodes.
+        has_ego: whether column 0 is the ego.
     """
     device = flat.states.device
     step = now[:, None] - torch.arange(history_steps - 1, -1, -1, device=device)
     column = torch.arange(width, device=device)
     columns = flat.columns[episode][:, None]
-    row = torch.where(step >= 0, flat.first[episode][:, None] + step * columns, len(flat.present) - 1)
+    begin = torch.where(step >= 0, flat.first[episode][:, None] + step * columns, len(flat.present) - 1)
     there = (step >= 0)[:, :, None] & (column < columns)[:, None]
-    seen = _pick(flat.visible, torch.where(there, row[:, :, None] + column, len(flat.present) - 1))
+    seen = _pick(flat.visible, torch.where(there, begin[:, :, None] + column, len(flat.present) - 1))
     weight = seen.sum(1) + _VISIBLE_NOW * seen[:, -1]
     key = (weight > 0).to(weight.dtype)
     if has_ego:
@@ -181,54 +182,54 @@ def cut(
     time: int,
     agents: int,
 ) -> Cut:
-    """Windows of the given size, padded at the end.
+    """Cuts windows of the given size, padded at the end.
 
     Args:
         flat: all episodes.
-        episode: of each window.
+        episode: index of the episode of each window.
         now: last observed step of each window.
-        casts: of these windows.
+        casts: agents of these windows.
         history_steps: longest history.
-        horizon_steps: steps after the last observed one; what the episode does not have is not valid.
-        time: steps of the result, at least as many as any window has.
-        agents: columns of the result, at least as many as any window has and at most as many as `casts`.
+        horizon_steps: steps after the last observed one; steps after the end of the episode are not valid.
+        time: number of steps of the result, at least that of the longest window.
+        agents: number of columns of the result, at least that of the widest window and at most that of `casts`.
     """
-    device, nobody = flat.states.device, len(flat.present) - 1
+    device, padding = flat.states.device, len(flat.present) - 1
     last = now - (now - history_steps + 1).clamp(min=0)
     tick = torch.arange(time, device=device)
     step = (now - last)[:, None] + tick
     end = torch.minimum(now + 1 + horizon_steps, flat.steps[episode])
     column = torch.arange(agents, device=device)
     known = column < casts.size[:, None]
-    who = torch.where(known, casts.order[:, :agents], 0)
+    agent = torch.where(known, casts.order[:, :agents], 0)
     columns, first = flat.columns[episode][:, None], flat.first[episode][:, None]
-    seen_now = _pick(flat.visible, torch.where(known, first + now[:, None] * columns + who, nobody))
+    seen_now = _pick(flat.visible, torch.where(known, first + now[:, None] * columns + agent, padding))
     there = (step < end[:, None])[:, :, None] & known[:, None]
-    entry = torch.where(there, (first + step * columns)[:, :, None] + who[:, None], nobody)
+    entry = torch.where(there, (first + step * columns)[:, :, None] + agent[:, None], padding)
     observed = (tick <= last[:, None])[:, :, None]
     later = _pick(flat.present, entry) & seen_now[:, None]
     valid = torch.where(observed, _pick(flat.visible, entry), later)
-    states = _pick(flat.states, torch.where(valid, entry, nobody))
-    labels = [_cut_labels(f, episode, step, who, columns, valid) for f in (flat.edge_types, flat.edge_attributes)]
+    states = _pick(flat.states, torch.where(valid, entry, padding))
+    labels = [_cut_labels(f, episode, step, agent, columns, valid) for f in (flat.edge_types, flat.edge_attributes)]
     return Cut(states, valid, last, *labels)
 
 
 def _cut_labels(
-    labels: FlatLabels | None, episode: Tensor, step: Tensor, who: Tensor, columns: Tensor, valid: Tensor
+    labels: FlatLabels | None, episode: Tensor, step: Tensor, agent: Tensor, columns: Tensor, valid: Tensor
 ) -> Tensor | None:
     if labels is None:
         return None
     step = torch.where(labels.fixed[episode][:, None], 0, step)
-    row = (step * columns)[:, :, None] + who[:, None]
-    row = labels.first[episode][:, None, None] + row * columns[:, None]
-    entry = torch.where(pair_mask(valid), row[..., None] + who[:, None, None], len(labels.values) - 1)
+    receiver = (step * columns)[:, :, None] + agent[:, None]
+    begin = labels.first[episode][:, None, None] + receiver * columns[:, None]
+    entry = torch.where(pair_mask(valid), begin[..., None] + agent[:, None, None], len(labels.values) - 1)
     return _pick(labels.values, entry)
 
 
 def _pick(values: Tensor, entry: Tensor) -> Tensor:
-    """`values[entry]`, several times faster on a CPU."""
-    rows = values.flatten() if values[0].numel() == 1 else values
-    return rows.index_select(0, entry.flatten()).view(*entry.shape, *values.shape[1:])
+    """Returns `values[entry]`, several times faster on a CPU."""
+    entries = values.flatten() if values[0].numel() == 1 else values
+    return entries.index_select(0, entry.flatten()).view(*entry.shape, *values.shape[1:])
 
 
 def _flat_labels(labels: Sequence[np.ndarray | None], unknown: int) -> FlatLabels | None:
@@ -251,19 +252,19 @@ def _joined_labels(parts: Sequence[FlatLabels | None]) -> FlatLabels | None:
 
 
 def _end_to_end(arrays: Sequence[np.ndarray], padding: int) -> Tensor:
-    """Rows of all arrays, and one more."""
+    """Returns the entries of all arrays, and one entry of padding."""
     return torch.from_numpy(
         np.concatenate([*arrays, np.full_like(arrays[0], padding, shape=(1, *arrays[0].shape[1:]))])
     )
 
 
 def _without_padding(parts: Sequence[Tensor]) -> Tensor:
-    """Rows of all tensors, with the last row of the last one only."""
+    """Returns the entries of all tensors, with the padding of the last one only."""
     return torch.cat([*(p[:-1] for p in parts), parts[-1][-1:]])
 
 
 def _shifted(first: Sequence[Tensor], entries: Sequence[Tensor]) -> Tensor:
-    """Where episodes begin when the entries of several stores lie end to end."""
+    """Returns where episodes begin when the entries of several stores lie end to end."""
     offsets = _starts(np.array([len(e) - 1 for e in entries], dtype=np.int64)).tolist()
     return torch.cat([f + offset for f, offset in zip(first, offsets, strict=True)])
 

@@ -1,7 +1,7 @@
-"""Training windows cut from episodes: what the ego could see up to a step, and what then happened.
+"""Cuts training windows from episodes: what the ego perceived up to a step, and what happened after it.
 
 History is masked to perception (range and nearest N at each step). After the last observed step, the agents visible
-then are followed for as long as they exist, seen or not: that is the truth a forecast is judged by.
+then are followed while they exist, visible or not: that is the truth a forecast is compared with.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,9 +24,9 @@ class WindowBatch:
     """Windows of equal length, padded at the end; columns are agents."""
 
     states: Float[Tensor, "batch time agents state"]
-    """World frame [SI]."""
+    """States, world frame [SI]."""
     valid: Bool[Tensor, "batch time agents"]
-    """Visible up to `last_observed`; afterwards present and visible at `last_observed`."""
+    """Whether the agent is visible, up to `last_observed`; afterwards, whether it is present and was visible then."""
     last_observed: Int[Tensor, " batch"]
     """Index of the last step that a forecaster may see."""
     edge_types: Int[Tensor, "batch time agents agents"] | None = None
@@ -59,11 +59,11 @@ def visible(episode: Episode, spec: SceneSpec) -> Bool[np.ndarray, "time agents"
 
 
 class Windows:
-    """All windows of some episodes, addressed by the step at which the forecast is made.
+    """Keeps all windows of some episodes, one for each step at which a forecast is made.
 
     Args:
-        episodes: at least one must have two steps.
-        spec: decides what is visible.
+        episodes: episodes of which at least one has two steps.
+        spec: range and number of visible agents.
         history_steps: longest history; shorter where the episode has just begun.
         horizon_steps: steps after the last observed one; shorter where the episode ends (masked).
         min_future_steps: keep only windows with at least this much future.
@@ -106,7 +106,7 @@ class Windows:
         """Cuts and pads the given windows; agents beyond the widest window cost nothing.
 
         Args:
-            indices: which windows.
+            indices: numbers of the windows.
             history_steps: a shorter history than the longest one.
 
         Raises:
@@ -128,9 +128,10 @@ class Windows:
         width = int(self.flat.columns[episode].max())
         casts = cast(self.flat, episode, now, history_steps, width, self.spec.has_ego)
         if self.spec.has_ego and not casts.ego_stays.all():
-            row = int((~casts.ego_stays).nonzero()[0])
+            window = int((~casts.ego_stays).nonzero()[0])
             raise UserError(
-                f"episode {int(episode[row])}: the ego (column 0) must be present at every step up to {int(now[row])}"
+                f"episode {int(episode[window])}: the ego (column 0) must be present at every step up to "
+                f"{int(now[window])}"
             )
         return casts
 

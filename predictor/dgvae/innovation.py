@@ -1,11 +1,10 @@
-"""Predict, compare, correct: how the encoder finds out what an edge does (not in the paper).
+"""Corrections of pair memories by prediction errors (not in the paper): predict, compare, correct.
 
-An LSTM per pair sees two agents and a summary of the rest. What an edge does to its receiver can only be told once the
-other edges' share is taken off, so each pair has to know what all the others are believed to do. Here each pair's
-memory weighs learned regressors of the pair; their sum over senders is what the receiver was expected to show, the
-difference to what it shows is the innovation, and the innovation times the regressor is how the pair should change its
-mind. It is one step of least mean squares in a learned space, as in a Kalman filter's correction; the LSTM decides
-what to do with it.
+The input of each pair's LSTM is two agents and a summary of the rest. The effect of one edge on its receiver can be
+estimated only after the effects of the other edges are subtracted. Here each pair's memory weighs learned regressors of
+the pair. Their sum over senders is the predicted motion of the receiver; observed minus predicted motion is the
+innovation; innovation times regressor is the correction of the pair. This is one step of least mean squares in a
+learned space, as in a Kalman filter; the correction is one more input of the LSTM's gates.
 """
 
 from jaxtyping import Bool, Float
@@ -16,17 +15,17 @@ from predictor.layers.pairs import PairLinear
 
 
 class Innovation(nn.Module):
-    """Corrections to pair memories from what was observed at one step.
+    """Computes corrections to pair memories from the observation of one step.
 
     Args:
-        inputs: size of an agent's input.
+        inputs: number of an agent's inputs.
         memory: size of a pair's memory.
-        width: of the learned space.
-        rounds: corrections at each step; a later one sees what the earlier one changed.
+        width: dimension of the learned space.
+        rounds: number of corrections at each step; a later one starts from the result of the earlier one.
     """
 
     def __init__(self, inputs: int, memory: int, width: int, rounds: int) -> None:
-        """Layers in the order in which data passes."""
+        """Creates the layers, in the order in which data passes them."""
         super().__init__()
         self.regressor_linear = PairLinear(inputs, width)
         self.regressor_pair = PairLinear(inputs, width)
@@ -39,7 +38,7 @@ class Innovation(nn.Module):
     def prepare(
         self, inputs: Float[Tensor, "*batch agents inputs"], pairs: Bool[Tensor, "*batch agents agents"]
     ) -> tuple[Float[Tensor, "*batch agents agents width"], Float[Tensor, "*batch agents width"]]:
-        """Regressors of each pair and targets of each agent; all steps at once, since no memory enters."""
+        """Computes regressors of each pair and targets of each agent, for all steps at once: no memory is involved."""
         curved = self.regressor_out(functional.elu(self.regressor_pair(inputs)))
         regressors = (self.regressor_linear(inputs) + curved) * pairs[..., None]
         return regressors, self.target(inputs)
@@ -50,7 +49,7 @@ class Innovation(nn.Module):
         regressors: Float[Tensor, "batch agents agents width"],
         targets: Float[Tensor, "batch agents width"],
     ) -> Float[Tensor, "batch agents agents memory"]:
-        """Σ over rounds of W (φ_ij ⊙ ε_i ‖ φ_ji ⊙ ε_j), with ε_i = τ_i − Σ_j w(h_ij) ⊙ φ_ij."""
+        """Computes Σ over rounds of W (φ_ij ⊙ ε_i ‖ φ_ji ⊙ ε_j), with ε_i = τ_i − Σ_j w(h_ij) ⊙ φ_ij."""
         believed = memory
         for own, other in zip(self.correct_own, self.correct_other, strict=True):
             innovation = targets - (self.weigh(believed) * regressors).sum(-2)

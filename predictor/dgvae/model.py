@@ -1,14 +1,14 @@
-"""The dG-VAE (paper Sec. IV): an encoder that infers edges and edge features, a decoder that moves agents along them.
+"""The dG-VAE (paper Sec. IV): an encoder infers edges and their features, a decoder predicts motion from them.
 
 Encoder: linear embedding → EdgeConv → edge embedding → forward LSTM per pair → learned prior and edge features;
 forward ‖ backward LSTM → posterior (training only). Decoder: messages along sampled edges, with edge features → GRU →
-change of state. `observe` and `rollout` make it a `Forecaster`; `window` is what training runs; both use the same
-layers and differ only in how many steps enter at once. Without gradients, single steps go through
-`predictor.dgvae.single_step`, which computes the same with fewer operations.
+change of state. `observe` and `rollout` make it a `Forecaster`; `window` is the pass of training; all use the same
+layers and differ only in the number of steps that they compute at once. Without gradients, single steps go through
+`predictor.dgvae.single_step`, which needs fewer operations for the same result.
 
-Two things the paper leaves open are settled here. An agent without edges would not see itself, so the decoder adds a
-linear term of the agent's own state to its messages. And while true states are fed, the graph is the prior's
-expectation, so that a history has one meaning; samples branch off at the first forecast step.
+Two things that the paper leaves open are settled here. Without edges an agent's own state would be no input of its
+decoder, so a linear term of that state is added to the messages. And during the observed history the edges' weights are
+the prior's probabilities, so that one history gives one memory; samples are drawn from the first forecast step on.
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ from predictor.dgvae.packing import Packed, Padded
 from predictor.dgvae.pair_matching import running_mean, running_mean_step, window_mean
 from predictor.dgvae.single_step import Encoding, Internal, Layers, Modules, Past, Stepper, differentiable, unpacked
 from predictor.forecaster import Belief, Memory, WindowOutput
-from predictor.graph import NOBODY, among_nearest, nearest, off_diagonal, others, pair_mask, with_diagonal
+from predictor.graph import NO_AGENT, among_nearest, nearest, off_diagonal, others, pair_mask, with_diagonal
 from predictor.layers.rnn import masked_gru
 from predictor.layers.state_codec import StateCodec
 from predictor.noise import Noise, PairNoise, noise_of_pairs
@@ -44,7 +44,7 @@ __all__ = ["DGVAE", "PRESETS", "DGVAEConfig", "Decoder", "Edges", "Encoder", "Wi
 
 
 class DGVAE(nn.Module):
-    """The model, as a `Forecaster` and as a training objective's forward pass.
+    """The dG-VAE, as a `Forecaster` and as the forward pass of training.
 
     Forecasts are differentiable, also by `torch.func`; float64 makes Jacobians exact:
 
@@ -56,12 +56,12 @@ class DGVAE(nn.Module):
 
     Args:
         spec: layout of the scenes.
-        config: sizes and variants.
-        horizon_steps: steps it is trained to forecast.
+        config: sizes and variants of the network.
+        horizon_steps: number of steps that it is trained to forecast.
     """
 
     def __init__(self, spec: SceneSpec, config: DGVAEConfig = PRESETS["paper"], horizon_steps: int = 5) -> None:
-        """Build the network; weights come from torch's generator, so seed it first."""
+        """Builds the network; weights are drawn from torch's generator, so seed it first."""
         super().__init__()
         self.spec = spec
         self.config = config
@@ -80,16 +80,18 @@ class DGVAE(nn.Module):
 
     @property
     def num_edge_types(self) -> int:
-        """Edge types, "no edge" included."""
+        """Number of edge types, "no edge" included."""
         return self.config.num_edge_types
 
     @property
     def edge_feature_dim(self) -> int:
-        """Size of an edge's features."""
+        """Number of features of an edge."""
         return self.config.edge_feature_dim
 
     def variant(self, **changes: Any) -> "DGVAE":
-        """The same weights under a changed config: `num_neighbours`, `rollout_graph`, `temperature`, `hard_samples`.
+        """Returns a model with these weights and a changed config.
+
+        The weights fit any value of `num_neighbours`, `rollout_graph`, `temperature` and `hard_samples`.
 
         Raises:
             UserError: an unknown field, or the weights do not fit the changed config.
@@ -106,23 +108,23 @@ class DGVAE(nn.Module):
         return other.train(self.training).requires_grad_(next(self.parameters()).requires_grad)
 
     def train(self, mode: bool = True) -> "DGVAE":
-        """As any module's; what was folded from the weights is forgotten."""
+        """Sets training mode as in any module, and deletes the folded weights."""
         self._stepper = None
         return super().train(mode)
 
     # --- Forecaster ---------------------------------------------------------------------------------------------
 
     def empty_memory(self, batch: int, agents: int) -> Memory:
-        """Zeros on the model's device."""
+        """Returns zeros on the model's device."""
         near = self.config.num_neighbours
-        nodes, pairs = self._nothing_seen(batch, agents, near or agents)
-        senders = torch.full((batch, agents, near), NOBODY, device=nodes[0].device) if near else None
+        nodes, pairs = self._zero_memory(batch, agents, near or agents)
+        senders = torch.full((batch, agents, near), NO_AGENT, device=nodes[0].device) if near else None
         return Memory(nodes, pairs, senders)
 
     def observe(
         self, memory: Memory, states: Float[Tensor, "batch agents state"], valid: Bool[Tensor, "batch agents"]
     ) -> tuple[Memory, Belief]:
-        """One encoder step and one decoder step under the prior's expected graph."""
+        """Computes one encoder step and one decoder step along the prior's edge probabilities."""
         padded = self._graph_now(states, valid)
         if padded.senders is not None:
             memory = memory.to_slots(padded.senders, padded.present)
@@ -142,9 +144,9 @@ class DGVAE(nn.Module):
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
     ) -> Float[Tensor, "batch samples agents horizon state"]:
-        """Feed predictions back through the encoder, so that the graph evolves; sample 0 takes expected graphs."""
+        """Rolls out, encoding predictions so that edges evolve; sample 0 uses edge probabilities, others draw types."""
         known: Internal = belief.internal
-        if differentiable():  # the history may have been seen without gradients
+        if differentiable():  # the history may have been observed without gradients
             known = unpacked(known, self._plain())
         layers, graph, edges = known.layers, known.graph, (known.probs, known.features)
         future = self._continue(
@@ -179,9 +181,9 @@ class DGVAE(nn.Module):
         rollout_steps: int,
         generator: torch.Generator | None = None,
     ) -> WindowOutput:
-        """Teacher-forced pass under the posterior and free-running roll-out under the prior, from the same encoding."""
+        """Runs a teacher-forced pass under the posterior and a roll-out under the prior, from the same encoding."""
         inputs, graph = self.codec.inputs(states, valid), self._graph_of_window(states, valid)
-        (node, seen), pairs = self._nothing_seen(states.shape[0], states.shape[2], graph.present.shape[-1])
+        (node, seen), pairs = self._zero_memory(states.shape[0], states.shape[2], graph.present.shape[-1])
         edges, features, past = self._encode(inputs, valid, graph, Past(*pairs, seen))
         posterior = self.encoder.posterior_logits(edges, graph.present)
         sampled = self._sampler(generator)(posterior)
@@ -195,7 +197,7 @@ class DGVAE(nn.Module):
         if not rollout_steps:
             return WindowOutput(one_step, states.new_zeros(len(states), states.shape[2], 0, states.shape[3]), *outputs)
 
-        # the longest history; asking a GPU for it would make it wait
+        # the longest history; reading it from a GPU would wait for the device
         steps = states.shape[1] if last_observed.is_cuda else int(last_observed.max())
         expected = edge_probabilities(edges.prior_logits[:, :steps])
         if shown is not features:
@@ -212,7 +214,7 @@ class DGVAE(nn.Module):
         return WindowOutput(one_step, future, *outputs)
 
     def _graph_of_window(self, states: Tensor, valid: Tensor) -> Padded:
-        """Pairs of each step: of everyone with all others, where the encoder does not need the square."""
+        """Returns the pairs of each step: each agent with all others, or dense where the encoder needs that."""
         present, near = pair_mask(valid), self.config.num_neighbours
         if near:
             present = present & among_nearest(states[..., : self.spec.position_dim].detach(), valid, near)
@@ -221,7 +223,7 @@ class DGVAE(nn.Module):
         return Padded(off_diagonal(present), others(valid.shape[-1], valid.device))
 
     def _dense(self, graph: Padded, prior: Tensor, posterior: Tensor, features: Tensor) -> tuple[Tensor, ...]:
-        """What a window says of pairs, with everyone's own entry in it: no edge, and zeros."""
+        """Converts a window's pair outputs to dense ones; diagonal entries are "no edge" and zeros."""
         if graph.senders is None:
             return prior, posterior, features
         nothing = features.new_zeros(features.shape[-1])
@@ -237,10 +239,10 @@ class DGVAE(nn.Module):
         senders, present = nearest(states[..., : self.spec.position_dim].detach(), valid, near)
         return Padded(present, senders)
 
-    def _nothing_seen(
+    def _zero_memory(
         self, batch: int, agents: int, slots: int
     ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
-        """Node and pair memory before any observation."""
+        """Returns node and pair memory before any observation."""
         zeros, config = self.codec.scales.new_zeros, self.config
         pair = zeros(batch, agents, slots, config.rnn_dim)
         static = zeros(batch, agents, slots, config.static_dim + 1 if config.static_dim else 0)
@@ -254,7 +256,7 @@ class DGVAE(nn.Module):
         return Modules(self.encoder, self.decoder)
 
     def _layers(self) -> Layers:
-        """For single steps: with gradients the modules themselves, otherwise the same with its weights folded."""
+        """Returns the layers for single steps: with gradients the modules themselves, else folded weights."""
         dropout = self.encoder.dropout.training and self.config.dropout > 0
         if differentiable() or dropout or self.config.innovation_rounds:
             return self._plain()
@@ -263,7 +265,7 @@ class DGVAE(nn.Module):
         return self._stepper
 
     def _encode(self, inputs: Tensor, valid: Tensor, graph: Padded, past: Past) -> Encoding:
-        """Encode a stretch of steps after `past`."""
+        """Encodes several steps after `past`."""
         inputs, seen = self._with_changes(inputs, valid, past.seen)
         edges = self.encoder(inputs, graph.present, past.hidden, past.cell, graph.senders)
         features, static = self._match(edges.features, graph.present, past.static)
@@ -272,11 +274,11 @@ class DGVAE(nn.Module):
     def _encode_step(
         self, layers: Layers, states: Tensor, valid: Tensor, graph: Padded | Packed, past: Past
     ) -> tuple[Past, Tensor, Tensor]:
-        """The same for one step: memory, prior logits and features after it."""
+        """Encodes one step: returns memory, prior logits and features after it."""
         inputs, seen = self.codec.inputs(states, valid), past.seen
         if self.sees_changes:
-            stretch, after = self._with_changes(inputs[:, None], valid[:, None], seen)
-            inputs, seen = stretch[:, 0], after[:, 0]
+            steps, after = self._with_changes(inputs[:, None], valid[:, None], seen)
+            inputs, seen = steps[:, 0], after[:, 0]
         inputs = graph.pack_nodes(inputs)
         hidden, cell, logits, features = layers.encode(inputs, graph, past.hidden, past.cell)
         static = past.static
@@ -287,7 +289,7 @@ class DGVAE(nn.Module):
         return Past(hidden, cell, static, seen), logits, features
 
     def _with_changes(self, inputs: Tensor, valid: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
-        """What the encoder sees of a stretch of steps, and what it remembers of each for the next one."""
+        """Returns the encoder's inputs at several steps, and its memory of each one for the next."""
         if not self.sees_changes:
             return inputs, inputs.new_zeros(*inputs.shape[:-1], 0)
         seen = torch.cat([inputs, torch.ones_like(inputs[..., :1])], dim=-1) * valid[..., None]
@@ -298,10 +300,7 @@ class DGVAE(nn.Module):
         return torch.cat([inputs, changes], dim=-1), seen
 
     def _match(self, features: Tensor, present: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
-        """Pair matching from the past: features whose static dimensions are running means, and these after each step.
-
-        Time axis second.
-        """
+        """Computes causal pair matching: features with running means as static dimensions, and these means."""
         static = self.config.static_dim
         if not static:
             return features, features.new_zeros(*present.shape, 0)
@@ -309,7 +308,7 @@ class DGVAE(nn.Module):
         return torch.cat([mean[..., :-1], features[..., static:]], dim=-1), mean
 
     def _match_window(self, features: Tensor, causal: Tensor, present: Tensor) -> Tensor:
-        """Features for the teacher-forced pass: the static ones from the whole window, if the config asks for that."""
+        """Returns features for the teacher-forced pass, with static ones from the whole window if so configured."""
         static = self.config.static_dim
         if not static or self.config.pair_matching == "causal":
             return causal
@@ -325,9 +324,9 @@ class DGVAE(nn.Module):
         features: Tensor,
         node: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """One decoder step: GRU states after it, and the next states."""
+        """Computes one decoder step: GRU states after it, and the next states."""
         inputs = graph.pack_nodes(self.codec.inputs(states, valid))
-        node, messages = layers.drive(inputs, graph, weights, features, node)
+        node, messages = layers.decode(inputs, graph, weights, features, node)
         node = graph.forget_absent(node, valid)
         change = graph.unpack_nodes(self.decoder.change(node))
         return node, self._integrate(layers, states, valid, graph, weights, features, change, messages)
@@ -343,7 +342,7 @@ class DGVAE(nn.Module):
         change: Tensor,
         messages: Tensor | None,
     ) -> Float[Tensor, "*batch agents state"]:
-        """States one step later; with substeps, messages are evaluated anew as the agents move."""
+        """Computes the states one step later; with substeps, messages are evaluated again as the agents move."""
         substeps = self.config.substeps
         if not substeps:
             return self.codec.advance(states, change)
@@ -369,7 +368,7 @@ class DGVAE(nn.Module):
         horizon_steps: int,
         sampler: Callable[[Tensor], Tensor],
     ) -> Float[Tensor, "batch agents horizon state"]:
-        """Roll out from an observation whose decoder step is still to be taken."""
+        """Rolls out from an observation before its decoder step."""
         drawn = graph.per_pair(sampler, logits)
         node, states = self._move(layers, states, valid, graph, drawn, features, node)
         return self._continue(layers, states, valid, graph, past, node, (drawn, features), horizon_steps, sampler)
@@ -386,9 +385,9 @@ class DGVAE(nn.Module):
         horizon_steps: int,
         sampler: Callable[[Tensor], Tensor] | None,
     ) -> Float[Tensor, "batch agents horizon state"]:
-        """Roll out from predicted states; without a sampler along expected graphs.
+        """Rolls out from predicted states; without a sampler along edge probabilities.
 
-        Who may interact with whom stays as it was observed; `edges` are weights and features, kept if frozen.
+        The observed pairs stay; `edges` are weights and features, kept if frozen.
         """
         future, (weights, features) = [states], edges
         for _ in range(horizon_steps - 1):

@@ -1,6 +1,6 @@
 """The dG-VAE's two networks (paper Sec. IV): the encoder of edges and the decoder of motion, and their sizes.
 
-Both work on one step or on many at once; `predictor.dgvae` puts them together. Linear layers on a concatenation of two
+Both take one step or many at once; `predictor.dgvae.model` combines them. Linear layers on a concatenation of two
 agents are computed per agent and added on the pair, and the last layer of an edge MLP is moved behind the sum over
 senders; both are identities.
 """
@@ -38,52 +38,52 @@ class DGVAEConfig:
     decoder_dim: int = 256
     """Width of the GRU of each agent."""
     num_edge_types: int = 2
-    """Edge types; the first one is "no edge" and sends no message."""
+    """Number of edge types; the first one is "no edge" and sends no message."""
     edge_feature_dim: int = 32
-    """Size of an edge's continuous features (paper: 16 to 64, by dataset); 0 is the ablation without them (dVAE)."""
+    """Number of an edge's continuous features (paper: 16 to 64, by dataset); 0 is the ablation without them (dVAE)."""
     temperature: float = 0.5
-    """Of the concrete distribution."""
+    """Temperature of the concrete distribution."""
     dropout: float = 0.0
-    """After the LSTM."""
+    """Dropout probability after the LSTM."""
     residual: Residual = "state"
-    """What the predicted change of position is added to: the state (paper), the state moved on at its own velocity, or
-    at the mean of its own and the predicted velocity (velocity-consistent)."""
+    """Position to which the predicted change is added: the current one (paper), or the current one moved on at the
+    current velocity, or at the mean of current and predicted velocity (velocity-consistent)."""
     delta_scales: tuple[float, ...] = ()
     """Typical one-step change of each feature [SI] beyond the residual; empty takes the spec's feature scales."""
     input_scales: tuple[float, ...] = ()
     """Spread of each feature over the map [SI], which divides the network's inputs; empty takes the spec's feature
     scales. A road of 500 m by 12 m needs it: at 100 m for both axes its lanes lie 0.04 apart."""
     change_scales: tuple[float, ...] = ()
-    """Typical one-step change of each input [SI]; given, the encoder also sees what changed since the last step."""
+    """Typical one-step change of each input [SI]; if given, the change since the last step is an encoder input too."""
     forget_bias: float = 0.0
-    """Added to the initial bias of the LSTMs' forget gates; 2 starts them with a memory of about eight steps."""
+    """Addend of the initial bias of the LSTMs' forget gates; 2 starts them with a memory of about eight steps."""
     innovation_rounds: int = 0
-    """Rounds of predict-compare-correct in the encoder at each step (`predictor.dgvae.innovation`); paper: 0."""
+    """Number of corrections of pair memories at each encoder step (`predictor.dgvae.innovation`); paper: 0."""
     innovation_dim: int = 32
-    """Width of such a round."""
+    """Width of these corrections."""
     static_dim: int = 0
-    """Pair matching: so many of the first feature dimensions are averaged over time (paper: 16); 0 is off."""
+    """Number of first feature dimensions that pair matching averages over time (paper: 16); 0 is off."""
     pair_matching: Literal["window", "causal"] = "causal"
-    """Average in training over the whole window (paper), or over the past of each step, as deployed."""
+    """Span of this average in training: the whole window (paper), or the past of each step, as when deployed."""
     substeps: int = 0
-    """Evaluations of the messages within a step, each moving the agents on; 0 is the paper's decoder, in which messages
-    act through the GRU alone."""
+    """Number of evaluations of the messages within a step, each followed by a motion of the agents; 0 is the paper's
+    decoder, in which messages act through the GRU alone."""
     gated_messages: bool = False
-    """Edge features scale the messages instead of being one more input of theirs."""
+    """Whether edge features scale the messages instead of being one more input of theirs."""
     zero_start: bool = False
-    """Fresh weights predict no change beyond the residual: with many senders, sums are large, and a free run through
-    random weights explodes."""
+    """Whether fresh weights predict no change beyond the residual: with many senders, sums are large, and a roll-out
+    through random weights diverges."""
     hard_samples: bool = False
-    """Sample one-hot graphs, with the gradient of the soft ones (straight-through)."""
+    """Whether sampled edge types are one-hot, with the gradient of the soft ones (straight-through)."""
     num_neighbours: int = 0
-    """An agent hears at most so many others, the nearest; 0 is everyone. The cost then grows with the number of agents,
-    not with its square. A roll-out keeps the neighbours it starts with."""
+    """Largest number of senders of an agent, the nearest ones; 0 takes all. With a limit, the cost grows with the
+    number of agents, not with its square. A roll-out keeps the neighbours that it starts with."""
     rollout_graph: Literal["evolving", "frozen"] = "evolving"
-    """Whether a roll-out feeds predictions back through the encoder, or keeps the edges and features it starts with:
-    faster, and less accurate unless trained so."""
+    """Whether a roll-out encodes its predictions ("evolving"), or keeps the edges and features that it starts with
+    ("frozen"): faster, and less accurate unless trained so."""
 
     def __post_init__(self) -> None:
-        """Check choices and ranges."""
+        """Checks choices and ranges."""
         check_choices(self)
         check_at_least(self, 1, "hidden_dim", "rnn_dim", "head_dim", "message_dim", "decoder_dim", "innovation_dim")
         check_at_least(self, 0, "edge_feature_dim", "innovation_rounds", "static_dim", "substeps", "num_neighbours")
@@ -115,14 +115,14 @@ PRESETS: dict[str, DGVAEConfig] = {
 
 
 class Edges(NamedTuple):
-    """Encoder outputs for a stretch of time; time axis second; pairs as the encoder got them."""
+    """Encoder outputs for several steps; pairs as in the encoder's input."""
 
     hidden: Float[Tensor, "batch time agents slots rnn"]
     cell: Float[Tensor, "batch time agents slots rnn"]
     prior_logits: Float[Tensor, "batch time agents slots types"]
     features: Float[Tensor, "batch time agents slots feature"]
     hidden_layer: Float[Tensor, "batch time agents slots hidden"]
-    """Of the edge MLP; its second layer is folded into the gates."""
+    """Hidden layer of the edge MLP; its second layer is folded into the gates."""
 
 
 def concrete_sample(
@@ -131,16 +131,16 @@ def concrete_sample(
     generator: torch.Generator | PairNoise | None = None,
     hard: bool = False,
 ) -> Float[Tensor, "*batch types"]:
-    """Reparameterised sample of the concrete distribution (paper Sec. IV, Sampling).
+    """Draws a reparameterised sample of the concrete distribution (paper Sec. IV, Sampling).
 
     Args:
         logits: unnormalised log-probabilities.
-        temperature: towards 0 samples become one-hot.
-        generator: source of the Gumbel noise; the one of each scene's own pairs, or one for all.
-        hard: one-hot samples whose gradient is that of the soft ones (straight-through).
+        temperature: temperature; samples become one-hot as it approaches 0.
+        generator: source of the Gumbel noise: a `PairNoise` with one generator per scene, or one generator for all.
+        hard: whether samples are one-hot, with the gradient of the soft ones (straight-through).
     """
     if logits.dtype in (torch.bfloat16, torch.float16):
-        logits = logits.float()  # the tails of the noise are what draws the rare type
+        logits = logits.float()  # rare types are drawn by the tails of the noise
     if isinstance(generator, PairNoise):
         uniform = generator.like(logits)
     else:
@@ -159,10 +159,10 @@ def _head(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 
 
 class Encoder(nn.Module):
-    """Edge logits and features from states, step by step or for many steps at once."""
+    """Computes edge logits and features from states, step by step or for many steps at once."""
 
     def __init__(self, config: DGVAEConfig, inputs: int) -> None:
-        """Layers in the order in which data passes."""
+        """Creates the layers, in the order in which data passes them."""
         super().__init__()
         self.config = config
         width, rnn = config.hidden_dim, config.rnn_dim
@@ -192,7 +192,7 @@ class Encoder(nn.Module):
         pairs: Bool[Tensor, "*batch agents slots"],
         senders: Int[Tensor, "*some agents slots"] | None = None,
     ) -> Float[Tensor, "*batch agents slots hidden"]:
-        """The graph block up to the hidden layer of the edge MLP; all steps at once."""
+        """Computes the graph block up to the hidden layer of the edge MLP, for all steps at once."""
         weight = pairs.to(inputs.dtype)
         summed = sum_over_senders(self.conv_pair.elu(inputs, senders, self.embed), weight)
         # Σ_j (W h_ij + b) = W Σ_j h_ij + n b: the second layer of EdgeConv costs agents, not pairs.
@@ -201,7 +201,7 @@ class Encoder(nn.Module):
         return self.edge_pair.elu(nodes, senders)
 
     def _gates(self, layer: nn.Linear, hidden: Tensor) -> Tensor:
-        """Input share of an LSTM's gates."""
+        """Computes the input share of an LSTM's gates."""
         weight, bias = folded(layer, self.edge_out)
         return _time_first(lambda x: functional.linear(x, weight, bias), hidden)
 
@@ -213,7 +213,7 @@ class Encoder(nn.Module):
         cell: Float[Tensor, "batch agents slots rnn"],
         senders: Int[Tensor, "*some agents slots"] | None = None,
     ) -> Edges:
-        """Run the forward LSTM from a given memory; a pair that is not present has its memory set to zero."""
+        """Runs the forward LSTM from a given memory; the memory of an absent pair is set to zero."""
         hidden_layer = _time_first(lambda x, mask: self.embed_edges(x, mask, senders), inputs, pairs)
         correct = self._correction(inputs, pairs) if self.config.innovation_rounds else None
         gates = self._gates(self.forward_input, hidden_layer)
@@ -240,7 +240,7 @@ class Encoder(nn.Module):
     def posterior_logits(
         self, edges: Edges, pairs: Bool[Tensor, "batch time agents slots"]
     ) -> Float[Tensor, "batch time agents slots types"]:
-        """Logits that have seen the future; training only."""
+        """Computes the posterior logits, from past and future; training only."""
         zeros = torch.zeros_like(edges.hidden[:, 0])
         gates = self._gates(self.backward_input, edges.hidden_layer)
         backward, _ = masked_lstm(gates, self.backward_hidden, pairs, zeros, zeros, reverse=True)
@@ -249,12 +249,12 @@ class Encoder(nn.Module):
 
 
 def _time_first(layer: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
-    """Apply a layer with time before batch, as the LSTMs hold it in memory; no copy is made of what they give."""
+    """Applies a layer with time before batch, which is the LSTMs' layout in memory, so that nothing is copied."""
     return layer(*(t.transpose(0, 1) for t in tensors)).transpose(0, 1)
 
 
 def edge_probabilities(logits: Float[Tensor, "*batch types"]) -> Float[Tensor, "*batch types"]:
-    """Softmax over edge types; of two types, a logistic function, which is several times faster on a CPU."""
+    """Computes the softmax over edge types; for two types as a logistic function, several times faster on a CPU."""
     if logits.shape[-1] != 2:
         return torch.softmax(logits, dim=-1)
     edge = torch.sigmoid(logits[..., 1] - logits[..., 0])
@@ -264,25 +264,25 @@ def edge_probabilities(logits: Float[Tensor, "*batch types"]) -> Float[Tensor, "
 def no_edge_where_absent(
     logits: Float[Tensor, "*batch types"], present: Bool[Tensor, "*batch 1"]
 ) -> Float[Tensor, "*batch types"]:
-    """The same, with certainty of "no edge" for pairs that are not there."""
+    """Returns the logits with certainty of "no edge" for absent pairs."""
     absent = torch.full_like(logits, -1e4)
     absent[..., 0] = 0.0
     return torch.where(present, logits, absent)
 
 
 class Decoder(nn.Module):
-    """Change of state from messages along edges."""
+    """Computes changes of state from messages along edges."""
 
     def __init__(self, config: DGVAEConfig, inputs: int, outputs: int) -> None:
-        """Layers in the order in which data passes."""
+        """Creates the layers, in the order in which data passes them."""
         super().__init__()
-        self.types = config.num_edge_types - 1  # type 0 is silent
+        self.types = config.num_edge_types - 1  # type 0 sends no message
         self.gated = config.gated_messages
         width = config.message_dim
         self.message_pair = PairLinear(inputs, self.types * width)
         if config.edge_feature_dim:
             self.message_feature = nn.Linear(config.edge_feature_dim, self.types * width, bias=False)
-        self.message_out = nn.Linear(width, self.types * width)  # one block for each type that speaks
+        self.message_out = nn.Linear(width, self.types * width)  # one block for each type that sends messages
         self.own = nn.Linear(inputs, width)
         self.gru = nn.GRUCell(width, config.decoder_dim)
         self.readout = nn.Linear(config.decoder_dim, outputs)
@@ -297,12 +297,12 @@ class Decoder(nn.Module):
         self,
         inputs: Float[Tensor, "*batch agents inputs"],
         pairs: Bool[Tensor, "*batch agents slots"],
-        graph: Float[Tensor, "*batch agents slots types"],
+        weights: Float[Tensor, "*batch agents slots types"],
         features: Float[Tensor, "*batch agents slots feature"],
         senders: Int[Tensor, "*some agents slots"] | None = None,
     ) -> Float[Tensor, "*batch agents message"]:
-        """Σ_j z_ij · h(x_i ‖ x_j ‖ e_ij) plus the agent's own term; all steps at once."""
-        return self.combine(inputs, self.pair_layer(inputs, features, senders), pairs, graph)
+        """Computes Σ_j z_ij · h(x_i ‖ x_j ‖ e_ij) plus the agent's own term, for all steps at once."""
+        return self.combine(inputs, self.pair_layer(inputs, features, senders), pairs, weights)
 
     def pair_layer(
         self,
@@ -310,7 +310,7 @@ class Decoder(nn.Module):
         features: Float[Tensor, "*batch agents slots feature"],
         senders: Int[Tensor, "*some agents slots"] | None = None,
     ) -> Float[Tensor, "*batch agents slots hidden"]:
-        """The hidden layer of h, one block for each type that speaks; the same whatever the graph."""
+        """Computes the hidden layer of h, one block for each type that sends messages; independent of edge weights."""
         if not self.has_features:
             return self.message_pair.elu(inputs, senders)
         feature = self.message_feature(features)
@@ -323,9 +323,9 @@ class Decoder(nn.Module):
         inputs: Float[Tensor, "*batch agents inputs"],
         layer: Float[Tensor, "*batch agents slots hidden"],
         pairs: Bool[Tensor, "*batch agents slots"],
-        graph: Float[Tensor, "*batch agents slots types"],
+        weights: Float[Tensor, "*batch agents slots types"],
     ) -> Float[Tensor, "*batch agents message"]:
-        """Messages from `pair_layer`, weighted by a graph."""
+        """Computes messages from the result of `pair_layer`, weighted by the edges' types."""
         total: Tensor = self.own(inputs)
         blocks = zip(
             layer.chunk(self.types, dim=-1),
@@ -334,7 +334,7 @@ class Decoder(nn.Module):
             strict=True,
         )
         for k, (layer_k, matrix, bias) in enumerate(blocks):
-            weight = graph[..., k + 1] * pairs
+            weight = weights[..., k + 1] * pairs
             # Σ_j z_ij (W h_ij + b) = W Σ_j z_ij h_ij + b Σ_j z_ij: the second layer costs agents, not pairs.
             summed = functional.linear(sum_over_senders(layer_k, weight), matrix)
             total = total + summed + weight.sum(-1, keepdim=True) * bias
@@ -345,12 +345,12 @@ class Decoder(nn.Module):
         messages: Float[Tensor, "batch agents message"],
         hidden: Float[Tensor, "batch agents decoder"],
     ) -> Float[Tensor, "batch agents decoder"]:
-        """One GRU step for every agent."""
+        """Computes one GRU step for every agent."""
         batch, agents, width = hidden.shape
         after: Tensor = self.gru(messages.reshape(batch * agents, -1), hidden.reshape(batch * agents, width))
         return after.view(batch, agents, width)
 
     def change(self, hidden: Float[Tensor, "*batch decoder"]) -> Float[Tensor, "*batch state"]:
-        """Change of state, in units of `delta_scales`."""
+        """Computes the change of state, in units of `delta_scales`."""
         change: Tensor = self.readout(functional.elu(hidden))
         return change

@@ -1,10 +1,11 @@
 """Scenes of different sizes without padding: agents and pairs of a whole batch in two flat lists.
 
-A batch of scenes is padded to its largest, and pairs to its square; in traffic most of that is empty. Single steps
-without gradients work on lists of those who are there. `Padded` has the same methods and leaves everything in place.
+A batch of scenes is padded to its largest, and pairs to the square of that; in traffic most of it is empty. Single
+steps without gradients compute on lists of the present agents and pairs (`Packed`). `Padded` has the same methods and
+leaves everything in place.
 
-The lists' lengths are rounded up by a few per cent, with entries that nobody reads: oneDNN compiles its products for
-each length it meets, which takes longer than the product, and so it meets few.
+The lengths of the lists are rounded up by a few per cent, with unused entries: oneDNN compiles its products for each
+length, which takes longer than the product, so there should be few lengths.
 """
 
 from collections.abc import Callable
@@ -17,90 +18,90 @@ from torch import Tensor
 from torch.nn import functional
 
 _LEAST_STEP = 8
-"""Lengths are multiples of it."""
+"""Smallest unit of which lengths are multiples."""
 
 
 class Padded(NamedTuple):
-    """Pairs as an array of agents × slots; axes as in `predictor.graph`."""
+    """Keeps pairs as an array of agents × slots; axes as in `predictor.graph`."""
 
     present: Bool[Tensor, "*batch agents slots"]
-    """Who may interact."""
+    """Which pairs may interact."""
     senders: Int[Tensor, "*some agents slots"] | None
-    """Whose each slot is; None if slot j is agent j's."""
+    """Index of the sender in each slot; None if slot j is agent j's."""
 
     @property
     def pairs_there(self) -> Bool[Tensor, "*batch agents slots"]:
-        """Which slots hold a pair."""
+        """Mask of the slots that hold a pair."""
         return self.present
 
     def pack_nodes(self, nodes: Tensor) -> Tensor:
-        """The same."""
+        """Returns `nodes` unchanged."""
         return nodes
 
     def pack_pairs(self, pairs: Tensor) -> Tensor:
-        """The same."""
+        """Returns `pairs` unchanged."""
         return pairs
 
     def among_pairs(self, pairs: Tensor) -> Tensor:
-        """Which entries are of pairs that are there."""
+        """Returns the mask of the entries of present pairs."""
         return self.present
 
     def forget_absent(self, nodes: Tensor, valid: Tensor) -> Tensor:
-        """Zeros for who is not there."""
+        """Sets the entries of absent agents to zero."""
         return nodes * valid[..., None]
 
     def unpack_nodes(self, nodes: Tensor) -> Tensor:
-        """The same."""
+        """Returns `nodes` unchanged."""
         return nodes
 
     def unpack_pairs(self, pairs: Tensor, no_edge: bool = False) -> Tensor:
-        """The same."""
+        """Returns `pairs` unchanged."""
         return pairs
 
     def per_pair(self, change: Callable[[Tensor], Tensor], pairs: Tensor) -> Tensor:
-        """A change to each pair by itself."""
+        """Applies a function of single pairs to all of them."""
         return change(pairs)
 
     def repeat_nodes(self, nodes: Tensor, times: int) -> Tensor:
-        """Each scene so many times in a row."""
+        """Repeats the agents of each scene `times` times."""
         return nodes.repeat_interleave(times, dim=0)
 
     def repeat_pairs(self, pairs: Tensor, times: int) -> Tensor:
-        """Each scene so many times in a row."""
+        """Repeats the pairs of each scene `times` times."""
         return pairs.repeat_interleave(times, dim=0)
 
     def repeat(self, times: int) -> "Padded":
-        """The pairs of a batch with each scene so many times in a row."""
+        """Returns the pairs of a batch in which each scene is repeated `times` times."""
         senders = None if self.senders is None else self.senders.repeat_interleave(times, dim=0)
         return Padded(self.present.repeat_interleave(times, dim=0), senders)
 
 
 @dataclass(frozen=True)
 class Packed:
-    """Lists of the agents and pairs that are there, scene by scene, pairs by receiver."""
+    """Lists the present agents and pairs, scene by scene, pairs by receiver."""
 
     padded: Padded
-    """Where they come from."""
+    """Padded pairs from which the lists are made."""
     valid: Bool[Tensor, "batch agents"]
-    """Likewise."""
+    """Which agents of the padded batch are present."""
     agents: Int[Tensor, " agents_there"]
-    """Places of the listed agents in the flattened batch."""
+    """Index of each listed agent in the flattened batch."""
     slots: Int[Tensor, " pairs_there"]
-    """Places of the listed pairs in the flattened array of pairs."""
+    """Index of each listed pair in the flattened array of pairs."""
     receivers: Int[Tensor, " pairs_there"]
-    """Which listed agent."""
+    """Index of each pair's receiver among the listed agents."""
     roles: Int[Tensor, "pairs 2"]
-    """Rows of receiver and sender where each listed agent has two in a row, as a receiver and as a sender."""
+    """Indices of receiver and sender in a list that holds each agent twice, first as receiver, then as sender."""
     offsets: Int[Tensor, " listed_and_end"]
-    """Where each listed agent's pairs begin, and where the last one's end."""
+    """Index of the first pair of each listed agent, and the number of pairs at the end."""
     each: Int[Tensor, " pairs_there"]
-    """0, 1, 2, …"""
+    """Index of each pair: 0, 1, 2, …"""
     counts: Int[Tensor, "listed 1"]
     """Number of each agent's senders."""
 
     @staticmethod
     def of(padded: Padded, valid: Bool[Tensor, "batch agents"]) -> "Packed":
-        """List what is there."""
+        """Lists the present agents and pairs."""
         present = padded.present
         width, slots_each = valid.shape[1], present.shape[2]
         place = valid.flatten().cumsum(0) - 1  # in the list of agents
@@ -131,43 +132,43 @@ class Packed:
 
     @property
     def pairs_there(self) -> Bool[Tensor, "batch agents slots"]:
-        """Which slots of the padded array hold a pair."""
+        """Mask of the slots of the padded array that hold a pair."""
         return self.padded.present
 
     def pack_nodes(self, nodes: Float[Tensor, "batch agents node"]) -> Float[Tensor, "listed node"]:
-        """Rows of the listed agents."""
+        """Returns the entries of the listed agents."""
         return nodes.flatten(0, 1).index_select(0, _lengthened(self.agents))
 
     def pack_pairs(self, pairs: Float[Tensor, "batch agents slots pair"]) -> Float[Tensor, "pairs pair"]:
-        """Rows of the listed pairs."""
+        """Returns the entries of the listed pairs."""
         return pairs.flatten(0, 2).index_select(0, _lengthened(self.slots))
 
     def among_pairs(self, pairs: Float[Tensor, "pairs pair"]) -> Bool[Tensor, " pairs"]:
-        """All of them."""
+        """Returns a mask that is True everywhere: only present pairs are listed."""
         return torch.ones(len(pairs), dtype=torch.bool, device=pairs.device)
 
     def forget_absent(
         self, nodes: Float[Tensor, "listed node"], valid: Bool[Tensor, "batch agents"]
     ) -> Float[Tensor, "listed node"]:
-        """The same: who is not there is not listed."""
+        """Returns `nodes` unchanged: absent agents are not listed."""
         return nodes
 
     def per_pair(
         self, change: Callable[[Tensor], Tensor], pairs: Float[Tensor, "pairs before"]
     ) -> Float[Tensor, "pairs after"]:
-        """A change to each pair by itself; what draws noise draws none for nobody."""
+        """Applies a function of single pairs to all listed ones; no noise is drawn for absent pairs."""
         changed = change(pairs[: len(self.slots)])
         return functional.pad(changed, (0, 0, 0, len(pairs) - len(changed)))
 
     def unpack_nodes(self, nodes: Float[Tensor, "listed node"]) -> Float[Tensor, "batch agents node"]:
-        """Zeros for who is not listed."""
+        """Returns the padded array of agents, with zeros for absent ones."""
         padded = nodes.new_zeros(self.valid.numel(), nodes.shape[-1])
         return padded.index_copy_(0, self.agents, nodes[: len(self.agents)]).unflatten(0, self.valid.shape)
 
     def unpack_pairs(
         self, pairs: Float[Tensor, "pairs pair"], no_edge: bool = False
     ) -> Float[Tensor, "batch agents slots pair"]:
-        """Zeros for pairs that are not listed; with `no_edge`, certainty of the first type."""
+        """Returns the padded array of pairs, with zeros for absent ones, or with certainty of type 0 if `no_edge`."""
         shape = self.padded.present.shape
         padded = pairs.new_zeros(shape.numel(), pairs.shape[-1])
         if no_edge:
@@ -175,28 +176,28 @@ class Packed:
         return padded.index_copy_(0, self.slots, pairs[: len(self.slots)]).unflatten(0, shape)
 
     def repeat_nodes(self, nodes: Float[Tensor, "listed node"], times: int) -> Float[Tensor, "more node"]:
-        """Each scene so many times in a row."""
+        """Repeats the agents of each scene `times` times."""
         scene = self.agents // self.valid.shape[1]
         return nodes.index_select(0, _lengthened(_repeated(scene, len(self.valid), times)))
 
     def repeat_pairs(self, pairs: Float[Tensor, "pairs pair"], times: int) -> Float[Tensor, "more pair"]:
-        """Each scene so many times in a row."""
+        """Repeats the pairs of each scene `times` times."""
         scene = self.slots // self.padded.present[0].numel()
         return pairs.index_select(0, _lengthened(_repeated(scene, len(self.valid), times)))
 
     def repeat(self, times: int) -> "Packed":
-        """The lists of a batch with each scene so many times in a row."""
+        """Returns the lists of a batch in which each scene is repeated `times` times."""
         return Packed.of(self.padded.repeat(times), self.valid.repeat_interleave(times, dim=0))
 
     def spread(self, shares: Float[Tensor, "listed two_out"]) -> Float[Tensor, "pairs out"]:
-        """Receiver's plus sender's share of each pair; an agent's two shares stand beside each other."""
+        """Computes receiver's plus sender's share of each pair; an agent's two shares are side by side."""
         of_roles = shares.view(-1, shares.shape[1] // 2)
         return functional.embedding_bag(self.roles, of_roles, mode="sum")
 
     def gather(
         self, pairs: Float[Tensor, "pairs out"], weight: Float[Tensor, " pairs"] | None = None
     ) -> Float[Tensor, "listed out"]:
-        """Sum over senders, weighted."""
+        """Computes the weighted sum over senders."""
         if weight is not None:
             weight = weight[: len(self.slots)]
         return functional.embedding_bag(
@@ -204,24 +205,24 @@ class Packed:
         )
 
     def total(self, weight: Float[Tensor, " pairs"]) -> Float[Tensor, "listed 1"]:
-        """Total weight of each agent's senders."""
+        """Computes the total weight of each agent's senders."""
         total = weight.new_zeros(len(self.counts))
         return total.index_add_(0, self.receivers, weight[: len(self.slots)])[:, None]
 
 
 def _rounded(length: int) -> int:
-    """At least so much, one of sixteen lengths between a number and its double."""
+    """Rounds a length up to one of sixteen lengths between a number and its double."""
     step = max(_LEAST_STEP, 1 << max(0, length.bit_length() - 5))
     return -(-max(length, 1) // step) * step
 
 
 def _lengthened(places: Int[Tensor, " there"]) -> Int[Tensor, " rounded"]:
-    """The list, rounded up with the first place."""
+    """Returns the list lengthened to a rounded length by zeros."""
     return functional.pad(places, (0, _rounded(len(places)) - len(places)))
 
 
 def _repeated(scene: Tensor, scenes: int, times: int) -> Tensor:
-    """Places of a list's entries, sorted by scene, when each scene is repeated."""
+    """Returns the indices of a list's entries, sorted by scene, when each scene is repeated."""
     sizes = torch.bincount(scene, minlength=scenes)
     starts = (sizes.cumsum(0) - sizes).repeat_interleave(times)
     sizes = sizes.repeat_interleave(times)

@@ -1,7 +1,7 @@
 """Disentangled edge features (paper Sec. IV): restricted labelling and pair matching.
 
 Restricted labelling is supervised: the first feature dimensions are regressed on known edge attributes. Pair matching
-is not: the first dimensions are averaged over time, so they can only carry what stays the same.
+is not: the first dimensions are averaged over time, so they can only hold what is constant.
 """
 
 import torch
@@ -14,11 +14,11 @@ def running_mean(
     pairs: Bool[Tensor, "batch time agents slots"],
     memory: Float[Tensor, "batch agents slots static_and_count"],
 ) -> Float[Tensor, "batch time agents slots static_and_count"]:
-    """Mean over the steps at which a pair was there without a break, and their number; what streaming can know.
+    """Computes the mean over the steps at which a pair was present without a break, and their number; causal.
 
     Args:
-        values: the feature dimensions to average.
-        pairs: which pairs are there.
+        values: feature dimensions to average.
+        pairs: which pairs are present.
         memory: mean and count before the first step; zeros for "nothing yet".
     """
     after = []
@@ -31,7 +31,7 @@ def running_mean(
 def running_mean_step(
     value: Float[Tensor, "*pairs static"], present: Bool[Tensor, "*pairs"], memory: Float[Tensor, "*pairs _"]
 ) -> Float[Tensor, "*pairs _"]:
-    """The same for one step, whatever the layout of pairs."""
+    """Computes `running_mean` for one step, in any layout of pairs."""
     mean, count = memory[..., :-1], memory[..., -1:] + 1
     return torch.cat([mean + (value - mean) / count, count], dim=-1) * present[..., None]
 
@@ -39,7 +39,7 @@ def running_mean_step(
 def window_mean(
     values: Float[Tensor, "batch time agents slots static"], pairs: Bool[Tensor, "batch time agents slots"]
 ) -> Float[Tensor, "batch time agents slots static"]:
-    """Mean over all steps of the window at which a pair is there (the paper's pair matching); training only."""
+    """Computes the mean over all steps of a window with the pair present (the paper's pair matching); training only."""
     present = pairs[..., None]
     mean = (values * present).sum(1, keepdim=True) / present.sum(1, keepdim=True).clamp(min=1)
     return mean * present

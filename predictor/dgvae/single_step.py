@@ -1,9 +1,9 @@
-"""Single steps of the dG-VAE without gradients: what streaming and roll-outs run.
+"""Single steps of the dG-VAE without gradients, used by streaming and roll-outs.
 
-The same function as the modules of `predictor.dgvae.networks`, with fewer operations: only agents and pairs that are
-there are computed (`predictor.dgvae.packing`), linear layers in a row are folded into one, layers on the same input are
-one product, and everything edge-sized is done in place. The folded weights are a snapshot; `is_current` tells whether
-the modules have changed since.
+The stepper computes the function of the modules of `predictor.dgvae.networks` with fewer operations: only present
+agents and pairs are computed (`predictor.dgvae.packing`), consecutive linear layers are folded into one, layers on one
+input are one product, and everything edge-sized is done in place. The folded weights are a snapshot; `is_current`
+returns whether the modules still have them.
 """
 
 from dataclasses import dataclass
@@ -22,16 +22,16 @@ from predictor.layers.rnn import elu, elu_, gru_step_, lstm_step_
 
 
 class Past(NamedTuple):
-    """What the encoder remembers; tensors with a time axis, or without one."""
+    """Memory of the encoder; tensors with a time axis, or without one."""
 
     hidden: Tensor
     cell: Tensor
     static: Tensor  # pair matching: mean and count (no column if off)
-    seen: Tensor  # the latest inputs and a 1 (no column if changes are not looked at)
+    seen: Tensor  # the latest inputs and a 1 (no column if changes are no input)
 
 
 class Encoding(NamedTuple):
-    """What the encoder makes of a stretch of steps."""
+    """Encoder outputs for several steps."""
 
     edges: Edges
     features: Tensor  # with the static dimensions averaged over the past of each step
@@ -40,22 +40,22 @@ class Encoding(NamedTuple):
 
 @runtime_checkable
 class Layers(Protocol):
-    """What single steps need of the networks; `graph` is `Padded` for the modules, `Packed` for the stepper."""
+    """Interface of the networks in single steps; `graph` is `Padded` for the modules, `Packed` for the stepper."""
 
     def encode(self, inputs: Tensor, graph: Any, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Memory of each pair after a step (hidden, cell), prior logits and features."""
+        """Computes the memory of each pair after a step (hidden, cell), prior logits and features."""
 
-    def drive(
+    def decode(
         self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, node: Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """GRU states after a step along a graph; and the messages, unless nobody else needs them."""
+        """Computes GRU states after a step along weighted edges; and the messages, unless only the GRU needs them."""
 
     def messages(self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor) -> Tensor:
-        """What reaches each agent along a graph."""
+        """Computes the sum of messages to each agent along weighted edges."""
 
 
 class Internal(NamedTuple):
-    """What a belief keeps to roll out from."""
+    """Data of a belief from which it is rolled out."""
 
     layers: Layers
     graph: Padded | Packed  # of all that follows but states
@@ -70,36 +70,36 @@ class Internal(NamedTuple):
 
 @dataclass(frozen=True)
 class Modules:
-    """Single steps through the modules themselves."""
+    """Computes single steps by the modules themselves."""
 
     encoder: Encoder
     decoder: Decoder
 
     def encode(self, inputs: Tensor, graph: Any, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """As `Layers.encode`."""
+        """Computes the memory of each pair after a step (hidden, cell), prior logits and features."""
         edges: Edges = self.encoder(inputs[:, None], graph.present[:, None], hidden, cell, graph.senders)
         return edges.hidden[:, 0], edges.cell[:, 0], edges.prior_logits[:, 0], edges.features[:, 0]
 
-    def drive(
+    def decode(
         self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, node: Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """As `Layers.drive`."""
+        """Computes GRU states after a step along weighted edges, and the messages."""
         messages = self.messages(inputs, graph, weights, features)
         return self.decoder.step(messages, node), messages
 
     def messages(self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor) -> Tensor:
-        """As `Layers.messages`."""
+        """Computes the sum of messages to each agent along weighted edges."""
         return self.decoder.messages(inputs, graph.present, weights, features, graph.senders)
 
 
 def differentiable() -> bool:
-    """Returns whether derivatives may be asked for: autograd, forward mode or a transform of `torch.func` is on."""
+    """Returns whether derivatives may be taken: autograd, forward mode or a transform of `torch.func` is on."""
     functional_transform: bool = torch._C._are_functorch_transforms_active()
     return torch.is_grad_enabled() or functional_transform or forward_ad._current_level >= 0
 
 
 def unpacked(known: Internal, layers: Layers) -> Internal:
-    """The same for other layers, which take padded arrays."""
+    """Returns the data of a belief for other layers, which take padded arrays."""
     graph = known.graph
     if isinstance(graph, Padded):
         return known
@@ -119,29 +119,29 @@ Layer = tuple[Tensor, Tensor]
 _ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
 
-# A product of this many multiplications or more is left to oneDNN, which takes longer to start.
+# Products of this many multiplications or more are computed by oneDNN, which takes longer to start.
 _LARGE = 2**20
 
 
 class Stepper:
-    """The encoder and decoder of one network, ready for single steps.
+    """Computes single steps of one network with folded weights.
 
     Args:
-        encoder: without innovation rounds; its dropout is off.
-        decoder: likewise.
+        encoder: encoder without innovation rounds and with dropout off.
+        decoder: decoder of the network.
     """
 
     def __init__(self, encoder: Encoder, decoder: Decoder) -> None:
-        """Fold the weights."""
+        """Folds the weights."""
         self._snapshot = _versions(encoder, decoder)
         with torch.no_grad():
             self._take_encoder(encoder)
             self._take_decoder(decoder)
 
     def is_current(self, encoder: Encoder, decoder: Decoder) -> bool:
-        """Whether these modules still have the weights that were folded.
+        """Returns whether these modules still have the weights that were folded.
 
-        What writes into a tensor behind autograd's back is not seen: `.data`, or the replay of a CUDA graph.
+        Changes that autograd does not count are not noticed: through `.data`, or by the replay of a CUDA graph.
         """
         return self._snapshot == _versions(encoder, decoder)
 
@@ -157,7 +157,7 @@ class Stepper:
         Float[Tensor, "pairs types"],
         Float[Tensor, "pairs feature"],
     ]:
-        """Memory of each pair after a step (hidden, cell), prior logits and features."""
+        """Computes the memory of each pair after a step (hidden, cell), prior logits and features."""
         summed = graph.gather(elu_(_spread(inputs, self._conv, graph)))
         nodes = _product(summed, (self._conv_out[0], None))
         nodes = elu_(nodes.addcmul_(graph.counts, self._conv_out[1]))
@@ -170,7 +170,7 @@ class Stepper:
         width = heads.shape[1] // 2
         return hidden, cell, _product(heads[:, :width], self._logits), _product(heads[:, width:], self._features)
 
-    def drive(
+    def decode(
         self,
         inputs: Float[Tensor, "listed inputs"],
         graph: Packed,
@@ -178,13 +178,13 @@ class Stepper:
         features: Float[Tensor, "pairs feature"],
         node: Float[Tensor, "listed decoder"],
     ) -> tuple[Float[Tensor, "listed decoder"], Float[Tensor, "listed message"] | None]:
-        """GRU states after a step along a graph; and the messages, if substeps need them."""
-        if self._driven is None:
+        """Computes GRU states after a step along weighted edges; and the messages, if substeps need them."""
+        if self._to_gates is None:
             messages = self.messages(inputs, graph, weights, features)
             gates = _product(messages, self._gru)
         else:
             messages = None
-            gates = self._along(inputs, graph, weights, features, *self._driven)
+            gates = self._along(inputs, graph, weights, features, *self._to_gates)
         return gru_step_(gates, _product(node, self._remembered), node), messages
 
     def messages(
@@ -194,7 +194,7 @@ class Stepper:
         weights: Float[Tensor, "pairs types"],
         features: Float[Tensor, "pairs feature"],
     ) -> Float[Tensor, "listed message"]:
-        """What reaches each agent along a graph, its own term included."""
+        """Computes the sum of messages to each agent along weighted edges, its own term included."""
         return self._along(inputs, graph, weights, features, self._own, self._out)
 
     def _along(
@@ -235,11 +235,11 @@ class Stepper:
         self._out: list[Layer] = list(zip(*parts, strict=True))
         self._gru = (gru.weight_ih.detach(), gru.bias_ih.detach())
         self._remembered = (gru.weight_hh.detach(), gru.bias_hh.detach())
-        self._driven: tuple[Layer, list[Layer]] | None = None
+        self._to_gates: tuple[Layer, list[Layer]] | None = None
         if not hasattr(decoder, "direct"):  # nothing but the GRU needs the messages
             weight, bias = self._gru
             own = (weight @ self._own[0], weight @ self._own[1] + bias)
-            self._driven = (own, [(weight @ matrix, weight @ share) for matrix, share in self._out])
+            self._to_gates = (own, [(weight @ matrix, weight @ share) for matrix, share in self._out])
 
 
 def _versions(*modules: nn.Module) -> list[tuple[int, int]]:
@@ -247,26 +247,26 @@ def _versions(*modules: nn.Module) -> list[tuple[int, int]]:
     return [(p.data_ptr(), 0 if p.is_inference() else p._version) for p in parameters]
 
 
-def _product(rows: Tensor, layer: tuple[Tensor, Tensor | None], plus: Tensor | None = None) -> Tensor:
-    """A linear layer, plus what is there already (which may be overwritten)."""
+def _product(inputs: Tensor, layer: tuple[Tensor, Tensor | None], plus: Tensor | None = None) -> Tensor:
+    """Computes a linear layer, plus `plus` (which may be overwritten)."""
     weight, bias = layer
-    if _ONEDNN and rows.device.type == "cpu" and rows.dtype is torch.float32:
-        if len(rows) * weight.numel() >= _LARGE:
+    if _ONEDNN and inputs.device.type == "cpu" and inputs.dtype is torch.float32:
+        if len(inputs) * weight.numel() >= _LARGE:
             linear = torch.ops.mkldnn._linear_pointwise
             if plus is None:
-                return linear(rows, weight, bias, "none", [], "")
-            return linear.binary(rows, plus, weight, bias, "add")
-    product = functional.linear(rows, weight, bias)
+                return linear(inputs, weight, bias, "none", [], "")
+            return linear.binary(inputs, plus, weight, bias, "add")
+    product = functional.linear(inputs, weight, bias)
     return product if plus is None else product.add_(plus)
 
 
 def _spread(nodes: Tensor, layer: Layer, graph: Packed) -> Tensor:
-    """A `PairLinear` whose two products are one."""
+    """Computes a `PairLinear` with one product instead of two."""
     return graph.spread(_product(nodes, layer))
 
 
 def _roles(pair: PairLinear, after: nn.Linear | None = None) -> Layer:
-    """Receiver's and sender's share of a `PairLinear`, one above the other."""
+    """Returns receiver's and sender's share of a `PairLinear` as one layer."""
     received, sent = (
         folded(role, after) if after is not None else _layer(role) for role in (pair.receiver, pair.sender)
     )
@@ -281,5 +281,5 @@ def _layer(linear: nn.Linear) -> Layer:
 
 
 def _beside(*layers: Layer) -> Layer:
-    """Layers on the same input as one."""
+    """Joins layers on the same input into one."""
     return torch.cat([weight for weight, _ in layers]), torch.cat([bias for _, bias in layers])

@@ -1,7 +1,7 @@
-"""From forecasts and truth to an accuracy table; used on windows of a dataset and on live environments alike.
+"""Computes accuracy from forecasts and truth, for windows of a dataset and for live environments.
 
-Outcomes are reduced to a few sums per window as they come, so that a test set of any size needs little memory; the
-forecasts themselves are not kept.
+Each batch of outcomes is reduced to a few sums per window, so a test set of any size needs little memory; the
+forecasts are not kept.
 """
 
 import math
@@ -37,67 +37,67 @@ __all__ = [
 ]
 
 OPTIONAL = ("coverage",)
-"""Left out, rather than NaN, where nothing of it could be measured."""
+"""Names of quantities that are left out, not NaN, if they could not be measured."""
 SCALAR_NAMES = {"rmse_m": "overall_rmse_m", "coverage": "coverage"}
-"""By-step quantities that also have one number over all steps."""
+"""Names of the numbers over all steps, by name of the quantity at each step."""
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Errors of one forecaster at one number of samples; NaN where there was no truth to compare with."""
+    """Errors of one forecaster at one number of samples; NaN without a truth to compare with."""
 
     name: str
-    """The forecaster."""
+    """Name of the forecaster."""
     num_samples: int
-    """K of the best-of-K metrics."""
+    """Number of samples, K of the best-of-K metrics."""
     min_ade_m: float
-    """Mean over agents whose truth is known over the whole horizon [m]."""
+    """Mean displacement [m], best sample per agent; mean over agents whose truth is known over the whole horizon."""
     min_fde_m: float
-    """The same at the last step [m]."""
+    """Displacement at the last step [m], best sample per agent; mean over these agents."""
     by_step_m: list[float]
-    """Displacement at each step of each agent's best sample [m], all agents whose truth is known there."""
+    """Displacement of each agent's best sample at each step [m]; mean over agents whose truth is known at the step."""
     rmse_m: list[float]
     """Root mean squared displacement of the samples' mean at each step [m]."""
     nll: list[float]
     """Negative log-likelihood at each step [nats], with the spread fitted on validation data; empty without one."""
     agents: int
-    """Forecasts (agent × instant) behind min_ade_m."""
+    """Number of forecasts (agent × step) behind `min_ade_m`."""
     min_joint_ade_m: float = math.nan
-    """Best sample per scene, mean over scenes [m]; the agents of min_ade_m."""
+    """Mean displacement [m], best sample per scene; mean over scenes, with the agents of `min_ade_m`."""
     min_joint_fde_m: float = math.nan
-    """The same at the last step [m]."""
+    """Displacement at the last step [m], best sample per scene; mean over scenes."""
     miss_rate: float = math.nan
-    """Share of the agents of min_fde_m whose final displacement, at best, is above the threshold."""
+    """Share of the agents of `min_fde_m` whose best final displacement is above the threshold."""
     overall_rmse_m: float = math.nan
-    """Root mean squared displacement of the samples' mean [m] over all steps and agents whose truth is known. All axes
-    count together, so it is never below the mean displacement; see `rmse_per_axis_m`."""
+    """Root mean squared displacement of the samples' mean [m] over all steps and agents whose truth is known. The
+    squares of all axes are added, so it is never below the mean displacement; see `rmse_per_axis_m`."""
     coverage: list[float] = field(default_factory=list)
-    """Share of truths within the central 90 % of the samples at each step; empty with too few samples to say."""
+    """Share of truths within the central 90 % of the samples at each step; empty with too few samples."""
     miss_by_step: list[float] = field(default_factory=list)
-    """Share of agents whose best sample is further off than the threshold at each step."""
+    """Share of agents whose best sample has a displacement above the threshold at each step."""
     miss_threshold_m: float = metrics.MISS_THRESHOLD_M
-    """Of the misses [m]."""
+    """Threshold of `miss_rate` and `miss_by_step` [m]."""
     scenes: int = 0
-    """Instants behind min_joint_ade_m."""
+    """Number of scenes behind `min_joint_ade_m`."""
     axes: int = 2
-    """Of a position."""
+    """Number of axes of a position."""
     statistics: dict[str, Statistic] = field(default_factory=dict)
     """Mean ± standard error over subsets of the windows, by name of the scalar fields above, and "coverage" over all
     steps; without those that could not be measured."""
     step_errors: dict[str, list[float | None]] = field(default_factory=dict)
-    """Standard error over the same subsets at each step, by name of the list fields above."""
+    """Standard error over these subsets at each step, by name of the list fields above."""
     intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """95 % bootstrap interval over batches (episodes, in a live environment), by name of the scalar fields; where asked
-    for."""
+    """95 % bootstrap interval over batches (episodes, in a live environment), by name of the scalar fields; empty
+    if not requested."""
     step_intervals: dict[str, list[tuple[float, float] | None]] = field(default_factory=dict)
-    """The same at each step, by name of the list fields."""
+    """95 % bootstrap interval over batches at each step, by name of the list fields."""
 
     @property
     def rmse_per_axis_m(self) -> float:
-        """Overall RMSE per coordinate [m]: root of the mean over axes too, `overall_rmse_m` / √axes.
+        """Overall RMSE per coordinate [m]: root of the mean over steps, agents and axes, `overall_rmse_m` / √axes.
 
         The paper does not define its RMSE, but reports some below the mean displacement of the same deterministic
-        model (springs, "Linear": 0.196 beside an ADE of 0.202); over equal steps only a mean over axes does that.
+        model (springs, "Linear": 0.196 beside an ADE of 0.202); over equal steps only a mean over axes gives that.
         """
         return self.overall_rmse_m / math.sqrt(self.axes)
 
@@ -107,10 +107,10 @@ class Tally:
 
     Args:
         std_m: spread per axis at each step [m] for the likelihood; empty, or shorter than the horizon, leaves it out.
-        miss_threshold_m: of the miss rate [m].
-        partial_agents: count also agents whose truth is known in part: their displacement is the mean over the known
-            steps, and their final one counts if the last step is known. Left out by default, so that every mean is
-            over forecasts of equal length.
+        miss_threshold_m: threshold of the miss rate [m].
+        partial_agents: whether agents with a partly known truth count: their displacement is the mean over the known
+            steps, and their final one counts if the last step is known. By default they do not, so that every mean
+            is over forecasts of equal length.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class Tally:
         miss_threshold_m: float = metrics.MISS_THRESHOLD_M,
         partial_agents: bool = False,
     ) -> None:
-        """Nothing collected yet."""
+        """Begins without outcomes."""
         self._std_m = tuple(std_m)
         self._threshold_m = miss_threshold_m
         self._partial = partial_agents
@@ -128,15 +128,17 @@ class Tally:
         self._counts: dict[str, list[np.ndarray]] = {}
 
     def add(self, outcome: Outcome) -> None:
-        """Take in a batch of windows.
+        """Adds a batch of windows.
 
         Raises:
-            ValueError: another number of samples, steps or axes than before.
+            ValueError: the number of samples, steps or axes differs from that of earlier batches.
         """
         _, samples, _, horizon, axes = outcome.forecast.shape
         shape = (samples, horizon, axes)
         if self._shape not in (None, shape):
-            raise ValueError(f"outcomes of one row need the same samples, horizon and axes {self._shape}, got {shape}")
+            raise ValueError(
+                f"outcomes of one tally need the same samples, horizon and axes {self._shape}, got {shape}"
+            )
         self._shape = shape
         for name, (value, valid) in self._measure(outcome).items():
             known, count = torch.where(valid, value, 0.0).double(), valid.double()
@@ -148,13 +150,13 @@ class Tally:
     def accuracy(
         self, name: str, num_subsets: int = NUM_SUBSETS, seed: int = 0, batch_intervals: bool = False
     ) -> Accuracy:
-        """One row of what was collected.
+        """Returns the accuracy over all batches that were added.
 
         Args:
             name: the forecaster's name.
-            num_subsets: subsets of windows behind the standard errors.
-            seed: of the subsets.
-            batch_intervals: also bootstrap over the batches that were added, where each is an independent episode.
+            num_subsets: number of subsets of windows for the standard errors.
+            seed: random seed of the subsets and of the bootstrap.
+            batch_intervals: whether to bootstrap over the batches, each of which must be an independent episode.
 
         Raises:
             ValueError: nothing was collected.
@@ -198,7 +200,7 @@ class Tally:
     def _bootstrap(
         self, seed: int
     ) -> tuple[dict[str, tuple[float, float]], dict[str, list[tuple[float, float] | None]]]:
-        """`Accuracy.intervals` and `Accuracy.step_intervals`."""
+        """Computes `Accuracy.intervals` and `Accuracy.step_intervals`."""
         scalars: dict[str, tuple[float, float]] = {}
         by_step: dict[str, list[tuple[float, float] | None]] = {}
         for key, parts in self._sums.items():
@@ -215,7 +217,7 @@ class Tally:
         return scalars, by_step
 
     def _measure(self, outcome: Outcome) -> dict[str, tuple[Tensor, Tensor]]:
-        """Every metric's values and mask: per agent, per scene, and per agent and step."""
+        """Computes values and mask of every metric: per agent, per scene, and per agent and step."""
         forecast, future, valid = outcome.forecast, outcome.future, outcome.valid
         horizon = forecast.shape[3]
         counted = valid if self._partial else valid & valid.all(-1, keepdim=True)
@@ -246,13 +248,13 @@ def summarise(
     std_m: Sequence[float] = (),
     miss_threshold_m: float = metrics.MISS_THRESHOLD_M,
 ) -> Accuracy:
-    """Average outcomes into one row.
+    """Computes the accuracy of outcomes.
 
     Args:
         name: the forecaster's name.
-        outcomes: at least one, of equal samples and horizon; an iterator is consumed as it goes.
+        outcomes: at least one, of equal samples and horizon; an iterator is consumed batch by batch.
         std_m: spread per axis at each step [m] for the likelihood; empty leaves it out.
-        miss_threshold_m: of the miss rate [m].
+        miss_threshold_m: threshold of the miss rate [m].
     """
     tally = Tally(std_m, miss_threshold_m)
     for outcome in outcomes:
@@ -261,7 +263,7 @@ def summarise(
 
 
 def fitted_std_m(outcomes: Iterable[Outcome]) -> tuple[float, ...]:
-    """Standard deviation per axis of the first sample's error at each step [m]: the maximum-likelihood round spread."""
+    """Computes the standard deviation per axis of the first sample's error at each step [m] (maximum likelihood)."""
     totals, counts = [], []
     for outcome in outcomes:
         squared = (outcome.forecast[:, 0] - outcome.future).square().sum(-1)
@@ -280,7 +282,7 @@ def _ratio(total: float, count: float) -> float:
 def _spread(
     sums: dict[str, np.ndarray], counts: dict[str, np.ndarray], num_subsets: int, seed: int
 ) -> tuple[dict[str, Statistic], dict[str, list[float | None]]]:
-    """`Accuracy.statistics` and `Accuracy.step_errors` from sums and counts per window (and step)."""
+    """Computes `Accuracy.statistics` and `Accuracy.step_errors` from sums and counts per window (and step)."""
     scalars: dict[str, Statistic | None] = {}
     step_errors: dict[str, list[float | None]] = {}
     for key in sums:

@@ -1,8 +1,8 @@
-"""Do edge features say what they should: R² of known attributes, and disentanglement (DCI, MIG), on NumPy arrays.
+"""Scores features against known factors: R² of attributes, and disentanglement (DCI, MIG), on NumPy arrays.
 
-For edges: rows are pairs (mask out pairs without an edge, whose spring constant means nothing), columns of `features`
-are the edge-feature dimensions, columns of `factors` the known attributes. R² that is negative is worse than knowing
-the mean alone. Where a number cannot be had (nothing valid, a constant target) it is None.
+For edges, a point is a pair (pairs without an edge are masked out, since their spring constant has no meaning), columns
+of `features` are the edge-feature dimensions, columns of `factors` the known attributes. A negative R² is worse than
+the mean alone. A number that is not defined (nothing valid, a constant target) is None.
 
 Sources: DCI, Eastwood & Williams, "A Framework for the Quantitative Evaluation of Disentangled Representations", ICLR
 2018; MIG, Chen et al., "Isolating Sources of Disentanglement in VAEs", NeurIPS 2018 (histograms as in Locatello et al.,
@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from predictor.support.errors import UserError
 
 MIN_R2 = 0.01
-"""Held-out R² from which on `dci` believes that a factor can be read."""
+"""Least held-out R² of a factor that `dci` counts as predictable."""
 
 
 def sklearn(module: str) -> Any:
@@ -39,15 +39,15 @@ def direct_r2(
     target: Float[np.ndarray, "*entries"],
     valid: Bool[np.ndarray, "*entries"],
 ) -> float | None:
-    """1 − SSE/SST of predictions as they are, nothing refitted: what restricted labelling is judged by.
+    """Computes 1 − SSE/SST of unchanged predictions, without a fit: the measure of restricted labelling.
 
     Args:
-        prediction: in the target's unit.
-        target: truth.
+        prediction: predictions in the unit of the target.
+        target: true values.
         valid: which entries count.
 
     Returns:
-        None where fewer than two targets count or all are equal.
+        R², or None if fewer than two targets count or all are equal.
     """
     given, truth = prediction[valid].astype(np.float64), target[valid].astype(np.float64)
     total = float(np.square(truth - truth.mean()).sum()) if len(truth) > 1 else 0.0
@@ -61,20 +61,20 @@ def linear_r2(
     ridge: float = 1e-3,
     seed: int = 0,
 ) -> float | None:
-    """R² of a linear read-out of all dimensions, fitted on one half and scored on the other.
+    """Computes R² of a linear regression on all dimensions, fitted on one half and scored on the other.
 
     The halves are drawn over the first axis, so that with (windows, receivers, senders) both directions of a spring
     fall into the same half.
 
     Args:
         features: edge features.
-        target: attribute to read out.
+        target: attribute to predict.
         valid: which entries count.
-        ridge: penalty per row on the weights of standardised features; small, for dimensions that are copies.
-        seed: of the halves.
+        ridge: penalty per point on the weights of standardised features; small, for equal dimensions.
+        seed: random seed of the halves.
 
     Returns:
-        None where a half has fewer than two valid entries, or the scored half's targets are all equal.
+        R², or None if a half has fewer than two valid entries or the targets of the scored half are all equal.
     """
     order = np.random.default_rng(seed).permutation(len(valid))
     fit, score = order[: len(order) // 2], order[len(order) // 2 :]
@@ -92,41 +92,41 @@ class DCI:
     """Disentanglement, completeness, informativeness; the first two lie between 0 and 1."""
 
     disentanglement: float | None
-    """1 where every dimension serves one factor at most; None with one factor (it would be 1 by definition)."""
+    """1 if every dimension predicts one factor at most; None with one factor (it would be 1 by definition)."""
     completeness: float | None
-    """1 where every factor is held by one dimension; None with one dimension."""
+    """1 if every factor is predicted by one dimension; None with one dimension."""
     informativeness: float | None
     """Mean over factors of the held-out R² of the regressor (the paper gives its error; 1 is perfect in either)."""
     importance: list[list[float]]
-    """Of each dimension (rows) for each factor (columns); all zero where no factor can be read at all."""
+    """Importance of each dimension (outer list) for each factor (inner list); all zero if no factor is predictable."""
 
 
 def dci(
-    features: Float[np.ndarray, "rows dims"],
-    factors: Float[np.ndarray, "rows factors"],
+    features: Float[np.ndarray, "points dims"],
+    factors: Float[np.ndarray, "points factors"],
     regressor: Literal["lasso", "forest"] = "lasso",
     seed: int = 0,
     alpha: float = 0.05,
 ) -> DCI:
-    """DCI of features, with factors and features standardised; fitted on half of the rows, scored on the other.
+    """Computes DCI of features, with factors and features standardised; fitted on one half, scored on the other.
 
     Importance is a Lasso's absolute weight (linear relations) or a random forest's impurity decrease (any). A factor
-    that the regressor cannot read (held-out R² below `MIN_R2`) has no importances: they would be noise, and noise in
-    one place looks perfectly disentangled. Where informativeness is low, the other two mean little.
+    that the regressor cannot predict (held-out R² below `MIN_R2`) has importance 0: it would be noise, and noise in a
+    single dimension looks perfectly disentangled. If informativeness is low, the other two have little meaning.
 
     Args:
-        features: one row per pair (or whatever carries features).
-        factors: the same rows' known attributes.
-        regressor: "lasso" or "forest"; the forest takes seconds where rows are ten thousands.
-        seed: of the halves and the forest.
-        alpha: the Lasso's penalty; correlations below it count as none.
+        features: features of the points, such as pairs.
+        factors: known attributes of the points.
+        regressor: "lasso" or "forest"; the forest takes seconds for ten thousand points.
+        seed: random seed of the halves and the forest.
+        alpha: penalty of the Lasso; correlations below it count as zero.
 
     Raises:
         UserError: scikit-learn is not installed.
-        ValueError: fewer than four rows.
+        ValueError: there are fewer than four points.
     """
     if len(features) < 4:
-        raise ValueError(f"dci needs at least 4 rows, got {len(features)}")
+        raise ValueError(f"dci needs at least 4 points, got {len(features)}")
     order = np.random.default_rng(seed).permutation(len(features))
     fit, score = order[: len(order) // 2], order[len(order) // 2 :]
     scale = sklearn("preprocessing").StandardScaler
@@ -150,12 +150,12 @@ def dci(
 
 
 def mig(
-    features: Float[np.ndarray, "rows dims"], factors: Float[np.ndarray, "rows factors"], bins: int = 20
+    features: Float[np.ndarray, "points dims"], factors: Float[np.ndarray, "points factors"], bins: int = 20
 ) -> float | None:
-    """Mutual information gap: how much more the best dimension says of a factor than the second, over its entropy.
+    """Computes the mutual information gap: (largest − second largest information about a factor) / its entropy.
 
-    Mean over factors that vary; about 1 where each is held by one dimension, 0 where two dimensions say the same or
-    none says anything; 0 to 1. One dimension alone is compared with knowing nothing. None if no factor varies.
+    The gap is a mean over factors that vary, from 0 to 1: about 1 if one dimension alone holds each factor, 0 if two
+    dimensions hold it equally or none does. A single dimension is compared with 0. None if no factor varies.
     """
     information = np.sort(mutual_information(features, factors, bins), axis=0)[::-1]
     second = information[1] if len(information) > 1 else np.zeros_like(information[0])
@@ -166,17 +166,18 @@ def mig(
 
 
 def mutual_information(
-    features: Float[np.ndarray, "rows dims"], factors: Float[np.ndarray, "rows factors"], bins: int = 20
+    features: Float[np.ndarray, "points dims"], factors: Float[np.ndarray, "points factors"], bins: int = 20
 ) -> Float[np.ndarray, "dims factors"]:
-    """Mutual information of each dimension and factor [nats], from histograms; never negative.
+    """Computes mutual information of each dimension and factor [nats], from histograms; never negative.
 
-    Bins hold equally many rows each, so that no monotone rescaling matters; values of few kinds (edge types) are their
-    own bins. Miller & Madow's correction takes off what finite samples add, (cells − rows − columns + 1) / 2n.
+    Bins hold equal numbers of points, so the result is invariant to monotone rescaling; a column with few distinct
+    values (edge types) has one bin for each. Miller & Madow's correction subtracts the bias of finite samples,
+    (cells − rows − columns + 1) / 2n of the contingency table.
     """
     if bins < 2:
         raise ValueError(f"bins must be at least 2, got {bins}")
-    rows, columns = _labels(features, bins).T, _labels(factors, bins).T
-    return np.array([[_information(row, column) for column in columns] for row in rows])
+    dims, kinds = _labels(features, bins).T, _labels(factors, bins).T
+    return np.array([[_information(dim, kind) for kind in kinds] for dim in dims])
 
 
 def _regressor(kind: Literal["lasso", "forest"], alpha: float, seed: int) -> Any:
@@ -185,8 +186,8 @@ def _regressor(kind: Literal["lasso", "forest"], alpha: float, seed: int) -> Any
     return sklearn("ensemble").RandomForestRegressor(n_estimators=50, min_samples_leaf=5, random_state=seed)
 
 
-def _decided(importance: Float[np.ndarray, "rows columns"]) -> float:
-    """1 − entropy of each row's shares (base: number of columns), rows weighted by their importance; 0 if all is 0."""
+def _decided(importance: Float[np.ndarray, "one other"]) -> float:
+    """Returns 1 − entropy of shares over the second axis (base: its length), weighted by importance; 0 if all are 0."""
     total = importance.sum(1)
     if not total.any():
         return 0.0
@@ -195,8 +196,8 @@ def _decided(importance: Float[np.ndarray, "rows columns"]) -> float:
     return float(((1 - entropy) * total).sum() / total.sum())
 
 
-def _labels(values: Float[np.ndarray, "rows columns"], bins: int) -> Int[np.ndarray, "rows columns"]:
-    """Bin of each value, column by column."""
+def _labels(values: Float[np.ndarray, "points columns"], bins: int) -> Int[np.ndarray, "points columns"]:
+    """Returns the bin of each value, column by column."""
     labels = np.empty(values.shape, dtype=np.int64)
     for column in range(values.shape[1]):
         kinds, labels[:, column] = np.unique(values[:, column], return_inverse=True)
@@ -206,8 +207,8 @@ def _labels(values: Float[np.ndarray, "rows columns"], bins: int) -> Int[np.ndar
     return labels
 
 
-def _information(first: Int[np.ndarray, " rows"], second: Int[np.ndarray, " rows"]) -> float:
-    """Mutual information of two labels [nats]; of a label with itself its entropy."""
+def _information(first: Int[np.ndarray, " points"], second: Int[np.ndarray, " points"]) -> float:
+    """Computes mutual information of two labels [nats]; of a label with itself its entropy."""
     cluster = sklearn("metrics.cluster")
     joint = cluster.contingency_matrix(first, second, sparse=True)
     excess = joint.nnz - joint.shape[0] - joint.shape[1] + 1

@@ -1,7 +1,7 @@
-"""Forecast metrics as pure functions; each returns its value and which entries mean something.
+"""Computes forecast metrics as pure functions; each returns values and a mask of the valid ones.
 
-Positions have two axes or three [m]. An agent with no valid step has no error: it is reported as invalid, not as a
-perfect 0, and so is a scene with no valid agent. Values where `valid` is not are meaningless.
+Positions have two axes or three [m]. An agent without a valid step has no error: it is invalid, not a perfect 0, and so
+is a scene without a valid agent. Invalid values are meaningless.
 """
 
 import math
@@ -14,13 +14,13 @@ MISS_THRESHOLD_M = 2.0
 """Final displacement above which a forecast misses [m]: the usual choice in driving (Argoverse 1 and 2)."""
 
 COVERAGE_SHARE = 0.9
-"""Share of the truth that the interval of `coverage` should hold."""
+"""Nominal share of truths within the interval of `coverage`."""
 
 
 def displacement(
     forecast: Float[Tensor, "batch samples agents horizon axes"], future: Float[Tensor, "batch agents horizon axes"]
 ) -> Float[Tensor, "batch samples agents horizon"]:
-    """Distance of each predicted position to the truth [m]."""
+    """Computes the distance of each predicted position to the truth [m]."""
     return torch.linalg.vector_norm(forecast - future[:, None], dim=-1)
 
 
@@ -29,7 +29,7 @@ def min_ade(
     future: Float[Tensor, "batch agents horizon axes"],
     valid: Bool[Tensor, "batch agents horizon"],
 ) -> tuple[Float[Tensor, "batch agents"], Bool[Tensor, "batch agents"]]:
-    """Best-of-samples mean displacement over valid steps [m] per agent."""
+    """Computes the mean displacement over valid steps [m] of the best sample per agent."""
     return _mean_displacement(forecast, future, valid).min(dim=1).values, valid.any(-1)
 
 
@@ -38,7 +38,7 @@ def min_fde(
     future: Float[Tensor, "batch agents horizon axes"],
     valid: Bool[Tensor, "batch agents horizon"],
 ) -> tuple[Float[Tensor, "batch agents"], Bool[Tensor, "batch agents"]]:
-    """Best-of-samples displacement at the last step of the horizon [m] per agent; valid if that step is."""
+    """Computes the displacement at the last step [m] of the best sample per agent; valid if that step is."""
     return displacement(forecast[..., -1:, :], future[..., -1:, :])[..., 0].min(dim=1).values, valid[..., -1]
 
 
@@ -47,11 +47,11 @@ def min_joint_ade(
     future: Float[Tensor, "batch agents horizon axes"],
     valid: Bool[Tensor, "batch agents horizon"],
 ) -> tuple[Float[Tensor, " batch"], Bool[Tensor, " batch"]]:
-    """Best-of-samples mean displacement [m] per scene: one sample is chosen for all agents together.
+    """Computes the mean displacement [m] of the best sample per scene: one sample is chosen for all its agents.
 
     A sample's error is the mean over the scene's valid agents of their mean displacement over valid steps, so it is
     never below the mean of `min_ade` over the same agents. (minJointADE, e.g. Weng et al., "Joint Metrics Matter",
-    ICCV 2023; "minSADE" in other places.)
+    ICCV 2023; also called "minSADE".)
     """
     agents = valid.any(-1).sum(-1)
     joint = _mean_displacement(forecast, future, valid).sum(-1) / agents.clamp(min=1)[:, None]
@@ -63,7 +63,7 @@ def min_joint_fde(
     future: Float[Tensor, "batch agents horizon axes"],
     valid: Bool[Tensor, "batch agents horizon"],
 ) -> tuple[Float[Tensor, " batch"], Bool[Tensor, " batch"]]:
-    """The same at the last step of the horizon [m], over the agents that are there; the best sample is its own best."""
+    """Computes the mean displacement at the last step [m] of the best sample per scene, over agents valid there."""
     return min_joint_ade(forecast[..., -1:, :], future[..., -1:, :], valid[..., -1:])
 
 
@@ -73,14 +73,14 @@ def miss_rate(
     valid: Bool[Tensor, "batch agents horizon"],
     threshold_m: float = MISS_THRESHOLD_M,
 ) -> tuple[Float[Tensor, "batch agents"], Bool[Tensor, "batch agents"]]:
-    """1 for each agent whose `min_fde` is above the threshold, else 0; its mean is the miss rate.
+    """Returns 1 for each agent whose `min_fde` is above the threshold, else 0; the mean is the miss rate.
 
     Args:
         forecast: sampled positions [m].
         future: true positions [m].
         valid: which entries count; an agent without its last step is invalid.
-        threshold_m: a final displacement of exactly this is no miss [m]. The default suits driving; scenes of other
-            size need their own.
+        threshold_m: largest final displacement that is not a miss [m]. The default suits driving; scenes of another
+            size need another value.
     """
     final, known = min_fde(forecast, future, valid)
     return (final > threshold_m).to(final.dtype), known
@@ -91,7 +91,7 @@ def min_displacement(
     future: Float[Tensor, "batch agents horizon axes"],
     valid: Bool[Tensor, "batch agents horizon"],
 ) -> tuple[Float[Tensor, "batch agents horizon"], Bool[Tensor, "batch agents horizon"]]:
-    """Displacement at each step [m] of each agent's best sample (best by its mean over valid steps)."""
+    """Computes the displacement at each step [m] of each agent's best sample (by its mean over valid steps)."""
     distance = torch.where(valid[:, None], displacement(forecast, future), 0.0)
     best = distance.sum(-1).argmin(dim=1)
     index = best[:, None, :, None].expand(-1, 1, -1, distance.shape[-1])
@@ -103,7 +103,7 @@ def squared_error(
     future: Float[Tensor, "batch agents horizon axes"],
     valid: Bool[Tensor, "batch agents horizon"],
 ) -> tuple[Float[Tensor, "batch agents horizon"], Bool[Tensor, "batch agents horizon"]]:
-    """Squared displacement of the mean of the samples [m²], axes added up; the root of its mean is the RMSE."""
+    """Computes the squared displacement of the samples' mean [m²], summed over axes (its root mean is the RMSE)."""
     return (forecast.mean(dim=1) - future).square().sum(-1), valid
 
 
@@ -113,7 +113,7 @@ def gaussian_mixture_nll(
     valid: Bool[Tensor, "batch agents horizon"],
     std_m: Float[Tensor, " horizon"],
 ) -> tuple[Float[Tensor, "batch agents horizon"], Bool[Tensor, "batch agents horizon"]]:
-    """Negative log-likelihood [nats] of the true position under equal round Gaussians around the samples.
+    """Computes the negative log-likelihood [nats] of the truth under equal isotropic Gaussians around the samples.
 
     Args:
         forecast: sampled positions [m].
@@ -133,20 +133,20 @@ def coverage(
     valid: Bool[Tensor, "batch agents horizon"],
     share: float = COVERAGE_SHARE,
 ) -> tuple[Float[Tensor, "batch agents horizon"], Bool[Tensor, "batch agents horizon"]]:
-    """1 where the truth is as near the samples' mean as the central `share` of the samples, else 0.
+    """Returns 1 where the truth is as near to the samples' mean as the central `share` of the samples, else 0.
 
-    Its mean is `share` if the samples are spread like the truth, less if they are too sure, more if too timid. The
-    truth's distance to the samples' mean is compared with the `share`-quantile of the samples' own distances. Two
-    details keep a few samples honest: a sample's distance is to the mean of the *others*, because the truth has no part
-    in the mean either (that is K/(K−1) times its distance to the mean of all), and the quantile is the value of rank
-    share·(K+1), between ranks by a line (Hyndman & Fan 1996, type 6: unbiased coverage).
+    The mean is `share` if the samples are spread like the truth, less if their spread is too small, more if it is too
+    large. The distance of the truth to the samples' mean is compared with the `share`-quantile of the samples'
+    distances. For small K, a sample's distance is to the mean of the *other* samples, since the mean does not include
+    the truth either (K/(K−1) times the distance to the mean of all), and the quantile is the value of rank share·(K+1),
+    linear between ranks (Hyndman & Fan 1996, type 6: unbiased coverage).
 
     Args:
         forecast: sampled positions [m].
         future: true positions [m].
         valid: which entries count.
-        share: between 0 and 1. K samples know only quantiles of rank 1 to K: where share·(K+1) is beyond (one sample;
-            fewer than 9 for 0.9), every entry is invalid.
+        share: share between 0 and 1. K samples give quantiles of rank 1 to K: if share·(K+1) is outside (one sample;
+            fewer than 9 for 0.9), all entries are invalid.
 
     Raises:
         ValueError: `share` is not between 0 and 1.
@@ -169,6 +169,6 @@ def _mean_displacement(
     future: Float[Tensor, "batch agents horizon axes"],
     valid: Bool[Tensor, "batch agents horizon"],
 ) -> Float[Tensor, "batch samples agents"]:
-    """Mean over valid steps [m]; 0 for an agent without one."""
+    """Computes the mean displacement over valid steps [m]; 0 for an agent without one."""
     distance = torch.where(valid[:, None], displacement(forecast, future), 0.0)
     return distance.sum(-1) / valid.sum(-1).clamp(min=1)[:, None]

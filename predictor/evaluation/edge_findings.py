@@ -1,4 +1,4 @@
-"""Watch a trained model on windows and gather what its edges say: rows of pairs, their truth, scores, graph."""
+"""Runs a trained model on windows and measures its edges: labelled pairs, scores of edge features, graph accuracy."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -26,121 +26,121 @@ from predictor.graph import pair_mask
 
 @dataclass(frozen=True)
 class Reading:
-    """How a drawn graph gets the value of an attribute from the features: offset + slope × dimension."""
+    """Linear estimate of an attribute from one feature dimension, for drawn graphs: offset + slope × feature."""
 
     dimension: int
-    """Which feature."""
+    """Index of the feature dimension."""
     slope: float = 1.0
-    """1 where restricted labelling made the feature the attribute itself."""
+    """Slope; 1 if restricted labelling trained the feature to equal the attribute."""
     offset: float = 0.0
-    """0 likewise."""
+    """Offset in the unit of the attribute; 0 in that case."""
 
 
 @dataclass(frozen=True)
-class Watched:
-    """What a model says of every pair at each step of the history, from the steps up to it."""
+class InferredEdges:
+    """Edge features and probabilities of all pairs, inferred at each step of the history from the steps up to it."""
 
     features: Float[np.ndarray, "batch time agents agents dims"]
     """Edge features, receiver first."""
     edge_probs: Float[np.ndarray, "batch time agents agents types"]
-    """Prior over edge types."""
+    """Prior probabilities of the edge types."""
     pairs: Bool[np.ndarray, "batch time agents agents"]
-    """Pairs of two different agents that are there."""
+    """Whether receiver and sender are different and both present."""
 
 
 @dataclass(frozen=True)
-class PairRows:
-    """Pairs of which the truth is known, at the last observed step; rows of an episode stand together."""
+class LabelledPairs:
+    """Pairs whose truth is known, at the last observed step; the pairs of an episode are adjacent."""
 
-    features: Float[np.ndarray, "rows dims"]
+    features: Float[np.ndarray, "pairs dims"]
     """Edge features."""
-    edge_prob: Float[np.ndarray, " rows"]
-    """The model's probability of an edge of any type."""
-    exists: Bool[np.ndarray, " rows"] | None
-    """Whether there is one; None where the data has attributes only."""
-    attributes: Float[np.ndarray, "rows attributes"]
-    """Known properties; no column where there are none."""
-    group: Int[np.ndarray, " rows"]
-    """Episode."""
-    distance_m: Float[np.ndarray, " rows"]
-    """Between the two agents."""
+    edge_prob: Float[np.ndarray, " pairs"]
+    """Probability of an edge of any type, by the model."""
+    exists: Bool[np.ndarray, " pairs"] | None
+    """Whether there is an edge; None if the data has attributes only."""
+    attributes: Float[np.ndarray, "pairs attributes"]
+    """Known properties of the edges; no column if there are none."""
+    group: Int[np.ndarray, " pairs"]
+    """Index of the episode."""
+    distance_m: Float[np.ndarray, " pairs"]
+    """Distance between the two agents [m]."""
 
-    def where(self, chosen: Bool[np.ndarray, " rows"]) -> "PairRows":
-        """Some of the rows."""
-        columns: dict[str, Any] = {name: None if rows is None else rows[chosen] for name, rows in vars(self).items()}
-        return PairRows(**columns)
+    def where(self, chosen: Bool[np.ndarray, " pairs"]) -> "LabelledPairs":
+        """Returns the chosen pairs."""
+        columns: dict[str, Any] = {name: None if x is None else x[chosen] for name, x in vars(self).items()}
+        return LabelledPairs(**columns)
 
     @staticmethod
-    def concatenate(parts: "Sequence[PairRows]") -> "PairRows":
-        """The rows of several batches."""
+    def concatenate(parts: "Sequence[LabelledPairs]") -> "LabelledPairs":
+        """Joins the pairs of several batches."""
         columns: dict[str, Any] = {}
         for name, first in vars(parts[0]).items():
             columns[name] = None if first is None else np.concatenate([vars(part)[name] for part in parts])
-        return PairRows(**columns)
+        return LabelledPairs(**columns)
 
 
 @dataclass(frozen=True)
 class Findings:
-    """All numbers; parts are None (or empty) where the data has no labels for them."""
+    """Measurements of a model's edges; those for which the data has no labels are None or empty."""
 
     windows: int
-    """Measured."""
+    """Number of windows measured."""
     episodes: int
-    """That they come from."""
+    """Number of episodes of these windows."""
     graph: GraphAccuracy | None
-    """The inferred graph against the true one."""
+    """Accuracy of the inferred graph."""
     edges: FactorScore | None
-    """Features against the existence of an edge, over all pairs."""
+    """Scores of the features against the existence of an edge, over all pairs."""
     separation: Separation | None
-    """The same by ranks."""
+    """Rank statistics of the features against the existence of an edge."""
     attributes: list[FactorScore]
-    """Features against each attribute, on true edges."""
+    """Scores of the features against each attribute, on true edges."""
     disentanglement: Disentanglement | None
-    """Of the attributes on true edges."""
+    """DCI and MIG of the attributes on true edges."""
     stillness: Stillness
-    """Over the whole history."""
+    """Change of the features over the whole history."""
     stillness_late: Stillness
-    """Over its second half, when the model has seen enough to make up its mind."""
+    """Change of the features over the second half of the history."""
     reading: Reading | None
-    """Of the first attribute."""
+    """Linear estimate of the first attribute, for drawn graphs."""
 
 
 @torch.inference_mode()
-def watch(forecaster: Forecaster, batch: WindowBatch) -> Watched:
-    """Stream the histories of windows that are all equally long, and keep what is believed at each step."""
+def infer_edges(forecaster: Forecaster, batch: WindowBatch) -> InferredEdges:
+    """Streams histories of equal length and keeps edge features and probabilities of each step."""
     memory = forecaster.empty_memory(batch.states.shape[0], batch.states.shape[2])
     beliefs: list[Belief] = []
     for step in range(int(batch.last_observed[0]) + 1):
         valid = batch.valid[:, step]
         memory, belief = forecaster.observe(memory, batch.states[:, step] * valid[..., None], valid)
         beliefs.append(belief.dense())
-    return Watched(
+    return InferredEdges(
         torch.stack([b.edge_features for b in beliefs], dim=1).cpu().numpy(),
         torch.stack([b.edge_probs for b in beliefs], dim=1).cpu().numpy(),
         pair_mask(batch.valid[:, : len(beliefs)]).cpu().numpy(),
     )
 
 
-def labelled_rows(
-    watched: Watched, batch: WindowBatch, episodes: Int[np.ndarray, " batch"], axes: int
-) -> PairRows | None:
-    """The pairs whose truth is known at the last observed step; None without labels."""
+def labelled_pairs(
+    inferred: InferredEdges, batch: WindowBatch, episodes: Int[np.ndarray, " batch"], axes: int
+) -> LabelledPairs | None:
+    """Returns the pairs whose truth is known at the last observed step; None without labels."""
     last = int(batch.last_observed[0])
     if batch.edge_types is None and batch.edge_attributes is None:
         return None
     types = None if batch.edge_types is None else batch.edge_types[:, last].numpy()
-    known = watched.pairs[:, -1] & (True if types is None else types >= 0)
+    known = inferred.pairs[:, -1] & (True if types is None else types >= 0)
     window, receiver, sender = np.nonzero(known)
-    # Both directions of a pair stand together, so that shuffled values keep their symmetry.
+    # Both directions of a pair are adjacent, so that shuffled values keep their symmetry.
     order = np.lexsort((receiver, np.maximum(receiver, sender), np.minimum(receiver, sender), window))
     at = window[order], receiver[order], sender[order]
     attributes = (
         np.zeros((*known.shape, 0)) if batch.edge_attributes is None else batch.edge_attributes[:, last].numpy()
     )
     positions = batch.states[:, last, :, :axes].numpy()
-    return PairRows(
-        watched.features[:, -1][at],
-        1 - watched.edge_probs[:, -1, ..., 0][at],
+    return LabelledPairs(
+        inferred.features[:, -1][at],
+        1 - inferred.edge_probs[:, -1, ..., 0][at],
         None if types is None else types[at] > 0,
         attributes[at],
         episodes[at[0]],
@@ -156,53 +156,53 @@ def measure(
     seed: int = 0,
     device: str = "cpu",
 ) -> tuple[Findings, Float[np.ndarray, " windows"]]:
-    """All numbers, and the graph accuracy of each window (NaN where no truth is known).
+    """Computes all findings, and the graph accuracy of each window (NaN without a known truth).
 
     Args:
-        forecaster: with edge features.
-        windows: of one length of history.
-        parts: which windows, in ascending order, cut into batches.
-        names: of the attributes.
-        seed: of shuffles and halves.
-        device: where the forecaster lives.
+        forecaster: model with edge features.
+        windows: windows with one length of history.
+        parts: numbers of the windows in ascending order, in batches.
+        names: names of the attributes.
+        seed: random seed of shuffles and halves.
+        device: device of the forecaster.
     """
     tally, whole, late = GraphTally(forecaster.num_edge_types), StillnessTally(), StillnessTally()
-    rows: list[PairRows] = []
+    pairs_of_batches: list[LabelledPairs] = []
     accuracies: list[float] = []
     episodes: list[np.ndarray] = []
     for indices in parts:
         batch = windows.batch(indices)
-        watched = watch(forecaster, batch.to(torch.device(device)))
+        inferred = infer_edges(forecaster, batch.to(torch.device(device)))
         episodes.append(windows.index[indices, 0])
-        edges = watched.pairs[:, -1]
+        edges = inferred.pairs[:, -1]
         if batch.edge_types is not None:
             types = batch.edge_types[:, int(batch.last_observed[0])].clamp(max=forecaster.num_edge_types - 1)
-            probs, pairs = torch.from_numpy(watched.edge_probs[:, -1]), torch.from_numpy(edges)
+            probs, pairs = torch.from_numpy(inferred.edge_probs[:, -1]), torch.from_numpy(edges)
             tally.add(probs, types, pairs)
             found = [graph_accuracy(p[None], t[None], v[None]) for p, t, v in zip(probs, types, pairs, strict=True)]
             accuracies += [np.nan if f is None else f for f in found]
             edges = edges & (types > 0).numpy()
-        known = labelled_rows(watched, batch, episodes[-1], windows.spec.position_dim)
-        rows += [] if known is None else [known]
-        for still, begin in ((whole, 0), (late, watched.pairs.shape[1] // 2)):
-            there = edges & watched.pairs[:, begin:].all(axis=1)
-            still.add(np.moveaxis(watched.features[:, begin:], 1, 3)[there])
+        known = labelled_pairs(inferred, batch, episodes[-1], windows.spec.position_dim)
+        pairs_of_batches += [] if known is None else [known]
+        for still, begin in ((whole, 0), (late, inferred.pairs.shape[1] // 2)):
+            there = edges & inferred.pairs[:, begin:].all(axis=1)
+            still.add(np.moveaxis(inferred.features[:, begin:], 1, 3)[there])
     findings = Findings(
         sum(map(len, episodes)),
         len(np.unique(np.concatenate(episodes))),
         graph=tally.results() if accuracies and not np.isnan(accuracies).all() else None,
         stillness=whole.results(),
         stillness_late=late.results(),
-        **_scores(rows, names, seed),
+        **_scores(pairs_of_batches, names, seed),
     )
     return findings, np.array(accuracies)
 
 
-def _scores(rows: Sequence[PairRows], names: Sequence[str], seed: int) -> dict[str, Any]:
-    """The labelled part of `Findings`."""
-    if not sum(len(r.group) for r in rows):
+def _scores(batches: Sequence[LabelledPairs], names: Sequence[str], seed: int) -> dict[str, Any]:
+    """Computes the part of `Findings` that needs labels."""
+    if not sum(len(b.group) for b in batches):
         return {"edges": None, "separation": None, "attributes": [], "disentanglement": None, "reading": None}
-    every = PairRows.concatenate(rows)
+    every = LabelledPairs.concatenate(batches)
     edges, relation, apart = every, None, None
     if every.exists is not None:
         exists = every.exists.astype(np.float64)
@@ -225,8 +225,8 @@ def _scores(rows: Sequence[PairRows], names: Sequence[str], seed: int) -> dict[s
     }
 
 
-def _reading(score: FactorScore, edges: PairRows) -> Reading | None:
-    """Dimension 0 as it is where that explains the attribute; else the best dimension after a straight line."""
+def _reading(score: FactorScore, edges: LabelledPairs) -> Reading | None:
+    """Returns dimension 0 unchanged if it explains the attribute, else the best dimension with a fitted line."""
     if score.dimension is None or score.correlation is None:
         return None
     if score.direct_r2 is not None and score.direct_r2 > 0:

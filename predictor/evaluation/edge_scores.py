@@ -1,6 +1,6 @@
-"""What edge features know, as pure functions: correlation beside chance, rank separation, disentanglement, stillness.
+"""Scores edge features: correlation beside chance, rank separation, disentanglement, change over time.
 
-Arrays in, numbers out; `predictor.interpret` gathers the arrays from a trained model.
+All functions are pure; `predictor.evaluation.edge_findings` gathers the arrays from a trained model.
 """
 
 from dataclasses import dataclass
@@ -12,95 +12,95 @@ from predictor.evaluation.disentanglement import DCI, dci, direct_r2, linear_r2,
 
 SHUFFLES = 100
 CHANCE_QUANTILE = 0.95
-"""Of the best |r| that a shuffled factor finds among all dimensions."""
+"""Quantile of the largest |r| among all dimensions with a shuffled factor that counts as chance."""
 FLAT = 1e-6
-"""A dimension whose standard deviation is below this share of its size (or of 1) says nothing: it is float noise."""
+"""Share of a dimension's magnitude (or of 1) below which its standard deviation counts as float noise."""
 
 
 @dataclass(frozen=True)
 class FactorScore:
-    """How well edge features know one property of pairs; None where it never varies or pairs are too few."""
+    """Scores of edge features against one property of pairs; None if it never varies or pairs are too few."""
 
     name: str
-    """The attribute, or "edge exists"."""
-    rows: int
-    """Pairs (at the last observed step of their window) that were scored."""
+    """Name of the attribute, or "edge exists"."""
+    pairs: int
+    """Number of pairs that were scored, at the last observed step of their window."""
     dimension: int | None = None
     """Feature dimension with the largest |r|."""
     correlation: float | None = None
     """Its Pearson r, with sign."""
     r2: float | None = None
-    """r²: what that one dimension explains after the best straight line."""
+    """r²: share of the variance that this dimension explains with a fitted line."""
     chance: float | None = None
     """Largest |r| over dimensions that a shuffled property reaches, 95th percentile over `SHUFFLES` shuffles."""
     linear_r2: float | None = None
-    """Held-out R² of a linear read-out of all dimensions; halves are whole episodes."""
+    """Held-out R² of a linear regression on all dimensions; halves are whole episodes."""
     direct_r2: float | None = None
-    """R² of dimension i as it stands against attribute i: what restricted labelling is judged by."""
+    """R² of dimension i, unchanged, against attribute i: the measure of restricted labelling."""
     distance_correlation: float | None = None
-    """r with the distance between the two agents, which anyone can measure."""
+    """r of the property with the distance between the two agents, for comparison."""
     correlations: tuple[float, ...] = ()
     """r of every dimension."""
 
 
 @dataclass(frozen=True)
 class Separation:
-    """Rank statistic: the chance that a pair with an edge has the larger value than a pair without (0.5: no use)."""
+    """Rank statistic (AUC): probability that a pair with an edge has a larger value than one without; 0.5 is chance."""
 
     dimension: int
-    """Feature dimension furthest from 0.5."""
+    """Feature dimension with the AUC furthest from 0.5."""
     auc: float
-    """Its statistic; near 0 it separates as well as near 1, the other way round."""
+    """AUC of this dimension; 0 separates as well as 1, with the opposite sign."""
     edge_prob_auc: float
-    """The same of the model's own probability of an edge."""
+    """AUC of the model's probability of an edge."""
 
 
 @dataclass(frozen=True)
 class Disentanglement:
     """DCI and MIG of the attributes on true edges."""
 
-    rows: int
-    """Edges."""
+    edges: int
+    """Number of true edges."""
     mig: float | None
     """Mutual information gap."""
     dci: DCI | None
-    """None where it could not be had; the note says why."""
+    """DCI; None if it is not defined, and the note says why."""
     note: str = ""
-    """Empty if all went well."""
+    """Reason why a score is missing; empty if none is."""
 
 
 @dataclass(frozen=True)
 class Stillness:
-    """How much of each dimension's variance lies within an edge over time; static features have none."""
+    """Share of each dimension's variance that lies within edges over time; 0 for static features."""
 
     edges: int
-    """Pairs present at every step of the stretch (only true edges where the data knows them)."""
+    """Number of pairs present at every step (only true edges if the data has them)."""
     steps: int
-    """Length of the stretch."""
+    """Number of steps."""
     spread: tuple[float, ...]
     """Standard deviation over all edges and steps."""
     within: tuple[float | None, ...]
-    """Variance within edges over total variance, 0 (static) to 1 (all of it is change); None for flat dimensions."""
+    """Variance within edges over total variance, 0 (static) to 1 (all variance is change); None for flat dimensions."""
 
 
-def correlations(features: Float[np.ndarray, "rows dims"], factor: Float[np.ndarray, " rows"]) -> tuple[float, ...]:
-    """Pearson's r of each dimension with the factor; 0 where one of them is flat."""
+def correlations(features: Float[np.ndarray, "pairs dims"], factor: Float[np.ndarray, " pairs"]) -> tuple[float, ...]:
+    """Computes Pearson's r of each dimension with the factor; 0 if one of them is flat."""
     return tuple(((_standardised(features).T @ _standardised(factor[:, None]))[:, 0] / max(1, len(factor))).tolist())
 
 
-def dealt_out(
-    factor: Float[np.ndarray, " rows"], groups: Int[np.ndarray, " rows"], rng: np.random.Generator
-) -> Float[np.ndarray, " rows"]:
-    """The factor, shuffled between groups: each gets another's values, read round from anywhere, in either direction.
+def shuffled_by_group(
+    factor: Float[np.ndarray, " pairs"], groups: Int[np.ndarray, " pairs"], rng: np.random.Generator
+) -> Float[np.ndarray, " pairs"]:
+    """Shuffles a factor between groups: each group takes the values of another one, from a random start, cyclically.
 
-    Rows of a group (an episode) are alike, and shuffling them one by one would make chance look smaller than it is.
-    Longer groups repeat the values that they get. Reading begins at an even row, so that both directions of a pair,
-    which stand together, stay together.
+    The pairs of a group (an episode) are alike, and shuffling them one by one would underestimate chance. A group that
+    is longer than the other one repeats its values. The direction is random. The start is an even place, so that both
+    directions of a pair, which are adjacent, stay adjacent.
 
     Args:
-        factor: what to shuffle.
-        groups: rows of a group stand together, groups in ascending order.
-        rng: source of the shuffle.
+        factor: values to shuffle.
+        groups: group of each pair, ascending.
+        rng: random generator of the shuffle.
     """
     _, first, group, count = np.unique(groups, return_index=True, return_inverse=True, return_counts=True)
     donor = rng.permutation(len(count))
@@ -112,37 +112,37 @@ def dealt_out(
 
 
 def chance_correlation(
-    features: Float[np.ndarray, "rows dims"],
-    factor: Float[np.ndarray, " rows"],
-    groups: Int[np.ndarray, " rows"],
+    features: Float[np.ndarray, "pairs dims"],
+    factor: Float[np.ndarray, " pairs"],
+    groups: Int[np.ndarray, " pairs"],
     seed: int = 0,
 ) -> float:
-    """95th percentile, over shuffles of the factor, of the largest |r| among the dimensions."""
+    """Computes the 95th percentile, over shuffles of the factor, of the largest |r| among the dimensions."""
     rng = np.random.default_rng(seed)
-    shuffled = np.stack([dealt_out(factor, groups, rng) for _ in range(SHUFFLES)], axis=1)
+    shuffled = np.stack([shuffled_by_group(factor, groups, rng) for _ in range(SHUFFLES)], axis=1)
     found = _standardised(features).T @ _standardised(shuffled) / max(1, len(factor))
     return float(np.quantile(np.abs(found).max(axis=0), CHANCE_QUANTILE))
 
 
 def score_factor(
     name: str,
-    features: Float[np.ndarray, "rows dims"],
-    factor: Float[np.ndarray, " rows"],
-    groups: Int[np.ndarray, " rows"],
-    distance_m: Float[np.ndarray, " rows"],
+    features: Float[np.ndarray, "pairs dims"],
+    factor: Float[np.ndarray, " pairs"],
+    groups: Int[np.ndarray, " pairs"],
+    distance_m: Float[np.ndarray, " pairs"],
     labelled_dimension: int | None = None,
     seed: int = 0,
 ) -> FactorScore:
-    """Everything about one property of pairs.
+    """Computes all scores of one property of pairs.
 
     Args:
-        name: of the property.
-        features: edge features, one row per pair.
-        factor: the property.
-        groups: episode of each row, ascending.
-        distance_m: between the two agents.
-        labelled_dimension: the dimension that restricted labelling would regress on it.
-        seed: of the shuffles and the halves.
+        name: name of the property.
+        features: edge features of the pairs.
+        factor: value of the property.
+        groups: episode of each pair, ascending.
+        distance_m: distance between the two agents [m].
+        labelled_dimension: dimension that restricted labelling regresses on the property.
+        seed: random seed of the shuffles and the halves.
     """
     if len(factor) < 3 or not _standardised(factor[:, None]).any():
         return FactorScore(name, len(factor))
@@ -167,23 +167,25 @@ def score_factor(
     )
 
 
-def rank_statistic(values: Float[np.ndarray, "rows dims"], exists: Bool[np.ndarray, " rows"]) -> list[float]:
-    """Area under the ROC curve (AUC) of each dimension: chance that an edge has a larger value than a pair without one.
+def rank_statistic(values: Float[np.ndarray, "pairs dims"], exists: Bool[np.ndarray, " pairs"]) -> list[float]:
+    """Computes the area under the ROC curve (AUC) of each dimension; an edge is the positive class.
 
     Raises:
-        ValueError: all rows are edges, or none.
+        ValueError: all pairs are edges, or none is.
     """
     with_edge, without = int(exists.sum()), int((~exists).sum())
     if not with_edge or not without:
-        raise ValueError(f"rows with and without an edge are needed, got {with_edge} with and {without} without")
+        raise ValueError(f"pairs with and without an edge are needed, got {with_edge} with and {without} without")
     area = sklearn("metrics").roc_auc_score
     return [float(area(exists, column)) for column in values.T]
 
 
 def separation(
-    features: Float[np.ndarray, "rows dims"], edge_prob: Float[np.ndarray, " rows"], exists: Bool[np.ndarray, " rows"]
+    features: Float[np.ndarray, "pairs dims"],
+    edge_prob: Float[np.ndarray, " pairs"],
+    exists: Bool[np.ndarray, " pairs"],
 ) -> Separation | None:
-    """How well the best dimension, and the model's own probability, tell edges from pairs without one."""
+    """Computes how well the best dimension and the model's probability separate edges from other pairs."""
     if exists.all() or not exists.any():
         return None
     found = rank_statistic(features, exists)
@@ -192,9 +194,9 @@ def separation(
 
 
 def disentanglement(
-    features: Float[np.ndarray, "rows dims"], factors: Float[np.ndarray, "rows factors"], seed: int = 0
+    features: Float[np.ndarray, "pairs dims"], factors: Float[np.ndarray, "pairs factors"], seed: int = 0
 ) -> Disentanglement:
-    """DCI and MIG of the factors that vary."""
+    """Computes DCI and MIG of the factors that vary."""
     if len(features) < 4:
         return Disentanglement(len(features), None, None, f"needs at least 4 edges, got {len(features)}")
     factors = factors[:, _standardised(factors).any(axis=0)]
@@ -204,7 +206,7 @@ def disentanglement(
 
 
 class StillnessTally:
-    """Variance within edges and in all, batch by batch.
+    """Collects variance within edges and in total, batch by batch.
 
     Example:
         >>> tally = StillnessTally()
@@ -214,13 +216,13 @@ class StillnessTally:
     """
 
     def __init__(self) -> None:
-        """Nothing added yet."""
+        """Begins without edges."""
         self._edges = self._steps = 0
         self._within: np.ndarray = np.zeros(0)
         self._sums: list[np.ndarray] = []  # count, Σ and Σ² of every batch
 
     def add(self, features: Float[np.ndarray, "edges time dims"]) -> None:
-        """Take in edges that are there at all of the steps."""
+        """Adds edges that are present at all steps."""
         values = features.astype(np.float64)
         self._edges, self._steps = self._edges + len(values), values.shape[1]
         within = np.square(values - values.mean(axis=1, keepdims=True)).sum(axis=(0, 1))
@@ -230,7 +232,7 @@ class StillnessTally:
         )
 
     def results(self) -> Stillness:
-        """The whole set's numbers."""
+        """Returns the result over all batches that were added."""
         count, total, squares = np.sum(self._sums, axis=0) if self._sums else np.zeros((3, 0))
         mean = total / np.maximum(count, 1)
         around = np.maximum(squares - count * mean**2, self._within)
@@ -242,8 +244,8 @@ class StillnessTally:
         return Stillness(self._edges, self._steps, tuple(spread.tolist()), tuple(within))
 
 
-def _standardised(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
-    """Mean 0 and variance 1 of each column; zeros where it is flat."""
+def _standardised(values: Float[np.ndarray, "pairs columns"]) -> Float[np.ndarray, "pairs columns"]:
+    """Scales each column to mean 0 and variance 1; a flat one to zeros."""
     centred = values.astype(np.float64) - values.mean(axis=0, dtype=np.float64)
     std = centred.std(axis=0)
     live = std > FLAT * np.maximum(1.0, np.abs(values).max(axis=0, initial=0.0))
@@ -251,11 +253,11 @@ def _standardised(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray
 
 
 def _by_group(
-    features: Float[np.ndarray, "rows dims"], factor: Float[np.ndarray, " rows"], groups: Int[np.ndarray, " rows"]
+    features: Float[np.ndarray, "pairs dims"], factor: Float[np.ndarray, " pairs"], groups: Int[np.ndarray, " pairs"]
 ) -> tuple[
     Float[np.ndarray, "groups places dims"], Float[np.ndarray, "groups places"], Bool[np.ndarray, "groups places"]
 ]:
-    """Rows of a group side by side, padded."""
+    """Returns features, factor and mask of the pairs, one group after the other, padded to equal length."""
     _, first, group, count = np.unique(groups, return_index=True, return_inverse=True, return_counts=True)
     place = np.arange(len(factor)) - first[group]
     valid = np.zeros((len(count), int(count.max(initial=0))), dtype=np.bool_)

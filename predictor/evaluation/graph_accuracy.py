@@ -1,12 +1,13 @@
-"""How right an inferred interaction graph is: accuracy, F1, connectivity, Brier score, with or without naming types.
+"""Computes the accuracy of an inferred interaction graph: accuracy, F1, connectivity, Brier score.
 
-Everything is per ordered pair (receiver, sender), so graphs may be symmetric or not, and over a whole evaluation set:
-`GraphTally` adds up confusion counts batch by batch. Type 0 is "no edge". A model that never saw a true graph may call
-the types by other names; `matched` then renames its types by the one permutation that is best on the *whole set*, never
-scene by scene, which would flatter. Unmatched is the honest reading where type 0 is "no edge" by construction (its
-messages are skipped).
+All measures are over ordered pairs (receiver, sender), so graphs may be symmetric or not, and over a whole evaluation
+set: `GraphTally` adds up confusion counts batch by batch. Type 0 is "no edge". A model trained without a true graph may
+number its types differently; `matched` then renames its types by the one permutation that is best on the *whole set*
+(a permutation per scene would overestimate). Without it, type 0 must be "no edge" by construction (its messages are
+skipped).
 
-Edges are unbalanced (70 % in k-springs): always saying "edge" has the accuracy `true_connectivity`, and F1 says more.
+Edges are unbalanced (70 % in k-springs): predicting "edge" for all pairs has the accuracy `true_connectivity`, so F1 is
+more informative.
 """
 
 import itertools
@@ -20,52 +21,53 @@ from torch import Tensor
 from predictor.evaluation.standard_errors import NUM_SUBSETS, Statistic, ratio_statistics
 
 PairTypes = Int[Tensor, " batch *pairs"]
-"""A type per pair; windows first, then receivers and senders, with a time axis between them or not."""
+"""Types of pairs: windows first, then receivers and senders, with or without a time axis between them."""
 
 PairMask = Bool[Tensor, " batch *pairs"]
-"""Which pairs count."""
+"""Whether a pair counts."""
 
 Predicted = Float[Tensor, "batch *pairs types"] | PairTypes
-"""Probabilities of the types, or types."""
+"""Predicted probabilities of the types, or predicted types."""
 
 UNKNOWN = -1
-"""True type of a pair of which nothing is known; stores write it."""
+"""True type of a pair whose type is unknown, as in stores."""
 
 MAX_MATCHED_TYPES = 7
-"""Permutations are tried one by one; 7! = 5040."""
+"""Largest number of types that can be matched; all 7! = 5040 permutations are tried."""
 
 
 @dataclass(frozen=True)
 class GraphAccuracy:
-    """What a tally says; None where there is nothing to say (no valid pair, no truth, no edge at all)."""
+    """Accuracy of inferred graphs; None if a measure is not defined (no valid pair, no truth, no edge)."""
 
     pairs: int
-    """Valid ordered pairs."""
+    """Number of valid ordered pairs."""
     connectivity: float | None
     """Share of pairs whose most likely type is an edge (the paper's NBA table)."""
     accuracy: float | None = None
     """Share of pairs whose most likely type is the true one."""
     f1: float | None = None
-    """Of "is an edge": 2 TP / (2 TP + FP + FN)."""
+    """F1 of "is an edge": 2 TP / (2 TP + FP + FN)."""
     precision: float | None = None
-    """Of "is an edge": TP / (TP + FP)."""
+    """Precision of "is an edge": TP / (TP + FP)."""
     recall: float | None = None
-    """Of "is an edge": TP / (TP + FN)."""
+    """Recall of "is an edge": TP / (TP + FN)."""
     brier: float | None = None
-    """Mean squared difference between the probability of an edge and its presence: 0 is perfect, 0.25 knows nothing.
-    Types given without probabilities count as certain."""
+    """Mean squared difference between the probability of an edge and its presence: 0 is perfect, 0.25 is a
+    constant probability of 0.5. Types given without probabilities count as certain."""
     true_connectivity: float | None = None
-    """Share of pairs that truly have an edge: the accuracy of always saying "edge" (with two types)."""
+    """Share of pairs with a true edge: the accuracy of predicting "edge" for all pairs (with two types)."""
     confusion: list[list[int]] | None = None
-    """Pairs by true type (rows) and most likely type (columns), after renaming."""
+    """Number of pairs by true type (outer list) and most likely type (inner list), after renaming."""
     permutation: tuple[int, ...] | None = None
-    """The true type that each of the model's types stands for; the identity unless matched."""
+    """True type of each of the model's types; the identity unless matched."""
     statistics: dict[str, Statistic] = field(default_factory=dict)
-    """Mean ± standard error over subsets of the windows, by the names above; the permutation is the whole set's."""
+    """Mean ± standard error over subsets of the windows, by the names above; the permutation is that of the
+    whole set."""
 
 
 class GraphTally:
-    """Confusion counts per window, batch by batch.
+    """Collects confusion counts per window, batch by batch.
 
     Example:
         >>> tally = GraphTally(num_types=2)
@@ -75,11 +77,11 @@ class GraphTally:
         1.0
 
     Args:
-        num_types: edge types of the model, "no edge" included; the truth may have fewer.
+        num_types: number of edge types of the model, "no edge" included; the truth may have fewer.
     """
 
     def __init__(self, num_types: int) -> None:
-        """Nothing added yet."""
+        """Begins without windows."""
         if num_types < 1:
             raise ValueError(f"num_types must be at least 1, got {num_types}")
         self.num_types = num_types
@@ -89,16 +91,16 @@ class GraphTally:
         self._has_truth: bool | None = None
 
     def add(self, predicted: Predicted, true_types: PairTypes | None, valid: PairMask) -> None:
-        """Take in a batch of windows.
+        """Adds a batch of windows.
 
         Args:
             predicted: probabilities of the types, or types.
-            true_types: looked at where `valid` only; a pair with -1 (unknown) does not count. None where there is no
-                truth at all: only connectivity is reported.
-            valid: which pairs count; leave out the diagonal and absent agents (`predictor.graph.pair_mask`).
+            true_types: true types, used where `valid`; a pair with -1 (unknown) does not count. None without any
+                truth: only connectivity is computed.
+            valid: pairs that count; leave out the diagonal and absent agents (`predictor.graph.pair_mask`).
 
         Raises:
-            ValueError: other types than `num_types`, or a truth in some batches only.
+            ValueError: a type is not below `num_types`, or only some batches have true types.
         """
         if self._has_truth not in (None, true_types is not None):
             raise ValueError("either all batches of a tally have true types or none; use two tallies")
@@ -120,15 +122,15 @@ class GraphTally:
         self._brier.append(squared.flatten(1, -2).sum(1).numpy())
 
     def results(self, matched: bool = False, num_subsets: int = NUM_SUBSETS, seed: int = 0) -> GraphAccuracy:
-        """The whole set's numbers.
+        """Returns the accuracy over all batches that were added.
 
         Args:
-            matched: rename the model's types by the permutation with the highest accuracy (ties: the identity).
-            num_subsets: subsets of windows behind the standard errors.
-            seed: of the subsets.
+            matched: whether to rename the model's types by the permutation of highest accuracy (ties: the identity).
+            num_subsets: number of subsets of windows for the standard errors.
+            seed: random seed of the subsets.
 
         Raises:
-            ValueError: `matched` without a truth, or with more types than can be tried.
+            ValueError: `matched` without true types, or with more than `MAX_MATCHED_TYPES` types.
         """
         if matched and not self._has_truth:
             raise ValueError("types can only be matched to true types; add them or pass matched=False")
@@ -154,7 +156,7 @@ class GraphTally:
         )
 
     def _as_both(self, predicted: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """Probabilities, and types that are in range everywhere."""
+        """Returns probabilities, and types with 0 where not valid."""
         if not predicted.is_floating_point():
             self._check(predicted[valid], "predicted")
             types = torch.where(valid, predicted, 0).long()
@@ -176,7 +178,10 @@ def graph_accuracy(
     valid: PairMask,
     matched: bool = False,
 ) -> float | None:
-    """Share of valid pairs whose most likely type is the true one; None without a valid pair. As `GraphTally.add`."""
+    """Computes the share of valid pairs whose most likely type is the true one; None without a valid pair.
+
+    Arguments and errors are those of `GraphTally.add`.
+    """
     return _tallied(predicted, true_types, valid).results(matched, num_subsets=1).accuracy
 
 
@@ -186,12 +191,15 @@ def graph_f1(
     valid: PairMask,
     matched: bool = False,
 ) -> float | None:
-    """F1 of "is an edge"; None where neither the truth nor the model has one. As `GraphTally.add`."""
+    """Computes F1 of "is an edge"; None if neither the truth nor the model has an edge.
+
+    Arguments and errors are those of `GraphTally.add`.
+    """
     return _tallied(predicted, true_types, valid).results(matched, num_subsets=1).f1
 
 
 def connectivity(predicted: Predicted, valid: PairMask) -> float | None:
-    """Share of valid pairs whose most likely type is an edge (any type but 0); None without a valid pair."""
+    """Computes the share of valid pairs whose most likely type is an edge (not 0); None without a valid pair."""
     return _tallied(predicted, None, valid).results(num_subsets=1).connectivity
 
 
@@ -207,14 +215,14 @@ def _tallied(predicted: Tensor, true_types: Tensor | None, valid: Tensor) -> Gra
 
 
 def _count(types: Tensor, valid: Tensor, num_types: int) -> Int[np.ndarray, "batch types"]:
-    """How many valid entries of each window have each type."""
+    """Counts the valid entries of each window by type."""
     windows = torch.arange(len(types)).reshape(-1, *[1] * (types.ndim - 1)).expand_as(types)
     index = (windows * num_types + types)[valid]
     return torch.bincount(index, minlength=len(types) * num_types).reshape(len(types), num_types).numpy()
 
 
 def _best_permutation(confusion: Int[np.ndarray, "types types"]) -> tuple[int, ...]:
-    """True type for each predicted type, such that the most pairs agree; the first in order among equals."""
+    """Returns the true type for each predicted type for which most pairs agree; the first permutation among equals."""
     types = len(confusion)
     if types > MAX_MATCHED_TYPES:
         raise ValueError(f"at most {MAX_MATCHED_TYPES} types can be matched, got {types}")
@@ -222,17 +230,17 @@ def _best_permutation(confusion: Int[np.ndarray, "types types"]) -> tuple[int, .
 
 
 def _ratios(confusion: np.ndarray, brier: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Numerator and denominator per window of every measure."""
+    """Computes numerator and denominator of every measure per window."""
     pairs, hits = confusion.sum((1, 2)), confusion[:, 1:, 1:].sum((1, 2))
-    said, are = confusion[:, :, 1:].sum((1, 2)), confusion[:, 1:].sum((1, 2))
+    inferred, true = confusion[:, :, 1:].sum((1, 2)), confusion[:, 1:].sum((1, 2))
     return {
-        "connectivity": (said, pairs),
+        "connectivity": (inferred, pairs),
         "accuracy": (np.trace(confusion, axis1=1, axis2=2), pairs),
-        "f1": (2 * hits, said + are),
-        "precision": (hits, said),
-        "recall": (hits, are),
+        "f1": (2 * hits, inferred + true),
+        "precision": (hits, inferred),
+        "recall": (hits, true),
         "brier": (brier, pairs),
-        "true_connectivity": (are, pairs),
+        "true_connectivity": (true, pairs),
     }
 
 
@@ -250,5 +258,5 @@ def _summary(
 def edge_entropy(
     edge_probs: Float[Tensor, "*batch types"], valid: Bool[Tensor, "*batch"]
 ) -> tuple[Float[Tensor, "*batch"], Bool[Tensor, "*batch"]]:
-    """Entropy of the edge type [nats] per pair: 0 is a decided graph, log(types) an uninformative one."""
+    """Computes the entropy of the edge type [nats] per pair: 0 is certain, log(types) is uninformative."""
     return -(edge_probs * torch.log(edge_probs.clamp(min=1e-12))).sum(-1), valid

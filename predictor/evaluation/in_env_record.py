@@ -1,7 +1,7 @@
-"""Accuracy of a checkpoint in live environments, kept beside its weights as `in_env.json`.
+"""Reads and writes the accuracy of a checkpoint in live environments, `in_env.json` beside its weights.
 
-`python -m envs.evaluate` writes accuracy.json; `python -m predictor.card` takes what the tables show from it into the
-record. The cards and the tables of README.md and docs/in_env.md are written from the records alone.
+`python -m envs.evaluate` writes accuracy.json; `python -m predictor.card` copies the values of the tables from it into
+the record. The cards and the tables of README.md and docs/in_env.md are written from the records alone.
 """
 
 import json
@@ -23,9 +23,9 @@ class Measurement:
     """Accuracy in one environment, with one driver and one number of samples; None where it was not measured."""
 
     env_id: str
-    """Environment."""
+    """Id of the environment."""
     driver: str
-    """Who drove."""
+    """Name of the driver."""
     episodes: int
     """Number of episodes."""
     samples: int
@@ -61,30 +61,30 @@ class Measurement:
     forecasts: int | None = None
     """Number of forecasts behind `min_ade_m`."""
     horizon_steps: int | None = None
-    """Number of steps forecast."""
+    """Number of forecast steps."""
     dt_s: float | None = None
     """Length of a step [s]."""
     note: str = ""
-    """What a reader of the number has to know; printed under the tables."""
+    """Remark that the number needs; printed under the tables."""
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """What a later measurement of the same thing has in common with this one."""
+        """Environment, driver and number of samples; a later measurement with this key replaces this one."""
         return self.env_id, self.driver, self.samples
 
 
 def measurements_of(accuracy: dict[str, Any], checkpoint: str) -> list[Measurement]:
-    """Returns what the content of an accuracy.json of `envs.evaluate` says about a checkpoint.
+    """Returns the measurements of a checkpoint in the content of an accuracy.json of `envs.evaluate`.
 
     Raises:
-        KeyError, TypeError: it is not such a file.
+        KeyError, TypeError: the content is not of such a file.
     """
-    rows = [row for row in accuracy["results"] if row["checkpoint"] == checkpoint]
-    return [_measurement(row, accuracy["config"], accuracy["provenance"]) for row in rows]
+    results = [result for result in accuracy["results"] if result["checkpoint"] == checkpoint]
+    return [_measurement(result, accuracy["config"], accuracy["provenance"]) for result in results]
 
 
 def read_record(folder: Path) -> list[Measurement]:
-    """Reads `in_env.json` of a checkpoint's folder; none if there is no such file.
+    """Reads `in_env.json` of a checkpoint's folder; empty if there is no such file.
 
     Raises:
         UserError: the file is not a record.
@@ -111,14 +111,14 @@ def update_record(folder: Path, found: Sequence[Measurement]) -> list[Measuremen
     return everything
 
 
-def _measurement(row: dict[str, Any], config: dict[str, Any], made: dict[str, Any]) -> Measurement:
-    one, straight = row["model"], row["constant_velocity"]
-    short = (row.get("histories") or {}).get("1") or {}
-    near = row.get("nearest_neighbours") or {}
-    median_ms, p95_ms = row.get("latency_median_ms"), row.get("latency_p95_ms")
+def _measurement(result: dict[str, Any], config: dict[str, Any], made: dict[str, Any]) -> Measurement:
+    one, straight = result["model"], result["constant_velocity"]
+    short = (result.get("histories") or {}).get("1") or {}
+    near = result.get("nearest_neighbours") or {}
+    median_ms, p95_ms = result.get("latency_median_ms"), result.get("latency_p95_ms")
     return Measurement(
-        env_id=row["env_id"],
-        driver=row.get("driver") or config["ego"],
+        env_id=result["env_id"],
+        driver=result.get("driver") or config["ego"],
         episodes=config["episodes"],
         samples=config["num_samples"] if "num_samples" in config else config["samples"],  # its name until version 0.1
         command=made["command"],
@@ -128,16 +128,16 @@ def _measurement(row: dict[str, Any], config: dict[str, Any], made: dict[str, An
         min_ade_m=one["min_ade_m"],
         min_ade_interval_m=_frozen((one.get("intervals") or {}).get("min_ade_m")),
         min_fde_m=one["min_fde_m"],
-        best_of_k_m=row["model_samples"]["min_ade_m"],
+        best_of_k_m=result["model_samples"]["min_ade_m"],
         one_step_m=short.get("min_ade_m"),
         one_step_interval_m=_frozen((short.get("intervals") or {}).get("min_ade_m")),
         neighbours_m=near.get("min_ade_m"),
-        below_cv=row["reduction"],
-        below_cv_interval=_frozen(row["reduction_interval"]),
+        below_cv=result["reduction"],
+        below_cv_interval=_frozen(result["reduction_interval"]),
         latency_ms=None if median_ms is None or p95_ms is None else (median_ms, p95_ms),
         forecasts=one.get("agents"),
         horizon_steps=len(one["by_step_m"]) if one.get("by_step_m") else None,
-        dt_s=row.get("dt_s"),
+        dt_s=result.get("dt_s"),
     )
 
 

@@ -1,8 +1,8 @@
-"""Run a forecaster over windows and line up what then happened: forecasts, truths, masks.
+"""Runs a forecaster over windows and returns its forecasts with the truth and its mask.
 
-Two readings of "the error of a sequence" (docs/protocol.md): *horizon-only* compares the free run after the last
-observed step (`run_window_batch`); *whole-sequence* puts in front of it the one-step predictions that were made from
-true states on the way there (`run_sequence_batch`).
+The error of a sequence has two views (docs/protocol.md): *horizon-only* compares the free run after the last observed
+step (`run_window_batch`); *whole-sequence* also compares the one-step predictions that are made from true states while
+observing (`run_sequence_batch`).
 """
 
 from collections.abc import Iterator
@@ -20,30 +20,30 @@ from predictor.support.errors import UserError
 
 @dataclass(frozen=True)
 class Outcome:
-    """Forecasts and what then happened; what was believed of the graph where that was asked for."""
+    """Forecasts and truth of a batch of windows; inferred and true graph if requested."""
 
     forecast: Float[Tensor, "batch samples agents horizon axes"]
     """Predicted positions [m]."""
     future: Float[Tensor, "batch agents horizon axes"]
-    """True positions [m], same frame."""
+    """True positions [m], in the frame of `forecast`."""
     valid: Bool[Tensor, "batch agents horizon"]
-    """Which truths exist and count."""
+    """Whether the truth exists and counts."""
     edge_probs: Float[Tensor, "batch agents agents types"] | None = None
-    """Prior over edge types at the last observed step, receiver first; columns are the window batch's."""
+    """Prior probabilities of the edge types at the last observed step, receiver first; agents as in the windows."""
     edge_features: Float[Tensor, "batch agents agents feature"] | None = None
     """Edge features at the last observed step."""
     present: Bool[Tensor, "batch agents"] | None = None
-    """Who is there at the last observed step (the ego too): `pair_mask` of it says which pairs mean something."""
+    """Whether the agent (or ego) is present at the last observed step; `pair_mask` of it gives the valid pairs."""
     edge_types: Int[Tensor, "batch agents agents"] | None = None
-    """True type of each edge at the last observed step where the data knows it, else -1."""
+    """True type of each edge at the last observed step, -1 where unknown."""
     edge_attributes: Float[Tensor, "batch agents agents attributes"] | None = None
     """Known properties of each edge at that step, zeros where unknown or absent."""
 
     def tail(self, steps: int) -> "Outcome":
-        """The last steps only: the horizon-only view of a whole sequence.
+        """Returns the last steps only: the horizon-only view of a whole sequence.
 
         Raises:
-            ValueError: there are not as many.
+            ValueError: there are fewer steps.
         """
         if not 1 <= steps <= self.valid.shape[-1]:
             raise ValueError(f"steps must be between 1 and {self.valid.shape[-1]}, got {steps}")
@@ -64,15 +64,15 @@ def run_window_batch(
     generator: torch.Generator | None = None,
     keep_beliefs: bool = False,
 ) -> Outcome:
-    """Stream the history of each window, forecast, and line up the truth; the ego is left out.
+    """Streams the history of each window, forecasts, and returns forecast and truth; the ego is left out.
 
     Args:
-        forecaster: forecasts without seeing beyond `last_observed`.
+        forecaster: model that gets the steps up to `last_observed`.
         batch: windows with at least `horizon_steps` steps (padding included) after `last_observed`.
-        horizon_steps: steps of free run.
-        num_samples: K.
-        generator: of the samples.
-        keep_beliefs: also return the graph at the last observed step, and the true one where the data has it.
+        horizon_steps: number of steps of the free run.
+        num_samples: number of samples K.
+        generator: random generator of the samples.
+        keep_beliefs: whether to return the graph at the last observed step, and the true one if the data has it.
     """
     belief: Belief | None = None
     for _, latest in _observed(forecaster, batch):
@@ -90,23 +90,23 @@ def run_sequence_batch(
     generator: torch.Generator | None = None,
     keep_beliefs: bool = False,
 ) -> Outcome:
-    """Predictions of every step but the first: one step ahead from true states while observing, then the free run.
+    """Predicts every step but the first: one step ahead from true states while observing, then the free run.
 
     The horizon axis has `last_observed` one-step predictions (made from steps 0 … last_observed − 1, of steps 1 …
     last_observed), then `horizon_steps` free ones; with a burn-in of n steps that is n − 1 + `horizon_steps`. The
-    one-step part is the forecaster's most likely prediction (sample 0), shared by all samples. Rows with a shorter
+    one-step part is the forecaster's most likely prediction (sample 0), shared by all samples. Windows with a shorter
     history have no truth at the beginning; an agent counts at a step if it is seen there and one step before. The
-    last `horizon_steps` entries equal `run_window_batch`'s. Arguments as there.
+    last `horizon_steps` entries equal those of `run_window_batch`, which has equal arguments.
     """
     axes = forecaster.spec.position_dim
-    rows = torch.arange(len(batch.states), device=batch.states.device)
+    window = torch.arange(len(batch.states), device=batch.states.device)
     predicted, truth, valid = [], [], []
     belief: Belief | None = None
     for step, belief in _observed(forecaster, batch):
         predicted.append(forecaster.rollout(belief, 1, 1)[:, 0, :, 0, :axes])
         ahead = (step + 1).clamp(min=0)
-        truth.append(batch.states[rows, ahead][..., :axes])
-        valid.append(_without_ego(forecaster, batch.valid[rows, ahead] & belief.valid))
+        truth.append(batch.states[window, ahead][..., :axes])
+        valid.append(_without_ego(forecaster, batch.valid[window, ahead] & belief.valid))
     assert belief is not None
     free = _free_run(forecaster, batch, belief, horizon_steps, num_samples, generator, keep_beliefs)
     if len(predicted) == 1:
@@ -133,9 +133,9 @@ def run_windows(
     whole_sequence: bool = False,
     keep_beliefs: bool = False,
 ) -> Iterator[Outcome]:
-    """Outcomes of the given windows, in batches; `whole_sequence` runs `run_sequence_batch`.
+    """Yields outcomes of the given windows in batches; `whole_sequence` runs `run_sequence_batch`.
 
-    Nothing is kept between batches: `predictor.evaluation.accuracy.summarise` takes the iterator itself.
+    Nothing is kept between batches; `predictor.evaluation.accuracy.summarise` consumes the iterator.
     """
     generator = torch.Generator(device=device).manual_seed(seed)
     run = run_sequence_batch if whole_sequence else run_window_batch
@@ -145,13 +145,13 @@ def run_windows(
 
 
 def sequence_indices(windows: Windows, burn_in_steps: int) -> Int[np.ndarray, " some"]:
-    """The window of each episode that has seen its first `burn_in_steps` steps, for `run_windows`.
+    """Returns the window of each episode that observes its first `burn_in_steps` steps, for `run_windows`.
 
-    Episodes that end before the horizon does are among them, masked; build `windows` with `min_future_steps` =
+    Episodes that end within the horizon are included, masked; build `windows` with `min_future_steps` =
     `horizon_steps` to leave them out.
 
     Raises:
-        UserError: the windows forget the first steps, or no episode is long enough.
+        UserError: the windows have a shorter history, or no episode is long enough.
     """
     if windows.history_steps < burn_in_steps:
         raise UserError(f"windows of {windows.history_steps} steps of history cannot hold {burn_in_steps} of burn-in")
@@ -162,17 +162,17 @@ def sequence_indices(windows: Windows, burn_in_steps: int) -> Int[np.ndarray, " 
 
 
 def _observed(forecaster: Forecaster, batch: WindowBatch) -> Iterator[tuple[Int[Tensor, " batch"], Belief]]:
-    """The step that each row is at, and the belief after it; histories end together.
+    """Yields the step of each window and the belief after it; all histories end together.
 
-    Rows with a shorter history see an empty scene until theirs begins (step below 0).
+    Windows with a shorter history get an empty scene until it begins (step below 0).
     """
-    rows = torch.arange(len(batch.states), device=batch.states.device)
+    window = torch.arange(len(batch.states), device=batch.states.device)
     memory = forecaster.empty_memory(batch.states.shape[0], batch.states.shape[2])
     for back in range(int(batch.last_observed.max()), -1, -1):
         step = batch.last_observed - back
         now = step.clamp(min=0)
-        valid = batch.valid[rows, now] & (step >= 0)[:, None]
-        memory, belief = forecaster.observe(memory, batch.states[rows, now] * valid[..., None], valid)
+        valid = batch.valid[window, now] & (step >= 0)[:, None]
+        memory, belief = forecaster.observe(memory, batch.states[window, now] * valid[..., None], valid)
         yield step, belief
 
 
@@ -186,15 +186,15 @@ def _free_run(
     keep_beliefs: bool,
 ) -> Outcome:
     axes = forecaster.spec.position_dim
-    rows = torch.arange(len(batch.states), device=batch.states.device)
+    window = torch.arange(len(batch.states), device=batch.states.device)
     forecast = forecaster.rollout(belief, horizon_steps, num_samples, generator)[..., :axes]
-    steps = batch.last_observed[:, None] + torch.arange(1, horizon_steps + 1, device=rows.device)
-    truth = batch.states[rows[:, None], steps].transpose(1, 2)[..., :axes]
-    valid = batch.valid[rows[:, None], steps].transpose(1, 2) & belief.valid[..., None]
+    steps = batch.last_observed[:, None] + torch.arange(1, horizon_steps + 1, device=window.device)
+    truth = batch.states[window[:, None], steps].transpose(1, 2)[..., :axes]
+    valid = batch.valid[window[:, None], steps].transpose(1, 2) & belief.valid[..., None]
     outcome = Outcome(forecast, truth, _without_ego(forecaster, valid))
     if not keep_beliefs:
         return outcome
-    now, belief = (rows, batch.last_observed), belief.dense()
+    now, belief = (window, batch.last_observed), belief.dense()
     return replace(
         outcome,
         edge_probs=belief.edge_probs,
@@ -208,7 +208,7 @@ def _free_run(
 def _without_ego(
     forecaster: Forecaster, valid: Bool[Tensor, "batch agents *steps"]
 ) -> Bool[Tensor, "batch agents *steps"]:
-    """Nobody forecasts the learner itself: row 0 does not count where there is an ego."""
+    """Returns the mask without agent 0 if that is the ego, which is not forecast."""
     if forecaster.spec.has_ego:
         valid = valid.clone()
         valid[:, 0] = False

@@ -1,7 +1,7 @@
-"""The paper's tables as data: which stores, which rows with which recipe, which budget, and the paper's own figures.
+"""Defines the paper's tables: their stores, their lines with a recipe each, budgets, and the paper's figures.
 
-A row is a model and what its training changes from the table's; everything else (data, steps, batch, history, horizon,
-selection) is the same for every row of a table. `predictor.suite` runs them.
+A line is a model and the training options in which it differs from its table; all others (data, steps, batch, history,
+horizon, selection) are equal for all lines of a table. `predictor.suite` runs them.
 """
 
 from dataclasses import dataclass, field
@@ -11,15 +11,15 @@ from predictor.models import ModelName
 
 Budget = Literal["smoke", "cpu", "paper"]
 Untrained = Literal["constant-velocity", "constant-velocity-noise", "least-squares"]
-"""What forecasts without a training run."""
+"""Forecasters without a training run."""
 BURN_IN_STEPS = 40
 HORIZON_STEPS = 10
 NUM_SAMPLES = 20
-"""K of a stochastic model; the others have one forecast."""
+"""Number of samples K of a stochastic model; the others have one forecast."""
 
 
 @dataclass(frozen=True)
-class Row:
+class Line:
     """One line of a table."""
 
     key: str
@@ -27,43 +27,43 @@ class Row:
     name: str
     """Name in the table."""
     model: ModelName | Untrained
-    """What forecasts."""
+    """Name of the forecaster."""
     set: tuple[str, ...] = ()
-    """Fields of the model's config, beyond the budget's sizes."""
+    """Fields of the model's config (name=value), in addition to the sizes of the budget."""
     train: dict[str, Any] = field(default_factory=dict)
-    """Fields of the training config that differ from the table's."""
+    """Fields of the training config that differ from those of the table."""
     paper: dict[str, float] = field(default_factory=dict)
     """The paper's figures, by column: "rmse", "ade", "fde", "ood_ade", "ood_fde", "graph" [m]."""
 
     @property
     def is_trained(self) -> bool:
-        """Whether the row needs a training run."""
+        """Whether the line needs a training run."""
         return self.model not in get_args(Untrained)
 
     @property
     def num_samples(self) -> int:
-        """Forecasts per window, K."""
+        """Number of forecasts per window, K."""
         return NUM_SAMPLES if self.model in ("dgvae", "dnri", "constant-velocity-noise") else 1
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """What a budget allows for one table; the same for every row."""
+    """Sizes of training and measuring in one budget of a table, equal for all its lines."""
 
     steps: int
-    """Optimiser steps."""
+    """Number of optimiser steps."""
     batch_size: int
-    """Windows per step."""
+    """Number of windows per step."""
     max_episodes: int
-    """Training episodes used; 0 is all."""
+    """Number of training episodes used; 0 is all."""
     val_windows: int
-    """Windows for model selection."""
+    """Number of windows for model selection."""
     test_windows: int
-    """Windows measured, of each test store; 0 is all."""
+    """Number of windows measured of each test store; 0 is all."""
     eval_every: int
-    """Steps between validations."""
+    """Number of steps between validations."""
     widths: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    """Config fields by model; none means the sizes of the papers."""
+    """Fields of the config (name=value) by model; empty takes the sizes of the papers."""
 
 
 @dataclass(frozen=True)
@@ -71,23 +71,23 @@ class Table:
     """One table of the paper."""
 
     title: str
-    """Heading."""
+    """Heading of the table."""
     train: str
     """Training store, below the data folder."""
     tests: dict[str, str]
-    """Test stores by what they are: "test" and, where there is one, "ood"."""
-    rows: tuple[Row, ...]
-    """In the order of the table."""
+    """Test stores by kind: "test", and if there is one, "ood" or "crowd"."""
+    lines: tuple[Line, ...]
+    """Lines in the order of the table."""
     budgets: dict[str, Sizes]
-    """By name."""
+    """Sizes by name of the budget."""
     val: str | None = None
     """Validation store; None holds out training episodes."""
     test_stride: int = 1
-    """Steps between two test windows of one episode."""
+    """Number of steps between two test windows of one episode."""
     unit: str = "m"
-    """Of errors."""
+    """Unit of errors."""
     commands: tuple[str, ...] = ()
-    """How the stores are made."""
+    """Commands that make the stores."""
 
 
 _SMALL = {
@@ -95,7 +95,7 @@ _SMALL = {
     "dnri": ("hidden_dim=64", "rnn_dim=32", "head_dim=64", "message_dim=64", "decoder_dim=64"),
     "imma": ("hidden_dim=64", "rnn_dim=32", "message_dim=64", "decoder_dim=64"),
 }
-"""Quarter to half of the published widths, so that a step of either graph model takes about as long on a CPU."""
+"""Widths of a quarter to a half of the published ones, so that both graph models take about equal time on a CPU."""
 
 _TINY = {
     "dgvae": ("hidden_dim=12", "rnn_dim=8", "head_dim=12", "message_dim=12", "decoder_dim=12"),
@@ -104,14 +104,14 @@ _TINY = {
 }
 
 _OURS = ("innovation_rounds=1", "forget_bias=2", "residual=trapezoid", "substeps=2", "gated_messages=true")
-"""What docs/training.md found to work, beyond the paper's network."""
+"""Options of the recipe in docs/training.md, in addition to the paper's network."""
 _TEACHER_FORCED = {"rollout_weight": 0.0, "one_step_weight": 1.0, "likelihood": "gaussian"}
-"""How the NRI family trains: one-step likelihood under the posterior, no free run."""
+"""Training options of the NRI family: one-step likelihood under the posterior, no free run."""
 
 
-def _dgvae(key: str, name: str, features: int, *more: str, paper: dict[str, float] | None = None, **train: Any) -> Row:
+def _dgvae(key: str, name: str, features: int, *more: str, paper: dict[str, float] | None = None, **train: Any) -> Line:
     changes = {"input_changes": True} | train
-    return Row(key, name, "dgvae", (*_OURS, f"edge_feature_dim={features}", *more), changes, paper or {})
+    return Line(key, name, "dgvae", (*_OURS, f"edge_feature_dim={features}", *more), changes, paper or {})
 
 
 def _figures(rmse: float, ade: float, fde: float, ood_ade: float = 0.0, ood_fde: float = 0.0) -> dict[str, float]:
@@ -127,18 +127,18 @@ SPRINGS = Table(
     val="springs/val",
     tests={"test": "springs/test", "ood": "springs/ood"},
     commands=("python -m predictor.data.springs --out {data}/springs",),
-    rows=(
-        Row("constant-velocity", "constant velocity", "constant-velocity"),
-        Row("constant-velocity-noise", "constant velocity + noise", "constant-velocity-noise"),
-        Row("mlp", "Linear (MLP)", "mlp", paper=_figures(0.196, 0.202, 0.446, 2.158, 3.541)),
-        Row("lstm-joint", "LSTM (all agents)", "lstm", _LSTM_JOINT, paper=_figures(0.037, 0.024, 0.159, 0.406, 1.485)),
-        Row("lstm", "LSTM (per agent)", "lstm"),
-        Row("imma", "IMMA", "imma", paper=_figures(0.162, 0.176, 0.350, 1.389, 1.934)),
-        Row(
+    lines=(
+        Line("constant-velocity", "constant velocity", "constant-velocity"),
+        Line("constant-velocity-noise", "constant velocity + noise", "constant-velocity-noise"),
+        Line("mlp", "Linear (MLP)", "mlp", paper=_figures(0.196, 0.202, 0.446, 2.158, 3.541)),
+        Line("lstm-joint", "LSTM (all agents)", "lstm", _LSTM_JOINT, paper=_figures(0.037, 0.024, 0.159, 0.406, 1.485)),
+        Line("lstm", "LSTM (per agent)", "lstm"),
+        Line("imma", "IMMA", "imma", paper=_figures(0.162, 0.176, 0.350, 1.389, 1.934)),
+        Line(
             "dnri", "dNRI", "dnri", train=_TEACHER_FORCED,
             paper=_figures(0.114, 0.058, 0.469, 0.379, 1.372) | {"graph": 0.877},
         ),
-        Row("dnri-free", "dNRI, trained in free run", "dnri", ("residual=trapezoid",), {"edge_cost": 1.0}),
+        Line("dnri-free", "dNRI, trained in free run", "dnri", ("residual=trapezoid",), {"edge_cost": 1.0}),
         _dgvae("dvae", "dVAE (no edge features)", 0, edge_cost=5.0),
         _dgvae("dgvae", "dG-VAE", 16, edge_cost=5.0, paper=_figures(0.019, 0.011, 0.048, 0.302, 1.063)),
         _dgvae("dgvae-pm", "dG-VAE + pair matching", 24, "static_dim=16", edge_cost=5.0),
@@ -150,7 +150,7 @@ SPRINGS = Table(
             "dgvae-rl", "dG-VAE + restricted labelling", 16, label_weight=200.0, type_label_weight=40.0,
             paper=_figures(0.016, 0.010, 0.063, 0.309, 1.032) | {"graph": 0.984},
         ),
-        Row("least-squares", "least squares (limit)", "least-squares"),
+        Line("least-squares", "least squares (limit)", "least-squares"),
     ),
     budgets={
         "smoke": Sizes(60, 16, 500, 100, 200, 30, _TINY),
@@ -165,19 +165,19 @@ _REAL_BUDGETS = {
 }
 
 
-def _real_rows(
+def _real_lines(
     features: int, static: int, paper: dict[str, dict[str, float]], more: tuple[str, ...] = ()
-) -> tuple[Row, ...]:
+) -> tuple[Line, ...]:
     free = ("residual=trapezoid",)
     return (
-        Row("constant-velocity", "constant velocity", "constant-velocity"),
-        Row("constant-velocity-noise", "constant velocity + noise", "constant-velocity-noise"),
-        Row("mlp", "Linear (MLP)", "mlp", paper=paper.get("mlp", {})),
-        Row("lstm-joint", "LSTM (all agents)", "lstm", _LSTM_JOINT, paper=paper.get("lstm", {})),
-        Row("lstm", "LSTM (per agent)", "lstm"),
-        Row("imma", "IMMA", "imma", paper=paper.get("imma", {})),
-        Row("dnri", "dNRI", "dnri", train=_TEACHER_FORCED, paper=paper.get("dnri", {})),
-        Row("dnri-free", "dNRI, trained in free run", "dnri", free),
+        Line("constant-velocity", "constant velocity", "constant-velocity"),
+        Line("constant-velocity-noise", "constant velocity + noise", "constant-velocity-noise"),
+        Line("mlp", "Linear (MLP)", "mlp", paper=paper.get("mlp", {})),
+        Line("lstm-joint", "LSTM (all agents)", "lstm", _LSTM_JOINT, paper=paper.get("lstm", {})),
+        Line("lstm", "LSTM (per agent)", "lstm"),
+        Line("imma", "IMMA", "imma", paper=paper.get("imma", {})),
+        Line("dnri", "dNRI", "dnri", train=_TEACHER_FORCED, paper=paper.get("dnri", {})),
+        Line("dnri-free", "dNRI, trained in free run", "dnri", free),
         _dgvae("dgvae", "dG-VAE", features, "substeps=1", *more, paper=paper.get("dgvae", {})),
         _dgvae(
             "dgvae-pm", "dG-VAE + pair matching", features, "substeps=1", *more, f"static_dim={static}",
@@ -198,7 +198,7 @@ MOCAP = Table(
         "python -m predictor.data.mocap --source CMU/35 --split test --out {data}/mocap35_test",
         "python -m predictor.data.mocap --source CMU/39 --split all --out {data}/mocap39",
     ),
-    rows=_real_rows(
+    lines=_real_lines(
         32, 16,
         {
             "mlp": _figures(2.726, 3.989, 4.493, 5.466, 5.750),
@@ -224,7 +224,7 @@ NBA = Table(
         "python -m predictor.data.nba --source score/train --out {data}/nba_train",
         "python -m predictor.data.nba --source score/test --out {data}/nba_test",
     ),
-    rows=_real_rows(
+    lines=_real_lines(
         32, 16,
         {
             "mlp": _figures(1.027, 1.038, 4.118),
@@ -239,12 +239,13 @@ NBA = Table(
 )  # fmt: skip
 
 
-def _crowd_rows(paper: dict[str, dict[str, float]]) -> tuple[Row, ...]:
-    """Variable N(t): without the rows that need a fixed cast."""
+def _crowd_lines(paper: dict[str, dict[str, float]]) -> tuple[Line, ...]:
+    """Returns the lines for variable N(t): without those that need a fixed set of agents."""
     return tuple(
-        row
-        for row in _real_rows(64, 16, paper)
-        if row.key in ("constant-velocity", "constant-velocity-noise", "lstm", "dnri", "dnri-free", "dgvae", "dgvae-pm")
+        line
+        for line in _real_lines(64, 16, paper)
+        if line.key
+        in ("constant-velocity", "constant-velocity-noise", "lstm", "dnri", "dnri-free", "dgvae", "dgvae-pm")
     )
 
 
@@ -266,7 +267,7 @@ SDD = Table(
         ),
         "python -m predictor.data.crowd --source {data}/sdd_test --episodes 3 --out {data}/sdd_crowd",
     ),
-    rows=_crowd_rows({}),
+    lines=_crowd_lines({}),
     budgets=_CROWD_BUDGETS,
 )
 
@@ -282,7 +283,7 @@ IND = Table(
         "python -m predictor.data.levelx --source inD --split test --out {data}/ind_test",
         "python -m predictor.data.levelx --source rounD --split all --out {data}/round",
     ),
-    rows=_crowd_rows(
+    lines=_crowd_lines(
         {
             "dnri": _figures(1.080, 0.561, 4.290, 4.831, 37.077),
             "dgvae": _figures(1.056, 0.486, 4.285, 4.958, 38.985),
@@ -299,8 +300,8 @@ _MOVES = (*_INFERS, "residual=trapezoid", "substeps=2")
 _WHOLE = (*_MOVES, "gated_messages=true")
 
 
-def _recipe(key: str, name: str, sets: tuple[str, ...], **train: Any) -> Row:
-    return Row(key, name, "dgvae", ("edge_feature_dim=16", *sets), {"edge_cost": 5.0, "input_changes": True} | train)
+def _recipe(key: str, name: str, sets: tuple[str, ...], **train: Any) -> Line:
+    return Line(key, name, "dgvae", ("edge_feature_dim=16", *sets), {"edge_cost": 5.0, "input_changes": True} | train)
 
 
 RECIPE = Table(
@@ -309,7 +310,7 @@ RECIPE = Table(
     val="springs/val",
     tests={"test": "springs/test", "ood": "springs/ood"},
     commands=SPRINGS.commands,
-    rows=(
+    lines=(
         _recipe("paper", "paper's network, teacher-forced, Gaussian", (), **_PLAIN, **_TEACHER_FORCED),
         _recipe("free", "paper's network, free run", (), **_PLAIN),
         _recipe("sees", "+ input changes, forget bias", _SEES, edge_cost=0.0),

@@ -1,9 +1,9 @@
-"""Mean and standard error over random subsets of a test set, as the paper reports ("across 20 test subsets", Sec. V).
+"""Computes mean and standard error over random subsets of a test set (paper Sec. V: "across 20 test subsets").
 
-The windows are dealt at random into subsets of (almost) equal size, the metric is computed on each, and the standard
+The windows are divided at random into subsets of (almost) equal size, the metric is computed on each, and the standard
 error is the subsets' standard deviation (n − 1) over √subsets. Equal seeds and numbers of windows give equal subsets,
-so rows of one table are compared on the same ones. It says how far a result depends on which windows were tested, not
-how far on the seed of training; windows that overlap in time are not independent, and then it is too small.
+so all lines of a table are compared on equal subsets. The error measures the dependence on the choice of test windows,
+not on the seed of training; it is too small if windows overlap in time, since they are not independent.
 """
 
 from dataclasses import dataclass
@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 NUM_SUBSETS = 20
-"""The paper's."""
+"""Number of subsets, as in the paper."""
 BOOTSTRAP_DRAWS = 2000
-"""Of an interval."""
+"""Number of bootstrap draws of an interval."""
 
 
 @dataclass(frozen=True)
@@ -22,11 +22,11 @@ class Statistic:
     """A metric over subsets of the test set."""
 
     mean: float
-    """Mean of the subsets' values; for a root or a ratio close to, but not quite, the value on the whole set."""
+    """Mean of the subsets' values; for a root or a ratio it differs slightly from the value on the whole set."""
     standard_error: float | None
     """Standard deviation of the subsets' values (n − 1) / √subsets; None with fewer than two."""
     subsets: int
-    """Subsets that held at least one valid entry; fewer than asked for where windows are fewer."""
+    """Number of subsets with at least one valid entry; fewer than requested if there are fewer windows."""
 
 
 def subset_statistics(
@@ -36,17 +36,17 @@ def subset_statistics(
     seed: int = 0,
     root: bool = False,
 ) -> Statistic | None:
-    """Mean over the valid entries of each subset of windows, then mean and standard error over subsets.
+    """Computes the mean over the valid entries of each subset of windows, then mean and standard error over subsets.
 
     Args:
-        values: any metric, windows first; looked at where `valid` only.
-        valid: which entries count.
-        num_subsets: at least 1; never more than there are windows.
-        seed: of the deal.
-        root: take the root of each subset's mean (squared errors become an RMSE).
+        values: any metric, windows first; used where `valid`.
+        valid: entries that count.
+        num_subsets: number of subsets, at least 1; limited to the number of windows.
+        seed: random seed of the subsets.
+        root: whether to take the root of each subset's mean (squared errors become an RMSE).
 
     Returns:
-        None if nothing is valid.
+        Mean and standard error, or None if nothing is valid.
     """
     rest = tuple(range(1, values.ndim))
     sums = np.where(valid, values, 0.0).astype(np.float64).sum(axis=rest)
@@ -60,7 +60,7 @@ def ratio_statistics(
     seed: int = 0,
     root: bool = False,
 ) -> Statistic | None:
-    """The same from each window's sum and number of valid entries (or any numerator and denominator)."""
+    """Computes the statistic of `subset_statistics` from the sum and the number of valid entries of each window."""
     values = subset_ratios(sums, counts, num_subsets, seed)
     values = np.sqrt(values[~np.isnan(values)]) if root else values[~np.isnan(values)]
     if not len(values):
@@ -72,18 +72,18 @@ def ratio_statistics(
 def batch_interval(
     sums: Float[np.ndarray, " batches"], counts: Float[np.ndarray, " batches"], seed: int = 0, root: bool = False
 ) -> tuple[float, float] | None:
-    """95 % percentile bootstrap of Σ sums / Σ counts over batches (episodes), which are drawn whole.
+    """Computes the 95 % percentile bootstrap of Σ sums / Σ counts over whole batches (episodes).
 
-    Equal seeds and numbers of batches give equal draws, so rows of one table are resampled alike.
+    Equal seeds and numbers of batches give equal draws, so all lines of a table have equal draws.
 
     Args:
         sums: numerator of each batch.
         counts: denominator of each batch.
-        seed: of the draws.
-        root: take the root of each draw's ratio.
+        seed: random seed of the draws.
+        root: whether to take the root of each draw's ratio.
 
     Returns:
-        None with fewer than two batches that count anything.
+        Lower and upper limit, or None with fewer than two batches with a count above 0.
     """
     if np.count_nonzero(counts) < 2:
         return None
@@ -97,7 +97,7 @@ def batch_interval(
 def subset_ratios(
     sums: Float[np.ndarray, " windows"], counts: Float[np.ndarray, " windows"], num_subsets: int, seed: int
 ) -> Float[np.ndarray, " subsets"]:
-    """Σ sums / Σ counts on each subset; NaN where a subset counts nothing."""
+    """Computes Σ sums / Σ counts on each subset; NaN if the count is 0."""
     if num_subsets < 1:
         raise ValueError(f"num_subsets must be at least 1, got {num_subsets}")
     order = np.random.default_rng(seed).permutation(len(sums))

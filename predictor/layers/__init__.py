@@ -1,1 +1,1 @@
-"""Layers that every model shares."""
+"""Layers that several models share."""

@@ -7,7 +7,7 @@ from torch.nn import functional
 
 
 class PairLinear(nn.Module):
-    """A linear layer on x_i ‖ x_j, computed as one node-level product for each role and added on the pair.
+    """Linear layer on x_i ‖ x_j, computed as one node-level product for each role and added on the pair.
 
     The weight on the concatenation splits into two blocks, so the cost is that of agents, not of pairs.
 
@@ -18,7 +18,7 @@ class PairLinear(nn.Module):
     """
 
     def __init__(self, inputs: int, outputs: int, relative: bool = False) -> None:
-        """Create both blocks."""
+        """Creates both blocks."""
         super().__init__()
         self.receiver = nn.Linear(inputs, outputs)
         self.sender = nn.Linear(inputs, outputs, bias=False)
@@ -30,12 +30,12 @@ class PairLinear(nn.Module):
         senders: Int[Tensor, "*some agents slots"] | None = None,
         after: nn.Linear | None = None,
     ) -> Float[Tensor, "*batch agents slots out"]:
-        """Pair features, before any non-linearity.
+        """Computes pair features, before any non-linearity.
 
         Args:
-            nodes: one per agent.
-            senders: who is in which slot; None is dense.
-            after: a linear layer that `nodes` are still to pass; two in a row are folded into one.
+            nodes: features of each agent.
+            senders: index of the agent in each slot; None is dense.
+            after: linear layer that is applied to `nodes` first; both are folded into one.
         """
         received, sent = self._roles(nodes, after)
         if senders is None:
@@ -49,7 +49,7 @@ class PairLinear(nn.Module):
         after: nn.Linear | None = None,
         extra: Float[Tensor, "*batch agents slots out"] | None = None,
     ) -> Float[Tensor, "*batch agents slots out"]:
-        """ELU of `forward`, and of what else is to be added to it; only the result is kept for the gradient."""
+        """Computes the ELU of `forward` plus `extra`; only the result is kept for the gradient."""
         pairs = self(nodes, senders, after)
         return functional.elu_(pairs if extra is None else pairs + extra)
 
@@ -67,16 +67,16 @@ class PairLinear(nn.Module):
 def to_pairs(
     nodes: Float[Tensor, "*batch agents node"], senders: Int[Tensor, "*some agents slots"]
 ) -> Float[Tensor, "*batch agents slots node"]:
-    """The node of each pair's sender; `senders` is one list for all, or one for each of the last batch axis."""
+    """Returns the node of each pair's sender; `senders` is one list for all, or one for each of the last batch axis."""
     agents, slots = senders.shape[-2:]
     if senders.ndim == 2:
         return nodes.index_select(-2, senders.flatten()).unflatten(-2, (agents, slots))
-    rows = senders + agents * torch.arange(len(senders), device=senders.device)[:, None, None]
-    return nodes.flatten(-3, -2).index_select(-2, rows.flatten()).unflatten(-2, tuple(senders.shape))
+    places = senders + agents * torch.arange(len(senders), device=senders.device)[:, None, None]
+    return nodes.flatten(-3, -2).index_select(-2, places.flatten()).unflatten(-2, tuple(senders.shape))
 
 
 def folded(outer: nn.Linear, inner: nn.Linear) -> tuple[Float[Tensor, "out in"], Float[Tensor, " out"]]:
-    """Weight and bias of two linear layers in a row: W (W' x + b') + b."""
+    """Returns weight and bias of two consecutive linear layers: W (W' x + b') + b."""
     bias = outer.weight @ inner.bias
     return outer.weight @ inner.weight, bias if outer.bias is None else bias + outer.bias
 
@@ -84,12 +84,12 @@ def folded(outer: nn.Linear, inner: nn.Linear) -> tuple[Float[Tensor, "out in"],
 def sum_over_senders(
     pairs: Float[Tensor, "*batch agents slots hidden"], weight: Float[Tensor, "*batch agents slots"]
 ) -> Float[Tensor, "*batch agents hidden"]:
-    """Σ_j weight_ij · pair_ij."""
+    """Computes Σ_j weight_ij · pair_ij."""
     return torch.matmul(weight[..., None, :], pairs)[..., 0, :]
 
 
 def masked_mean(values: Float[Tensor, "*batch"], valid: Bool[Tensor, "*batch"]) -> Float[Tensor, ""]:
-    """Mean over valid entries; 0 if there is none."""
+    """Computes the mean over valid entries; 0 if there is none."""
     # where, not a product: an invalid entry may be infinite, and inf · 0 is NaN.
     total = torch.where(valid, values, torch.zeros_like(values)).sum()
     return total / valid.sum().clamp(min=1)

@@ -14,10 +14,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 _MANY = 2**15
-"""Numbers from which six fast operations beat a slow one."""
+"""Number of elements from which six fast operations take less time than a slow one."""
 
 Correction = Callable[[int, Tensor], Tensor]
-"""What else to add to the gates, given the step and the hidden state before it."""
+"""Function that computes an addend of the gates from the step's index and the hidden state before it."""
 
 
 def masked_lstm(
@@ -29,21 +29,21 @@ def masked_lstm(
     reverse: bool = False,
     correct: Correction | None = None,
 ) -> tuple[Float[Tensor, "batch time agents slots rnn"], Float[Tensor, "batch time agents slots rnn"]]:
-    """An LSTM for each pair, from gate inputs of all steps; a pair that is not there has its memory set to zero.
+    """Runs an LSTM for each pair, from gate inputs of all steps; the memory of an absent pair is set to zero.
 
     Args:
         gates: input share of the gates (input, forget, candidate, output).
-        recurrent: hidden state to gates.
-        pairs: which pairs are there.
-        hidden: before the first step (after the last one, if reversed).
-        cell: likewise.
-        reverse: run from the last step to the first.
-        correct: what else to add to the gates, given the step and the hidden state before it.
+        recurrent: layer from the hidden state to the gates.
+        pairs: which pairs are present.
+        hidden: hidden state before the first step (after the last one, if reversed).
+        cell: cell state at the same step.
+        reverse: whether to run from the last step to the first.
+        correct: function that computes an addend of the gates.
 
     Returns:
         Hidden and cell state after each step; views, whose memory has time first.
     """
-    assert correct is None or not reverse  # corrections know the steps in their order only
+    assert correct is None or not reverse  # corrections are computed for the steps in their order only
     with _full_precision(gates.device):
         steps = list(zip(_steps(gates), _steps(pairs[..., None].to(gates.dtype)), strict=True))
         h, c = hidden.flatten(0, -2), cell.flatten(0, -2)
@@ -66,13 +66,13 @@ def masked_gru(
     valid: Bool[Tensor, "batch time agents"],
     hidden: Float[Tensor, "batch agents hidden"],
 ) -> Float[Tensor, "batch time agents hidden"]:
-    """States of a `GRUCell` for each agent after each step; an absent agent has its memory set to zero.
+    """Runs a `GRUCell` for each agent and returns its state after each step; that of an absent agent is set to zero.
 
     Args:
-        inputs: of the cell.
-        cell: its weights.
-        valid: who is there.
-        hidden: before the first step.
+        inputs: inputs of the cell.
+        cell: cell with the weights.
+        valid: which agents are present.
+        hidden: state before the first step.
     """
     if not inputs.shape[1]:
         return hidden.new_zeros(len(hidden), 0, *hidden.shape[1:])
@@ -87,7 +87,7 @@ def masked_gru(
 def lstm_step_(
     gates: Float[Tensor, "pairs gates"], cell: Float[Tensor, "pairs rnn"]
 ) -> tuple[Float[Tensor, "pairs rnn"], Float[Tensor, "pairs rnn"]]:
-    """Hidden and cell state after one step; `gates` (input and recurrent share) is overwritten."""
+    """Computes hidden and cell state after one step; `gates` (input and recurrent share) is overwritten."""
     _squash(gates)
     i, f, s, o = gates.chunk(4, dim=-1)
     cell = f.mul(cell).addcmul_(i, s, value=2).sub_(i)
@@ -97,7 +97,7 @@ def lstm_step_(
 def gru_step_(
     gates: Float[Tensor, "agents gates"], share: Float[Tensor, "agents gates"], hidden: Float[Tensor, "agents hidden"]
 ) -> Float[Tensor, "agents hidden"]:
-    """State of a GRU after one step; `gates` (the input's share) is overwritten, `share` is the hidden state's."""
+    """Computes a GRU's state after one step; `gates` (the input's share) is overwritten, `share` is the state's."""
     width = hidden.shape[-1]
     gates[:, : 2 * width].add_(share[:, : 2 * width]).sigmoid_()
     r, z, u = gates.chunk(3, dim=-1)
@@ -106,7 +106,7 @@ def gru_step_(
 
 
 def elu_(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """ELU in place; of many numbers on a CPU from the logistic function, x⁺ + 1/σ(−x⁻) − 2: a third faster there."""
+    """Computes ELU in place; for many numbers on a CPU as x⁺ + 1/σ(−x⁻) − 2 (σ: logistic), which is a third faster."""
     if x.device.type != "cpu" or x.numel() < _MANY:
         return torch.nn.functional.elu_(x)
     below = x.clamp(max=0).neg_().sigmoid_().reciprocal_()
@@ -114,46 +114,46 @@ def elu_(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 
 
 def elu(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """The same, not in place."""
+    """Computes ELU like `elu_`, not in place."""
     if x.device.type != "cpu" or x.numel() < _MANY:
         return torch.nn.functional.elu(x)
     return x.clamp(min=0).add_(x.clamp(max=0).neg_().sigmoid_().reciprocal_()).sub_(2)
 
 
 def _tanh(x: Tensor) -> Tensor:
-    """tanh; of many numbers on a CPU from the logistic function."""
+    """Computes tanh; of many numbers on a CPU with the logistic function."""
     if x.device.type != "cpu" or x.numel() < _MANY:
         return torch.tanh(x)
     return x.mul(2).sigmoid_().mul_(2).sub_(1)
 
 
 def _squash(gates: Tensor) -> None:
-    """σ of input, forget and output, and σ(2·) of the candidate, in place."""
+    """Computes σ of input, forget and output gate, and σ(2·) of the candidate, in place."""
     rnn = gates.shape[-1] // 4
     gates[:, 2 * rnn : 3 * rnn].mul_(2)
     gates.sigmoid_()
 
 
 def _lstm_step(gate: Tensor, present: Tensor, weight: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
-    """Hidden and cell state after one step, zero where absent; `gate` is the input's share."""
+    """Computes hidden and cell state after one step, zero where absent; `gate` is the input's share."""
     i, f, g, o = torch.addmm(gate.to(hidden.dtype), hidden, weight.t()).chunk(4, dim=-1)
     cell = torch.addcmul(torch.sigmoid(f) * cell, torch.sigmoid(i), torch.tanh(g)) * present
     return torch.sigmoid(o) * torch.tanh(cell), cell  # 0 where the cell is
 
 
 def _steps(sequence: Tensor) -> tuple[Tensor, ...]:
-    """Each time step, agents or pairs in one list."""
+    """Returns each time step, with agents or pairs in one list."""
     # unbind, not [t]: the gradient of an index is a full-size tensor of zeros for every step
     return sequence.transpose(0, 1).flatten(1, -2).unbind(0)
 
 
 def _sequence(steps: list[Tensor], like: Tensor) -> Tensor:
-    """Steps put together again, batch first in shape and time first in memory."""
+    """Joins steps, batch first in shape and time first in memory."""
     return torch.stack(steps).unflatten(1, like.shape[:-1]).transpose(0, 1)
 
 
 def _full_precision(device: torch.device) -> AbstractContextManager[object]:
-    """Recurrences add up over many steps, so that autocast leaves them alone."""
+    """Turns autocast off: rounding errors of recurrences add up over many steps."""
     if not torch.amp.is_autocast_available(device.type):
         return nullcontext()
     return torch.autocast(device.type, enabled=False)

@@ -1,6 +1,6 @@
-"""From states to network inputs and back: scaling, frames, and what a predicted change is added to.
+"""Conversion of states to network inputs and back: scaling, frames, and how a predicted change is added.
 
-Every forecaster shares it, so that a comparison of models is not a comparison of normalisations.
+All forecasters share it, so that a comparison of models is not a comparison of normalisations.
 """
 
 from typing import Literal
@@ -22,14 +22,14 @@ def drift(
     after: Float[Tensor, "*batch state"],
     fraction: float = 1.0,
 ) -> Float[Tensor, "*batch axes"]:
-    """Change of position in one step that follows from velocities alone [m].
+    """Computes the change of position in one step that follows from velocities alone [m].
 
     Args:
-        spec: layout.
-        residual: "state" has none; "constant_velocity" is v·dt; "trapezoid" is (v + v')/2·dt.
-        states: now.
-        after: one step later; only "trapezoid" looks at its velocities.
-        fraction: of a step.
+        spec: layout of the states.
+        residual: "state" gives zero; "constant_velocity" gives v·dt; "trapezoid" gives (v + v')/2·dt.
+        states: current states [SI].
+        after: states one step later [SI]; only "trapezoid" uses their velocities.
+        fraction: fraction of a step.
     """
     axes = spec.position_dim
     velocity = states[..., axes : 2 * axes]
@@ -41,13 +41,13 @@ def drift(
 
 
 class StateCodec(nn.Module):
-    """Scaled features in the spec's frame, and next states from a network's output.
+    """Computes scaled features in the spec's frame, and next states from a network's output.
 
     Args:
-        spec: layout, frame and scales.
+        spec: layout, frame and scales of the states.
         delta_scales: typical one-step change of each feature [SI]; empty takes the spec's feature scales.
-        residual: what the predicted change of position is added to.
-        input_scales: divisors of the inputs; empty takes the spec's feature scales.
+        residual: position to which the predicted change is added; see `drift`.
+        input_scales: divisors of the inputs [SI]; empty takes the spec's feature scales.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class StateCodec(nn.Module):
         residual: Residual = "state",
         input_scales: tuple[float, ...] = (),
     ) -> None:
-        """Buffers only; nothing is learned and nothing is saved."""
+        """Creates buffers only; nothing is learned and nothing is saved."""
         super().__init__()
         deltas, inputs = delta_scales or spec.feature_scales, input_scales or spec.feature_scales
         for name, scales in (("delta_scales", deltas), ("input_scales", inputs)):
@@ -83,13 +83,13 @@ class StateCodec(nn.Module):
 
     @property
     def num_inputs(self) -> int:
-        """Columns of `inputs`: the features, and the ego's mark where there is an ego."""
+        """Number of columns of `inputs`: the features, and the ego's mark where there is an ego."""
         return self.spec.num_features + int(self.spec.has_ego)
 
     def inputs(
         self, states: Float[Tensor, "*batch agents state"], valid: Bool[Tensor, "*batch agents"]
     ) -> Float[Tensor, "*batch agents inputs"]:
-        """Scaled features, re-centred at this very step, plus the ego's mark; zeros where absent."""
+        """Computes scaled features, re-centred at this step, plus the ego's mark; zeros where absent."""
         axes = self.spec.position_dim
         positions, present = states[..., :axes], valid[..., None]
         centre = positions[..., :1, :] * self._ego_axes
@@ -106,12 +106,12 @@ class StateCodec(nn.Module):
     def advance(
         self, states: Float[Tensor, "*batch state"], change: Float[Tensor, "*batch state"], fraction: float = 1.0
     ) -> Float[Tensor, "*batch state"]:
-        """States [SI] a step, or a fraction of one, later.
+        """Computes the states [SI] a step, or a fraction of one, later.
 
         Args:
-            states: now [SI].
+            states: current states [SI].
             change: predicted rate of change, in units of `delta_scales` per step.
-            fraction: of a step.
+            fraction: fraction of a step.
         """
         axes = self.spec.position_dim
         after = states + change * (self.deltas * self._predicted * fraction)

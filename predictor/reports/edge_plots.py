@@ -1,6 +1,6 @@
-"""Pictures of what edges mean (`predictor.interpret`): graphs, edge-feature matrices, forecasts.
+"""Draws edges for `predictor.interpret`: graphs, edge-feature matrices, forecasts.
 
-Functions take arrays and return an axis or a figure; nothing is computed here but where things go on the page.
+Functions take arrays and return an axis or a figure; they compute the layout only.
 """
 
 import itertools
@@ -21,56 +21,56 @@ from predictor.reports.plots import plot_scene
 from predictor.reports.tables import plain
 
 GRAPH_QUANTILES = (0.0, 0.1, 0.5)
-"""Of graph accuracy over windows: the ones that graph.png shows, the least accurate first."""
+"""Quantiles of graph accuracy whose windows graph.png shows, the least accurate first."""
 
 NUM_TRAJECTORIES = 4
-"""Windows in trajectories.png."""
+"""Number of windows in trajectories.png."""
 
 DIMENSIONS_SHOWN = 4
-"""Feature dimensions per block of features.png."""
+"""Number of feature dimensions per block of features.png."""
 
 RIGHT, MISSED, INVENTED, TRUE = "#1f5fa8", "#c0392b", "#e08e0b", "#404040"
 
 WIDTHS = (1.0, 5.0)
-"""Of a drawn edge [points], from the smallest true value to the largest."""
+"""Line widths of drawn edges [points], from the smallest true value to the largest."""
 
 ROAD_RATIO = 6.0
-"""Length over width from which a scene is drawn stretched: to scale, a road is a line."""
+"""Least ratio of length to width of a scene that is drawn not to scale, so that a road is not a thin line."""
 
 MAX_NUMBERED = 9
-"""Agents up to which drawn edges bear numbers."""
+"""Largest number of agents with numbers on drawn edges."""
 
 MAX_NAMED = 40
-"""Agents up to which matrices bear names."""
+"""Largest number of agents with names beside matrices."""
 
 CROWD, SAMPLES_IN_CROWD = 12, 5
-"""From how many agents on fewer samples are drawn, and how many."""
+"""Number of agents above which fewer samples are drawn, and the number of these samples."""
 
 
 @dataclass(frozen=True)
 class WindowShown:
-    """One window with all that the pictures need; arrays are receiver first."""
+    """One window with the arrays of all pictures, receiver first."""
 
     place: str
-    """Where it is in the store."""
+    """Episode and step of the window in the store."""
     names: Sequence[str]
-    """Of the agents."""
+    """Names of the agents."""
     history: Float[np.ndarray, "time agents axes"]
     """Observed positions [m]."""
     history_valid: Bool[np.ndarray, "time agents"]
-    """Who is there."""
+    """Whether the agent is present."""
     features: Float[np.ndarray, "time agents agents dims"]
     """Edge features at each observed step."""
     edge_prob: Float[np.ndarray, "agents agents"]
-    """The model's probability of an edge at the last observed step."""
+    """Probability of an edge at the last observed step, by the model."""
     pairs: Bool[np.ndarray, "time agents agents"]
-    """Which pairs are there."""
+    """Whether both agents of the pair are present."""
     forecast: Float[np.ndarray, "samples agents horizon axes"]
     """Predicted positions [m]."""
     future: Float[np.ndarray, "agents horizon axes"]
-    """True ones [m]."""
+    """True positions [m]."""
     future_valid: Bool[np.ndarray, "agents horizon"]
-    """Which of them are known."""
+    """Whether the true position is known."""
     types: Int[np.ndarray, "agents agents"] | None = None
     """True edge types at the last observed step, -1 where unknown."""
     attributes: Float[np.ndarray, "agents agents attributes"] | None = None
@@ -78,7 +78,7 @@ class WindowShown:
 
 
 def circle(agents: int) -> Float[np.ndarray, "agents 2"]:
-    """Places on a circle, the first at the top, clockwise."""
+    """Returns places on a unit circle, the first at the top, clockwise."""
     angle = np.pi / 2 - 2 * np.pi * np.arange(agents) / max(agents, 1)
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
@@ -92,16 +92,16 @@ def plot_graph(
     truth: Bool[np.ndarray, "agents agents"] | None = None,
     value_range: tuple[float, float] = (0.0, 1.0),
 ) -> Axes:
-    """Edges with their values as numbers and widths; symmetric graphs as lines, others as arrows sender → receiver.
+    """Draws edges with their values as numbers and widths; a symmetric graph as lines, others as arrows to receivers.
 
     Args:
-        ax: where to draw.
-        places: of the agents.
-        edges: receiver first.
-        names: of the agents.
-        values: numbers on the edges; among arrows, of which there may be many, on those alone that are true.
-        truth: right, missed (dotted) and invented edges get their own colour; None draws all in one.
-        value_range: values that get the thinnest and the thickest line.
+        ax: axis to draw on.
+        places: positions of the agents.
+        edges: whether there is an edge, receiver first.
+        names: names of the agents.
+        values: numbers on the edges; among arrows, which may be many, on true edges only.
+        truth: true edges; right, missed (dotted) and invented edges get a colour each; None draws all in one colour.
+        value_range: values of the thinnest and the thickest line.
     """
     both = edges if truth is None else edges | truth
     directed = not np.array_equal(both, both.T) or not np.array_equal(edges, edges.T)
@@ -140,7 +140,7 @@ def graphs_figure(
     where: str,
     on_circle: bool = True,
 ) -> Figure:
-    """True graphs above, inferred ones below; one column per window."""
+    """Draws true graphs above, inferred ones below, one column per window."""
     figure = Figure(figsize=(4.3 * len(windows), 8.4), layout="constrained")
     axes = figure.subplots(2, len(windows), squeeze=False)
     every = [w.types > 0 for w in windows if w.types is not None]
@@ -161,14 +161,14 @@ def graphs_figure(
         if symmetric:  # one line per pair: the mean of both directions
             prob = (prob + prob.T) / 2
             inferred = None if inferred is None else (inferred + inferred.T) / 2
-        said = (prob > 0.5) & known
+        found = (prob > 0.5) & known
         numbers = prob if inferred is None else inferred
         places = circle(int(there.sum())) if on_circle else window.history[-1, there, :2]
         names = [name for name, present in zip(window.names, there, strict=True) if present]
         plot_graph(axes[0, column], places, truth, names, true_values, value_range=spread)
-        plot_graph(axes[1, column], places, said, names, numbers, truth, spread)
+        plot_graph(axes[1, column], places, found, names, numbers, truth, spread)
         counted = np.triu(known) if symmetric else known
-        right, all_pairs = int((said == truth)[counted].sum()), int(counted.sum())
+        right, all_pairs = int((found == truth)[counted].sum()), int(counted.sum())
         axes[0, column].set_title(f"{_percentile(column)} window: {window.place}\ntruth", fontsize=10)
         what = "pairs" if symmetric else "ordered pairs"
         axes[1, column].set_title(
@@ -179,7 +179,7 @@ def graphs_figure(
     commoner = None if graph.true_connectivity is None else max(graph.true_connectivity, 1 - graph.true_connectivity)
     figure.legend(handles=_edge_legend(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     figure.suptitle(
-        f"{where}: accuracy {plain(graph.accuracy)} over all ordered pairs (always giving the commoner answer: "
+        f"{where}: accuracy {plain(graph.accuracy)} over all ordered pairs (always the more frequent answer: "
         f"{plain(commoner)})\nnumbers and widths: {_value_name(reading, attribute_names)}"
         + ("" if on_circle else "; arrows go from sender to receiver"),
         fontsize=10,
@@ -196,8 +196,8 @@ def _value_name(reading: Reading | None, names: Sequence[str]) -> str:
     if reading is None or not names:
         return "the model's probability of an edge (truth: none)"
     if (reading.slope, reading.offset) == (1.0, 0.0):
-        return f"{names[0]}; inferred: feature {reading.dimension} as it is"
-    return f"{names[0]}; inferred: feature {reading.dimension}, brought to its unit by a line fitted to the truth"
+        return f"{names[0]}; inferred: feature {reading.dimension}, unchanged"
+    return f"{names[0]}; inferred: feature {reading.dimension}, scaled by a line fitted to the truth"
 
 
 def _frame(ax: Axes, on_circle: bool) -> None:
@@ -228,10 +228,10 @@ def plot_matrix(
     names: Sequence[str],
     crossed: Bool[np.ndarray, "agents agents"] | None = None,
 ) -> Axes:
-    """Receivers × senders as a heat map; NaN (no pair, no edge) is grey; `crossed` pairs bear a small cross."""
+    """Draws receivers × senders as a heat map; NaN (no pair, no edge) is grey; `crossed` pairs have a small cross."""
     ax.set_facecolor("0.85")
     low, high = limits
-    if high - low <= 1e-6 * max(1.0, abs(low), abs(high)):  # flat: no contrast out of float noise
+    if high - low <= 1e-6 * max(1.0, abs(low), abs(high)):  # flat: float noise must not look like contrast
         low, high = low - 0.5, high + 0.5
     ax.imshow(np.ma.masked_invalid(matrix), vmin=low, vmax=high, cmap="viridis")
     few = len(names) <= 12
@@ -248,7 +248,7 @@ def plot_matrix(
 def features_figure(
     window: WindowShown, static_dim: int, dt_s: float, attribute_names: Sequence[str], where: str
 ) -> Figure:
-    """Matrices of the first dimensions at the first and the last observed step; static and dynamic ones apart."""
+    """Draws matrices of the first dimensions at the first and last observed step, static and dynamic ones apart."""
     there = window.history_valid[-1]
     among = np.ix_(there, there)
     names = [name for name, present in zip(window.names, there, strict=True) if present]
@@ -269,17 +269,17 @@ def features_figure(
         figsize=(0.6 + 1.15 * side * columns, len(blocks) * (2.35 * side + 1.1) + 0.8), layout="constrained"
     )
     figure.suptitle(
-        f"Edge features: {where}, {window.place}\nrow: receiver (who is influenced), column: sender; grey: no pair"
+        f"Edge features: {where}, {window.place}\nrow: receiver (which is influenced), column: sender; grey: no pair"
         + (", or in the truth no edge" if truths else "")
-        + "; cross: no edge inferred, so the feature is hardly used",
+        + "; cross: no edge inferred, so the feature has little effect",
         fontsize=10,
     )
-    silent = (window.edge_prob <= 0.5)[among] & window.pairs[-1][among]
+    unlinked = (window.edge_prob <= 0.5)[among] & window.pairs[-1][among]
     parts = figure.subfigures(len(blocks), 1, squeeze=False)[:, 0]
     for (title, block), part in zip(blocks, parts, strict=True):
         part.suptitle(title, fontsize=11, fontweight="bold")
         axes = part.subplots(len(steps), columns, squeeze=False)
-        _feature_block(part, axes, block[:DIMENSIONS_SHOWN], matrices, steps, names, silent)
+        _feature_block(part, axes, block[:DIMENSIONS_SHOWN], matrices, steps, names, unlinked)
         _truth_columns(part, axes[:, columns - len(truths) :], truths, names)
         for ax in axes.flat:
             ax.set_axis_off() if not ax.images else None
@@ -287,7 +287,7 @@ def features_figure(
 
 
 def _true_matrices(window: WindowShown, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """The known attributes on true edges (existence where there are none), as the heat maps need them."""
+    """Returns the known attributes on true edges (existence of an edge without attributes), NaN elsewhere."""
     there = window.history_valid[-1]
     among = np.ix_(there, there)
     pairs = window.pairs[-1][among]
@@ -310,22 +310,24 @@ def _feature_block(
     matrices: dict[int, np.ndarray],
     steps: dict[int, str],
     names: Sequence[str],
-    silent: Bool[np.ndarray, "agents agents"],
+    unlinked: Bool[np.ndarray, "agents agents"],
 ) -> None:
-    """One column per dimension, one row per step, one scale per column."""
+    """Draws a grid with one column per dimension, the steps below each other, one scale per column."""
     for column, dimension in enumerate(dimensions):
         both = np.stack([matrix[..., dimension] for matrix in matrices.values()])
         limits = (float(np.nanmin(both)), float(np.nanmax(both)))
-        for row, (step, label) in enumerate(steps.items()):
-            ax = axes[row, column]
-            plot_matrix(ax, matrices[step][..., dimension], limits, names, silent if row == len(steps) - 1 else None)
-            ax.set_title(f"feature {dimension}" if not row else "", fontsize=10)
+        for place, (step, label) in enumerate(steps.items()):
+            ax = axes[place, column]
+            plot_matrix(
+                ax, matrices[step][..., dimension], limits, names, unlinked if place == len(steps) - 1 else None
+            )
+            ax.set_title(f"feature {dimension}" if not place else "", fontsize=10)
             ax.set_ylabel(label if not column else "", fontsize=10)
         _scale(part, axes[:, column])
 
 
 def _truth_columns(part: Any, axes: Any, truths: dict[str, np.ndarray], names: Sequence[str]) -> None:
-    """The truth at the last step, beside the features there."""
+    """Draws the truth at the last step, beside the features of that step."""
     for column, (name, matrix) in zip(axes.T, truths.items(), strict=True):
         finite = matrix[np.isfinite(matrix)]
         limits = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
@@ -342,7 +344,7 @@ def _scale(part: Any, column: Any) -> None:
 
 
 def trajectories_figure(windows: Sequence[WindowShown], feature_names: Sequence[str], where: str) -> Figure:
-    """Samples beside the truth; three axes are seen along the one with the least variance."""
+    """Draws samples beside the truth; of three axes, the one with the least variance is not shown."""
     axes_shown = shown_axes(np.concatenate([w.history[w.history_valid] for w in windows]))
     past = 1 + windows[0].future.shape[1]  # as long as the forecast; more hides it
     extents = [np.ptp(w.history[-past:][w.history_valid[-past:]][:, axes_shown], axis=0) for w in windows]
@@ -370,7 +372,7 @@ def trajectories_figure(windows: Sequence[WindowShown], feature_names: Sequence[
             ax.set_aspect("auto")
             ax.margins(0.02, 0.2)
         ax.set_title(f"{window.place}{_error(window)}", fontsize=10)
-    view = "" if windows[0].history.shape[-1] == 2 else "; seen along the axis that varies least"
+    view = "" if windows[0].history.shape[-1] == 2 else "; the axis with the least variance is not shown"
     figure.suptitle(
         f"{where}\nlast {min(past, len(windows[0].history))} observed steps solid (square: now), "
         f"{drawn} forecast{'s' * (drawn > 1)} dashed, truth thin black{view}",
@@ -380,13 +382,13 @@ def trajectories_figure(windows: Sequence[WindowShown], feature_names: Sequence[
 
 
 def shown_axes(positions: Float[np.ndarray, "points axes"]) -> list[int]:
-    """The plane that is drawn: x and y, or of three axes the two with the largest variance, the larger one flat."""
+    """Returns the axes that are drawn: x and y, or of three the two with the largest variance, the larger one first."""
     axes: list[int] = np.argsort(-positions.var(axis=0), kind="stable")[:2].tolist()
     return axes if positions.shape[1] > 2 else [0, 1]
 
 
 def _error(window: WindowShown) -> str:
-    """Mean over agents of the best sample's mean displacement."""
+    """Returns the mean over agents of the best sample's mean displacement [m], as text."""
     whole = window.future_valid.all(axis=-1)
     if not whole.any():
         return ""

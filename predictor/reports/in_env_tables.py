@@ -1,4 +1,4 @@
-"""Tables of measurements in live environments as Markdown, and their places between the markers of a page.
+"""Writes measurements in live environments as Markdown tables, between the markers of a page.
 
 A table of a page stands between `<!-- table: NAME -->` and `<!-- end -->`; what is between them is replaced.
 """
@@ -11,7 +11,7 @@ from predictor.support.errors import UserError
 from predictor.support.markdown import table
 
 MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
-"""A table with its markers."""
+"""Pattern of a table with its markers."""
 
 Column = Callable[[Measurement], str]
 
@@ -58,13 +58,13 @@ COLUMNS: dict[str, Column] = {
     "latency median / p95 [ms]": lambda m: "–" if m.latency_ms is None else "{:.0f} / {:.0f}".format(*m.latency_ms),
     "forecasts": lambda m: "–" if m.forecasts is None else f"{m.forecasts:,}",
 }
-"""Every column, by its heading."""
+"""Columns by heading."""
 
 CARD = (
     "env", "driver", "episodes", "K", "minADE₁ / minFDE₁ [m]", "best of K [m]", "nearest neighbours ADE [m]",
     "constant velocity ADE / FDE [m]", "ADE below constant velocity (95 %)",
 )  # fmt: skip
-"""Columns of a checkpoint's card."""
+"""Headings of the table in a checkpoint's card."""
 
 
 def measurement_table(measurements: Sequence[Measurement], headings: Sequence[str] = CARD) -> str:

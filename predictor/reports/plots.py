@@ -1,4 +1,4 @@
-"""Plots of forecasts and their accuracy; functions take arrays and an axis and return the axis."""
+"""Plots forecasts and their accuracy; functions take arrays and an axis and return the axis."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from predictor.evaluation.accuracy import Accuracy
 
 
-def plot_error_by_horizon(ax: Axes, rows: Sequence[Accuracy], dt_s: float) -> Axes:
+def plot_error_by_horizon(ax: Axes, accuracies: Sequence[Accuracy], dt_s: float) -> Axes:
     """Draws displacement against time ahead, a line per forecaster; constant velocity is grey, dotted with noise."""
-    for row in rows:
-        time_s = dt_s * np.arange(1, len(row.by_step_m) + 1)
-        style: dict[str, Any] = {"color": "grey"} if row.name.startswith("constant velocity") else {}
-        if style and row.num_samples > 1:
+    for accuracy in accuracies:
+        time_s = dt_s * np.arange(1, len(accuracy.by_step_m) + 1)
+        style: dict[str, Any] = {"color": "grey"} if accuracy.name.startswith("constant velocity") else {}
+        if style and accuracy.num_samples > 1:
             style["ls"] = ":"
-        ax.plot(time_s, row.by_step_m, marker="o", label=f"{row.name}, K = {row.num_samples}", **style)
+        ax.plot(time_s, accuracy.by_step_m, marker="o", label=f"{accuracy.name}, K = {accuracy.num_samples}", **style)
     ax.set_xlabel("time ahead [s]")
     ax.set_ylabel("displacement of the best sample [m]")
     ax.set_ylim(bottom=0)
@@ -27,25 +27,25 @@ def plot_error_by_horizon(ax: Axes, rows: Sequence[Accuracy], dt_s: float) -> Ax
     return ax
 
 
-def plot_rows_by_step(ax: Axes, results: Sequence[dict[str, Any]], kind: str, dt_s: float) -> Axes:
-    """A suite's rows: displacement of the best sample at each step of the free run, with standard errors; log scale.
+def plot_results_by_step(ax: Axes, results: Sequence[dict[str, Any]], kind: str, dt_s: float) -> Axes:
+    """Draws the displacement of the best sample at each step of the free run with standard errors; log scale.
 
     Args:
-        ax: where to draw.
-        results: rows of a suite's table.json.
+        ax: axis to draw on.
+        results: results of a suite's table.json, one per line of the table.
         kind: test store, "test" or "ood".
-        dt_s: length of a step.
+        dt_s: length of a step [s].
     """
-    for i, row in enumerate(results):
-        view = row["tests"][kind]["horizon_only"]
-        if row["key"] == "least-squares":  # the limit, orders of magnitude below
+    for i, result in enumerate(results):
+        view = result["tests"][kind]["horizon_only"]
+        if result["key"] == "least-squares":  # the limit, orders of magnitude below
             continue
-        ours = row["key"].startswith(("dgvae", "dvae"))
-        baseline = row["key"].startswith("constant-velocity")
+        ours = result["key"].startswith(("dgvae", "dvae"))
+        baseline = result["key"].startswith("constant-velocity")
         time_s = dt_s * np.arange(1, len(view["by_step_m"]) + 1)
         errors = [error or 0.0 for error in view["step_errors"]["by_step_m"]]
-        label = f"{row['name']}, K = {view['num_samples']}"
-        dashes = "-" if ours else ":" if row["key"] == "constant-velocity-noise" else "--"
+        label = f"{result['name']}, K = {view['num_samples']}"
+        dashes = "-" if ours else ":" if result["key"] == "constant-velocity-noise" else "--"
         style: dict[str, Any] = {"ls": dashes, "lw": 2.0 if ours else 1.2, "marker": "o", "ms": 3}
         color = "black" if baseline else colormaps["tab20"](i % 20)
         ax.errorbar(time_s, view["by_step_m"], yerr=errors, color=color, label=label, **style)
@@ -63,15 +63,15 @@ def plot_scene(
     future: NDArray[np.floating],
     future_valid: NDArray[np.bool_],
 ) -> Axes:
-    """One scene in metres: history solid, forecast dashed, truth thin.
+    """Draws one scene in metres: history solid, forecast dashed, truth thin.
 
     Args:
-        ax: where to draw.
-        history: (time, agents, 2).
-        history_valid: (time, agents).
-        forecast: (samples, agents, horizon, 2).
-        future: (agents, horizon, 2).
-        future_valid: (agents, horizon); agents without a valid step get no forecast drawn.
+        ax: axis to draw on.
+        history: observed positions [m] (time, agents, 2).
+        history_valid: presence (time, agents).
+        forecast: predicted positions [m] (samples, agents, horizon, 2).
+        future: true positions [m] (agents, horizon, 2).
+        future_valid: presence (agents, horizon); agents without a valid step get no forecast drawn.
     """
     for agent in range(history.shape[1]):
         seen = history_valid[:, agent]

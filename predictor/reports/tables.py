@@ -1,4 +1,4 @@
-"""A suite's results as Markdown and LaTeX: ours beside the paper's, both views, graph and features."""
+"""Writes tables of results: of a suite, of edge scores, of accuracies; as Markdown, LaTeX or for the terminal."""
 
 import math
 from collections.abc import Sequence
@@ -20,13 +20,13 @@ SCALARS = (
     "missed",
     "cover",
 )
-"""Columns of both tables between K and the steps."""
+"""Headings of both accuracy tables between K and the steps."""
 
-ROW_NAMES = {"dgvae": "dG-VAE", "dnri": "dNRI", "imma": "IMMA", "lstm": "LSTM", "mlp": "MLP"}
-"""What a table calls a model; others go by their own name."""
+MODEL_NAMES = {"dgvae": "dG-VAE", "dnri": "dNRI", "imma": "IMMA", "lstm": "LSTM", "mlp": "MLP"}
+"""Names of models in tables; the others keep their own name."""
 
 MAX_STEPS_SHOWN = 6
-"""Steps of the horizon that fit on a screen, the first and the last among them; accuracy.json has all."""
+"""Largest number of steps in a table, the first and the last among them; accuracy.json has all."""
 
 VIEWS = {"horizon_only": "Horizon-only", "whole_sequence": "Whole sequence"}
 EXPLAINED = {
@@ -37,14 +37,14 @@ METRICS = {"overall_rmse_m": ("RMSE", "rmse"), "min_ade_m": ("minADE", "ade"), "
 
 
 def markdown_report(content: dict[str, Any]) -> str:
-    """The whole table: one part per view, then graph and features."""
+    """Returns the report of a suite as Markdown: one table per view, then graph and features."""
     sizes = content["sizes"]
     parts = [
         f"# {content['title']}, budget `{content['budget']}`",
         f"{sizes['steps']:,} optimiser steps of {sizes['batch_size']} windows, "
-        f"{sizes['max_episodes'] or 'all'} training episodes, the same for every row; selected on free-run minADE. "
+        f"{sizes['max_episodes'] or 'all'} training episodes, equal for all lines; selected on free-run minADE. "
         f"Training took {content['train_seconds'] / 60:.0f} core-minutes or device-minutes in all. "
-        "Mean ± standard error over 20 random subsets of the test windows. Metres. One seed per row.",
+        "Mean ± standard error over 20 random subsets of the test windows. Metres. One seed per line.",
     ]
     for view, heading in VIEWS.items():
         parts += [f"## {heading}", EXPLAINED[view] + ".", _accuracy_table(content, view)]
@@ -53,14 +53,14 @@ def markdown_report(content: dict[str, Any]) -> str:
         parts += ["## Graph and edge features", graph]
     parts.append(_size_line(content))
     if content["failed"]:
-        parts.append("Failed rows: " + "; ".join(f"{k}: {v}" for k, v in content["failed"].items()))
+        parts.append("Failed lines: " + "; ".join(f"{k}: {v}" for k, v in content["failed"].items()))
     made = content["provenance"]
     parts.append(f"`{made['command']}`, commit {made['commit']}, {made['machine']}.")
     return "\n\n".join(parts) + "\n"
 
 
 def latex_table(content: dict[str, Any]) -> str:
-    """Both views as one booktabs table."""
+    """Returns both views as one booktabs table."""
     kinds = _kinds(content)
     columns = [(view, kind, metric) for view in VIEWS for kind in kinds for metric in METRICS]
     lines = [
@@ -70,9 +70,9 @@ def latex_table(content: dict[str, Any]) -> str:
         " & ".join(["Model", "$K$", *(f"{VIEWS[v]}, {k}: {METRICS[m][0]} [m]" for v, k, m in columns)]) + r" \\",
         r"\midrule",
     ]
-    for row in content["rows"]:
-        cells = [_cell(row, v, k, m).replace("±", r"$\pm$") for v, k, m in columns]
-        lines.append(" & ".join([row["name"], _samples_of(row), *cells]) + r" \\")
+    for result in content["rows"]:
+        cells = [_cell(result, v, k, m).replace("±", r"$\pm$") for v, k, m in columns]
+        lines.append(" & ".join([result["name"], _samples_of(result), *cells]) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
@@ -91,21 +91,21 @@ def _accuracy_table(content: dict[str, Any], view: str) -> str:
         "paper's " + " / ".join(name for name, _ in METRICS.values()) + (" / OOD" if "ood" in kinds else "")
     )
     lines = []
-    for row in content["rows"]:
-        cells = [_cell(row, view, kind, metric) for kind in kinds for metric in METRICS]
-        figures = content["paper"].get(row["key"], {})
+    for result in content["rows"]:
+        cells = [_cell(result, view, kind, metric) for kind in kinds for metric in METRICS]
+        figures = content["paper"].get(result["key"], {})
         beside = " / ".join(f"{figures[key]:.3f}" for key in paper_keys if key in figures)
-        lines.append([row["name"], _samples_of(row), *cells, beside or "–"])
+        lines.append([result["name"], _samples_of(result), *cells, beside or "–"])
     return markdown.table(headings, lines, "-" + "r" * (len(headings) - 2) + "-")
 
 
-def _samples_of(row: dict[str, Any]) -> str:
+def _samples_of(result: dict[str, Any]) -> str:
     """Returns K, the number of forecasts per window that the best-of-K errors choose from."""
-    return str(next(iter(row["tests"].values()))["horizon_only"]["num_samples"])
+    return str(next(iter(result["tests"].values()))["horizon_only"]["num_samples"])
 
 
-def _cell(row: dict[str, Any], view: str, kind: str, metric: str) -> str:
-    accuracy = row["tests"][kind][view]
+def _cell(result: dict[str, Any], view: str, kind: str, metric: str) -> str:
+    accuracy = result["tests"][kind][view]
     statistic = accuracy["statistics"].get(metric)
     if statistic is None:
         return f"{accuracy[metric]:.3f}"
@@ -115,20 +115,20 @@ def _cell(row: dict[str, Any], view: str, kind: str, metric: str) -> str:
 
 
 def _graph_table(content: dict[str, Any]) -> str:
-    """Graph accuracy, F1, connectivity; R² of the first attribute on true edges; calibration of the samples."""
+    """Returns graph accuracy, F1, connectivity, R² of the first attribute on true edges, and coverage as a table."""
     kinds = _kinds(content)
     lines = []
-    for row in content["rows"]:
+    for result in content["rows"]:
         cells: list[str] = []
         for kind in kinds:
-            test = row["tests"][kind]
+            test = result["tests"][kind]
             graph, scores = test["graph"] or {}, test["features"] or {}
             coverage = test["horizon_only"]["statistics"].get("coverage")
             numbers = [graph.get("accuracy"), graph.get("f1"), graph.get("connectivity"), test.get("prior_entropy")]
             numbers += [scores.get("direct_r2"), scores.get("linear_r2"), coverage and coverage["mean"]]
             cells += [_number(x) for x in numbers]
         if any(c != "–" for c in cells):
-            lines.append([row["name"], _samples_of(row), *cells])
+            lines.append([result["name"], _samples_of(result), *cells])
     if not lines:
         return ""
     names = [
@@ -158,12 +158,12 @@ def _size_line(content: dict[str, Any]) -> str:
     memory = max((t.get("peak_memory_mb", 0.0) for r in content["rows"] for t in r["tests"].values()), default=0.0)
     return (
         f"Measured on {'; '.join(tests)}. Parameters (training time): {', '.join(sizes)}. "
-        f"Largest memory of any row's process, training included: {memory:,.0f} MB."
+        f"Largest memory of any line's process, training included: {memory:,.0f} MB."
     )
 
 
 def scores_markdown(content: dict[str, Any]) -> str:
-    """What scores.json holds, as tables and sentences."""
+    """Returns the content of scores.json as tables and sentences in Markdown."""
     parts = [
         f"# What the edges of `{content['config']['checkpoint']}` say about {content['source']}",
         f"{content['windows']} windows of {content['episodes']} episodes; features are read at the last of "
@@ -175,7 +175,7 @@ def scores_markdown(content: dict[str, Any]) -> str:
     scores = [score for score in [relation, *content["attributes"]] if score is not None]
     if scores:
         parts += ["## In words", "\n".join(f"* {_sentence(score)}" for score in scores)]
-        parts += ["## What features know", _factor_table(scores), FACTOR_NOTE]
+        parts += ["## Scores of the features", _factor_table(scores), FACTOR_NOTE]
     if content["graph"] is not None:
         parts += ["## Graph", _graph_lines(content)]
     if content["disentanglement"] is not None:
@@ -189,27 +189,29 @@ def scores_markdown(content: dict[str, Any]) -> str:
 FACTOR_NOTE = (
     "best: dimension with the largest |r|. chance: the largest |r| among all dimensions that 95 of 100 shuffled "
     "properties stay below. distance: r of the property with the distance between the two agents, for comparison. "
-    "linear R²: all dimensions, fitted on half of the episodes, scored on the other half. direct R²: dimension i as it "
-    "is against attribute i; only restricted labelling aims at it (negative: worse than the mean)."
+    "linear R²: all dimensions, fitted on half of the episodes, scored on the other half. direct R²: dimension i, "
+    "unchanged, against attribute i; only restricted labelling trains for it (negative: worse than the mean)."
 )
 
 
 def _sentence(score: dict[str, Any]) -> str:
     name, r, chance = f"**{score['name']}**", score["correlation"], score["chance"]
     if r is None:
-        return f"{name}: nothing to say; {score['rows']} pairs, or all of them are alike."
+        return f"{name}: not scored; {score['pairs']} pairs are too few, or the property does not vary."
     if abs(r) <= chance:
-        return f"{name}: no feature goes with it beyond chance (best |r| {abs(r):.2f}, chance {chance:.2f})."
-    by_hand = abs(score["distance_correlation"]) >= abs(r)
-    ruler = f"; the distance alone does no worse (r = {score['distance_correlation']:+.2f})" if by_hand else ""
-    return f"{name}: feature {score['dimension']} goes with it, r = {r:+.2f} (chance {chance:.2f}){ruler}."
+        return f"{name}: no feature correlates with it beyond chance (best |r| {abs(r):.2f}, chance {chance:.2f})."
+    by_distance = abs(score["distance_correlation"]) >= abs(r)
+    distance = (
+        f"; the distance alone is as informative (r = {score['distance_correlation']:+.2f})" if by_distance else ""
+    )
+    return f"{name}: feature {score['dimension']} correlates with it, r = {r:+.2f} (chance {chance:.2f}){distance}."
 
 
 def _factor_table(scores: Sequence[dict[str, Any]]) -> str:
-    rows = [
+    lines = [
         [
             s["name"],
-            str(s["rows"]),
+            str(s["pairs"]),
             "–" if s["dimension"] is None else str(s["dimension"]),
             _signed(s["correlation"]),
             plain(s["r2"]),
@@ -221,14 +223,14 @@ def _factor_table(scores: Sequence[dict[str, Any]]) -> str:
         for s in scores
     ]
     header = ["property", "pairs", "best", "r", "r²", "chance", "distance", "linear R²", "direct R²"]
-    return markdown.table(header, rows)
+    return markdown.table(header, lines)
 
 
 def _graph_lines(content: dict[str, Any]) -> str:
     graph, apart = content["graph"], content["separation"]
     lines = [
         f"* accuracy {plain(graph['accuracy'])}, F1 {plain(graph['f1'])} over {graph['pairs']} ordered pairs; "
-        f"always saying 'edge' has accuracy {plain(graph['true_connectivity'])}, always 'no edge' "
+        f"predicting 'edge' for all pairs has accuracy {plain(graph['true_connectivity'])}, 'no edge' for all "
         f"{plain(None if graph['true_connectivity'] is None else 1 - graph['true_connectivity'])}"
     ]
     if apart is not None:
@@ -243,8 +245,8 @@ def _graph_lines(content: dict[str, Any]) -> str:
 def _disentanglement_lines(content: dict[str, Any]) -> str:
     found = content["disentanglement"]
     lines = [
-        f"* MIG {plain(found['mig'])} over {found['rows']} true edges (1: each attribute is held by one dimension "
-        "alone, 0: by none, or by two alike)"
+        f"* MIG {plain(found['mig'])} over {found['edges']} true edges (1: each attribute is held by one dimension "
+        "alone, 0: by none, or by two equally)"
     ]
     if found["dci"] is not None:
         dci = found["dci"]
@@ -261,28 +263,28 @@ def _disentanglement_lines(content: dict[str, Any]) -> str:
 def _dimension_table(content: dict[str, Any], scores: Sequence[dict[str, Any]]) -> str:
     scored = [s for s in scores if s["correlations"]]
     whole, late = content["stillness"], content["stillness_late"]
-    rows = []
+    lines = []
     for d, spread in enumerate(late["spread"]):
         kind = "static" if d < content["static_dim"] else "dynamic"
-        row = [str(d), kind, f"{spread:.3g}", plain(whole["within"][d], 2), plain(late["within"][d], 2)]
-        rows.append(row + [_signed(s["correlations"][d]) for s in scored])
+        cells = [str(d), kind, f"{spread:.3g}", plain(whole["within"][d], 2), plain(late["within"][d], 2)]
+        lines.append(cells + [_signed(s["correlations"][d]) for s in scored])
     header = ["feature", "kind", "spread", "changing", "changing, 2nd half", *(f"r: {s['name']}" for s in scored)]
-    return markdown.table(header, rows)
+    return markdown.table(header, lines)
 
 
 def _stillness_note(content: dict[str, Any]) -> str:
     whole, late = content["stillness"], content["stillness_late"]
     which = "true edges" if content["edges"] is not None else "pairs"
     return (
-        f"changing: variance within a pair over time / variance over pairs and time; 0 stands still, 1 is all change. "
-        f"Over all {whole['steps']} observed steps ({whole['edges']} {which} that are there throughout), and over the "
-        f"second half ({late['edges']}). static: averaged over the past (pair matching), so stiller by construction. "
+        f"changing: variance within a pair over time / variance over pairs and time; 0 is static, 1 is all change. "
+        f"Over all {whole['steps']} observed steps ({whole['edges']} {which} present at all of them), and over the "
+        f"second half ({late['edges']}). static: averaged over the past (pair matching): less change by construction. "
         f"spread: standard deviation in the second half; a dash beside it is a dimension that never changes at all."
     )
 
 
 def plain(value: float | None, places: int = 3) -> str:
-    """A number to so many places, or a dash."""
+    """Returns a number with `places` decimals, or a dash for None."""
     return "–" if value is None else f"{value:.{places}f}"
 
 
@@ -290,62 +292,64 @@ def _signed(value: float | None) -> str:
     return "–" if value is None else f"{value:+.2f}"
 
 
-def accuracy_table(rows: Sequence[Accuracy], dt_s: float, title: str) -> Table:
-    """One line per row; the columns by horizon hold displacement, RMSE and NLL, for `MAX_STEPS_SHOWN` of its steps."""
+def accuracy_table(accuracies: Sequence[Accuracy], dt_s: float, title: str) -> Table:
+    """Returns a terminal table, one line per accuracy; displacement, RMSE and NLL at `MAX_STEPS_SHOWN` steps."""
     table = Table(title=title, show_lines=True)
     table.add_column("forecaster")
     for heading in ("K", *SCALARS, "forecasts"):
         table.add_column("\n".join(heading.split()).replace("[", r"\["), justify="right")
-    shown = _steps_shown(rows)
+    shown = _steps_shown(accuracies)
     for step in shown:
         table.add_column(f"{dt_s * (step + 1):g} s", justify="right")
-    for row in rows:
-        stacks = [(row.by_step_m[i], row.rmse_m[i], *([row.nll[i]] if row.nll else [])) for i in shown]
+    for one in accuracies:
+        stacks = [(one.by_step_m[i], one.rmse_m[i], *([one.nll[i]] if one.nll else [])) for i in shown]
         cells = ["\n".join(_rounded_number(value, 2) for value in stack) for stack in stacks]
-        scalars = [cell.replace(" ± ", "\n±") for cell in _scalar_cells(row)]
-        table.add_row(row.name, str(row.num_samples), *scalars, str(row.agents), *cells)
+        scalars = [cell.replace(" ± ", "\n±") for cell in _scalar_cells(one)]
+        table.add_row(one.name, str(one.num_samples), *scalars, str(one.agents), *cells)
     table.caption = (
         r"by time ahead: displacement of the best sample \[m] / RMSE of the mean \[m] / NLL \[nats], top to bottom; "
-        f"± standard error over subsets of the windows; missed: ends more than {rows[0].miss_threshold_m:g} m off; "
+        f"± standard error over subsets of the windows; missed: final displacement above "
+        f"{accuracies[0].miss_threshold_m:g} m; "
         f"cover: truths within the central {100 * COVERAGE_SHARE:g} % of the samples"
     )
     return table
 
 
-def markdown_table(rows: Sequence[Accuracy], dt_s: float) -> str:
-    """The same as Markdown; by time ahead the displacement alone."""
-    shown = _steps_shown(rows)
+def markdown_table(accuracies: Sequence[Accuracy], dt_s: float) -> str:
+    """Returns the table of `accuracy_table` as Markdown, with displacement only at the steps."""
+    shown = _steps_shown(accuracies)
     steps = [f"{dt_s * (i + 1):g} s" for i in shown]
     lines = [
-        [row.name, str(row.num_samples), *_scalar_cells(row), *(_rounded_number(row.by_step_m[i], 2) for i in shown)]
-        for row in rows
+        [one.name, str(one.num_samples), *_scalar_cells(one), *(_rounded_number(one.by_step_m[i], 2) for i in shown)]
+        for one in accuracies
     ]
     return markdown.table(["forecaster", "K", *SCALARS, *steps], lines) + "\n"
 
 
-def _steps_shown(rows: Sequence[Accuracy]) -> list[int]:
-    horizon = len(rows[0].by_step_m)
+def _steps_shown(accuracies: Sequence[Accuracy]) -> list[int]:
+    horizon = len(accuracies[0].by_step_m)
     return np.linspace(0, horizon - 1, min(horizon, MAX_STEPS_SHOWN)).round().astype(int).tolist()
 
 
 def _rounded_number(value: float, places: int) -> str:
-    """Fixed places, or two digits where those would show fewer; springs err by millimetres, traffic by metres."""
+    """Returns a number with `places` decimals, or with two digits if it is small (errors of springs: millimetres)."""
     if math.isnan(value):
         return "–"
     return f"{value:.{places}f}" if value == 0 or abs(value) >= 10 ** (1 - places) else f"{value:.2g}"
 
 
-def _scalar_cells(row: Accuracy) -> list[str]:
-    """Cells under `SCALARS`; what was not measured is a dash."""
+def _scalar_cells(accuracy: Accuracy) -> list[str]:
+    """Returns the cells under `SCALARS`; a dash for what was not measured."""
 
     def metres(name: str) -> str:
-        value: float = getattr(row, name)
-        error = row.statistics[name].standard_error if name in row.statistics else None
+        value: float = getattr(accuracy, name)
+        error = accuracy.statistics[name].standard_error if name in accuracy.statistics else None
         return _rounded_number(value, 3) + ("" if error is None else f" ± {_rounded_number(error, 3)}")
 
     lengths = [
         metres(name) for name in ("min_ade_m", "min_fde_m", "min_joint_ade_m", "min_joint_fde_m", "overall_rmse_m")
     ]
-    miss = "–" if math.isnan(row.miss_rate) else f"{100 * row.miss_rate:.1f} %"
-    covered = f"{100 * row.statistics['coverage'].mean:.0f} %" if "coverage" in row.statistics else "–"
+    miss = "–" if math.isnan(accuracy.miss_rate) else f"{100 * accuracy.miss_rate:.1f} %"
+    share = accuracy.statistics.get("coverage")
+    covered = "–" if share is None else f"{100 * share.mean:.0f} %"
     return [*lengths, miss, covered]

@@ -1,1 +1,1 @@
-"""What every package uses and nothing of forecasting: errors, checks, files, command lines, provenance, the process."""
+"""Tools of all packages, unrelated to forecasting: errors, checks, files, command lines, provenance, processes."""

@@ -1,7 +1,7 @@
-"""Turns the words of a command line into a config: tyro's options, errors in one line, old names of options.
+"""Parsing of a command line into a config: tyro's options, errors in one line, old names of options.
 
-A config checks itself in `__post_init__`. tyro draws a box around such an error and exits; `parse` raises the error
-itself, so that `predictor.support.errors.run_entry_point` prints one line and exits with status 2.
+Configs are checked in `__post_init__`. tyro prints such an error in a box and exits; `parse` raises the error itself,
+so that `predictor.support.errors.run_entry_point` prints one line and exits with status 2.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ from predictor.support.errors import UserError
 
 Config = TypeVar("Config")
 
-_SAID_IN_A_SENTENCE = ("Invalid choice", "Missing argument", "Value error")
+_SENTENCE_TITLES = ("Invalid choice", "Missing argument", "Value error")
 """Titles of tyro's boxes whose first part is a sentence; the other boxes list options and stay as they are."""
 
 
@@ -27,7 +27,7 @@ _SAID_IN_A_SENTENCE = ("Invalid choice", "Missing argument", "Value error")
 class Renamed:
     """Marks a config's field whose option had another name: `num_envs: Annotated[int, Renamed("envs")] = 1`.
 
-    The old option works for one release and says on stderr what it is called now.
+    The old option works for one release and prints the new name on stderr.
     """
 
     old: str
@@ -43,20 +43,20 @@ def parse(config_class: type[Config], description: str | None = None, args: Sequ
         args: words of the command line; None takes those of this process.
 
     Raises:
-        UserError: a value that the config refuses, or that is not of its field's type.
-        SystemExit: unknown or missing options (status 2, listed on stderr), or `--help` (status 0).
+        UserError: the config rejects a value, or a value does not have its field's type.
+        SystemExit: options are unknown or missing (status 2, listed on stderr), or `--help` is given (status 0).
     """
     words = with_new_names(config_class, sys.argv[1:] if args is None else args)
-    said = io.StringIO()
+    printed = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(printed):
             return tyro.cli(config_class, description=description, args=words)
     except SystemExit as leaving:
         if (error := _user_error_behind(leaving)) is not None:
             raise error from None
-        if sentence := _sentence_in(said.getvalue()):
+        if sentence := _sentence_in(printed.getvalue()):
             raise UserError(sentence) from None
-        print(said.getvalue(), end="", file=sys.stderr)
+        print(printed.getvalue(), end="", file=sys.stderr)
         raise
 
 
@@ -92,16 +92,16 @@ def _option(name: str) -> str:
 
 
 def _user_error_behind(error: BaseException | None) -> UserError | None:
-    """Returns the `UserError` while handling which this exception was raised."""
+    """Returns the `UserError` during whose handling this exception was raised; None if there is none."""
     while error is not None and not isinstance(error, UserError):
         error = error.__context__
     return error
 
 
 def _sentence_in(box: str) -> str:
-    """Returns what a box of tyro says in a sentence, without its frame; empty for a box that lists options."""
+    """Returns the sentence in a box of tyro, without the frame; empty for a box that lists options."""
     lines = re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines()
-    if not lines or lines[0].strip("╭─╮+- ") not in _SAID_IN_A_SENTENCE:
+    if not lines or lines[0].strip("╭─╮+- ") not in _SENTENCE_TITLES:
         return ""
     inside = [line.strip("│ ") for line in lines[1:]]
     after_title = itertools.dropwhile(_is_rule, inside)
@@ -110,5 +110,5 @@ def _sentence_in(box: str) -> str:
 
 
 def _is_rule(line: str) -> bool:
-    """Returns whether a line of a box is empty or a rule; tyro draws with ASCII where stdout has nothing else."""
+    """Returns whether a line of a box is empty or a rule; tyro uses ASCII if stdout has nothing else."""
     return not line.strip("╰╯─-")

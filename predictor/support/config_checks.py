@@ -1,6 +1,6 @@
 """Checks that configs call in `__post_init__`; each raises a `UserError` that names the field and its value.
 
-They look at values alone. What a file system or a run must fulfil is checked by the function that uses the config.
+They check values alone. Requirements on files or on a run are checked by the function that uses the config.
 """
 
 import math
@@ -15,7 +15,7 @@ def check_choices(config: Any) -> None:
     """Checks every field whose type is a `Literal`, also inside an optional or a tuple.
 
     Raises:
-        UserError: a value that the type does not list.
+        UserError: a value is not listed by its type.
     """
     for name, allowed in _closed_fields(type(config)).items():
         value = getattr(config, name)
@@ -24,10 +24,10 @@ def check_choices(config: Any) -> None:
 
 
 def check_choice(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
-    """Checks one value.
+    """Checks that one value is among the allowed ones.
 
     Raises:
-        UserError: it is not among the allowed ones.
+        UserError: it is not.
     """
     if value not in allowed:
         listed = ", ".join(str(choice) for choice in allowed if choice is not None)
@@ -35,10 +35,10 @@ def check_choice(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
 
 
 def check_at_least(config: Any, least: int, *names: str) -> None:
-    """Checks that numbers, or all entries of tuples, are finite and not below a bound; None passes.
+    """Checks that numbers, or all entries of tuples, are finite and at least `least`; None passes.
 
     Raises:
-        UserError: one is.
+        UserError: one is not.
     """
     bound = f"be at least {least}" if least else "not be negative"
     for name in names:
@@ -68,7 +68,7 @@ def _closed_fields(config_class: type) -> dict[str, tuple[Any, ...]]:
 
 
 def _choices(kind: Any) -> tuple[Any, ...]:
-    """Returns what a type lists; empty if it is open."""
+    """Returns the values that a type lists; empty if it lists none."""
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Literal:
         return arguments

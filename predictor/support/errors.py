@@ -1,19 +1,19 @@
-"""Errors a user can cause, and how an entry point shows them: one clear line, exit status 2, no traceback."""
+"""Errors that a user can cause, printed by an entry point in one line, with exit status 2 and no traceback."""
 
 import sys
 from collections.abc import Callable
 
 
 class UserError(ValueError):
-    """Bad input: says what was required, what arrived and what to do."""
+    """Raised for bad input; the message names what was required, what was given and what to do."""
 
 
 class ProtocolError(RuntimeError):
-    """The library was driven in an order that has no meaning (for example a step before the first reset)."""
+    """Raised when methods are called in a wrong order (for example a step before the first reset)."""
 
 
 def run_entry_point(main: Callable[[], None]) -> None:
-    """Run `main`; turn user errors into one line on stderr and exit status 2, Ctrl-C into status 130."""
+    """Runs `main`; turns user errors into one line on stderr and exit status 2, Ctrl-C into status 130."""
     try:
         main()
     except (UserError, FileNotFoundError, PermissionError) as error:

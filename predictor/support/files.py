@@ -1,6 +1,6 @@
-"""Writes files and folders so that a reader finds the old version or the whole new one, never a part.
+"""Writing of files and folders so that a reader finds the old version or the whole new one, never a part.
 
-What is not complete yet stands beside its target under a hidden name that ends in ``.partial``.
+Unfinished files are beside their targets, under hidden names that end in ``.partial``.
 """
 
 import json
@@ -15,10 +15,10 @@ from typing import Any
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Gives a temporary name to write to; renames it to `path` at the end, or deletes it if the body raises.
+    """Yields a temporary path to write to; renames it to `path` at the end, or deletes it if the body raises.
 
-    The content is flushed to disk before it is renamed, so that also a power cut leaves the old file or the new one.
-    The temporary name keeps the suffix of `path`, by which encoders choose their format.
+    The content is flushed to disk before it is renamed, so that even a power cut leaves the old file or the new one.
+    The temporary name has the suffix of `path`, by which encoders choose their format.
     """
     partial = _beside(path, path.suffix)
     try:
@@ -32,7 +32,7 @@ def new_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Gives an empty temporary folder to fill; puts it in the place of `path` at the end, or deletes it on an error."""
+    """Yields an empty temporary folder to fill; replaces `path` by it at the end, or deletes it on an error."""
     with scratch_folder(path) as partial:
         yield partial
         _replace_folder(partial, path)
@@ -40,7 +40,7 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def scratch_folder(path: Path) -> Iterator[Path]:
-    """Gives an empty temporary folder beside `path`, on the same disk; deletes it at the end."""
+    """Yields an empty temporary folder beside `path`, on the same disk; deletes it at the end."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = _beside(path)
     partial.mkdir()
@@ -51,7 +51,7 @@ def scratch_folder(path: Path) -> Iterator[Path]:
 
 
 def copy_file(source: Path, target: Path) -> None:
-    """Copies a file."""
+    """Copies a file to `target`."""
     with new_file(target) as partial:
         shutil.copyfile(source, partial)
 
@@ -63,12 +63,12 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Writes JSON; what JSON has no type for is written as its string."""
+    """Writes JSON; values without a JSON type are written as strings."""
     write_text(path, json.dumps(content, indent=2, default=str) + "\n")
 
 
 def delete_leftovers(folder: Path) -> None:
-    """Deletes what a killed process left unfinished in a folder."""
+    """Deletes the unfinished files that a killed process left in a folder."""
     for leftover in folder.glob(".*.partial*"):
         if leftover.is_dir():
             shutil.rmtree(leftover, ignore_errors=True)
@@ -89,7 +89,7 @@ def _flush(path: Path) -> None:
 
 
 def _replace_folder(new: Path, target: Path) -> None:
-    """Puts `new` in the place of `target`; a crash leaves one of them whole under the target's name or beside it."""
+    """Replaces `target` by `new`; a crash leaves one of them whole, under the target's name or beside it."""
     if not target.exists():
         new.rename(target)
         return

@@ -1,4 +1,4 @@
-"""Lets a package export names of its modules and import each module only when one of its names is used.
+"""Lazy exports: a package exports names of its modules and imports each module only when one of its names is used.
 
 `from envs import VectorForecast` must not need the packages of `envs.sb3`, so `envs/__init__.py` cannot import its
 modules. It lists them instead, and once more under `TYPE_CHECKING` for type checkers and editors.
@@ -10,15 +10,15 @@ from typing import Any
 
 
 def lazy_exports(package: str, modules: Mapping[str, Sequence[str]]) -> tuple[Callable[[str], Any], list[str]]:
-    """Makes the `__getattr__` and the `__all__` of a package.
+    """Creates `__getattr__` and `__all__` of a package.
 
     Args:
         package: name of the package, for the error message.
-        modules: module → names it exports.
+        modules: names that each module exports, by the module's name.
 
     Returns:
-        The function that imports the module of a name and returns the name's value; it raises an AttributeError for
-        other names. The sorted names.
+        A function that imports the module of a name and returns the name's value, with an AttributeError for other
+        names; and the sorted names.
     """
     module_of = {name: module for module, names in modules.items() for name in names}
 

@@ -1,4 +1,4 @@
-"""Markdown tables: the one place that knows how a line of cells is written."""
+"""Markdown tables."""
 
 from collections.abc import Iterable, Sequence
 
@@ -6,16 +6,16 @@ _RULES = {"-": "---", "l": ":---", "r": "---:"}
 
 
 def table(headings: Sequence[str], lines: Iterable[Sequence[str]], align: str = "") -> str:
-    """Writes a table; no newline at its end.
+    """Returns a table as text, without a newline at its end.
 
     Args:
-        headings: of the columns.
+        headings: headings of the columns.
         lines: cells of each line, as many as there are headings; a ``|`` in a cell is escaped.
-        align: a letter for each column: ``l`` left, ``r`` right, ``-`` as the page has it; the last letter stands for
-            all columns that follow, nothing for ``-``.
+        align: letter for each column: ``l`` left, ``r`` right, ``-`` the page's default; the last letter holds for all
+            further columns, and an empty text is ``-``.
 
     Raises:
-        ValueError: a line has more or fewer cells than there are headings.
+        ValueError: a line does not have as many cells as there are headings.
     """
     letters = (align or "-").ljust(len(headings), (align or "-")[-1])[: len(headings)]
     written = [_line(headings), f"|{'|'.join(_RULES[letter] for letter in letters)}|"]

@@ -1,4 +1,4 @@
-"""How a result was made: command, commit, versions, time. Goes into every run folder, store and checkpoint."""
+"""Provenance of a result: command, commit, versions, time; it is written to every run folder, store and checkpoint."""
 
 import datetime
 import importlib.metadata
@@ -13,7 +13,7 @@ from typing import Any
 
 
 def provenance(packages: Sequence[str], command: str | None = None) -> dict[str, Any]:
-    """Command line, git commit (with "+changes" if the tree is dirty), package versions, machine, UTC time."""
+    """Returns command line, git commit (with "+changes" if the tree is dirty), package versions, machine, UTC time."""
     if command is None:
         command = " ".join(["python", *(_module_or_script()), *map(shlex.quote, sys.argv[1:])])
     return {

@@ -1,6 +1,6 @@
-"""How the process uses the machine: memory that stays mapped, who multiplies matrices, and how precisely.
+"""Use of the machine by the process: device, memory that stays mapped, library and precision of matrix products.
 
-Entry points call `tune`; it changes no result beyond the last bits. `precision` does what it says.
+Entry points call `tune`, which changes results in the last bits only; `precision` changes them as its name says.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ import torch
 from predictor.support.errors import UserError
 
 Precision = Literal["float32", "bfloat16"]
-"""Of products and convolutions: "bfloat16" rounds their inputs and results; weights, states and losses stay float32."""
+"""Precision of products: "bfloat16" rounds their inputs and results; weights, states and losses stay float32."""
 
 # glibc's <malloc.h>
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4
@@ -28,7 +28,7 @@ def resolve_device(device: str) -> str:
     """Returns the torch device of a name: cpu, cuda, cuda:N, or auto, which is cuda where torch finds such a device.
 
     Raises:
-        UserError: another name, or no such device in this machine.
+        UserError: the name is another one, or this machine has no such device.
     """
     if device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
@@ -44,10 +44,10 @@ def resolve_device(device: str) -> str:
 
 
 def tune(device: str = "cpu") -> None:
-    """Settings for a process of our own: freed memory is kept, products take the faster library.
+    """Sets a process up for speed: freed memory is kept, matrix products use the faster library.
 
     Args:
-        device: where tensors live; the setting behind the second would let products on CUDA round to TF32.
+        device: device of the tensors; on CUDA the library is not set, since that would let products round to TF32.
     """
     keep_freed_memory()
     if device == "cpu":
@@ -56,9 +56,9 @@ def tune(device: str = "cpu") -> None:
 
 @cache
 def keep_freed_memory() -> bool:
-    """Let glibc keep freed memory instead of handing it back to the kernel; whether it could be done.
+    """Makes glibc keep freed memory instead of returning it to the kernel; returns whether this was possible.
 
-    Training steps and forecasts allocate and free the same large tensors again and again. By default each of them is
+    Training steps and forecasts allocate and free large tensors of equal sizes repeatedly. By default each of them is
     mapped and cleared anew, which costs as much as the arithmetic on it. The process's resident size stays at its peak
     instead.
     """
@@ -71,10 +71,10 @@ def keep_freed_memory() -> bool:
 
 @cache
 def prefer_onednn() -> bool:
-    """Leave float32 matrix products to oneDNN where torch's default, MKL, is slow; whether it was done.
+    """Makes torch use oneDNN for float32 matrix products where its default, MKL, is slow; returns whether it does.
 
-    MKL keeps its AVX-512 kernels for Intel's processors; on AMD's, oneDNN is twice as fast. torch asks oneDNN only if
-    it may round inputs to bfloat16, so this is done only where oneDNN turns out not to.
+    MKL uses its AVX-512 kernels on Intel's processors only; on AMD's, oneDNN is twice as fast. torch uses oneDNN only
+    if it may round inputs to bfloat16, so this is set only where a test shows that oneDNN does not.
     """
     if "AuthenticAMD" not in _cpu_info("vendor_id") or torch.backends.cpu.get_cpu_capability() != "AVX512":
         return False
@@ -87,7 +87,7 @@ def prefer_onednn() -> bool:
 
 
 def _products_are_exact() -> bool:
-    """Whether products of some shapes and layouts are as precise as float32 is; bfloat16 would be 4,000 times worse."""
+    """Returns whether products of some shapes and layouts are as precise as float32; bfloat16 is 4,000 times worse."""
     noise = torch.Generator().manual_seed(0)
     for rows, inner, columns in ((64, 64, 64), (1024, 48, 96), (300, 256, 256)):
         a, b = (torch.randn(shape, generator=noise) for shape in ((rows, inner), (inner, columns)))
@@ -100,20 +100,20 @@ def _products_are_exact() -> bool:
 
 @contextlib.contextmanager
 def precision(kind: Precision, device: str) -> Iterator[None]:
-    """Products at this precision while it lasts, by autocast; pays where the processor multiplies bfloat16 natively."""
+    """Computes products inside the block at this precision, by autocast; faster where bfloat16 is native."""
     with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=kind == "bfloat16"):
         yield
 
 
 def processor() -> str:
-    """The processor's name as the operating system gives it, and how many logical cores there are."""
+    """Returns the processor's name as the operating system gives it, and the number of logical cores."""
     names = _cpu_info("model name")
     name = names[0] if names else platform.processor() or platform.machine()
     return f"{name}, {os.cpu_count()} logical cores"
 
 
 def _cpu_info(field: str) -> list[str]:
-    """Values of a field of Linux's list of processors; none elsewhere."""
+    """Returns the values of a field of Linux's list of processors; none on other systems."""
     with contextlib.suppress(OSError), open("/proc/cpuinfo") as file:
         return [line.split(":", 1)[1].strip() for line in file if line.startswith(field)]
     return []

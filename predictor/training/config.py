@@ -19,12 +19,12 @@ Capture = Literal["auto", "off"]
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Train a forecaster on one or more episode stores."""
+    """Options of training a forecaster on one or more episode stores."""
 
     data: tuple[Path, ...]
     """Episode stores (python -m envs.collect makes them); several are mixed by their number of windows."""
     out: Path
-    """Run folder: checkpoint/, config.json, TensorBoard, training state."""
+    """Run folder, with checkpoint/, config.json, TensorBoard and training state."""
     val_data: tuple[Path, ...] = ()
     """Episode stores for model selection; none given, episodes of `data` are held out."""
     model: ModelName = "dgvae"
@@ -34,9 +34,9 @@ class TrainConfig:
     set: tuple[str, ...] = ()
     """Fields of the network's config to change, as field=value: --set hidden_dim=64 static_dim=16."""
     input_changes: bool = False
-    """Give the dG-VAE's encoder also what changed since the last step (`change_scales`, fitted to the data)."""
+    """Whether changes since the last step are inputs of the dG-VAE's encoder (`change_scales`, fitted to the data)."""
     fit_inputs: bool = False
-    """Divide the dG-VAE's inputs by their spread in the data (`input_scales`) instead of the spec's scales."""
+    """Whether the dG-VAE's inputs are divided by their spread in the data (`input_scales`), not the spec's scales."""
     steps: int = 4000
     """Number of optimiser steps."""
     batch_size: int = 64
@@ -44,12 +44,12 @@ class TrainConfig:
     lr: float = 2e-3
     """Peak learning rate (Adam), after warm-up, then cosine to 2 %."""
     history_steps: int = 10
-    """Number of observed steps fed to the network, at most; at deployment its memory is unlimited."""
+    """Largest number of observed steps of a training window; at deployment the history is unlimited."""
     min_history_steps: int = 0
-    """Least value of `history_steps` that a batch may draw; 0 gives every batch `history_steps` itself."""
+    """Smallest `history_steps` that is drawn for a batch; 0 takes `history_steps` itself for every batch."""
     val_history_steps: int = 1
-    """Number of observed steps that a window for model selection has at least; with the value of `history_steps`, whole
-    sequences are cut as in the tables."""
+    """Smallest number of observed steps of a window for model selection; if equal to `history_steps`, whole sequences
+    are cut as in the tables."""
     horizon_steps: int = 5
     """Number of steps forecast in training, and the default horizon of the checkpoint."""
     curriculum_steps: int = 0
@@ -57,21 +57,22 @@ class TrainConfig:
     one_step_weight: float = 0.2
     """Weight of the teacher-forced one-step likelihood."""
     rollout_weight: float = 1.0
-    """Weight of the free-running likelihood; 0 trains teacher-forced only, as the NRI family does."""
+    """Weight of the likelihood of the roll-out; 0 trains teacher-forced only, as the NRI family does."""
     kl_weight: float = 1.0
     """Weight of KL(posterior ‖ prior)."""
     kl_warmup_steps: int = 0
     """Number of optimiser steps over which the KL weight grows linearly from 0."""
     edge_cost: float = 0.0
-    """Price [nats] of a certain edge, so that edges which explain nothing are dropped; 0 is the paper's."""
+    """Cost [nats] of a certain edge, which removes edges that explain nothing; 0 is the paper's."""
     label_weight: float = 0.0
-    """Restricted labelling: weight of the regression of the first feature dimensions on known edge attributes."""
+    """Weight of restricted labelling: regression of the first feature dimensions on known edge attributes."""
     type_label_weight: float = 0.0
-    """Restricted labelling of edge types: weight of the prior's and posterior's cross-entropy with known types."""
+    """Weight of restricted labelling of edge types: the prior's and posterior's cross-entropy with known types."""
     variance: float = 5e-5
-    """Fixed variance of the likelihood, in scaled units (paper: σ)."""
+    """Fixed variance of the likelihood, in scaled units (σ in the paper)."""
     likelihood: Likelihood = "laplace"
-    """"gaussian" is the paper's; "laplace" weighs large errors less and gives lower displacement errors."""
+    """Likelihood of the loss: "gaussian" is the paper's; "laplace" weighs large errors less and gives lower
+    displacement errors."""
     clip_norm: float = 100.0
     """Largest gradient norm."""
     max_episodes: int = 0
@@ -81,7 +82,7 @@ class TrainConfig:
     val_windows: int = 1500
     """Number of held-out windows measured for model selection."""
     eval_every: int = 250
-    """Number of optimiser steps between validations; the training state is saved then too."""
+    """Number of optimiser steps between validations, at which the training state is saved too."""
     patience: int = 8
     """Number of validations without a better minADE after which training stops."""
     seed: int = 0
@@ -92,20 +93,20 @@ class TrainConfig:
     """Precision of matrix products in training: "tf32" (CUDA) rounds inputs to 10 bits, which tensor cores
     multiply; "bfloat16" rounds inputs and results to 7 (autocast). Weights, memories and losses stay float32."""
     data_device: DataDevice = "auto"
-    """Where windows are cut: by the CPU, or on the training device, which then holds all the data. "auto" takes the
+    """Processor that cuts windows: the CPU, or the training device, which then holds all the data. "auto" takes the
     device if that is CUDA and the data fits into half of its free memory."""
     capture: Capture = "auto"
-    """How steps are launched: "auto" records them as CUDA graphs where that is possible, "off" launches each kernel."""
+    """Launch of steps: "auto" records them as CUDA graphs where that is possible, "off" launches each kernel."""
     threads: int = 0
     """Number of CPU threads of torch; 0 leaves torch's choice."""
     resume: bool = False
-    """Continue a run that was stopped; finished runs stay as they are."""
+    """Whether to continue a run that was stopped; finished runs stay as they are."""
 
     def __post_init__(self) -> None:
-        """Check choices and ranges; `device="auto"` becomes the device that is taken.
+        """Checks choices and ranges; replaces `device="auto"` by the chosen device.
 
         Raises:
-            UserError: a value that makes no sense, or a device that is not there.
+            UserError: a value is out of range, or the device does not exist.
         """
         check_choices(self)
         check_at_least(
@@ -133,10 +134,10 @@ class TrainConfig:
 
 
 def check_precision(precision: TrainPrecision, device: str) -> None:
-    """Checks that a device has the arithmetic of a precision.
+    """Checks that a device supports a precision.
 
     Raises:
-        UserError: it has not.
+        UserError: it does not.
     """
     if precision == "tf32" and not device.startswith("cuda"):
         raise UserError("precision 'tf32' needs a CUDA device; use --precision float32 or --device cuda")

@@ -1,10 +1,10 @@
-"""A training step that is recorded once as a CUDA graph and replayed from then on.
+"""Training steps that are recorded once as a CUDA graph and then replayed.
 
-Paper-size steps are tens of thousands of small kernels; launched one by one from Python they cost several times what
-they compute. A graph holds them all, with the memory they work on, and is launched as one. What it takes: shapes that
-never vary, inputs that are copied into fixed places, and no look at a result from the host.
+A paper-size step is tens of thousands of small kernels; launching them one by one from Python takes several times as
+long as computing them. A graph holds them all, with the memory they work on, and is launched as one. It requires
+constant shapes, inputs that are copied into fixed tensors, and that the host reads no result during the step.
 
-`CapturedStep` keeps the books (inputs, warm-up, outputs) and knows nothing of CUDA; a `Recorder` does the recording.
+`CapturedStep` handles inputs, warm-up and outputs and does not depend on CUDA; a `Recorder` does the recording.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -18,34 +18,34 @@ from predictor.data.windows import WindowBatch
 from predictor.support.errors import UserError
 
 Terms = Mapping[str, Tensor]
-"""Named results of a step, scalars on its device."""
+"""Named results of a step: scalars on its device."""
 Step = Callable[[WindowBatch], Terms]
-"""One whole training step: forward, loss, backward, clipping, update. Changes its state in place."""
+"""One whole training step: forward, loss, backward, clipping, update; it changes its state in place."""
 
 WARM_UP_STEPS = 3
 _SYNCHRONISED = "synchronizing CUDA operation"
 
 
 class NotCapturableError(RuntimeError):
-    """The step looks at a result from the host, so it cannot be recorded."""
+    """Raised when the host reads a result during a step, which therefore cannot be recorded."""
 
 
 @runtime_checkable
 class Recorder(Protocol):
-    """Turns work into something that can be replayed."""
+    """Interface of what records work and replays it."""
 
     def warm_up(self, work: Callable[[], None]) -> None:
-        """Run the work a few times, so that what is set up lazily is there.
+        """Runs the work a few times, so that everything that is set up lazily exists.
 
         Raises:
             NotCapturableError: the work cannot be recorded.
         """
 
     def record(self, work: Callable[[], None]) -> Callable[[], None]:
-        """What replays the work; the recording itself need not execute it."""
+        """Returns a function that replays the work; the recording itself need not execute it."""
 
     def forget(self) -> None:
-        """All recordings so far will not be replayed any more."""
+        """Declares that all recordings so far are no longer replayed."""
 
 
 class CudaRecorder:
@@ -53,18 +53,18 @@ class CudaRecorder:
 
     Args:
         device: current CUDA device.
-        noise: generator that the work draws from, besides the device's default one. A replay starts from the seed and
-            offset that generators have then.
+        noise: generator that the work uses, besides the device's default one. A replay starts from the seed and
+            offset that the generators have at that time.
     """
 
     def __init__(self, device: torch.device, noise: torch.Generator) -> None:
-        """Nothing is allocated yet."""
+        """Stores the arguments; nothing is allocated yet."""
         self.device = device
         self.noise = noise
-        self._pool: Any = None  # torch's handle is a type of its own, which not every release names
+        self._pool: Any = None  # torch's handle has a type that not every release names
 
     def warm_up(self, work: Callable[[], None]) -> None:
-        """Run on a side stream, as capturing demands, with every synchronisation an error."""
+        """Runs the work on a side stream, as capturing requires, with every synchronisation an error."""
         stream = torch.cuda.Stream(self.device)
         stream.wait_stream(torch.cuda.current_stream(self.device))
         mode = torch.cuda.get_sync_debug_mode()
@@ -76,16 +76,16 @@ class CudaRecorder:
         except RuntimeError as error:
             if _SYNCHRONISED not in str(error):
                 raise
-            raise NotCapturableError("this model looks at results from the host while it runs") from error
+            raise NotCapturableError("this model's results are read by the host during a step") from error
         finally:
             torch.cuda.set_sync_debug_mode(mode)
             torch.cuda.current_stream(self.device).wait_stream(stream)
 
     def record(self, work: Callable[[], None]) -> Callable[[], None]:
-        """Capture; only kernels of this thread matter, so that others may go on preparing data.
+        """Captures the work; only kernels of this thread count, so that other threads may continue to prepare data.
 
         Raises:
-            UserError: CUDA does not capture the work. A capture that broke leaves the device in no state to go on.
+            UserError: CUDA does not capture the work; the device cannot be used after a failed capture.
         """
         if self._pool is None:
             self._pool = torch.cuda.graph_pool_handle()
@@ -100,19 +100,20 @@ class CudaRecorder:
         return graph.replay
 
     def forget(self) -> None:
-        """A pool whose graphs are gone cannot be joined again: the next recording opens a new one."""
+        """Drops the memory pool: once its graphs are deleted it cannot be used; the next recording creates one."""
         self._pool = None
 
 
 class CapturedStep:
-    """A step on tensors of fixed size.
+    """Runs a recorded step on tensors of fixed size.
 
     Args:
-        step: the work.
-        example: a batch of the size that every later one has.
-        state: every tensor that the step changes; tensors that only exist after a first step start at zero.
-        generators: what the step draws from.
-        recorder: how it is recorded.
+        step: function that computes the step.
+        example: batch of the size of all later ones.
+        state: function that returns every tensor that the step changes; tensors that do not exist before the first
+            step start at zero.
+        generators: generators that the step uses.
+        recorder: records the step.
 
     Raises:
         NotCapturableError: the step cannot be recorded; state and generators are as before.
@@ -126,7 +127,7 @@ class CapturedStep:
         generators: Sequence[torch.Generator],
         recorder: Recorder,
     ) -> None:
-        """Warm up, take that back, and record."""
+        """Warms up, restores state and generators, and records."""
         self.replays = 0
         self._inputs = {name: tensor.clone() for name, tensor in _tensors(example).items()}
         self._outputs: Terms = {}
@@ -146,7 +147,7 @@ class CapturedStep:
         self._replay = recorder.record(work)
 
     def __call__(self, batch: WindowBatch) -> Terms:
-        """Run the step on a batch; the results are overwritten by the next call.
+        """Runs the step on a batch; the results are overwritten by the next call.
 
         Raises:
             ValueError: the batch differs from the example in shape or kind.
@@ -163,13 +164,13 @@ class CapturedStep:
 
 
 def signature(tensors: Mapping[str, Tensor] | WindowBatch) -> tuple[tuple[str, tuple[int, ...], torch.dtype], ...]:
-    """Names, shapes and types: what a recording is good for."""
+    """Returns names, shapes and types; a recording is valid for one such signature."""
     named = _tensors(tensors) if isinstance(tensors, WindowBatch) else tensors
     return tuple((name, tuple(tensor.shape), tensor.dtype) for name, tensor in named.items())
 
 
 def default_generator(device: torch.device) -> torch.Generator:
-    """What dropout draws from."""
+    """Returns the generator that dropout uses."""
     if device.type != "cuda":
         return torch.default_generator
     return torch.cuda.default_generators[torch.cuda.current_device() if device.index is None else device.index]
@@ -182,7 +183,7 @@ def _tensors(batch: WindowBatch) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def _put_back(state: Sequence[Tensor], kept: Sequence[tuple[Tensor, Tensor]]) -> None:
-    """In place, since recordings know tensors by their address."""
+    """Restores tensors in place, since recordings refer to tensors by their memory addresses."""
     before = {id(tensor): copy for tensor, copy in kept}
     for tensor in state:
         if id(tensor) in before:

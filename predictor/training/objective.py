@@ -1,4 +1,4 @@
-"""What training minimises: likelihoods of one step and of a free run, KL to the prior, labels, the price of edges."""
+"""Training objective: likelihoods of one step and of a roll-out, KL to the prior, labels, cost of edges."""
 
 import math
 from typing import get_args
@@ -26,18 +26,18 @@ def nll(
     variance: float,
     likelihood: Likelihood = "gaussian",
 ) -> Float[Tensor, ""]:
-    """Negative log-likelihood at fixed variance, up to a constant: summed over features, mean over valid entries.
+    """Computes the negative log-likelihood at fixed variance, up to a constant: sum of features, mean of valid entries.
 
     Args:
-        predicted: states [SI].
+        predicted: predicted states [SI].
         target: true states [SI].
         valid: which entries count.
         scales: divisors that make features comparable; the variance is in these units.
-        variance: σ of the paper (which uses it as a variance), 5e-5 there.
+        variance: variance of the likelihood; σ in the paper (which uses it as a variance), 5e-5 there.
         likelihood: "gaussian" (paper) or "laplace" with the same variance, whose gradient does not grow with the error.
 
     Raises:
-        UserError: another likelihood.
+        UserError: the likelihood has another name.
     """
     check_choice("likelihood", likelihood, get_args(Likelihood))
     # masked before it is squared: the gradient of an infinite error is NaN, also times zero
@@ -54,7 +54,7 @@ def kl_categorical(
     prior_logits: Float[Tensor, "*batch types"],
     valid: Bool[Tensor, "*batch"],
 ) -> Float[Tensor, ""]:
-    """KL(posterior ‖ prior) over edge types [nats], mean over valid pairs."""
+    """Computes KL(posterior ‖ prior) over edge types [nats], mean over valid pairs."""
     log_q = torch.log_softmax(posterior_logits, dim=-1)
     log_p = torch.log_softmax(prior_logits, dim=-1)
     return masked_mean((log_q.exp() * (log_q - log_p)).sum(-1), valid)
@@ -71,19 +71,19 @@ def window_loss(
     kl_scale: float | Float[Tensor, ""] = 1.0,
     scales: Float[Tensor, " state"] | None = None,
 ) -> tuple[Float[Tensor, ""], Terms]:
-    """The objective and its terms for one batch of windows.
+    """Computes the objective and its terms for one batch of windows.
 
     Args:
-        model: only its spec is looked at.
-        batch: the windows.
-        output: what the model made of them.
-        config: weights.
+        model: source of the spec.
+        batch: windows.
+        output: the model's output for them.
+        config: weights of the terms.
         kl_scale: share of the KL's full weight (warm-up).
         scales: the spec's feature scales on the batch's device; None copies them there, which a captured step cannot.
     """
     if scales is None:
         scales = torch.tensor(model.spec.feature_scales, device=batch.states.device)
-    rows = torch.arange(len(batch.states), device=batch.states.device)
+    windows = torch.arange(len(batch.states), device=batch.states.device)[:, None]
     both = batch.valid[:, 1:] & batch.valid[:, :-1]
     terms: Terms = {}
     one_step = nll(output.one_step[:, :-1], batch.states[:, 1:], both, scales, config.variance, config.likelihood)
@@ -91,9 +91,9 @@ def window_loss(
     terms["nll_one_step"] = one_step
     horizon = output.rollout.shape[2]
     if horizon:
-        steps = batch.last_observed[:, None] + torch.arange(1, horizon + 1, device=rows.device)
-        truth = batch.states[rows[:, None], steps].transpose(1, 2)
-        valid = batch.valid[rows[:, None], steps].transpose(1, 2)
+        steps = batch.last_observed[:, None] + torch.arange(1, horizon + 1, device=windows.device)
+        truth = batch.states[windows, steps].transpose(1, 2)
+        valid = batch.valid[windows, steps].transpose(1, 2)
         rollout = nll(output.rollout, truth, valid, scales, config.variance, config.likelihood)
         total = total + config.rollout_weight * rollout
         terms["nll_rollout"] = rollout
@@ -123,7 +123,7 @@ def _graph_loss(
         total = total + config.edge_cost * edges
     if batch.edge_types is not None:
         known = pairs & (batch.edge_types >= 0)
-        # 0 is "no edge"; everything else counts as an edge where the model has fewer types than the labels
+        # 0 is "no edge"; all other types count as an edge where the model has fewer types than the labels
         truth = batch.edge_types.long().clamp(0, prior.shape[-1] - 1)
         terms["graph_accuracy"] = masked_mean((prior.detach().argmax(-1) == truth).float(), known)
         if config.type_label_weight:
@@ -154,12 +154,12 @@ def restricted_labelling(
     attributes: Float[Tensor, "batch time agents agents attributes"],
     labelled: Bool[Tensor, "batch time agents agents"],
 ) -> Float[Tensor, ""]:
-    """Mean squared error of the first feature dimensions against known edge attributes.
+    """Computes the mean squared error of the first feature dimensions against known edge attributes.
 
     Args:
         features: edge features from the past; as many of the first dimensions are used as there are attributes.
-        attributes: true values; anything where not labelled.
-        labelled: pairs with an edge whose attributes are known.
+        attributes: true values; arbitrary where not labelled.
+        labelled: mask of pairs with an edge whose attributes are known.
     """
     # masked before it is squared: the gradient of an infinite error is NaN, also times zero
     error = torch.where(labelled[..., None], features[..., : attributes.shape[-1]] - attributes, 0.0)

@@ -1,4 +1,4 @@
-"""One training run of a forecaster: data, model, optimiser, and where it stands.
+"""One training run of a forecaster: data, model, optimiser and progress.
 
 Every random draw is a function of (seed, step), so a run that was killed and resumed ends with the same weights as one
 that was not.
@@ -29,7 +29,7 @@ from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 from predictor.support.files import new_file
 from predictor.support.runtime import precision
-from predictor.training.batches import Plan, open_feed, plan
+from predictor.training.batches import Plan, open_batches, plan
 from predictor.training.config import TrainConfig
 from predictor.training.cuda_graph import (
     CapturedStep,
@@ -42,30 +42,30 @@ from predictor.training.cuda_graph import (
 from predictor.training.objective import window_loss
 
 LOG_EVERY = 25
-"""Steps between two points of the training curves; on a CUDA device also between two looks at the numbers."""
+"""Number of steps between two points of the training curves; on a CUDA device also between readings of results."""
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Windows of all stores, split by episode."""
+    """Keeps windows of all stores, split by episode."""
 
     spec: SceneSpec
-    """Of the first store; the others are compatible."""
+    """Layout of the first store's scenes; the others are compatible."""
     sources: tuple[str, ...]
-    """What each store was recorded from."""
+    """Source of each store's recordings."""
     train: list[Windows]
-    """One per store."""
+    """Training windows of each store."""
     val: list[Windows]
-    """One per store."""
+    """Windows of each store for model selection."""
     train_episodes: list[Episode]
     """All training episodes."""
 
 
 def load_data(config: TrainConfig) -> TrainingData:
-    """Read and split the stores.
+    """Reads and splits the stores.
 
     Raises:
-        UserError: stores of different features or dt, or too few episodes.
+        UserError: stores differ in features or dt, or have too few episodes.
     """
     stores: list[EpisodeStore] = [read_store(path) for path in (*config.data, *config.val_data)]
     spec = stores[0].info.spec
@@ -96,7 +96,7 @@ def load_data(config: TrainConfig) -> TrainingData:
 
 
 def _check_labels(config: TrainConfig, stores: Sequence[EpisodeStore]) -> None:
-    """Weights of labels need labels in every training store; without this they would silently do nothing."""
+    """Checks that every training store has the labels for which the config has a weight."""
     for option, name in (("label_weight", "edge_attributes"), ("type_label_weight", "edge_types")):
         for path, store in zip(config.data, stores, strict=False):
             if getattr(config, option) and any(getattr(e, name) is None for e in store.episodes[:1]):
@@ -118,7 +118,7 @@ def _windows(config: TrainConfig, episodes: Sequence[Episode], spec: SceneSpec, 
 
 
 def typical_change(episodes: Sequence[Episode], spec: SceneSpec, residual: Residual) -> tuple[float, ...]:
-    """Root mean square of what the decoder has to predict in one step, per feature [SI]."""
+    """Computes the root mean square of the change that the decoder predicts in one step, per feature [SI]."""
     total, count = np.zeros(spec.num_features), 0
     for episode in episodes:
         both = episode.valid[1:] & episode.valid[:-1]
@@ -132,7 +132,7 @@ def typical_change(episodes: Sequence[Episode], spec: SceneSpec, residual: Resid
 
 
 def typical_spread(episodes: Sequence[Episode], spec: SceneSpec) -> tuple[float, ...]:
-    """Standard deviation of each input feature over the data [SI], positions as the spec's frame gives them."""
+    """Computes the standard deviation of each input feature over the data [SI], with positions in the spec's frame."""
     states = [_in_frame(episode, spec)[episode.valid] for episode in episodes]
     spread = np.concatenate(states).astype(np.float64).std(axis=0)
     least = 1e-2 * np.array(spec.feature_scales)
@@ -147,10 +147,11 @@ def _in_frame(episode: Episode, spec: SceneSpec) -> np.ndarray:
 
 
 def model_config(config: TrainConfig, data: TrainingData) -> Any:
-    """The network's config, with scales fitted to the training data.
+    """Builds the network's config, with scales fitted to the training data.
 
     Raises:
-        UserError: a field of --set that the model does not have, or --input-changes or --fit-inputs for another model.
+        UserError: --set names a field that the model does not have, or --input-changes or --fit-inputs is set for
+            another model than the dG-VAE.
     """
     plain = configure(config.model, config.preset, config.set)
     fitted = {"delta_scales": typical_change(data.train_episodes, data.spec, plain.residual)}
@@ -167,7 +168,7 @@ def model_config(config: TrainConfig, data: TrainingData) -> Any:
 
 @contextmanager
 def _tensor_cores(allowed: bool) -> Iterator[None]:
-    """Let products of float32 on CUDA round their inputs to TF32 while it lasts; else leave torch's setting."""
+    """Lets products of float32 on CUDA round their inputs to TF32 inside the block; else keeps torch's setting."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if allowed else before)
     try:
@@ -177,14 +178,14 @@ def _tensor_cores(allowed: bool) -> Iterator[None]:
 
 
 class Trainer:
-    """One training run: model, optimiser, data, and where it stands.
+    """Runs the training: model, optimiser, data and progress.
 
-    On a CUDA device a step is recorded and replayed (`predictor.training.cuda_graph`), the data lives there if it fits,
-    and nothing is read back between calls of `read`.
+    On a CUDA device a step is recorded and replayed (`predictor.training.cuda_graph`), the data is kept there if it
+    fits, and nothing is read back between calls of `read`.
     """
 
     def __init__(self, config: TrainConfig, data: TrainingData) -> None:
-        """Build everything from the config and the seed."""
+        """Builds model, batches and optimiser from the config and the seed."""
         self.config = config
         self.data = data
         self.device = torch.device(config.device)
@@ -199,10 +200,10 @@ class Trainer:
         self.stale = 0
         self.baseline_m = self._baseline()
         self.noise = torch.Generator(device=self.device)
-        source = open_feed(config, data.train, self.device)
-        self.feed, self.notes = source.feed, source.notes
+        source = open_batches(config, data.train, self.device)
+        self.batches, self.notes = source.batches, source.notes
         self.read_every = LOG_EVERY if on_cuda else 1
-        self._looks = not on_cuda
+        self._checks_each_loss = not on_cuda
         self._recorder: Recorder | None = CudaRecorder(self.device, self.noise) if source.capture else None
         self._recorded: dict[Any, CapturedStep] = {}
         self.optimizer = self._adam(capturable=source.capture)
@@ -213,20 +214,20 @@ class Trainer:
 
     @property
     def finished(self) -> bool:
-        """All steps done, or no progress for `patience` validations."""
+        """Whether all steps are done, or `patience` validations brought no progress."""
         return self.step >= self.config.steps or self.stale >= self.config.patience
 
     def train_step(self) -> Mapping[str, Tensor]:
-        """One optimiser step; the batch and all noise depend on (seed, step) alone.
+        """Computes one optimiser step; the batch and all noise depend on (seed, step) alone.
 
         Returns:
             Loss, gradient norm and the objective's terms, on the device; a later step may overwrite them.
 
         Raises:
-            UserError: the loss is not finite (on a CUDA device, `read` says so).
+            UserError: the loss is not finite (on a CUDA device, `read` raises this).
         """
         now = self.plan(self.step)
-        batch = self.feed.batch(now)
+        batch = self.batches.batch(now)
         torch.manual_seed(now.dropout_seed)
         self.noise.manual_seed(now.noise_seed)
         for group in self.optimizer.param_groups:
@@ -244,11 +245,11 @@ class Trainer:
         return terms
 
     def plan(self, step: int) -> Plan:
-        """Batch, seeds and schedules of a step."""
+        """Returns batch, seeds and schedules of a step."""
         return plan(self.config, [len(w) for w in self.data.train], step)
 
     def read(self, terms: Mapping[str, Tensor]) -> dict[str, float]:
-        """Numbers of the latest step; waits for the device.
+        """Returns the terms of the latest step as numbers; waits for the device.
 
         Raises:
             UserError: the loss was not finite in a step since the last reading.
@@ -262,14 +263,14 @@ class Trainer:
         return dict(zip(terms, values, strict=True))
 
     def _optimise(self, batch: WindowBatch, rollout_steps: int) -> Mapping[str, Tensor]:
-        """Forward, loss, backward, clipping, update; on a CUDA device the host never looks at a result."""
+        """Computes forward, loss, backward, clipping and update; on a CUDA device the host reads no result."""
         kind = self.config.precision
         with _tensor_cores(kind == "tf32"):
             with precision("bfloat16" if kind == "bfloat16" else "float32", self.device.type):
                 output = self.model.window(batch.states, batch.valid, batch.last_observed, rollout_steps, self.noise)
             exact = WindowOutput(*(None if t is None else t.float() for t in output))  # type: ignore[arg-type]
             loss, terms = window_loss(self.model, batch, exact, self.config, self._kl_scale, self._scales)
-            if self._looks and not torch.isfinite(loss):
+            if self._checks_each_loss and not torch.isfinite(loss):
                 raise UserError(f"the loss is {float(loss.detach())} at step {self.step}; lower --lr or check the data")
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()
@@ -279,10 +280,10 @@ class Trainer:
         return {"loss": loss.detach(), "grad_norm": norm, **terms}
 
     def _replayed(self, recorder: Recorder, batch: WindowBatch, rollout_steps: int) -> Mapping[str, Tensor]:
-        """The same from a recording, made where there is none for this kind of batch."""
+        """Replays a step; records it first if there is no recording for these shapes."""
         key = (rollout_steps, signature(batch))
         if key not in self._recorded:
-            if any(steps != rollout_steps for steps, _ in self._recorded):  # the free run has grown, and never shrinks
+            if any(steps != rollout_steps for steps, _ in self._recorded):  # the roll-out has grown, and never shrinks
                 self._forget()
             try:
                 self._recorded[key] = CapturedStep(
@@ -299,7 +300,7 @@ class Trainer:
         return self._recorded[key](batch)
 
     def _state(self) -> list[Tensor]:
-        """Everything that a step changes."""
+        """Returns every tensor that a step changes."""
         moments = (v for values in self.optimizer.state.values() for v in values.values() if isinstance(v, Tensor))
         return [*self.model.parameters(), *self.model.buffers(), *moments, self._finite]
 
@@ -309,7 +310,7 @@ class Trainer:
             self._recorder.forget()
 
     def _adam(self, capturable: bool) -> torch.optim.Adam:
-        """Adam; captured, its rate is a tensor, and running it uncaptured for a while is no mistake."""
+        """Returns Adam; for capturing its rate is a tensor, and torch's warning about uncaptured steps is off."""
         rate: Any = torch.tensor(self.config.lr, device=self.device) if capturable else self.config.lr
         fused = True if self.device.type == "cuda" else None
         optimizer = torch.optim.Adam(self.model.parameters(), lr=rate, capturable=capturable, fused=fused)
@@ -317,14 +318,14 @@ class Trainer:
         return optimizer
 
     def validate(self) -> tuple[Accuracy, tuple[float, ...]]:
-        """Free-running accuracy of the most likely forecast on held-out episodes, and its spread."""
+        """Returns accuracy of the most likely forecast on held-out episodes, and its spread per step and axis [m]."""
         self.model.eval()
         outcomes = [o for w, i in self._val_indices() for o in run_windows(
             self.model, w, i, self.config.horizon_steps, device=self.config.device)]  # fmt: skip
         return summarise(self.config.model, outcomes), fitted_std_m(outcomes)
 
     def save(self, path: Path) -> None:
-        """Write the training state so that a kill leaves the old or the new one."""
+        """Writes the training state so that a kill leaves the old or the new one."""
         state = {
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -336,12 +337,12 @@ class Trainer:
             torch.save(state, partial)
 
     def restore(self, path: Path) -> None:
-        """Continue from a saved training state, of this kind of device or another."""
-        self._forget()  # recordings know tensors that are replaced here
+        """Continues from a saved training state, of this kind of device or another."""
+        self._forget()  # recordings refer to tensors that are replaced here
         try:
             state = torch.load(path, weights_only=True, map_location=self.device)
             self.model.load_state_dict(state["model"])
-            # how Adam runs is this run's own; what it remembers is the saved one's
+            # Adam's settings are this run's, its moments are the saved ones
             groups = zip(self.optimizer.state_dict()["param_groups"], state["optimizer"]["param_groups"], strict=True)
             state["optimizer"]["param_groups"] = [ours | {"params": theirs["params"]} for ours, theirs in groups]
             self.optimizer.load_state_dict(state["optimizer"])
@@ -352,8 +353,8 @@ class Trainer:
             raise UserError(f"{path} cannot be read ({reason}); train anew into another --out") from error
 
     def close(self) -> None:
-        """Stop what prepares batches."""
-        self.feed.close()
+        """Stops the preparation of batches."""
+        self.batches.close()
 
     def _baseline(self) -> float:
         spec, steps = self.data.spec, self.config.horizon_steps

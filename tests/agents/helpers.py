@@ -1,4 +1,4 @@
-"""What several test files of `agents` share: untrained policies, and an environment that nobody can read or drive."""
+"""Helpers of several test files of `agents`: untrained policies; an environment without reader and heuristic driver."""
 
 from typing import Any
 
@@ -13,11 +13,11 @@ from agents.vec_envs import make_multiagent_venv
 
 TOY = f"{__name__}:Meadow"
 LIVES = {"ant_0": 2, "bee_0": 5}
-"""Steps that each agent lives."""
+"""Number of steps that each agent lives."""
 
 
 class Meadow(ParallelEnv):
-    """Everyone is paid its action; the ant dies before the bee."""
+    """Environment in which each agent's reward is its action; the ant dies before the bee."""
 
     metadata = {"name": "meadow_v0"}
     possible_agents = list(LIVES)
@@ -53,10 +53,10 @@ _SEEN, _DONE = gym.spaces.Box(0, 10, (1,), np.float32), gym.spaces.Discrete(2)
 
 
 def policy_for(task: Task) -> PPO:
-    """Untrained, with weights large enough that its actions depend on what it sees."""
-    rows = make_multiagent_venv(task, 1)
-    kind = "MultiInputPolicy" if isinstance(rows.observation_space, gym.spaces.Dict) else "MlpPolicy"
-    model = PPO(kind, rows, n_steps=4, batch_size=4 * rows.num_envs, policy_kwargs={"net_arch": [8]}, seed=0)
+    """Makes an untrained policy with weights so large that its actions depend on the observation."""
+    venv = make_multiagent_venv(task, 1)
+    kind = "MultiInputPolicy" if isinstance(venv.observation_space, gym.spaces.Dict) else "MlpPolicy"
+    model = PPO(kind, venv, n_steps=4, batch_size=4 * venv.num_envs, policy_kwargs={"net_arch": [8]}, seed=0)
     with torch.no_grad():
         for parameter in model.policy.parameters():
             parameter.mul_(5.0)

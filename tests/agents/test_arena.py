@@ -19,7 +19,7 @@ def test_every_task_has_its_arena():
         arena.close()
 
 
-def test_native_policies_are_measured_on_the_original(monkeypatch: pytest.MonkeyPatch):
+def test_policies_of_envpool_are_measured_on_the_original(monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("envpool")
     asked: list[tuple[Task, int, bool]] = []
 

@@ -56,13 +56,13 @@ def test_standard_error_of_one_value_is_unknown():
 
 
 def test_summary_of_episodes():
-    row = summarize("ppo", EPISODES)
-    assert (row.policy, row.episodes) == ("ppo", 3)
-    assert row.return_mean == pytest.approx(17.0)
-    assert row.length_mean == pytest.approx(24.0)
-    assert row.crash_rate == pytest.approx(1 / 3)
-    assert row.mean_speed_mps == pytest.approx(25.0)
-    assert row.crash_low < row.crash_rate < row.crash_high
+    line = summarize("ppo", EPISODES)
+    assert (line.policy, line.episodes) == ("ppo", 3)
+    assert line.return_mean == pytest.approx(17.0)
+    assert line.length_mean == pytest.approx(24.0)
+    assert line.crash_rate == pytest.approx(1 / 3)
+    assert line.mean_speed_mps == pytest.approx(25.0)
+    assert line.crash_low < line.crash_rate < line.crash_high
 
 
 def test_written_summary_is_valid_json_and_a_table(tmp_path: Path):
@@ -75,7 +75,7 @@ def test_written_summary_is_valid_json_and_a_table(tmp_path: Path):
 
     content = json.loads((tmp_path / "summary.json").read_text(), parse_constant=refuse)
     assert content["algorithm"] == "ppo"
-    assert [row["policy"] for row in content["policies"]] == ["ppo", "silent"]
+    assert [line["policy"] for line in content["policies"]] == ["ppo", "silent"]
     assert content["policies"][1]["mean_speed_mps"] is None
     assert [e["seed"] for e in content["episodes"]["ppo"]] == [10, 11, 12]
     lines = (tmp_path / "summary.md").read_text().splitlines()
@@ -85,7 +85,7 @@ def test_written_summary_is_valid_json_and_a_table(tmp_path: Path):
 
 
 def herd(seed: int, ants: float, bees: float) -> EpisodeResult:
-    """An episode of several roles, without an ego."""
+    """Returns the result of an episode with several roles, without an ego."""
     return EpisodeResult(seed, (ants + bees) / 2, 5, None, math.nan, {"ant": ants, "bee": bees})
 
 
@@ -101,9 +101,9 @@ def test_without_an_ego_there_are_roles_but_no_crashes(tmp_path: Path):
     assert lines[-1].endswith("return: mean over the learners.")
     assert [column.header for column in evaluation.table().columns] == lines[0].strip("| ").split(" | ")
     content = json.loads((tmp_path / "summary.json").read_text())
-    row = content["policies"][0]
-    assert (row["crash_rate"], row["crash_low"], row["mean_speed_mps"]) == (None, None, None)
-    assert row["role_returns"] == {"ant": [2.0, 1.0], "bee": [6.0, 2.0]}
+    line = content["policies"][0]
+    assert (line["crash_rate"], line["crash_low"], line["mean_speed_mps"]) == (None, None, None)
+    assert line["role_returns"] == {"ant": [2.0, 1.0], "bee": [6.0, 2.0]}
     assert content["episodes"]["ppo"][1]["returns_by_role"] == {"ant": 3.0, "bee": 8.0}
 
 
@@ -129,7 +129,7 @@ def test_one_role_needs_no_column():
     )
 
 
-def test_everyone_plays_the_same_held_out_seeds():
+def test_all_policies_play_the_same_held_out_seeds():
     task = Task(TOY, "none")
     model, calls = policy_for(task), []
     evaluation = evaluate_policy_on_seeds(task, model, "ppo", 3, on_episode=lambda: calls.append(None))

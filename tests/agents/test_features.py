@@ -55,8 +55,8 @@ def test_size_is_ego_and_attended():
 
 
 def by_loop(extractor: ForecastAttention, observations: dict[str, torch.Tensor]) -> torch.Tensor:
-    """The features, one row and one agent at a time: tokens, keys, values and weights as in the textbook."""
-    config, rows = extractor.config, []
+    """Computes the features, one env and one agent at a time: tokens, keys, values and weights as in the textbook."""
+    config, features = extractor.config, []
     for b in range(BATCH):
         ego = extractor.ego(observations["observation"][b].flatten())
         tokens = [extractor.null_token]
@@ -77,8 +77,8 @@ def by_loop(extractor: ForecastAttention, observations: dict[str, torch.Tensor])
             torch.softmax(key @ query / len(query) ** 0.5, dim=0) @ value
             for query, key, value in zip(*(p.chunk(config.heads, dim=-1) for p in projected), strict=True)
         ]
-        rows.append(torch.cat([ego, extractor.attended(torch.cat(heads))]))
-    return torch.stack(rows)
+        features.append(torch.cat([ego, extractor.attended(torch.cat(heads))]))
+    return torch.stack(features)
 
 
 @pytest.mark.parametrize("absent", [0, 1, AGENTS], ids=lambda n: f"{n} absent")
@@ -107,7 +107,7 @@ def test_order_of_agents_does_not_matter():
     torch.testing.assert_close(extractor(permuted(observations, [4, 2, 0, 3, 1])), extractor(observations))
 
 
-def test_padded_rows_change_nothing_whatever_they_hold():
+def test_padded_agents_change_nothing_whatever_they_hold():
     extractor, observations = make_extractor(SHAPES), make_observations(SHAPES)
     observations["valid"][:, 3:] = 0
     expected = extractor(observations)

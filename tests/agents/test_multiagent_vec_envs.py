@@ -16,12 +16,12 @@ from tests.agents.helpers import LIVES, TOY, policy_for
 TAG, SPREAD = "simple_tag_v3", "simple_spread_v3"
 
 
-def told(results: list[EpisodeResult]) -> list[tuple]:
-    """Without the speed, whose NaN equals nothing."""
+def facts(results: list[EpisodeResult]) -> list[tuple]:
+    """Returns the results without the speed, as NaN is not equal to NaN."""
     return [(r.seed, r.episode_return, r.length, r.crashed, r.returns_by_role) for r in results]
 
 
-# --- Rows -------------------------------------------------------------------------------------------------------------
+# --- Environments -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -34,12 +34,12 @@ def told(results: list[EpisodeResult]) -> list[tuple]:
     ],
     ids=["all", "role", "agent", "both"],
 )
-def test_every_learner_of_every_copy_is_a_row(learners: tuple[str, ...], expected: list[str]):
-    rows = make_multiagent_venv(Task(TAG, "none", learners=learners), 2)
-    assert rows.num_envs == 2 * len(expected)
-    assert rows.get_attr("possible_agents")[0] == ["adversary_0", "adversary_1", "adversary_2", "agent_0"]
-    assert rows.venv.agents_of_envs == 2 * expected  # type: ignore[attr-defined]
-    rows.close()
+def test_every_learner_of_every_copy_is_an_environment(learners: tuple[str, ...], expected: list[str]):
+    venv = make_multiagent_venv(Task(TAG, "none", learners=learners), 2)
+    assert venv.num_envs == 2 * len(expected)
+    assert venv.get_attr("possible_agents")[0] == ["adversary_0", "adversary_1", "adversary_2", "agent_0"]
+    assert venv.venv.agents_of_envs == 2 * expected  # type: ignore[attr-defined]
+    venv.close()
 
 
 def test_unknown_learners_are_named():
@@ -47,7 +47,7 @@ def test_unknown_learners_are_named():
         make_multiagent_venv(Task(TAG, learners=("wolf",), observe="none"), 1)
 
 
-def test_rows_observe_what_the_task_says():
+def test_learners_observe_what_the_task_says():
     own = make_multiagent_venv(Task(SPREAD, "none"), 1)
     assert own.observation_space == make_multiagent_env(SPREAD).observation_space("agent_0")
     seeing = make_multiagent_venv(Task(SPREAD, "constant-velocity"), 1)
@@ -60,7 +60,7 @@ def test_rows_observe_what_the_task_says():
 
 
 def prey_actions(env: Any, observations: Any) -> list[int]:
-    """What the partner does with the prey until the end of the episode."""
+    """Returns the actions of the driver for the prey until the end of the episode."""
     actions = []
     while env.agents:
         found = drive(env, {"agent_0": observations["agent_0"]}, np.random.default_rng())
@@ -71,9 +71,9 @@ def prey_actions(env: Any, observations: Any) -> list[int]:
 
 
 @pytest.mark.parametrize("observe", ["none", "constant-velocity"])
-@pytest.mark.parametrize("partner", ["varied", "heuristic"])
-def test_the_prey_is_driven_anew_in_each_episode_by_seed(partner: str, observe: Any):
-    env = MakeCopy(Task(TAG, observe, learners=("adversary",), driver=partner))()
+@pytest.mark.parametrize("driver", ["varied", "heuristic"])
+def test_the_prey_is_driven_anew_in_each_episode_by_seed(driver: str, observe: Any):
+    env = MakeCopy(Task(TAG, observe, learners=("adversary",), driver=driver))()
     played = [prey_actions(env, env.reset(seed=seed)[0]) for seed in (7, None, 7, None, 8)]
     assert played[:2] == played[2:4]
     assert played[0] != played[1]
@@ -94,7 +94,7 @@ def test_a_driver_serves_one_episode():
 def test_drivers_by_name_see_no_forecasts():
     seen: list[Any] = []
 
-    class Watched(gym.Space[Any]):
+    class Driven(gym.Space[Any]):
         agents = ["ant"]
 
         @staticmethod
@@ -102,18 +102,18 @@ def test_drivers_by_name_see_no_forecasts():
             seen.append(observations)
             return {}
 
-    drive(Watched, {"ant": {"observation": 1, "forecast": 2}, "bee": 3}, np.random.default_rng())
+    drive(Driven, {"ant": {"observation": 1, "forecast": 2}, "bee": 3}, np.random.default_rng())
     assert seen == [{"ant": 1, "bee": 3}]
 
 
-def test_where_all_learn_nobody_needs_to_be_able_to_drive():
-    rows = make_multiagent_venv(Task(TOY, "none", driver="heuristic"), 1)
-    rows.reset()
-    assert rows.step(np.array([1, 0]))[1].tolist() == [1.0, 0.0]
-    rows = make_multiagent_venv(Task(TOY, "none", learners=("ant",), driver="heuristic"), 1)
-    rows.reset()
+def test_where_all_learn_the_driver_need_not_be_able_to_drive():
+    venv = make_multiagent_venv(Task(TOY, "none", driver="heuristic"), 1)
+    venv.reset()
+    assert venv.step(np.array([1, 0]))[1].tolist() == [1.0, 0.0]
+    venv = make_multiagent_venv(Task(TOY, "none", learners=("ant",), driver="heuristic"), 1)
+    venv.reset()
     with pytest.raises(UserError, match="no heuristic drives meadow_v0"):
-        rows.step(np.array([1]))
+        venv.step(np.array([1]))
 
 
 # --- Arena ------------------------------------------------------------------------------------------------------------
@@ -125,10 +125,10 @@ def test_results_depend_on_the_seed_alone(observe: Any):
     model, arena = policy_for(task), MultiagentArena(task)
     for policy in (model, *arena.baselines):
         results = arena.play(policy, [3, 4])
-        assert told(arena.play(policy, [4, 3])) == told(results)[::-1]
+        assert facts(arena.play(policy, [4, 3])) == facts(results)[::-1]
         assert [r.seed for r in results] == [3, 4]
-        assert told(results)[0][1:] != told(results)[1][1:] or policy is model
-    assert told(MultiagentArena(task).play(model, [4])) == told(arena.play(model, [4]))
+        assert facts(results)[0][1:] != facts(results)[1][1:] or policy is model
+    assert facts(MultiagentArena(task).play(model, [4])) == facts(arena.play(model, [4]))
 
 
 def test_a_policy_is_played_as_in_a_plain_loop():

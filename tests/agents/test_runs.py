@@ -17,7 +17,7 @@ MADE = {"command": "python toy.py"}
 
 
 class Toy(gym.Env[np.ndarray, np.int64]):
-    """Pays for action 1; ends after five steps."""
+    """Environment with episodes of five steps and a reward for action 1."""
 
     def __init__(self, size: int = 2) -> None:
         self.observation_space = gym.spaces.Box(-1, 1, (size,), np.float32)

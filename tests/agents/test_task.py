@@ -36,7 +36,7 @@ def test_a_missing_envpool_is_named(without_envpool: None):
         Task("highway-fast-v0", backend="envpool")
 
 
-def test_a_missing_envpool_hinders_nobody_else(without_envpool: None):
+def test_a_missing_envpool_does_not_matter_to_other_backends(without_envpool: None):
     assert Task("highway-fast-v0").backend == "gymnasium"
 
 
@@ -60,8 +60,8 @@ def test_the_check_gives_the_action_space_of_the_learners():
         listener.check()
 
 
-def test_the_check_finds_partners_that_cannot_drive():
-    assert Task(TOY, "none").check() == gym.spaces.Discrete(2)  # everyone learns
+def test_the_check_finds_drivers_that_cannot_drive():
+    assert Task(TOY, "none").check() == gym.spaces.Discrete(2)  # all agents learn
     assert Task(TOY, "none", learners=("ant",), driver="varied").check() == gym.spaces.Discrete(2)
     with pytest.raises(UserError, match="no heuristic drives meadow_v0"):
         Task(TOY, "none", learners=("ant",)).check()

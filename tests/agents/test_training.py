@@ -25,7 +25,7 @@ CONSTANT_VELOCITY = Task("highway-fast-v0", "constant-velocity")
 
 
 class Coin(gym.Env[np.ndarray, np.int64]):
-    """Three steps; pays for action 1."""
+    """Environment with episodes of three steps and a reward for action 1."""
 
     observation_space = gym.spaces.Box(0, 1, (1,), np.float32)
     action_space = gym.spaces.Discrete(2)
@@ -42,14 +42,14 @@ class Coin(gym.Env[np.ndarray, np.int64]):
 
 @pytest.fixture
 def make_selection(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], EgoArena]:
-    """From a number of rows to an arena of coins."""
+    """Function from a number of environments to an arena of coins."""
 
     def make_venv(task: Task, num_envs: int, seeded: bool) -> VecMonitor:
         assert seeded
         return VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Coin())] * num_envs))
 
     monkeypatch.setattr("agents.arena.make_venv", make_venv)
-    return lambda rows: EgoArena(CONSTANT_VELOCITY, rows)
+    return lambda num_envs: EgoArena(CONSTANT_VELOCITY, num_envs)
 
 
 def make_ppo() -> PPO:
@@ -62,9 +62,9 @@ def plan(**changes: Any) -> TrainingPlan:
     return TrainingPlan(**(defaults | changes))
 
 
-@pytest.mark.parametrize("rows", [1, 2, 3])
+@pytest.mark.parametrize("num_envs", [1, 2, 3])
 def test_every_selection_plays_the_same_seeds(
-    rows: int, make_selection: Callable[[int], EgoArena], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    num_envs: int, make_selection: Callable[[int], EgoArena], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     played: list[int] = []
     queue = SeededEpisodes.queue
@@ -74,9 +74,9 @@ def test_every_selection_plays_the_same_seeds(
         queue(self, seeds, ego)
 
     monkeypatch.setattr(SeededEpisodes, "queue", note)
-    make_ppo().learn(32, callback=SelectBest(make_selection(rows), tmp_path / "best.zip", 5, every_steps=16))
+    make_ppo().learn(32, callback=SelectBest(make_selection(num_envs), tmp_path / "best.zip", 5, every_steps=16))
     seeds = [SELECTION_SEED + i for i in range(5)]
-    assert [sorted(played[:5]), sorted(played[5:])] == [seeds, seeds]  # rows take turns
+    assert [sorted(played[:5]), sorted(played[5:])] == [seeds, seeds]  # environments take turns
 
 
 def test_there_is_always_a_selection_at_the_end(make_selection: Callable[[int], EgoArena], tmp_path: Path):
@@ -85,7 +85,7 @@ def test_there_is_always_a_selection_at_the_end(make_selection: Callable[[int], 
 
 
 class Scripted:
-    """An arena whose results are given: one list of returns per measurement."""
+    """Arena with given results: one list of returns per measurement."""
 
     baselines = ()
 
@@ -210,8 +210,8 @@ def test_presets():
     particles = preset_for("simple_tag_v3", "ppo")
     assert (particles.gamma, particles.n_steps) == (0.95, 100)  # type: ignore[union-attr]
     assert preset_for("simple_tag_v3", "dqn") == DQNPreset()
-    native = preset_for("highway-fast-v0", "ppo", "envpool")
-    assert (native.gamma, native.batch_size) == (0.8, 512)
+    envpool = preset_for("highway-fast-v0", "ppo", "envpool")
+    assert (envpool.gamma, envpool.batch_size) == (0.8, 512)
     assert preset_for("racetrack-v1", "ppo", "envpool").gamma == 0.9
     assert preset_for("highway-fast-v0", "dqn", "envpool") == DQNPreset()
 
@@ -234,7 +234,7 @@ def test_same_seed_same_policy(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_batch_is_never_larger_than_a_rollout():
-    """EnvPool's preset is made for many rows; SB3 would warn of a cut batch with few."""
+    """EnvPool's preset is made for many environments; with few, SB3 would warn of a cut batch."""
     pytest.importorskip("envpool")
     task = Task("highway-fast-v0", "none", backend="envpool")
     few = TrainingPlan(task, "ppo", 100, 2, 0)

@@ -31,15 +31,15 @@ class Dice(gym.Env[np.ndarray, np.int64]):
 
 
 class Silent(Dice):
-    """Never says whether the ego crashed."""
+    """Never reports whether the ego crashed."""
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         obs, reward, terminated, truncated, info = super().step(action)
         return obs, reward, terminated, truncated, {"speed": info["speed"]}
 
 
-def dice_venv(rows: int) -> VecEnv:
-    return VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Dice())] * rows))
+def dice_venv(num_envs: int) -> VecEnv:
+    return VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Dice())] * num_envs))
 
 
 def always_two(obs: np.ndarray) -> np.ndarray:
@@ -54,10 +54,10 @@ def expected(seed: int) -> EpisodeResult:
     return EpisodeResult(seed, 2.0 * length, length, crashes, float(np.mean(speeds)))
 
 
-@pytest.mark.parametrize("rows", [1, 2, 5, 9])
-def test_every_seed_is_played_once_for_any_number_of_rows(rows: int):
+@pytest.mark.parametrize("num_envs", [1, 2, 5, 9])
+def test_every_seed_is_played_once_for_any_number_of_environments(num_envs: int):
     seeds = range(100, 107)
-    assert run_episodes(dice_venv(rows), always_two, seeds) == [expected(seed) for seed in seeds]
+    assert run_episodes(dice_venv(num_envs), always_two, seeds) == [expected(seed) for seed in seeds]
 
 
 def test_a_crash_flag_that_is_never_reported_is_unknown():
@@ -73,9 +73,9 @@ def test_second_evaluation_starts_afresh():
     assert run_episodes(venv, always_two, range(5)) == first
 
 
-@pytest.mark.parametrize("rows", [1, 3])
-def test_random_ego_depends_on_the_seed_alone(rows: int):
-    assert run_episodes(dice_venv(rows), "random", range(6)) == run_episodes(dice_venv(2), "random", range(6))
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_random_ego_depends_on_the_seed_alone(num_envs: int):
+    assert run_episodes(dice_venv(num_envs), "random", range(6)) == run_episodes(dice_venv(2), "random", range(6))
 
 
 def test_idle_ego_ignores_the_actions_that_arrive():
@@ -103,7 +103,7 @@ def test_checkpoint_without_forecast_is_refused():
         Task("highway-fast-v0", "none", "highway")
 
 
-def test_rows_observe_what_the_task_says():
+def test_environments_observe_what_the_task_says():
     own = make_venv(Task("highway-fast-v0", "none"), 1)
     assert isinstance(own.observation_space, gym.spaces.Box)
     own.close()
@@ -113,20 +113,20 @@ def test_rows_observe_what_the_task_says():
     forecast.close()
 
 
-def test_native_rows_observe_what_the_others_do():
+def test_envpool_environments_observe_what_gymnasium_environments_do():
     pytest.importorskip("envpool")
     for observe in ("none", "constant-velocity"):
-        native = make_venv(Task("highway-fast-v0", observe, backend="envpool"), 3)
+        envpool = make_venv(Task("highway-fast-v0", observe, backend="envpool"), 3)
         plain = make_venv(Task("highway-fast-v0", observe), 1)
-        assert native.num_envs == 3
-        assert native.get_attr("task_id") == ["HighwayFast-v0"] * 3
-        assert native.observation_space == plain.observation_space
-        assert native.action_space == plain.action_space
-        native.close()
+        assert envpool.num_envs == 3
+        assert envpool.get_attr("task_id") == ["HighwayFast-v0"] * 3
+        assert envpool.observation_space == plain.observation_space
+        assert envpool.action_space == plain.action_space
+        envpool.close()
         plain.close()
 
 
-def test_agents_of_a_parallel_env_are_rows():
-    rows = make_venv(Task("simple_tag_v3", "none", learners=("adversary",)), 2)
-    assert rows.num_envs == 6
-    rows.close()
+def test_learners_of_a_multiagent_env_are_environments():
+    venv = make_venv(Task("simple_tag_v3", "none", learners=("adversary",)), 2)
+    assert venv.num_envs == 6
+    venv.close()

@@ -15,17 +15,17 @@ HERE = "a processor"
 def line(
     value: float, name: str = "step", kind: Kind = "ratio", better: Better = "lower", tolerance: float = 1.5
 ) -> Line:
-    """A line of section "data" whose compared number is `value`."""
+    """Returns a line of section "data" whose compared number is `value`."""
     return Line("data", name, {"agents": 5}, value, "ms", compared=Compared(value, kind, better, tolerance))
 
 
 def baseline(*lines: Line) -> Baseline:
-    """Made of lines, here."""
+    """Makes a baseline of lines, measured on this machine."""
     return Baseline("quick", 1, HERE, {r.key: r.compared for r in lines if r.compared is not None})
 
 
 def write(path: Path, lines: Sequence[Line], settings: Settings = QUICK, machine: str = HERE) -> Path:
-    """The same in a file."""
+    """Writes a baseline of lines to a file."""
     made: dict[str, Any] = {}
     write_baseline(path, settings, lines, machine, made)
     return path

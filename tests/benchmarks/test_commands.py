@@ -37,7 +37,7 @@ def test_every_command_says_how_it_is_run(name: str):
 
 
 def test_no_text_runs_a_benchmark_as_a_file():
-    """As a file, its folder would come before the standard library, and the project's packages would be missing."""
+    """Run as a file, it would hide modules of the standard library and miss the packages of this project."""
     texts = [*(ROOT / "benchmarks").glob("*.py"), *(ROOT / "docs").rglob("*.md"), ROOT / "README.md", ROOT / "Makefile"]
     as_file = re.compile(r"python3?\s+benchmarks/\S+")
     assert [f"{path.name}: {hit}" for path in texts for hit in as_file.findall(path.read_text())] == []

@@ -22,13 +22,13 @@ def _baddbmm(target: Any, left: Any, right: Any, out_shape: Any = None, **_: Any
     return 2 * left[0] * left[1] * left[2] * right[2]
 
 
-def _linear(rows: Any, second: Any, third: Any, *_: Any, out_shape: Any = None, **__: Any) -> int:
+def _linear(first: Any, second: Any, third: Any, *_: Any, out_shape: Any = None, **__: Any) -> int:
     weight = third if isinstance(third, Sequence) and len(third) == 2 else second  # with or without something to add to
-    return 2 * rows[0] * weight[0] * weight[1]
+    return 2 * first[0] * weight[0] * weight[1]
 
 
 def executed(call: Any) -> float:
-    """FLOP that torch counts; it knows products, but not those into one of their own inputs or by oneDNN."""
+    """Returns FLOP as counted by torch, which misses products into one of their own inputs and those of oneDNN."""
     others = {torch.ops.aten.addmm_: _addmm, torch.ops.aten.baddbmm_: _baddbmm}
     if torch.backends.mkldnn.is_available():
         others[torch.ops.mkldnn._linear_pointwise] = _linear

@@ -53,14 +53,14 @@ def test_one_command_from_nothing_to_a_summary(
     assert "2 steps in " in said and f"written to {small.out / 'summary.json'}" in said
     # again: nothing is made, trained or measured anew
     monkeypatch.setattr(script, "make", lambda _: pytest.fail("the data is there"))
-    monkeypatch.setattr(script, "run_row", lambda *_: pytest.fail("the row is there"))
+    monkeypatch.setattr(script, "run_line", lambda *_: pytest.fail("the line is there"))
     script.main()
     again = json.loads((small.out / "summary.json").read_text())
     assert (again["tests"], again["data_seconds"]) == (summary["tests"], {})
 
 
 def test_a_run_that_was_stopped_goes_on(small: GpuSpringsConfig, monkeypatch: pytest.MonkeyPatch):
-    """The summary says how many steps the time is for."""
+    """The summary has the number of steps that the time is for."""
     sizes = replace(script.SPRINGS.budgets["smoke"], steps=3, eval_every=1, val_windows=4, test_windows=4)
     monkeypatch.setitem(script.SPRINGS.budgets, "smoke", sizes)
     whole = replace(small, steps=0)

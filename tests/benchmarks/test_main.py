@@ -17,14 +17,14 @@ from tests.benchmarks.helpers import line, write
 
 @pytest.fixture(autouse=True)
 def gentle(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The test process keeps its allocator and its threads, and measures almost nothing."""
+    """Keeps allocator and threads of the test process, and measures almost nothing."""
     monkeypatch.setattr(entry, "keep_freed_memory", lambda: False)
     monkeypatch.setattr(torch, "set_num_threads", lambda threads: None)
     monkeypatch.setattr(Meter, "of", staticmethod(lambda settings: Meter(3, 0.0, 0.0)))
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    """The exit status of `python -m benchmarks …`."""
+    """Returns the exit status of `python -m benchmarks …`."""
     monkeypatch.setattr(sys, "argv", ["benchmarks", "--quick", "--threads", "1", *arguments])
     try:
         run_entry_point(entry.main)
@@ -34,7 +34,7 @@ def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 
 
 def serve(monkeypatch: pytest.MonkeyPatch, *measurements: Sequence[Line]) -> list[str]:
-    """Let section "data" give these lines, one measurement after the other; returns what was run."""
+    """Lets section "data" give these lines, one measurement after the other; returns what was run."""
     left, ran = list(measurements), []
 
     def run(section: str, settings: object) -> list[Line]:

@@ -21,7 +21,7 @@ def test_the_exponent_is_a_least_squares_fit():
 
 
 class _Worker:
-    """Says that memory grows with the square of agents."""
+    """Answers that memory grows with the square of the number of agents."""
 
     def __init__(self, threads: int, environment: dict[str, str]) -> None:
         assert threads == 1 and environment["MALLOC_MMAP_THRESHOLD_"]

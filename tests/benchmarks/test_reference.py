@@ -59,7 +59,7 @@ def checkout(folder: Path, code: str) -> Path:
 
 @pytest.fixture(autouse=True)
 def no_dnri(monkeypatch: pytest.MonkeyPatch):
-    """Nothing of it stays imported."""
+    """Removes the modules of dNRI afterwards."""
     before = set(sys.modules)
     yield
     for name in set(sys.modules) - before:

@@ -1,4 +1,4 @@
-"""Operations are told apart by name, and shares add up."""
+"""Operations are classified by name, and shares add up."""
 
 import pytest
 import torch

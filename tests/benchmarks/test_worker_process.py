@@ -27,9 +27,9 @@ def test_a_worker_that_dies_is_reported():
             other.ask("forecast")
 
 
-def test_memory_that_nobody_reports_is_none(monkeypatch: pytest.MonkeyPatch):
-    def nobody(name: str) -> int:
+def test_memory_that_proc_lacks_is_none(monkeypatch: pytest.MonkeyPatch):
+    def lacking(name: str) -> int:
         raise OSError
 
-    monkeypatch.setattr(worker_process, "_status_bytes", nobody)
+    monkeypatch.setattr(worker_process, "_status_bytes", lacking)
     assert peak_rise(lambda: None) is None

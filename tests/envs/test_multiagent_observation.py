@@ -415,7 +415,10 @@ def test_a_good_scene_passes():
     [
         (GOOD.scene, r"toy: reading must give a MultiagentScene .* got Scene"),
         (None, r"toy: reading must give a MultiagentScene .* got NoneType"),
-        (multiagent_scene((1, 2, 3, 4), size=3), r"toy: a scene needs 6 rows \(max_agents\), padding included, got 3"),
+        (
+            multiagent_scene((1, 2, 3, 4), size=3),
+            r"toy: a scene needs 6 agents \(max_agents\), padding included, got 3",
+        ),
         (multiagent_scene((1, 2, 3, 4), (5, 6, 7, 8), ids=(4, 4)), "toy: ids must be unique"),
         (replace(GOOD, heading_rad=np.zeros(5)), "toy: heading_rad must hold 6 finite numbers"),
         (replace(GOOD, heading_rad=np.full(6, np.nan)), "toy: heading_rad must hold 6 finite numbers"),

@@ -99,7 +99,7 @@ def test_every_id_makes_and_reads(env_id: str):
     steps = 0
     while env.agents:
         multi = reader.read(env)
-        multi.scene.check(env_id, reader.spec, rows=reader.spec.max_agents)
+        multi.scene.check(env_id, reader.spec, agents=reader.spec.max_agents)
         assert set(multi.index_of) == set(env.agents)
         env.step(dict.fromkeys(env.agents, 0))
         steps += 1

@@ -380,7 +380,7 @@ class BadReader(NamedReader):
             states[1, 2] = np.nan
         elif self.fault == "ids must be unique":
             ids[1] = 0
-        elif self.fault == "row 0 must hold the ego":
+        elif self.fault == "agent 0 must be the ego":
             valid[0] = False
         return Scene(states, ids, valid)
 
@@ -394,7 +394,7 @@ def test_any_env_works_with_a_reader_of_its_own():
     assert obs in env.observation_space
 
 
-@pytest.mark.parametrize("fault", ["states must be finite", "ids must be unique", "row 0 must hold the ego"])
+@pytest.mark.parametrize("fault", ["states must be finite", "ids must be unique", "agent 0 must be the ego"])
 def test_reader_that_breaks_the_contract_is_named(fault: str):
     env = SceneObservation(gym.make("CartPole-v1"), reader=lambda env: BadReader(fault))
     with pytest.raises(UserError, match=f"scene reader of 'CartPole-v1': {fault}"):

@@ -132,20 +132,20 @@ def random_presence(seed: int, *shape: int, ego: bool = True, share: float = 0.7
     return torch.from_numpy(drawn)
 
 
-def scene(agents: Mapping[int, Sequence[float]], rows: int, order: Sequence[int] | None = None) -> Scene:
-    """A scene from id → state [SI].
+def scene(agents: Mapping[int, Sequence[float]], size: int, order: Sequence[int] | None = None) -> Scene:
+    """Returns a scene from id → state [SI].
 
     Args:
-        agents: who is present.
-        rows: rows of the scene.
-        order: id of each row (-1 for none); left out, agents stand in the mapping's order and padding follows.
+        agents: state of each present agent by its id.
+        size: number of agents, padding included.
+        order: id at each place (-1 for none); None takes the mapping's order, with padding at the end.
     """
     if order is None:
         order = list(agents)
-    states, ids, valid = np.zeros((rows, 4)), np.full(rows, PADDING_ID), np.zeros(rows, dtype=np.bool_)
-    for row, agent in enumerate(order):
+    states, ids, valid = np.zeros((size, 4)), np.full(size, PADDING_ID), np.zeros(size, dtype=np.bool_)
+    for place, agent in enumerate(order):
         if agent != PADDING_ID:
-            states[row], ids[row], valid[row] = agents[agent], agent, True
+            states[place], ids[place], valid[place] = agents[agent], agent, True
     return Scene(states, ids, valid)
 
 

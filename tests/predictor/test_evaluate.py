@@ -87,28 +87,28 @@ def test_smoke(
 
 def test_known_model_scores_what_it_must(data: Path, checkpoint: Path):
     one, many, straight, _ = evaluate(EvaluateConfig(str(checkpoint), data, num_samples=4))
-    for row in (one, many):
-        assert row.min_ade_m == pytest.approx(straight.min_ade_m, rel=1e-5)
-        assert row.min_fde_m == pytest.approx(straight.min_fde_m, rel=1e-5)
-        assert row.by_step_m == pytest.approx(straight.by_step_m, rel=1e-5)
-        assert row.rmse_m == pytest.approx(straight.rmse_m, rel=1e-5)
+    for found in (one, many):
+        assert found.min_ade_m == pytest.approx(straight.min_ade_m, rel=1e-5)
+        assert found.min_fde_m == pytest.approx(straight.min_fde_m, rel=1e-5)
+        assert found.by_step_m == pytest.approx(straight.by_step_m, rel=1e-5)
+        assert found.rmse_m == pytest.approx(straight.rmse_m, rel=1e-5)
         # one point: d²/(2σ²) + 2 log σ + log 2π on average, with the checkpoint's spread
         expected = [
             r**2 / (2 * s**2) + 2 * math.log(s) + math.log(2 * math.pi)
-            for r, s in zip(row.rmse_m, (1.0, 2.0), strict=True)
+            for r, s in zip(found.rmse_m, (1.0, 2.0), strict=True)
         ]
-        assert row.nll == pytest.approx(expected, rel=1e-4)
+        assert found.nll == pytest.approx(expected, rel=1e-4)
     assert straight.min_ade_m > 0.5
     assert one.agents == 3 * 4  # of 6 steps, 4 have two steps after them; one other agent per episode
 
 
 def test_horizon_and_number_of_windows_can_be_chosen(data: Path, checkpoint: Path):
-    rows = evaluate(EvaluateConfig(str(checkpoint), data, horizon_steps=4, max_windows=5))
-    assert all(len(r.by_step_m) == 4 and r.agents <= 5 for r in rows)
-    assert [r.num_samples for r in rows] == [1, 20, 1, 20]
+    accuracies = evaluate(EvaluateConfig(str(checkpoint), data, horizon_steps=4, max_windows=5))
+    assert all(len(r.by_step_m) == 4 and r.agents <= 5 for r in accuracies)
+    assert [r.num_samples for r in accuracies] == [1, 20, 1, 20]
 
 
-def test_one_sample_gives_one_row(data: Path, checkpoint: Path):
+def test_one_sample_gives_one_line(data: Path, checkpoint: Path):
     assert [r.name for r in evaluate(EvaluateConfig(str(checkpoint), data, num_samples=1))] == [
         "dG-VAE",
         "constant velocity",
@@ -118,11 +118,11 @@ def test_one_sample_gives_one_row(data: Path, checkpoint: Path):
 def test_rows_bear_the_name_of_the_model(data: Path, tmp_path: Path):
     torch.manual_seed(0)
     save_checkpoint(tmp_path / "mlp", MLP(spec(), MLPConfig(), 2), CheckpointInfo(spec(), MLPConfig(), 2, model="mlp"))
-    rows = evaluate(EvaluateConfig(str(tmp_path / "mlp"), data, num_samples=2))
-    assert [r.name for r in rows] == ["MLP", "MLP", "constant velocity", "constant velocity + noise"]
+    accuracies = evaluate(EvaluateConfig(str(tmp_path / "mlp"), data, num_samples=2))
+    assert [r.name for r in accuracies] == ["MLP", "MLP", "constant velocity", "constant velocity + noise"]
 
 
-def test_equal_seeds_give_equal_rows(data: Path, checkpoint: Path):
+def test_equal_seeds_give_equal_accuracies(data: Path, checkpoint: Path):
     settings = EvaluateConfig(str(checkpoint), data, num_samples=3, max_windows=6)
     assert evaluate(settings) == evaluate(settings)
 
@@ -148,18 +148,18 @@ def test_markdown_closed_form():
 
 def test_small_errors_keep_two_digits():
     errors = [0.00123, 0.0]
-    row = Accuracy("dG-VAE", 1, 0.01, 0.00987, errors, errors, [], 7)
-    row = replace(row, statistics={"min_fde_m": Statistic(0.00987, 0.0000123, 20)})
-    cells = [c.strip() for c in markdown_table([row], 1.0).splitlines()[-1].split("|")[1:-1]]
+    found = Accuracy("dG-VAE", 1, 0.01, 0.00987, errors, errors, [], 7)
+    found = replace(found, statistics={"min_fde_m": Statistic(0.00987, 0.0000123, 20)})
+    cells = [c.strip() for c in markdown_table([found], 1.0).splitlines()[-1].split("|")[1:-1]]
     assert cells[2:4] == ["0.010", "0.0099 ± 1.2e-05"] and cells[-2:] == ["0.0012", "0.00"]
 
 
 def test_long_horizons_show_some_steps_and_the_last():
     errors = [float(i) for i in range(50)]
-    rows = [Accuracy("constant velocity", 1, 1.0, 1.0, errors, errors, errors, 7)]
-    assert markdown_table(rows, 0.1).splitlines()[0] == f"{HEADING} 0.1 s | 1.1 s | 2.1 s | 3 s | 4 s | 5 s |"
+    accuracies = [Accuracy("constant velocity", 1, 1.0, 1.0, errors, errors, errors, 7)]
+    assert markdown_table(accuracies, 0.1).splitlines()[0] == f"{HEADING} 0.1 s | 1.1 s | 2.1 s | 3 s | 4 s | 5 s |"
     console = Console(width=160, record=True, file=io.StringIO())
-    console.print(accuracy_table(rows, 0.1, "title"))
+    console.print(accuracy_table(accuracies, 0.1, "title"))
     assert "49.00" in console.export_text() and "48.00" not in console.export_text()
 
 
@@ -167,9 +167,9 @@ def test_constant_velocity_is_a_checkpoint_of_every_store(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], data: Path, checkpoint: Path, tmp_path: Path
 ):
     settings = EvaluateConfig("constant-velocity", data, horizon_steps=2)
-    row, noisy = evaluate(settings)
-    assert (noisy.num_samples, noisy.agents) == (20, row.agents) and noisy.min_ade_m < row.min_ade_m
-    assert row == evaluate(EvaluateConfig(str(checkpoint), data, num_samples=1))[-1]
+    found, noisy = evaluate(settings)
+    assert (noisy.num_samples, noisy.agents) == (20, found.agents) and noisy.min_ade_m < found.min_ade_m
+    assert found == evaluate(EvaluateConfig(str(checkpoint), data, num_samples=1))[-1]
     assert len(evaluate(EvaluateConfig("constant-velocity", data))[0].by_step_m) == 5
     out = tmp_path / "out"
     run(monkeypatch, "--checkpoint", "constant-velocity", "--data", data, "--horizon-steps", 2, "--out", out)
@@ -188,9 +188,9 @@ def test_three_axes(tmp_path: Path):
     states[:, :, 5] = 2 * np.arange(8.0)[:, None]
     episode = Episode(states, np.ones((8, 2), dtype=np.bool_), np.arange(2))
     write_store(tmp_path / "solid", StoreInfo(layout, "solid"), [episode])
-    row, _ = evaluate(EvaluateConfig("constant-velocity", tmp_path / "solid", horizon_steps=2, out=tmp_path / "out"))
-    assert row.axes == 3
-    assert row.by_step_m == pytest.approx([1.0, 4.0])  # what v·t leaves out of (t + h)²
+    found, _ = evaluate(EvaluateConfig("constant-velocity", tmp_path / "solid", horizon_steps=2, out=tmp_path / "out"))
+    assert found.axes == 3
+    assert found.by_step_m == pytest.approx([1.0, 4.0])  # what v·t leaves out of (t + h)²
     assert (tmp_path / "out" / "scenes.png").exists()
 
 
@@ -243,7 +243,7 @@ def horizon_beyond_every_episode(data: Path, checkpoint: Path) -> list[Any]:
     return ["--checkpoint", checkpoint, "--data", data, "--horizon-steps", 6]
 
 
-def nobody_stays(data: Path, checkpoint: Path) -> list[Any]:
+def no_agent_stays(data: Path, checkpoint: Path) -> list[Any]:
     other, episodes = data.with_name("other"), read_store(data).episodes
     for episode in episodes:
         episode.valid[1::2, 1] = False
@@ -264,7 +264,7 @@ def nobody_stays(data: Path, checkpoint: Path) -> list[Any]:
         (negative_samples, "samples must be at least 1, got -1"),
         (no_horizon, "horizon_steps must be at least 1, got 0"),
         (horizon_beyond_every_episode, "episodes have at most 6 steps, a horizon of 6 needs 7; lower --horizon-steps"),
-        (nobody_stays, "in 15 windows no agent but the ego is there for all 2 steps of the horizon; lower --horizon"),
+        (no_agent_stays, "in 15 windows no agent but the ego is there for all 2 steps of the horizon; lower --horizon"),
     ],
 )
 def test_bad_input_is_one_line(
@@ -289,5 +289,5 @@ def test_windows_without_a_future_are_refused(data: Path, checkpoint: Path, tmp_
 
 
 def test_longest_horizon_that_fits_is_measured(data: Path, checkpoint: Path):
-    rows = evaluate(EvaluateConfig(str(checkpoint), data, horizon_steps=5, num_samples=2))
-    assert all(len(r.by_step_m) == 5 and r.agents == 3 and math.isfinite(r.min_ade_m) for r in rows)
+    accuracies = evaluate(EvaluateConfig(str(checkpoint), data, horizon_steps=5, num_samples=2))
+    assert all(len(r.by_step_m) == 5 and r.agents == 3 and math.isfinite(r.min_ade_m) for r in accuracies)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from predictor.graph import NOBODY, among_nearest, nearest, off_diagonal, others, pair_mask, to_dense, with_diagonal
+from predictor.graph import NO_AGENT, among_nearest, nearest, off_diagonal, others, pair_mask, to_dense, with_diagonal
 from predictor.layers.pairs import PairLinear, folded, sum_over_senders, to_pairs
 from tests.predictor.helpers import random_presence, random_states
 
@@ -121,7 +121,7 @@ def test_to_pairs_with_one_list_for_all():
 
 
 @pytest.mark.parametrize("time", [(), (2,), (2, 1)], ids=["none", "one", "two"])
-def test_to_pairs_with_a_list_for_each_row(time: tuple[int, ...]):
+def test_to_pairs_with_a_list_for_each_scene(time: tuple[int, ...]):
     nodes, senders = draw(0, *time, 3, 4, 5), anyone(1, 3, 4, 6)
     pairs = to_pairs(nodes, senders)
     assert pairs.shape == (*time, 3, 4, 6, 5)
@@ -134,8 +134,8 @@ def test_to_pairs_with_a_list_for_each_row(time: tuple[int, ...]):
 def test_to_dense_against_a_loop(seed: int):
     batch, agents, slots = 2, 4, 3
     pairs, absent = draw(seed, batch, agents, slots, 2), draw(seed + 1, 2)
-    senders = draw(seed + 2, batch, agents, agents).argsort(-1)[..., :slots]  # nobody twice
-    senders[draw(seed + 3, batch, agents, slots) > 0.5] = NOBODY  # what such a slot holds is nobody's
+    senders = draw(seed + 2, batch, agents, agents).argsort(-1)[..., :slots]  # no agent twice
+    senders[draw(seed + 3, batch, agents, slots) > 0.5] = NO_AGENT  # the content of such a slot must not matter
     dense = to_dense(pairs, senders, absent)
     for b, i, j in product(range(batch), range(agents), range(agents)):
         slot = senders[b, i].tolist().index(j) if j in senders[b, i] else None
@@ -174,7 +174,7 @@ def test_nearest_of_two_in_one_place():
     assert senders[0, :2, 0].tolist() == [1, 0] and present.all()
 
 
-def test_absent_agents_are_nobody_whatever_their_position():
+def test_absent_agents_are_no_neighbours_whatever_their_position():
     positions, valid = random_states(0, 1, 4, 4)[..., :2], torch.tensor([[True, True, False, True]])
     littered = positions.clone()
     littered[0, 2] = positions[0, 0]
@@ -215,8 +215,8 @@ def linear(seed: int, inputs: int, outputs: int, bias: bool = True) -> nn.Linear
 
 @pytest.mark.parametrize("bias", [True, False])
 def test_folded_is_one_layer_after_the_other(bias: bool):
-    outer, inner, rows = linear(0, 4, 3, bias), linear(1, 5, 4), draw(0, 6, 5)
-    torch.testing.assert_close(nn.functional.linear(rows, *folded(outer, inner)), outer(inner(rows)), **EXACT)
+    outer, inner, inputs = linear(0, 4, 3, bias), linear(1, 5, 4), draw(0, 6, 5)
+    torch.testing.assert_close(nn.functional.linear(inputs, *folded(outer, inner)), outer(inner(inputs)), **EXACT)
 
 
 def pair_linear(relative: bool) -> PairLinear:
@@ -247,10 +247,10 @@ def test_pairs_with_senders_are_some_of_the_dense_ones(relative: bool, folding: 
 def test_gradients_through_senders_are_those_of_the_dense_pairs(relative: bool):
     layer, after, leaf, senders = pair_linear(relative), linear(1, 3, 4), draw(0, 2, 4, 3), anyone(0, 2, 4, 2)
     weight, gradients = draw(1, 2, 4, 2, 5), []
-    rows, receivers = torch.arange(2)[:, None, None], torch.arange(4)[:, None]
+    scenes, receivers = torch.arange(2)[:, None, None], torch.arange(4)[:, None]
     for dense in (False, True):
         nodes = leaf.clone().requires_grad_()
-        pairs = layer(nodes, None, after)[rows, receivers, senders] if dense else layer(nodes, senders, after)
+        pairs = layer(nodes, None, after)[scenes, receivers, senders] if dense else layer(nodes, senders, after)
         wrt = [nodes, *layer.parameters(), *after.parameters()]
         gradients.append(torch.autograd.grad((pairs * weight).sum(), wrt))
     torch.testing.assert_close(*gradients, **EXACT)

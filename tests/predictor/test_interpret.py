@@ -20,16 +20,16 @@ from predictor.data.springs import Physics, SpringsConfig, make_episodes, spring
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.data.windows import Windows
 from predictor.dgvae import DGVAE
-from predictor.evaluation.edge_findings import labelled_rows, measure, watch
+from predictor.evaluation.edge_findings import infer_edges, labelled_pairs, measure
 from predictor.evaluation.edge_scores import (
     StillnessTally,
     chance_correlation,
     correlations,
-    dealt_out,
     disentanglement,
     rank_statistic,
     score_factor,
     separation,
+    shuffled_by_group,
 )
 from predictor.evaluation.outcomes import run_window_batch
 from predictor.forecaster import Belief, Memory
@@ -39,7 +39,7 @@ from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from predictor.support.errors import UserError, run_entry_point
 from tests.predictor.helpers import RICH, circling_episode, model, spec, write_circles
 
-ROWS = 600
+PAIRS = 600
 
 
 def drawn(seed: int, *shape: int) -> np.ndarray:
@@ -50,11 +50,11 @@ def drawn(seed: int, *shape: int) -> np.ndarray:
 
 
 def test_correlations_have_a_sign_and_dead_dimensions_have_none():
-    factor = drawn(0, ROWS)
-    noise = 0.3 + 1e-9 * drawn(1, ROWS)
-    features = np.stack([factor, -3 * factor + 7, np.full(ROWS, 2.0), noise], axis=1)
+    factor = drawn(0, PAIRS)
+    noise = 0.3 + 1e-9 * drawn(1, PAIRS)
+    features = np.stack([factor, -3 * factor + 7, np.full(PAIRS, 2.0), noise], axis=1)
     assert correlations(features, factor) == pytest.approx((1.0, -1.0, 0.0, 0.0))
-    assert correlations(features, np.ones(ROWS)) == (0.0, 0.0, 0.0, 0.0)
+    assert correlations(features, np.ones(PAIRS)) == (0.0, 0.0, 0.0, 0.0)
 
 
 @given(st.integers(0, 10**6))
@@ -64,10 +64,10 @@ def test_correlations_against_numpy(seed: int):
 
 
 def test_a_feature_that_is_the_attribute():
-    factor, groups = 1.0 + drawn(0, ROWS), np.arange(ROWS) // 2
-    features = np.stack([drawn(1, ROWS), factor], axis=1)
-    score = score_factor("k", features, factor, groups, np.abs(drawn(2, ROWS)), labelled_dimension=1)
-    assert (score.name, score.rows, score.dimension) == ("k", ROWS, 1)
+    factor, groups = 1.0 + drawn(0, PAIRS), np.arange(PAIRS) // 2
+    features = np.stack([drawn(1, PAIRS), factor], axis=1)
+    score = score_factor("k", features, factor, groups, np.abs(drawn(2, PAIRS)), labelled_dimension=1)
+    assert (score.name, score.pairs, score.dimension) == ("k", PAIRS, 1)
     assert score.correlation == pytest.approx(1.0) and score.r2 == pytest.approx(1.0)
     assert score.direct_r2 == pytest.approx(1.0) and score.linear_r2 == pytest.approx(1.0, abs=1e-4)
     assert score.chance is not None and score.chance < 0.2
@@ -76,16 +76,16 @@ def test_a_feature_that_is_the_attribute():
 
 
 def test_a_feature_that_is_the_attribute_upside_down():
-    factor = 1.0 + drawn(0, ROWS)
-    score = score_factor("k", -2 * factor[:, None], factor, np.arange(ROWS), drawn(1, ROWS), labelled_dimension=0)
+    factor = 1.0 + drawn(0, PAIRS)
+    score = score_factor("k", -2 * factor[:, None], factor, np.arange(PAIRS), drawn(1, PAIRS), labelled_dimension=0)
     assert score.correlation == pytest.approx(-1.0) and score.r2 == pytest.approx(1.0)
     assert score.direct_r2 is not None and score.direct_r2 < 0
-    beyond = score_factor("k", -2 * factor[:, None], factor, np.arange(ROWS), drawn(1, ROWS), labelled_dimension=1)
+    beyond = score_factor("k", -2 * factor[:, None], factor, np.arange(PAIRS), drawn(1, PAIRS), labelled_dimension=1)
     assert beyond.direct_r2 is None
 
 
 def test_features_that_know_nothing_stay_about_at_chance():
-    score = score_factor("k", drawn(0, ROWS, 8), drawn(1, ROWS), np.arange(ROWS), drawn(2, ROWS))
+    score = score_factor("k", drawn(0, PAIRS, 8), drawn(1, PAIRS), np.arange(PAIRS), drawn(2, PAIRS))
     assert score.correlation is not None and score.chance is not None
     assert abs(score.correlation) < 1.2 * score.chance < 0.2
     assert score.linear_r2 is not None and score.linear_r2 < 0.05
@@ -93,9 +93,9 @@ def test_features_that_know_nothing_stay_about_at_chance():
 
 @pytest.mark.parametrize("factor", [np.zeros(0), np.array([1.0, 2.0]), np.full(50, 3.0)], ids=["none", "two", "alike"])
 def test_nothing_is_said_of_a_property_that_does_not_vary(factor: np.ndarray):
-    rows = len(factor)
-    score = score_factor("k", drawn(0, rows, 2), factor, np.arange(rows), np.ones(rows), labelled_dimension=0)
-    assert (score.rows, score.dimension, score.correlation, score.direct_r2) == (rows, None, None, None)
+    pairs = len(factor)
+    score = score_factor("k", drawn(0, pairs, 2), factor, np.arange(pairs), np.ones(pairs), labelled_dimension=0)
+    assert (score.pairs, score.dimension, score.correlation, score.direct_r2) == (pairs, None, None, None)
 
 
 # --- Chance -----------------------------------------------------------------------------------------------------------
@@ -104,7 +104,7 @@ def test_nothing_is_said_of_a_property_that_does_not_vary(factor: np.ndarray):
 @given(st.integers(0, 10**6), st.integers(1, 7), st.sampled_from([2, 4, 6]))
 def test_dealing_out_is_a_permutation_that_keeps_couples(seed: int, groups: int, size: int):
     couples = np.arange(groups * size) // 2  # both directions of a pair have one value
-    dealt = dealt_out(couples.astype(float), np.arange(groups * size) // size, np.random.default_rng(seed))
+    dealt = shuffled_by_group(couples.astype(float), np.arange(groups * size) // size, np.random.default_rng(seed))
     assert sorted(dealt.tolist()) == sorted(couples.tolist())
     assert (dealt[::2] == dealt[1::2]).all()
     homes = dealt.reshape(groups, size) // (size // 2)
@@ -113,14 +113,14 @@ def test_dealing_out_is_a_permutation_that_keeps_couples(seed: int, groups: int,
 
 def test_dealing_out_fills_longer_groups_by_repeating():
     groups, factor = np.array([0, 1, 1, 1, 1, 1]), np.array([9.0, 1.0, 2.0, 3.0, 4.0, 5.0])
-    seen = {tuple(dealt_out(factor, groups, np.random.default_rng(seed)).tolist()) for seed in range(50)}
-    swapped = {row for row in seen if row[0] != 9.0}
-    assert all(row[1:] == (9.0,) * 5 for row in swapped) and len(swapped) > 1
-    assert all(sorted(row) == [1.0, 2.0, 3.0, 4.0, 5.0, 9.0] for row in seen - swapped)
+    seen = {tuple(shuffled_by_group(factor, groups, np.random.default_rng(seed)).tolist()) for seed in range(50)}
+    swapped = {values for values in seen if values[0] != 9.0}
+    assert all(values[1:] == (9.0,) * 5 for values in swapped) and len(swapped) > 1
+    assert all(sorted(values) == [1.0, 2.0, 3.0, 4.0, 5.0, 9.0] for values in seen - swapped)
 
 
-def test_chance_is_that_of_the_episodes_not_of_the_rows():
-    """Twenty episodes of one value each have twenty things to compare, however many rows they have."""
+def test_chance_is_that_of_the_episodes_not_of_the_pairs():
+    """Twenty episodes of one value each have twenty things to compare, however many pairs they have."""
     groups = np.repeat(np.arange(20), 50)
     factor, features = drawn(0, 20)[groups], drawn(1, 20)[groups][:, None]
     alike = chance_correlation(features, factor, groups)
@@ -157,16 +157,16 @@ def test_rank_statistic_is_that_of_all_couples(seed: int):
 
 
 def test_rank_statistic_needs_both_kinds():
-    with pytest.raises(ValueError, match="rows with and without an edge are needed, got 3 with and 0 without"):
+    with pytest.raises(ValueError, match="pairs with and without an edge are needed, got 3 with and 0 without"):
         rank_statistic(np.zeros((3, 1)), np.ones(3, dtype=np.bool_))
 
 
 def test_separation_finds_a_dimension_that_is_small_on_edges():
-    exists = np.arange(ROWS) % 3 == 0
-    features = np.stack([drawn(0, ROWS), -1.0 * exists, drawn(1, ROWS)], axis=1)
+    exists = np.arange(PAIRS) % 3 == 0
+    features = np.stack([drawn(0, PAIRS), -1.0 * exists, drawn(1, PAIRS)], axis=1)
     found = separation(features, 0.1 + 0.8 * exists, exists)
     assert found is not None and (found.dimension, found.auc, found.edge_prob_auc) == (1, 0.0, 1.0)
-    assert separation(features, np.ones(ROWS), np.ones(ROWS, dtype=np.bool_)) is None
+    assert separation(features, np.ones(PAIRS), np.ones(PAIRS, dtype=np.bool_)) is None
 
 
 # --- Disentanglement --------------------------------------------------------------------------------------------------
@@ -180,10 +180,10 @@ def test_copies_of_two_attributes_are_disentangled():
 
 
 def test_attributes_that_do_not_vary_are_left_out():
-    factors = np.concatenate([drawn(0, ROWS, 1), np.full((ROWS, 1), 1.5)], axis=1)
-    found = disentanglement(drawn(1, ROWS, 2), factors)
+    factors = np.concatenate([drawn(0, PAIRS, 1), np.full((PAIRS, 1), 1.5)], axis=1)
+    found = disentanglement(drawn(1, PAIRS, 2), factors)
     assert found.dci is not None and found.dci.disentanglement is None  # one factor is left
-    assert disentanglement(drawn(1, ROWS, 2), np.ones((ROWS, 1))).note == "no attribute varies"
+    assert disentanglement(drawn(1, PAIRS, 2), np.ones((PAIRS, 1))).note == "no attribute varies"
     assert disentanglement(drawn(1, 3, 2), drawn(2, 3, 1)).note == "needs at least 4 edges, got 3"
 
 
@@ -228,11 +228,11 @@ def test_one_step_or_no_edge_says_nothing_of_stillness():
     assert StillnessTally().results().within == ()
 
 
-# --- Watching ---------------------------------------------------------------------------------------------------------
+# --- Inferred edges ---------------------------------------------------------------------------------------------------
 
 
-class Ruler:
-    """Knows the distance of every pair, and calls it an edge where the sender is ahead on x."""
+class DistanceModel:
+    """Gives the distance of every pair as a feature, and an edge if the sender is ahead on x."""
 
     horizon_steps, num_edge_types, edge_feature_dim = 2, 2, 2
 
@@ -249,7 +249,7 @@ class Ruler:
         return memory, Belief(states, valid, torch.stack([1 - ahead, ahead], dim=-1), features, None)
 
     def rollout(self, *_: Any, **__: Any) -> torch.Tensor:
-        raise AssertionError("nobody asked for a forecast")
+        raise AssertionError("no forecast is needed")
 
 
 def labelled_episode(seed: int, steps: int = 8, agents: int = 4) -> Episode:
@@ -268,39 +268,39 @@ def labelled_windows() -> Windows:
 def test_watching_ends_with_what_the_forecaster_believes():
     windows, forecaster = labelled_windows(), model("rich", has_ego=False)
     batch = windows.batch(np.array([0, 3, 7]))
-    watched = watch(forecaster, batch)
+    inferred = infer_edges(forecaster, batch)
     outcome = run_window_batch(forecaster, batch, 2, keep_beliefs=True)
-    assert watched.features.shape[:2] == (3, 4) and watched.pairs.sum() == 3 * 4 * 12
-    np.testing.assert_array_equal(watched.features[:, -1], outcome.edge_features)
-    np.testing.assert_array_equal(watched.edge_probs[:, -1], outcome.edge_probs)
+    assert inferred.features.shape[:2] == (3, 4) and inferred.pairs.sum() == 3 * 4 * 12
+    np.testing.assert_array_equal(inferred.features[:, -1], outcome.edge_features)
+    np.testing.assert_array_equal(inferred.edge_probs[:, -1], outcome.edge_probs)
     static = slice(0, forecaster.config.static_dim)
-    first = watch(forecaster, windows.batch(np.array([0]), history_steps=4)).features[:, 0]
+    first = infer_edges(forecaster, windows.batch(np.array([0]), history_steps=4)).features[:, 0]
     # a batch of three against a batch of one: float32 products round by the size of their batch
-    np.testing.assert_allclose(watched.features[:1, 0, ..., static], first[..., static], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(inferred.features[:1, 0, ..., static], first[..., static], rtol=1e-5, atol=1e-6)
 
 
 def test_known_pairs_are_read_at_the_last_observed_step():
     windows = labelled_windows()
     batch = windows.batch(np.array([1, 2]))
-    rows = labelled_rows(watch(Ruler(), batch), batch, windows.index[[1, 2], 0], 2)
-    assert rows is not None and len(rows.group) == 2 * 9  # of 12 pairs, three have agent 3 as receiver
-    np.testing.assert_allclose(rows.features[:, 0], rows.attributes[:, 0], rtol=1e-5)
-    np.testing.assert_allclose(rows.distance_m, rows.attributes[:, 0], rtol=1e-5)
-    np.testing.assert_array_equal(rows.exists, rows.features[:, 1] > 0)
-    np.testing.assert_array_equal(rows.exists, rows.edge_prob > 0.5)
-    assert rows.group.tolist() == [0] * 18
+    pairs = labelled_pairs(infer_edges(DistanceModel(), batch), batch, windows.index[[1, 2], 0], 2)
+    assert pairs is not None and len(pairs.group) == 2 * 9  # of 12 pairs, three have agent 3 as receiver
+    np.testing.assert_allclose(pairs.features[:, 0], pairs.attributes[:, 0], rtol=1e-5)
+    np.testing.assert_allclose(pairs.distance_m, pairs.attributes[:, 0], rtol=1e-5)
+    np.testing.assert_array_equal(pairs.exists, pairs.features[:, 1] > 0)
+    np.testing.assert_array_equal(pairs.exists, pairs.edge_prob > 0.5)
+    assert pairs.group.tolist() == [0] * 18
 
 
-def test_no_labels_no_rows():
+def test_no_labels_no_pairs():
     windows = Windows([circling_episode(0)], spec(has_ego=False), 3, 2, 2, 3)
     batch = windows.batch(np.array([0]))
-    assert labelled_rows(watch(Ruler(), batch), batch, np.array([0]), 2) is None
+    assert labelled_pairs(infer_edges(DistanceModel(), batch), batch, np.array([0]), 2) is None
 
 
 def test_a_forecaster_that_knows_everything_scores_it():
     windows = labelled_windows()
     parts = np.array_split(np.arange(len(windows)), 3)
-    found, accuracies = measure(Ruler(), windows, parts, ("distance_m",))
+    found, accuracies = measure(DistanceModel(), windows, parts, ("distance_m",))
     assert (found.windows, found.episodes) == (len(windows), 6)
     assert found.graph is not None and found.graph.accuracy == 1.0 and (accuracies == 1.0).all()
     assert found.separation is not None and found.separation.edge_prob_auc == found.separation.auc == 1.0
@@ -324,7 +324,7 @@ def test_batches_do_not_matter():
 
 
 def test_a_feature_in_another_unit_is_read_with_a_line():
-    class Inches(Ruler):
+    class Inches(DistanceModel):
         def observe(self, memory: Memory, states: torch.Tensor, valid: torch.Tensor) -> tuple[Memory, Belief]:
             memory, belief = super().observe(memory, states, valid)
             return memory, replace(belief, edge_features=5 - belief.edge_features[..., :1] / 0.0254)
@@ -436,11 +436,11 @@ def test_smoke_with_labels(
         assert picture.startswith(b"\x89PNG") and len(picture) > 10_000
     content = json.loads((out / "scores.json").read_text(), parse_constant=refuse)
     assert (content["windows"], content["episodes"], content["static_dim"]) == (20, 10, 3)
-    assert content["graph"]["pairs"] == content["edges"]["rows"] == 20 * 12
+    assert content["graph"]["pairs"] == content["edges"]["pairs"] == 20 * 12
     (score,) = content["attributes"]
-    assert score["name"] == "spring_constant" and 0 < score["rows"] < 20 * 12
+    assert score["name"] == "spring_constant" and 0 < score["pairs"] < 20 * 12
     assert len(score["correlations"]) == len(content["stillness"]["within"]) == 6
-    assert score["direct_r2"] < 0 < score["chance"] < 1  # nobody trained it
+    assert score["direct_r2"] < 0 < score["chance"] < 1  # it is not trained
     assert content["config"]["burn_in_steps"] == 4 and content["provenance"]["command"]
     text = (out / "scores.md").read_text()
     assert "| property | pairs | best | r |" in text and "* DCI: disentanglement – (not defined for one" in text
@@ -508,7 +508,7 @@ def test_types_without_attributes_and_joints_with_names(tmp_path: Path):
     checkpoint = saved(tmp_path / "toy", layout, static_dim=6)  # all of them: no dynamic block
     found = interpret(InterpretConfig(str(checkpoint), tmp_path / "solid", tmp_path / "out", 3, 4, 2, num_samples=1))
     assert found.attributes == [] and found.disentanglement is None and found.reading is None
-    assert found.edges is not None and found.edges.rows == 2 * 3
+    assert found.edges is not None and found.edges.pairs == 2 * 3
     assert (tmp_path / "out" / "graph.png").exists()
 
 
@@ -570,7 +570,7 @@ def out_is_a_file(springs: Path, folder: Path) -> list[Any]:
             "mlp' is a model 'mlp' and has no edge features to interpret; pass a dG-VAE with edge_feature_dim",
         ),
         (another_store, "toy' was trained at dt_s=0.5 but store "),
-        (alone, "in 20 windows there are never two agents at once, so no edges"),
+        (alone, "none of 20 windows has two agents at once, so there are no edges"),
         (lambda s, f: [*fitting(f), "--data", f / "nowhere"], "no episode store at "),
         (
             lambda s, f: [*fitting(f), "--burn-in-steps", 8],

@@ -28,7 +28,7 @@ def observed(seed: int, share: float) -> tuple[Tensor, Tensor]:
 
 
 def with_another_future(states: Tensor, valid: Tensor, last_observed: Tensor, seed: int) -> tuple[Tensor, Tensor]:
-    """Other states and other presence after each row's last observation; not one future number stays."""
+    """Other states and other presence after each window's last observation; not one future number stays."""
     later = torch.arange(TIME) > last_observed[:, None]
     other_valid = torch.where(later[..., None], ~valid, valid)
     other_valid[..., 0] = True
@@ -38,13 +38,13 @@ def with_another_future(states: Tensor, valid: Tensor, last_observed: Tensor, se
 
 
 def streamed(forecaster: Any, states: Tensor, valid: Tensor, last_observed: Tensor) -> list[Tensor]:
-    """Belief and forecast of each row at its last observation, from one stream over the whole window."""
+    """Belief and forecast of each window at its last observation, from one stream over the whole window."""
     memory, beliefs = forecaster.empty_memory(BATCH, AGENTS), []
     for now, present in zip(states.unbind(1), valid.unbind(1), strict=True):
         memory, belief = forecaster.observe(memory, now, present)
         forecast = forecaster.rollout(belief, HORIZON, 2, torch.Generator().manual_seed(3))
         beliefs.append((belief.edge_probs, belief.edge_features, forecast))
-    return [torch.stack([beliefs[t][i][row] for row, t in enumerate(last_observed.tolist())]) for i in range(3)]
+    return [torch.stack([beliefs[t][i][window] for window, t in enumerate(last_observed.tolist())]) for i in range(3)]
 
 
 def in_window(forecaster: Any, states: Tensor, valid: Tensor, last_observed: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
-"""Streaming by id: rows in any order, agents that come and go, episodes that end row by row.
+"""Streaming by id: agents in any order that come and go, episodes that end env by env.
 
-The reference never streams: it lays out each row's whole episode as one window in which every stay of an agent has a
-column of its own, and encodes it in one call.
+The reference never streams: it lays out the whole episode of an environment as one window in which every stay of an
+agent has its own column, and encodes it in one call.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from predictor.scene import PADDING_ID, Forecast, Scene, SceneBatch
 from predictor.support.errors import ProtocolError
 from tests.predictor.helpers import ROAD, batch, model, random_states, scene, spec
 
-ROWS, AGENTS, EGO = 3, 4, 0
+ENVS, AGENTS, EGO = 3, 4, 0
 OTHERS = (3, 7, 11, 20)  # more than fit in a scene beside the ego
 History = list[Scene]
 
@@ -36,8 +36,8 @@ def assert_same(ours: Forecast, expected: Forecast, tolerance: float = 1e-5) -> 
     torch.testing.assert_close(ours.xy, expected.xy, rtol=1e-5 if tolerance < 1e-4 else 1e-2, atol=10 * tolerance)
 
 
-def rows_of(forecast: Forecast, rows: Sequence[int]) -> Forecast:
-    chosen = list(rows)
+def envs_of(forecast: Forecast, envs: Sequence[int]) -> Forecast:
+    chosen = list(envs)
     return Forecast(
         forecast.xy[chosen], forecast.edge_probs[chosen], forecast.edge_features[chosen], forecast.valid[chosen]
     )
@@ -67,74 +67,74 @@ def reference(forecaster: DGVAE, history: History) -> Forecast:
     probs = torch.zeros(1, AGENTS, AGENTS, forecaster.num_edge_types)
     probs[..., 0] = 1.0
     features = torch.zeros(1, AGENTS, AGENTS, forecaster.edge_feature_dim)
-    rows = np.flatnonzero(last.valid)
-    xy[0, 0, rows] = window.rollout[0, place, :, :2] - tensor[0, -1, 0, :2]
-    probs[0, rows[:, None], rows] = window.prior_logits[0, -1][place][:, place].softmax(-1)
-    features[0, rows[:, None], rows] = window.features[0, -1][place][:, place]
+    places = np.flatnonzero(last.valid)
+    xy[0, 0, places] = window.rollout[0, place, :, :2] - tensor[0, -1, 0, :2]
+    probs[0, places[:, None], places] = window.prior_logits[0, -1][place][:, place].softmax(-1)
+    features[0, places[:, None], places] = window.features[0, -1][place][:, place]
     return Forecast(xy, probs, features, torch.from_numpy(last.valid)[None])
 
 
 @st.composite
 def scenes(draw: st.DrawFn) -> Scene:
-    """The ego and some others, in any rows, with states that never repeat."""
-    rows: list[int] = draw(st.permutations([*OTHERS, PADDING_ID, PADDING_ID]))
-    order = [EGO, *rows[: AGENTS - 1]]
+    """The ego and some others, at any places, with states that never repeat."""
+    places: list[int] = draw(st.permutations([*OTHERS, PADDING_ID, PADDING_ID]))
+    order = [EGO, *places[: AGENTS - 1]]
     values = random_states(draw(st.integers(0, 2**16)), AGENTS, 4).double().numpy()
-    return scene({agent: values[row] for row, agent in enumerate(order) if agent != PADDING_ID}, AGENTS, order)
+    return scene({agent: values[place] for place, agent in enumerate(order) if agent != PADDING_ID}, AGENTS, order)
 
 
-some_rows = st.lists(st.sampled_from(range(ROWS)), unique=True, min_size=1).map(np.array)
+some_envs = st.lists(st.sampled_from(range(ENVS)), unique=True, min_size=1).map(np.array)
 
 
 class Streams(RuleBasedStateMachine):
-    """Everything that can happen to the parallel rows of an environment, in any order."""
+    """Everything that can happen to the parallel environments, in any order."""
 
     size: Literal["fast", "rich"] = "fast"
     tolerance = 1e-5
 
-    @initialize(first=st.tuples(*[scenes()] * ROWS))
+    @initialize(first=st.tuples(*[scenes()] * ENVS))
     def begin(self, first: tuple[Scene, ...]) -> None:
         self.model = model(self.size, num_edge_types=3, frame=ROAD)
-        self.online = OnlineForecaster(self.model, ROWS, AGENTS)
-        self.histories: list[History] = [[] for _ in range(ROWS)]
+        self.online = OnlineForecaster(self.model, ENVS, AGENTS)
+        self.histories: list[History] = [[] for _ in range(ENVS)]
         self.judged: list[History] = []
         self.step(first)
 
-    @rule(now=st.tuples(*[scenes()] * ROWS))
+    @rule(now=st.tuples(*[scenes()] * ENVS))
     def step(self, now: tuple[Scene, ...]) -> None:
         self.online.observe(batch(*now))
         self.histories = [[*past, each] for past, each in zip(self.histories, now, strict=True)]
         self.judged = self.histories
 
-    @rule(rows=some_rows, now=st.tuples(*[scenes()] * ROWS))
-    def step_some_rows(self, rows: np.ndarray, now: tuple[Scene, ...]) -> None:
-        self.online.observe(batch(*now[: len(rows)]), rows)
-        for row, each in zip(rows, now, strict=False):
-            self.histories[row] = [*self.histories[row], each]
-        self.judged = [self.histories[row] for row in rows]
+    @rule(envs=some_envs, now=st.tuples(*[scenes()] * ENVS))
+    def step_some_envs(self, envs: np.ndarray, now: tuple[Scene, ...]) -> None:
+        self.online.observe(batch(*now[: len(envs)]), envs)
+        for env, each in zip(envs, now, strict=False):
+            self.histories[env] = [*self.histories[env], each]
+        self.judged = [self.histories[env] for env in envs]
 
-    @rule(rows=some_rows, now=st.tuples(*[scenes()] * ROWS))
-    def reset_some_rows(self, rows: np.ndarray, now: tuple[Scene, ...]) -> None:
-        self.online.reset(rows)
-        self.histories = [[] if row in rows else past for row, past in enumerate(self.histories)]
+    @rule(envs=some_envs, now=st.tuples(*[scenes()] * ENVS))
+    def reset_some_envs(self, envs: np.ndarray, now: tuple[Scene, ...]) -> None:
+        self.online.reset(envs)
+        self.histories = [[] if env in envs else past for env, past in enumerate(self.histories)]
         self.step(now)
 
-    @rule(ended=some_rows, now=st.tuples(*[scenes()] * ROWS), successors=st.tuples(*[scenes()] * ROWS))
+    @rule(ended=some_envs, now=st.tuples(*[scenes()] * ENVS), successors=st.tuples(*[scenes()] * ENVS))
     def step_over_a_boundary(self, ended: np.ndarray, now: tuple[Scene, ...], successors: tuple[Scene, ...]) -> None:
         self.online.observe_boundary(batch(*now), ended, batch(*successors[: len(ended)]))
         terminal = [[*past, each] for past, each in zip(self.histories, now, strict=True)]
         fresh = [[each] for each in successors[: len(ended)]]
         self.judged = terminal + fresh
         self.histories = list(terminal)
-        for row, history in zip(ended, fresh, strict=True):
-            self.histories[row] = history
+        for env, history in zip(ended, fresh, strict=True):
+            self.histories[env] = history
 
     @invariant()
     def forecast_is_that_of_the_whole_history(self) -> None:
         ours = self.online.forecast()
         assert len(ours.xy) == len(self.judged)
-        for row, history in enumerate(self.judged):
-            assert_same(rows_of(ours, [row]), reference(self.model, history), self.tolerance)
+        for env, history in enumerate(self.judged):
+            assert_same(envs_of(ours, [env]), reference(self.model, history), self.tolerance)
 
 
 class RichStreams(Streams):
@@ -158,8 +158,8 @@ def forecaster() -> DGVAE:
     return model(num_edge_types=3, frame=ROAD)
 
 
-def online(forecaster: DGVAE, rows: int = 1) -> OnlineForecaster:
-    return OnlineForecaster(forecaster, rows, AGENTS)
+def online(forecaster: DGVAE, envs: int = 1) -> OnlineForecaster:
+    return OnlineForecaster(forecaster, envs, AGENTS)
 
 
 def states_of(seed: int, *agents: int) -> dict[int, Sequence[float]]:
@@ -175,8 +175,8 @@ def after(forecaster: DGVAE, *history: Scene) -> Forecast:
     return stream.forecast()
 
 
-def differ(one: Forecast, other: Forecast, row: int = 0) -> float:
-    return (one.edge_features[row] - other.edge_features[row]).abs().max().item()
+def differ(one: Forecast, other: Forecast, env: int = 0) -> float:
+    return (one.edge_features[env] - other.edge_features[env]).abs().max().item()
 
 
 def test_forecast_before_any_observation_is_refused(forecaster: DGVAE):
@@ -184,17 +184,17 @@ def test_forecast_before_any_observation_is_refused(forecaster: DGVAE):
         online(forecaster).forecast()
 
 
-def test_history_follows_the_id_when_rows_are_sorted_anew(forecaster: DGVAE):
+def test_history_follows_the_id_when_places_are_sorted_anew(forecaster: DGVAE):
     first, second = states_of(0, 0, 3, 7), states_of(1, 0, 3, 7)
     kept = after(forecaster, scene(first, AGENTS), scene(second, AGENTS))
     moved = after(forecaster, scene(first, AGENTS), scene(second, AGENTS, [0, PADDING_ID, 7, 3]))
-    rows = torch.tensor([0, 3, 2])
-    torch.testing.assert_close(moved.xy[:, :, rows], kept.xy[:, :, :3])
-    torch.testing.assert_close(moved.edge_features[:, rows][:, :, rows], kept.edge_features[:, :3, :3])
-    torch.testing.assert_close(moved.edge_probs[:, rows][:, :, rows], kept.edge_probs[:, :3, :3])
+    places = torch.tensor([0, 3, 2])
+    torch.testing.assert_close(moved.xy[:, :, places], kept.xy[:, :, :3])
+    torch.testing.assert_close(moved.edge_features[:, places][:, :, places], kept.edge_features[:, :3, :3])
+    torch.testing.assert_close(moved.edge_probs[:, places][:, :, places], kept.edge_probs[:, :3, :3])
 
 
-def test_leaver_leaks_nothing_into_a_newcomer_in_its_row(forecaster: DGVAE):
+def test_nothing_of_an_agent_that_left_reaches_a_new_agent_at_its_place(forecaster: DGVAE):
     first, second = states_of(0, 0, 3), states_of(1, 0, 7)
     heir = after(forecaster, scene(first, AGENTS), scene(second, AGENTS))
     newcomer = after(forecaster, scene({0: first[0]}, AGENTS), scene(second, AGENTS))
@@ -228,8 +228,8 @@ def test_agent_that_is_not_valid_is_forgotten_even_if_its_id_stays(forecaster: D
     )
 
 
-def test_reset_of_one_row_is_felt_in_that_row_only(forecaster: DGVAE):
-    now, then = [scene(states_of(row, 0, 3, 7), AGENTS) for row in range(3)], scene(states_of(9, 0, 3, 7), AGENTS)
+def test_reset_of_one_env_changes_that_env_only(forecaster: DGVAE):
+    now, then = [scene(states_of(env, 0, 3, 7), AGENTS) for env in range(3)], scene(states_of(9, 0, 3, 7), AGENTS)
     stream, untouched = online(forecaster, 3), online(forecaster, 3)
     for each in (stream, untouched):
         each.observe(batch(*now))
@@ -237,21 +237,21 @@ def test_reset_of_one_row_is_felt_in_that_row_only(forecaster: DGVAE):
     for each in (stream, untouched):
         each.observe(batch(then, then, then))
     ours, expected = stream.forecast(), untouched.forecast()
-    assert_same(rows_of(ours, [0, 2]), rows_of(expected, [0, 2]), tolerance=1e-6)
-    assert_same(rows_of(ours, [1]), after(forecaster, then))
-    assert differ(ours, expected, row=1) > 1e-2
+    assert_same(envs_of(ours, [0, 2]), envs_of(expected, [0, 2]), tolerance=1e-6)
+    assert_same(envs_of(ours, [1]), after(forecaster, then))
+    assert differ(ours, expected, env=1) > 1e-2
 
 
-def test_reset_of_all_rows(forecaster: DGVAE):
+def test_reset_of_all_envs(forecaster: DGVAE):
     now, then = scene(states_of(0, 0, 3), AGENTS), scene(states_of(9, 0, 3), AGENTS)
     stream = online(forecaster, 2)
     stream.observe(batch(now, now))
     stream.reset()
     stream.observe(batch(then, then))
-    assert_same(stream.forecast(), rows_of(after(forecaster, then), [0, 0]))
+    assert_same(stream.forecast(), envs_of(after(forecaster, then), [0, 0]))
 
 
-def test_reset_of_no_row_changes_nothing(forecaster: DGVAE):
+def test_reset_of_no_env_changes_nothing(forecaster: DGVAE):
     now, then = scene(states_of(0, 0, 3), AGENTS), scene(states_of(9, 0, 3), AGENTS)
     stream = online(forecaster)
     stream.observe(batch(now))
@@ -270,11 +270,11 @@ def test_boundary_is_the_last_scene_then_reset_then_the_first_scene(forecaster: 
     ours = at_once.forecast()
     assert ours.valid.tolist()[3] == [True, True, False, False]
     step_by_step.observe(batch(*last))
-    assert_same(rows_of(ours, [0, 1, 2]), step_by_step.forecast())
+    assert_same(envs_of(ours, [0, 1, 2]), step_by_step.forecast())
     step_by_step.reset(np.array([2]))
     step_by_step.observe(batch(first), np.array([2]))
-    assert_same(rows_of(ours, [3]), step_by_step.forecast())
-    assert_same(rows_of(ours, [3]), after(forecaster, first))
+    assert_same(envs_of(ours, [3]), step_by_step.forecast())
+    assert_same(envs_of(ours, [3]), after(forecaster, first))
     for each in (at_once, step_by_step):
         each.observe(batch(*following))
     assert_same(at_once.forecast(), step_by_step.forecast())
@@ -282,21 +282,21 @@ def test_boundary_is_the_last_scene_then_reset_then_the_first_scene(forecaster: 
 
 def test_batch_is_one_by_one(forecaster: DGVAE):
     histories = [
-        [scene(states_of(10 * row + t, 0, 3, *OTHERS[1 : 1 + row]), AGENTS) for t in range(4)] for row in range(3)
+        [scene(states_of(10 * env + t, 0, 3, *OTHERS[1 : 1 + env]), AGENTS) for t in range(4)] for env in range(3)
     ]
     stream = online(forecaster, 3)
     for now in zip(*histories, strict=True):
         stream.observe(batch(*now))
     together = stream.forecast(horizon_steps=5)
     assert together.xy.shape == (3, 1, AGENTS, 5, 2)
-    for row, history in enumerate(histories):
+    for env, history in enumerate(histories):
         alone = online(forecaster)
         for each in history:
             alone.observe(batch(each))
-        assert_same(rows_of(together, [row]), alone.forecast(horizon_steps=5))
+        assert_same(envs_of(together, [env]), alone.forecast(horizon_steps=5))
 
 
-def test_observing_some_rows_leaves_the_others_alone(forecaster: DGVAE):
+def test_observing_some_envs_leaves_the_others_alone(forecaster: DGVAE):
     past, last = ([scene(states_of(9 * k + r, 0, 3, 7), AGENTS) for r in range(3)] for k in range(2))
     extra = scene(states_of(50, 0, 7, 3), AGENTS)
     stream = online(forecaster, 3)
@@ -304,9 +304,9 @@ def test_observing_some_rows_leaves_the_others_alone(forecaster: DGVAE):
     stream.observe(batch(extra), np.array([1]))
     assert_same(stream.forecast(), after(forecaster, past[1], extra))
     stream.observe(batch(*last))
-    assert_same(rows_of(stream.forecast(), [0]), after(forecaster, past[0], last[0]))
-    assert_same(rows_of(stream.forecast(), [1]), after(forecaster, past[1], extra, last[1]))
-    assert_same(rows_of(stream.forecast(), [2]), after(forecaster, past[2], last[2]))
+    assert_same(envs_of(stream.forecast(), [0]), after(forecaster, past[0], last[0]))
+    assert_same(envs_of(stream.forecast(), [1]), after(forecaster, past[1], extra, last[1]))
+    assert_same(envs_of(stream.forecast(), [2]), after(forecaster, past[2], last[2]))
 
 
 def test_scenes_are_not_changed(forecaster: DGVAE):
@@ -381,7 +381,7 @@ def test_forecast_of_the_model_is_relative_to_the_ego_too():
 # --- Padding and samples ----------------------------------------------------------------------------------------------
 
 
-def test_padded_rows_are_invisible_whatever_they_hold(forecaster: DGVAE):
+def test_padded_agents_do_not_matter_whatever_they_hold(forecaster: DGVAE):
     history = [scene(states_of(t, 0, 3, 7), AGENTS, [0, PADDING_ID, 3, 7]) for t in range(4)]
     littered = []
     for t, now in enumerate(history):
@@ -394,15 +394,15 @@ def test_padded_rows_are_invisible_whatever_they_hold(forecaster: DGVAE):
     assert ours.valid.tolist() == [[True, False, True, True]]
 
 
-def test_more_rows_change_nothing(forecaster: DGVAE):
+def test_more_padding_changes_nothing(forecaster: DGVAE):
     narrow, wide = OnlineForecaster(forecaster, 1, 3), OnlineForecaster(forecaster, 1, 6)
     for t in range(3):
         agents = states_of(t, 0, 3, 7)
         narrow.observe(batch(scene(agents, 3)))
         wide.observe(batch(scene(agents, 6, [0, PADDING_ID, 7, PADDING_ID, PADDING_ID, 3])))
-    ours, expected, rows = wide.forecast(), narrow.forecast(), torch.tensor([0, 5, 2])
-    torch.testing.assert_close(ours.xy[:, :, rows], expected.xy)
-    torch.testing.assert_close(ours.edge_features[:, rows][:, :, rows], expected.edge_features)
+    ours, expected, places = wide.forecast(), narrow.forecast(), torch.tensor([0, 5, 2])
+    torch.testing.assert_close(ours.xy[:, :, places], expected.xy)
+    torch.testing.assert_close(ours.edge_features[:, places][:, :, places], expected.edge_features)
 
 
 def test_ego_alone(forecaster: DGVAE):

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from predictor.graph import NOBODY
+from predictor.graph import NO_AGENT
 from predictor.scene import (
     KINEMATIC_FEATURES,
     KINEMATIC_FEATURES_3D,
@@ -123,13 +123,13 @@ def test_what_a_perception_system_sees_may_differ():
 
 
 def test_good_scene_passes_its_check():
-    scene(THREE, rows=5).check()
+    scene(THREE, size=5).check()
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"valid": np.array([False, True, True])}, "my reader: row 0 must hold the ego"),
+        ({"valid": np.array([False, True, True])}, "my reader: agent 0 must be the ego"),
         ({"ids": np.array([0, 8, 8])}, r"my reader: ids must be unique within a scene, got \[0, 8, 8\]"),
         ({"ids": np.array([0, 8, -3])}, r"my reader: ids of valid agents must be non-negative, got \[0, 8, -3\]"),
         ({"states": np.full((3, 4), np.inf)}, "my reader: states must be finite"),
@@ -208,17 +208,17 @@ def test_an_ego_that_sees_everything_sees_no_padding():
     assert order[seen].tolist() == [0, 2]
 
 
-def test_stacking_keeps_the_order_of_rows():
-    first, second = scene(THREE, rows=4), scene({0: (0.5,) * 4}, rows=4)
+def test_stacking_keeps_the_order_of_scenes():
+    first, second = scene(THREE, size=4), scene({0: (0.5,) * 4}, size=4)
     both = batch(first, second)
     assert len(both) == 2
-    for row, each in enumerate((first, second)):
-        np.testing.assert_array_equal(both.states[row], each.states)
-        np.testing.assert_array_equal(both.ids[row], each.ids)
-        np.testing.assert_array_equal(both.valid[row], each.valid)
+    for env, each in enumerate((first, second)):
+        np.testing.assert_array_equal(both.states[env], each.states)
+        np.testing.assert_array_equal(both.ids[env], each.ids)
+        np.testing.assert_array_equal(both.valid[env], each.valid)
 
 
-def test_rows_of_a_batch():
+def test_scenes_of_a_batch():
     scenes = [Scene(np.full((2, 4), float(i)), np.array([i, -1]), np.array([True, False]), float(i)) for i in range(4)]
     chosen = batch(*scenes)[np.array([3, 1])]
     assert chosen.heading_rad.tolist() == [3.0, 1.0]
@@ -235,22 +235,22 @@ BATCH, AGENTS, SLOTS, NO_EDGE = 2, 5, 3, (1.0, 0.0, 0.0)
 
 
 def forecast(seed: int, agents: int = AGENTS, slots: int = SLOTS) -> Forecast:
-    """With a list of senders; a slot that holds nobody has no edge, as a forecaster gives it."""
+    """With a list of senders; an empty slot has no edge, as a forecaster gives it."""
     generator = torch.Generator().manual_seed(seed)
     score = torch.rand(BATCH, agents, agents, generator=generator) + 9 * torch.eye(agents)
     senders = score.argsort(-1)[..., :slots]
-    senders[torch.rand(senders.shape, generator=generator) > 0.7] = NOBODY
-    heard = (senders != NOBODY)[..., None]
+    senders[torch.rand(senders.shape, generator=generator) > 0.7] = NO_AGENT
+    received = (senders != NO_AGENT)[..., None]
     probs = torch.randn(BATCH, agents, slots, 3, generator=generator).softmax(-1)
     features = torch.randn(BATCH, agents, slots, 2, generator=generator)
     xy, valid = torch.zeros(BATCH, 1, agents, 4, 2), torch.ones(BATCH, agents).bool()
-    return Forecast(xy, torch.where(heard, probs, torch.tensor(NO_EDGE)), features * heard, valid, senders)
+    return Forecast(xy, torch.where(received, probs, torch.tensor(NO_EDGE)), features * received, valid, senders)
 
 
 def test_dense_edges_against_a_loop():
     sparse = forecast(0)
     assert sparse.senders is not None
-    garbage = torch.where((sparse.senders == NOBODY)[..., None], torch.tensor(7.0), sparse.edge_features)
+    garbage = torch.where((sparse.senders == NO_AGENT)[..., None], torch.tensor(7.0), sparse.edge_features)
     probs, features = dense_edges(sparse.edge_probs, garbage, sparse.senders)
     for b, i, j in product(range(BATCH), range(AGENTS), range(AGENTS)):
         slot = sparse.senders[b, i].tolist().index(j) if j in sparse.senders[b, i] else None
@@ -288,7 +288,7 @@ def test_edges_of_the_ego_are_those_of_the_dense_forecast(seed: int, agents: int
 
 def test_where_there_is_no_slot_the_ego_has_no_edge():
     full = forecast(0)
-    lonely = replace(full, senders=torch.full_like(full.senders, NOBODY))
+    lonely = replace(full, senders=torch.full_like(full.senders, NO_AGENT))
     for one in (lonely, lonely.dense()):
         probs, features = one.ego_edges()
         assert torch.equal(probs, torch.tensor(NO_EDGE).expand(BATCH, AGENTS, 2, 3)) and not features.any()

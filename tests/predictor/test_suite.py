@@ -1,4 +1,4 @@
-"""The suite: rows are trained and measured once, failures say why, and the table says what was run."""
+"""The suite: lines are trained and measured once, failures say why, and the table says what was run."""
 
 import json
 import sys
@@ -15,11 +15,11 @@ from predictor.data.springs import SpringsConfig, make
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.data.windows import Windows
 from predictor.evaluation import paper_tables as tables
-from predictor.evaluation.measure_row import protocol_indices
-from predictor.evaluation.paper_tables import NUM_SAMPLES, TABLES, Row
+from predictor.evaluation.measure_line import protocol_indices
+from predictor.evaluation.paper_tables import NUM_SAMPLES, TABLES, Line
 from predictor.models import configure
 from predictor.reports.tables import latex_table, markdown_report
-from predictor.suite import SuiteConfig, row_config, row_folder, run_row, run_suite
+from predictor.suite import SuiteConfig, line_config, line_folder, run_line, run_suite
 from predictor.support.errors import UserError
 from tests.predictor.helpers import spec
 
@@ -35,16 +35,16 @@ def config(data: Path, out: Path, **changes: Any) -> SuiteConfig:
     return SuiteConfig("springs", data, out, "smoke", **({"steps": 2, "workers": 1} | changes))
 
 
-def row(key: str) -> Row:
-    return next(r for r in TABLES["springs"].rows if r.key == key)
+def line(key: str) -> Line:
+    return next(r for r in TABLES["springs"].lines if r.key == key)
 
 
-# --- Rows ---------------------------------------------------------------------------------------------------------
+# --- Lines --------------------------------------------------------------------------------------------------------
 
 
 def test_least_squares_is_the_limit(data: Path, tmp_path: Path):
     """Known law, unknown constants: everything is recovered, in and out of distribution."""
-    result = run_row(config(data, tmp_path), row("least-squares"))
+    result = run_line(config(data, tmp_path), line("least-squares"))
     for kind in ("test", "ood"):
         measured = result["tests"][kind]
         assert measured["horizon_only"]["min_ade_m"] < 1e-3
@@ -53,8 +53,8 @@ def test_least_squares_is_the_limit(data: Path, tmp_path: Path):
 
 
 @pytest.mark.parametrize("key", ["dgvae-rl", "dvae", "dnri", "lstm-joint"])
-def test_every_kind_of_row_is_trained_and_measured(data: Path, tmp_path: Path, key: str):
-    result = run_row(config(data, tmp_path), row(key))
+def test_every_kind_of_line_is_trained_and_measured(data: Path, tmp_path: Path, key: str):
+    result = run_line(config(data, tmp_path), line(key))
     measured = result["tests"]["test"]
     assert result["parameters"] > 0
     assert measured["windows"] == 24
@@ -63,23 +63,23 @@ def test_every_kind_of_row_is_trained_and_measured(data: Path, tmp_path: Path, k
     assert whole["by_step_m"][-1] == pytest.approx(horizon["by_step_m"][-1], rel=0.3)  # best by another mean
     assert set(horizon["statistics"]) >= {"min_ade_m", "min_fde_m", "overall_rmse_m"}
     assert (measured["features"] is None) == (key != "dgvae-rl")
-    saved = json.loads((row_folder(config(data, tmp_path), row(key)) / "result.json").read_text())
+    saved = json.loads((line_folder(config(data, tmp_path), line(key)) / "result.json").read_text())
     assert saved["tests"]["test"]["horizon_only"]["min_ade_m"] == horizon["min_ade_m"]
 
 
-def test_a_row_on_labelled_data_needs_scikit_learn_before_it_is_trained(
+def test_a_line_on_labelled_data_needs_scikit_learn_before_it_is_trained(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     for name in [name for name in sys.modules if name.split(".")[0] == "sklearn"]:
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setattr(suite, "train", lambda _: pytest.fail("trained"))
     with pytest.raises(UserError, match=r"need scikit-learn: pip install 'dgvae-rl\[scores\]'"):
-        run_row(config(data, tmp_path), row("dgvae-rl"))
+        run_line(config(data, tmp_path), line("dgvae-rl"))
 
 
-def test_all_rows_of_a_table_share_data_steps_and_protocol(data: Path, tmp_path: Path):
-    trained = [r for r in TABLES["springs"].rows if r.is_trained]
-    configs = [row_config(config(data, tmp_path), r, tmp_path / r.key) for r in trained]
+def test_all_lines_of_a_table_share_data_steps_and_protocol(data: Path, tmp_path: Path):
+    trained = [r for r in TABLES["springs"].lines if r.is_trained]
+    configs = [line_config(config(data, tmp_path), r, tmp_path / r.key) for r in trained]
     shared = ("data", "val_data", "steps", "batch_size", "max_episodes", "history_steps", "horizon_steps", "lr", "seed")
     for name in shared:
         assert len({getattr(c, name) for c in configs}) == 1, name
@@ -88,47 +88,47 @@ def test_all_rows_of_a_table_share_data_steps_and_protocol(data: Path, tmp_path:
 # --- Caching ------------------------------------------------------------------------------------------------------
 
 
-def test_a_row_has_a_folder_of_its_own_for_each_config_and_data(data: Path, tmp_path: Path):
+def test_a_line_has_a_folder_of_its_own_for_each_config_and_data(data: Path, tmp_path: Path):
     base = config(data, tmp_path)
     folders = {
-        row_folder(base, row("dgvae")),
-        row_folder(base, row("dnri")),
-        row_folder(replace(base, steps=3), row("dgvae")),
-        row_folder(replace(base, seed=1), row("dgvae")),
-        row_folder(base, replace(row("dgvae"), set=("edge_feature_dim=4",))),
+        line_folder(base, line("dgvae")),
+        line_folder(base, line("dnri")),
+        line_folder(replace(base, steps=3), line("dgvae")),
+        line_folder(replace(base, seed=1), line("dgvae")),
+        line_folder(base, replace(line("dgvae"), set=("edge_feature_dim=4",))),
     }
     assert len(folders) == 5
-    assert row_folder(replace(base, workers=2), row("dgvae")) in folders  # nothing that changes no number
+    assert line_folder(replace(base, workers=2), line("dgvae")) in folders  # nothing that changes no number
 
 
 def test_suite_runs_what_is_missing_and_nothing_else(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    settings = config(data, tmp_path, rows=("constant-velocity", "mlp"), workers=2)
+    settings = config(data, tmp_path, lines=("constant-velocity", "mlp"), workers=2)
     content = run_suite(settings)
     assert [r["key"] for r in content["rows"]] == ["constant-velocity", "mlp"]
     assert not content["failed"]
     for name in ("table.md", "table.tex", "table.json", "by_step.png"):
         assert (settings.folder / name).exists()
-    monkeypatch.setattr(suite, "_start", lambda *_: pytest.fail("a finished row was started again"))
+    monkeypatch.setattr(suite, "_start", lambda *_: pytest.fail("a finished line was started again"))
     again = run_suite(settings)
     assert again["rows"] == content["rows"]
 
 
-def test_a_row_that_fails_says_why_and_leaves_the_others(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    broken = config(data, tmp_path, rows=("constant-velocity", "mlp"), workers=2)
-    folder = row_folder(broken, row("mlp")) / "run"
+def test_a_line_that_fails_says_why_and_leaves_the_others(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    broken = config(data, tmp_path, lines=("constant-velocity", "mlp"), workers=2)
+    folder = line_folder(broken, line("mlp")) / "run"
     folder.mkdir(parents=True)
-    (folder / "somebody.txt").write_text("not a run")
+    (folder / "unknown.txt").write_text("not a run")
     content = run_suite(broken)
     assert [r["key"] for r in content["rows"]] == ["constant-velocity"]
     assert "not empty and not a training run" in content["failed"]["mlp"]
-    assert "Failed rows: mlp" in (broken.folder / "table.md").read_text()
+    assert "Failed lines: mlp" in (broken.folder / "table.md").read_text()
 
 
 # --- Tables -------------------------------------------------------------------------------------------------------
 
 
-def test_reports_have_a_line_for_each_row_and_the_papers_figures(data: Path, tmp_path: Path):
-    settings = config(data, tmp_path, rows=("constant-velocity", "least-squares"), workers=2)
+def test_reports_have_a_line_for_each_model_and_the_papers_figures(data: Path, tmp_path: Path):
+    settings = config(data, tmp_path, lines=("constant-velocity", "least-squares"), workers=2)
     content = run_suite(settings)
     content["paper"] = {"least-squares": {"rmse": 0.125, "ade": 0.25, "fde": 0.5}}
     text, latex = markdown_report(content), latex_table(content)
@@ -138,7 +138,7 @@ def test_reports_have_a_line_for_each_row_and_the_papers_figures(data: Path, tmp
 
 
 def test_the_stochastic_control_has_as_many_samples_as_the_models_and_says_so(data: Path, tmp_path: Path):
-    content = run_suite(config(data, tmp_path, rows=("constant-velocity", "constant-velocity-noise"), workers=2))
+    content = run_suite(config(data, tmp_path, lines=("constant-velocity", "constant-velocity-noise"), workers=2))
     straight, noisy = (r["tests"]["test"]["horizon_only"] for r in content["rows"])
     assert (straight["num_samples"], noisy["num_samples"]) == (1, 20)
     assert noisy["min_ade_m"] < 0.8 * straight["min_ade_m"]
@@ -151,20 +151,20 @@ def test_the_stochastic_control_has_as_many_samples_as_the_models_and_says_so(da
 
 @pytest.mark.parametrize("name", ["springs", "mocap", "nba", "sdd", "ind"])
 def test_every_table_of_the_paper_has_the_stochastic_control(name: str):
-    rows = {r.key: r for r in TABLES[name].rows}
-    assert rows["constant-velocity-noise"].num_samples == rows["dgvae"].num_samples == NUM_SAMPLES
-    assert not rows["constant-velocity-noise"].is_trained
+    lines = {r.key: r for r in TABLES[name].lines}
+    assert lines["constant-velocity-noise"].num_samples == lines["dgvae"].num_samples == NUM_SAMPLES
+    assert not lines["constant-velocity-noise"].is_trained
 
 
 @pytest.mark.parametrize("name", list(TABLES))
 @pytest.mark.parametrize("budget", ["smoke", "cpu", "paper"])
-def test_every_row_of_every_table_is_a_valid_config(name: Any, budget: Any, tmp_path: Path):
+def test_every_line_of_every_table_is_a_valid_config(name: Any, budget: Any, tmp_path: Path):
     settings = SuiteConfig(name, tmp_path, tmp_path, budget)
-    keys = [r.key for r in TABLES[name].rows]
+    keys = [r.key for r in TABLES[name].lines]
     assert len(set(keys)) == len(keys)
-    for each in TABLES[name].rows:
+    for each in TABLES[name].lines:
         if each.is_trained:
-            made = row_config(settings, each, tmp_path)
+            made = line_config(settings, each, tmp_path)
             configure(made.model, made.preset, made.set)
 
 
@@ -184,8 +184,8 @@ def test_windows_end_their_burn_in_at_every_stride():
     ("changes", "message"),
     [
         (
-            {"rows": ("dgvea",)},
-            "table 'springs' has no row 'dgvea'; there are constant-velocity, constant-velocity-noise",
+            {"lines": ("dgvea",)},
+            "table 'springs' has no line 'dgvea'; there are constant-velocity, constant-velocity-noise",
         ),
         ({"steps": -1}, "steps must not be negative, got -1"),
         ({"device": "cuda:7"}, "device 'cuda:7' was asked for but torch finds no CUDA device"),
@@ -206,4 +206,4 @@ def test_test_stores_too_short_for_the_protocol_are_refused(data: Path, tmp_path
     write_store(tmp_path / "short", StoreInfo(spec(has_ego=False), "short"), [short])
     table = replace(tables.SPRINGS, tests={"test": "short"})
     with pytest.raises(UserError, match="test store of 'short' fits no window of the protocol"):
-        suite.measure_row(table, row("constant-velocity"), tmp_path, table.budgets["smoke"], None, 0, "cpu")
+        suite.measure_line(table, line("constant-velocity"), tmp_path, table.budgets["smoke"], None, 0, "cpu")

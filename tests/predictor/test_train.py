@@ -93,9 +93,9 @@ def test_circles_are_learned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     trainer = learned(monkeypatch, tmp_path, episodes, steps=150, batch_size=16, horizon_steps=3, val_fraction=0.25)
     trainer.model.eval()
     seen = trainer.data.train[0]
-    row = summarise("model", list(run_windows(trainer.model, seen, np.arange(len(seen)), 3)))
+    found = summarise("model", list(run_windows(trainer.model, seen, np.arange(len(seen)), 3)))
     assert trainer.baseline_m > 2.0
-    assert row.min_ade_m < trainer.baseline_m / 5
+    assert found.min_ade_m < trainer.baseline_m / 5
     assert trainer.validate()[0].min_ade_m < trainer.baseline_m / 2
 
 
@@ -516,7 +516,7 @@ def test_stores_are_mixed_by_their_windows(tiny: None, circles: Path, tmp_path: 
     assert data.sources == ("circles", "short")
     assert [len(w) for w in data.train] == [4 * 9, 4 * 1]
     trainer = Trainer(settings, data)
-    batch = trainer.feed.batch(trainer.plan(0))
+    batch = trainer.batches.batch(trainer.plan(0))
     longest = batch.valid[..., 0].sum(dim=1)
     assert len(batch.states) == 400
     assert 20 < int((longest == 2).sum()) < 130  # 1 in 10 from the short store, and the last windows of the other
@@ -535,7 +535,7 @@ def test_typical_change_closed_form(residual: str, expected: list[float]):
 
 
 def test_loss_closed_form(tmp_path: Path):
-    """One row, two agents; the last one is absent at the last step. Scales 10, 10, 5, 5."""
+    """One window, two agents; the last one is absent at the last step. Scales 10, 10, 5, 5."""
     states = torch.zeros(1, 3, 2, 4)
     valid = torch.tensor([[[True, True], [True, True], [True, False]]])
     even = torch.zeros(1, 3, 2, 2, 2)

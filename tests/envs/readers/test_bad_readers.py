@@ -95,7 +95,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "twins": ({"ids": np.array([0, 8, 8])}, r"ids must be unique within a scene, got \[0, 8, 8\]"),
     "negative_id": ({"ids": np.array([0, 8, -2])}, r"ids of valid agents must be non-negative, got \[0, 8, -2\]"),
     "padding_id": ({"ids": np.array([0, 8, PADDING_ID])}, r"ids of valid agents must be non-negative"),
-    "no_ego": ({"valid": np.array([False, True, True])}, "row 0 must hold the ego, but it is not valid"),
+    "no_ego": ({"valid": np.array([False, True, True])}, "agent 0 must be the ego, but it is not valid"),
     "nan": ({"states": GOOD["states"] * [1, 1, np.nan, 1]}, r"states must be finite, .*got \[\[.*nan"),
     "infinite": ({"states": GOOD["states"] + [np.inf, 0, 0, 0]}, "states must be finite"),
     "nan_heading": ({"heading_rad": float("nan")}, "heading_rad must be .*finite.*, got nan"),
@@ -175,7 +175,7 @@ def test_what_is_no_scene_names_the_class_of_the_reader():
 
 def test_arrays_of_unequal_length_are_named():
     for fields in ({"ids": np.arange(4)}, {"states": np.zeros((2, 4))}, {"valid": np.ones(5, dtype=np.bool_)}):
-        with pytest.raises(UserError, match="states, ids and valid need one row per agent, got"):
+        with pytest.raises(UserError, match="states, ids and valid need one entry per agent, got"):
             through_a_function(lambda fields=fields: raw_scene(**fields)).reset(seed=0)
 
 
@@ -194,7 +194,7 @@ def test_of_too_many_the_nearest_are_kept():
 @pytest.mark.parametrize("agents", [3, 5])
 def test_a_read_of_ones_own_must_be_padded_to_max_agents(agents: int):
     env = SceneObservation(Room(), reader=lambda env: PaddedReader(lambda: crowd(agents)))
-    expected = rf"a scene needs 4 rows \(max_agents\), padding included, got {agents}"
+    expected = rf"a scene needs 4 agents \(max_agents\), padding included, got {agents}"
     with pytest.raises(UserError, match=f"scene reader of 'Room': {expected}"):
         env.reset(seed=0)
 

@@ -82,7 +82,7 @@ def test_every_scenario_reads(env_id: str, landmarks: bool):
     assert reader.spec.max_agents == AGENTS[env_id] + still
     while env.agents:
         multi = reader.read(env)
-        multi.scene.check(env_id, reader.spec, rows=reader.spec.max_agents)
+        multi.scene.check(env_id, reader.spec, agents=reader.spec.max_agents)
         assert sorted(multi.index_of) == sorted(env.agents)
         for name, index in multi.index_of.items():
             body = named(env, name)

@@ -47,7 +47,7 @@ def test_scene_is_what_stands_on_the_grid():
     reader = PursuitReader(env)
     assert isinstance(reader, MultiagentReader)
     multi = reader.read(env)
-    multi.scene.check("pursuit", reader.spec, rows=5)
+    multi.scene.check("pursuit", reader.spec, agents=5)
     expected = [[0, 0, 0, 0, 0], [3, 2, 0, 0, 0], [15, 15, 0, 0, 1], [1, 12, 0, 0, 1], [2, 2, 0, 0, 1]]
     assert multi.scene.states.tolist() == expected
     assert multi.scene.ids.tolist() == [0, 1, 2, 3, 4]

@@ -32,7 +32,7 @@ def world(request: pytest.FixtureRequest) -> World:
 
 def test_perceived_agents_are_among_all_agents(world: World):
     for perceived, full in watched(world, seed=0):
-        perceived.check("perceived", world.spec, rows=world.spec.max_agents)
+        perceived.check("perceived", world.spec, agents=world.spec.max_agents)
         full.check("full", world.spec)
         assert full.valid.all()
         truth = dict(zip(full.ids.tolist(), full.states, strict=True))

@@ -15,14 +15,14 @@ def present(valid: Tensor) -> list[int]:
 
 
 def pairs_of(valid: Tensor) -> list[Pair]:
-    """(receiver, sender) of everyone present."""
+    """(receiver, sender) of all present agents."""
     return [(i, j) for i in present(valid) for j in present(valid) if i != j]
 
 
-def joined(layer: PairLinear, receiver: Tensor, sender: Tensor, rows: slice = slice(None)) -> Tensor:
+def joined(layer: PairLinear, receiver: Tensor, sender: Tensor, part: slice = slice(None)) -> Tensor:
     """The layer as one matrix on the concatenation."""
-    matrix = torch.cat([layer.receiver.weight, layer.sender.weight], dim=1)[rows]
-    return matrix @ torch.cat([receiver, sender]) + layer.receiver.bias[rows]
+    matrix = torch.cat([layer.receiver.weight, layer.sender.weight], dim=1)[part]
+    return matrix @ torch.cat([receiver, sender]) + layer.receiver.bias[part]
 
 
 def embed(encoder: FrameEncoder, inputs: Tensor, valid: Tensor) -> dict[Pair, Tensor]:
@@ -73,8 +73,8 @@ def decode(
         for j in present(valid):
             for k, out in enumerate(decoder.message_out):
                 if i != j:
-                    rows = slice(k * width, (k + 1) * width)
-                    first = joined(decoder.message_pair, hidden.get(i, zero), hidden.get(j, zero), rows)
+                    part = slice(k * width, (k + 1) * width)
+                    first = joined(decoder.message_pair, hidden.get(i, zero), hidden.get(j, zero), part)
                     messages = messages + weights[i, j][k] * torch.tanh(out(torch.tanh(first)))
         x, m = decoder.input_gates(inputs[i]).chunk(3), decoder.message_gates(messages).chunk(3)
         reset, keep = torch.sigmoid(x[0] + m[0]), torch.sigmoid(x[1] + m[1])

@@ -152,9 +152,9 @@ def test_streaming_forecasts_what_the_window_does(kind: str, valid: Tensor, seed
     forecaster, states = tiny(kind), scenes(seed)
     window = quiet_window(forecaster, states, valid, torch.tensor(last_observed))
     beliefs = [belief for _, belief in stream(forecaster, states, valid)]
-    for row, t in enumerate(last_observed):
+    for index, t in enumerate(last_observed):
         streamed = forecaster.rollout(beliefs[t], HORIZON)
-        torch.testing.assert_close(streamed[row, 0], window.rollout[row], **METRES)
+        torch.testing.assert_close(streamed[index, 0], window.rollout[index], **METRES)
     for t, belief in enumerate(beliefs):
         if window.prior_logits is None:  # teacher forcing follows the same graph as streaming
             torch.testing.assert_close(forecaster.rollout(belief, 1)[:, 0, :, 0], window.one_step[:, t], **METRES)
@@ -261,20 +261,20 @@ def test_permuting_agents_permutes_outputs(kind: str, valid: Tensor, seed: int, 
 
 
 @every_kind
-def test_rows_of_a_batch_do_not_see_each_other(kind: str):
+def test_scenes_of_a_batch_are_independent(kind: str):
     forecaster, states, valid = tiny(kind), scenes(), random_presence(0, BATCH, TIME, AGENTS)
     together = everything(forecaster, states, valid)
-    for row in range(BATCH):
-        for name, alone in everything(forecaster, states[row : row + 1], valid[row : row + 1]).items():
-            torch.testing.assert_close(alone[0], together[name][row], **METRES, msg=lambda m, n=name: f"{n}: {m}")
+    for scene in range(BATCH):
+        for name, alone in everything(forecaster, states[scene : scene + 1], valid[scene : scene + 1]).items():
+            torch.testing.assert_close(alone[0], together[name][scene], **METRES, msg=lambda m, n=name: f"{n}: {m}")
 
 
 @every_kind
 def test_an_ego_alone_and_frames_without_agents_are_forecast(kind: str):
     forecaster, states = tiny(kind, has_ego=False), scenes()
     valid = random_presence(0, BATCH, TIME, AGENTS, ego=False)
-    valid[0] = False  # nobody, ever
-    valid[1, 2] = valid[1, 5] = False  # nobody for a while
+    valid[0] = False  # never an agent
+    valid[1, 2] = valid[1, 5] = False  # no agent for some steps
     valid[1, 4] = torch.tensor([False, True, False, False])  # one alone
     for values in everything(forecaster, states, valid).values():
         assert torch.isfinite(values).all()
@@ -313,20 +313,20 @@ def test_agents_forget_what_was_before_they_left(kind: str):
 
 
 @pytest.mark.parametrize("kind", PER_AGENT)
-def test_memory_moves_with_agents_that_change_rows(kind: str):
+def test_memory_moves_with_agents_that_change_places(kind: str):
     forecaster, states, valid = tiny(kind, has_ego=False), scenes(), torch.ones(BATCH, TIME, AGENTS).bool()
     order = torch.tensor([[2, 0, 3, 1], [1, 3, 2, 0]])
-    rows = torch.arange(BATCH)[:, None]
+    envs = torch.arange(BATCH)[:, None]
     (memory, _), (_, expected) = list(stream(forecaster, states, valid))[-2:]
     moved = memory.reorder(order, torch.ones(BATCH, AGENTS).bool())
-    belief = forecaster.observe(moved, states[rows, -1, order], valid[:, -1])[1]
+    belief = forecaster.observe(moved, states[envs, -1, order], valid[:, -1])[1]
     ours, plain = forecaster.rollout(belief, HORIZON), forecaster.rollout(expected, HORIZON)
-    torch.testing.assert_close(ours[:, 0], plain[rows, 0, order], **METRES)
+    torch.testing.assert_close(ours[:, 0], plain[envs, 0, order], **METRES)
 
 
 @every_kind
-def test_a_newcomer_does_not_inherit_from_whoever_had_its_row(kind: str):
-    """Three of four stay and a new agent takes the row of the one who left."""
+def test_a_new_agent_has_no_memory_of_the_one_at_its_place_before(kind: str):
+    """Three of four stay and a new agent takes the place of the one that left."""
     forecaster, states, valid = tiny(kind), scenes(), torch.ones(BATCH, TIME, AGENTS).bool()
     known = torch.tensor([[True, True, False, True]] * BATCH)
     memory = list(stream(forecaster, states, valid))[-2][0]
@@ -343,13 +343,13 @@ def test_a_newcomer_does_not_inherit_from_whoever_had_its_row(kind: str):
 
 
 @every_kind
-def test_rows_of_memory_are_selected_replaced_and_joined(kind: str):
+def test_envs_of_memory_are_selected_replaced_and_joined(kind: str):
     forecaster, states, valid = tiny(kind), scenes(batch=3), torch.ones(3, TIME, AGENTS).bool()
     memory = list(stream(forecaster, states, valid))[-2][0]
     empty = forecaster.empty_memory(1, AGENTS)
     shuffled = memory.select(torch.tensor([2, 0]))
-    joined = Memory.concatenate(shuffled, empty)  # rows: third, first, nobody's
-    replaced = joined.replace_rows(torch.tensor([0]), empty)
+    joined = Memory.concatenate(shuffled, empty)  # environments: third, first, an empty one
+    replaced = joined.replace_envs(torch.tensor([0]), empty)
     now = states[torch.tensor([2, 0, 1]), -1]
 
     def forecast(from_memory: Memory) -> Tensor:

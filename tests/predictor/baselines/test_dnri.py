@@ -132,7 +132,7 @@ def test_absent_pairs_have_no_edge_for_certain():
 
 
 def test_the_first_type_is_silent():
-    """Without edges the others cannot be heard: moving them leaves an agent's forecast as it is."""
+    """Without edges there are no messages: moving the others leaves an agent's forecast as it is."""
     forecaster = fresh("dnri-3types").requires_grad_(False)
     head = forecaster.encoder.prior_head[-1]
     head.weight.zero_()
@@ -178,8 +178,8 @@ def test_samples_depend_on_the_generator_alone(forecaster: DNRI):
     assert distance.min() > 1e-4
 
 
-def test_samples_belong_to_their_row():
-    """Without noise every sample of a row is that row's own expected forecast, so rows and samples are not mixed up."""
+def test_samples_belong_to_their_scene():
+    """Without noise every sample of a scene is its own expected forecast, so scenes and samples are not mixed up."""
     forecaster = tiny("dnri")
     belief = last(forecaster, random_states(0, BATCH, TIME, AGENTS, 4), torch.ones(BATCH, TIME, AGENTS).bool())
     with no_noise():

@@ -76,15 +76,15 @@ def test_against_a_loop(kind: str, valid: Tensor, seed: int):
 def test_attention_hand_computed():
     scores = torch.tensor([[9.0, 0.0, 0.0], [1.0, 9.0, 1.0 + torch.log(torch.tensor(3.0)).item()], [5.0, 6.0, 7.0]])
     ours = masked_attention(scores, pair_mask(torch.ones(3).bool()))
-    last_row = torch.tensor([5.0, 6.0]).softmax(0).tolist()
-    expected = torch.tensor([[0.0, 0.5, 0.5], [0.25, 0.0, 0.75], [*last_row, 0.0]])
+    last_receiver = torch.tensor([5.0, 6.0]).softmax(0).tolist()
+    expected = torch.tensor([[0.0, 0.5, 0.5], [0.25, 0.0, 0.75], [*last_receiver, 0.0]])
     torch.testing.assert_close(ours, expected)
     assert masked_attention(scores, pair_mask(torch.tensor([True, False, True]))).tolist() == [
         [0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0],
     ]  # fmt: skip
 
 
-def test_attention_over_nobody_is_nothing_with_a_finite_gradient():
+def test_attention_without_senders_is_zero_with_a_finite_gradient():
     scores = torch.randn(2, 3, 3, generator=torch.Generator().manual_seed(0), requires_grad=True)
     weights = masked_attention(scores, pair_mask(torch.tensor([[False] * 3, [True, False, False]])))
     assert not weights.any()
@@ -148,19 +148,19 @@ def test_layers_are_added_one_by_one():
     assert gradients(forecaster) == [True, True, True]
 
 
-def test_volume_fades_a_layer_in():
+def test_weight_of_an_added_layer_is_raised_from_0_to_1():
     forecaster = fresh("imma").requires_grad_(False)
     states, valid = random_states(0, BATCH, TIME, AGENTS, 4), torch.ones(BATCH, TIME, AGENTS).bool()
 
-    def forecast(layer: int | None, volume: float) -> Tensor:
-        forecaster.train_layer(layer, volume)
+    def forecast(layer: int | None, weight: float) -> Tensor:
+        forecaster.train_layer(layer, weight)
         return forecaster.rollout(last(forecaster, states, valid), HORIZON)
 
     everything = forecast(None, 1.0)
     torch.testing.assert_close(forecast(0, 1.0), everything, **TOLERANCE)
     torch.testing.assert_close(forecast(0, 0.0), forecast(1, 1.0), **TOLERANCE)
     assert not torch.allclose(forecast(0, 0.5), everything, atol=1e-4)
-    assert "volume" not in forecaster.state_dict()  # a trained model speaks with all layers
+    assert "_layer_weights" not in forecaster.state_dict()  # a trained model uses all layers
 
 
 @pytest.mark.parametrize("layer", [-1, 2])

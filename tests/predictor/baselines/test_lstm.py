@@ -129,18 +129,18 @@ def one_step(forecaster: LSTM, memory: Memory, states: Tensor, valid: Tensor) ->
 
 def test_the_scene_is_remembered_while_anybody_stays():
     forecaster = tiny("lstm-joint", has_ego=False)
-    states, everyone = random_states(0, 1, TIME, AGENTS, 4), torch.ones(1, AGENTS).bool()
-    memory = list(stream(forecaster, states[:, :-1], everyone[:, None].expand(-1, TIME - 1, -1)))[-1][0]
+    states, all_agents = random_states(0, 1, TIME, AGENTS, 4), torch.ones(1, AGENTS).bool()
+    memory = list(stream(forecaster, states[:, :-1], all_agents[:, None].expand(-1, TIME - 1, -1)))[-1][0]
     now, source = states[:, -1], torch.arange(AGENTS)[None]
-    expected = one_step(forecaster, memory, now, everyone)
-    for stays in range(AGENTS):  # whoever it is, in whichever row: newcomers' rows are zero and do not count
+    expected = one_step(forecaster, memory, now, all_agents)
+    for stays in range(AGENTS):  # whichever agent, at any place: memories of new agents are zero and do not count
         kept = memory.reorder(source, torch.arange(AGENTS)[None] == stays)
-        torch.testing.assert_close(one_step(forecaster, kept, now, everyone), expected, **TOLERANCE)
-    new = one_step(forecaster, forecaster.empty_memory(1, AGENTS), now, everyone)
+        torch.testing.assert_close(one_step(forecaster, kept, now, all_agents), expected, **TOLERANCE)
+    new = one_step(forecaster, forecaster.empty_memory(1, AGENTS), now, all_agents)
     replaced = memory.reorder(source, torch.zeros(1, AGENTS).bool())
-    torch.testing.assert_close(one_step(forecaster, replaced, now, everyone), new, **TOLERANCE)
+    torch.testing.assert_close(one_step(forecaster, replaced, now, all_agents), new, **TOLERANCE)
     assert not torch.allclose(new, expected, atol=1e-2)
-    # by id or by row: who has left does not keep the scene's memory, also where nobody has re-sorted the rows
+    # by id or by place: an agent that left does not keep the scene's memory, also if no agent was re-sorted
     alone = torch.tensor([[False, False, True, True]])
     first = list(stream(forecaster, states[:, :-1], ~alone[:, None].expand(-1, TIME - 1, -1)))[-1][0]
     ours = one_step(forecaster, first, now, alone)
@@ -153,21 +153,21 @@ def test_joint_takes_no_more_agents_than_it_has_columns():
     memory, states = forecaster.empty_memory(1, 5), random_states(0, 1, 5, 4)
     three, four = torch.tensor([[True, True, True, False, False]]), torch.tensor([[True, False, False, True, False]])
     assert forecaster.rollout(forecaster.observe(memory, states, three)[1], 2).shape == (1, 1, 5, 2, 4)
-    with pytest.raises(UserError, match="takes 3 agents in fixed rows, but row 3 holds one too; .* num_agents=4 or"):
+    with pytest.raises(UserError, match="agents at fixed places, but place 3 holds one too; .* num_agents=4 or"):
         forecaster.observe(memory, states, four)
     with pytest.raises(UserError, match="takes 3 agents"):
         forecaster.window(states[:, None], four[:, None], torch.tensor([0]), 1)
 
 
 @pytest.mark.parametrize("kind", ["lstm", "lstm-joint"])
-def test_memory_lies_on_the_rows_of_present_agents(kind: str):
+def test_memory_is_kept_with_present_agents(kind: str):
     forecaster = tiny(kind)
     states, valid = random_states(0, BATCH, TIME, AGENTS, 4), random_presence(0, BATCH, TIME, AGENTS)
     memory = list(stream(forecaster, states, valid))[-1][0]
     assert [m.shape[-1] for m in memory.nodes] == [5, 5] + ([1] if kind == "lstm-joint" else [])
     if kind == "lstm-joint":
-        for row in range(BATCH):
-            present = memory.nodes[0][row, valid[row, -1]]
+        for env in range(BATCH):
+            present = memory.nodes[0][env, valid[env, -1]]
             assert torch.equal(present, present[:1].expand_as(present))
 
 

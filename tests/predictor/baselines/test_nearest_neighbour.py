@@ -47,7 +47,7 @@ METRES = {"rtol": 1e-5, "atol": 1e-4}
 LAYOUTS = {
     "world": spec(),
     "road": spec(ROAD),
-    "nobody": spec(has_ego=False),
+    "no ego": spec(has_ego=False),
     "centroid": SceneSpec(0.5, ("centroid", "world"), has_ego=False),
     "near": spec(max_agents=3, perception_m=25.0),
     "near centroid": spec(("centroid", "ego"), max_agents=3, perception_m=25.0),
@@ -91,8 +91,8 @@ def observe(forecaster: NearestNeighbour, states: Tensor, valid: Tensor | None =
     return forecaster.observe(forecaster.empty_memory(len(states), states.shape[1]), states, valid)[1]
 
 
-def scene_of(layout: SceneSpec, seed: int, rows: int = 2, agents: int = 4) -> Tensor:
-    drawn = np.random.default_rng([seed, 7]).uniform(-20, 20, size=(rows, agents, layout.num_features))
+def scene_of(layout: SceneSpec, seed: int, scenes: int = 2, agents: int = 4) -> Tensor:
+    drawn = np.random.default_rng([seed, 7]).uniform(-20, 20, size=(scenes, agents, layout.num_features))
     return torch.from_numpy(drawn.astype(np.float32))
 
 
@@ -284,17 +284,17 @@ def test_forecasts_are_those_of_plain_loops(layout: SceneSpec, seed: int, k: int
     valid[1, 0] = False  # of the second scene, the ego where there is one
     states[..., -1] = states[..., -1].round().clamp(0, 1) if layout.constant_features else states[..., -1]
     ours = forecaster.rollout(observe(forecaster, states * valid[..., None], valid), HORIZON, 3).numpy()
-    for row, agent in valid.nonzero().tolist():
-        now = states[row].numpy().astype(np.float64) * valid[row].numpy()[:, None]
-        query = np.array(loop_features(layout, now, valid[row].numpy(), agent))
+    for env, agent in valid.nonzero().tolist():
+        now = states[env].numpy().astype(np.float64) * valid[env].numpy()[:, None]
+        query = np.array(loop_features(layout, now, valid[env].numpy(), agent))
         distances = [math.dist(example / scales, query / scales) for example in table]
         order = sorted(range(len(distances)), key=distances.__getitem__)[:k]
         expected = [sum(moves[i] for i in order) / len(order)] + [moves[order[s % len(order)]] for s in range(2)]
         for sample, moved in enumerate(expected):
             places = np.concatenate([np.zeros((1, axes)), moved])
-            np.testing.assert_allclose(ours[row, sample, agent, :, :axes] - now[agent, :axes], moved, atol=1e-4)
+            np.testing.assert_allclose(ours[env, sample, agent, :, :axes] - now[agent, :axes], moved, atol=1e-4)
             velocities = (places[1:] - places[:-1]) / layout.dt_s
-            np.testing.assert_allclose(ours[row, sample, agent, :, axes : 2 * axes], velocities, atol=1e-3)
+            np.testing.assert_allclose(ours[env, sample, agent, :, axes : 2 * axes], velocities, atol=1e-3)
 
 
 @pytest.mark.parametrize("count", [1, 4, BLOCK - 1, BLOCK, BLOCK + 1, 5 * BLOCK, 1000])
@@ -309,12 +309,12 @@ def test_no_example_is_nearer_than_the_nearest(count: int, grid: bool, monkeypat
     queries = torch.cat([features[:7], torch.from_numpy(rng.uniform(-30, 30, size=(5, 4)))])
     index, distances = forecaster.nearest(queries)
     scales = feature_scales(forecaster.spec, features)
-    for row, query in enumerate(queries):
+    for query_index, query in enumerate(queries):
         expected = sorted(float(((x - query) / scales).norm()) for x in features)[:5]
-        np.testing.assert_allclose(distances[row], expected, atol=1e-9)
-        found = [float(((features[i] - query) / scales).norm()) for i in index[row]]
+        np.testing.assert_allclose(distances[query_index], expected, atol=1e-9)
+        found = [float(((features[i] - query) / scales).norm()) for i in index[query_index]]
         np.testing.assert_allclose(found, expected, atol=1e-9)
-        assert len(set(index[row].tolist())) == len(expected)
+        assert len(set(index[query_index].tolist())) == len(expected)
 
 
 def test_near_examples_far_from_the_middle_are_told_apart():
@@ -353,7 +353,7 @@ def test_an_example_is_there_for_the_whole_horizon():
         who([ones, ones])
 
 
-def test_the_ego_is_no_example_and_nobody_is_while_it_is_absent():
+def test_the_ego_is_no_example_and_no_agent_is_while_it_is_absent():
     ones = [1, 1, 1]
     assert who([ones, [0, 1, 1], [0, 1, 1], ones]) == [1.0, 2.0]
     with pytest.raises(UserError, match="an agent other than the ego that is perceived"):
@@ -389,14 +389,16 @@ def test_features_closed_form():
 def test_as_many_examples_as_allowed_are_drawn():
     layout = spec()
     episodes = [random_episode(i, layout) for i in range(8)]
-    everyone = collect_examples(episodes, layout, HORIZON)
+    all_examples = collect_examples(episodes, layout, HORIZON)
     some, same, other = (collect_examples(episodes, layout, HORIZON, 20, seed) for seed in (0, 0, 1))
-    assert len(everyone.features) > 60 and len(some.features) == len(some.displacements) == 20
+    assert len(all_examples.features) > 60 and len(some.features) == len(some.displacements) == 20
     assert torch.equal(some.features, same.features) and not torch.equal(some.features, other.features)
-    rows = (some.features[:, None] == everyone.features).all(-1).nonzero()[:, 1]
-    assert torch.equal(some.displacements, everyone.displacements[rows])
-    assert len(set(rows.tolist())) == 20 and rows.max() > len(everyone.features) / 2
-    assert len(collect_examples(episodes, layout, HORIZON, len(everyone.features)).features) == len(everyone.features)
+    places = (some.features[:, None] == all_examples.features).all(-1).nonzero()[:, 1]
+    assert torch.equal(some.displacements, all_examples.displacements[places])
+    assert len(set(places.tolist())) == 20 and places.max() > len(all_examples.features) / 2
+    assert len(collect_examples(episodes, layout, HORIZON, len(all_examples.features)).features) == len(
+        all_examples.features
+    )
 
 
 @pytest.mark.parametrize(
@@ -422,7 +424,7 @@ def test_an_episode_without_anyone_does_not_matter():
     assert torch.equal(collect_examples(with_gaps, layout, HORIZON).features, expected.features)
 
 
-# --- Who is there, and in which row -----------------------------------------------------------------------------------
+# --- Which agents are there, and where --------------------------------------------------------------------------------
 
 
 @every_layout
@@ -452,15 +454,15 @@ def test_permuting_agents_permutes_forecasts(layout: SceneSpec, seed: int, order
     torch.testing.assert_close(permuted, plain[:, :, order], **METRES)
 
 
-def test_rows_of_a_batch_do_not_see_each_other(fitted: NearestNeighbour):
+def test_scenes_of_a_batch_are_independent(fitted: NearestNeighbour):
     states, valid = random_states(0, 3, 4, 4), random_presence(0, 3, 4)
     together = fitted.rollout(observe(fitted, states, valid), HORIZON)
-    for row in range(3):
-        alone = fitted.rollout(observe(fitted, states[[row]], valid[[row]]), HORIZON)
-        torch.testing.assert_close(alone[0], together[row], **METRES)
+    for env in range(3):
+        alone = fitted.rollout(observe(fitted, states[[env]], valid[[env]]), HORIZON)
+        torch.testing.assert_close(alone[0], together[env], **METRES)
 
 
-def test_nobody_is_forecast_as_nothing(fitted: NearestNeighbour):
+def test_no_agents_have_empty_forecasts(fitted: NearestNeighbour):
     states = random_states(0, 2, 3, 4)
     assert not fitted.rollout(observe(fitted, states, torch.zeros(2, 3).bool()), HORIZON, 2).any()
     assert fitted.rollout(observe(fitted, states[:, :0]), HORIZON, 2).shape == (2, 2, 0, HORIZON, 4)

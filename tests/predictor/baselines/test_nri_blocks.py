@@ -62,7 +62,7 @@ def test_decoder_against_a_loop(kinds: int):
 
 
 def test_messages_hand_computed():
-    """Two agents, one-wide everything: agent 0 hears 0.5 · tanh(3 · tanh(h₀ + 2 h₁)), agent 1 hears nothing."""
+    """Two agents, one-wide everything: agent 0 receives 0.5 · tanh(3 · tanh(h₀ + 2 h₁)), agent 1 receives nothing."""
     decoder = HiddenDecoder(1, 1, 1, 1, 1).requires_grad_(False)
     decoder.message_pair.receiver.weight.fill_(1.0)
     decoder.message_pair.receiver.bias.zero_()
@@ -70,8 +70,8 @@ def test_messages_hand_computed():
     decoder.message_out[0].weight.fill_(3.0)
     decoder.message_out[0].bias.zero_()
     hidden, weights = torch.tensor([[0.1], [0.2]]), torch.tensor([[[0.0], [0.5]], [[0.0], [0.0]]])
-    heard = 0.5 * torch.tanh(3 * torch.tanh(torch.tensor(0.5)))
-    torch.testing.assert_close(decoder.messages(hidden, weights), torch.stack([heard, heard * 0])[:, None])
+    received = 0.5 * torch.tanh(3 * torch.tanh(torch.tensor(0.5)))
+    torch.testing.assert_close(decoder.messages(hidden, weights), torch.stack([received, received * 0])[:, None])
 
 
 def test_gradients_of_messages_and_update():

@@ -28,7 +28,7 @@ def test_crowds_hold_at_least_as_many_agents_as_wanted(tmp_path: Path):
     assert all(len(np.unique(c.ids)) == c.states.shape[1] for c in crowds)
 
 
-def test_everybody_moves_as_recorded_and_scenes_share_a_centre():
+def test_all_agents_move_as_recorded_and_scenes_share_a_centre():
     first, second = circling_episode(0, agents=2), circling_episode(1, agents=3)
     second.valid[:4, 1] = False
     crowd = overlay([first, second], 2, seed=5)
@@ -54,7 +54,7 @@ def test_refused(tmp_path: Path, changes: dict[str, object], message: str):
 
 
 def test_scenes_with_an_ego_or_too_short_ones_are_refused(tmp_path: Path):
-    with pytest.raises(UserError, match="has an ego, and there can be only one"):
+    with pytest.raises(UserError, match="has an ego, and an episode has at most one"):
         make_crowds(config(store(tmp_path / "a", [circling_episode(0)], has_ego=True)))
     with pytest.raises(UserError, match="no episode has 10 steps and an agent at step 7"):
         make_crowds(config(store(tmp_path / "b", [circling_episode(0, steps=6)])))

@@ -21,30 +21,30 @@ CORNER_META = "id,width,height,initialFrame,finalFrame,numFrames,class,drivingDi
 CORNER_RECORDING = "id,frameRate,locationId,speedLimit,month\n1,25,2,-1.00,9.2017\n"
 
 
-def centre_row(track: int, frame: int) -> str:
+def centre(track: int, frame: int) -> str:
     """A car turns and speeds up; what the loader does not use is no number."""
     return f"0,{track},{frame},?,{frame},{-track},{30 * track},2,4,{10 + frame},-1,?,?,?,?,{track + 0.5},-0.25"
 
 
-def write_centre(folder: Path, name: str = "00", location: str = "3", rate: str = "25", rows: list[str] | None = None):
-    if rows is None:
+def write_centre(folder: Path, name: str = "00", location: str = "3", rate: str = "25", lines: list[str] | None = None):
+    if lines is None:
         # Track 1 from frame 0 to 20, track 3 from 10 to 40 without frames 20–24; track 4 stands from 60 on.
-        rows = [centre_row(1, frame) for frame in range(21)]
-        rows += [centre_row(3, frame) for frame in range(10, 41) if not 20 <= frame < 25]
-        rows += [centre_row(4, frame) for frame in range(60, 66)]
+        lines = [centre(1, frame) for frame in range(21)]
+        lines += [centre(3, frame) for frame in range(10, 41) if not 20 <= frame < 25]
+        lines += [centre(4, frame) for frame in range(60, 66)]
     folder.mkdir(exist_ok=True)
-    (folder / f"{name}_tracks.csv").write_text("\n".join([CENTRE, *rows]) + "\n")
+    (folder / f"{name}_tracks.csv").write_text("\n".join([CENTRE, *lines]) + "\n")
     meta = ["0,1,0,20,21,2,4,car", "0,3,10,40,31,2,4,truck_bus", "0,4,60,65,6,0,0,pedestrian", "0,5,0,0,1,0,0,bicycle"]
     (folder / f"{name}_tracksMeta.csv").write_text("\n".join([CENTRE_META, *meta]) + "\n")
     (folder / f"{name}_recordingMeta.csv").write_text(RECORDING.format(location=location, rate=rate))
 
 
-def write_corner(folder: Path, rows: list[str] | None = None):
-    if rows is None:
-        rows = [f"{f},7,{100 - f},20,4,2,-25,0.5,0.75,-0.5,0,0,0,0,0,0,0,2" for f in range(1, 12)]
-        rows += [f"{f},8,{f},30,10,2.5,20,-1,-0.25,0.125,0,0,0,0,0,0,0,5" for f in range(1, 12)]
+def write_corner(folder: Path, lines: list[str] | None = None):
+    if lines is None:
+        lines = [f"{f},7,{100 - f},20,4,2,-25,0.5,0.75,-0.5,0,0,0,0,0,0,0,2" for f in range(1, 12)]
+        lines += [f"{f},8,{f},30,10,2.5,20,-1,-0.25,0.125,0,0,0,0,0,0,0,5" for f in range(1, 12)]
     folder.mkdir(exist_ok=True)
-    (folder / "01_tracks.csv").write_text("\n".join([CORNER, *rows]) + "\n")
+    (folder / "01_tracks.csv").write_text("\n".join([CORNER, *lines]) + "\n")
     (folder / "01_tracksMeta.csv").write_text(f"{CORNER_META}\n7,4,2,1,11,11,Car,1\n8,10,2.5,1,11,11,Truck,2\n")
     (folder / "01_recordingMeta.csv").write_text(CORNER_RECORDING)
 
@@ -173,8 +173,8 @@ def test_highd_by_hand(tmp_path: Path, loader: Loader):
 
 def test_acceleration_across_points_to_the_left_of_the_heading(tmp_path: Path, loader: Loader):
     """Both cars accelerate upwards in the image (y falls): left for one that drives right, right for the other."""
-    rows = [f"{f},{car},50,20,4,2,{v},0,0,-1,0,0,0,0,0,0,0,2" for car, v in ((7, -25), (8, 25)) for f in range(1, 12)]
-    write_corner(tmp_path / "highD", rows)
+    lines = [f"{f},{car},50,20,4,2,{v},0,0,-1,0,0,0,0,0,0,0,2" for car, v in ((7, -25), (8, 25)) for f in range(1, 12)]
+    write_corner(tmp_path / "highD", lines)
     (episode,) = loader.load(tmp_path / "highD").episodes
     assert episode.states[0, :, 7].tolist() == [-1.0, 1.0]
 
@@ -182,15 +182,18 @@ def test_acceleration_across_points_to_the_left_of_the_heading(tmp_path: Path, l
 # --- Refusals ---------------------------------------------------------------------------------------------------------
 
 TRACK_ERRORS = {
-    "nan": (centre_row(1, 1).replace(",1,-1,", ",nan,-1,"), "xCenter must be a finite number, got 'nan'"),
-    "empty": (centre_row(1, 1).replace(",1,-1,", ",,-1,"), "xCenter must be a finite number, got ''"),
-    "text": (centre_row(1, 1).replace("-0.25", "left"), "latAcceleration must be a finite number, got 'left'"),
+    "nan": (centre(1, 1).replace(",1,-1,", ",nan,-1,"), "xCenter must be a finite number, got 'nan'"),
+    "empty": (centre(1, 1).replace(",1,-1,", ",,-1,"), "xCenter must be a finite number, got ''"),
+    "text": (centre(1, 1).replace("-0.25", "left"), "latAcceleration must be a finite number, got 'left'"),
     "short": ("0,1,1,1,2,3", "expected 17 columns, got 6"),
-    "frame": (centre_row(1, 1).replace("0,1,1,", "0,1,1.5,", 1), "frame must be a whole number from 0 up, got 1.5"),
-    "track": (centre_row(1, 1).replace("0,1,1,", "0,-2,1,", 1), "trackId must be a whole number from 0 up, got -2"),
-    "huge": (centre_row(1, 1).replace("0,1,1,", "0,1e30,1,", 1), "trackId must be a whole number from 0 up, got 1e+30"),
-    "twice": (centre_row(1, 0), "track 1 has frame 0 in line 2 already"),
-    "unknown track": (centre_row(6, 5), "track 6 is not in 00_tracksMeta.csv"),
+    "frame": (centre(1, 1).replace("0,1,1,", "0,1,1.5,", 1), "frame must be a whole number from 0 up, got 1.5"),
+    "track": (centre(1, 1).replace("0,1,1,", "0,-2,1,", 1), "trackId must be a whole number from 0 up, got -2"),
+    "huge": (
+        centre(1, 1).replace("0,1,1,", "0,1e30,1,", 1),
+        "trackId must be a whole number from 0 up, got 1e+30",
+    ),
+    "twice": (centre(1, 0), "track 1 has frame 0 in line 2 already"),
+    "unknown track": (centre(6, 5), "track 6 is not in 00_tracksMeta.csv"),
 }
 
 

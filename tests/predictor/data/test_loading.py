@@ -131,7 +131,7 @@ def test_the_card_says_what_was_measured(tmp_path: Path):
     save_dataset(config, spec(), [episode()], NOTES, [source], {"joints": ("a", "b")})
     card = config.card_path.read_text()
     assert sorted(p.name for p in (tmp_path / "deep").iterdir()) == ["store", "store.md"]
-    for row in (
+    for line in (
         "| episodes | 1 |",
         "| labels | toy |",
         "| steps | 3 (0.0 min) |",
@@ -143,7 +143,7 @@ def test_the_card_says_what_was_measured(tmp_path: Path):
         "| `x_m` | 100 | 0.816 |",
         "| `vx_mps` | 30 | 0.943 |",
     ):
-        assert row in card
+        assert line in card
     facts = read_store(config.out).info.provenance
     assert facts["source_sha256"] == checksum(source, [source])
     assert facts["source_sha256"] in card

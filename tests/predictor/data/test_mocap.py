@@ -304,7 +304,7 @@ ASF_ERRORS = {
     "unknown child": (39, "root upper tail", 39, "bone 'tail' is not in :bonedata"),
     "orphan": (39, "root upper", 37, "no parent is given for side"),
     "two parents": (40, "upper lower side", 40, "bone 'side' has two parents"),
-    "no way up": (39, "lower upper side", 39, "bone 'lower' must hang on a parent before it has children"),
+    "no way up": (39, "lower upper side", 39, "bone 'lower' must have a parent before it has children"),
     "no hierarchy": (37, "# gone", 36, "a bone has no"),
 }
 

@@ -15,7 +15,7 @@ FOOT_M = 0.3048
 
 
 def feet(entity: int, t: float) -> tuple[float, float]:
-    """The ball (-1) rolls from the middle along x, 1 foot per step; players stand, one per row, and creep along y."""
+    """The ball (-1) rolls from the middle along x, 1 foot per step; players on parallel lines move slowly along y."""
     if entity == -1:
         return 47.0 + t, 25.0
     place = PLAYERS.index(entity)
@@ -114,7 +114,7 @@ SCORE_ERRORS = {
     "two balls": (2, "0 -2 1 2 BALL", 11, "frame 0 must hold 1 ball and 10 players, got 2 and 9"),
     "no ball": (4, "0 99 1 2 PLAYER", 11, "frame 0 must hold 1 ball and 10 players, got 0 and 11"),
     "missing player": (2, None, 10, "frame 0 must hold 1 ball and 10 players, got 1 and 9"),
-    "stranger": (13, "12 99 1 2 PLAYER", 22, "frame 12 holds ids that the first frame does not: [99]"),
+    "unknown id": (13, "12 99 1 2 PLAYER", 22, "frame 12 holds ids that the first frame does not: [99]"),
 }
 
 
@@ -160,9 +160,9 @@ def test_values_that_make_no_sense(possessions: Path, loader: Loader, words: tup
 
 def moment(t: int, late_ms: int = 0, quarter: int = 1, players: list[int] = PLAYERS) -> list[Any]:
     """Moment number `t` (40 ms each) of the play that `feet` describes, three times slower than in the text layout."""
-    rows = [[-1, -1, *feet(-1, t / 3), 5.0]]
-    rows += [[100 + (i < 5), player, *feet(PLAYERS[i], t / 3), 0.0] for i, player in enumerate(players)]
-    return [quarter, 1_450_000_000_000 + 40 * t + late_ms, 700.0, 20.0, None, rows]
+    points = [[-1, -1, *feet(-1, t / 3), 5.0]]
+    points += [[100 + (i < 5), player, *feet(PLAYERS[i], t / 3), 0.0] for i, player in enumerate(players)]
+    return [quarter, 1_450_000_000_000 + 40 * t + late_ms, 700.0, 20.0, None, points]
 
 
 def game(*events: list[Any]) -> str:
@@ -200,13 +200,13 @@ def test_events_overlap_and_play_is_interrupted(games: Path, loader: Loader):
     store = loader.load(games, "--format", "sportvu", "--episode-steps", 4)
     # 13 moments in each passage, 5 kept, 4 velocities.
     assert [e.label for e in store.episodes] == ["7/0", "7/1", "7/2", "7/3"]
-    for row in (
+    for line in (
         "| moments read | 58 |",
         "| moments without 1 ball and 10 players | 1 |",
         "| moments repeated by a later event | 5 |",
         "| passages without interruption | 4 |",
     ):
-        assert row in loader.card
+        assert line in loader.card
     assert [99 in e.ids for e in store.episodes] == [False, False, True, True]
     np.testing.assert_allclose(store.episodes[1].states[:, 0, 0], (20 / 3 + np.arange(1, 5)) * FOOT_M, rtol=1e-5)
 
@@ -233,9 +233,9 @@ def broken_moment(change: Any) -> str:
     return json.dumps(content, indent=0)
 
 
-def set_to(row: int, column: int, value: Any) -> Any:
+def set_to(point: int, column: int, value: Any) -> Any:
     def change(values: list[Any]) -> None:
-        values[5][row][column] = value
+        values[5][point][column] = value
 
     return change
 
@@ -249,8 +249,8 @@ SPORTVU_ERRORS = {
     "too large": (game([moment(0)]).replace("47.0", "1e999"), ", events[0].moments[0]: positions must be finite"),
     "word": (broken_moment(set_to(2, 2, "x")), ", events[0].moments[1]: expected [quarter, ms, clock,"),
     "null": (broken_moment(set_to(2, 2, None)), ", events[0].moments[1]: expected [quarter, ms, clock,"),
-    "short row": (broken_moment(lambda m: m[5][3].__delitem__(slice(2, 5))), ", events[0].moments[1]: expected ["),
-    "no rows": (broken_moment(lambda m: m.pop()), ", events[0].moments[1]: expected [quarter, ms, clock,"),
+    "short point": (broken_moment(lambda m: m[5][3].__delitem__(slice(2, 5))), ", events[0].moments[1]: expected ["),
+    "no points": (broken_moment(lambda m: m.pop()), ", events[0].moments[1]: expected [quarter, ms, clock,"),
     "id": (broken_moment(set_to(2, 1, 0)), ", events[0].moments[1]: ids of players must be positive"),
 }
 

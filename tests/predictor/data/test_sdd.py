@@ -20,18 +20,18 @@ SCALES = """quad:
 """
 
 
-def row(track: int, frame: int, x: float, y: float, label: str = "Pedestrian", lost: bool = False) -> str:
+def line(track: int, frame: int, x: float, y: float, label: str = "Pedestrian", lost: bool = False) -> str:
     """A box of 4 × 6 pixels around (x, y)."""
     return f'{track} {x - 2:g} {y - 3:g} {x + 2:g} {y + 3:g} {frame} {int(lost)} 0 0 "{label}"'
 
 
 ROWS = [
     # A pedestrian walks along x, 2 pixels per frame; frame 30 is none of the kept ones.
-    *(row(4, frame, 100 + 2 * frame, 50) for frame in (0, 12, 24, 30, 36)),
+    *(line(4, frame, 100 + 2 * frame, 50) for frame in (0, 12, 24, 30, 36)),
     # A biker is lost at frame 24.
-    *(row(2, frame, 10, 5 * frame, "Biker", lost=frame == 24) for frame in (0, 12, 24, 36, 48)),
-    # A cart stands from frame 96 on; nobody is there in between.
-    *(row(9, frame, 300, 200, "Cart") for frame in (84, 96, 108)),
+    *(line(2, frame, 10, 5 * frame, "Biker", lost=frame == 24) for frame in (0, 12, 24, 36, 48)),
+    # A cart stands from frame 96 on; no agent is present in between.
+    *(line(9, frame, 300, 200, "Cart") for frame in (84, 96, 108)),
 ]
 
 
@@ -74,10 +74,10 @@ def test_states_by_hand(dataset: Path, loader: Loader):
     for line in (
         "| agents per step (min / median / max) | 0 / 1 / 2 |",
         "| steps without an agent | 3 |",
-        "| rows read | 13 |",
-        "| rows dropped: lost | 1 |",
-        "| rows dropped: between steps | 1 |",
-        "| rows dropped: no velocity (first of a track or after a gap) | 4 |",
+        "| lines read | 13 |",
+        "| lines dropped: lost | 1 |",
+        "| lines dropped: between steps | 1 |",
+        "| lines dropped: no velocity (first of a track or after a gap) | 4 |",
     ):
         assert line in loader.card
 
@@ -93,7 +93,7 @@ def test_videos_are_cut_and_empty_stretches_left_out(dataset: Path, loader: Load
 
 def test_another_time_step(dataset: Path, annotations: Path, loader: Loader):
     with annotations.open("a") as file:
-        file.write(row(4, 48, 172, 50) + "\n")
+        file.write(line(4, 48, 172, 50) + "\n")
     store = loader.load(dataset, "--dt-s", 0.8)
     assert store.info.spec.dt_s == 0.8
     (episode,) = store.episodes
@@ -107,7 +107,7 @@ def test_another_time_step(dataset: Path, annotations: Path, loader: Loader):
     ("label", "column"), [("Pedestrian", 0), ("Biker", 1), ("Skater", 1), ("Cart", 2), ("Car", 2), ("Bus", 2)]
 )
 def test_classes(dataset: Path, annotations: Path, loader: Loader, label: str, column: int):
-    annotations.write_text("".join(row(0, frame, 1, 2, label) + "\n" for frame in (0, 12, 24)))
+    annotations.write_text("".join(line(0, frame, 1, 2, label) + "\n" for frame in (0, 12, 24)))
     (episode,) = loader.load(dataset).episodes
     np.testing.assert_array_equal(episode.states[:, 0, 4:], np.eye(3)[[column] * 2])
 
@@ -117,7 +117,7 @@ def test_splits_are_by_video(dataset: Path, loader: Loader):
     for video in range(30):
         folder = dataset / "hyang" / f"video{video}"
         folder.mkdir(parents=True)
-        (folder / "annotations.txt").write_text("".join(row(0, frame, 1, 2) + "\n" for frame in (0, 12, 24)))
+        (folder / "annotations.txt").write_text("".join(line(0, frame, 1, 2) + "\n" for frame in (0, 12, 24)))
         scales.append(f"   video{video}:\n      scale: 0.1\n")
     (dataset / "estimated_scales.yaml").write_text(SCALES + "hyang:\n" + "".join(scales))
     found = []
@@ -138,8 +138,8 @@ def test_the_documented_splits():
         assert split_of(name, sdd.SPLIT_SEED) == "val"
 
 
-def test_a_video_in_which_nobody_moves_on_gives_nothing(dataset: Path, annotations: Path, loader: Loader):
-    annotations.write_text(row(0, 0, 1, 2) + "\n" + row(1, 12, 1, 2, lost=True) + "\n")
+def test_a_video_without_a_moving_agent_gives_nothing(dataset: Path, annotations: Path, loader: Loader):
+    annotations.write_text(line(0, 0, 1, 2) + "\n" + line(1, 12, 1, 2, lost=True) + "\n")
     loader.refuses(dataset, f"{dataset} gives no episode for split 'all'; videos: 1")
     annotations.write_text("")
     loader.refuses(dataset, f"{dataset} gives no episode for split 'all'; videos: 1")
@@ -157,7 +157,7 @@ ROW_ERRORS = {
     "negative track": ('-1 1 2 3 4 12 0 0 0 "Pedestrian"', "track id must be at least 0, got -1"),
     "lost": ('4 1 2 3 4 12 2 0 0 "Pedestrian"', "lost must be 0 or 1, got '2'"),
     "label": ('4 1 2 3 4 12 0 0 0 "Dog"', "label must be one of Pedestrian, Biker, Skater, Cart, Car, Bus, got 'Dog'"),
-    "twice": (row(4, 0, 1, 1), "track 4 has frame 0 in line 1 already"),
+    "twice": (line(4, 0, 1, 1), "track 4 has frame 0 in line 1 already"),
 }
 
 

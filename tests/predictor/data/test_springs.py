@@ -81,7 +81,7 @@ def test_error_falls_with_the_square_of_the_substeps():
     assert 3.5 < errors[0] / errors[1] < 4.5
 
 
-def test_without_springs_everybody_goes_straight_on():
+def test_without_springs_all_particles_go_straight_on():
     physics = replace(OPEN, num_agents=3)
     _, where, velocity = drawn(2, physics)
     states = simulate(physics, torch.zeros(2, 3, 3), where, velocity)
@@ -95,8 +95,8 @@ def test_the_given_state_comes_first_and_scenes_do_not_mix():
     start = drawn(3, physics)
     together = simulate(physics, *start)
     assert torch.equal(together[:, 0], torch.cat(start[1:], dim=-1))
-    for row in range(3):
-        torch.testing.assert_close(simulate(physics, *(t[row : row + 1] for t in start))[0], together[row])
+    for i in range(3):
+        torch.testing.assert_close(simulate(physics, *(t[i : i + 1] for t in start))[0], together[i])
 
 
 # --- Conservation -----------------------------------------------------------------------------------------------------
@@ -162,7 +162,7 @@ def test_corners_reflect_both_axes():
     ]
 
 
-def test_nobody_leaves_the_box():
+def test_no_particle_leaves_the_box():
     physics = Physics(box_m=0.6, frames=60, speed_mps=2.0)
     couplings, where, velocity = drawn(5, physics)
     states = simulate(physics, couplings, where.clamp(-0.6, 0.6), velocity)

@@ -70,9 +70,9 @@ def test_every_field_of_the_spec_comes_back(tmp_path: Path):
 
 
 def test_episode_from_scenes_gives_each_id_a_column():
-    first = scene({0: (1.0,) * 4, 7: (2.0,) * 4}, rows=4)
-    second = scene({0: (3.0,) * 4, 9: (4.0,) * 4}, rows=4, order=[0, -1, -1, 9])
-    third = scene({0: (5.0,) * 4, 9: (6.0,) * 4, 7: (7.0,) * 4}, rows=4)
+    first = scene({0: (1.0,) * 4, 7: (2.0,) * 4}, size=4)
+    second = scene({0: (3.0,) * 4, 9: (4.0,) * 4}, size=4, order=[0, -1, -1, 9])
+    third = scene({0: (5.0,) * 4, 9: (6.0,) * 4, 7: (7.0,) * 4}, size=4)
     joined = Episode.from_scenes([first, second, third], "idle", 5)
     assert joined.ids.tolist() == [0, 7, 9]
     assert joined.valid.tolist() == [[True, True, False], [True, False, True], [True, True, True]]

@@ -3,17 +3,19 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from predictor.data.tracks import TrackRows, cut_episodes, with_velocities
+from predictor.data.tracks import TrackPoints, cut_episodes, with_velocities
 
 
-def rows(*entries: tuple[int, int, float]) -> TrackRows:
+def points(*entries: tuple[int, int, float]) -> TrackPoints:
     """From (step, track, x); y is 10 x."""
     steps, tracks, x = (np.array(column) for column in zip(*entries, strict=True))
-    return TrackRows(steps.astype(np.int64), tracks.astype(np.int64), np.stack([x, 10 * x], axis=-1).astype(np.float64))
+    return TrackPoints(
+        steps.astype(np.int64), tracks.astype(np.int64), np.stack([x, 10 * x], axis=-1).astype(np.float64)
+    )
 
 
 def test_velocities_look_back_and_gaps_have_none():
-    given = rows((3, 7, 1.0), (4, 7, 1.5), (6, 7, 9.0), (7, 7, 8.0), (5, 2, 0.0), (4, 2, 1.0))
+    given = points((3, 7, 1.0), (4, 7, 1.5), (6, 7, 9.0), (7, 7, 8.0), (5, 2, 0.0), (4, 2, 1.0))
     kept, velocities_mps, origin = with_velocities(given, 0.5)
     assert kept.tracks.tolist() == [2, 7, 7]
     assert kept.steps.tolist() == [5, 4, 7]
@@ -22,15 +24,15 @@ def test_velocities_look_back_and_gaps_have_none():
     np.testing.assert_array_equal(kept.states, given.states[origin])
 
 
-def test_nobody_ever_follows():
-    kept, velocities_mps, origin = with_velocities(rows((0, 1, 0.0), (0, 2, 0.0), (2, 1, 0.0)), 0.1)
+def test_a_recording_without_consecutive_points_gives_nothing():
+    kept, velocities_mps, origin = with_velocities(points((0, 1, 0.0), (0, 2, 0.0), (2, 1, 0.0)), 0.1)
     assert (len(kept), velocities_mps.shape, origin.tolist()) == (0, (0, 2), [])
 
 
 def test_episodes_tile_a_recording():
     counts: Counter[str] = Counter()
     # Steps 10–18 in episodes of 4: 10–13, 14–17 (empty), 18–21 of which only 18 and 19 exist.
-    given = rows((10, 5, 1.0), (12, 5, 2.0), (12, 3, 3.0), (18, 9, 4.0), (19, 9, 5.0))
+    given = points((10, 5, 1.0), (12, 5, 2.0), (12, 3, 3.0), (18, 9, 4.0), (19, 9, 5.0))
     first, last = cut_episodes(given, 4, "here", counts)
     assert (first.ids.tolist(), last.ids.tolist()) == ([3, 5], [9])
     assert first.valid.tolist() == [[False, True], [False, False], [True, True], [False, False]]
@@ -43,10 +45,10 @@ def test_episodes_tile_a_recording():
 
 
 @pytest.mark.parametrize("steps", [3, 4, 5])
-def test_every_row_is_in_one_episode(steps: int):
+def test_every_point_is_in_one_episode(steps: int):
     rng = np.random.default_rng(steps)
     present = np.argwhere(rng.random((40, 6)) < 0.3)
-    given = rows(*((int(step), int(track), float(step + track)) for step, track in present))
+    given = points(*((int(step), int(track), float(step + track)) for step, track in present))
     found = cut_episodes(given, steps, "", Counter())
     assert all(len(episode.states) <= steps for episode in found)
     lost = len(given) - sum(int(episode.valid.sum()) for episode in found)
@@ -56,10 +58,10 @@ def test_every_row_is_in_one_episode(steps: int):
 
 def test_an_episode_of_one_step_is_counted():
     counts: Counter[str] = Counter()
-    assert len(cut_episodes(rows((0, 1, 0.0), (1, 1, 0.0), (2, 1, 0.0)), 2, "", counts)) == 1
+    assert len(cut_episodes(points((0, 1, 0.0), (1, 1, 0.0), (2, 1, 0.0)), 2, "", counts)) == 1
     assert counts == {"episodes left out: one step": 1}
 
 
 def test_nothing_gives_nothing():
-    empty = TrackRows(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
+    empty = TrackPoints(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
     assert cut_episodes(empty, 5, "", Counter()) == []

@@ -47,16 +47,16 @@ def cut_one(episode: Episode, layout: SceneSpec, now: int, history: int, horizon
     return Cut(begin, last, columns, episode.states[begin:end][:, columns] * seen[..., None], seen)
 
 
-def loop(windows: Windows, episodes: list[Episode], rows: np.ndarray, history: int) -> WindowBatch:
+def loop(windows: Windows, episodes: list[Episode], places: np.ndarray, history: int) -> WindowBatch:
     """Window by window; the layout of `WindowBatch` in words."""
-    chosen = [(episodes[e], now) for e, now in windows.index[rows].tolist()]
+    chosen = [(episodes[e], now) for e, now in windows.index[places].tolist()]
     cuts = [cut_one(e, windows.spec, now, history, windows.horizon_steps) for e, now in chosen]
     time, agents = max(c.last for c in cuts) + 1 + windows.horizon_steps, max(len(c.columns) for c in cuts)
     states = np.zeros((len(cuts), time, agents, windows.spec.num_features), dtype=np.float32)
     valid = np.zeros((len(cuts), time, agents), dtype=np.bool_)
-    for row, cut in enumerate(cuts):
+    for window, cut in enumerate(cuts):
         steps, seen = cut.seen.shape
-        states[row, :steps, :seen], valid[row, :steps, :seen] = cut.states, cut.seen
+        states[window, :steps, :seen], valid[window, :steps, :seen] = cut.states, cut.seen
     labels = [loop_labels([e for e, _ in chosen], cuts, name, valid) for name in ("edge_types", "edge_attributes")]
     last = torch.tensor([cut.last for cut in cuts])
     return WindowBatch(torch.from_numpy(states), torch.from_numpy(valid), last, *labels)
@@ -69,10 +69,10 @@ def loop_labels(episodes: list[Episode], cuts: list[Cut], name: str, valid: np.n
     fill = -1 if name == "edge_types" else 0
     batch, time, agents = valid.shape
     made = np.full((batch, time, agents, agents, *first.shape[3:]), fill, dtype=first.dtype)
-    for row, (episode, cut) in enumerate(zip(episodes, cuts, strict=True)):
+    for window, (episode, cut) in enumerate(zip(episodes, cuts, strict=True)):
         labels, (steps, seen) = getattr(episode, name), cut.seen.shape
         stretch = labels if len(labels) == 1 else labels[cut.begin : cut.begin + steps]
-        made[row, :steps, :seen, :seen] = stretch[:, cut.columns][:, :, cut.columns]
+        made[window, :steps, :seen, :seen] = stretch[:, cut.columns][:, :, cut.columns]
     made[~(valid[..., :, None] & valid[..., None, :] & ~np.eye(agents, dtype=np.bool_))] = fill
     return torch.from_numpy(made)
 
@@ -129,9 +129,9 @@ def assert_same(ours: WindowBatch, expected: WindowBatch) -> None:
 @given(drawn=STORES, seed=st.integers(0, 100))
 def test_index_arithmetic_is_the_loop(drawn: dict[str, Any], seed: int):
     windows, episodes, history = store(drawn)
-    rows = np.random.default_rng(seed).integers(len(windows), size=5)
-    assert_same(windows.batch(rows, history), loop(windows, episodes, rows, history))
-    assert_same(windows.batch(rows), loop(windows, episodes, rows, windows.history_steps))
+    places = np.random.default_rng(seed).integers(len(windows), size=5)
+    assert_same(windows.batch(places, history), loop(windows, episodes, places, history))
+    assert_same(windows.batch(places), loop(windows, episodes, places, windows.history_steps))
 
 
 @settings(max_examples=40)
@@ -140,12 +140,12 @@ def test_resident_windows_are_windows(drawn: dict[str, Any], seed: int, longer: 
     """Padded to a shape that depends on nothing that was drawn."""
     windows, _, history = store(drawn)
     resident = ResidentWindows([windows], CPU)
-    rows = np.random.default_rng(seed).integers(len(windows), size=5)
+    places = np.random.default_rng(seed).integers(len(windows), size=5)
     time = history + windows.horizon_steps + longer
-    batch = resident.batch(torch.from_numpy(rows), history, time)
+    batch = resident.batch(torch.from_numpy(places), history, time)
     assert batch.valid.shape == (5, time, resident.agents)
-    assert_same(batch, padded(windows.batch(rows, history), time, resident.agents))
-    assert resident.batch(torch.from_numpy(rows), history).valid.shape[1] == history + windows.horizon_steps
+    assert_same(batch, padded(windows.batch(places, history), time, resident.agents))
+    assert resident.batch(torch.from_numpy(places), history).valid.shape[1] == history + windows.horizon_steps
     assert len(resident) == len(windows)
 
 
@@ -155,9 +155,9 @@ def test_sizes_are_those_of_the_windows(drawn: dict[str, Any]):
     windows, episodes, _ = store(drawn)
     sizes = window_sizes(windows)
     assert sizes.shape == (len(windows),)
-    for row, (episode, now) in enumerate(windows.index.tolist()):
+    for window, (episode, now) in enumerate(windows.index.tolist()):
         cut = cut_one(episodes[episode], windows.spec, now, windows.history_steps, windows.horizon_steps)
-        assert sizes[row] == len(cut.columns)
+        assert sizes[window] == len(cut.columns)
 
 
 @pytest.mark.parametrize("labelled", [(True, True), (True, False)], ids=["all_labelled", "some_labelled"])
@@ -167,10 +167,10 @@ def test_resident_windows_of_two_stores_are_numbered_store_by_store(labelled: tu
         episodes = [random_episode(10 * i + j, 5 + i, 2 + i + j, True, 1 if known else None) for j in range(3)]
         stores.append(Windows(episodes, spec(), 3, 2))
     resident = ResidentWindows(stores, CPU)
-    rows = [np.array([0, 3, 7]), np.array([1, 2])]
-    expected = concatenate([w.batch(r) for w, r in zip(stores, rows, strict=True)])
+    places = [np.array([0, 3, 7]), np.array([1, 2])]
+    expected = concatenate([w.batch(r) for w, r in zip(stores, places, strict=True)])
     batch = resident.batch(
-        torch.from_numpy(np.concatenate([r + o for r, o in zip(rows, resident.offsets, strict=True)]))
+        torch.from_numpy(np.concatenate([r + o for r, o in zip(places, resident.offsets, strict=True)]))
     )
     assert_same(batch, padded(expected, 5, resident.agents))
     assert (batch.edge_types is not None) == all(labelled)
@@ -189,7 +189,7 @@ def test_an_ego_that_leaves_is_found_when_windows_move_to_the_device():
 
 
 def test_bytes_are_those_of_the_tensors():
-    """64 entries and the one that is nobody, of 4 floats and 2 marks; one label for each of 16 pairs, and unknown."""
+    """64 entries and the one of padding, of 4 floats and 2 marks; one label for each of 16 pairs, and unknown."""
     windows = Windows([random_episode(0, 16, 4, True, 1)], spec(), 3, 1)
     sizes, labels = 65 * (4 * 4 + 2) + 3 * 8, 17 * (1 + 2 * 4) + 2 * (8 + 1)
     assert windows.flat.num_bytes == sizes + labels
@@ -198,16 +198,16 @@ def test_bytes_are_those_of_the_tensors():
 
 
 def test_a_window_without_anybody():
-    """Nobody is seen, and nobody is an ego: a batch without columns."""
-    nobody = Episode(np.zeros((3, 2, 4), np.float32), np.zeros((3, 2), np.bool_), np.arange(2))
-    windows = Windows([nobody], spec(has_ego=False), 2, 1)
+    """Without a visible agent and without an ego, a batch has no columns."""
+    unseen = Episode(np.zeros((3, 2, 4), np.float32), np.zeros((3, 2), np.bool_), np.arange(2))
+    windows = Windows([unseen], spec(has_ego=False), 2, 1)
     assert windows.batch(np.array([0, 1])).states.shape == (2, 3, 0, 4)
-    empty = replace(nobody, states=nobody.states[:, :0], valid=nobody.valid[:, :0], ids=nobody.ids[:0])
+    empty = replace(unseen, states=unseen.states[:, :0], valid=unseen.valid[:, :0], ids=unseen.ids[:0])
     assert Windows([empty], spec(has_ego=False), 2, 1).batch(np.array([1])).valid.shape == (1, 3, 0)
 
 
 def test_absent_agents_hide_what_their_states_hold():
-    """A store may have anything where nobody is."""
+    """A store may have any value where no agent is."""
     episode = random_episode(0, 4, 3, True, None)
     episode.valid[:, 1] = False
     episode.states[:, 1] = np.nan

@@ -66,7 +66,7 @@ def test_distance_is_in_the_plane():
     assert visible(episode, spec(perception_m=4.99)).tolist() == [[True, False]]
 
 
-def test_without_an_ego_everyone_is_seen():
+def test_without_an_ego_all_agents_are_seen():
     episode = along_x([0.0, None], [1000.0, 1000.0])
     assert visible(episode, spec(has_ego=False)).tolist() == [[True, True], [False, True]]
 
@@ -137,9 +137,9 @@ def test_windows_against_a_loop(
     episodes = [random_episode(seed + i, steps, 5) for i, steps in enumerate((6, 3))]
     windows = Windows(episodes, layout, history_steps, horizon_steps)
     batch = windows.batch(np.arange(len(windows)))
-    for row, (number, now) in enumerate(windows.index.tolist()):
+    for window, (number, now) in enumerate(windows.index.tolist()):
         episode, begin = episodes[number], max(0, now - history_steps + 1)
-        assert batch.last_observed[row] == now - begin
+        assert batch.last_observed[window] == now - begin
         expected = {}
         for agent in range(5):
             track = np.full((batch.states.shape[1], 4), np.nan)
@@ -149,13 +149,15 @@ def test_windows_against_a_loop(
                     track[t - begin] = episode.states[t, agent]
             if np.isfinite(track[: now - begin + 1]).any():
                 expected[track.tobytes()] = agent
-        tracks = np.where(batch.valid[row, :, :, None].numpy(), batch.states[row].numpy(), np.nan).astype(np.float64)
+        tracks = np.where(batch.valid[window, :, :, None].numpy(), batch.states[window].numpy(), np.nan).astype(
+            np.float64
+        )
         ours = [
             tracks[:, column].tobytes() for column in range(tracks.shape[1]) if np.isfinite(tracks[:, column]).any()
         ]
         assert sorted(ours) == sorted(expected)
         assert expected[ours[0]] == 0  # the ego is column 0
-        assert not batch.states[row][~batch.valid[row]].any()
+        assert not batch.states[window][~batch.valid[window]].any()
 
 
 def sees(episode: Episode, layout: SceneSpec, t: int, agent: int) -> bool:
@@ -198,7 +200,7 @@ def test_episodes_without_a_window_are_refused(episodes: list[Episode], message:
 
 
 def test_a_batch_may_have_a_shorter_history():
-    """As if the windows had been made with it: what was before is not there, and nobody who was seen then only."""
+    """As if the windows had been made with it: what was before is not there, nor is any agent seen only then."""
     episode = along_x([float(t) for t in range(6)], [3.0, 50.0, 50.0, 50.0, 50.0, 50.0])
     windows = Windows([episode], spec(perception_m=10.0), history_steps=4, horizon_steps=1)
     long, short = windows.batch(np.array([0, 3])), windows.batch(np.array([0, 3]), history_steps=2)
@@ -255,22 +257,22 @@ def test_labels_follow_their_agents(seed: int, per_step: bool, history_steps: in
     windows = Windows(episodes, layout, history_steps, horizon_steps=2)
     batch = windows.batch(np.arange(len(windows)), shorter)
     assert batch.edge_types is not None and batch.edge_attributes is not None
-    for row, (number, now) in enumerate(windows.index.tolist()):
+    for window, (number, now) in enumerate(windows.index.tolist()):
         episode, begin = episodes[number], max(0, now - (shorter or history_steps) + 1)
         who = {}  # agents by their column, recognised by their states
         for column, agent in product(range(batch.valid.shape[2]), range(5)):
-            steps = batch.valid[row, :, column].nonzero()[:, 0]
+            steps = batch.valid[window, :, column].nonzero()[:, 0]
             if len(steps) and all(
-                np.array_equal(batch.states[row, t, column].numpy(), episode.states[begin + t, agent])
+                np.array_equal(batch.states[window, t, column].numpy(), episode.states[begin + t, agent])
                 for t in steps.tolist()
             ):
                 who[column] = agent
         for t, i, j in product(range(batch.valid.shape[1]), *(range(batch.valid.shape[2]),) * 2):
-            known = bool(batch.valid[row, t, i] and batch.valid[row, t, j]) and i != j
+            known = bool(batch.valid[window, t, i] and batch.valid[window, t, j]) and i != j
             code = 10 * who[i] + who[j] + 100 * (begin + t) * per_step if known else -1
-            assert batch.edge_types[row, t, i, j] == code
+            assert batch.edge_types[window, t, i, j] == code
             expected = [code / 2, -code] if known else [0.0, 0.0]
-            assert batch.edge_attributes[row, t, i, j].tolist() == expected
+            assert batch.edge_attributes[window, t, i, j].tolist() == expected
 
 
 def test_windows_without_labels_have_none():
@@ -287,7 +289,7 @@ def test_labels_move_with_the_batch():
 # --- Joining and splitting --------------------------------------------------------------------------------------------
 
 
-def test_concatenation_pads_and_keeps_every_row():
+def test_concatenation_pads_and_keeps_every_window():
     small = only(Windows([along_x([0.0, 1.0, 2.0])], spec(), 1, 1), 0, 1)
     wide = only(Windows([along_x([5.0] * 6, [6.0] * 6)], spec(), 3, 2), 2)
     joined = concatenate([small, wide])

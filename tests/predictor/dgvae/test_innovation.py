@@ -78,9 +78,9 @@ def test_against_a_loop(rounds: int, seed: int, share: float):
     inputs, memory = drawn(seed, BATCH, AGENTS, INPUTS), drawn(seed + 1, BATCH, AGENTS, AGENTS, MEMORY)
     pairs = pair_mask(random_presence(seed, BATCH, AGENTS, ego=False, share=share))
     ours = corrections(innovation, memory, inputs, pairs)
-    for row in range(BATCH):
-        expected = loop(innovation, memory[row], inputs[row], pairs[row])
-        torch.testing.assert_close(ours[row][pairs[row]], expected[pairs[row]], rtol=0, atol=1e-10)
+    for scene in range(BATCH):
+        expected = loop(innovation, memory[scene], inputs[scene], pairs[scene])
+        torch.testing.assert_close(ours[scene][pairs[scene]], expected[pairs[scene]], rtol=0, atol=1e-10)
 
 
 def test_hand_computed():
@@ -114,7 +114,7 @@ def test_hand_computed():
 
 @pytest.mark.parametrize("rounds", [1, 2])
 def test_masked_pairs_contribute_nothing(rounds: int):
-    """Whatever an absent agent shows and whatever its pairs remember, nobody else's memory feels it; nor do copies of
+    """Whatever an absent agent shows and whatever its pairs remember, no other memory changes; nor do copies of
     oneself."""
     innovation = block(rounds)
     valid = torch.tensor([[True, True, False, True], [True, False, False, True]])

@@ -95,9 +95,11 @@ def test_streaming_forecasts_what_the_window_does(
     states = random_states(seed, BATCH, TIME, AGENTS, 4)
     window = window_without_noise(forecaster, states, valid, torch.tensor(last_observed))
     beliefs = [belief for _, belief in stream(forecaster, states, valid)]
-    for row, t in enumerate(last_observed):
+    for index, t in enumerate(last_observed):
         streamed = forecaster.rollout(beliefs[t], forecaster.horizon_steps)
-        torch.testing.assert_close(streamed[row, 0], window.rollout[row], rtol=1e-5, atol=1e-4)  # positions: tens of m
+        torch.testing.assert_close(
+            streamed[index, 0], window.rollout[index], rtol=1e-5, atol=1e-4
+        )  # positions: tens of m
 
 
 def test_streaming_in_two_stretches_equals_one():
@@ -432,14 +434,14 @@ def test_samples_depend_on_the_generator_alone(belief: Belief):
     assert (one[:, 1:] - other[:, 1:]).abs().amax((2, 3, 4)).min() > 1e-4
 
 
-def test_samples_differ_from_each_other_and_between_rows(belief: Belief):
+def test_samples_differ_from_each_other_and_between_scenes(belief: Belief):
     drawn = model(num_edge_types=3).rollout(belief, 3, 5, torch.Generator().manual_seed(0))
     distance = (drawn[:, :, None] - drawn[:, None]).abs().amax((-1, -2, -3)) + torch.eye(5)
     assert distance.min() > 1e-4
 
 
-def test_samples_belong_to_their_row(belief: Belief):
-    """Without noise every sample of a row is that row's own expected forecast, so rows and samples are not mixed up."""
+def test_samples_belong_to_their_scene(belief: Belief):
+    """Without noise every sample of a scene is its own expected forecast, so scenes and samples are not mixed up."""
     forecaster = model(num_edge_types=3)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dgvae, "concrete_sample", lambda logits, *_: torch.softmax(logits, dim=-1))

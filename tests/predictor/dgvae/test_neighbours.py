@@ -1,7 +1,7 @@
 """Neighbour lists, frozen roll-outs, and variants of a network that switch them on.
 
-With room for everyone, a neighbour list is the dense model; with less, it is the dense model under the mask of who is
-near, which is what the training window computes.
+With room for all agents, a neighbour list is the dense model; with less, the dense model under the mask of near ones,
+which is what the training window computes.
 """
 
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ from predictor.dgvae import model as dgvae
 from predictor.dgvae.networks import Decoder, DGVAEConfig
 from predictor.dgvae.packing import Packed
 from predictor.forecaster import Belief, Memory, WindowOutput
-from predictor.graph import NOBODY, others, pair_mask
+from predictor.graph import NO_AGENT, others, pair_mask
 from predictor.online import OnlineForecaster
 from predictor.scene import PADDING_ID, Forecast, Scene
 from predictor.support.errors import UserError
@@ -38,8 +38,8 @@ from tests.predictor.helpers import (
     scene,
     spec,
 )
-from tests.predictor.test_online import AGENTS as ROWS_OF_A_SCENE
-from tests.predictor.test_online import ROWS, Streams, assert_same, reference, rows_of
+from tests.predictor.test_online import AGENTS as AGENTS_OF_A_SCENE
+from tests.predictor.test_online import ENVS, Streams, assert_same, envs_of, reference
 from tests.predictor.test_online import scenes as any_scenes
 
 BATCH, TIME, AGENTS, HORIZON = 2, 5, 5, 4
@@ -88,7 +88,7 @@ def stream(forecaster: DGVAE, states: Tensor, valid: Tensor) -> Iterator[tuple[M
 
 @torch.no_grad()
 def streamed(forecaster: DGVAE, states: Tensor, valid: Tensor) -> dict[str, Tensor]:
-    """Time axis second; agents (and pairs of them) follow it. Where an absent agent would go is nobody's business."""
+    """Time axis second; agents (and pairs of them) follow it. States of absent agents are not compared."""
     beliefs = [belief for _, belief in stream(forecaster, states, valid)]
     dense = [belief.dense() for belief in beliefs]
     return {
@@ -114,21 +114,21 @@ def same(ours: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
         torch.testing.assert_close(ours[name], values, **EXACT, msg=lambda m, n=name: f"{n}: {m}")
 
 
-# --- Room for everyone ------------------------------------------------------------------------------------------------
+# --- Room for all agents ----------------------------------------------------------------------------------------------
 
 
 @every_config
 @pytest.mark.parametrize("near", [AGENTS - 1, AGENTS, AGENTS + 3])
 @settings(max_examples=4)
 @given(valid=presence(), seed=seeds)
-def test_with_room_for_everyone_it_is_the_dense_model(name: str, near: int, valid: Tensor, seed: int):
+def test_with_room_for_all_agents_it_is_the_dense_model(name: str, near: int, valid: Tensor, seed: int):
     states = scenes(seed)
     same(streamed(precise(name, near), states, valid), streamed(precise(name), states, valid))
 
 
 @every_config
 @pytest.mark.parametrize("near", [AGENTS - 1, AGENTS + 3])
-def test_with_room_for_everyone_training_is_that_of_the_dense_model(name: str, near: int):
+def test_with_room_for_all_agents_training_is_that_of_the_dense_model(name: str, near: int):
     states, valid = scenes(0), random_presence(0, BATCH, TIME, AGENTS)
     ours, expected = (
         precise(name, k).window(states, valid, torch.tensor([2, 3]), HORIZON, torch.Generator().manual_seed(0))
@@ -159,8 +159,8 @@ def test_streaming_is_the_masked_window(name: str, near: int, valid: Tensor, see
 def test_neighbours_matter():
     """Without this, the equalities above would hold for a model in which all, or none, are neighbours."""
     states, valid = scenes(0), torch.ones(BATCH, TIME, AGENTS).bool()
-    everyone, two = (streamed(precise("fast", k), states, valid) for k in (0, 2))
-    for name, values in everyone.items():
+    all_agents, two = (streamed(precise("fast", k), states, valid) for k in (0, 2))
+    for name, values in all_agents.items():
         assert (two[name] - values).abs().max() > 1e-2, name
     assert ((two["features"] != 0).any(-1).sum(-1) == 2).all()
     lists = {tuple(m.senders[0, 0].sort().values.tolist()) for m, _ in stream(precise("fast", 2), states, valid)}
@@ -175,10 +175,10 @@ def standing(*x_m: float) -> Tensor:
 
 
 def remembered(forecaster: DGVAE, *instants: Tensor) -> Memory:
-    everyone = torch.ones(instants[0].shape[:2]).bool()
+    all_agents = torch.ones(instants[0].shape[:2]).bool()
     memory = forecaster.empty_memory(*instants[0].shape[:2])
     for states in instants:
-        memory, _ = forecaster.observe(memory, states, everyone)
+        memory, _ = forecaster.observe(memory, states, all_agents)
     return memory
 
 
@@ -210,10 +210,10 @@ def test_a_pair_that_stays_keeps_its_memory_in_another_slot(context: Any):
     assert before.senders[0, 0].tolist() == [1, 2] and after.senders[0, 0].tolist() == [3, 1]
     torch.testing.assert_close(of_pair(after, 0, 3), of_pair(fresh, 0, 3), **EXACT)
     assert (of_pair(after, 0, 1)[0] - of_pair(fresh, 0, 1)[0]).abs().max() > 1e-2
-    states, everyone = torch.stack([first, second], dim=1), torch.ones(1, 2, 4).bool()
+    states, all_agents = torch.stack([first, second], dim=1), torch.ones(1, 2, 4).bool()
     dense = forecaster.encoder(
-        forecaster.codec.inputs(states, everyone),
-        forecaster._graph_of_window(states, everyone).present,
+        forecaster.codec.inputs(states, all_agents),
+        forecaster._graph_of_window(states, all_agents).present,
         *(torch.zeros(1, 4, 3, 5, dtype=torch.float64),) * 2,
         others(4),
     )
@@ -267,13 +267,13 @@ def test_fewer_agents_than_slots(name: str, agents: int):
     same(everything(precise(name, 4), states, valid), everything(precise(name), states, valid))
 
 
-@pytest.mark.parametrize("present", [0, 1], ids=["nobody", "ego alone"])
+@pytest.mark.parametrize("present", [0, 1], ids=["no agent", "ego alone"])
 def test_without_others_there_are_no_edges(present: int):
     forecaster, states = precise("rich", 2), scenes(0)
     valid = torch.zeros(BATCH, TIME, AGENTS).bool()
     valid[..., :present] = True
     memory, belief = list(stream(forecaster, states, valid))[-1]
-    assert (memory.senders == NOBODY).all() and torch.equal(belief.senders, memory.senders)
+    assert (memory.senders == NO_AGENT).all() and torch.equal(belief.senders, memory.senders)
     assert torch.equal(belief.edge_probs[..., 0], torch.ones(BATCH, AGENTS, 2).double())
     assert not belief.edge_features.any() and not any(m.any() for m in memory.pairs)
     assert not memory.nodes[0][:, present:].any()
@@ -347,8 +347,8 @@ def gradients(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.mark.usefixtures("gradients")
 @pytest.mark.parametrize("frozen", [False, True], ids=["evolving", "frozen"])
-def test_samples_belong_to_their_row(frozen: bool):
-    """Without noise every sample of a row is that row's own expected forecast, along its own neighbours."""
+def test_samples_belong_to_their_scene(frozen: bool):
+    """Without noise every sample of a scene is that scene's own expected forecast, along its own neighbours."""
     forecaster, states = precise("rich", 2, frozen=frozen), scenes(0)
     _, belief = list(stream(forecaster, states, random_presence(0, BATCH, TIME, AGENTS)))[-1]
     with pytest.MonkeyPatch.context() as patch:
@@ -380,31 +380,31 @@ def near_road(near: int) -> DGVAE:
 
 
 class NearStreams(Streams):
-    """Rows sorted anew, agents that come and go, single resets, terminal scenes: as the masked window has it."""
+    """Agents sorted anew, that come and go, single resets, terminal scenes: as the masked window has it."""
 
-    @initialize(near=st.integers(1, 3), first=st.tuples(*[any_scenes()] * ROWS))
+    @initialize(near=st.integers(1, 3), first=st.tuples(*[any_scenes()] * ENVS))
     def begin(self, near: int, first: tuple[Scene, ...]) -> None:
         self.model = near_road(near)
-        self.online = OnlineForecaster(self.model, ROWS, ROWS_OF_A_SCENE)
-        self.histories, self.judged = [[] for _ in range(ROWS)], []
+        self.online = OnlineForecaster(self.model, ENVS, AGENTS_OF_A_SCENE)
+        self.histories, self.judged = [[] for _ in range(ENVS)], []
         self.step(first)
 
     @invariant()
     def forecast_is_that_of_the_whole_history(self) -> None:
         ours = self.online.forecast()
         near = self.model.config.num_neighbours
-        assert ours.senders is not None and ours.senders.shape[1:] == (ROWS_OF_A_SCENE, near)
+        assert ours.senders is not None and ours.senders.shape[1:] == (AGENTS_OF_A_SCENE, near)
         assert len(ours.xy) == len(self.judged)
-        for row, history in enumerate(self.judged):
-            assert_same(rows_of(ours.dense(), [row]), reference(self.model, history), self.tolerance)
+        for env, history in enumerate(self.judged):
+            assert_same(envs_of(ours.dense(), [env]), reference(self.model, history), self.tolerance)
 
 
 TestNearStreams = NearStreams.TestCase
 TestNearStreams.settings = settings(max_examples=6, stateful_step_count=5)
 
 
-def online(near: int, *history: Scene, rows: int = 4) -> Forecast:
-    forecaster = OnlineForecaster(near_road(near), 1, rows)
+def online(near: int, *history: Scene, agents: int = 4) -> Forecast:
+    forecaster = OnlineForecaster(near_road(near), 1, agents)
     for now in history:
         forecaster.observe(batch(now))
     return forecaster.forecast()
@@ -414,7 +414,7 @@ def states_of(seed: int, *ids: int) -> dict[int, Any]:
     return dict(zip(ids, random_states(seed, len(ids), 4).double().tolist(), strict=True))
 
 
-def test_memory_and_neighbours_follow_the_id_when_rows_are_sorted_anew():
+def test_memory_and_neighbours_follow_the_id_when_agents_are_sorted_anew():
     first, second = states_of(0, 0, 3, 7, 11), states_of(1, 0, 3, 7, 11)
     kept = online(1, scene(first, 4), scene(second, 4))
     moved = online(1, scene(first, 4), scene(second, 4, [0, 11, 7, 3]))
@@ -426,17 +426,17 @@ def test_memory_and_neighbours_follow_the_id_when_rows_are_sorted_anew():
     assert (kept.edge_features - online(1, scene(second, 4)).edge_features).abs().max() > 1e-2  # there is a memory
 
 
-def test_empty_columns_hear_nobody():
+def test_empty_places_receive_no_messages():
     """Columns behind the last agent are left out on the way in, and are back on the way out."""
     history = [scene(states_of(t, 0, 3, 7), 3) for t in range(3)]
     wide = [scene(states_of(t, 0, 3, 7), 6, [0, PADDING_ID, 7, 3, PADDING_ID, PADDING_ID]) for t in range(3)]
-    ours, expected, at = online(2, *wide, rows=6), online(2, *history, rows=3), torch.tensor([0, 3, 2])
+    ours, expected, at = online(2, *wide, agents=6), online(2, *history, agents=3), torch.tensor([0, 3, 2])
     assert ours.senders.shape == (1, 6, 2) and ours.edge_probs.shape == (1, 6, 2, 3)
     dense = ours.dense()
     pairs = (t[:, at][:, :, at] for t in (dense.edge_probs, dense.edge_features))
     assert_same(Forecast(ours.xy[:, :, at], *pairs, ours.valid[:, at]), expected.dense())
     for empty in (1, 4, 5):
-        assert (ours.senders[:, empty] == NOBODY).all() and not ours.edge_features[:, empty].any()
+        assert (ours.senders[:, empty] == NO_AGENT).all() and not ours.edge_features[:, empty].any()
         assert torch.equal(ours.edge_probs[:, empty, :, 0], torch.ones(1, 2))
 
 
@@ -444,7 +444,7 @@ def test_a_stream_ten_kilometres_down_the_road():
     """In float32, with more agents than torch.cdist compares one by one."""
     crowd = [scene(states_of(t, *range(30)), 30) for t in range(3)]
     moved = [Scene(s.states + [1e4, 0.0, 0.0, 0.0], s.ids, s.valid) for s in crowd]
-    here, there = online(3, *crowd, rows=30), online(3, *moved, rows=30)
+    here, there = online(3, *crowd, agents=30), online(3, *moved, agents=30)
     assert torch.equal(here.senders, there.senders)
     assert_same(there.dense(), here.dense(), tolerance=1e-5)
 
@@ -453,7 +453,7 @@ def test_ego_alone_and_then_not():
     """Memory with no agents but the ego takes in others, and they leave again."""
     alone, crowd = scene(states_of(0, 0), 4), scene(states_of(1, 0, 3, 7, 11), 4)
     forecast = online(2, alone, crowd, alone)
-    assert (forecast.senders == NOBODY).all() and torch.isfinite(forecast.xy).all()
+    assert (forecast.senders == NO_AGENT).all() and torch.isfinite(forecast.xy).all()
     assert_same(online(2, alone, crowd, crowd).dense(), reference(near_road(2), [alone, crowd, crowd]))
 
 

@@ -43,26 +43,26 @@ def test_lengths_are_few_and_little_is_added():
 
 def test_a_change_is_made_to_pairs_that_are_there_alone(valid: Tensor):
     packed, seen = lists(valid), []
-    rows = packed.pack_pairs(torch.rand(BATCH, AGENTS, AGENTS, 2))
+    listed = packed.pack_pairs(torch.rand(BATCH, AGENTS, AGENTS, 2))
     there = int(pair_mask(valid).sum())
-    assert len(rows) > there  # else this shows nothing
+    assert len(listed) > there  # else this shows nothing
 
     def double(pairs: Tensor) -> Tensor:
         seen.append(len(pairs))
         return 2 * pairs
 
-    changed = packed.per_pair(double, rows)
-    assert seen == [there] and len(changed) == len(rows)
-    assert torch.equal(changed[:there], 2 * rows[:there])
+    changed = packed.per_pair(double, listed)
+    assert seen == [there] and len(changed) == len(listed)
+    assert torch.equal(changed[:there], 2 * listed[:there])
 
 
 def test_sums_over_senders_leave_the_filling_out(valid: Tensor):
     packed, pairs = lists(valid), pair_mask(valid)
     edges, weights = torch.rand(BATCH, AGENTS, AGENTS, 2), torch.rand(BATCH, AGENTS, AGENTS, 1)
-    rows, weight = packed.pack_pairs(edges), packed.pack_pairs(weights)[:, 0]
+    listed, weight = packed.pack_pairs(edges), packed.pack_pairs(weights)[:, 0]
     for ours, expected in (
-        (packed.gather(rows), (edges * pairs[..., None]).sum(2)),
-        (packed.gather(rows, weight), (edges * weights * pairs[..., None]).sum(2)),
+        (packed.gather(listed), (edges * pairs[..., None]).sum(2)),
+        (packed.gather(listed, weight), (edges * weights * pairs[..., None]).sum(2)),
         (packed.total(weight), (weights * pairs[..., None]).sum(2)),
         (packed.counts.float(), pairs.sum(2, keepdim=True).float()),
     ):
@@ -79,8 +79,8 @@ def test_repeated_scenes_are_those_of_a_repeated_batch(valid: Tensor):
     assert torch.equal(ours, packed.unpack_nodes(packed.pack_nodes(nodes)).repeat_interleave(3, dim=0))
 
 
-def test_nobody_anywhere():
+def test_no_agents_at_all():
     packed = lists(torch.zeros(2, 3, dtype=torch.bool))
-    rows = packed.pack_pairs(torch.ones(2, 3, 3, 4))
-    assert not packed.unpack_nodes(packed.gather(rows)).any()
-    assert not packed.unpack_pairs(rows).any()
+    listed = packed.pack_pairs(torch.ones(2, 3, 3, 4))
+    assert not packed.unpack_nodes(packed.gather(listed)).any()
+    assert not packed.unpack_pairs(listed).any()

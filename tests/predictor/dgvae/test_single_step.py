@@ -85,7 +85,7 @@ def run(
     """All that observing and rolling out give to the outside: memory and edges after each step, forecasts at the end.
 
     Samples go along graphs that are sharper than the expected ones, and the same each time: who is drawn for in which
-    order is not the same with the modules. Where an absent agent would go is nobody's business.
+    order is not the same with the modules. States of absent agents are not compared.
     """
     states, valid = shown or scenes(dtype=next(forecaster.parameters()).dtype)
     with context(), pytest.MonkeyPatch.context() as patch:
@@ -154,7 +154,7 @@ def test_both_ways_of_doing_without_gradients(name: str):
 @pytest.mark.parametrize("context", WITHOUT_GRADIENTS.values(), ids=WITHOUT_GRADIENTS)
 def test_it_is_used_where_there_are_no_gradients(context: Any, monkeypatch: pytest.MonkeyPatch):
     """Folded once, then one encoder step for each observation and each fed-back prediction."""
-    counts = {"folded": 0, "encode": 0, "drive": 0}
+    counts = {"folded": 0, "encode": 0, "decode": 0}
 
     class Counting(Stepper):
         def __init__(self, *parts: Any) -> None:
@@ -165,17 +165,17 @@ def test_it_is_used_where_there_are_no_gradients(context: Any, monkeypatch: pyte
             counts["encode"] += 1
             return super().encode(*args)
 
-        def drive(self, *args: Any) -> Any:
-            counts["drive"] += 1
-            return super().drive(*args)
+        def decode(self, *args: Any) -> Any:
+            counts["decode"] += 1
+            return super().decode(*args)
 
     monkeypatch.setattr(dgvae, "Stepper", Counting)
     forecaster = made(FAST_LIKE)
     run(forecaster, torch.enable_grad)
-    assert counts == {"folded": 0, "encode": 0, "drive": 0}
+    assert counts == {"folded": 0, "encode": 0, "decode": 0}
     run(forecaster, context)
     fed_back = 2 * (HORIZON - 1)  # along the expected graph, and along drawn ones
-    assert counts == {"folded": 1, "encode": TIME + fed_back, "drive": TIME + fed_back + 1}
+    assert counts == {"folded": 1, "encode": TIME + fed_back, "decode": TIME + fed_back + 1}
 
 
 def test_where_every_slot_is_taken_the_same_graphs_are_drawn():
@@ -440,5 +440,5 @@ def test_layout_of_memory_changes_nothing(name: str):
 
 
 def test_expanded_presence():
-    states, everyone = scenes()[0], torch.ones(1, 1, AGENTS, dtype=torch.bool).expand(BATCH, TIME, AGENTS)
-    same(run(kept(FAST_LIKE), shown=(states, everyone)), run(kept(FAST_LIKE), shown=(states, everyone.clone())))
+    states, all_agents = scenes()[0], torch.ones(1, 1, AGENTS, dtype=torch.bool).expand(BATCH, TIME, AGENTS)
+    same(run(kept(FAST_LIKE), shown=(states, all_agents)), run(kept(FAST_LIKE), shown=(states, all_agents.clone())))

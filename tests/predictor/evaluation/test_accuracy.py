@@ -19,13 +19,13 @@ from tests.predictor.helpers import ROAD, model, random_presence, random_states,
 
 
 def outcome(errors: list[list[list[float]]], valid: list[list[bool]]) -> Outcome:
-    """One row; errors along x as [sample][agent][step], of a truth at the origin."""
+    """One window; errors along x as [sample][agent][step], of a truth at the origin."""
     forecast = torch.zeros(1, *np.shape(errors), 2)
     forecast[0, ..., 0] = torch.tensor(errors)
     return Outcome(forecast, torch.zeros(1, *np.shape(valid), 2), torch.tensor(valid)[None])
 
 
-# Three agents over two rows of different size; the second never has its last step, the third has no step at all.
+# Three agents over two windows of different size; the second never has its last step, the third has no step at all.
 OUTCOMES = [
     outcome([[[1.0, 3.0], [5.0, 9.0]], [[2.0, 6.0], [1.0, 9.0]]], [[True, True], [True, False]]),
     outcome([[[7.0, 7.0]], [[7.0, 7.0]]], [[False, False]]),
@@ -34,51 +34,51 @@ OUTCOMES = [
 
 
 def test_summary_closed_form():
-    row = summarise("model", OUTCOMES, std_m=(1.0, 2.0))
-    assert (row.name, row.num_samples, row.agents) == ("model", 2, 2)
-    assert row.min_ade_m == pytest.approx((2.0 + 1.0) / 2)  # of agents whose truth is known throughout
-    assert row.min_fde_m == pytest.approx((3.0 + 0.0) / 2)
-    assert row.by_step_m == pytest.approx([(1 + 1 + 2) / 3, (3 + 0) / 2])  # of each agent's best sample
+    accuracy = summarise("model", OUTCOMES, std_m=(1.0, 2.0))
+    assert (accuracy.name, accuracy.num_samples, accuracy.agents) == ("model", 2, 2)
+    assert accuracy.min_ade_m == pytest.approx((2.0 + 1.0) / 2)  # of agents whose truth is known throughout
+    assert accuracy.min_fde_m == pytest.approx((3.0 + 0.0) / 2)
+    assert accuracy.by_step_m == pytest.approx([(1 + 1 + 2) / 3, (3 + 0) / 2])  # of each agent's best sample
     # of the samples' mean: 1.5, 3 and 3 at the first step, 4.5 and 0 at the second
-    assert row.rmse_m == pytest.approx([math.sqrt((1.5**2 + 9 + 9) / 3), math.sqrt(4.5**2 / 2)])
+    assert accuracy.rmse_m == pytest.approx([math.sqrt((1.5**2 + 9 + 9) / 3), math.sqrt(4.5**2 / 2)])
 
     def nll(first: float, second: float, std: float) -> float:
         halves = (math.exp(-(e**2) / (2 * std**2)) / (2 * math.pi * std**2) for e in (first, second))
         return -math.log(sum(halves) / 2)
 
-    assert row.nll == pytest.approx(
+    assert accuracy.nll == pytest.approx(
         [(nll(1, 2, 1) + nll(5, 1, 1) + nll(4, 2, 1)) / 3, (nll(3, 6, 2) + nll(0, 0, 2)) / 2], rel=1e-5
     )
 
 
 def test_joint_and_overall_numbers_closed_form():
-    row = summarise("model", OUTCOMES)
+    accuracy = summarise("model", OUTCOMES)
     # the agents known throughout are one per scene here: the first of the first scene, that of the third
-    assert (row.scenes, row.axes) == (2, 2)
-    assert row.min_joint_ade_m == pytest.approx((2.0 + 1.0) / 2)
-    assert row.min_joint_fde_m == pytest.approx((3.0 + 0.0) / 2)
-    assert row.miss_rate == pytest.approx(0.5)  # 3 m misses, 0 m does not
-    assert row.overall_rmse_m == pytest.approx(math.sqrt((1.5**2 + 9 + 9 + 4.5**2 + 0) / 5))
-    assert row.rmse_per_axis_m == pytest.approx(row.overall_rmse_m / math.sqrt(2))
+    assert (accuracy.scenes, accuracy.axes) == (2, 2)
+    assert accuracy.min_joint_ade_m == pytest.approx((2.0 + 1.0) / 2)
+    assert accuracy.min_joint_fde_m == pytest.approx((3.0 + 0.0) / 2)
+    assert accuracy.miss_rate == pytest.approx(0.5)  # 3 m misses, 0 m does not
+    assert accuracy.overall_rmse_m == pytest.approx(math.sqrt((1.5**2 + 9 + 9 + 4.5**2 + 0) / 5))
+    assert accuracy.rmse_per_axis_m == pytest.approx(accuracy.overall_rmse_m / math.sqrt(2))
     assert summarise("model", OUTCOMES, miss_threshold_m=3.0).miss_rate == 0.0
 
 
 def test_one_sample_serves_all_agents_of_a_scene():
     both = outcome([[[1.0, 1.0], [5.0, 5.0]], [[4.0, 4.0], [3.0, 3.0]]], [[True, True], [True, True]])
-    row = summarise("model", [both])
-    assert row.min_ade_m == pytest.approx((1 + 3) / 2)
-    assert row.min_joint_ade_m == row.min_joint_fde_m == pytest.approx((1 + 5) / 2)
+    accuracy = summarise("model", [both])
+    assert accuracy.min_ade_m == pytest.approx((1 + 3) / 2)
+    assert accuracy.min_joint_ade_m == accuracy.min_joint_fde_m == pytest.approx((1 + 5) / 2)
 
 
 def test_agents_known_in_part_count_where_asked_for():
     tally = Tally(partial_agents=True)
     for o in OUTCOMES:
         tally.add(o)
-    row = tally.accuracy("model")
-    assert row.agents == 3
-    assert row.min_ade_m == pytest.approx((2.0 + 1.0 + 1.0) / 3)  # the second agent: 1 m at its only step
-    assert row.min_fde_m == pytest.approx((3.0 + 0.0) / 2)
-    assert row.by_step_m == summarise("model", OUTCOMES).by_step_m
+    accuracy = tally.accuracy("model")
+    assert accuracy.agents == 3
+    assert accuracy.min_ade_m == pytest.approx((2.0 + 1.0 + 1.0) / 3)  # the second agent: 1 m at its only step
+    assert accuracy.min_fde_m == pytest.approx((3.0 + 0.0) / 2)
+    assert accuracy.by_step_m == summarise("model", OUTCOMES).by_step_m
 
 
 def gaussian(seed: int, samples: int = 20, windows: int = 400, spread: float = 1.0, axes: int = 2) -> Outcome:
@@ -100,28 +100,28 @@ def test_coverage_says_whether_the_samples_are_spread_like_the_truth():
 
 @pytest.mark.parametrize("samples", [1, 8])
 def test_too_few_samples_have_no_coverage(samples: int):
-    row = summarise("a", [gaussian(0, samples)])
-    assert row.coverage == [] and "coverage" not in row.statistics and "coverage" not in row.step_errors
+    accuracy = summarise("a", [gaussian(0, samples)])
+    assert accuracy.coverage == [] and "coverage" not in accuracy.statistics and "coverage" not in accuracy.step_errors
 
 
 def test_statistics_are_those_of_the_subsets():
     """Against plain loops over the same subsets."""
     whole = gaussian(0, samples=4, windows=90)
-    row = summarise("a", [whole])
+    accuracy = summarise("a", [whole])
     parts = np.array_split(np.random.default_rng(0).permutation(90), 20)
-    rows = [summarise("a", [Outcome(whole.forecast[p], whole.future[p], whole.valid[p])]) for p in parts]
+    of_parts = [summarise("a", [Outcome(whole.forecast[p], whole.future[p], whole.valid[p])]) for p in parts]
     names = ("min_ade_m", "min_fde_m", "min_joint_ade_m", "min_joint_fde_m", "miss_rate", "overall_rmse_m")
-    assert set(row.statistics) == set(names)
+    assert set(accuracy.statistics) == set(names)
     for name in names:
-        values = [getattr(r, name) for r in rows]
-        found = row.statistics[name]
+        values = [getattr(r, name) for r in of_parts]
+        found = accuracy.statistics[name]
         assert found.mean == pytest.approx(np.mean(values), rel=1e-5)
         assert found.standard_error == pytest.approx(np.std(values, ddof=1) / math.sqrt(20), rel=1e-4)
         assert found.subsets == 20
     for name in ("by_step_m", "rmse_m"):
         for step in range(2):
-            values = [getattr(r, name)[step] for r in rows]
-            assert row.step_errors[name][step] == pytest.approx(np.std(values, ddof=1) / math.sqrt(20), rel=1e-4)
+            values = [getattr(r, name)[step] for r in of_parts]
+            assert accuracy.step_errors[name][step] == pytest.approx(np.std(values, ddof=1) / math.sqrt(20), rel=1e-4)
 
 
 def test_rows_on_the_same_windows_have_the_same_subsets():
@@ -134,9 +134,9 @@ def test_rows_on_the_same_windows_have_the_same_subsets():
 
 
 def test_one_window_has_no_standard_error():
-    row = summarise("a", [OUTCOMES[0]])
-    assert row.statistics["min_ade_m"] == Statistic(2.0, None, 1)
-    assert row.step_errors["by_step_m"] == [None, None]
+    accuracy = summarise("a", [OUTCOMES[0]])
+    assert accuracy.statistics["min_ade_m"] == Statistic(2.0, None, 1)
+    assert accuracy.step_errors["by_step_m"] == [None, None]
 
 
 def tallied(outcomes: list[Outcome], batch_intervals: bool = True) -> Accuracy:
@@ -148,34 +148,36 @@ def tallied(outcomes: list[Outcome], batch_intervals: bool = True) -> Accuracy:
 
 def test_intervals_over_batches_closed_form():
     """Two of the three batches count something: the intervals end at what each of them says alone."""
-    row = tallied(OUTCOMES)
-    assert row.intervals["min_ade_m"] == pytest.approx((1.0, 2.0))
-    assert row.intervals["min_fde_m"] == pytest.approx((0.0, 3.0))
-    assert row.intervals["miss_rate"] == (0.0, 1.0)
-    assert row.intervals["overall_rmse_m"] == pytest.approx((math.sqrt(9 / 2), math.sqrt((1.5**2 + 9 + 4.5**2) / 3)))
-    assert row.step_intervals["by_step_m"] == [pytest.approx((1.0, 2.0)), pytest.approx((0.0, 3.0))]
-    assert row.step_intervals["rmse_m"] == [
+    accuracy = tallied(OUTCOMES)
+    assert accuracy.intervals["min_ade_m"] == pytest.approx((1.0, 2.0))
+    assert accuracy.intervals["min_fde_m"] == pytest.approx((0.0, 3.0))
+    assert accuracy.intervals["miss_rate"] == (0.0, 1.0)
+    assert accuracy.intervals["overall_rmse_m"] == pytest.approx(
+        (math.sqrt(9 / 2), math.sqrt((1.5**2 + 9 + 4.5**2) / 3))
+    )
+    assert accuracy.step_intervals["by_step_m"] == [pytest.approx((1.0, 2.0)), pytest.approx((0.0, 3.0))]
+    assert accuracy.step_intervals["rmse_m"] == [
         pytest.approx((math.sqrt((1.5**2 + 9) / 2), 3.0)),
         pytest.approx((0.0, 4.5)),
     ]
-    assert len(row.step_intervals["nll"]) == 2
+    assert len(accuracy.step_intervals["nll"]) == 2
     alone = [tallied([o]) for o in (OUTCOMES[0], OUTCOMES[2])]
-    assert row.step_intervals["nll"][0] == pytest.approx(sorted(one.nll[0] for one in alone))
+    assert accuracy.step_intervals["nll"][0] == pytest.approx(sorted(one.nll[0] for one in alone))
 
 
 def test_equal_batches_have_intervals_without_width():
-    row = tallied([gaussian(0, windows=20)] * 3)
-    for name, (low, high) in row.intervals.items():
-        whole = np.mean(row.coverage) if name == "coverage" else getattr(row, name)
+    accuracy = tallied([gaussian(0, windows=20)] * 3)
+    for name, (low, high) in accuracy.intervals.items():
+        whole = np.mean(accuracy.coverage) if name == "coverage" else getattr(accuracy, name)
         assert low == pytest.approx(high) == pytest.approx(whole, rel=1e-2)
-    for name, found in row.step_intervals.items():
-        assert found == [pytest.approx((value, value)) for value in getattr(row, name)]
+    for name, found in accuracy.step_intervals.items():
+        assert found == [pytest.approx((value, value)) for value in getattr(accuracy, name)]
 
 
 def test_one_batch_has_no_interval():
-    row = tallied([gaussian(0)])
-    assert row.intervals == {}
-    assert all(found == [None, None] for found in row.step_intervals.values())
+    accuracy = tallied([gaussian(0)])
+    assert accuracy.intervals == {}
+    assert all(found == [None, None] for found in accuracy.step_intervals.values())
     assert tallied(OUTCOMES, batch_intervals=False).intervals == {}
     assert tallied(OUTCOMES, batch_intervals=False).step_intervals == {}
 
@@ -222,14 +224,14 @@ def test_an_iterator_is_enough_and_forecasts_are_not_kept():
     assert sum(a.size for a in kept) < 3 * 50 * 2 * 20  # far fewer numbers than the 240 per window of a forecast
 
 
-def test_outcomes_of_different_shape_are_no_row():
+def test_outcomes_of_different_shape_are_refused():
     tally = Tally()
     tally.add(gaussian(0, samples=3))
     with pytest.raises(ValueError, match=r"same samples, horizon and axes \(3, 2, 2\), got \(4, 2, 2\)"):
         tally.add(gaussian(0, samples=4))
 
 
-def test_no_outcome_is_no_row():
+def test_no_outcome_is_refused():
     with pytest.raises(ValueError, match="an accuracy needs at least one outcome, got none"):
         summarise("a", [])
     with pytest.raises(ValueError, match="a spread needs at least one outcome, got none"):
@@ -237,20 +239,20 @@ def test_no_outcome_is_no_row():
 
 
 def test_three_axes():
-    row = summarise("a", [gaussian(0, axes=3)], (1.0, 1.0))
-    assert row.axes == 3
-    assert row.rmse_per_axis_m == pytest.approx(row.overall_rmse_m / math.sqrt(3))
-    assert row.overall_rmse_m == pytest.approx(math.sqrt(3 * (1 + 1 / 20)), rel=0.03)
+    accuracy = summarise("a", [gaussian(0, axes=3)], (1.0, 1.0))
+    assert accuracy.axes == 3
+    assert accuracy.rmse_per_axis_m == pytest.approx(accuracy.overall_rmse_m / math.sqrt(3))
+    assert accuracy.overall_rmse_m == pytest.approx(math.sqrt(3 * (1 + 1 / 20)), rel=0.03)
     first = gaussian(0, samples=1, axes=3)
     assert fitted_std_m([first]) == pytest.approx([math.sqrt(2)] * 2, rel=0.05)
 
 
 def test_numbers_are_those_of_the_metrics():
     o = gaussian(0, samples=5)
-    row, whole = summarise("a", [o]), o.valid & o.valid.all(-1, keepdim=True)
+    accuracy, whole = summarise("a", [o]), o.valid & o.valid.all(-1, keepdim=True)
     for name, metric in (("min_joint_ade_m", metrics.min_joint_ade), ("miss_rate", metrics.miss_rate)):
         value, known = metric(o.forecast, o.future, whole)
-        assert getattr(row, name) == pytest.approx(value[known].mean().item(), rel=1e-5)
+        assert getattr(accuracy, name) == pytest.approx(value[known].mean().item(), rel=1e-5)
 
 
 def test_order_of_batches_does_not_matter():
@@ -260,11 +262,17 @@ def test_order_of_batches_does_not_matter():
 
 
 def test_nothing_known_is_not_a_perfect_score():
-    row = summarise("model", [OUTCOMES[1]])
-    assert row.agents == row.scenes == 0
-    numbers = (row.min_ade_m, row.min_fde_m, row.min_joint_ade_m, row.min_joint_fde_m, row.miss_rate)
-    assert all(math.isnan(x) for x in (*numbers, row.overall_rmse_m, *row.by_step_m, *row.rmse_m))
-    assert row.statistics == {} and row.coverage == []
+    accuracy = summarise("model", [OUTCOMES[1]])
+    assert accuracy.agents == accuracy.scenes == 0
+    numbers = (
+        accuracy.min_ade_m,
+        accuracy.min_fde_m,
+        accuracy.min_joint_ade_m,
+        accuracy.min_joint_fde_m,
+        accuracy.miss_rate,
+    )
+    assert all(math.isnan(x) for x in (*numbers, accuracy.overall_rmse_m, *accuracy.by_step_m, *accuracy.rmse_m))
+    assert accuracy.statistics == {} and accuracy.coverage == []
 
 
 @pytest.mark.parametrize("std_m", [(), (1.0,)], ids=["none", "too_short"])
@@ -307,21 +315,22 @@ def test_streamed_windows_against_a_loop():
     batch = cut.batch(np.arange(len(cut)))
     ours = run_window_batch(forecaster, batch, horizon_steps=3)
     assert sorted(set(batch.last_observed.tolist())) == [0, 1, 2, 3]
-    for row, last in enumerate(batch.last_observed.tolist()):
+    for window, last in enumerate(batch.last_observed.tolist()):
         memory = forecaster.empty_memory(1, batch.states.shape[2])
         for t in range(last + 1):
-            memory, belief = forecaster.observe(memory, batch.states[row, t][None], batch.valid[row, t][None])
+            memory, belief = forecaster.observe(memory, batch.states[window, t][None], batch.valid[window, t][None])
         expected = forecaster.rollout(belief, 3)[0, ..., :2]
-        now = batch.valid[row, last]
-        torch.testing.assert_close(ours.forecast[row][:, now], expected[:, now], rtol=1e-5, atol=1e-4)
+        now = batch.valid[window, last]
+        torch.testing.assert_close(ours.forecast[window][:, now], expected[:, now], rtol=1e-5, atol=1e-4)
         for agent in range(batch.states.shape[2]):
             for step in range(3):
-                truth, known = batch.states[row, last + 1 + step, agent, :2], batch.valid[row, last + 1 + step, agent]
-                assert torch.equal(ours.future[row, agent, step], truth)
-                assert ours.valid[row, agent, step] == (known and agent > 0)  # the ego is not forecast
+                at = window, last + 1 + step, agent
+                truth, known = batch.states[at][:2], batch.valid[at]
+                assert torch.equal(ours.future[window, agent, step], truth)
+                assert ours.valid[window, agent, step] == (known and agent > 0)  # the ego is not forecast
 
 
-def test_without_an_ego_everyone_is_judged():
+def test_without_an_ego_all_agents_count():
     batch = WindowBatch(random_states(0, 2, 4, 3, 4), torch.ones(2, 4, 3).bool(), torch.tensor([1, 0]))
     assert run_window_batch(model(has_ego=False), batch, 2).valid.all()
 
@@ -332,9 +341,9 @@ def test_straight_motion_is_forecast_by_constant_velocity():
     states[..., :2] = 0.5 * np.arange(6)[:, None, None] * states[..., 2:]
     cut = Windows([Episode(states, np.ones((6, 2), dtype=np.bool_), np.arange(2))], spec(dt_s=0.5), 2, 3)
     outcomes = list(run_windows(ConstantVelocity(spec(dt_s=0.5)), cut, np.arange(len(cut)), 3))
-    row = summarise("constant velocity", outcomes)
-    assert row.min_ade_m == pytest.approx(0.0, abs=1e-5)
-    assert row.agents == 3  # windows at steps 0, 1, 2 have their whole future
+    accuracy = summarise("constant velocity", outcomes)
+    assert accuracy.min_ade_m == pytest.approx(0.0, abs=1e-5)
+    assert accuracy.agents == 3  # windows at steps 0, 1, 2 have their whole future
 
 
 def test_batches_are_aligned_with_the_windows():

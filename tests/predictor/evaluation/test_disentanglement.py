@@ -12,12 +12,12 @@ from sklearn.metrics import r2_score
 from predictor.evaluation.disentanglement import dci, direct_r2, linear_r2, mig, mutual_information
 from predictor.support.errors import UserError
 
-ROWS = 4000
+POINTS = 4000
 
 
-def factors(seed: int = 0, count: int = 3, rows: int = ROWS) -> np.ndarray:
+def factors(seed: int = 0, count: int = 3, points: int = POINTS) -> np.ndarray:
     """Independent, uniform attributes."""
-    return np.random.default_rng(seed).uniform(0.5, 2.0, size=(rows, count))
+    return np.random.default_rng(seed).uniform(0.5, 2.0, size=(points, count))
 
 
 def every(target: np.ndarray) -> np.ndarray:
@@ -74,16 +74,16 @@ def test_linear_r2_reads_out_any_affine_code():
 
 def test_linear_r2_of_features_that_know_nothing_is_about_zero():
     target = factors(count=1)[:, 0]
-    noise = np.random.default_rng(1).normal(size=(ROWS, 16))
+    noise = np.random.default_rng(1).normal(size=(POINTS, 16))
     assert linear_r2(noise, target, every(target)) == pytest.approx(0.0, abs=0.02)
-    # … on the half that it was not fitted on: with few rows it is worse than the mean, not better
+    # … on the half that it was not fitted on: with few points it is worse than the mean, not better
     few = linear_r2(noise[:40], target[:40], every(target[:40]))
     assert few is not None and few < 0
 
 
 def test_linear_r2_is_that_of_the_signal():
     """Feature = target + noise of equal variance: R² of the best read-out is 1/2."""
-    target, noise = np.random.default_rng(0).normal(size=(2, ROWS))
+    target, noise = np.random.default_rng(0).normal(size=(2, POINTS))
     assert linear_r2((target + noise)[:, None], target, every(target)) == pytest.approx(0.5, abs=0.03)
 
 
@@ -103,7 +103,7 @@ def test_linear_r2_is_that_of_the_normal_equations(seed: int):
 
 def test_linear_r2_does_not_mind_copies_and_constants():
     target = factors(count=1)[:, 0]
-    features = np.stack([target, target, np.full(ROWS, 7.0), np.zeros(ROWS)], axis=1)
+    features = np.stack([target, target, np.full(POINTS, 7.0), np.zeros(POINTS)], axis=1)
     assert linear_r2(features, target, every(target)) == pytest.approx(1.0, abs=1e-4)
 
 
@@ -119,15 +119,15 @@ def test_linear_r2_takes_pairs_of_windows_and_keeps_a_window_together():
 
 
 def test_linear_r2_sees_only_what_counts():
-    target = factors(count=1, rows=100)[:, 0]
+    target = factors(count=1, points=100)[:, 0]
     valid = np.random.default_rng(0).random(100) < 0.5
     features = np.where(valid, target, np.nan)[:, None]
     assert linear_r2(features, np.where(valid, target, np.inf), valid) == pytest.approx(1.0, abs=1e-4)
 
 
-@pytest.mark.parametrize("rows", [0, 1, 2, 3])
-def test_linear_r2_of_too_little_is_none(rows: int):
-    target = np.arange(float(rows))
+@pytest.mark.parametrize("points", [0, 1, 2, 3])
+def test_linear_r2_of_too_little_is_none(points: int):
+    target = np.arange(float(points))
     assert linear_r2(target[:, None], target, every(target)) is None
 
 
@@ -149,7 +149,7 @@ def test_dci_of_one_dimension_per_factor(features: np.ndarray, regressor: Any):
 
 @pytest.mark.parametrize("regressor", ["lasso", "forest"])
 def test_dci_of_features_that_know_nothing(regressor: Any):
-    found = dci(np.random.default_rng(1).normal(size=(ROWS, 3)), factors(), regressor)
+    found = dci(np.random.default_rng(1).normal(size=(POINTS, 3)), factors(), regressor)
     assert found.disentanglement == pytest.approx(0.0, abs=0.01)
     assert found.completeness == pytest.approx(0.0, abs=0.01)
     assert found.informativeness is not None and found.informativeness < 0.01
@@ -183,18 +183,18 @@ def test_importance_says_which_dimension_holds_what():
 def test_what_is_true_by_definition_is_not_a_score():
     assert dci(factors(), factors(count=1)).disentanglement is None
     assert dci(factors(count=1), factors()).completeness is None
-    constant = dci(factors(), np.ones((ROWS, 2)))
+    constant = dci(factors(), np.ones((POINTS, 2)))
     assert constant.informativeness is None and constant.disentanglement == 0.0
 
 
 def test_dci_depends_on_the_seed_alone():
-    noisy = factors() + 0.3 * np.random.default_rng(1).normal(size=(ROWS, 3))
+    noisy = factors() + 0.3 * np.random.default_rng(1).normal(size=(POINTS, 3))
     assert dci(noisy, factors(), "forest", seed=1) == dci(noisy, factors(), "forest", seed=1)
     assert dci(noisy, factors(), "forest", seed=1) != dci(noisy, factors(), "forest", seed=2)
 
 
-def test_dci_needs_rows():
-    with pytest.raises(ValueError, match="dci needs at least 4 rows, got 3"):
+def test_dci_needs_points():
+    with pytest.raises(ValueError, match="dci needs at least 4 points, got 3"):
         dci(np.zeros((3, 2)), np.zeros((3, 2)))
 
 
@@ -224,7 +224,7 @@ def test_mig_of_one_dimension_per_factor():
 
 
 def test_mig_of_features_that_know_nothing():
-    assert mig(np.random.default_rng(1).normal(size=(ROWS, 3)), factors()) == pytest.approx(0.0, abs=0.01)
+    assert mig(np.random.default_rng(1).normal(size=(POINTS, 3)), factors()) == pytest.approx(0.0, abs=0.01)
 
 
 def test_mig_of_a_copy_is_zero():
@@ -241,9 +241,9 @@ def test_mig_of_one_dimension_is_its_share_of_the_entropy():
 
 
 def test_factors_that_never_vary_are_left_out():
-    both = np.concatenate([factors(), np.ones((ROWS, 1))], axis=1)
+    both = np.concatenate([factors(), np.ones((POINTS, 1))], axis=1)
     assert mig(factors(), both) == mig(factors(), factors())
-    assert mig(factors(), np.ones((ROWS, 2))) is None
+    assert mig(factors(), np.ones((POINTS, 2))) is None
 
 
 @pytest.mark.parametrize("sides", [2, 5])

@@ -190,9 +190,9 @@ def test_joint_metrics_closed_form(valid: list[list[bool]], ade: float, fde: flo
     assert value.tolist() == pytest.approx([fde]) and counts.tolist() == [True]
 
 
-def test_scene_with_nobody_valid_is_invalid():
-    nobody = torch.zeros(1, 2, 2).bool()
-    assert min_joint_ade(BEST_DIFFERS, ORIGIN, nobody)[1].tolist() == [False]
+def test_scene_without_a_valid_agent_is_invalid():
+    absent = torch.zeros(1, 2, 2).bool()
+    assert min_joint_ade(BEST_DIFFERS, ORIGIN, absent)[1].tolist() == [False]
     gone = torch.tensor([[[True, False], [True, False]]])
     assert min_joint_ade(BEST_DIFFERS, ORIGIN, gone)[1].tolist() == [True]
     assert min_joint_fde(BEST_DIFFERS, ORIGIN, gone)[1].tolist() == [False]
@@ -406,20 +406,22 @@ def test_choosing_jointly_is_never_better(batch: tuple[Tensor, Tensor, Tensor]):
 def test_joint_ade_against_a_loop(batch: tuple[Tensor, Tensor, Tensor]):
     forecast, future, valid = batch
     value, counts = min_joint_ade(forecast, future, valid)
-    for row in range(len(forecast)):
-        there = [a for a in range(forecast.shape[2]) if valid[row, a].any()]
-        assert counts[row] == bool(there)
+    for scene in range(len(forecast)):
+        there = [a for a in range(forecast.shape[2]) if valid[scene, a].any()]
+        assert counts[scene] == bool(there)
         if there:
             errors = [
                 sum(
-                    sum(math.dist(f, t) for f, t, v in zip(*per_agent, strict=True) if v) / int(valid[row, a].sum())
+                    sum(math.dist(f, t) for f, t, v in zip(*per_agent, strict=True) if v) / int(valid[scene, a].sum())
                     for a in there
-                    for per_agent in [(forecast[row, k, a].tolist(), future[row, a].tolist(), valid[row, a].tolist())]
+                    for per_agent in [
+                        (forecast[scene, k, a].tolist(), future[scene, a].tolist(), valid[scene, a].tolist())
+                    ]
                 )
                 / len(there)
                 for k in range(forecast.shape[1])
             ]
-            assert value[row].item() == pytest.approx(min(errors), rel=1e-5)
+            assert value[scene].item() == pytest.approx(min(errors), rel=1e-5)
 
 
 @given(batches, st.sampled_from([0.35, 0.5, 0.6]))
@@ -428,13 +430,13 @@ def test_coverage_against_a_loop(batch: tuple[Tensor, Tensor, Tensor], share: fl
     samples = forecast.shape[1]
     value, counts = coverage(forecast, future, valid, share)
     assert torch.equal(counts, valid & (1 <= share * (samples + 1) <= samples))
-    for row, agent, step in counts.nonzero().tolist():
-        points = forecast[row, :, agent, step].double()
+    for scene, agent, step in counts.nonzero().tolist():
+        points = forecast[scene, :, agent, step].double()
         others = [torch.cat([points[:k], points[k + 1 :]]).mean(0) for k in range(samples)]
         spread = sorted(float((p - o).norm()) for p, o in zip(points, others, strict=True))
         rank = share * (samples + 1)
         below, rest = int(rank), rank - int(rank)
         limit = spread[below - 1] + (rest * (spread[below] - spread[below - 1]) if rest > 1e-9 else 0.0)
-        distance = float((future[row, agent, step].double() - points.mean(0)).norm())
+        distance = float((future[scene, agent, step].double() - points.mean(0)).norm())
         if abs(distance - limit) > 1e-4:
-            assert value[row, agent, step].item() == float(distance < limit)
+            assert value[scene, agent, step].item() == float(distance < limit)

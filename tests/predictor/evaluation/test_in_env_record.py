@@ -39,7 +39,7 @@ def test_everything_that_accuracy_json_says_of_a_checkpoint_is_taken_over():
         "by_step_m": [0.5, 2.0],
         "intervals": {"min_ade_m": [0.5, 1.5]},
     }
-    row = {
+    result = {
         "env_id": "toy-v0", "checkpoint": "toy", "driver": "varied", "dt_s": 0.5, "model": one,
         "model_samples": {"min_ade_m": 0.75}, "constant_velocity": {"min_ade_m": 4.0, "min_fde_m": 8.0},
         "nearest_neighbours": {"min_ade_m": 3.0}, "histories": {"1": one | {"min_ade_m": 1.75}},
@@ -47,7 +47,7 @@ def test_everything_that_accuracy_json_says_of_a_checkpoint_is_taken_over():
     }  # fmt: skip
     content = {
         "config": {"episodes": 6, "samples": 20, "ego": None},
-        "results": [row, row | {"checkpoint": "other"}],
+        "results": [result, result | {"checkpoint": "other"}],
         "provenance": {"command": "python -m envs.evaluate", "commit": "abc"},
     }
     (found,) = measurements_of(json.loads(json.dumps(content)), "toy")

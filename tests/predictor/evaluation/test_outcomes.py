@@ -22,7 +22,7 @@ SOLID = SceneSpec(
 
 @dataclass
 class Marking:
-    """Forecasts, at every step ahead, where everyone is plus 100 per step seen, 10 per step ahead and 1 per sample."""
+    """Forecasts, at every step ahead, the position plus 100 per step seen, 10 per step ahead and 1 per sample."""
 
     spec: SceneSpec
     horizon_steps: int = 3
@@ -46,9 +46,9 @@ class Marking:
         return belief.states[:, None, :, None] + mark + ahead
 
 
-def moving(spec_: SceneSpec, rows: int = 2, steps: int = 6, agents: int = 3) -> Tensor:
+def moving(spec_: SceneSpec, windows: int = 2, steps: int = 6, agents: int = 3) -> Tensor:
     """Everyone is at (step / 10, …) at each step, plus the agent's number / 100."""
-    states = torch.zeros(rows, steps, agents, spec_.num_features)
+    states = torch.zeros(windows, steps, agents, spec_.num_features)
     return states + torch.arange(steps)[:, None, None] / 10 + torch.arange(agents)[:, None] / 100
 
 
@@ -71,19 +71,19 @@ def test_sequence_closed_form(layout: SceneSpec):
 
 def test_histories_of_different_length_end_together():
     layout = spec(has_ego=False)
-    batch = WindowBatch(moving(layout, rows=3), torch.ones(3, 6, 3).bool(), torch.tensor([3, 1, 0]))
+    batch = WindowBatch(moving(layout, windows=3), torch.ones(3, 6, 3).bool(), torch.tensor([3, 1, 0]))
     given = run_sequence_batch(Marking(layout), batch, horizon_steps=2)
     assert given.valid[:, 0].tolist() == [
         [True, True, True, True, True],
         [False, False, True, True, True],
         [False, False, False, True, True],
     ]
-    for row, last in enumerate([3, 1, 0]):
-        alone = WindowBatch(batch.states[row : row + 1], batch.valid[row : row + 1], torch.tensor([last]))
+    for window, last in enumerate([3, 1, 0]):
+        alone = WindowBatch(batch.states[window : window + 1], batch.valid[window : window + 1], torch.tensor([last]))
         expected = run_sequence_batch(Marking(layout), alone, horizon_steps=2)
         steps = last + 2
-        torch.testing.assert_close(given.forecast[row, ..., -steps:, :], expected.forecast[0])
-        torch.testing.assert_close(given.future[row, ..., -steps:, :], expected.future[0])
+        torch.testing.assert_close(given.forecast[window, ..., -steps:, :], expected.forecast[0])
+        torch.testing.assert_close(given.future[window, ..., -steps:, :], expected.future[0])
 
 
 def test_one_step_counts_only_from_seen_to_seen():
@@ -166,12 +166,12 @@ def test_beliefs_are_those_of_the_last_observed_step(whole_sequence: bool):
     batch = cut.batch(indices)
     assert given.present is not None and given.edge_probs is not None and given.edge_features is not None
     assert torch.equal(given.present, batch.valid[torch.arange(len(cut)), batch.last_observed])
-    row = 6
+    window = 6
     memory = forecaster.empty_memory(1, batch.states.shape[2])
-    for t in range(int(batch.last_observed[row]) + 1):
-        memory, belief = forecaster.observe(memory, batch.states[row, t][None], batch.valid[row, t][None])
-    torch.testing.assert_close(given.edge_probs[row], belief.edge_probs[0])
-    torch.testing.assert_close(given.edge_features[row], belief.edge_features[0])
+    for t in range(int(batch.last_observed[window]) + 1):
+        memory, belief = forecaster.observe(memory, batch.states[window, t][None], batch.valid[window, t][None])
+    torch.testing.assert_close(given.edge_probs[window], belief.edge_probs[0])
+    torch.testing.assert_close(given.edge_features[window], belief.edge_features[0])
     assert torch.equal(given.forecast, without.forecast)
     if whole_sequence:
         assert given.tail(3).edge_probs is given.edge_probs

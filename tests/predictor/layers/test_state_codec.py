@@ -15,7 +15,7 @@ from predictor.support.errors import UserError
 from tests.predictor.helpers import random_presence, random_states, spec
 
 SCALES_3D = (10.0, 10.0, 2.0, 5.0, 5.0, 4.0)
-# Two who are there, one who is not: what stands in its row must not matter.
+# Two present agents and an absent one, whose values must not matter.
 PLANE = [[30.0, 5.0, 10.0, 0.0], [40.0, -5.0, 5.0, -5.0], [900.0, 900.0, 9.0, 9.0]]
 SPACE = [[30.0, 5.0, 1.0, 10.0, 0.0, 2.0], [40.0, -5.0, 3.0, 5.0, -5.0, -4.0], [900.0] * 6]
 PRESENT = torch.tensor([True, True, False])
@@ -82,7 +82,7 @@ def test_features_beyond_the_kinematic_ones_are_scaled_only():
     ]
 
 
-def test_nobody_has_no_centroid_and_no_inputs():
+def test_without_agents_there_is_no_centroid_and_no_input():
     inputs = codec("centroid", "centroid").inputs(torch.tensor(PLANE).double(), torch.zeros(3).bool())
     assert torch.equal(inputs, torch.zeros(3, 4).double())
 

@@ -14,13 +14,16 @@ def ax() -> Iterator[Axes]:
     yield Figure().add_subplot()
 
 
-def row(name: str, samples: int, errors: list[float]) -> Accuracy:
+def accuracy(name: str, samples: int, errors: list[float]) -> Accuracy:
     return Accuracy(name, samples, 0.0, 0.0, errors, errors, [], 1)
 
 
 def test_error_curves_are_drawn_over_seconds(ax: Axes):
     assert (
-        plot_error_by_horizon(ax, [row("dG-VAE", 20, [1.0, 2.0]), row("constant velocity", 1, [3.0, 4.0])], 0.5) is ax
+        plot_error_by_horizon(
+            ax, [accuracy("dG-VAE", 20, [1.0, 2.0]), accuracy("constant velocity", 1, [3.0, 4.0])], 0.5
+        )
+        is ax
     )
     model, straight = ax.lines
     assert model.get_xdata().tolist() == straight.get_xdata().tolist() == [0.5, 1.0]

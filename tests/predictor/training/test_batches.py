@@ -16,14 +16,14 @@ from predictor.data.device_windows import ResidentWindows
 from predictor.data.windows import WindowBatch, Windows
 from predictor.dgvae.networks import PRESETS
 from predictor.support.errors import UserError
-from predictor.training import batches as feed_module
+from predictor.training import batches as batches_module
 from predictor.training.batches import (
-    HostFeed,
+    DeviceBatches,
+    HostBatches,
     Plan,
-    PrefetchedFeed,
-    ResidentFeed,
+    PrefetchedBatches,
     Shapes,
-    open_feed,
+    open_batches,
     padding_factor,
     plan,
 )
@@ -61,9 +61,9 @@ def test_plans_are_functions_of_seed_and_step():
     for step in (19, 3, 0):
         again = plan(CONFIG, [10, 20], step)
         for f in fields(Plan):
-            if f.name != "rows":
+            if f.name != "windows":
                 assert getattr(again, f.name) == getattr(plans[step], f.name)
-        assert all(np.array_equal(a, b) for a, b in zip(again.rows, plans[step].rows, strict=True))
+        assert all(np.array_equal(a, b) for a, b in zip(again.windows, plans[step].windows, strict=True))
     assert len({p.dropout_seed for p in plans} | {p.noise_seed for p in plans}) == 40
     assert {p.history_steps for p in plans} == {1, 2, 3, 4}
     other = plan(replace(CONFIG, seed=1), [10, 20], 0)
@@ -71,10 +71,10 @@ def test_plans_are_functions_of_seed_and_step():
 
 
 def test_every_store_gives_its_share():
-    rows = [plan(CONFIG, [10, 1000], step).rows for step in range(50)]
-    assert all(len(a) + len(b) == 6 for a, b in rows)
-    assert sum(len(a) for a, _ in rows) < 20
-    assert all((a < 10).all() and (b < 1000).all() for a, b in rows)
+    drawn = [plan(CONFIG, [10, 1000], step).windows for step in range(50)]
+    assert all(len(a) + len(b) == 6 for a, b in drawn)
+    assert sum(len(a) for a, _ in drawn) < 20
+    assert all((a < 10).all() and (b < 1000).all() for a, b in drawn)
 
 
 def test_rate_warms_up_and_falls_to_2_percent():
@@ -100,7 +100,7 @@ def test_rounding_does_not_exceed_the_longest_history():
 def test_fixed_shapes_only_append_absence(step: int):
     stores, shapes = windows(), Shapes(5, 4, 3)
     now = plan(CONFIG, [len(w) for w in stores], step)
-    loose, fixed = (HostFeed(stores, CPU, s).batch(now) for s in (None, shapes))
+    loose, fixed = (HostBatches(stores, CPU, s).batch(now) for s in (None, shapes))
     time, agents = loose.valid.shape[1:]
     assert fixed.valid.shape == (6, 7, 5)
     assert torch.equal(fixed.states[:, :time, :agents], loose.states)
@@ -120,13 +120,13 @@ def test_padding_factor(agents: list[int], batch_size: int, expected: float):
 
 @pytest.mark.parametrize("shapes", [None, Shapes(3, 4, 3)], ids=["loose", "fixed"])
 @pytest.mark.parametrize("step", range(4))
-def test_resident_feed_gives_the_same_windows(step: int, shapes: Shapes | None):
+def test_device_batches_give_the_same_windows(step: int, shapes: Shapes | None):
     """From two stores, in the same order; without fixed shapes it pads to the widest window of all."""
     stores = windows()
     now = plan(CONFIG, [len(w) for w in stores], step)
     agents = shapes.agents if shapes else None
-    ours = ResidentFeed(ResidentWindows(stores, CPU, agents), CPU, shapes).batch(now)
-    expected = HostFeed(stores, CPU, shapes or Shapes(3, now.history_steps, 3)).batch(now)
+    ours = DeviceBatches(ResidentWindows(stores, CPU, agents), CPU, shapes).batch(now)
+    expected = HostBatches(stores, CPU, shapes or Shapes(3, now.history_steps, 3)).batch(now)
     assert_same(ours, expected)
 
 
@@ -135,7 +135,7 @@ def test_training_on_resident_data_is_training(tmp_path: Path, changes: dict[str
     data = write_circles(tmp_path / "circles")
     settings = TrainConfig((data,), tmp_path / "run", batch_size=16, history_steps=4, horizon_steps=3, **changes)
     host, resident = (Trainer(s, load_data(s)) for s in (settings, replace(settings, data_device="device")))
-    assert isinstance(host.feed, HostFeed) and isinstance(resident.feed, ResidentFeed)
+    assert isinstance(host.batches, HostBatches) and isinstance(resident.batches, DeviceBatches)
     for _ in range(5):
         assert resident.read(resident.train_step()) == pytest.approx(host.read(host.train_step()), rel=1e-6)
 
@@ -153,7 +153,7 @@ def test_what_does_not_fit_is_refused_with_both_sizes():
 # --- One ahead --------------------------------------------------------------------------------------------------------
 
 
-class Watched(HostFeed):
+class Watched(HostBatches):
     """Notes who cuts which batch, and hands it on without a device."""
 
     def __init__(self, stores: list[Windows]) -> None:
@@ -170,19 +170,19 @@ def unpinned(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(WindowBatch, "pinned_to", WindowBatch.to)
 
 
-def prefetched(stores: list[Windows], steps: int = 6) -> tuple[PrefetchedFeed, Watched]:
+def prefetched(stores: list[Windows], steps: int = 6) -> tuple[PrefetchedBatches, Watched]:
     watched = Watched(stores)
-    return PrefetchedFeed(watched, lambda step: plan(CONFIG, [len(w) for w in stores], step), steps), watched
+    return PrefetchedBatches(watched, lambda step: plan(CONFIG, [len(w) for w in stores], step), steps), watched
 
 
 def test_batches_prepared_ahead_are_the_same(unpinned: None):
     stores = windows()
-    feed, watched = prefetched(stores)
+    batches, watched = prefetched(stores)
     for step in range(6):
         now = plan(CONFIG, [len(w) for w in stores], step)
-        assert_same(feed.batch(now), HostFeed(stores, CPU).batch(now))
-    assert feed._next is None  # there is no step after the last
-    feed.close()
+        assert_same(batches.batch(now), HostBatches(stores, CPU).batch(now))
+    assert batches._next is None  # there is no step after the last
+    batches.close()
     assert [step for step, _ in watched.cut] == list(range(6))  # each once
     assert [name.startswith("batches") for _, name in watched.cut] == [False] + [True] * 5
 
@@ -190,33 +190,33 @@ def test_batches_prepared_ahead_are_the_same(unpinned: None):
 def test_a_step_out_of_order_is_cut_at_once(unpinned: None):
     """After a restored state; what was prepared in vain does not matter."""
     stores = windows()
-    feed, _ = prefetched(stores)
+    batches, _ = prefetched(stores)
     for step in (0, 4, 2):
         now = plan(CONFIG, [len(w) for w in stores], step)
-        assert_same(feed.batch(now), HostFeed(stores, CPU).batch(now))
-    feed.close()
+        assert_same(batches.batch(now), HostBatches(stores, CPU).batch(now))
+    batches.close()
 
 
 def test_errors_of_the_thread_arrive(unpinned: None):
     stores = windows()
-    feed, watched = prefetched(stores)
-    feed.batch(plan(CONFIG, [len(w) for w in stores], 0))
-    assert feed._next is not None
-    feed._next[1].result()
+    batches, watched = prefetched(stores)
+    batches.batch(plan(CONFIG, [len(w) for w in stores], 0))
+    assert batches._next is not None
+    batches._next[1].result()
     watched.windows = [None]  # type: ignore[list-item]
-    feed.batch(plan(CONFIG, [len(w) for w in stores], 1))
+    batches.batch(plan(CONFIG, [len(w) for w in stores], 1))
     with pytest.raises((TypeError, AttributeError, ValueError)):
-        feed.batch(plan(CONFIG, [len(w) for w in stores], 2))
-    feed.close()
+        batches.batch(plan(CONFIG, [len(w) for w in stores], 2))
+    batches.close()
 
 
 def test_closing_waits_for_the_thread(unpinned: None, monkeypatch: pytest.MonkeyPatch):
     stores = windows()
-    feed, watched = prefetched(stores)
+    batches, watched = prefetched(stores)
     original = watched.on_host
     monkeypatch.setattr(watched, "on_host", lambda now: (time.sleep(0.05), original(now))[1])
-    feed.batch(plan(CONFIG, [len(w) for w in stores], 0))
-    feed.close()
+    batches.batch(plan(CONFIG, [len(w) for w in stores], 0))
+    batches.close()
     assert not [t for t in threading.enumerate() if t.name.startswith("batches")]
 
 
@@ -232,9 +232,9 @@ def card(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 
     def with_free(free: int) -> None:
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (free, free))
-        resident = feed_module.ResidentWindows
+        resident = batches_module.ResidentWindows
         monkeypatch.setattr(
-            feed_module, "ResidentWindows", lambda stores, _, agents, budget: resident(stores, CPU, agents, budget)
+            batches_module, "ResidentWindows", lambda stores, _, agents, budget: resident(stores, CPU, agents, budget)
         )
 
     return with_free
@@ -246,45 +246,47 @@ def card(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 )
 def test_data_goes_to_the_device_if_it_fits(card: Callable[[int], None], asked: Any, free: int, resident: bool):
     card(free)
-    source = open_feed(replace(CONFIG, data_device=asked), windows(), CUDA)
+    source = open_batches(replace(CONFIG, data_device=asked), windows(), CUDA)
     assert (
         source.capture and source.notes[0] == "steps are captured as CUDA graphs, with 3 agents and histories in eights"
     )
     if resident:
-        assert isinstance(source.feed, ResidentFeed) and source.notes[1] == "windows live on the device (0 MiB)"
-        assert source.feed.shapes == Shapes(3, 4, 3)
+        assert isinstance(source.batches, DeviceBatches) and source.notes[1] == "windows are kept on the device (0 MiB)"
+        assert source.batches.shapes == Shapes(3, 4, 3)
     else:
-        assert isinstance(source.feed, PrefetchedFeed) and source.notes[1:] == (ON_HOST,)
-        assert source.feed.feed.shapes == Shapes(3, 4, 3)
-    source.feed.close()
+        assert isinstance(source.batches, PrefetchedBatches) and source.notes[1:] == (ON_HOST,)
+        assert source.batches.batches.shapes == Shapes(3, 4, 3)
+    source.batches.close()
 
 
 def test_data_that_must_go_to_the_device_and_does_not_fit_is_refused(card: Callable[[int], None]):
     card(2**12)
     with pytest.raises(UserError, match=r"the windows need .* MiB on cpu and 0\.0 MiB are set aside for them"):
-        open_feed(replace(CONFIG, data_device="device"), windows(), CUDA)
+        open_batches(replace(CONFIG, data_device="device"), windows(), CUDA)
 
 
 def test_shapes_stay_fixed_without_capturing(card: Callable[[int], None]):
     """So that noise is drawn in the same shapes, and steps can be compared."""
     card(2**20)
-    source = open_feed(replace(CONFIG, capture="off"), windows(), CUDA)
-    assert isinstance(source.feed, ResidentFeed) and source.feed.shapes == Shapes(3, 4, 3)
-    assert not source.capture and source.notes == ("windows live on the device (0 MiB)",)
+    source = open_batches(replace(CONFIG, capture="off"), windows(), CUDA)
+    assert isinstance(source.batches, DeviceBatches) and source.batches.shapes == Shapes(3, 4, 3)
+    assert not source.capture and source.notes == ("windows are kept on the device (0 MiB)",)
 
 
 def test_crowds_that_vary_are_not_padded_to_the_largest(card: Callable[[int], None]):
     card(2**30)
     stores = windows(replace(CONFIG, batch_size=1), agents=(2,) * 20 + (12,))
-    source = open_feed(replace(CONFIG, batch_size=1), stores, CUDA)
-    assert not source.capture and isinstance(source.feed, PrefetchedFeed) and source.feed.feed.shapes is None
+    source = open_batches(replace(CONFIG, batch_size=1), stores, CUDA)
+    assert (
+        not source.capture and isinstance(source.batches, PrefetchedBatches) and source.batches.batches.shapes is None
+    )
     reason = r"steps are not captured: scenes hold 2 to 7 agents, and padding every batch to 7 would cost 9\.\d times"
     assert re.match(reason, source.notes[0]) and source.notes[1:] == (ON_HOST,)
-    source.feed.close()
+    source.batches.close()
 
 
 def test_on_a_cpu_batches_are_cut_by_it():
-    for asked, kind in (("auto", HostFeed), ("cpu", HostFeed), ("device", ResidentFeed)):
-        source = open_feed(replace(CONFIG, data_device=asked), windows(), CPU)  # type: ignore[arg-type]
-        assert type(source.feed) is kind and source.feed.shapes is None  # type: ignore[attr-defined]
+    for asked, kind in (("auto", HostBatches), ("cpu", HostBatches), ("device", DeviceBatches)):
+        source = open_batches(replace(CONFIG, data_device=asked), windows(), CPU)  # type: ignore[arg-type]
+        assert type(source.batches) is kind and source.batches.shapes is None  # type: ignore[attr-defined]
         assert (source.capture, source.notes) == (False, ())

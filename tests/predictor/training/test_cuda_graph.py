@@ -13,7 +13,7 @@ from predictor.data.windows import WindowBatch
 from predictor.support.errors import UserError
 from predictor.train import train
 from predictor.training import trainer as trainer_module
-from predictor.training.batches import HostFeed, PrefetchedFeed, Shapes
+from predictor.training.batches import HostBatches, PrefetchedBatches, Shapes
 from predictor.training.config import TrainConfig
 from predictor.training.cuda_graph import CapturedStep, NotCapturableError, default_generator, signature
 from predictor.training.objective import window_loss
@@ -58,7 +58,7 @@ class Refusing(FakeRecorder):
 
     def warm_up(self, work: Callable[[], None]) -> None:
         work()
-        raise NotCapturableError("this model looks at results from the host while it runs")
+        raise NotCapturableError("this model's results are read by the host during a step")
 
 
 pytestmark = pytest.mark.usefixtures("tiny")
@@ -74,14 +74,14 @@ def made(settings: TrainConfig, recorder: FakeRecorder | None = None, padded: bo
     trainer = Trainer(settings, load_data(settings))
     trainer._recorder = recorder
     if padded:
-        assert isinstance(trainer.feed, HostFeed)
-        trainer.feed.shapes = Shapes(3, settings.history_steps, settings.horizon_steps)
+        assert isinstance(trainer.batches, HostBatches)
+        trainer.batches.shapes = Shapes(3, settings.history_steps, settings.horizon_steps)
     return trainer
 
 
-def batch(scale: float = 1.0, rows: int = 2) -> WindowBatch:
-    states = scale * torch.arange(rows * 3 * 2 * 4, dtype=torch.float32).view(rows, 3, 2, 4)
-    return WindowBatch(states, torch.ones(rows, 3, 2).bool(), torch.zeros(rows, dtype=torch.int64))
+def batch(scale: float = 1.0, windows: int = 2) -> WindowBatch:
+    states = scale * torch.arange(windows * 3 * 2 * 4, dtype=torch.float32).view(windows, 3, 2, 4)
+    return WindowBatch(states, torch.ones(windows, 3, 2).bool(), torch.zeros(windows, dtype=torch.int64))
 
 
 # --- The books --------------------------------------------------------------------------------------------------------
@@ -162,7 +162,7 @@ def test_another_shape_is_refused():
     with pytest.raises(
         ValueError, match=r"the step was recorded for .*\(2, 3, 2, 4\).*, got .*\(5, 3, 2, 4\).*another"
     ):
-        captured(batch(rows=5))
+        captured(batch(windows=5))
     labelled = replace(batch(), edge_types=torch.zeros(2, 3, 2, 2, dtype=torch.int8))
     with pytest.raises(ValueError, match="edge_types"):
         captured(labelled)
@@ -171,7 +171,7 @@ def test_another_shape_is_refused():
 
 def test_signatures_tell_what_a_recording_is_good_for():
     assert signature(batch()) == signature(batch(3.0))
-    assert signature(batch()) != signature(batch(rows=3))
+    assert signature(batch()) != signature(batch(windows=3))
 
 
 # --- In training ------------------------------------------------------------------------------------------------------
@@ -215,7 +215,7 @@ def test_a_model_that_cannot_be_recorded_is_trained_all_the_same(circles: Path, 
     plain, trainer = made(settings), made(settings, Refusing())
     for _ in range(3):
         assert trainer.read(trainer.train_step()) == plain.read(plain.train_step())
-    reason = "this model looks at results from the host while it runs"
+    reason = "this model's results are read by the host during a step"
     assert trainer.notes == (f"steps are not captured: {reason}",)
     assert trainer._recorder is None
 
@@ -232,7 +232,7 @@ def test_the_user_is_told_once(
     monkeypatch.setattr(Trainer, "__init__", refusing)
     train(config(circles, tmp_path / "run"))
     said = capsys.readouterr().out
-    assert said.count("first line") == said.count("steps are not captured: this model looks at results") == 1
+    assert said.count("first line") == said.count("steps are not captured: this model's results are read") == 1
 
 
 # --- Not looking ------------------------------------------------------------------------------------------------------
@@ -243,7 +243,7 @@ def test_losses_that_are_not_finite_are_found_when_the_numbers_are_read(
 ):
     """As on a CUDA device: the host does not look at every step, and then names the steps that it did not look at."""
     trainer = made(config(circles, tmp_path, steps=100), FakeRecorder())
-    trainer._looks = False
+    trainer._checks_each_loss = False
     trainer.read(trainer.train_step())
     trainer.train_step()
 
@@ -327,18 +327,18 @@ def test_captured_steps_are_eager_steps(
 def test_what_is_resident_and_what_is_not_is_the_same_training(circles: Path, tmp_path: Path):
     settings = config(circles, tmp_path, device="cuda", steps=100, **SCHEDULES)
     here, there = (made_on_cuda(replace(settings, data_device=where)) for where in ("cpu", "device"))
-    assert isinstance(here.feed, PrefetchedFeed) and not isinstance(there.feed, PrefetchedFeed)
+    assert isinstance(here.batches, PrefetchedBatches) and not isinstance(there.batches, PrefetchedBatches)
     for _ in range(5):
         assert here.read(here.train_step()) == pytest.approx(there.read(there.train_step()), rel=1e-5)
     here.close()
 
 
 @NEEDS_CUDA
-def test_a_model_that_looks_falls_back_on_cuda(circles: Path, tmp_path: Path):
+def test_a_model_whose_results_are_read_is_not_captured_on_cuda(circles: Path, tmp_path: Path):
     trainer = made_on_cuda(config(circles, tmp_path, device="cuda", model="dnri"))
     trainer.read(trainer.train_step())
     if trainer._recorder is None:
-        assert "steps are not captured: this model looks at results" in trainer.notes[-1]
+        assert "steps are not captured: this model's results are read" in trainer.notes[-1]
 
 
 @NEEDS_CUDA

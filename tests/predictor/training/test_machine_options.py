@@ -13,7 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from predictor import train as training
 from predictor.evaluation.paper_tables import TABLES
-from predictor.suite import SuiteConfig, row_config, row_folder
+from predictor.suite import SuiteConfig, line_config, line_folder
 from predictor.support.errors import UserError
 from predictor.train import train
 from predictor.training import trainer as trainer_module
@@ -228,15 +228,15 @@ def test_background_work_ends_with_the_run(circles: Path, tmp_path: Path, monkey
 # --- The suite --------------------------------------------------------------------------------------------------------
 
 
-def test_precision_is_part_of_a_row_and_the_machine_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_precision_is_part_of_a_line_and_the_machine_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("predictor.suite._fingerprint", str)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: True)
-    row = next(r for r in TABLES["springs"].rows if r.key == "dgvae")
+    line = next(r for r in TABLES["springs"].lines if r.key == "dgvae")
     suite = SuiteConfig("springs", tmp_path, tmp_path)
-    assert row_config(replace(suite, precision="bfloat16"), row, tmp_path).precision == "bfloat16"
+    assert line_config(replace(suite, precision="bfloat16"), line, tmp_path).precision == "bfloat16"
     folders = [
-        row_folder(s, row)
+        line_folder(s, line)
         for s in (suite, replace(suite, precision="bfloat16"), replace(suite, device="cuda"), replace(suite, workers=1))
     ]
     assert folders[0] != folders[1] and folders[0] == folders[2] == folders[3]

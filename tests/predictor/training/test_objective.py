@@ -90,7 +90,7 @@ def test_rollout_likelihood(likelihood: Any, variance: float, expected: float):
 
 
 def test_rollout_is_compared_with_what_followed_its_own_last_observation():
-    """Rows are aligned by `last_observed`, not by the beginning of the window."""
+    """Windows are aligned by `last_observed`, not by the beginning of the window."""
     states = random_states(0, 2, 5, 2, 4)
     windows = WindowBatch(states, torch.ones(2, 5, 2).bool(), torch.tensor([0, 2]))
     truth = torch.stack([states[0, 1:3], states[1, 3:5]]).transpose(1, 2)

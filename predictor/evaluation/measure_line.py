@@ -1,4 +1,4 @@
-"""Measure one row of a table: accuracy in both views on every test store, the inferred graph, the edge features."""
+"""Measures one line of a table: accuracy in both views on every test store, the inferred graph, the edge features."""
 
 import resource
 import time
@@ -18,37 +18,37 @@ from predictor.evaluation.accuracy import Tally, fitted_std_m
 from predictor.evaluation.disentanglement import direct_r2, linear_r2
 from predictor.evaluation.graph_accuracy import GraphTally, edge_entropy
 from predictor.evaluation.outcomes import Outcome, run_windows
-from predictor.evaluation.paper_tables import BURN_IN_STEPS, HORIZON_STEPS, Row, Sizes, Table
+from predictor.evaluation.paper_tables import BURN_IN_STEPS, HORIZON_STEPS, Line, Sizes, Table
 from predictor.graph import pair_mask
 from predictor.support.errors import UserError
 
 PAIR_BUDGET = 60_000
-"""Pairs × samples per batch: what keeps memory small for scenes of any size."""
+"""Largest number of pairs × samples per batch; it limits memory for scenes of any size."""
 
 
-def measure_row(
-    table: Table, row: Row, data: Path, sizes: Sizes, checkpoint: Path | None, seed: int, device: str
+def measure_line(
+    table: Table, line: Line, data: Path, sizes: Sizes, checkpoint: Path | None, seed: int, device: str
 ) -> dict[str, Any]:
-    """Results of a row: parameters, and for each test store both views, graph and feature scores."""
+    """Returns the results of a line: parameters, and for each test store both views, graph and feature scores."""
     stores = {kind: read_store(data / name) for kind, name in table.tests.items()}
     spec = next(iter(stores.values())).info.spec
     forecaster: Any
     std_m: tuple[float, ...] = ()
     parameters = 0
-    if row.model == "constant-velocity":
+    if line.model == "constant-velocity":
         forecaster = ConstantVelocity(spec, HORIZON_STEPS)
-    elif row.model == "constant-velocity-noise":
+    elif line.model == "constant-velocity-noise":
         forecaster = _fitted_noise(read_store(data / table.train), sizes)
-    elif row.model == "least-squares":
+    elif line.model == "least-squares":
         forecaster = SpringLeastSquares(spec, HORIZON_STEPS)
     else:
         assert checkpoint is not None
         forecaster, info = load_checkpoint(checkpoint, device)
         std_m, parameters = info.std_m, sum(p.numel() for p in forecaster.parameters())
         for kind, store in stores.items():
-            info.spec.check_compatible(store.info.spec, f"row '{row.key}'", f"store {data / table.tests[kind]}")
+            info.spec.check_compatible(store.info.spec, f"line '{line.key}'", f"store {data / table.tests[kind]}")
     results = {
-        kind: _measure_store(forecaster, store, table, row, sizes, std_m, seed, device)
+        kind: _measure_store(forecaster, store, table, line, sizes, std_m, seed, device)
         for kind, store in stores.items()
     }
     return {"parameters": parameters, "tests": results}
@@ -64,7 +64,7 @@ def _fitted_noise(store: EpisodeStore, sizes: Sizes) -> NoisyConstantVelocity:
 
 
 def protocol_indices(windows: Windows, stride: int, limit: int, seed: int) -> np.ndarray:
-    """Windows that end their burn-in at every `stride`-th step of an episode; `limit` of them, drawn evenly."""
+    """Returns the windows whose burn-in ends at every `stride`-th step of an episode; at most `limit`, drawn evenly."""
     chosen = np.flatnonzero((windows.index[:, 1] - (BURN_IN_STEPS - 1)) % stride == 0)
     if limit and len(chosen) > limit:
         chosen = np.sort(np.random.default_rng(seed).permutation(chosen)[:limit])
@@ -75,7 +75,7 @@ def _measure_store(
     forecaster: Any,
     store: EpisodeStore,
     table: Table,
-    row: Row,
+    line: Line,
     sizes: Sizes,
     std_m: tuple[float, ...],
     seed: int,
@@ -86,7 +86,7 @@ def _measure_store(
     except UserError as error:
         raise UserError(f"test store of '{store.info.source}' fits no window of the protocol: {error}") from error
     chosen = protocol_indices(windows, table.test_stride, sizes.test_windows, seed)
-    samples = row.num_samples
+    samples = line.num_samples
     horizon_only, whole = Tally(std_m), Tally(partial_agents=True)
     graph, features, entropies = GraphTally(forecaster.num_edge_types), _Features(), []
     agents = [int(store.episodes[e].valid[t].sum()) for e, t in windows.index[chosen].tolist()]
@@ -104,15 +104,15 @@ def _measure_store(
         pairs = pair_mask(outcome.present)
         graph.add(outcome.edge_probs, _binary(outcome, forecaster.num_edge_types), pairs)
         entropies.append(edge_entropy(outcome.edge_probs, pairs)[0][pairs].cpu())
-        if row.model in ("dgvae", "least-squares"):  # the others' features are placeholders
+        if line.model in ("dgvae", "least-squares"):  # features of the others are placeholders
             features.add(outcome)
     result: dict[str, Any] = {
         "windows": len(chosen),
         "agents": {"min": min(agents), "median": float(np.median(agents)), "max": max(agents)},
-        "horizon_only": asdict(horizon_only.accuracy(row.name)),
-        "whole_sequence": asdict(whole.accuracy(row.name)),
-        "graph": asdict(graph.results()) if row.model in ("dgvae", "dnri", "least-squares") else None,
-        "prior_entropy": float(torch.cat(entropies).mean()) if row.model in ("dgvae", "dnri") else None,
+        "horizon_only": asdict(horizon_only.accuracy(line.name)),
+        "whole_sequence": asdict(whole.accuracy(line.name)),
+        "graph": asdict(graph.results()) if line.model in ("dgvae", "dnri", "least-squares") else None,
+        "prior_entropy": float(torch.cat(entropies).mean()) if line.model in ("dgvae", "dnri") else None,
         "features": features.scores(),
         "seconds": time.perf_counter() - began,
         "peak_memory_mb": _peak_memory_mb(device),
@@ -121,19 +121,19 @@ def _measure_store(
 
 
 def _peak_memory_mb(device: str) -> float:
-    """Of the accelerator since measuring began, or of this process since it started."""
+    """Returns the peak memory [MB] of the accelerator since measuring began, or of this process since it started."""
     if device.startswith("cuda"):
         return torch.cuda.max_memory_allocated() / 2**20
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def _binary(outcome: Outcome, num_types: int) -> torch.Tensor | None:
-    """True types, as far as the model tells them apart."""
+    """Returns the true types, limited to those that the model has."""
     return None if outcome.edge_types is None else outcome.edge_types.clamp(-1, num_types - 1)
 
 
 class _Features:
-    """Edge features beside true attributes, over all windows of one size."""
+    """Collects edge features and true attributes over all windows of one size."""
 
     def __init__(self) -> None:
         self._features: list[np.ndarray] = []
@@ -152,7 +152,7 @@ class _Features:
         self._valid.append(valid.cpu().numpy())
 
     def scores(self) -> dict[str, Any] | None:
-        """R² of the first attribute on true edges: from the first dimension as it is, and by a linear read-out."""
+        """Computes R² of the first attribute on true edges, by the first dimension and by a linear regression."""
         if not self._features:
             return None
         features, truth, valid = (np.concatenate(x) for x in (self._features, self._truth, self._valid))
