@@ -54,7 +54,7 @@ _LEFT_DIRECTION = 1
 
 @dataclass(frozen=True)
 class Recording:
-    """Names and files of one recording, and what its meta file says."""
+    """Name and files of one recording, with location and frame rate from its meta file."""
 
     name: str
     """Name as in the file names, such as "00"."""

@@ -267,7 +267,7 @@ def _columns(skeleton: Skeleton) -> dict[str, slice]:
 def _check_frame(path: Path, number: int, flags: set[str], missing: set[str]) -> None:
     for flag in (":FULLY-SPECIFIED", ":DEGREES"):
         if flag not in flags:
-            raise bad_line(path, number, f"the header must say {flag}", "convert the file")
+            raise bad_line(path, number, f"the header must contain {flag}", "convert the file")
     if missing:
         raise bad_line(path, number, f"the frame that ends here lacks {', '.join(sorted(missing))}")
 

@@ -1,4 +1,4 @@
-"""The episode store: ragged episodes of scenes in one Zarr group, written once, atomically.
+"""Reads and writes the episode store: ragged episodes of scenes in one Zarr group, written once, atomically.
 
 Within an episode an agent keeps its column from its first step to its last, so a window is a slice; absent agents have
 `valid=False`. All agents of the simulator are stored; which of them the ego perceives is decided when windows are cut

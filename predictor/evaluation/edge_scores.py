@@ -64,7 +64,7 @@ class Disentanglement:
     mig: float | None
     """Mutual information gap."""
     dci: DCI | None
-    """DCI; None if it is not defined, and the note says why."""
+    """DCI; None if it is not defined, with the reason in `note`."""
     note: str = ""
     """Reason why a score is missing; empty if none is."""
 

@@ -165,7 +165,7 @@ def _size_line(content: dict[str, Any]) -> str:
 def scores_markdown(content: dict[str, Any]) -> str:
     """Returns the content of scores.json as tables and sentences in Markdown."""
     parts = [
-        f"# What the edges of `{content['config']['checkpoint']}` say about {content['source']}",
+        f"# Edges of `{content['config']['checkpoint']}` on {content['source']}",
         f"{content['windows']} windows of {content['episodes']} episodes; features are read at the last of "
         f"{content['config']['burn_in_steps']} observed steps.",
     ]

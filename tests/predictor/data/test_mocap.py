@@ -262,7 +262,7 @@ AMC_ERRORS = {
     "gap": (8, "137", 8, "frame numbers must be consecutive: expected 136, got 137"),
     "repeated": (8, "135", 8, "frame numbers must be consecutive: expected 136, got 135"),
     "frame": (8, "136.5", 8, "a frame number must be a whole number, got '136.5'"),
-    "radians": (3, ":RADIANS", 4, "the header must say :DEGREES"),
+    "radians": (3, ":RADIANS", 4, "the header must contain :DEGREES"),
     "no frame number": (4, None, 4, "expected a frame number before 'root'"),
 }
 
@@ -281,7 +281,7 @@ def test_a_motion_that_breaks_off_is_refused(subject: Path, loader: Loader):
     path.write_text(":FULLY-SPECIFIED\n:DEGREES\n")
     loader.refuses(subject, f"{path} holds no frame; get the file anew")
     path.write_text("")
-    loader.refuses(subject, f"{path}, line 0: the header must say :FULLY-SPECIFIED")
+    loader.refuses(subject, f"{path}, line 0: the header must contain :FULLY-SPECIFIED")
 
 
 ASF_ERRORS = {
