@@ -80,7 +80,7 @@ class Recording:
     _steps: list[_Step] = field(default_factory=list)
 
     def __len__(self) -> int:
-        """Number of pictures."""
+        """Returns the number of pictures."""
         return len(self._frames)
 
     @property

@@ -139,7 +139,7 @@ class MultiagentRecording:
     _moments: list[_Moment] = field(default_factory=list)
 
     def __len__(self) -> int:
-        """Number of pictures."""
+        """Returns the number of pictures."""
         return 1 + self.num_steps * self.frames_per_step
 
     @property

@@ -84,7 +84,7 @@ def short_env(duration: int, vehicles: int = 8, **kwargs: Any) -> gym.Env:
 
 
 def short_scene_env(duration: int) -> SceneObservation:
-    """A row of a vector env, as the checkpoint's spec wants it; picklable with functools.partial."""
+    """One environment of a vector env, as the checkpoint's spec wants it; picklable with functools.partial."""
     return SceneObservation(short_env(duration), PERCEPTION_M, MAX_AGENTS)
 
 
@@ -135,7 +135,7 @@ def forecast_of_history(forecaster: Forecaster, spec: SceneSpec, scenes: Sequenc
 def random_scenes(
     rng: np.random.Generator, batch: int, agents: int, features: int = 4, present: Sequence[int] | None = None
 ) -> SceneBatch:
-    """Scenes with the ego in row 0 and, unless said, a random number of others in random rows."""
+    """Scenes with the ego at index 0 and, unless said, a random number of others in random places."""
     valid = rng.random((batch, agents)) < 0.7
     if present is not None:
         valid = np.arange(agents) < np.asarray(present)[:, None]
@@ -190,7 +190,7 @@ def cruising_env(**kwargs: Any) -> gym.Env:
 
 
 class ShuffledReader(HighwayReader):
-    """Sees what `HighwayReader` sees, with the others' rows in another order at each step."""
+    """Sees what `HighwayReader` sees, with the others' places in another order at each step."""
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env, PERCEPTION_M, MAX_AGENTS)

@@ -41,7 +41,7 @@ _serials = itertools.count()
 
 
 def serial(body: Any) -> int:
-    """A number for this object alone; unlike id() never reused, and unlike a reference it keeps nobody alive."""
+    """A number for this object alone; unlike id() never reused, and unlike a reference it keeps no agent alive."""
     if not hasattr(body, "serial"):
         body.serial = next(_serials)
     number: int = body.serial
@@ -113,8 +113,8 @@ class Crowd(gym.Env):
 
     def _table(self) -> np.ndarray:
         table = np.zeros((TABLE_ROWS, len(COLUMNS)))
-        for row, walker in enumerate(self.people):
-            table[row] = (1.0, *walker.state, walker.number, self.heading_rad)
+        for i, walker in enumerate(self.people):
+            table[i] = (1.0, *walker.state, walker.number, self.heading_rad)
         table[1:] = table[1 + self.np_random.permutation(TABLE_ROWS - 1)]
         return table
 
@@ -208,7 +208,7 @@ class Swarm(ParallelEnv):
 
 
 class SwarmReader:
-    """Everyone; each looks where it walks."""
+    """All agents; each looks where it walks."""
 
     spec = SceneSpec(
         dt_s=DT_S, frame=("centroid", "centroid"), has_ego=False, perception_m=1000.0, max_agents=len(LIVES)
@@ -224,9 +224,9 @@ class SwarmReader:
         bodies = env.unwrapped.bodies
         states = np.array([walker.state for walker in bodies.values()])
         ids = np.array([walker.number for walker in bodies.values()], dtype=np.int64)
-        rows = {name: row for row, name in enumerate(bodies) if LIVES[name].learns}
+        index_of = {name: i for i, name in enumerate(bodies) if LIVES[name].learns}
         scene = Scene(states, ids, np.ones(len(bodies), dtype=np.bool_))
-        return pad_multiagent_scene(scene, rows, np.arctan2(states[:, 3], states[:, 2]), self.spec)
+        return pad_multiagent_scene(scene, index_of, np.arctan2(states[:, 3], states[:, 2]), self.spec)
 
 
 # --- Who stands where, by the simulators' own objects -----------------------------------------------------------------
@@ -275,30 +275,30 @@ class Subject:
 
     make: Callable[[], Any]
     bodies: Callable[[Any], Bodies]
-    """Everyone who is there."""
+    """Ids of all agents that are there."""
     near_m: float
-    """A perception that leaves somebody out."""
+    """A perception that leaves an agent out."""
     seed: int = 0
-    shared: bool = False
+    multiagent: bool = False
     """Whether many learn, with `ForecastParallelEnv`."""
     reader: Callable[[SceneSpec], Any] | None = None
     """From a spec to what makes a reader; None takes the family's."""
     spec: Any = None
     """A `SceneSpec` for `reader`."""
     enters: bool = False
-    """Whether somebody comes into sight in the recorded episode."""
+    """Whether an agent comes into sight in the recorded episode."""
     leaves: bool = False
-    """Whether somebody goes out of sight."""
+    """Whether an agent goes out of sight."""
     dies: bool = False
     """Whether a learner is gone before the end."""
     sight_m: float = 1000.0
-    """Perception in the recorded episode; the default sees everybody."""
+    """Perception in the recorded episode; the default sees all agents."""
     tolerance_m: float = 1e-9
     """Between a scene and the simulator."""
 
 
-ROWS = 16
-"""Of a scene around one ego in a recorded episode: enough for everybody in sight."""
+SIZE = 16
+"""Size of a scene around one ego in a recorded episode: enough for all agents in sight."""
 HIGHWAY = SceneSpec(dt_s=1.0, frame=("ego", "world"))
 CROWD = SceneSpec(dt_s=DT_S, frame=("ego", "ego"))
 KINEMATICS = {
@@ -312,7 +312,7 @@ def highway(env_id: str, **config: Any) -> Callable[[], gym.Env]:
     return partial(make_env, env_id, config=config, disable_env_checker=True)
 
 
-def rows_reader(spec: SceneSpec, columns: Sequence[str], gate_m: float) -> EntityRowsReader:
+def table_reader(spec: SceneSpec, columns: Sequence[str], gate_m: float) -> EntityRowsReader:
     return EntityRowsReader(tuple(columns), spec, gate_m)
 
 
@@ -338,39 +338,39 @@ SUBJECTS: dict[str, Subject] = {
     "envpool-intersection": Subject(
         partial(make_env, "envpool/Intersection-v0"), envpool_bodies, 25.0, enters=True, sight_m=50.0
     ),
-    "rows-highway": Subject(
+    "table-highway": Subject(
         highway("highway-fast-v0", **SMALL, observation=KINEMATICS), highway_bodies, 60.0,
-        reader=partial(rows_reader, columns=COLUMNS[:5], gate_m=10.0), spec=HIGHWAY, tolerance_m=1e-3,
+        reader=partial(table_reader, columns=COLUMNS[:5], gate_m=10.0), spec=HIGHWAY, tolerance_m=1e-3,
     ),
-    "rows-crowd": crowd(partial(rows_reader, columns=UNNAMED, gate_m=3.0), shift_m=12.0),
-    "rows-crowd-ids": crowd(partial(rows_reader, columns=COLUMNS, gate_m=3.0)),
+    "table-crowd": crowd(partial(table_reader, columns=UNNAMED, gate_m=3.0), shift_m=12.0),
+    "table-crowd-ids": crowd(partial(table_reader, columns=COLUMNS, gate_m=3.0)),
     "function": crowd(partial(FunctionReader, read_crowd)),
     "own-reader": crowd(lambda spec: lambda env: CrowdReader(spec)),
-    "tag": Subject(parallel("simple_tag_v3", max_cycles=10), mpe_bodies, 0.8, shared=True),
-    "spread": Subject(parallel("simple_spread_v3", max_cycles=10), mpe_bodies, 0.8, shared=True),
+    "tag": Subject(parallel("simple_tag_v3", max_cycles=10), mpe_bodies, 0.8, multiagent=True),
+    "spread": Subject(parallel("simple_spread_v3", max_cycles=10), mpe_bodies, 0.8, multiagent=True),
     "treasure": Subject(
         parallel("collect_treasure_v1", num_collectors=5, num_treasures=8, max_cycles=8), mpe_bodies, 0.8, 6,
-        shared=True, enters=True, leaves=True,
+        multiagent=True, enters=True, leaves=True,
     ),
     "pursuit": Subject(
         parallel("pursuit_v5", x_size=7, y_size=7, n_pursuers=4, n_evaders=6, n_catch=1, surround=False, max_cycles=10),
-        pursuit_bodies, 3.0, shared=True, leaves=True,
+        pursuit_bodies, 3.0, multiagent=True, leaves=True,
     ),
     "intersection-agents": Subject(
         parallel("intersection-multi-agent-v1", controlled_vehicles=3, initial_vehicle_count=4, duration=8),
-        highway_bodies, 30.0, shared=True, enters=True, dies=True,
+        highway_bodies, 30.0, multiagent=True, enters=True, dies=True,
     ),
     "swarm": Subject(
-        Swarm, swarm_bodies, 12.0, shared=True, reader=lambda spec: SwarmReader, spec=SwarmReader.spec,
+        Swarm, swarm_bodies, 12.0, multiagent=True, reader=lambda spec: SwarmReader, spec=SwarmReader.spec,
         enters=True, leaves=True, dies=True,
     ),
 }  # fmt: skip
-NATIVE = pytest.mark.skipif(importlib.util.find_spec("envpool") is None, reason="needs envpool")
+NEEDS_ENVPOOL = pytest.mark.skipif(importlib.util.find_spec("envpool") is None, reason="needs envpool")
 
 
 def named(condition: Callable[[Subject], bool] = lambda subject: True) -> Any:
     """Runs a test for each subject of which a condition holds."""
-    marks = {name: NATIVE if name.startswith("envpool") else () for name in SUBJECTS}
+    marks = {name: NEEDS_ENVPOOL if name.startswith("envpool") else () for name in SUBJECTS}
     chosen = [pytest.param(name, marks=marks[name]) for name, subject in SUBJECTS.items() if condition(subject)]
     return pytest.mark.parametrize("name", chosen)
 
@@ -382,18 +382,18 @@ def named(condition: Callable[[Subject], bool] = lambda subject: True) -> Any:
 class Moment:
     """One instant of an episode."""
 
-    shared: MultiagentScene
-    """What the forecaster got; with one ego, it is the one agent that has a row."""
+    multi: MultiagentScene
+    """What the forecaster got; with one ego, it is the one agent that has an environment."""
     views: Views
     """The entries that each agent got."""
     forecast: Forecast
     """Behind them."""
     bodies: Bodies
-    """Everyone who was there."""
+    """Ids of all agents that are there."""
 
     @property
     def present(self) -> set[int]:
-        scene = self.shared.scene
+        scene = self.multi.scene
         return set(scene.ids[scene.valid].tolist())
 
 
@@ -416,29 +416,29 @@ class Session:
         subject: what to wrap.
         folder: for the checkpoint.
         sight_m: perception; None takes the recorded episode's.
-        rows: of a view, the viewer included; None takes enough for everyone.
+        size: size of a view, the viewer included; None takes enough for all agents.
     """
 
-    def __init__(self, subject: Subject, folder: Path, sight_m: float | None = None, rows: int | None = None) -> None:
+    def __init__(self, subject: Subject, folder: Path, sight_m: float | None = None, size: int | None = None) -> None:
         self.subject, bare = subject, subject.make()
         self.env: Any
         sight_m = subject.sight_m if sight_m is None else sight_m
-        if subject.shared:
+        if subject.multiagent:
             maker = subject.reader and subject.reader(subject.spec)
             spec = (multiagent_reader_for(bare) if maker is None else maker(bare)).spec
             self.model = tiny(spec)
             self.env = ForecastParallelEnv(
-                bare, forecaster=self.model, reader=maker, perception_m=sight_m, max_agents=rows
+                bare, forecaster=self.model, reader=maker, perception_m=sight_m, max_agents=size
             )
         else:
-            rows = ROWS if rows is None else rows
-            maker = subject.reader and subject.reader(replace(subject.spec, perception_m=sight_m, max_agents=rows))
-            spec = (reader_for(bare, sight_m, rows) if maker is None else maker(bare)).spec
+            size = SIZE if size is None else size
+            maker = subject.reader and subject.reader(replace(subject.spec, perception_m=sight_m, max_agents=size))
+            spec = (reader_for(bare, sight_m, size) if maker is None else maker(bare)).spec
             self.model = tiny(spec)
             save_checkpoint(folder, self.model, CheckpointInfo(spec, self.model.config, HORIZON))
-            self.env = ForecastObservation(bare, str(folder), reader=maker, perception_m=sight_m, max_agents=rows)
+            self.env = ForecastObservation(bare, str(folder), reader=maker, perception_m=sight_m, max_agents=size)
         self.spec = spec
-        self.view = replace(spec, perception_m=sight_m, max_agents=spec.max_agents if rows is None else rows)
+        self.view = replace(spec, perception_m=sight_m, max_agents=spec.max_agents if size is None else size)
 
     def play(self, seed: int, steps: int = 100, turn: int | None = None) -> list[Moment]:
         """An episode, or its first steps, with random actions: from step `turn` on, others."""
@@ -454,23 +454,23 @@ class Session:
         """Empty memory."""
         return Stream(self)
 
-    def first_sight(self, shared: MultiagentScene) -> "Stream":
+    def first_sight(self, multi: MultiagentScene) -> "Stream":
         """Memory of nothing but this scene."""
         stream = Stream(self)
-        stream.observe(shared)
+        stream.observe(multi)
         return stream
 
     def windowed(self, moments: Sequence[Moment]) -> Views:
         """The entries after these moments by the other way: no stream, one window with a column for each stay."""
-        shared = moments[-1].shared
-        forecast = full_window(self.model, [moment.shared.scene for moment in moments])
-        if self.subject.shared:
-            return agent_entries(shared, forecast, self.view)
-        entries = ego_entries(SceneBatch.stack([shared.scene]), forecast)
+        multi = moments[-1].multi
+        forecast = full_window(self.model, [moment.multi.scene for moment in moments])
+        if self.subject.multiagent:
+            return agent_entries(multi, forecast, self.view)
+        entries = ego_entries(SceneBatch.stack([multi.scene]), forecast)
         return {EGO: {key: value[0] for key, value in entries.items()}}
 
     def _step(self, rng: np.random.Generator) -> Any:
-        if not self.subject.shared:
+        if not self.subject.multiagent:
             obs, _, terminated, truncated, _ = self.env.step(draw(self.env.action_space, rng))
             self.ended = bool(terminated or truncated)
             return obs
@@ -480,7 +480,7 @@ class Session:
 
     def _moment(self, seen: Any) -> Moment:
         scene: Any = self.env.scene
-        if not self.subject.shared:
+        if not self.subject.multiagent:
             scene, seen = MultiagentScene(scene, {EGO: 0}, np.full(len(scene.ids), scene.heading_rad)), {EGO: seen}
         views = {name: {key: view[key] for key in view if key != "observation"} for name, view in seen.items()}
         assert all(set(view) == set(FORECAST_KEYS) for view in views.values())
@@ -491,19 +491,19 @@ class Stream:
     """The forecaster's memory of one subject, fed by hand."""
 
     def __init__(self, session: Session) -> None:
-        self._shared, view = session.subject.shared, session.view
+        self._multiagent, view = session.subject.multiagent, session.view
         config = ForecastConfig()
         self._stream: Any = (
             MultiagentStream(session.model, session.spec, config, view.perception_m, view.max_agents)
-            if self._shared
+            if self._multiagent
             else ForecastStream(session.model, session.spec, 1, config)
         )
 
-    def observe(self, shared: MultiagentScene) -> Views:
-        if self._shared:
-            views: Views = self._stream.observe(shared)
+    def observe(self, multi: MultiagentScene) -> Views:
+        if self._multiagent:
+            views: Views = self._stream.observe(multi)
             return views
-        entries = self._stream.observe(SceneBatch.stack([shared.scene]))
+        entries = self._stream.observe(SceneBatch.stack([multi.scene]))
         return {EGO: {key: value[0] for key, value in entries.items()}}
 
     @property
@@ -539,12 +539,12 @@ def full_window(model: DGVAE, scenes: Sequence[Scene]) -> Forecast:
         patch.setattr(dgvae, "concrete_sample", lambda logits, *_: torch.softmax(logits, dim=-1))
         window = model.window(tensor, present_, torch.tensor([len(scenes) - 1]), HORIZON)
     last, place = scenes[-1], places[-1]
-    rows, count = np.flatnonzero(last.valid), len(last.valid)
+    known, count = np.flatnonzero(last.valid), len(last.valid)
     assert window.prior_logits is not None and window.features is not None
     xy = torch.zeros(1, 1, count, HORIZON, 2)
     probs = torch.zeros(1, count, count, model.num_edge_types)
     features = torch.zeros(1, count, count, model.edge_feature_dim)
-    xy[0, 0, rows] = window.rollout[0, place, :, :2] - tensor[0, -1, 0, :2] * model.spec.has_ego
-    probs[0, rows[:, None], rows] = window.prior_logits[0, -1][place][:, place].softmax(-1)
-    features[0, rows[:, None], rows] = window.features[0, -1][place][:, place]
+    xy[0, 0, known] = window.rollout[0, place, :, :2] - tensor[0, -1, 0, :2] * model.spec.has_ego
+    probs[0, known[:, None], known] = window.prior_logits[0, -1][place][:, place].softmax(-1)
+    features[0, known[:, None], known] = window.features[0, -1][place][:, place]
     return Forecast(xy, probs, features, torch.from_numpy(last.valid)[None])

@@ -47,7 +47,7 @@ def play(venv: ParallelVecEnv, steps: int = STEPS) -> list[Any]:
     sequence: list[Any] = []
     for t in range(steps):
         obs, _, dones, infos = venv.step(np.full(venv.num_envs, t % 2))
-        sequence += [obs, *(infos[row]["terminal_observation"] for row in np.flatnonzero(dones) if infos[row]["alive"])]
+        sequence += [obs, *(infos[i]["terminal_observation"] for i in np.flatnonzero(dones) if infos[i]["alive"])]
     return sequence
 
 
@@ -60,7 +60,7 @@ def assert_same_sequences(found: list[Any], expected: list[Any], tolerance: floa
 @pytest.mark.parametrize("samples", [1, 4])
 @pytest.mark.parametrize("has_ego", [False, True], ids=["world", "absent ego"])
 def test_copies_together_see_what_they_see_alone(samples: int, has_ego: bool, monkeypatch: pytest.MonkeyPatch):
-    """Over the ends of episodes, with other rows at other times, and with own noise."""
+    """Over the ends of episodes, with other environments at other times, and with own noise."""
     options: dict[str, Any] = {"num_samples": samples}
     if has_ego:
         options["forecaster"] = tiny_model(replace(WORLD, has_ego=True))

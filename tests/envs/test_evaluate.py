@@ -99,7 +99,7 @@ def summary(spec: SceneSpec, errors_m: list[float], latencies_s: list[list[float
     return _summary(EvaluateConfig(**changes), "here", STILL, "idle", spec, episodes)
 
 
-def test_rows_and_intervals_closed_form():
+def test_lines_and_intervals_closed_form():
     """Two episodes of equally many forecasts: a quarter of the draws is one of them twice."""
     found = summary(HIGHWAY_SPEC, [1.0, 3.0], [[0.1], [0.1]])
     assert (found.model.min_ade_m, found.constant_velocity.min_ade_m) == pytest.approx((2.0, 4.0))
@@ -107,7 +107,7 @@ def test_rows_and_intervals_closed_form():
     assert found.model.step_intervals["by_step_m"] == [pytest.approx((1.0, 3.0))] * HORIZON
     assert found.reduction == pytest.approx(0.5)
     assert found.reduction_interval == pytest.approx((0.5, 0.5))
-    assert [row.name for row in found.lines] == ["constant velocity (deployed)"] * 2 + ["constant velocity"]
+    assert [line.name for line in found.lines] == ["constant velocity (deployed)"] * 2 + ["constant velocity"]
 
 
 def test_an_episodes_first_scene_warms_up_and_is_not_timed():
@@ -169,18 +169,18 @@ def test_constant_velocity_is_its_own_baseline(env_id: str, in_process: None):
     assert result.reduction_interval == pytest.approx((0.0, 0.0), abs=1e-4)
     assert (result.checkpoint, result.dt_s) == (STILL, {ROAD: 1.0, TAG: 0.1}[env_id])
     assert result.driver == {ROAD: "varied", TAG: "heuristic"}[env_id]
-    for row in (result.model, result.model_samples):
-        assert row.agents == result.constant_velocity.agents > 0
+    for line in (result.model, result.model_samples):
+        assert line.agents == result.constant_velocity.agents > 0
         for name in ("min_ade_m", "min_fde_m", "by_step_m", "rmse_m"):
             expected = getattr(result.constant_velocity, name)
-            assert getattr(row, name) == pytest.approx(expected, rel=1e-4, abs=1e-6)
+            assert getattr(line, name) == pytest.approx(expected, rel=1e-4, abs=1e-6)
     assert (result.model.num_samples, result.model_samples.num_samples) == (1, 3)
     assert result.constant_velocity.min_ade_m > 0.01
     assert result.nearest_neighbours is None and result.graph is None and result.histories == {}
     assert len(result.lines) == 3
 
 
-def test_everyone_counts_in_an_arena_but_its_obstacles(in_process: None):
+def test_all_agents_count_in_an_arena_but_its_obstacles_do_not(in_process: None):
     """Four agents, at each of the five scenes that have two steps of truth, in two episodes."""
     assert measure(TAG, STILL).model.agents == 2 * 5 * 4
 
@@ -198,8 +198,10 @@ def test_a_learned_checkpoint_is_measured(in_process: None, tmp_path: Path):
     assert result.reduction == pytest.approx(1 - result.model.min_ade_m / result.constant_velocity.min_ade_m, rel=1e-4)
     low, high = result.reduction_interval
     assert low <= result.reduction <= high
-    assert all(np.isfinite(row.nll).all() and len(row.nll) == HORIZON for row in (result.model, result.model_samples))
-    assert [row.name for row in result.lines] == [
+    assert all(
+        np.isfinite(line.nll).all() and len(line.nll) == HORIZON for line in (result.model, result.model_samples)
+    )
+    assert [line.name for line in result.lines] == [
         "dG-VAE", "dG-VAE", "dG-VAE, 1 step of history", "dG-VAE, 9 steps of history", "constant velocity",
     ]  # fmt: skip
     assert result.histories[9].by_step_m == pytest.approx(result.model.by_step_m, rel=1e-4)  # all of the episode
@@ -208,8 +210,8 @@ def test_a_learned_checkpoint_is_measured(in_process: None, tmp_path: Path):
     assert 0 < result.latency_median_ms <= result.latency_p95_ms
     # each episode alone: the ends of the interval over both
     alone = [measure(ROAD, str(path), horizon_steps=None, episodes=1, seed=900_000 + i).model for i in range(2)]
-    assert all(row.intervals == {} for row in alone)
-    assert result.model.intervals["min_ade_m"] == pytest.approx(sorted(row.min_ade_m for row in alone), rel=1e-5)
+    assert all(line.intervals == {} for line in alone)
+    assert result.model.intervals["min_ade_m"] == pytest.approx(sorted(line.min_ade_m for line in alone), rel=1e-5)
 
 
 def test_a_learned_checkpoint_is_measured_among_many_learners(in_process: None, tmp_path: Path):
@@ -222,7 +224,7 @@ def test_a_learned_checkpoint_is_measured_among_many_learners(in_process: None, 
     assert 0 < result.latency_median_ms <= result.latency_p95_ms
 
 
-def test_neighbours_have_a_row_where_there_is_data(in_process: None, tmp_path: Path):
+def test_neighbours_have_a_line_where_there_is_data(in_process: None, tmp_path: Path):
     """A folder of stores, of which one is named by the env; it holds the very episode, six times."""
     settings: dict[str, Any] = {"driver": "idle", "seed": 5, "episodes": 1}
     (recorded,) = collect(CollectConfig(ROAD, tmp_path, 1, ("idle",), 5, 6, False, 1))

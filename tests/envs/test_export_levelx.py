@@ -65,14 +65,14 @@ def test_the_three_files_agree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     assert (recording["recordingId"], recording["frameRate"], recording["duration"]) == ("1", "25", "3.04")
     assert int(recording["numTracks"]) == len(meta)
     assert "-0.00000" not in (out / "01_tracks.csv").read_text()
-    for row in meta:
-        own = [t for t in tracks if t["trackId"] == row["trackId"]]
+    for line in meta:
+        own = [t for t in tracks if t["trackId"] == line["trackId"]]
         numbers = [int(t["frame"]) for t in own]
-        assert (numbers[0], numbers[-1], len(own)) == tuple(int(row[k]) for k in TRACKS_META[2:5])
+        assert (numbers[0], numbers[-1], len(own)) == tuple(int(line[k]) for k in TRACKS_META[2:5])
         assert [int(t["trackLifetime"]) for t in own] == list(range(len(own)))
-        assert row["class"] == "car"
-    for row in tracks:
-        values = {name: float(row[name]) for name in TRACKS}
+        assert line["class"] == "car"
+    for line in tracks:
+        values = {name: float(line[name]) for name in TRACKS}
         heading = np.radians(values["heading"])
         along, across = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
         for kind in ("Velocity", "Acceleration"):
@@ -84,10 +84,10 @@ def test_the_three_files_agree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
 
 def test_accelerations_are_backward_differences(tmp_path: Path):
     export(ExportConfig("intersection-v2", tmp_path / "export", 1, "idle", SEED, 2))
-    rows = [r for r in read(tmp_path / "export" / "00_tracks.csv") if r["trackId"] == "0"]
+    lines = [r for r in read(tmp_path / "export" / "00_tracks.csv") if r["trackId"] == "0"]
     for axis in "xy":
-        velocity = np.array([float(r[f"{axis}Velocity"]) for r in rows])
-        acceleration = np.array([float(r[f"{axis}Acceleration"]) for r in rows])
+        velocity = np.array([float(r[f"{axis}Velocity"]) for r in lines])
+        acceleration = np.array([float(r[f"{axis}Acceleration"]) for r in lines])
         assert acceleration[0] == 0.0
         np.testing.assert_allclose(acceleration[1:], np.diff(velocity) * 25, atol=1e-3)
 
@@ -96,7 +96,7 @@ def test_an_export_depends_on_its_seed_alone(tmp_path: Path):
     export(ExportConfig("roundabout-v1", tmp_path / "two", 2, "varied", 7, 2))
     export(ExportConfig("roundabout-v1", tmp_path / "one", 1, "varied", 8, 2))
     second, alone = (read(tmp_path / name) for name in ("two/01_tracks.csv", "one/00_tracks.csv"))
-    assert [{**row, "recordingId": ""} for row in second] == [{**row, "recordingId": ""} for row in alone]
+    assert [{**line, "recordingId": ""} for line in second] == [{**line, "recordingId": ""} for line in alone]
 
 
 def test_policy_steps_stay_as_long_as_they_are():

@@ -83,16 +83,16 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> str:
     return save_tiny(tmp_path_factory.mktemp("checkpoints") / "tiny-plaza", SPEC)
 
 
-def actions(row: int) -> np.ndarray:
-    return np.random.default_rng(row).uniform(-1, 1, (STEPS, 2)).astype(np.float32)
+def actions(i: int) -> np.ndarray:
+    return np.random.default_rng(i).uniform(-1, 1, (STEPS, 2)).astype(np.float32)
 
 
-def alone(duration: int, reader: MakeReader, checkpoint: str, row: int, idle_steps: bool = False) -> list[Any]:
-    """What a row should show at each step, played by one wrapper: (observation, closing observation or None)."""
+def alone(duration: int, reader: MakeReader, checkpoint: str, i: int, idle_steps: bool = False) -> list[Any]:
+    """Returns (observation, closing observation or None) of each step of an environment, played by one wrapper."""
     env = ForecastObservation(Plaza(duration), checkpoint, reader=reader)
-    shown: list[Any] = [(env.reset(seed=row)[0], None)]
+    shown: list[Any] = [(env.reset(seed=i)[0], None)]
     fresh = False
-    for action in actions(row):
+    for action in actions(i):
         if fresh:
             shown.append((env.reset()[0], None))
             fresh = False
@@ -106,8 +106,8 @@ def alone(duration: int, reader: MakeReader, checkpoint: str, row: int, idle_ste
     return shown
 
 
-def row_of(observations: Mapping[str, Any], row: int) -> dict[str, Any]:
-    return {key: value[row] for key, value in observations.items()}
+def one_of(observations: Mapping[str, Any], i: int) -> dict[str, Any]:
+    return {key: value[i] for key, value in observations.items()}
 
 
 # --- gymnasium.make ---------------------------------------------------------------------------------------------------
@@ -146,43 +146,43 @@ def test_a_registered_reader_keeps_the_spec_text(checkpoint: str):
 # --- gymnasium's vector environments ----------------------------------------------------------------------------------
 
 
-def make_row(duration: int, reader: MakeReader) -> gym.Env:
+def make_one(duration: int, reader: MakeReader) -> gym.Env:
     return SceneObservation(Plaza(duration), reader=reader)
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 @pytest.mark.parametrize("reader", READERS)
-def test_vector_rows_are_as_if_alone(reader: str, mode: AutoresetMode, checkpoint: str):
-    makers = [partial(make_row, duration, READERS[reader]) for duration in DURATIONS]
+def test_vector_envs_are_as_if_alone(reader: str, mode: AutoresetMode, checkpoint: str):
+    makers = [partial(make_one, duration, READERS[reader]) for duration in DURATIONS]
     idle = mode is AutoresetMode.NEXT_STEP
-    wanted = [alone(duration, READERS[reader], checkpoint, row, idle) for row, duration in enumerate(DURATIONS)]
+    wanted = [alone(duration, READERS[reader], checkpoint, i, idle) for i, duration in enumerate(DURATIONS)]
     env = VectorForecast(SyncVectorEnv(makers, autoreset_mode=mode), checkpoint)
     obs, infos = env.reset(seed=[0, 1])
     closings = 0
     for step in range(STEPS + 1):
-        for row, shown in enumerate(wanted):
-            assert_same(row_of(obs, row), shown[step][0])
+        for i, shown in enumerate(wanted):
+            assert_same(one_of(obs, i), shown[step][0])
             if shown[step][1] is not None:
-                assert_same(infos["final_obs"][row], shown[step][1])
+                assert_same(infos["final_obs"][i], shown[step][1])
                 closings += 1
         if step < STEPS:
-            obs, _, _, _, infos = env.step(np.stack([actions(row)[step] for row in range(len(DURATIONS))]))
+            obs, _, _, _, infos = env.step(np.stack([actions(i)[step] for i in range(len(DURATIONS))]))
     assert closings == (0 if idle else 3)
 
 
 # Python 3.12 warns of every fork of a process with threads; that it works is what is tested.
 @pytest.mark.filterwarnings("ignore:.*use of fork.. may lead to deadlocks:DeprecationWarning")
 def test_each_worker_process_has_its_own_reader(checkpoint: str):
-    makers = [partial(make_row, duration, SHOWN) for duration in DURATIONS]
+    makers = [partial(make_one, duration, SHOWN) for duration in DURATIONS]
     vector = AsyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP, context="fork")
-    wanted = [alone(duration, SHOWN, checkpoint, row) for row, duration in enumerate(DURATIONS)]
+    wanted = [alone(duration, SHOWN, checkpoint, i) for i, duration in enumerate(DURATIONS)]
     env = VectorForecast(vector, checkpoint)
     try:
         obs, _ = env.reset(seed=[0, 1])
         for step in range(4):
-            for row, shown in enumerate(wanted):
-                assert_same(row_of(obs, row), shown[step][0])
-            obs, *_ = env.step(np.stack([actions(row)[step] for row in range(len(DURATIONS))]))
+            for i, shown in enumerate(wanted):
+                assert_same(one_of(obs, i), shown[step][0])
+            obs, *_ = env.step(np.stack([actions(i)[step] for i in range(len(DURATIONS))]))
     finally:
         env.close()
 
@@ -190,38 +190,38 @@ def test_each_worker_process_has_its_own_reader(checkpoint: str):
 # --- Stable-Baselines3 ------------------------------------------------------------------------------------------------
 
 
-def check_sb3_rows(venv: VecEnv, reader: MakeReader, checkpoint: str, duration: int = 3) -> None:
-    """Rows, and what closes their episodes, are as if alone."""
-    wanted = [alone(duration, reader, checkpoint, row) for row in range(venv.num_envs)]
+def check_sb3_envs(venv: VecEnv, reader: MakeReader, checkpoint: str, duration: int = 3) -> None:
+    """Environments, and what closes their episodes, are as if alone."""
+    wanted = [alone(duration, reader, checkpoint, i) for i in range(venv.num_envs)]
     try:
         venv.seed(0)
         obs: Any = venv.reset()
         infos: Any = [{}] * venv.num_envs
         for step in range(STEPS + 1):
-            for row, shown in enumerate(wanted):
-                assert_same(row_of(obs, row), shown[step][0])
+            for i, shown in enumerate(wanted):
+                assert_same(one_of(obs, i), shown[step][0])
                 if shown[step][1] is not None:
-                    assert_same(infos[row]["terminal_observation"], shown[step][1])
+                    assert_same(infos[i]["terminal_observation"], shown[step][1])
             if step < STEPS:
-                obs, _, _, infos = venv.step(np.stack([actions(row)[step] for row in range(venv.num_envs)]))
+                obs, _, _, infos = venv.step(np.stack([actions(i)[step] for i in range(venv.num_envs)]))
     finally:
         venv.close()
 
 
 @pytest.mark.parametrize("kind", [DummyVecEnv, partial(SubprocVecEnv, start_method="spawn")], ids=["dummy", "spawn"])
 def test_sb3_takes_it_as_a_wrapper_class(kind: Callable[..., VecEnv], checkpoint: str):
-    """One wrapper in each row; the reader travels to the worker process with its arguments."""
+    """One wrapper in each environment; the reader travels to the worker process with its arguments."""
     kwargs = {"checkpoint": checkpoint, "reader": SHOWN}
-    rows = 2 if kind is DummyVecEnv else 1
-    venv = make_vec_env(Plaza, rows, wrapper_class=ForecastObservation, wrapper_kwargs=kwargs, vec_env_cls=kind)
-    check_sb3_rows(venv, SHOWN, checkpoint)
+    count = 2 if kind is DummyVecEnv else 1
+    venv = make_vec_env(Plaza, count, wrapper_class=ForecastObservation, wrapper_kwargs=kwargs, vec_env_cls=kind)
+    check_sb3_envs(venv, SHOWN, checkpoint)
 
 
 @pytest.mark.parametrize("reader", READERS)
 def test_sb3_shares_one_forward(reader: str, checkpoint: str):
     kwargs = {"reader": READERS[reader]}
     venv = make_vec_env("Plaza-v0", n_envs=2, wrapper_class=SceneObservation, wrapper_kwargs=kwargs)
-    check_sb3_rows(VecForecast(venv, checkpoint), READERS[reader], checkpoint)
+    check_sb3_envs(VecForecast(venv, checkpoint), READERS[reader], checkpoint)
 
 
 @pytest.mark.parametrize(("flatten", "policy"), [(False, "MultiInputPolicy"), (True, "MlpPolicy")])
@@ -263,13 +263,13 @@ def zoo_envs(settings: Mapping[str, Any]) -> VecEnv:
 def test_the_zoo_wraps_each_environment(checkpoint: str):
     register_reader(Plaza, ASKED)
     venv = zoo_envs({"env_wrapper": {"envs.wrappers.ForecastObservation": {"checkpoint": checkpoint}}})
-    check_sb3_rows(venv, ASKED, checkpoint)
+    check_sb3_envs(venv, ASKED, checkpoint)
 
 
 def test_the_zoo_stacks_wrappers(checkpoint: str):
     register_reader(Plaza, ASKED)
     entry = ["envs.wrappers.SceneObservation", {"envs.wrappers.ForecastObservation": {"checkpoint": checkpoint}}]
-    check_sb3_rows(zoo_envs({"env_wrapper": entry}), ASKED, checkpoint)
+    check_sb3_envs(zoo_envs({"env_wrapper": entry}), ASKED, checkpoint)
 
 
 def test_the_zoo_wraps_all_of_them_at_once(checkpoint: str):
@@ -280,7 +280,7 @@ def test_the_zoo_wraps_all_of_them_at_once(checkpoint: str):
     }
     venv = zoo_envs(settings)
     assert isinstance(venv, VecForecast)
-    check_sb3_rows(venv, ASKED, checkpoint)
+    check_sb3_envs(venv, ASKED, checkpoint)
 
 
 def test_the_guides_zoo_settings_make_an_environment():

@@ -98,9 +98,9 @@ def test_every_id_makes_and_reads(env_id: str):
     env.reset(seed=0)
     steps = 0
     while env.agents:
-        shared = reader.read(env)
-        shared.scene.check(env_id, reader.spec, agents=reader.spec.max_agents)
-        assert set(shared.index_of) == set(env.agents)
+        multi = reader.read(env)
+        multi.scene.check(env_id, reader.spec, agents=reader.spec.max_agents)
+        assert set(multi.index_of) == set(env.agents)
         env.step(dict.fromkeys(env.agents, 0))
         steps += 1
     assert steps == 3

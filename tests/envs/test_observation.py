@@ -132,7 +132,7 @@ def test_forecast_counts_from_where_the_ego_is_now():
 
 
 def test_edges_read_agent_to_ego_before_ego_to_agent():
-    """Pairs are (receiver, sender): row 0 of the graph is what the ego receives."""
+    """Pairs are (receiver, sender): index 0 of the graph is what the ego receives."""
     scenes = one_scene((20, 0, 0, 0), (10, 0, 0, 0))
     probs = torch.zeros(1, 3, 3, 2)
     features = torch.zeros(1, 3, 3, 1)
@@ -194,12 +194,12 @@ def test_order_skips_padding_that_lies_nearer():
 # --- ForecastStream: the semantics of DESIGN.md as a policy meets them ------------------------------------------------
 
 
-def stream(spec: SceneSpec, rows: int = 1, **config: Any) -> ForecastStream:
-    return ForecastStream(tiny_model(spec), spec, rows, ForecastConfig(**config))
+def stream(spec: SceneSpec, envs: int = 1, **config: Any) -> ForecastStream:
+    return ForecastStream(tiny_model(spec), spec, envs, ForecastConfig(**config))
 
 
 def drive(rng: np.random.Generator, batch: int, steps: int, agents: int = 6, present: Any = None) -> list[SceneBatch]:
-    """Scenes in which everyone keeps an id and moves a little."""
+    """Scenes in which each agent keeps an id and moves a little."""
     first = random_scenes(rng, batch, agents, present=present)
     scenes = [first]
     for _ in range(steps - 1):
@@ -261,21 +261,21 @@ def test_ego_alone_is_an_empty_observation():
             assert all((value == 0).all() for value in entries.values())
 
 
-def test_memory_follows_ids_when_rows_are_sorted_anew():
+def test_memory_follows_ids_when_agents_are_sorted_anew():
     rng = np.random.default_rng(3)
     scenes = drive(rng, batch=2, steps=4, present=[6, 6])
     fixed, sorted_anew = stream(HIGHWAY_SPEC, 2), stream(HIGHWAY_SPEC, 2)
-    by_row = stream(HIGHWAY_SPEC, 2)
+    by_place = stream(HIGHWAY_SPEC, 2)
     for scene in scenes:
         order = np.concatenate([[0], 1 + rng.permutation(5)])
         moved = SceneBatch(scene.states[:, order], scene.ids[:, order], scene.valid[:, order], scene.heading_rad)
         expected, actual = fixed.observe(scene), sorted_anew.observe(moved)
         assert_same(actual, expected)
-        wrong = by_row.observe(replace(moved, ids=scene.ids))
-    assert largest_difference(wrong, expected) > 100 * TOLERANCE  # rows for ids would have been noticed
+        wrong = by_place.observe(replace(moved, ids=scene.ids))
+    assert largest_difference(wrong, expected) > 100 * TOLERANCE  # places for ids would have been noticed
 
 
-def test_a_newcomer_inherits_nothing_from_the_leaver_of_its_row():
+def test_a_newcomer_inherits_nothing_from_the_leaver_of_its_place():
     """An edge's features come from the memory of its pair alone: a newcomer's are those of a first sight."""
     scenes = drive(np.random.default_rng(9), batch=1, steps=3, present=[3])
     ids = scenes[2].ids.copy()
@@ -291,17 +291,17 @@ def test_a_newcomer_inherits_nothing_from_the_leaver_of_its_row():
     assert np.abs(actual[veteran] - first_sight[veteran]).max() > 1e-3
 
 
-def test_a_row_of_a_batch_is_as_if_alone():
+def test_an_env_of_a_batch_is_as_if_alone():
     scenes = drive(np.random.default_rng(4), batch=3, steps=3)
     together = stream(HIGHWAY_SPEC, 3)
     alone = [stream(HIGHWAY_SPEC) for _ in range(3)]
     for scene in scenes:
         entries = together.observe(scene)
-        for row, single in enumerate(alone):
-            assert_same({k: v[[row]] for k, v in entries.items()}, single.observe(scene[np.array([row])]))
+        for env, single in enumerate(alone):
+            assert_same({k: v[[env]] for k, v in entries.items()}, single.observe(scene[np.array([env])]))
 
 
-def test_reset_forgets_the_named_rows_only():
+def test_reset_forgets_the_named_envs_only():
     scenes = drive(np.random.default_rng(5), batch=2, steps=3)
     kept, cut, fresh = stream(HIGHWAY_SPEC, 2), stream(HIGHWAY_SPEC, 2), stream(HIGHWAY_SPEC, 2)
     for scene in scenes[:2]:

@@ -121,7 +121,7 @@ class Toy(ParallelEnv):
 
 
 class ToyReader:
-    """Everyone, in other rows at each step unless told not to."""
+    """All agents, in other places at each step unless told not to."""
 
     def __init__(self, env: Any, spec: SceneSpec = WORLD, shuffle: bool = True) -> None:
         self.spec, self._shuffle = spec, shuffle
@@ -136,13 +136,13 @@ class ToyReader:
         if self._shuffle:
             order = self._rng.permutation(order)
         names = list(toy.lives)
-        rows = {names[i]: row for row, i in enumerate(order) if names[i] in toy.observed}
-        everyone = Scene(toy.tracks[toy.t][order], 100 + order, np.ones(len(order), dtype=np.bool_))
-        return pad_multiagent_scene(everyone, rows, toy.headings[toy.t][order], self.spec, "ToyReader")
+        index_of = {names[i]: index for index, i in enumerate(order) if names[i] in toy.observed}
+        full = Scene(toy.tracks[toy.t][order], 100 + order, np.ones(len(order), dtype=np.bool_))
+        return pad_multiagent_scene(full, index_of, toy.headings[toy.t][order], self.spec, "ToyReader")
 
 
 class Reference:
-    """The same forecasts by the plainest means: a row for every body of the script, a loop for every agent."""
+    """The same forecasts by the plainest means: an environment for every body of the script, a loop for every agent."""
 
     def __init__(self, forecaster: Forecaster, toy: Toy, perception_m: float, max_agents: int) -> None:
         self._front = int(forecaster.spec.has_ego)
@@ -168,9 +168,9 @@ class Reference:
             edge_features=forecast.edge_features[:, front:, front:],
             valid=forecast.valid[:, front:],
         )
-        shared = MultiagentScene(scene, {}, toy.headings[toy.t])
+        multi = MultiagentScene(scene, {}, toy.headings[toy.t])
         return {
-            name: view_by_loops(shared, forecast, i, self._view)
+            name: view_by_loops(multi, forecast, i, self._view)
             for i, name in enumerate(toy.lives)
             if name in toy.observed and valid[i]
         }
@@ -336,27 +336,27 @@ def test_identities_are_forgotten_before_a_new_episode_is_read():
 
 
 @pytest.mark.parametrize("learns", [True, False], ids=["learners", "traffic"])
-def test_who_takes_a_leavers_row_gets_none_of_its_memory(learns: bool):
-    """The newcomer of step 4 stands in the row of the leaver of step 3 and has the edges of a first sight."""
+def test_an_agent_in_a_leavers_place_gets_none_of_its_memory(learns: bool):
+    """The newcomer of step 4 stands in the place of the leaver of step 3 and has the edges of a first sight."""
     lives = {"stays": Life(), "leaves": Life(last=3, learns=learns), "comes": Life(first=4, learns=learns)}
     env = wrap(Toy(lives), shuffle=False, perception_m=np.inf)
     fresh = wrap(Toy(lives), shuffle=False, perception_m=np.inf)
     env.reset(seed=0)
     fresh.reset(seed=0)
-    rows = []
+    places = []
     for _ in range(4):
         observations, *_ = env.step(act(env))
-        rows.append({int(i): row for row, i in enumerate(env.scene.scene.ids) if i >= 0})
+        places.append({int(i): index for index, i in enumerate(env.scene.scene.ids) if i >= 0})
         fresh.stream.reset()
         first_sight, *_ = fresh.step(act(fresh))
-    assert rows[2][101] == rows[3][102] == 1
+    assert places[2][101] == places[3][102] == 1
     assert observations["stays"]["valid"].sum() == 1
     np.testing.assert_allclose(
         observations["stays"]["edge_features"], first_sight["stays"]["edge_features"], rtol=1e-5, atol=1e-5
     )
 
 
-def test_memory_survives_a_change_of_rows():
+def test_memory_survives_a_change_of_places():
     shuffled, fixed = wrap(Toy(), shuffle=True), wrap(Toy(), shuffle=False)
     for seen, wanted in zip(play(shuffled), play(fixed), strict=True):
         for name in wanted:
@@ -403,8 +403,8 @@ def test_a_dying_agent_off_the_map_sees_nothing():
     assert episode[3]["stays"]["valid"].sum() == 4
 
 
-def test_nobody_left_and_nobody_there():
-    """All learners die at step 2, then one joins; then everybody is off the map."""
+def test_no_learner_left_and_no_agent_there():
+    """All learners die at step 2, then one joins; then all agents are off the map."""
     lives = {"a": Life(last=2), "b": Life(last=2), "late": Life(first=2, last=4)}
     env = wrap(Toy(lives, vanish=True))
     observations, _ = env.reset(seed=0)
@@ -421,11 +421,11 @@ def test_scene_and_forecast_are_of_the_latest_step():
     env = wrap(Toy({"a": Life(), "b": Life()}), forecaster=ConstantVelocity(WORLD, 2), perception_m=np.inf)
     env.reset(seed=0)
     observations, *_ = env.step(act(env))
-    scene, row = env.scene.scene, env.scene.index_of["a"]
-    np.testing.assert_array_equal(scene.states[row], env.unwrapped.tracks[1, 0])
-    expected = scene.states[row, :2] + 2 * scene.states[row, 2:4]
-    np.testing.assert_allclose(env.forecast.xy[0, 0, row, 1], expected, rtol=1e-5)
-    offset = env.forecast.xy[0, 0, env.scene.index_of["b"], 1].numpy() - scene.states[row, :2]
+    scene, index = env.scene.scene, env.scene.index_of["a"]
+    np.testing.assert_array_equal(scene.states[index], env.unwrapped.tracks[1, 0])
+    expected = scene.states[index, :2] + 2 * scene.states[index, 2:4]
+    np.testing.assert_allclose(env.forecast.xy[0, 0, index, 1], expected, rtol=1e-5)
+    offset = env.forecast.xy[0, 0, env.scene.index_of["b"], 1].numpy() - scene.states[index, :2]
     assert np.linalg.norm(observations["a"]["forecast"][0, 1]) == pytest.approx(np.linalg.norm(offset), rel=1e-4)
     assert env.scene_spec is env.reader.spec
 
@@ -462,8 +462,8 @@ def test_checkpoint_decides_how_far_agents_see(tmp_path: Path):
     near = ForecastParallelEnv(Toy(), path, reader=ToyReader)
     far = ForecastParallelEnv(Toy(), path, reader=ToyReader, perception_m=np.inf)
     seen = [observation["valid"].sum() for step in play(near) for observation in step.values()]
-    everyone = [observation["valid"].sum() for step in play(far) for observation in step.values()]
-    assert sum(seen) < sum(everyone)
+    full = [observation["valid"].sum() for step in play(far) for observation in step.values()]
+    assert sum(seen) < sum(full)
     toy = Toy()
     expected = ForecastParallelEnv(toy, reader=ToyReader, forecaster=tiny_model(WORLD), perception_m=9.0)
     assert seen == [observation["valid"].sum() for step in play(expected) for observation in step.values()]
@@ -476,7 +476,7 @@ def test_constant_velocity_needs_no_checkpoint():
     assert (observation["edge_probs"] == 0).all()
 
 
-def test_more_rows_than_agents_are_padding():
+def test_larger_max_agents_are_padding():
     wide = play(wrap(Toy(), max_agents=12, shuffle=False))
     exact = play(wrap(Toy(), shuffle=False))
     for seen, wanted in zip(wide, exact, strict=True):

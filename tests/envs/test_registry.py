@@ -57,7 +57,7 @@ except UserError as error:
     assert "need the envpool package" in line and "pip install 'dgvae-rl[envpool]'" in line
 
 
-def test_native_environments_are_made_by_id():
+def test_envpool_environments_are_made_by_id():
     pytest.importorskip("envpool")
     env = make_env("envpool/HighwayFast-v0", vehicles_count=7)
     assert env.unwrapped.task_id == "HighwayFast-v0"  # type: ignore[attr-defined]
@@ -76,7 +76,7 @@ def test_native_environments_are_made_by_id():
         ("intersection-v2", "Intersection-v0"),
     ],
 )
-def test_the_native_copy_has_the_version_or_else_the_name(env_id: str, task: str):
+def test_the_envpool_copy_has_the_version_or_else_the_name(env_id: str, task: str):
     assert envpool_task_of(env_id) == task
 
 
@@ -102,7 +102,7 @@ def test_what_was_not_copied_is_named(env_id: str):
         ("racetrack-v1", "racetrack"),
     ],
 )
-def test_a_native_environment_has_the_checkpoint_of_its_original(env_id: str, checkpoint: str):
+def test_an_envpool_environment_has_the_checkpoint_of_its_original(env_id: str, checkpoint: str):
     assert checkpoint_for(env_id) == checkpoint
 
 

@@ -81,9 +81,9 @@ def assert_same_agents(actual: Mapping[str, Any], expected: Mapping[str, Any]) -
         for view in (actual, expected)
     )
     left = list(range(len(ours)))
-    for row in theirs:
-        nearest = min(left, key=lambda i: float(np.abs(ours[i] - row).max()))
-        np.testing.assert_allclose(ours[nearest], row, rtol=TOLERANCE, atol=TOLERANCE)
+    for state in theirs:
+        nearest = min(left, key=lambda i: float(np.abs(ours[i] - state).max()))
+        np.testing.assert_allclose(ours[nearest], state, rtol=TOLERANCE, atol=TOLERANCE)
         left.remove(nearest)
     assert not left
 
@@ -101,8 +101,8 @@ def test_an_episode_opens_with_one_step_of_history(name: str, take: Callable[[st
     assert_same_views(new[0].views, session.windowed(new[:1]))
     stale = session.stream()
     for moment in old[:4]:
-        stale.observe(moment.shared)
-    leaks = [difference(stale.observe(moment.shared), moment.views) for moment in new]
+        stale.observe(moment.multi)
+    leaks = [difference(stale.observe(moment.multi), moment.views) for moment in new]
     assert max(leaks) > 1e-3  # a history that stays would be noticed
 
 
@@ -111,7 +111,7 @@ def test_an_episode_closes_with_its_own_history(name: str, take: Callable[[str],
     session, (old, new) = take(name).session, take(name).episodes
     for episode in (old, new):
         assert_same_views(episode[-1].views, session.windowed(episode))
-        forgotten = session.stream().observe(episode[-1].shared)
+        forgotten = session.stream().observe(episode[-1].multi)
         assert difference(forgotten, episode[-1].views) > 1e-3
 
 
@@ -128,7 +128,7 @@ def test_an_id_is_a_body(name: str, take: Callable[[str], Take]):
     subject, episode = SUBJECTS[name], take(name).episodes[0]
     could_be: dict[int, set[Any]] = {}
     for moment in episode:
-        scene = moment.shared.scene
+        scene = moment.multi.scene
         for state, number in zip(scene.states[scene.valid], scene.ids[scene.valid].tolist(), strict=True):
             there = nearby(moment.bodies, state, subject.tolerance_m)
             could_be[number] = could_be.get(number, there) & there
@@ -143,22 +143,22 @@ def test_an_id_is_a_body(name: str, take: Callable[[str], Take]):
     assert any(set(before.views) - set(after.views) for before, after in pairs) == subject.dies
 
 
-def sorted_anew(shared: MultiagentScene, rng: np.random.Generator) -> MultiagentScene:
-    """The same scene with everyone in another row; a single ego keeps the first."""
-    fixed = int(EGO in shared.index_of)
-    order = np.r_[np.arange(fixed), fixed + rng.permutation(len(shared.scene.ids) - fixed)]
-    place, scene = np.argsort(order), shared.scene
+def sorted_anew(multi: MultiagentScene, rng: np.random.Generator) -> MultiagentScene:
+    """The same scene with all agents in another place; a single ego keeps the first."""
+    fixed = int(EGO in multi.index_of)
+    order = np.r_[np.arange(fixed), fixed + rng.permutation(len(multi.scene.ids) - fixed)]
+    place, scene = np.argsort(order), multi.scene
     moved = Scene(scene.states[order], scene.ids[order], scene.valid[order], scene.heading_rad)
-    rows = {name: int(place[row]) for name, row in shared.index_of.items()}
-    return MultiagentScene(moved, rows, shared.heading_rad[order])
+    index_of = {name: int(place[index]) for name, index in multi.index_of.items()}
+    return MultiagentScene(moved, index_of, multi.heading_rad[order])
 
 
 @named()
-def test_rows_are_only_an_order(name: str, take: Callable[[str], Take]):
+def test_results_do_not_depend_on_the_order_of_agents(name: str, take: Callable[[str], Take]):
     session, episode = take(name).session, take(name).episodes[0]
     stream, rng = session.stream(), np.random.default_rng(0)
     for moment in episode:
-        views = stream.observe(sorted_anew(moment.shared, rng))
+        views = stream.observe(sorted_anew(moment.multi, rng))
         assert set(views) == set(moment.views)
         for viewer, view in moment.views.items():
             assert_same_agents(views[viewer], view)
@@ -170,11 +170,11 @@ def test_a_newcomer_inherits_nothing(name: str, take: Callable[[str], Take]):
     session, episode = take(name).session, take(name).episodes[0]
     newcomers, remembered = 0, 0.0
     for before, now in itertools.pairwise(episode):
-        scene = now.shared.scene
+        scene = now.multi.scene
         fresh = scene.valid & ~np.isin(scene.ids, list(before.present))
         pairs = scene.valid[:, None] & scene.valid & ~np.eye(len(fresh), dtype=np.bool_)
         new = pairs & (fresh[:, None] | fresh)
-        first_sight = session.first_sight(now.shared).forecast.edge_features[0].numpy()
+        first_sight = session.first_sight(now.multi).forecast.edge_features[0].numpy()
         features = now.forecast.edge_features[0].numpy()
         np.testing.assert_allclose(features[new], first_sight[new], rtol=TOLERANCE, atol=TOLERANCE)
         newcomers += int(fresh.sum())
@@ -185,7 +185,7 @@ def test_a_newcomer_inherits_nothing(name: str, take: Callable[[str], Take]):
 
 @pytest.mark.parametrize(("name", "step"), [("function", 4), ("own-reader", 4), ("rows-crowd-ids", 4), ("swarm", 5)])
 def test_the_toys_newcomer_stands_where_the_leaver_would_be(name: str, step: int, take: Callable[[str], Take]):
-    """So that the test above is about somebody whom motion alone would take for the leaver."""
+    """So that the test above is about an agent that motion alone would take for the leaver."""
     before, now = take(name).episodes[0][step - 1 : step + 1]
     ((gone, was),) = [(i, s) for i, s in states_of(before).items() if i not in now.present]
     ((come, state),) = [(i, s) for i, s in states_of(now).items() if i not in before.present]
@@ -195,7 +195,7 @@ def test_the_toys_newcomer_stands_where_the_leaver_would_be(name: str, step: int
 
 
 def states_of(moment: Moment) -> dict[int, np.ndarray]:
-    scene = moment.shared.scene
+    scene = moment.multi.scene
     return dict(zip(scene.ids[scene.valid].tolist(), scene.states[scene.valid], strict=True))
 
 
@@ -219,27 +219,27 @@ def test_another_future_leaves_the_past_alone(name: str, take: Callable[[str], T
     for seen, wanted in zip(other[: TURN + 1], episode, strict=False):
         assert_same_views(seen.views, wanted.views, tolerance=0.0)
     later = list(zip(other, episode, strict=False))[TURN + 1 :]
-    assert any((seen.shared.scene.states != wanted.shared.scene.states).any() for seen, wanted in later)
+    assert any((seen.multi.scene.states != wanted.multi.scene.states).any() for seen, wanted in later)
 
 
 # --- 5. Padding is invisible ------------------------------------------------------------------------------------------
 
 
 @named()
-def test_more_rows_are_padding(name: str, take: Callable[[str], Take], fresh: Callable[..., Session]):
+def test_larger_max_agents_are_padding(name: str, take: Callable[[str], Take], fresh: Callable[..., Session]):
     session, episode = take(name).session, take(name).episodes[0]
-    rows = session.view.max_agents
-    wide = fresh(name, rows=rows + 5).play(SUBJECTS[name].seed, steps=3)
+    size = session.view.max_agents
+    wide = fresh(name, size=size + 5).play(SUBJECTS[name].seed, steps=3)
     for seen, wanted in zip(wide, episode, strict=False):
         for viewer, view in wanted.views.items():
-            common = {key: value[: rows - 1] for key, value in seen.views[viewer].items()}
+            common = {key: value[: size - 1] for key, value in seen.views[viewer].items()}
             assert_same(common, view)
-            assert all((value[rows - 1 :] == 0).all() for value in seen.views[viewer].values())
+            assert all((value[size - 1 :] == 0).all() for value in seen.views[viewer].values())
     assert len(wide) > 2
 
 
 @named()
-@pytest.mark.parametrize("bounds", [{"sight_m": 1e-6}, {"rows": 1}], ids=["sees nobody", "room for nobody"])
+@pytest.mark.parametrize("bounds", [{"sight_m": 1e-6}, {"size": 1}], ids=["sees no agent", "room for no agent"])
 def test_the_viewer_alone_works(name: str, bounds: dict[str, Any], fresh: Callable[..., Session]):
     session = fresh(name, **bounds)
     for moment in session.play(SUBJECTS[name].seed, steps=2):
@@ -252,10 +252,10 @@ def test_the_viewer_alone_works(name: str, bounds: dict[str, Any], fresh: Callab
 # --- 6. Frame ---------------------------------------------------------------------------------------------------------
 
 
-def shifted(shared: MultiagentScene, axis: int, shift_m: float) -> MultiagentScene:
-    states = shared.scene.states.copy()
-    states[shared.scene.valid, axis] += shift_m
-    return replace(shared, scene=replace(shared.scene, states=states))
+def shifted(multi: MultiagentScene, axis: int, shift_m: float) -> MultiagentScene:
+    states = multi.scene.states.copy()
+    states[multi.scene.valid, axis] += shift_m
+    return replace(multi, scene=replace(multi.scene, states=states))
 
 
 @named()
@@ -266,7 +266,7 @@ def test_a_shift_matters_only_where_there_is_a_map(name: str, axis: int, take: C
     shift_m = 10_000.0 if frame == "ego" else scale
     stream = session.stream()
     for moment in episode:
-        views = stream.observe(shifted(moment.shared, axis, shift_m))
+        views = stream.observe(shifted(moment.multi, axis, shift_m))
     if frame == "world":
         assert difference(views, episode[-1].views) > 1e-3
     else:
@@ -279,10 +279,10 @@ def test_views_turn_with_the_viewer_and_start_from_it(name: str, take: Callable[
     """Turned back and moved back, what a viewer sees are the scene's positions and the world's forecasts."""
     session, compared = take(name).session, 0
     for moment in take(name).episodes[0][::2]:
-        scene, xy = moment.shared.scene, moment.forecast.xy[0, 0].numpy()
+        scene, xy = moment.multi.scene, moment.forecast.xy[0, 0].numpy()
         for viewer, view in moment.views.items():
-            row = moment.shared.index_of[viewer]
-            heading_rad, own = moment.shared.heading_rad[row], scene.states[row]
+            index = moment.multi.index_of[viewer]
+            heading_rad, own = moment.multi.heading_rad[index], scene.states[index]
             origin = 0.0 if session.spec.has_ego else own[:2]  # of the forecast behind the views
             cos, sin = np.cos(heading_rad), np.sin(heading_rad)
             back = np.array([[cos, sin], [-sin, cos]])
@@ -299,15 +299,15 @@ def test_views_turn_with_the_viewer_and_start_from_it(name: str, take: Callable[
 
 
 @named()
-@pytest.mark.parametrize("rows", [None, 3], ids=["near", "near and few"])
-def test_views_hold_the_nearest_within_perception(name: str, rows: int | None, fresh: Callable[..., Session]):
+@pytest.mark.parametrize("size", [None, 3], ids=["near", "near and few"])
+def test_views_hold_the_nearest_within_perception(name: str, size: int | None, fresh: Callable[..., Session]):
     """Against a plain loop over the simulator's own bodies."""
     subject = SUBJECTS[name]
-    session, dropped = fresh(name, sight_m=subject.near_m, rows=rows), 0
+    session, dropped = fresh(name, sight_m=subject.near_m, size=size), 0
     for moment in session.play(subject.seed, steps=4):
         places = np.array([place for _, place in moment.bodies])
         for viewer, view in moment.views.items():
-            own = moment.shared.scene.states[moment.shared.index_of[viewer], :2]
+            own = moment.multi.scene.states[moment.multi.index_of[viewer], :2]
             around_m = np.sort(np.linalg.norm(places - own, axis=1))[1:]  # the first is the viewer
             expected = around_m[around_m <= subject.near_m][: session.view.max_agents - 1]
             seen_m = np.linalg.norm(view["agents"][view["valid"] == 1, :2], axis=1)

@@ -34,7 +34,7 @@ from tests.envs.helpers import (
 )
 
 DURATIONS = (2, 5, 3)
-"""Steps per episode of each row, so that rows end at different times."""
+"""Steps per episode of each environment, so that environments end at different times."""
 STEPS = 7
 SEED = 20
 ACTIONS = np.random.default_rng(0).integers(5, size=(STEPS, len(DURATIONS)))
@@ -42,8 +42,8 @@ MAKERS = [partial(short_scene_env, duration) for duration in DURATIONS]
 
 
 @dataclass
-class Row:
-    """What one row should see, played alone by `ForecastObservation`."""
+class Played:
+    """What one environment should see, played alone by `ForecastObservation`."""
 
     opening: dict[str, Any]
     """The first observation."""
@@ -55,10 +55,10 @@ class Row:
     """By step at which an episode ended: the first observation of the next."""
 
 
-def play_alone(row: int, checkpoint: str, idle_steps: bool = False) -> Row:
-    """One row for `STEPS` steps of its vector env; with `idle_steps`, the step after an end only resets."""
-    env = ForecastObservation(short_env(DURATIONS[row]), checkpoint)
-    played = Row(env.reset(seed=SEED + row)[0])
+def play_alone(i: int, checkpoint: str, idle_steps: bool = False) -> Played:
+    """One environment for `STEPS` steps of its vector env; with `idle_steps`, the step after an end only resets."""
+    env = ForecastObservation(short_env(DURATIONS[i]), checkpoint)
+    played = Played(env.reset(seed=SEED + i)[0])
     fresh_at = -1
     for t in range(STEPS):
         if t == fresh_at:
@@ -66,7 +66,7 @@ def play_alone(row: int, checkpoint: str, idle_steps: bool = False) -> Row:
             played.rewards.append(0.0)
             played.ends.append(False)
             continue
-        obs, reward, terminated, truncated, _ = env.step(int(ACTIONS[t, row]))
+        obs, reward, terminated, truncated, _ = env.step(int(ACTIONS[t, i]))
         played.steps.append(obs)
         played.rewards.append(float(reward))
         played.ends.append(terminated or truncated)
@@ -77,23 +77,23 @@ def play_alone(row: int, checkpoint: str, idle_steps: bool = False) -> Row:
 
 
 @pytest.fixture(scope="module")
-def alone(highway_checkpoint: str) -> list[Row]:
-    return [play_alone(row, highway_checkpoint) for row in range(len(DURATIONS))]
+def alone(highway_checkpoint: str) -> list[Played]:
+    return [play_alone(i, highway_checkpoint) for i in range(len(DURATIONS))]
 
 
 @pytest.fixture(scope="module")
-def alone_with_idle_steps(highway_checkpoint: str) -> list[Row]:
-    return [play_alone(row, highway_checkpoint, idle_steps=True) for row in range(len(DURATIONS))]
+def alone_with_idle_steps(highway_checkpoint: str) -> list[Played]:
+    return [play_alone(i, highway_checkpoint, idle_steps=True) for i in range(len(DURATIONS))]
 
 
-def row_of(observations: dict[str, Any], row: int) -> dict[str, Any]:
-    return {key: value[row] for key, value in observations.items()}
+def one_of(observations: dict[str, Any], i: int) -> dict[str, Any]:
+    return {key: value[i] for key, value in observations.items()}
 
 
-def test_rows_end_at_different_steps(alone: list[Row], alone_with_idle_steps: list[Row]):
-    """What the tests below rely on: every row ends, no two alike, and not all at once."""
-    for rows in (alone, alone_with_idle_steps):
-        ends = [tuple(row.ends) for row in rows]
+def test_envs_end_at_different_steps(alone: list[Played], alone_with_idle_steps: list[Played]):
+    """What the tests below rely on: every environment ends, no two alike, and not all at once."""
+    for episodes in (alone, alone_with_idle_steps):
+        ends = [tuple(played.ends) for played in episodes]
         assert all(any(e) for e in ends)
         assert len(set(ends)) == len(DURATIONS)
 
@@ -126,37 +126,37 @@ SB3_KINDS: dict[str, Callable[[], VecEnv]] = {
 # Python 3.12 warns of every fork of a process with threads; that it works is what is tested.
 @pytest.mark.filterwarnings("ignore:.*use of fork.. may lead to deadlocks:DeprecationWarning")
 @pytest.mark.parametrize("kind", SB3_KINDS)
-def test_sb3_rows_are_as_if_alone(kind: str, alone: list[Row], highway_checkpoint: str):
+def test_sb3_envs_are_as_if_alone(kind: str, alone: list[Played], highway_checkpoint: str):
     venv = VecForecast(SB3_KINDS[kind](), highway_checkpoint)
-    rows = alone[: venv.num_envs]
+    episodes = alone[: venv.num_envs]
     try:
         venv.seed(SEED)
         obs: Any = venv.reset()
-        for row, played in enumerate(rows):
-            assert_same(row_of(obs, row), played.opening)
+        for i, played in enumerate(episodes):
+            assert_same(one_of(obs, i), played.opening)
         for t in range(STEPS):
-            obs, rewards, dones, infos = venv.step(ACTIONS[t, : len(rows)])
-            assert dones.tolist() == [played.ends[t] for played in rows]
-            assert rewards.tolist() == pytest.approx([played.rewards[t] for played in rows], abs=1e-6)
-            for row, played in enumerate(rows):
+            obs, rewards, dones, infos = venv.step(ACTIONS[t, : len(episodes)])
+            assert dones.tolist() == [played.ends[t] for played in episodes]
+            assert rewards.tolist() == pytest.approx([played.rewards[t] for played in episodes], abs=1e-6)
+            for i, played in enumerate(episodes):
                 if played.ends[t]:
-                    assert_same(infos[row]["terminal_observation"], played.steps[t])
-                    assert_same(row_of(obs, row), played.successors[t])
+                    assert_same(infos[i]["terminal_observation"], played.steps[t])
+                    assert_same(one_of(obs, i), played.successors[t])
                 else:
-                    assert "terminal_observation" not in infos[row]
-                    assert_same(row_of(obs, row), played.steps[t])
+                    assert "terminal_observation" not in infos[i]
+                    assert_same(one_of(obs, i), played.steps[t])
     finally:
         venv.close()
 
 
-def test_sb3_reset_forgets_every_row(alone: list[Row], highway_checkpoint: str):
+def test_sb3_reset_forgets_every_env(alone: list[Played], highway_checkpoint: str):
     venv = VecForecast(DummyVecEnv(MAKERS), highway_checkpoint)
     venv.reset()
     venv.step(ACTIONS[0])
     venv.seed(SEED)
     obs: Any = venv.reset()
-    for row, played in enumerate(alone):
-        assert_same(row_of(obs, row), played.opening)
+    for i, played in enumerate(alone):
+        assert_same(one_of(obs, i), played.opening)
 
 
 def test_sb3_observations_lie_in_the_space(highway_checkpoint: str):
@@ -164,13 +164,13 @@ def test_sb3_observations_lie_in_the_space(highway_checkpoint: str):
     space = venv.observation_space
     assert isinstance(space, gym.spaces.Dict)
     assert set(space) == {"observation", *FORECAST_KEYS}
-    observations: list[Any] = [row_of(venv.reset(), row) for row in range(3)]
+    observations: list[Any] = [one_of(venv.reset(), i) for i in range(3)]
     for t in range(3):
         obs, _, dones, infos = venv.step(ACTIONS[t])
-        observations += [row_of(obs, row) for row in range(3)]
-        observations += [infos[row]["terminal_observation"] for row in np.flatnonzero(dones)]
-        for row in np.flatnonzero(dones):
-            assert {"TimeLimit.truncated", "episode"} <= set(infos[row])
+        observations += [one_of(obs, i) for i in range(3)]
+        observations += [infos[i]["terminal_observation"] for i in np.flatnonzero(dones)]
+        for i in np.flatnonzero(dones):
+            assert {"TimeLimit.truncated", "episode"} <= set(infos[i])
     assert len(observations) > 12
     assert all(space.contains(obs) for obs in observations)
     assert observations[0]["forecast"].shape == (MAX_AGENTS - 1, 2, 4, 2)
@@ -185,66 +185,66 @@ def vector(mode: AutoresetMode, checkpoint: str, kind: Any = SyncVectorEnv, **kw
 
 @pytest.mark.filterwarnings("ignore:.*use of fork.. may lead to deadlocks:DeprecationWarning")
 @pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv], ids=["sync", "async"])
-def test_same_step_rows_are_as_if_alone(kind: Any, alone: list[Row], highway_checkpoint: str):
+def test_same_step_envs_are_as_if_alone(kind: Any, alone: list[Played], highway_checkpoint: str):
     env = vector(AutoresetMode.SAME_STEP, highway_checkpoint, kind)
     try:
         obs, _ = env.reset(seed=SEED)
-        for row, played in enumerate(alone):
-            assert_same(row_of(obs, row), played.opening)
+        for i, played in enumerate(alone):
+            assert_same(one_of(obs, i), played.opening)
         for t in range(STEPS):
             obs, rewards, terminations, truncations, infos = env.step(ACTIONS[t])
             assert (terminations | truncations).tolist() == [played.ends[t] for played in alone]
             assert rewards.tolist() == pytest.approx([played.rewards[t] for played in alone])
-            for row, played in enumerate(alone):
+            for i, played in enumerate(alone):
                 if played.ends[t]:
-                    assert_same(infos["final_obs"][row], played.steps[t])
-                    assert_same(row_of(obs, row), played.successors[t])
+                    assert_same(infos["final_obs"][i], played.steps[t])
+                    assert_same(one_of(obs, i), played.successors[t])
                 else:
-                    assert_same(row_of(obs, row), played.steps[t])
+                    assert_same(one_of(obs, i), played.steps[t])
     finally:
         env.close()
 
 
-def test_next_step_rows_are_as_if_alone(alone_with_idle_steps: list[Row], highway_checkpoint: str):
+def test_next_step_envs_are_as_if_alone(alone_with_idle_steps: list[Played], highway_checkpoint: str):
     env = vector(AutoresetMode.NEXT_STEP, highway_checkpoint)
     obs, _ = env.reset(seed=SEED)
-    for row, played in enumerate(alone_with_idle_steps):
-        assert_same(row_of(obs, row), played.opening)
+    for i, played in enumerate(alone_with_idle_steps):
+        assert_same(one_of(obs, i), played.opening)
     for t in range(STEPS):
         obs, rewards, terminations, truncations, _ = env.step(ACTIONS[t])
         assert (terminations | truncations).tolist() == [played.ends[t] for played in alone_with_idle_steps]
         assert rewards.tolist() == pytest.approx([played.rewards[t] for played in alone_with_idle_steps])
-        for row, played in enumerate(alone_with_idle_steps):
-            assert_same(row_of(obs, row), played.steps[t])
+        for i, played in enumerate(alone_with_idle_steps):
+            assert_same(one_of(obs, i), played.steps[t])
 
 
-def test_disabled_rows_are_as_if_alone(alone: list[Row], highway_checkpoint: str):
+def test_disabled_envs_are_as_if_alone(alone: list[Played], highway_checkpoint: str):
     env = vector(AutoresetMode.DISABLED, highway_checkpoint)
     obs, _ = env.reset(seed=SEED)
     for t in range(STEPS):
         obs, _, terminations, truncations, _ = env.step(ACTIONS[t])
         ended = terminations | truncations
         assert ended.tolist() == [played.ends[t] for played in alone]
-        for row, played in enumerate(alone):
-            assert_same(row_of(obs, row), played.steps[t])
+        for i, played in enumerate(alone):
+            assert_same(one_of(obs, i), played.steps[t])
         if ended.any():
             obs, _ = env.reset(options={"reset_mask": ended})
-            for row, played in enumerate(alone):
-                assert_same(row_of(obs, row), played.successors[t] if ended[row] else played.steps[t])
+            for i, played in enumerate(alone):
+                assert_same(one_of(obs, i), played.successors[t] if ended[i] else played.steps[t])
 
 
-def test_disabled_partial_reset_right_after_reset(alone: list[Row], highway_checkpoint: str):
-    """A row that is reset before its episode ends forgets; the others carry on, having seen nothing twice."""
+def test_disabled_partial_reset_right_after_reset(alone: list[Played], highway_checkpoint: str):
+    """An environment that is reset before its episode ends forgets; the others carry on, having seen nothing twice."""
     env = vector(AutoresetMode.DISABLED, highway_checkpoint)
     env.reset(seed=SEED)
     env.step(ACTIONS[0])
     obs, _ = env.reset(seed=SEED, options={"reset_mask": np.array([True, False, False])})
-    assert_same(row_of(obs, 0), alone[0].opening)
+    assert_same(one_of(obs, 0), alone[0].opening)
     again, _, _, _, _ = env.step(np.array([ACTIONS[0, 0], ACTIONS[1, 1], ACTIONS[1, 2]]))
-    assert_same(row_of(again, 0), alone[0].steps[0])
-    for row in (1, 2):
-        assert_same(row_of(obs, row), alone[row].steps[0])
-        assert_same(row_of(again, row), alone[row].steps[1])
+    assert_same(one_of(again, 0), alone[0].steps[0])
+    for i in (1, 2):
+        assert_same(one_of(obs, i), alone[i].steps[0])
+        assert_same(one_of(again, i), alone[i].steps[1])
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.name)
@@ -255,7 +255,7 @@ def test_gymnasium_observations_lie_in_the_space(mode: AutoresetMode, highway_ch
     assert obs in env.observation_space
     obs, _, _, _, _ = env.step(ACTIONS[0])
     assert obs in env.observation_space
-    assert row_of(obs, 0) in env.single_observation_space
+    assert one_of(obs, 0) in env.single_observation_space
     assert obs["forecast"].shape == (3, MAX_AGENTS - 1, 2, 3, 2)
 
 
@@ -271,7 +271,7 @@ def test_returned_observations_are_not_written_to_later(highway_checkpoint: str)
 
 
 def test_the_usual_makers_work(highway_checkpoint: str):
-    """What SB3 and gymnasium offer to make many rows at once, with the reader's own perception."""
+    """What SB3 and gymnasium offer to make many environments at once, with the reader's own perception."""
     sb3 = VecForecast(make_vec_env("highway-fast-v0", 2, seed=SEED, wrapper_class=SceneObservation), highway_checkpoint)
     made = gym.make_vec("highway-fast-v0", 2, vectorization_mode="sync", wrappers=(SceneObservation,))
     gymnasium = VectorForecast(made, highway_checkpoint)
@@ -329,7 +329,7 @@ def test_gymnasium_makes_one_forward_per_step(
         assert spy.calls() == [3 + extra]
 
 
-def test_a_partial_reset_forwards_only_its_rows(highway_checkpoint: str, monkeypatch: pytest.MonkeyPatch):
+def test_a_partial_reset_forwards_only_its_envs(highway_checkpoint: str, monkeypatch: pytest.MonkeyPatch):
     env = vector(AutoresetMode.DISABLED, highway_checkpoint)
     env.reset(seed=SEED)
     spy = Spy(env.stream.forecaster, monkeypatch)
@@ -410,7 +410,7 @@ def test_gymnasium_same_seed_same_sequences(highway_checkpoint: str):
 # --- Errors -----------------------------------------------------------------------------------------------------------
 
 
-def test_rows_without_scenes_are_named():
+def test_envs_without_scenes_are_named():
     bare = [partial(short_env, 2)]
     with pytest.raises(UserError, match="VecForecast needs environments that report scenes, got Box .*SceneObserva"):
         VecForecast(DummyVecEnv(bare), "constant-velocity")
@@ -422,7 +422,7 @@ def differing() -> list[Callable[[], gym.Env]]:
     return [lambda range_m=range_m: SceneObservation(short_env(2), range_m, 4) for range_m in (50.0, 60.0)]
 
 
-def test_rows_with_differing_specs_are_named():
+def test_envs_with_differing_specs_are_named():
     expected = r"all environments must have the same scene spec, got .*perception_m=50.0.*perception_m=60.0"
     with pytest.raises(UserError, match=expected):
         VecForecast(DummyVecEnv(differing()), "constant-velocity")
@@ -430,7 +430,7 @@ def test_rows_with_differing_specs_are_named():
         VectorForecast(SyncVectorEnv(differing()), "constant-velocity")
 
 
-def test_rows_of_differing_ids_are_named():
+def test_envs_of_differing_ids_are_named():
     """Both stand on a 1 s step and have observations of the same shape; their checkpoints differ."""
     ids = [lambda i=i: SceneObservation(make_env(i), PERCEPTION_M, 4) for i in ("merge-v1", "merge-generic-v1")]
     with pytest.raises(UserError, match=r"the same env id, got \['merge-generic-v1', 'merge-v1'\]"):
@@ -473,8 +473,8 @@ def test_a_wrapper_below_changes_nothing(mode: AutoresetMode, kind: Any, highway
             assert_same(obs, expected)
             ended = terminations | truncations
             episodes += int(infos["episode"]["l"].astype(bool).sum()) if "episode" in infos else 0
-            for row in np.flatnonzero(ended) if mode is AutoresetMode.SAME_STEP else ():
-                assert_same(infos["final_obs"][row], plain_infos["final_obs"][row])
+            for i in np.flatnonzero(ended) if mode is AutoresetMode.SAME_STEP else ():
+                assert_same(infos["final_obs"][i], plain_infos["final_obs"][i])
             if mode is AutoresetMode.DISABLED and ended.any():
                 masks = [{"reset_mask": ended.copy()} for _ in range(2)]
                 assert_same(env.reset(options=masks[0])[0], plain.reset(options=masks[1])[0])
@@ -503,16 +503,16 @@ def test_a_reset_seeds_the_noise_of_the_environments_it_resets(highway_checkpoin
     mask = np.array([False, True, False])
     obs, _ = env.reset(seed=[None, 5, None], options={"reset_mask": mask})
     alone = ForecastObservation(short_env(DURATIONS[1]), highway_checkpoint, num_samples=4)
-    assert_same(row_of(obs, 1), alone.reset(seed=5)[0])
+    assert_same(one_of(obs, 1), alone.reset(seed=5)[0])
     found, expected = env.step(ACTIONS[0])[0], untouched.step(ACTIONS[0])[0]
-    for row in (0, 2):
-        assert_same(row_of(found, row), row_of(expected, row))
-    assert_same(row_of(found, 1), alone.step(int(ACTIONS[0, 1]))[0])
+    for i in (0, 2):
+        assert_same(one_of(found, i), one_of(expected, i))
+    assert_same(one_of(found, 1), alone.step(int(ACTIONS[0, 1]))[0])
 
 
 @pytest.mark.parametrize("maker", ["sb3", "gymnasium"])
-def test_samples_of_a_row_are_those_of_its_environment_alone(maker: str, highway_checkpoint: str):
-    """Also over the ends of episodes, where the stream forecasts a row twice in one batch."""
+def test_samples_of_an_env_are_those_of_its_environment_alone(maker: str, highway_checkpoint: str):
+    """Also over the ends of episodes, where the stream forecasts an environment twice in one batch."""
     alone = [ForecastObservation(short_env(d), highway_checkpoint, num_samples=5) for d in DURATIONS]
     venv: Any = VecForecast(DummyVecEnv(MAKERS), highway_checkpoint, num_samples=5)
     if maker == "gymnasium":
@@ -521,13 +521,13 @@ def test_samples_of_a_row_are_those_of_its_environment_alone(maker: str, highway
     else:
         venv.seed(SEED)
         obs = venv.reset()
-    for row, env in enumerate(alone):
-        assert_same(row_of(obs, row), env.reset(seed=SEED + row)[0], 1e-3)
+    for i, env in enumerate(alone):
+        assert_same(one_of(obs, i), env.reset(seed=SEED + i)[0], 1e-3)
     for t in range(4):
         obs = venv.step(ACTIONS[t])[0]
-        for row, env in enumerate(alone):
-            own, _, terminated, truncated, _ = env.step(int(ACTIONS[t, row]))
-            assert_same(row_of(obs, row), env.reset()[0] if terminated or truncated else own, 1e-3)
+        for i, env in enumerate(alone):
+            own, _, terminated, truncated, _ = env.step(int(ACTIONS[t, i]))
+            assert_same(one_of(obs, i), env.reset()[0] if terminated or truncated else own, 1e-3)
 
 
 def test_the_old_import_of_vec_forecast_still_works():

@@ -224,7 +224,7 @@ def test_reset_forgets(highway_checkpoint: str):
         assert_same(obs, want, tolerance=0.0)
 
 
-def test_memory_follows_the_vehicle_not_the_row(highway_checkpoint: str):
+def test_memory_follows_the_vehicle_not_the_place(highway_checkpoint: str):
     def make(**kwargs: Any) -> gym.Env:
         return ForecastObservation(short_env(10), highway_checkpoint, **kwargs)
 

@@ -68,7 +68,7 @@ def put(env: ParallelEnv, **positions: tuple[float, float]) -> None:
 
 @pytest.fixture
 def perfect(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody slips, sleeps, leans or dawdles."""
+    """No agent slips, sleeps, leans or dawdles."""
     monkeypatch.setattr(Habits, "draw", staticmethod(lambda rng: PERFECT))
 
 
@@ -120,7 +120,7 @@ def test_only_the_living_act(name: str):
 
 
 @pytest.mark.parametrize("name", DRIVER_NAMES)
-def test_some_agents_may_be_driven_by_somebody_else(name: str):
+def test_some_agents_may_have_another_driver(name: str):
     env = make_multiagent_env("simple_tag_v3")
     observations, _ = env.reset(seed=0)
     driver = make_driver(name, env, rng())
@@ -153,8 +153,8 @@ def test_random_takes_each_action_equally_often():
     driver = make_driver("random", env, rng())
     counts = np.zeros((3, 6))
     for _ in range(2000):
-        for row, action in enumerate(driver(seen(env)).values()):
-            counts[row, action] += 1
+        for agent, action in enumerate(driver(seen(env)).values()):
+            counts[agent, action] += 1
     assert not counts[:, :2].any()
     np.testing.assert_allclose(counts[:, 2:] / 2000, 0.25, atol=0.05)
 
@@ -373,7 +373,7 @@ def test_the_pusher_guards_the_landmark_that_the_agent_is_nearest_to(perfect: No
     assert make_driver("heuristic", env, rng())(observations) == expected
 
 
-def test_prey_eats_only_while_nobody_is_near(perfect: None):
+def test_prey_eats_only_while_no_adversary_is_near(perfect: None):
     env = make_multiagent_env("simple_world_comm_v3", num_adversaries=1, num_good=1, num_food=1, num_obstacles=1)
     observations, _ = env.reset(seed=0)
     world = env.unwrapped.world
@@ -417,7 +417,7 @@ def test_pursuers_close_in_and_catch():
     assert left["heuristic"] < left["random"]
 
 
-def test_pursuers_go_round_nobody_stands_in_a_wall(perfect: None):
+def test_pursuers_go_round_walls(perfect: None):
     env = make_multiagent_env("pursuit_v5", n_pursuers=1, n_evaders=1, freeze_evaders=True, max_cycles=40)
     observations, _ = env.reset(seed=0)
     grid = env.unwrapped.env
@@ -432,7 +432,7 @@ def test_pursuers_go_round_nobody_stands_in_a_wall(perfect: None):
     assert cells[-1] == cells[20]
 
 
-def test_everyone_has_habits_of_its_own_in_each_episode(monkeypatch: pytest.MonkeyPatch):
+def test_each_agent_has_habits_of_its_own_in_each_episode(monkeypatch: pytest.MonkeyPatch):
     drawn: list[Habits] = []
     draw = Habits.draw
     monkeypatch.setattr(Habits, "draw", staticmethod(lambda rng: drawn.append(draw(rng)) or drawn[-1]))
@@ -475,6 +475,6 @@ def test_where_there_is_no_heuristic_the_others_are_named():
 
 @pytest.mark.parametrize("name", DRIVER_NAMES)
 @pytest.mark.parametrize("space", [gym.spaces.MultiBinary(3), gym.spaces.Box(-np.inf, np.inf, (2,))])
-def test_spaces_nobody_can_drive_are_named_early(space: gym.Space, name: str):
+def test_spaces_that_no_driver_supports_are_named_early(space: gym.Space, name: str):
     with pytest.raises(UserError, match=r"drivers need a Discrete or a bounded Box action space, got (Multi|Box)"):
         make_driver(name, Booth(space), rng())

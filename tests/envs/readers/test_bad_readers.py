@@ -79,13 +79,13 @@ def through_a_reader(make_scene: Callable[[], Any]) -> gym.Env:
     return SceneObservation(Room(), reader=lambda env: PaddedReader(padded))
 
 
-def pad(scene: Scene, rows: int) -> Scene:
-    """Rows of padding of whatever kind of array there is."""
+def pad(scene: Scene, agents: int) -> Scene:
+    """Agents of padding of whatever kind of array there is."""
     fields = {}
     for name, nothing in (("states", 0), ("ids", PADDING_ID), ("valid", False)):
         array = getattr(scene, name)
-        if isinstance(array, np.ndarray) and array.ndim and len(array) < rows:
-            blank = np.full((rows - len(array), *array.shape[1:]), nothing, dtype=array.dtype)
+        if isinstance(array, np.ndarray) and array.ndim and len(array) < agents:
+            blank = np.full((agents - len(array), *array.shape[1:]), nothing, dtype=array.dtype)
             array = np.concatenate([array, blank])
         fields[name] = array
     return raw_scene(**fields, heading_rad=scene.heading_rad)
@@ -173,7 +173,7 @@ def test_what_is_no_scene_names_the_class_of_the_reader():
         env.reset(seed=0)
 
 
-def test_rows_that_do_not_match_are_named():
+def test_arrays_of_unequal_length_are_named():
     for fields in ({"ids": np.arange(4)}, {"states": np.zeros((2, 4))}, {"valid": np.ones(5, dtype=np.bool_)}):
         with pytest.raises(UserError, match="states, ids and valid need one entry per agent, got"):
             through_a_function(lambda fields=fields: raw_scene(**fields)).reset(seed=0)
@@ -191,10 +191,10 @@ def test_of_too_many_the_nearest_are_kept():
     assert obs["scene_ids"].tolist() == [0, 8, 7, 6]
 
 
-@pytest.mark.parametrize("rows", [3, 5])
-def test_a_read_of_ones_own_must_have_max_agents_rows(rows: int):
-    env = SceneObservation(Room(), reader=lambda env: PaddedReader(lambda: crowd(rows)))
-    expected = rf"a scene needs 4 agents \(max_agents\), padding included, got {rows}"
+@pytest.mark.parametrize("agents", [3, 5])
+def test_a_read_of_ones_own_must_be_padded_to_max_agents(agents: int):
+    env = SceneObservation(Room(), reader=lambda env: PaddedReader(lambda: crowd(agents)))
+    expected = rf"a scene needs 4 agents \(max_agents\), padding included, got {agents}"
     with pytest.raises(UserError, match=f"scene reader of 'Room': {expected}"):
         env.reset(seed=0)
 
@@ -228,8 +228,8 @@ def test_a_scene_without_the_specs_features_never_reaches_a_checkpoint():
 
 
 def test_an_absent_agent_is_out_of_sight_also_of_an_ego_that_sees_everything():
-    everyone = Scene(**GOOD | {"valid": np.array([True, False, True])})
-    seen = perceive(everyone, replace(SPEC, perception_m=np.inf))
+    full = Scene(**GOOD | {"valid": np.array([True, False, True])})
+    seen = perceive(full, replace(SPEC, perception_m=np.inf))
     assert seen.ids.tolist() == [0, 3, PADDING_ID, PADDING_ID]
     assert seen.valid.tolist() == [True, True, False, False]
 

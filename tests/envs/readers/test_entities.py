@@ -66,20 +66,20 @@ def test_scales_bring_each_column_to_si():
     assert scene.states.tolist() == [[50, 5, -1, 0.25]]
 
 
-def test_one_row_of_numbers_is_the_same_table():
+def test_a_flat_observation_is_the_same_table():
     config = EntityRowsReader(COLUMNS, SPEC)
     table = np.arange(10.0) + 1
     (flat,), (square,) = scenes_of(config, table), scenes_of(config, table.reshape(2, 5))
     np.testing.assert_array_equal(flat.states, square.states)
 
 
-def test_rows_without_presence_are_nobody():
+def test_lines_without_presence_hold_no_agent():
     table = [[1, 0, 0, 0, 0], [0, 5, 5, 0, 0], [1, 9, 9, 0, 0]]
     (scene,) = scenes_of(EntityRowsReader(COLUMNS, SPEC), table)
     assert scene.states[:, 0].tolist() == [0, 9]
 
 
-def test_padding_is_nobody_only_if_said_and_never_the_ego():
+def test_padding_holds_no_agent_only_if_set_and_is_never_the_ego():
     columns, table = COLUMNS[1:], [[-1.0] * 4, [-1.0] * 4, [-1.0, -1.0, 0.0, -1.0]]
     for padding, agents in ((None, 3), (-1.0, 2), (0.0, 3)):
         (scene,) = scenes_of(EntityRowsReader(columns, SPEC, padding=padding, scales=(3.0,) * 4), table)
@@ -115,7 +115,7 @@ def test_three_axes():
     assert second.ids.tolist() == [0, 1]
 
 
-# --- Relative rows ----------------------------------------------------------------------------------------------------
+# --- Relative lines ---------------------------------------------------------------------------------------------------
 
 
 def walk(seed: int, agents: int = 5, steps: int = 6) -> np.ndarray:
@@ -128,7 +128,7 @@ def walk(seed: int, agents: int = 5, steps: int = 6) -> np.ndarray:
 
 
 @given(st.integers(0, 500))
-def test_relative_rows_are_restored(seed: int):
+def test_relative_lines_are_restored(seed: int):
     absolute = walk(seed)
     relative = absolute.copy()
     relative[:, 1:] -= absolute[:, :1]
@@ -182,14 +182,14 @@ def test_normalised_ids_are_whole_numbers_again():
 
 @given(st.integers(0, 500))
 def test_without_one_motion_tells_who_is_who(seed: int):
-    """Rows in another order at each step; the one that leaves and the one that enters are not the same."""
+    """Lines in another order at each step; the one that leaves and the one that enters are not the same."""
     rng = np.random.default_rng(seed)
     states = walk(seed)
     config = EntityRowsReader(COLUMNS, SPEC, gate_m=3.0)
     tables, orders = [], []
-    for step, rows in enumerate(states):
+    for step, lines in enumerate(states):
         order = [0, *rng.permutation(np.arange(1, 5))]
-        table = np.concatenate([np.ones((5, 1)), rows], axis=1)
+        table = np.concatenate([np.ones((5, 1)), lines], axis=1)
         table[3 if step < 3 else 4, 0] = 0  # agent 4 takes agent 3's place in the scene, somewhere else
         tables.append(table[order])
         orders.append([agent for agent in order if table[agent, 0]])
@@ -227,7 +227,7 @@ def test_who_was_out_of_sight_can_be_remembered(memory_steps: int, after: int):
 
 def test_the_wrappers_show_it_each_observation_once():
     states = walk(seed=1)
-    tables = [np.concatenate([np.ones((5, 1)), rows], axis=1) for rows in states]
+    tables = [np.concatenate([np.ones((5, 1)), lines], axis=1) for lines in states]
     env = SceneObservation(Table(*tables), reader=EntityRowsReader(COLUMNS, SPEC))
     for episode in range(2):
         for step, (obs, *_) in enumerate(play(env, [0] * 5, seed=episode)):
@@ -269,15 +269,15 @@ def test_highway_kinematics_tell_what_the_simulator_knows(shown: dict[str, Any],
     seen = 0
     for action in random_actions(env, 12):
         reader.see(obs)
-        scene, everyone = reader.read_all(env), truth.read_all(env)
+        scene, full = reader.read_all(env), truth.read_all(env)
         place, motion = scene.states[:, :2] - scene.states[0, :2], scene.states[:, 2:]
-        exact, speeds = everyone.states[:, :2] - everyone.states[0, :2], everyone.states[:, 2:]
+        exact, speeds = full.states[:, :2] - full.states[0, :2], full.states[:, 2:]
         unclipped = np.abs(place[:, 0]) < 199
         nearest = np.linalg.norm(place[:, None] - exact, axis=-1).argmin(axis=1)
         np.testing.assert_allclose(place[unclipped], exact[nearest][unclipped], atol=1e-3)
         np.testing.assert_allclose(motion[unclipped], speeds[nearest][unclipped], atol=1e-4)
-        np.testing.assert_allclose(scene.states[:, 1], everyone.states[nearest, 1], atol=1e-3)
-        now = dict(zip(everyone.ids[nearest[unclipped]].tolist(), scene.ids[unclipped].tolist(), strict=True))
+        np.testing.assert_allclose(scene.states[:, 1], full.states[nearest, 1], atol=1e-3)
+        now = dict(zip(full.ids[nearest[unclipped]].tolist(), scene.ids[unclipped].tolist(), strict=True))
         for vehicle, number in now.items():
             assert number_of.setdefault(number, vehicle) == vehicle  # never another's number
             assert before.get(vehicle, number) == number  # and no new one while in sight
@@ -344,7 +344,7 @@ def test_observations_that_make_no_scene_are_named(table: Any, message: str):
         scenes_of(EntityRowsReader(COLUMNS, SPEC), table)
 
 
-def test_what_nobody_is_may_hold_anything():
+def test_lines_without_an_agent_may_hold_anything():
     (scene,) = scenes_of(EntityRowsReader(COLUMNS, SPEC), [[1, 0, 0, 0, 0], [0, np.nan, 0, 0, 0]])
     assert scene.ids.tolist() == [0]
 

@@ -62,8 +62,8 @@ def actions_of(pool: Any, rng: np.random.Generator) -> np.ndarray:
     return rng.uniform(-1, 1, (count, *space.shape)).astype(np.float32)
 
 
-def started(task_id: str, rows: int, seed: int = 0, **settings: Any) -> Any:
-    pool = make_pool(task_id, [seed + i for i in range(rows)], num_threads=1, **settings)
+def started(task_id: str, envs: int, seed: int = 0, **settings: Any) -> Any:
+    pool = make_pool(task_id, [seed + i for i in range(envs)], num_threads=1, **settings)
     pool.reset()
     return pool
 
@@ -110,17 +110,17 @@ def test_states_are_those_of_the_simulator(task_id: str):
     env.reset(seed=3)
     for _ in range(3):
         scene, (state,) = reader.read_all(env), env.debug_states()
-        for row, vehicle in zip(scene.states, state.vehicles, strict=True):
+        for one, vehicle in zip(scene.states, state.vehicles, strict=True):
             velocity = vehicle.speed * np.array([np.cos(vehicle.heading), np.sin(vehicle.heading)])
-            np.testing.assert_allclose(row, [vehicle.x, vehicle.y, *velocity], rtol=1e-15)
+            np.testing.assert_allclose(one, [vehicle.x, vehicle.y, *velocity], rtol=1e-15)
         assert scene.heading_rad == state.vehicles[0].heading
         scene.check("test", reader.spec)
         env.step(np.zeros(1) if task_id == "Racetrack-v0" else 1)
 
 
 @pytest.mark.parametrize("task_id", HIGHWAY_ENV_OF)
-def test_the_ego_is_in_row_0(task_id: str):
-    """Its speed is the one that EnvPool reports for the controlled vehicle, and nobody else's."""
+def test_the_ego_has_index_0(task_id: str):
+    """Its speed is the one that EnvPool reports for the controlled vehicle, and no other vehicle's."""
     pool, rng = started(task_id, 8), np.random.default_rng(0)
     for _ in range(5):
         _, _, _, _, info = pool.step(actions_of(pool, rng))
@@ -131,15 +131,15 @@ def test_the_ego_is_in_row_0(task_id: str):
 @pytest.mark.parametrize(("perception_m", "max_agents"), [(100.0, 12), (60.0, 6), (1.0, 3), (400.0, 40)])
 @pytest.mark.parametrize("task_id", ["HighwayFast-v0", "Roundabout-v0"])
 def test_perception_is_that_of_one_env(task_id: str, perception_m: float, max_agents: int):
-    """The whole pool at once sees what `perceive` sees row by row, bit for bit."""
-    pool, rng, rows = started(task_id, 5), np.random.default_rng(0), np.arange(5)
+    """The whole pool at once sees what `perceive` sees one by one, bit for bit."""
+    pool, rng, envs = started(task_id, 5), np.random.default_rng(0), np.arange(5)
     spec = envpool_spec(task_id, pool.config, perception_m, max_agents)
     reader = PoolReader(spec, 5)
     for _ in range(4):
-        batch, everyone = reader.read(pool.debug_states(), rows), reader.read_all(pool.debug_states(), rows)
-        for i in rows:
-            row = Scene(everyone.states[i], everyone.ids[i], everyone.valid[i], float(everyone.heading_rad[i]))
-            expected = perceive(row, spec)
+        batch, full = reader.read(pool.debug_states(), envs), reader.read_all(pool.debug_states(), envs)
+        for i in envs:
+            one = Scene(full.states[i], full.ids[i], full.valid[i], float(full.heading_rad[i]))
+            expected = perceive(one, spec)
             np.testing.assert_array_equal(batch.states[i], expected.states)
             np.testing.assert_array_equal(batch.ids[i], expected.ids)
             np.testing.assert_array_equal(batch.valid[i], expected.valid)
@@ -147,14 +147,14 @@ def test_perception_is_that_of_one_env(task_id: str, perception_m: float, max_ag
         pool.step(actions_of(pool, rng))
 
 
-def test_rows_of_different_length_are_padded():
+def test_scenes_of_different_size_are_padded():
     states = [State([Seen(0, 0, 1, 0), Seen(9, 0, 2, np.pi / 2)], 0), State([Seen(5, 5, 3, 0)], 0)]
     reader = PoolReader(SceneSpec(dt_s=1.0, max_agents=2), 2)
-    everyone = reader.read_all(states, np.arange(2))
-    assert everyone.valid.tolist() == [[True, True], [True, False]]
-    assert everyone.ids.tolist() == [[0, 1], [0, -1]]
-    np.testing.assert_allclose(everyone.states[0, 1], [9, 0, 0, 2], atol=1e-15)
-    assert (everyone.states[1, 1] == 0).all()
+    full = reader.read_all(states, np.arange(2))
+    assert full.valid.tolist() == [[True, True], [True, False]]
+    assert full.ids.tolist() == [[0, 1], [0, -1]]
+    np.testing.assert_allclose(full.states[0, 1], [9, 0, 0, 2], atol=1e-15)
+    assert (full.states[1, 1] == 0).all()
     assert reader.read(states, np.arange(2)).ids.tolist() == [[0, 1], [0, -1]]
 
 
@@ -164,14 +164,14 @@ def test_rows_of_different_length_are_padded():
 @pytest.mark.parametrize("task_id", BUSY_TASKS)
 def test_identities_survive_a_hidden_order(task_id: str):
     """EnvPool's list keeps its order, so its index is the truth; the reader gets it shuffled, and kinematics only."""
-    pool, rng, rows = started(task_id, 4, duration=12), np.random.default_rng(1), np.arange(4)
+    pool, rng, envs = started(task_id, 4, duration=12), np.random.default_rng(1), np.arange(4)
     reader = PoolReader(envpool_spec(task_id, pool.config), 4)
     count = len(pool.debug_states()[0].vehicles)
     before, clock, pairs = np.zeros((4, count), dtype=np.int64), np.full(4, 99), 0
     for _ in range(20):
         states, order = pool.debug_states(), np.r_[0, 1 + rng.permutation(count - 1)]
         now = np.empty((4, count), dtype=np.int64)
-        now[:, order] = reader.read_all([shown(s, order) for s in states], rows).ids
+        now[:, order] = reader.read_all([shown(s, order) for s in states], envs).ids
         for i, state in enumerate(states):
             if state.elapsed_step > clock[i]:
                 assert now[i].tolist() == before[i].tolist()
@@ -207,13 +207,13 @@ def drifting(rng: np.random.Generator, agents: int, steps: int) -> list[tuple[np
 
 @settings(max_examples=40)
 @given(st.integers(0, 10_000), st.integers(1, 9), st.sampled_from([3.0, GATE_M, 100.0]))
-def test_many_rows_at_once_are_as_one_by_one(seed: int, agents: int, gate_m: float):
-    """`PoolIdentity` against `IdentityTracker`, with absences, shuffles, resets and steps of some rows only."""
-    rng, rows = np.random.default_rng(seed), 3
-    pool, single = PoolIdentity(rows, gate_m), [IdentityTracker(DT_S, gate_m) for _ in range(rows)]
-    paths = [drifting(rng, agents, 6) for _ in range(rows)]
+def test_many_envs_at_once_are_as_one_by_one(seed: int, agents: int, gate_m: float):
+    """`PoolIdentity` against `IdentityTracker`, with absences, shuffles, resets and steps of some environments only."""
+    rng, envs = np.random.default_rng(seed), 3
+    pool, single = PoolIdentity(envs, gate_m), [IdentityTracker(DT_S, gate_m) for _ in range(envs)]
+    paths = [drifting(rng, agents, 6) for _ in range(envs)]
     for t in range(6):
-        some = np.flatnonzero(rng.random(rows) < 0.8) if t else np.arange(rows)
+        some = np.flatnonzero(rng.random(envs) < 0.8) if t else np.arange(envs)
         for i in some[rng.random(len(some)) < 0.2]:
             pool.reset(np.array([i]))
             single[i].reset()
@@ -228,13 +228,13 @@ def test_many_rows_at_once_are_as_one_by_one(seed: int, agents: int, gate_m: flo
 
 
 def test_a_skipped_step_is_part_of_the_motion():
-    pool, rows, order = started("HighwayFast-v0", 2), np.arange(2), np.r_[0, 20:0:-1]
+    pool, envs, order = started("HighwayFast-v0", 2), np.arange(2), np.r_[0, 20:0:-1]
     reader = PoolReader(envpool_spec("HighwayFast-v0", pool.config), 2)
-    reader.read_all(pool.debug_states(), rows)
+    reader.read_all(pool.debug_states(), envs)
     for _ in range(3):
         for _ in range(2):
             pool.step(np.ones(2, dtype=np.int64))
-        found = reader.read_all([shown(s, order) for s in pool.debug_states()], rows).ids
+        found = reader.read_all([shown(s, order) for s in pool.debug_states()], envs).ids
         np.testing.assert_array_equal(found, np.broadcast_to(order, (2, 21)))
 
 
@@ -245,14 +245,14 @@ def test_reading_twice_changes_nothing():
     for _ in range(4):
         expected = once.read(env)
         for _ in range(2):
-            everyone, perceived = reader.read_all(env), reader.read(env)
-            assert everyone.ids.tolist() == list(range(21))
+            full, perceived = reader.read_all(env), reader.read(env)
+            assert full.ids.tolist() == list(range(21))
             np.testing.assert_array_equal(perceived.ids, expected.ids)
             np.testing.assert_array_equal(perceived.states, expected.states)
         env.step(1)
 
 
-def test_a_new_episode_numbers_anew_even_if_nobody_says_so():
+def test_a_new_episode_numbers_anew_without_a_reset():
     env = EnvPoolEnv("HighwayFast-v0", vehicles_count=6)
     reader = EnvPoolReader(env)
     env.reset(seed=0)

@@ -18,7 +18,7 @@ SPEC = SceneSpec(dt_s=0.5, perception_m=10.0, max_agents=3)
 
 
 class Parade(gym.Env):
-    """Everyone walks straight on; the ego stands, turned by a quarter."""
+    """Each agent walks straight on; the ego stands, turned by a quarter."""
 
     observation_space = gym.spaces.Box(-1, 1, (1,), np.float64)
     action_space = gym.spaces.Discrete(1)
@@ -53,7 +53,7 @@ def unregistered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(envs.readers, "_REGISTERED", {})
 
 
-def test_the_ego_perceives_the_nearest_of_everyone():
+def test_the_ego_perceives_the_nearest_agents():
     env = SceneObservation(Parade(), reader=PARADE)
     obs, _ = env.reset()
     assert obs["scene_ids"].tolist() == [7, 9, 3]

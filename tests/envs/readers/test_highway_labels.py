@@ -36,7 +36,7 @@ from tests.envs.helpers import light_env, random_actions, short_env
 
 Place = tuple[float, float]
 ASIDE = (-100.0, 12.0)
-"""On the last lane, behind everyone."""
+"""On the last lane, behind all agents."""
 
 
 @pytest.fixture
@@ -137,7 +137,7 @@ def test_an_ego_is_unknown_whatever_drives_it(env: gym.Env):
     assert (read_labels(env).edge_types[0] == UNKNOWN).all()
 
 
-def test_who_crashed_follows_nobody_and_still_leads(env: gym.Env):
+def test_a_crashed_vehicle_has_no_leader_and_still_leads(env: gym.Env):
     _, wreck, _ = place(env, (0.0, 4.0), (30.0, 4.0), (60.0, 4.0))
     wreck.crashed = True
     labels = read_labels(env)
@@ -200,7 +200,7 @@ def test_kinds_and_desired_speeds_are_the_drivers_own(env: gym.Env):
 
 
 @pytest.mark.parametrize("asked_mps", [0.0, 12.0, 25.0, 40.0])
-def test_with_nobody_ahead_the_desired_speed_is_kept(env: gym.Env, asked_mps: float):
+def test_without_a_leader_the_desired_speed_is_kept(env: gym.Env, asked_mps: float):
     for vehicle in drivers_of_all_kinds(env.unwrapped.road):
         env.unwrapped.road.vehicles = [vehicle]
         vehicle.target_speed = asked_mps
@@ -241,7 +241,7 @@ def test_labels_hold_the_traits_of_each_driver(env_id: str):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_who_is_labelled_a_leader_moves_the_driver_and_nobody_else_does(env: gym.Env, seed: int):
+def test_labelled_leaders_change_the_acceleration_and_no_other_vehicle_does(env: gym.Env, seed: int):
     """By intervention: each other vehicle in turn drives back at full speed; who may pull out is not asked."""
     rng, road = np.random.default_rng(seed), env.unwrapped.road
     road.vehicles = []
@@ -308,17 +308,17 @@ def test_leaders_are_those_that_the_drivers_then_brake_for(env_id: str, monkeypa
             targets = [getattr(vehicle, "target_lane_index", None) for vehicle in vehicles]
             asked.clear()
             env.unwrapped.road.act()
-            for row, vehicle in enumerate(vehicles):
-                found = {sender for receiver, sender in edges(labels) if receiver == row}
+            for place, vehicle in enumerate(vehicles):
+                found = {sender for receiver, sender in edges(labels) if receiver == place}
                 fronts = [front for asker, front in asked if asker is vehicle]
                 agents = {vehicles.index(front) for front in fronts if front in vehicles}
-                if row and vehicle.target_lane_index != targets[row]:  # it began or ended a lane change just now
+                if place and vehicle.target_lane_index != targets[place]:  # it began or ended a lane change just now
                     assert fronts[0] not in vehicles or vehicles.index(fronts[0]) in found
                 else:
                     assert agents == found
                 for sender in found:
                     distance_m = abs(vehicle.lane_distance_to(vehicles[sender]))
-                    assert labels.edge_attributes[row, sender, 2] == pytest.approx(distance_m, rel=1e-6)
+                    assert labels.edge_attributes[place, sender, 2] == pytest.approx(distance_m, rel=1e-6)
                 checked += len(found)
             _, _, terminated, truncated, _ = env.step(action)
             if terminated or truncated:
@@ -345,9 +345,9 @@ def scene(*ids: int) -> Scene:
     return Scene(np.zeros((len(ids), 4)), np.array(ids), np.ones(len(ids), dtype=np.bool_))
 
 
-def label(rows: int, leads: Sequence[tuple[int, int]]) -> SceneLabels:
-    types = np.zeros((rows, rows), dtype=np.int8)
-    attributes = np.zeros((rows, rows, len(ATTRIBUTE_NAMES)), dtype=np.float32)
+def label(agents: int, leads: Sequence[tuple[int, int]]) -> SceneLabels:
+    types = np.zeros((agents, agents), dtype=np.int8)
+    attributes = np.zeros((agents, agents, len(ATTRIBUTE_NAMES)), dtype=np.float32)
     for receiver, sender in leads:
         types[receiver, sender], attributes[receiver, sender] = LEADER, (receiver, sender, 7, 8, 9)
     return SceneLabels(types, attributes)
@@ -364,7 +364,13 @@ def test_labels_go_to_the_columns_of_their_agents():
         [[0, 0, 0], [1, 0, 0], [0, 1, 0]],
         [[0, -1, 0], [-1, -1, -1], [1, -1, 0]],
     ]
-    assert labelled.edge_attributes[1, 2, 1].tolist() == [1, 2, 7, 8, 9]  # receiver id 7 in row 1, sender id 3 in row 2
+    assert labelled.edge_attributes[1, 2, 1].tolist() == [
+        1,
+        2,
+        7,
+        8,
+        9,
+    ]  # receiver id 7 at index 1, sender id 3 at index 2
     assert labelled.edge_attributes[1, 1, 0].tolist() == [2, 0, 7, 8, 9]
     assert ((labelled.edge_attributes != 0).any(-1) == (labelled.edge_types == LEADER)).all()
 
@@ -402,13 +408,13 @@ def test_labels_follow_their_agents_through_the_store_into_windows(tmp_path: Pat
     batch = windows.batch(np.arange(len(windows)))
     assert batch.edge_types is not None and batch.edge_attributes is not None
     moved = edges_seen = 0
-    for row, (number, now) in enumerate(windows.index.tolist()):
-        begin = now - int(batch.last_observed[row])
-        for t, valid in enumerate(batch.valid[row].numpy()):
-            ids = ids_of(episodes[number], begin + t, batch.states[row, t].numpy(), valid)
+    for place, (number, now) in enumerate(windows.index.tolist()):
+        begin = now - int(batch.last_observed[place])
+        for t, valid in enumerate(batch.valid[place].numpy()):
+            ids = ids_of(episodes[number], begin + t, batch.states[place, t].numpy(), valid)
             moved += ids[valid].tolist() != sorted(ids[valid].tolist())
             for i, j in np.argwhere(~np.eye(len(ids), dtype=np.bool_)):
-                found = int(batch.edge_types[row, t, i, j]), batch.edge_attributes[row, t, i, j].tolist()
+                found = int(batch.edge_types[place, t, i, j]), batch.edge_attributes[place, t, i, j].tolist()
                 both = valid[i] and valid[j]
                 assert found == (
                     truths[number][begin + t][ids[i], ids[j]] if both else (UNKNOWN, [0.0] * len(ATTRIBUTE_NAMES))

@@ -95,7 +95,7 @@ def crowd(seed: int, agents: int, steps: int, dt_s: float = DT_S) -> tuple[np.nd
 
 
 @given(st.integers(0, 1000))
-def test_numbers_stay_whatever_the_order_of_rows(seed: int):
+def test_numbers_stay_in_any_order_of_agents(seed: int):
     rng = np.random.default_rng(seed)
     positions, velocities = crowd(seed, agents=12, steps=8)
     tracker = IdentityTracker(DT_S, gate_m=3.0)
@@ -155,7 +155,7 @@ def test_keys_must_match():
     assert tracker.update(place, still, keys=several + [[0, 0], [0, 1]]).tolist() == [0, 2]
 
 
-def test_rows_that_are_not_present_are_no_agents():
+def test_entries_that_are_not_valid_are_no_agents():
     tracker = IdentityTracker(dt_s=1.0, gate_m=1.0)
     place, still = np.array([[0.0, 0.0], [np.nan, 0.0], [9.0, 0.0]]), np.zeros((3, 2))
     assert tracker.update(place, still, np.array([True, False, True])).tolist() == [0, -1, 1]

@@ -50,9 +50,9 @@ def named(env: ParallelEnv, name: str) -> Any:
     return next(body for body in world_of(env).agents if body.name == name)
 
 
-def entity_of_id(env: ParallelEnv, shared: MultiagentScene) -> dict[int, Any]:
+def entity_of_id(env: ParallelEnv, multi: MultiagentScene) -> dict[int, Any]:
     """Which entity each id stands for, found by position."""
-    scene = shared.scene
+    scene = multi.scene
     found = {}
     for state, number in zip(scene.states[scene.valid], scene.ids[scene.valid], strict=True):
         (entity,) = [e for e in world_of(env).entities if np.array_equal(e.state.p_pos, state[:2])]
@@ -81,14 +81,14 @@ def test_every_scenario_reads(env_id: str, landmarks: bool):
     still = len(world_of(env).landmarks) if landmarks else 0
     assert reader.spec.max_agents == AGENTS[env_id] + still
     while env.agents:
-        shared = reader.read(env)
-        shared.scene.check(env_id, reader.spec, agents=reader.spec.max_agents)
-        assert sorted(shared.index_of) == sorted(env.agents)
-        for name, row in shared.index_of.items():
+        multi = reader.read(env)
+        multi.scene.check(env_id, reader.spec, agents=reader.spec.max_agents)
+        assert sorted(multi.index_of) == sorted(env.agents)
+        for name, index in multi.index_of.items():
             body = named(env, name)
-            np.testing.assert_array_equal(shared.scene.states[row, :4], [*body.state.p_pos, *body.state.p_vel])
-            assert shared.scene.states[row, RADIUS] == body.size
-        assert not shared.heading_rad.any()
+            np.testing.assert_array_equal(multi.scene.states[index, :4], [*body.state.p_pos, *body.state.p_vel])
+            assert multi.scene.states[index, RADIUS] == body.size
+        assert not multi.heading_rad.any()
         random_step(env, rng)
 
 
@@ -147,15 +147,15 @@ def test_wrapped_environments_read_alike(tag: ParallelEnv):
     assert seen.index_of == plain.index_of
 
 
-@pytest.mark.parametrize("rows", [4, 7])
-def test_scenes_are_padded_to_their_rows(tag: ParallelEnv, rows: int):
-    scene = MpeReader(tag, landmarks=False, max_agents=rows).read(tag).scene
-    assert scene.valid.tolist() == [True] * 4 + [False] * (rows - 4)
+@pytest.mark.parametrize("size", [4, 7])
+def test_scenes_are_padded_to_max_agents(tag: ParallelEnv, size: int):
+    scene = MpeReader(tag, landmarks=False, max_agents=size).read(tag).scene
+    assert scene.valid.tolist() == [True] * 4 + [False] * (size - 4)
     assert (scene.ids[4:] == PADDING_ID).all()
     assert not scene.states[4:].any()
 
 
-def test_too_few_rows_are_named(tag: ParallelEnv):
+def test_too_small_max_agents_are_named(tag: ParallelEnv):
     with pytest.raises(UserError, match="MpeReader: 6 agents do not fit max_agents=5; raise max_agents"):
         MpeReader(tag, max_agents=5).read(tag)
 
@@ -181,11 +181,11 @@ def test_an_id_stays_with_its_entity_when_lists_are_sorted_anew(tag: ParallelEnv
     for _ in range(6):
         world_of(tag).agents = [world_of(tag).agents[i] for i in rng.permutation(4)]
         rng.shuffle(world_of(tag).landmarks)
-        shared = reader.read(tag)
-        assert entity_of_id(tag, shared) == first
-        for name, row in shared.index_of.items():
-            np.testing.assert_array_equal(shared.scene.states[row, :2], named(tag, name).state.p_pos)
-        orders.add(tuple(shared.scene.ids.tolist()))
+        multi = reader.read(tag)
+        assert entity_of_id(tag, multi) == first
+        for name, index in multi.index_of.items():
+            np.testing.assert_array_equal(multi.scene.states[index, :2], named(tag, name).state.p_pos)
+        orders.add(tuple(multi.scene.ids.tolist()))
     assert len(orders) > 1
 
 
@@ -198,10 +198,10 @@ def test_who_leaves_takes_its_number_along_although_python_reuses_addresses(tag:
         visitor.name = "visitor"
         visitor.state.p_pos, visitor.state.p_vel = np.array([0.01 * step, 3.0]), np.zeros(2)
         world.agents.append(visitor)
-        shared = reader.read(tag)
-        numbers.append(int(shared.scene.ids[4]))
+        multi = reader.read(tag)
+        numbers.append(int(multi.scene.ids[4]))
         addresses.append(id(visitor))
-        assert "visitor" not in shared.index_of
+        assert "visitor" not in multi.index_of
         world.agents.pop()
         del visitor
     assert len(set(addresses)) < len(addresses)
@@ -268,7 +268,7 @@ def test_a_treasure_is_another_one_even_if_its_absence_was_not_read():
 # --- Who is living ----------------------------------------------------------------------------------------------------
 
 
-def test_who_dies_in_the_middle_of_an_episode_has_no_row_but_its_body_stays(tag: ParallelEnv):
+def test_an_agent_that_dies_in_an_episode_has_no_index_but_its_body_stays(tag: ParallelEnv):
     reader = MpeReader(tag)
     before = reader.read(tag)
     tag.agents = [name for name in tag.agents if name != "adversary_1"]
@@ -278,16 +278,16 @@ def test_who_dies_in_the_middle_of_an_episode_has_no_row_but_its_body_stays(tag:
     assert after.scene.valid.all()
 
 
-def test_last_observations_have_rows_although_nobody_lives_by_then():
+def test_last_observations_have_indices_although_no_agent_lives_by_then():
     env = make("simple_tag_v3", max_cycles=2)
     env.reset(seed=0)
     reader = MpeReader(env)
     random_step(env, np.random.default_rng(0))
-    rows = reader.read(env).index_of
+    index_of = reader.read(env).index_of
     observations, *_ = env.step(dict.fromkeys(env.agents, 1))
     assert env.agents == []
-    assert reader.read(env).index_of == rows
-    assert set(rows) == set(observations)
+    assert reader.read(env).index_of == index_of
+    assert set(index_of) == set(observations)
 
 
 def test_reading_before_the_first_reset_is_a_protocol_error():

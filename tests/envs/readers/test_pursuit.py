@@ -37,8 +37,8 @@ def step(env: ParallelEnv, *actions: int) -> None:
     env.step(dict(zip(env.agents, actions or [STAY] * len(env.agents), strict=True)))
 
 
-def by_id(shared: MultiagentScene) -> dict[int, list[float]]:
-    scene = shared.scene
+def by_id(multi: MultiagentScene) -> dict[int, list[float]]:
+    scene = multi.scene
     return {int(i): s.tolist() for i, s in zip(scene.ids[scene.valid], scene.states[scene.valid], strict=True)}
 
 
@@ -46,13 +46,13 @@ def test_scene_is_what_stands_on_the_grid():
     env = placed([(0, 0), (3, 2)], [(15, 15), (1, 12), (2, 2)])
     reader = PursuitReader(env)
     assert isinstance(reader, MultiagentReader)
-    shared = reader.read(env)
-    shared.scene.check("pursuit", reader.spec, agents=5)
+    multi = reader.read(env)
+    multi.scene.check("pursuit", reader.spec, agents=5)
     expected = [[0, 0, 0, 0, 0], [3, 2, 0, 0, 0], [15, 15, 0, 0, 1], [1, 12, 0, 0, 1], [2, 2, 0, 0, 1]]
-    assert shared.scene.states.tolist() == expected
-    assert shared.scene.ids.tolist() == [0, 1, 2, 3, 4]
-    assert shared.index_of == {"pursuer_0": 0, "pursuer_1": 1}
-    assert not shared.heading_rad.any()
+    assert multi.scene.states.tolist() == expected
+    assert multi.scene.ids.tolist() == [0, 1, 2, 3, 4]
+    assert multi.index_of == {"pursuer_0": 0, "pursuer_1": 1}
+    assert not multi.heading_rad.any()
 
 
 def test_spec_describes_the_grid():
@@ -147,25 +147,25 @@ def test_one_comes_as_another_is_caught():
     assert 2 not in after
 
 
-def test_the_last_scene_has_rows_for_everyone():
+def test_the_last_scene_has_indices_of_all_agents():
     env = placed([(4, 2), (6, 2)], [(5, 2)])
     reader = PursuitReader(env)
     reader.read(env)
     observations, _, terminations, _, _ = env.step({"pursuer_0": RIGHT, "pursuer_1": LEFT})
     assert all(terminations.values())
     assert env.agents == []
-    shared = reader.read(env)
-    assert shared.index_of == {"pursuer_0": 0, "pursuer_1": 1}
-    assert set(shared.index_of) == set(observations)
-    assert shared.scene.valid.tolist() == [True, True, False]
+    multi = reader.read(env)
+    assert multi.index_of == {"pursuer_0": 0, "pursuer_1": 1}
+    assert set(multi.index_of) == set(observations)
+    assert multi.scene.valid.tolist() == [True, True, False]
 
 
-def test_who_dies_in_the_middle_of_an_episode_has_no_row_but_its_body_stays():
+def test_an_agent_that_dies_in_an_episode_has_no_index_but_its_body_stays():
     env = placed([(4, 2), (6, 2)], [(9, 9)])
     env.agents = ["pursuer_1"]
-    shared = PursuitReader(env).read(env)
-    assert shared.index_of == {"pursuer_1": 1}
-    assert shared.scene.valid.all()
+    multi = PursuitReader(env).read(env)
+    assert multi.index_of == {"pursuer_1": 1}
+    assert multi.scene.valid.all()
 
 
 def test_a_whole_episode_keeps_identities_and_velocities():
@@ -178,14 +178,14 @@ def test_a_whole_episode_keeps_identities_and_velocities():
     last: dict[Any, np.ndarray] = {}
     caught = 0
     while env.agents:
-        shared = reader.read(env)
+        multi = reader.read(env)
         bodies = [*grid_of(env).pursuer_layer.allies, *grid_of(env).evader_layer.allies]
-        assert shared.scene.valid.sum() == len(bodies)
-        for row, body in enumerate(bodies):
+        assert multi.scene.valid.sum() == len(bodies)
+        for index, body in enumerate(bodies):
             position = np.array(body.current_position(), dtype=np.float64)
             velocity = position - last.get(body, position)
-            assert number_of.setdefault(body, int(shared.scene.ids[row])) == shared.scene.ids[row]
-            np.testing.assert_array_equal(shared.scene.states[row, :4], [*position, *velocity])
+            assert number_of.setdefault(body, int(multi.scene.ids[index])) == multi.scene.ids[index]
+            np.testing.assert_array_equal(multi.scene.states[index, :4], [*position, *velocity])
             last[body] = position
         step(env, *rng.integers(5, size=len(env.agents)).tolist())
         caught = 38 - len(bodies)
@@ -217,7 +217,7 @@ def test_reading_before_the_first_reset_is_a_protocol_error():
         PursuitReader(env).read(env)
 
 
-def test_too_few_rows_are_named():
+def test_too_small_max_agents_are_named():
     env = placed([(4, 2), (6, 2)], [(9, 9)])
     with pytest.raises(UserError, match="PursuitReader: 3 agents do not fit max_agents=2; raise max_agents"):
         PursuitReader(env, max_agents=2).read(env)

@@ -122,12 +122,12 @@ def test_nearest_come_first_and_the_ego_before_all(env: gym.Env):
 
 
 def by_object_order(env: gym.Env, scene: Scene) -> list[Vehicle]:
-    """The vehicles of the rows; the ego first among those that share its place."""
+    """The vehicles of the scene; the ego first among those that share its place."""
     ego = env.unwrapped.vehicle
-    everyone = [ego] + [v for v in env.unwrapped.road.vehicles if v is not ego]
+    full = [ego] + [v for v in env.unwrapped.road.vehicles if v is not ego]
     found: list[Vehicle] = []
     for state in scene.states[scene.valid]:
-        found.append(next(v for v in everyone if v not in found and np.array_equal(v.position, state[:2])))
+        found.append(next(v for v in full if v not in found and np.array_equal(v.position, state[:2])))
     return found
 
 
@@ -156,7 +156,7 @@ def test_what_is_out_of_sight_changes_nothing(env: gym.Env):
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
 
 
-def test_truth_has_everyone(env: gym.Env):
+def test_truth_has_all_agents(env: gym.Env):
     place(env, (10.0, 0.0), (200.0, 0.0), (5000.0, 0.0))
     reader = reader_for(env, perception_m=50.0, max_agents=2)
     seen, truth = reader.read(env), reader.read_all(env)

@@ -89,17 +89,17 @@ def played(made: EpisodeTask) -> tuple[Outcome, Outcome]:
 # --- Truth ------------------------------------------------------------------------------------------------------------
 
 
-def scene(*agents: tuple[float, ...], rows: int = 3, features: int = 4) -> Scene:
-    """Agents as (id, x, y, and the last features); padded to `rows`."""
-    states, ids, valid = np.zeros((rows, features)), np.full(rows, -1), np.zeros(rows, dtype=np.bool_)
-    for row, (number, x, y, *rest) in enumerate(agents):
-        states[row, :2], ids[row], valid[row] = (x, y), int(number), True
-        states[row, 4 : 4 + len(rest)] = rest
+def scene(*agents: tuple[float, ...], size: int = 3, features: int = 4) -> Scene:
+    """Agents as (id, x, y, and the last features); padded to `places`."""
+    states, ids, valid = np.zeros((size, features)), np.full(size, -1), np.zeros(size, dtype=np.bool_)
+    for i, (number, x, y, *rest) in enumerate(agents):
+        states[i, :2], ids[i], valid[i] = (x, y), int(number), True
+        states[i, 4 : 4 + len(rest)] = rest
     return Scene(states, ids, valid)
 
 
 def truth(*agents: tuple[float, ...], features: int = 4) -> Scene:
-    return scene(*agents, rows=len(agents), features=features)
+    return scene(*agents, size=len(agents), features=features)
 
 
 def test_futures_follow_ids_beyond_perception_until_agents_leave_the_road():
@@ -124,14 +124,14 @@ def test_futures_follow_ids_beyond_perception_until_agents_leave_the_road():
     assert (future[~valid] == 0).all()
 
 
-def test_without_an_ego_everyone_but_landmarks_is_counted_in_world_coordinates():
-    """The agent in row 0 moves and counts; the landmark between the two agents is the same at all times."""
+def test_without_an_ego_all_agents_but_landmarks_are_counted_in_world_coordinates():
+    """The agent at index 0 moves and counts; the landmark between the two agents is the same at all times."""
     prey, rock, hunter = (1.0, 0.0, 0.05), (0.0, 1.0, 0.2), (0.0, 0.0, 0.1)
     assert MPE_FEATURES[4:] == ("adversary", "landmark", "radius_m")
     moments = [
         ((7, 0.5, 0.1 * t, *prey), (8, -0.5, 0.5, *rock), (9, 0.2 * t, -0.5, *hunter)) for t in range(3)
     ]  # fmt: skip
-    scenes = [scene(*agents, rows=4, features=7) for agents in moments[:1]]
+    scenes = [scene(*agents, size=4, features=7) for agents in moments[:1]]
     future, valid = futures(scenes, [truth(*agents, features=7) for agents in moments], 2, tag_spec())
     assert valid[0].tolist() == [[True, True], [False, False], [True, True], [False, False]]
     torch.testing.assert_close(future[0, 0], torch.tensor([[0.5, 0.1], [0.5, 0.2]]))
@@ -160,7 +160,7 @@ def test_an_episode_that_is_cut_keeps_its_last_scene():
 
 
 def test_out_of_sight_is_not_out_of_truth():
-    """Nobody leaves this road, so whoever is seen has a future up to the episode's end, seen again or not."""
+    """No agent leaves this road, so whoever is seen has a future up to the episode's end, seen again or not."""
     steps, seed = 8, 16
     env = SceneObservation(make_env("highway-fast-v0"))
     ego = make_ego_driver("random", env, driver_rng(seed))
@@ -180,7 +180,7 @@ def test_out_of_sight_is_not_out_of_truth():
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_way_back_undoes_the_ego_view(seed: int):
-    """For rows in any order, with gaps, and any heading."""
+    """For places in any order, with gaps, and any heading."""
     rng = np.random.default_rng(seed)
     scenes = random_scenes(rng, 1, 6)
     forecast = random_forecast(rng, scenes, 3, HORIZON, 2, 4)
@@ -192,7 +192,7 @@ def test_the_way_back_undoes_the_ego_view(seed: int):
 
 
 @pytest.mark.parametrize("env_id", ["highway-fast-v0", "intersection-v2", "racetrack-v1"])
-def test_forecasts_come_back_into_rows_and_world_axes(env_id: str, drifting: None):
+def test_forecasts_come_back_into_scene_order_and_world_axes(env_id: str, drifting: None):
     """Whatever the ego's heading and the order of agents: what returns is what the forecaster said."""
     model, straight = played(task(env_id))
     assert model.forecast.shape[1] == 2
@@ -310,13 +310,13 @@ def test_neighbours_that_lived_through_this_very_episode_are_exact(tmp_path: Pat
 # --- Edges and time ---------------------------------------------------------------------------------------------------
 
 
-def test_true_edges_are_moved_to_the_rows_of_who_is_perceived():
-    everyone = truth((0, 0, 0), (4, 10, 0), (2, 20, 0), (9, 30, 0))
+def test_true_edges_are_moved_to_the_order_of_the_perceived_agents():
+    full = truth((0, 0, 0), (4, 10, 0), (2, 20, 0), (9, 30, 0))
     types = np.full((4, 4), -1, dtype=np.int8)
     types[1] = (0, -1, 1, 0)  # 4 follows 2
     types[2] = (0, 0, -1, 1)  # 2 follows 9
     labels = SceneLabels(types, np.zeros((4, 4, 5), dtype=np.float32))
-    found = _types_of(scene((0, 0, 0), (9, 30, 0), (2, 20, 0), rows=4), everyone, labels)
+    found = _types_of(scene((0, 0, 0), (9, 30, 0), (2, 20, 0), size=4), full, labels)
     assert found.tolist() == [[-1, -1, -1, -1], [-1, -1, -1, -1], [0, 1, -1, -1], [-1, -1, -1, -1]]
 
 
@@ -327,7 +327,7 @@ def test_the_graph_is_noted_where_the_simulator_knows_one(highway_checkpoint: st
     assert all(probs.shape == (agents, agents, 2) for probs in episode.edge_probs)
     types = np.stack(episode.edge_types)
     assert types.shape == (7, agents, agents)
-    assert (types == LEADER).any() and (types[:, 0] == -1).all()  # the ego follows nobody that is known
+    assert (types == LEADER).any() and (types[:, 0] == -1).all()  # the ego follows no agent that is known
 
 
 def test_many_learners_have_no_known_graph_and_time_passes(tmp_path: Path):

@@ -14,7 +14,7 @@ from predictor.evaluation.accuracy import Accuracy
 from predictor.evaluation.graph_accuracy import GraphAccuracy
 
 
-def row(name: str, ade_m: float, samples: int = 1) -> Accuracy:
+def accuracy(name: str, ade_m: float, samples: int = 1) -> Accuracy:
     """Three steps; the interval at the second one is missing."""
     steps = [ade_m / 2, ade_m, 2 * ade_m]
     band = [(0.4 * ade_m, 0.6 * ade_m), None, (1.5 * ade_m, 2.5 * ade_m)]
@@ -27,15 +27,16 @@ def row(name: str, ade_m: float, samples: int = 1) -> Accuracy:
 
 def result(env_id: str = "tag", checkpoint: str = "mine", reduction: float = 0.5) -> EnvAccuracy:
     return EnvAccuracy(
-        env_id, checkpoint, "heuristic", 0.1, row("dG-VAE", 1.0), row("dG-VAE", 0.5, 20), row(STRAIGHT, 2.0),
+        env_id, checkpoint, "heuristic", 0.1,
+        accuracy("dG-VAE", 1.0), accuracy("dG-VAE", 0.5, 20), accuracy(STRAIGHT, 2.0),
         reduction, (0.4, 0.6), latency_median_ms=1.25, latency_p95_ms=4.5,
     )  # fmt: skip
 
 
 def full() -> EnvAccuracy:
     graph = GraphAccuracy(120, 0.3, accuracy=0.875, f1=0.5, true_connectivity=0.25)
-    histories = {1: row("dG-VAE, 1 step of history", 1.5)}
-    return replace(result(), nearest_neighbours=row(NEIGHBOURS, 1.25), histories=histories, graph=graph)
+    histories = {1: accuracy("dG-VAE, 1 step of history", 1.5)}
+    return replace(result(), nearest_neighbours=accuracy(NEIGHBOURS, 1.25), histories=histories, graph=graph)
 
 
 def case(error_m: float = 1.0, agents: int = 3) -> Case:

@@ -16,7 +16,7 @@ ROAD = "two-way-v0"
 
 
 def watched(world: World, seed: int, steps: int = 4) -> list[tuple[Scene, Scene]]:
-    """What is perceived, and everyone, at the start of an episode and after each step."""
+    """What is perceived, and all agents, at the start of an episode and after each step."""
     world.reset(seed)
     seen = [(world.perceived(), world.full_scene())]
     for _ in range(steps):
@@ -30,17 +30,17 @@ def world(request: pytest.FixtureRequest) -> World:
     return open_world(request.param, "varied")
 
 
-def test_who_is_perceived_is_among_everyone(world: World):
-    for perceived, everyone in watched(world, seed=0):
+def test_perceived_agents_are_among_all_agents(world: World):
+    for perceived, full in watched(world, seed=0):
         perceived.check("perceived", world.spec, agents=world.spec.max_agents)
-        everyone.check("everyone", world.spec)
-        assert everyone.valid.all()
-        truth = dict(zip(everyone.ids.tolist(), everyone.states, strict=True))
+        full.check("full", world.spec)
+        assert full.valid.all()
+        truth = dict(zip(full.ids.tolist(), full.states, strict=True))
         assert int(perceived.valid.sum()) > 1
-        for row in np.flatnonzero(perceived.valid):
-            np.testing.assert_array_equal(perceived.states[row], truth[int(perceived.ids[row])])
+        for i in np.flatnonzero(perceived.valid):
+            np.testing.assert_array_equal(perceived.states[i], truth[int(perceived.ids[i])])
         if world.spec.has_ego:
-            assert everyone.ids[0] == perceived.ids[0]
+            assert full.ids[0] == perceived.ids[0]
 
 
 def test_an_episode_is_a_function_of_its_seed(world: World):
@@ -62,16 +62,16 @@ def test_a_step_says_when_the_episode_is_over():
     assert ends[0] is False and set(ends) <= {False, True}
 
 
-def test_edges_are_known_on_roads_in_the_rows_of_everyone():
+def test_edges_are_known_on_roads_in_the_order_of_all_agents():
     world = open_world(ROAD, "idle")
     world.reset(0)
     labels = world.labels()
     assert labels is not None
     assert labels.edge_types.shape == (len(world.full_scene().ids),) * 2
     assert (labels.edge_types == LEADER).any()
-    shared = open_world(TAG, "idle")
-    shared.reset(0)
-    assert shared.labels() is None
+    multi = open_world(TAG, "idle")
+    multi.reset(0)
+    assert multi.labels() is None
 
 
 def test_one_ego_or_many_learners_with_forecasts_or_without(highway_checkpoint: str):
@@ -80,10 +80,10 @@ def test_one_ego_or_many_learners_with_forecasts_or_without(highway_checkpoint: 
     assert isinstance(forecast, EgoWorld) and isinstance(forecast.env, ForecastObservation)
     forecast.reset(0)
     assert forecast.observation["forecast"].ndim == 4
-    shared = open_world(TAG, "idle", "constant-velocity", horizon_steps=7, num_samples=2)
-    assert isinstance(shared, MultiagentWorld)
-    shared.reset(0)
-    assert shared.env.forecast.xy.shape == (1, 2, shared.spec.max_agents, 7, 2)
+    multi = open_world(TAG, "idle", "constant-velocity", horizon_steps=7, num_samples=2)
+    assert isinstance(multi, MultiagentWorld)
+    multi.reset(0)
+    assert multi.env.forecast.xy.shape == (1, 2, multi.spec.max_agents, 7, 2)
 
 
 def test_a_policy_gets_the_most_likely_of_several_forecasts(tmp_path: Path, highway_checkpoint: str):

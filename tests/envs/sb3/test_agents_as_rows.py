@@ -103,7 +103,7 @@ class Scripted(ParallelEnv):
 
 
 def row(value: float, agent: str) -> list[float]:
-    """A padded observation with the one-hot of ant or bee behind it; `value` 0 is a row that waits."""
+    """A padded observation with the one-hot of ant or bee behind it; `value` 0 is an environment that waits."""
     if not value:
         return [0.0] * 5
     return [value, value, 0, 1, 0] if agent.startswith("ant") else [value, value, value, 0, 1]
@@ -177,7 +177,7 @@ def test_copies_do_not_touch_each_other():
         np.testing.assert_equal(both[3], [*single[0][3], *single[1][3]])
 
 
-def test_rows_name_their_agent_copy_and_role():
+def test_each_env_has_its_agent_copy_and_role():
     venv = ParallelVecEnv([Scripted, Scripted])
     assert venv.agents_of_envs == [*SIZES, *SIZES]
     assert venv.copies_of_envs == [0, 0, 0, 1, 1, 1]
@@ -359,7 +359,7 @@ BOX2, BOX3 = spaces.Box(-1, 1, (2,), np.float32), spaces.Box(0.5, 2, (3,), np.fl
 FIVE, THREE = spaces.Discrete(5), spaces.Discrete(3, start=-1)
 
 
-def test_padded_bounds_hold_every_agent_the_padding_and_a_waiting_row():
+def test_padded_bounds_hold_every_agent_the_padding_and_a_waiting_env():
     venv = ParallelVecEnv([with_spaces({"a": BOX2, "b": BOX3}, {"a": FIVE, "b": FIVE})])
     assert venv.observation_space == spaces.Box(
         np.array([-1, -1, 0, 0, 0], np.float32), np.array([2, 2, 2, 1, 1], np.float32)
@@ -415,7 +415,7 @@ def test_padding_adds_zeros_at_the_end_of_each_axis_and_nothing_else(shapes: lis
         assert np.count_nonzero(seen) == np.count_nonzero(sample)
 
 
-def test_a_numbered_observation_is_a_row_too():
+def test_a_discrete_observation_is_stacked_too():
     factory = with_spaces({"a": THREE, "b": THREE}, {"a": FIVE, "b": FIVE})
 
     class Alone(factory):
@@ -558,7 +558,7 @@ def test_random_actions_cover_each_agents_own_space():
         random_actions(env, {"c": 0}, generator)
 
 
-def test_a_partner_that_forgets_somebody_is_told():
+def test_a_partner_without_an_action_for_an_agent_is_named():
     venv = ParallelVecEnv([Scripted], agents=["bee_0"], partner=lambda env, observations, generator: {"ant_0": 0})
     venv.reset()
     with pytest.raises(UserError, match=r"gave no action for \['ant_1'\]"):
@@ -598,7 +598,7 @@ def test_copies_must_be_there_distinct_and_alike():
             ParallelVecEnv(factories)
 
 
-def test_agents_without_a_row_or_without_an_observation_are_named():
+def test_unknown_agents_and_agents_without_an_observation_are_named():
     venv = ParallelVecEnv([Scripted])
     venv.envs[0].possible_agents.remove("bee_0")
     venv.reset()
@@ -656,7 +656,7 @@ def test_reset_infos_follow_every_reset():
     assert venv.reset_infos == [{"reset": 2, "alive": True}] * 3
 
 
-def test_attributes_and_methods_go_to_the_copy_of_a_row():
+def test_attributes_and_methods_go_to_the_copy_of_an_env():
     venv = ParallelVecEnv([Scripted, Scripted])
     venv.set_attr("calls", 5, indices=[4])
     assert venv.get_attr("calls") == [0, 0, 0, 5, 5, 5]

@@ -32,11 +32,11 @@ from tests.envs.helpers import MAX_AGENTS, PERCEPTION_M, assert_same, play, rand
 
 ROOT = Path(__file__).parents[3]
 SEED = 20
-ROWS = 3
+ENVS = 3
 STEPS = 12
 SMALL = {"vehicles_count": 8, "duration": 5}
-"""Short episodes on a road with few vehicles: rows crash or run out of time, at different steps."""
-ACTIONS = np.random.default_rng(3).integers(5, size=(STEPS, ROWS))
+"""Short episodes on a road with few vehicles: environments crash or run out of time, at different steps."""
+ACTIONS = np.random.default_rng(3).integers(5, size=(STEPS, ENVS))
 
 CHECKER_WARNINGS = (
     r"ignore:.*is different from the unwrapped version:UserWarning",
@@ -55,7 +55,7 @@ def ignore_checker_warnings(test: Any) -> Any:
 
 def small_pool(**kwargs: Any) -> EnvPoolVecEnv:
     usual = {"num_threads": 1, "perception_m": PERCEPTION_M, "max_agents": MAX_AGENTS, **SMALL}
-    return EnvPoolVecEnv("HighwayFast-v0", ROWS, seed=SEED, **(usual | kwargs))
+    return EnvPoolVecEnv("HighwayFast-v0", ENVS, seed=SEED, **(usual | kwargs))
 
 
 def small_env(scenes: bool = True) -> gym.Env:
@@ -64,8 +64,8 @@ def small_env(scenes: bool = True) -> gym.Env:
     return SceneObservation(env, PERCEPTION_M, MAX_AGENTS) if scenes else env
 
 
-def row_of(observations: Any, row: int) -> Any:
-    return {key: value[row] for key, value in observations.items()}
+def one_of(observations: Any, index: int) -> Any:
+    return {key: value[index] for key, value in observations.items()}
 
 
 # --- One environment --------------------------------------------------------------------------------------------------
@@ -129,7 +129,7 @@ def test_without_a_seed_the_next_episode_follows():
     assert (episodes[0][0] != episodes[0][1]).any() and (episodes[0][1] != episodes[0][2]).any()
 
 
-def test_environments_that_nobody_seeds_differ():
+def test_environments_without_a_seed_differ():
     first, second = (EnvPoolEnv("HighwayFast-v0").reset()[0] for _ in range(2))
     assert (first != second).any()
 
@@ -147,7 +147,7 @@ def test_time_ends_an_episode_by_truncation():
 
 
 def test_a_crash_is_a_termination():
-    """At full speed behind traffic, every row hits somebody before the time is over."""
+    """At full speed behind traffic, every environment hits an agent before the time is over."""
     env = EnvPoolEnv("HighwayFast-v0")
     for seed in range(3):
         env.reset(seed=seed)
@@ -199,9 +199,9 @@ def test_forecasts_wrap_it(highway_checkpoint: str):
 
 
 @pytest.mark.parametrize("scenes", [True, False])
-def test_rows_are_single_environments(scenes: bool):
+def test_envs_of_a_pool_are_single_environments(scenes: bool):
     """Observations, closing observations, rewards, ends and infos of SB3 over single environments, bit for bit."""
-    pool, single = small_pool(scenes=scenes), DummyVecEnv([partial(small_env, scenes)] * ROWS)
+    pool, single = small_pool(scenes=scenes), DummyVecEnv([partial(small_env, scenes)] * ENVS)
     single.seed(SEED)
     assert pool.observation_space == single.observation_space and pool.action_space == single.action_space
     assert_same(pool.reset(), single.reset(), tolerance=0.0)
@@ -212,15 +212,15 @@ def test_rows_are_single_environments(scenes: bool):
         assert_same(obs, expected, tolerance=0.0)
         np.testing.assert_array_equal(rewards, expected_rewards)
         assert dones.tolist() == expected_dones.tolist()
-        for row in range(ROWS):
-            closing, expected_closing = (i[row].pop("terminal_observation", None) for i in (infos, expected_infos))
-            assert infos[row] == expected_infos[row]
-            assert (closing is None) == (expected_closing is None) == (not dones[row])
+        for index in range(ENVS):
+            closing, expected_closing = (i[index].pop("terminal_observation", None) for i in (infos, expected_infos))
+            assert infos[index] == expected_infos[index]
+            assert (closing is None) == (expected_closing is None) == (not dones[index])
             if closing is not None:
                 assert_same(closing, expected_closing, tolerance=0.0)
-                assert pool.reset_infos[row] == single.reset_infos[row]
-                ended.append((t, row))
-    assert len(ended) > ROWS and len({t for t, _ in ended}) > 2  # rows end at different steps, more than once
+                assert pool.reset_infos[index] == single.reset_infos[index]
+                ended.append((t, index))
+    assert len(ended) > ENVS and len({t for t, _ in ended}) > 2  # environments end at different steps, more than once
 
 
 @pytest.mark.parametrize("task_id", HIGHWAY_ENV_OF)
@@ -234,11 +234,11 @@ def test_observations_lie_in_the_space(task_id: str):
             obs,
             *({k: v[None] for k, v in i["terminal_observation"].items()} for i in infos if len(i) > 3),
         ]
-    assert all(row_of(o, i) in pool.observation_space for o in observations for i in range(len(o["scene_ids"])))
+    assert all(one_of(o, i) in pool.observation_space for o in observations for i in range(len(o["scene_ids"])))
 
 
-def test_an_ended_row_closes_with_the_old_scene_and_opens_with_a_new_one():
-    pool, idle = small_pool(vehicles_count=30, perception_m=1000.0, max_agents=40), np.ones(ROWS, dtype=np.int64)
+def test_an_ended_env_closes_with_the_old_scene_and_opens_with_a_new_one():
+    pool, idle = small_pool(vehicles_count=30, perception_m=1000.0, max_agents=40), np.ones(ENVS, dtype=np.int64)
     obs: Any = pool.reset()
     for _ in range(5):
         last = obs
@@ -246,57 +246,57 @@ def test_an_ended_row_closes_with_the_old_scene_and_opens_with_a_new_one():
         if dones.any():
             break
     assert dones.any()
-    for row in np.flatnonzero(dones):
-        closing, opening = infos[row]["terminal_observation"], row_of(obs, row)
+    for index in np.flatnonzero(dones):
+        closing, opening = infos[index]["terminal_observation"], one_of(obs, index)
         assert sorted(opening["scene_ids"][opening["scene_valid"] == 1]) == list(range(31))
-        moved_m = closing["scene_states"][0, 0] - last["scene_states"][row, 0, 0]
+        moved_m = closing["scene_states"][0, 0] - last["scene_states"][index, 0, 0]
         assert 0 < moved_m < 40  # the ego, one step on
         assert opening["scene_states"][0, 0] < closing["scene_states"][0, 0] - 20  # back at the start of a road
         assert set(closing["scene_ids"]) <= set(range(31)) | {-1}
 
 
-def play_alone(row: int, checkpoint: str) -> list[tuple[Any, Any]]:
+def play_alone(index: int, checkpoint: str) -> list[tuple[Any, Any]]:
     """What each step leads to, and what closes the episode where it ends."""
     env = ForecastObservation(small_env(), checkpoint)
-    steps: list[tuple[Any, Any]] = [(env.reset(seed=SEED + row)[0], None)]
+    steps: list[tuple[Any, Any]] = [(env.reset(seed=SEED + index)[0], None)]
     for t in range(STEPS):
-        obs, _, terminated, truncated, _ = env.step(int(ACTIONS[t, row]))
+        obs, _, terminated, truncated, _ = env.step(int(ACTIONS[t, index]))
         steps.append((env.reset()[0], obs) if terminated or truncated else (obs, None))
     return steps
 
 
 def test_forecasts_are_those_of_single_environments(highway_checkpoint: str):
-    """Over several episodes: memory follows each row's own boundaries, and identities are the same."""
+    """Over several episodes: memory follows each environment's own boundaries, and identities are the same."""
     venv = VecForecast(VecMonitor(small_pool()), highway_checkpoint)
-    alone = [play_alone(row, highway_checkpoint) for row in range(ROWS)]
+    alone = [play_alone(index, highway_checkpoint) for index in range(ENVS)]
     obs: Any = venv.reset()
     infos: list[Any] = []
     closings = 0
     for t in range(STEPS + 1):
-        for row in range(ROWS):
-            expected, closing = alone[row][t]
-            assert_same(row_of(obs, row), expected)
+        for index in range(ENVS):
+            expected, closing = alone[index][t]
+            assert_same(one_of(obs, index), expected)
             if closing is not None:
-                assert_same(infos[row]["terminal_observation"], closing)
+                assert_same(infos[index]["terminal_observation"], closing)
                 closings += 1
         if t < STEPS:
             obs, _, _, infos = venv.step(ACTIONS[t])
-    assert closings > ROWS
+    assert closings > ENVS
 
 
 def test_monitored_episodes_add_up():
     venv = VecMonitor(small_pool())
     venv.reset()
-    returns, lengths, episodes = np.zeros(ROWS), np.zeros(ROWS), 0
+    returns, lengths, episodes = np.zeros(ENVS), np.zeros(ENVS), 0
     for t in range(STEPS):
         _, rewards, dones, infos = venv.step(ACTIONS[t])
         returns, lengths = returns + rewards, lengths + 1
-        for row in np.flatnonzero(dones):
-            assert infos[row]["episode"]["r"] == pytest.approx(returns[row], rel=1e-5)
-            assert infos[row]["episode"]["l"] == lengths[row]
-            returns[row] = lengths[row] = 0
+        for index in np.flatnonzero(dones):
+            assert infos[index]["episode"]["r"] == pytest.approx(returns[index], rel=1e-5)
+            assert infos[index]["episode"]["l"] == lengths[index]
+            returns[index] = lengths[index] = 0
             episodes += 1
-    assert episodes > ROWS
+    assert episodes > ENVS
 
 
 @pytest.mark.parametrize("scenes", [True, False])
@@ -328,7 +328,9 @@ def test_seeding_repeats_the_sequence():
     for obs, expected, repeated in zip(first, reseeded, again, strict=True):
         assert_same(obs, expected, tolerance=0.0)
         assert_same(repeated, expected, tolerance=0.0)
-    assert (other[0]["observation"][:-1] == first[0]["observation"][1:]).all()  # row i of seed s + 1 is row i + 1 of s
+    assert (
+        other[0]["observation"][:-1] == first[0]["observation"][1:]
+    ).all()  # environment i of seed s + 1 is environment i + 1 of s
     assert (other[0]["observation"] != first[0]["observation"]).any()
 
 
@@ -341,7 +343,7 @@ def test_a_seed_is_used_once():
     assert (first["observation"] != second["observation"]).any()
 
 
-def test_pools_that_nobody_seeds_differ():
+def test_pools_without_a_seed_differ():
     first, second = (EnvPoolVecEnv("HighwayFast-v0", 2, scenes=False).reset() for _ in range(2))
     assert (np.asarray(first) != np.asarray(second)).any()
 
@@ -368,7 +370,7 @@ class Frugal:
     """A pool that hands out the same buffer at each step, as EnvPool may and does not."""
 
     def __init__(self, pool: Any) -> None:
-        self._pool, self._buffer = pool, np.zeros((ROWS, 5, 5), np.float32)
+        self._pool, self._buffer = pool, np.zeros((ENVS, 5, 5), np.float32)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._pool, name)
@@ -386,16 +388,16 @@ def test_a_buffer_of_the_simulator_is_not_handed_out():
         assert_same(obs, expected, tolerance=0.0)
 
 
-def test_attributes_are_shared_by_the_rows():
+def test_all_envs_have_the_attributes():
     venv = small_pool()
-    assert venv.get_attr("scene_source") == ["envpool/HighwayFast-v0"] * ROWS
+    assert venv.get_attr("scene_source") == ["envpool/HighwayFast-v0"] * ENVS
     assert venv.get_attr("scene_spec", [0, 2]) == [venv.scene_spec] * 2
     assert venv.get_attr("render_mode", 1) == [None]
     assert venv.has_attr("action_type") and not venv.has_attr("nothing_of_the_kind")
-    assert venv.env_is_wrapped(gym.Wrapper) == [False] * ROWS
+    assert venv.env_is_wrapped(gym.Wrapper) == [False] * ENVS
     venv.reset()
     assert [len(states[0].vehicles) for states in venv.env_method("debug_states", indices=[1])] == [9]
-    with pytest.raises(AttributeError, match="live in C"):
+    with pytest.raises(AttributeError, match="are in C"):
         venv.set_attr("render_mode", None)
     with pytest.raises(AttributeError, match="no method 'fly'"):
         venv.env_method("fly")
@@ -467,14 +469,14 @@ def test_stepping_before_the_first_reset_is_named():
         venv.step_wait()
 
 
-def test_every_row_needs_an_action():
+def test_every_env_needs_an_action():
     venv = small_pool()
     venv.reset()
     with pytest.raises(UserError, match="one action for each of 3 envs, got 2"):
         venv.step(ACTIONS[0, :2])
 
 
-def test_a_pool_needs_rows():
+def test_a_pool_needs_envs():
     with pytest.raises(UserError, match="num_envs must be at least 1, got 0"):
         EnvPoolVecEnv("Merge-v0", 0)
 

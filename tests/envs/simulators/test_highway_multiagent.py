@@ -21,7 +21,7 @@ SLOWER, IDLE = 0, 1
 
 
 def empty_road(agents: int = 2, **config: Any) -> HighwayParallelEnv:
-    """A reset environment with nobody but the agents."""
+    """A reset environment with the agents only."""
     env = HighwayParallelEnv(controlled_vehicles=agents, spawn_probability=0.0, **config)
     env.reset(seed=0)
     env.highway.road.vehicles = list(env.highway.controlled_vehicles)
@@ -54,7 +54,7 @@ def run(env: Any, seed: int = 0) -> list[Any]:
 
 @pytest.mark.parametrize("env_id", [INTERSECTION, "intersection-multi-agent-v1"])
 def test_simulation_is_highway_envs(env_id: str):
-    """Until somebody is gone, the numbers are those of the gymnasium environment."""
+    """Until an agent is gone, the numbers are those of the gymnasium environment."""
     env = HighwayParallelEnv(env_id, controlled_vehicles=3)
     inside = env.highway.__class__(config={"controlled_vehicles": 3})
     observations, _ = env.reset(seed=1)
@@ -230,16 +230,16 @@ def test_reader_sees_every_vehicle_as_it_is():
     assert isinstance(reader, MultiagentReader)
     env.reset(seed=2)
     for _ in range(4):
-        shared = check_multiagent_scene(reader.read(env), reader.spec)
+        multi = check_multiagent_scene(reader.read(env), reader.spec)
         vehicles = env.highway.road.vehicles
-        assert shared.scene.valid.sum() == len(vehicles) > 3
+        assert multi.scene.valid.sum() == len(vehicles) > 3
         for i, vehicle in enumerate(vehicles):
             velocity = vehicle.speed * np.array([np.cos(vehicle.heading), np.sin(vehicle.heading)])
-            np.testing.assert_allclose(shared.scene.states[i], [*vehicle.position, *velocity])
-            assert shared.heading_rad[i] == vehicle.heading
-        assert list(shared.index_of) == env.agents
+            np.testing.assert_allclose(multi.scene.states[i], [*vehicle.position, *velocity])
+            assert multi.heading_rad[i] == vehicle.heading
+        assert list(multi.index_of) == env.agents
         for agent, vehicle in env.vehicles.items():
-            assert vehicles[shared.index_of[agent]] is vehicle
+            assert vehicles[multi.index_of[agent]] is vehicle
             assert vehicle is env.highway.controlled_vehicles[int(agent[-1])]
         env.step(all_idle(env))
 
@@ -263,7 +263,7 @@ def test_ids_are_the_vehicles_own():
     assert sorted(reader.read(env).scene.ids)[-1] == len(env.highway.road.vehicles) - 1
 
 
-def test_an_agent_has_a_row_for_its_last_observation_and_no_longer():
+def test_an_agent_has_an_index_for_its_last_observation_and_no_longer():
     env = empty_road(2)
     reader = multiagent_reader_for(env)
     wreck = env.highway.controlled_vehicles[0]
@@ -273,18 +273,18 @@ def test_an_agent_has_a_row_for_its_last_observation_and_no_longer():
     assert env.agents == ["vehicle_1"]
     assert set(reader.read(env).index_of) == {"vehicle_0", "vehicle_1"}
     env.step(all_idle(env))
-    shared = reader.read(env)
-    assert list(shared.index_of) == ["vehicle_1"]
-    assert shared.scene.ids[0] == number  # it is still there, for others to see
+    multi = reader.read(env)
+    assert list(multi.index_of) == ["vehicle_1"]
+    assert multi.scene.ids[0] == number  # it is still there, for others to see
 
 
 def test_an_empty_road_can_be_read():
     env = empty_road(2)
     env.highway.road.vehicles = []
     env._observed = []
-    shared = multiagent_reader_for(env).read(env)
-    assert not shared.scene.valid.any()
-    assert shared.index_of == {}
+    multi = multiagent_reader_for(env).read(env)
+    assert not multi.scene.valid.any()
+    assert multi.index_of == {}
 
 
 def test_spec_follows_the_config():
@@ -334,12 +334,12 @@ def displacement_m(forecasts: list[np.ndarray], scenes: list[Scene]) -> float:
     errors = []
     horizon = forecasts[0].shape[1]
     for t in range(len(scenes) - horizon):
-        for row in np.flatnonzero(scenes[t].valid):
+        for agent in np.flatnonzero(scenes[t].valid):
             for h in range(1, horizon + 1):
-                later = np.flatnonzero(scenes[t + h].valid & (scenes[t + h].ids == scenes[t].ids[row]))
+                later = np.flatnonzero(scenes[t + h].valid & (scenes[t + h].ids == scenes[t].ids[agent]))
                 if len(later):
                     truth = scenes[t + h].states[later[0], :2]
-                    errors.append(float(np.linalg.norm(forecasts[t][row, h - 1] - truth)))
+                    errors.append(float(np.linalg.norm(forecasts[t][agent, h - 1] - truth)))
     return float(np.mean(errors))
 
 
@@ -351,11 +351,11 @@ def test_the_checkpoint_of_the_single_ego_serves_and_beats_constant_velocity():
         forecasts: dict[str, list[np.ndarray]] = {"model": [], "straight": []}
         observations, _ = env.reset(seed=seed)
         while True:
-            shared: MultiagentScene = env.scene
-            scenes.append(shared.scene)
+            multi: MultiagentScene = env.scene
+            scenes.append(multi.scene)
             forecasts["model"].append(env.forecast.xy[0, 0].numpy())
             steps_s = np.arange(1, 6)[:, None]
-            states = shared.scene.states[:, None]
+            states = multi.scene.states[:, None]
             forecasts["straight"].append(states[..., :2] + states[..., 2:4] * steps_s)
             for agent, observation in observations.items():
                 assert env.observation_space(agent).contains(observation)

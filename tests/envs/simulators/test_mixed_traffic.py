@@ -72,7 +72,7 @@ def watch(env: gym.Env, seed: int, steps: int = 6, meanwhile: Callable[[], Any] 
 
 @pytest.fixture
 def road() -> Any:
-    """Four lanes at y = 0, 4, 8 and 12 m with a limit of 30 m/s, nobody on them."""
+    """Four lanes at y = 0, 4, 8 and 12 m with a limit of 30 m/s, no agent on them."""
     env = make("highway-v0", vehicles_count=1)
     env.reset(seed=0)
     env.unwrapped.road.vehicles = []
@@ -121,7 +121,7 @@ def test_contracts_of_gymnasium_and_sb3(env_id: str):
 def test_a_seed_fixes_drivers_and_motion(env_id: str):
     first, again, other = (watch(make(env_id), seed) for seed in (3, 3, 4))
     assert first == again
-    assert [row[4] for row in first[0]] != [row[4] for row in other[0]]
+    assert [line[4] for line in first[0]] != [line[4] for line in other[0]]
     env = make(env_id)
     watch(env, 4)
     assert watch(env, 3) == first  # not the first episode of this env
@@ -251,7 +251,7 @@ def test_each_kind_accelerates_like_its_class_of_highway_env(
         setattr(plain, name, getattr(mixed, name))
     leader = None if gap_m is None else Vehicle(road, np.array([gap_m, 4.0]), 0.0, leader_mps)
     assert mixed.acceleration(mixed, leader) == pytest.approx(plain.acceleration(plain, leader), rel=1e-12)
-    assert mixed.acceleration(None, leader) == 0  # MOBIL asks so where nobody follows
+    assert mixed.acceleration(None, leader) == 0  # MOBIL asks so where no agent follows
 
 
 @pytest.mark.parametrize("kind", DRIVER_KINDS)

@@ -78,10 +78,10 @@ def test_forecasts_and_truth_are_in_the_picture(recording: Recording):
 def test_forecast_starts_where_the_agent_was_and_stays_there(recording: Recording):
     """Constant velocity on a straight road: the first forecast point is where the agent is one step later."""
     step, later = recording._steps[0], recording._frames[recording.frame_of_step(1)]
-    shared = [row for row, key in enumerate(step.keys) if key in later.positions_m]
-    assert shared
-    for row in shared:
-        error_m = np.hypot(*(step.forecast_m[row, 0, 0] - later.positions_m[step.keys[row]]))
+    common = [i for i, key in enumerate(step.keys) if key in later.positions_m]
+    assert common
+    for i in common:
+        error_m = np.hypot(*(step.forecast_m[i, 0, 0] - later.positions_m[step.keys[i]]))
         assert error_m < 3.0  # accelerations are at most 5 m/s²
 
 

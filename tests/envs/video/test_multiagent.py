@@ -83,14 +83,14 @@ class StraightEnv(ParallelEnv):
         before = list(self.agents)
         self.step_count += 1
         observations, infos = self._living()
-        everyone = sorted({*before, *self.agents})
-        observations |= {name: np.zeros(1, np.float32) for name in everyone}
+        names = sorted({*before, *self.agents})
+        observations |= {name: np.zeros(1, np.float32) for name in names}
         rewards = {n: 1.0 if n.startswith("adv") else -2.0 if n == "agent_0" else -4.0 for n in before}
         over = self.step_count == STEPS
         if over:
             self.agents = []
-        ended = {name: over or name not in self.agents for name in everyone}
-        return observations, rewards, ended, dict.fromkeys(everyone, False), infos
+        ended = {name: over or name not in self.agents for name in names}
+        return observations, rewards, ended, dict.fromkeys(names, False), infos
 
     def _living(self) -> tuple[dict, dict]:
         self.agents = [name for name in self.present() if name in LEARNERS]
@@ -103,7 +103,7 @@ def place(name: str, step: float) -> np.ndarray:
 
 
 class StraightReader:
-    """Rows in another order at each step; landmarks and, on request, sizes and headings."""
+    """Places in another order at each step; landmarks and, on request, sizes and headings."""
 
     def __init__(self, env: Any, headings: bool = False, sizes: bool = True) -> None:
         self._rng = np.random.default_rng(0)
@@ -128,12 +128,12 @@ class StraightReader:
         scene = Scene(
             states[:, : self.spec.num_features], np.array([NUMBERS[n] for n in names]), np.ones(len(names)) > 0
         )
-        rows = {name: row for row, name in enumerate(names) if name in base.agents}
-        return pad_multiagent_scene(scene, rows, np.full(len(names), -np.pi / 2 * self._headings), self.spec)
+        index_of = {name: i for i, name in enumerate(names) if name in base.agents}
+        return pad_multiagent_scene(scene, index_of, np.full(len(names), -np.pi / 2 * self._headings), self.spec)
 
 
 class OneEdge(ForecastParallelEnv):
-    """adversary_0 acts on agent_0 with probability `prob`, and nobody else on anybody."""
+    """adversary_0 acts on agent_0 with probability `prob`, and no other agent on any."""
 
     prob = 1.0
 
@@ -141,9 +141,9 @@ class OneEdge(ForecastParallelEnv):
     def forecast(self) -> Forecast:
         probs = np.zeros((1, 6, 6, 2), np.float32)
         probs[..., 0] = 1.0
-        rows = self.scene.index_of
-        if {"agent_0", "adversary_0"} <= set(rows):
-            probs[0, rows["agent_0"], rows["adversary_0"]] = 1 - self.prob, self.prob
+        index_of = self.scene.index_of
+        if {"agent_0", "adversary_0"} <= set(index_of):
+            probs[0, index_of["agent_0"], index_of["adversary_0"]] = 1 - self.prob, self.prob
         forecast = super().forecast
         return replace(forecast, edge_probs=forecast.edge_probs.new_tensor(probs))
 
@@ -204,7 +204,7 @@ def test_frame_is_saved_as_drawn(recording: MultiagentRecording, tmp_path: Path)
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "frame.png")), recording.draw(9))
 
 
-def test_nobody_stands_outside_and_y_points_up(recording: MultiagentRecording):
+def test_no_agent_stands_outside_and_y_points_up(recording: MultiagentRecording):
     width, height = recording._arena.size_px
     for step in range(STEPS + 1):
         for body in recording._moments[step].bodies.values():
@@ -241,7 +241,7 @@ def test_the_dead_vanish_and_who_joins_appears(recording: MultiagentRecording):
 
 
 def test_forecast_and_truth_of_straight_motion_coincide(recording: MultiagentRecording):
-    """Although the rows of the scene change places at each step."""
+    """Although the places of the scene change places at each step."""
     for step, moment in enumerate(recording._moments):
         for name, key in NUMBERS.items():
             if key not in moment.bodies:
@@ -358,7 +358,7 @@ def test_pictures_are_equally_large_whatever_the_returns(recording: MultiagentRe
     places=st.lists(st.tuples(*[st.floats(-1e4, 1e4)] * 2), min_size=1, max_size=5),
     y_up=st.booleans(),
 )
-def test_arenas_hold_everyone_at_equal_aspect(places: list[tuple[float, float]], y_up: bool):
+def test_arenas_hold_all_agents_at_equal_aspect(places: list[tuple[float, float]], y_up: bool):
     places_m = np.array(places)
     arena = Arena.around(places_m, np.zeros(len(places)), 400, y_up)
     assert max(arena.size_px) == 400
