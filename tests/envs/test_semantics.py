@@ -183,7 +183,7 @@ def test_a_newcomer_inherits_nothing(name: str, take: Callable[[str], Take]):
     assert remembered > 1e-3
 
 
-@pytest.mark.parametrize(("name", "step"), [("function", 4), ("own-reader", 4), ("rows-crowd-ids", 4), ("swarm", 5)])
+@pytest.mark.parametrize(("name", "step"), [("function", 4), ("own-reader", 4), ("table-crowd-ids", 4), ("swarm", 5)])
 def test_the_toys_newcomer_stands_where_the_leaver_would_be(name: str, step: int, take: Callable[[str], Take]):
     """So that the test above is about an agent that motion alone would take for the leaver."""
     before, now = take(name).episodes[0][step - 1 : step + 1]
