@@ -96,4 +96,4 @@ def _half(model: DGVAE, case: Case) -> Any:
     states, valid = scenes(case.batch, case.agents)
     valid[:, 1::2] = False
     _, belief = model.observe(model.empty_memory(*valid.shape), states * valid[..., None], valid)
-    return model.rollout(belief, case.horizon, case.samples, torch.Generator().manual_seed(0))
+    return model.rollout(belief, case.horizon, case.samples, torch.Generator().manual_seed(0)).states

@@ -180,8 +180,8 @@ def _our_predictions(states: torch.Tensor, future: int) -> tuple[Callable[[], An
     empty = model.empty_memory(batch, agents)
     with torch.inference_mode():
         before, _ = stream(empty, states[:, : history - 1])
-    streamed = inference(lambda: model.rollout(stream(before, states[:, history - 1 :])[1], future))
-    anew = inference(lambda: model.rollout(stream(empty, states)[1], future))
+    streamed = inference(lambda: model.rollout(stream(before, states[:, history - 1 :])[1], future).states)
+    anew = inference(lambda: model.rollout(stream(empty, states)[1], future).states)
     for call in (streamed, anew):
         call()
     return streamed, anew

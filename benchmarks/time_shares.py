@@ -76,10 +76,10 @@ def subjects() -> dict[str, tuple[Callable[[], Any], int]]:
     _, many = observed(paper, *scenes(64, 12))
     return {
         f"roll-out of {shape.future} steps, {shape.batch} × {shape.agents} agents, widths of dNRI": (
-            inference(lambda: equal.rollout(belief, shape.future)),
+            inference(lambda: equal.rollout(belief, shape.future).states),
             1,
         ),
-        "roll-out of 5 steps, 64 × 12 agents, paper": (inference(lambda: paper.rollout(many, 5)), 1),
+        "roll-out of 5 steps, 64 × 12 agents, paper": (inference(lambda: paper.rollout(many, 5).states), 1),
         "training step, 128 × 5 agents × 50 steps, paper": (TrainingStep(sized("paper"), 5, 50, 128), 5),
     }
 

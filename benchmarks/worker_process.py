@@ -132,7 +132,7 @@ def forecast(preset: str, agents: int, neighbours: int, horizon: int) -> dict[st
         states, valid = scenes(1, count)
         with torch.inference_mode():
             memory, belief = model.observe(model.empty_memory(1, count), states, valid)
-            return memory, belief, model.rollout(belief, horizon)
+            return memory, belief, model.rollout(belief, horizon).states
 
     look(4)  # loads kernels and starts threads
     return {"peak_bytes": peak_rise(lambda: look(agents))}

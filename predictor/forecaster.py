@@ -147,6 +147,17 @@ def edgeless_belief(
     return Belief(states, valid, probs, states.new_zeros(batch, agents, agents, edge_feature_dim))
 
 
+class Futures(NamedTuple):
+    """Possible futures of each scene of a batch; each sample is a whole scene."""
+
+    states: Float[Tensor, "batch samples agents horizon state"]
+    """Future states [SI]; sample 0 is the single forecast, for use where only one is wanted."""
+    mode_probs: Float[Tensor, "batch samples agents"] | None = None
+    """Probability of each sample for each agent, which sum to 1 over the samples; None if the samples are draws."""
+    scale: Float[Tensor, "batch samples agents horizon axes"] | None = None
+    """Standard deviation of the position around each sample [m]; None if the forecaster has no such estimate."""
+
+
 @runtime_checkable
 class Forecaster(Protocol):
     """Interface of models that forecast scenes step by step."""
@@ -180,8 +191,8 @@ class Forecaster(Protocol):
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
-    ) -> Float[Tensor, "batch samples agents horizon state"]:
-        """Computes future states [SI]: sample 0 follows the most likely graph, the others draw theirs.
+    ) -> Futures:
+        """Computes possible futures: sample 0 is the single forecast, the others are drawn or enumerated.
 
         With one generator per scene of the batch, a scene's samples depend on no other scene.
         """
@@ -200,6 +211,16 @@ class WindowOutput(NamedTuple):
     """Logits of edge types from past and future."""
     features: Float[Tensor, "batch time agents agents feature"] | None = None
     """Edge features from the past."""
+    modes: Futures | None = None
+    """Enumerated futures after `last_observed`, `rollout` first; None for models without modes."""
+
+    def float(self) -> "WindowOutput":
+        """Returns the output in float32."""
+
+        def exact(value: Any) -> Any:
+            return type(value)(*map(exact, value)) if isinstance(value, tuple) else None if value is None else value.float()
+
+        return WindowOutput(*map(exact, self))
 
 
 @runtime_checkable

@@ -21,6 +21,15 @@ def pair_mask(valid: Bool[Tensor, "*batch agents"]) -> Bool[Tensor, "*batch agen
     return valid[..., :, None] & valid[..., None, :] & distinct
 
 
+def self_pairs(
+    agents: int, senders: Int[Tensor, "*some agents slots"] | None, device: torch.device | None = None
+) -> Bool[Tensor, "*some agents slots"]:
+    """Returns which slots hold an agent's pair with itself."""
+    if senders is None:
+        return torch.eye(agents, dtype=torch.bool, device=device)
+    return senders == torch.arange(agents, device=device)[:, None]
+
+
 def others(agents: int, device: torch.device | None = None) -> Int[Tensor, "agents slots"]:
     """Returns the senders of a graph in which each agent receives from all others, in order."""
     indices = torch.arange(agents, device=device)

@@ -79,7 +79,8 @@ def configure(name: str, preset: str, overrides: Sequence[str] = (), **fitted: A
 
     Args:
         name: name of the model.
-        preset: "paper" or "fast"; models other than the dG-VAE have their published sizes, halved for "fast".
+        preset: "paper", "fast" or "plural"; models other than the dG-VAE have their published sizes, halved unless
+            "paper".
         overrides: texts such as "hidden_dim=64".
         fitted: values of fields such as `delta_scales`; an override wins.
 
@@ -88,7 +89,7 @@ def configure(name: str, preset: str, overrides: Sequence[str] = (), **fitted: A
     """
     cls = _kind(name).config
     base = PRESETS[preset] if name == "dgvae" else cls()
-    if name != "dgvae" and preset == "fast":
+    if name != "dgvae" and preset != "paper":
         widths = {f.name: getattr(base, f.name) for f in dataclasses.fields(cls) if f.name.endswith("_dim")}
         base = dataclasses.replace(base, **{k: max(1, v // 2) for k, v in widths.items()})
     return dataclasses.replace(base, **{**fitted, **dict(_parse(cls, text) for text in overrides)})

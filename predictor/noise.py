@@ -70,3 +70,22 @@ def noise_of_pairs(
     if noise is None or isinstance(noise, torch.Generator):
         return noise
     return PairNoise(noise, present, draws, steps, types)
+
+
+def uniform_of_agents(
+    noise: Noise | None, valid: Bool[Tensor, "scenes agents"], draws: int
+) -> Float[Tensor, "scenes draws agents"]:
+    """Draws uniform numbers in [0, 1) for the present agents of each scene; 0.5 for absent ones.
+
+    Raises:
+        UserError: the number of generators is not the number of scenes.
+    """
+    shape = (len(valid), draws, valid.shape[1])
+    if noise is None or isinstance(noise, torch.Generator):
+        return torch.rand(shape, device=valid.device, generator=noise)
+    if len(noise) != len(valid):
+        raise UserError(f"samples need one generator per scene, got {len(noise)} generators for {len(valid)} scenes")
+    drawn = torch.full(shape, 0.5)
+    for scene, (own, present) in enumerate(zip(noise, valid.cpu(), strict=True)):
+        drawn[scene, :, present] = torch.from_numpy(own.random((draws, int(present.sum())), dtype=np.float32))
+    return drawn.to(valid.device)

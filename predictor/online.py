@@ -135,7 +135,7 @@ class OnlineForecaster:
             raise ProtocolError("forecast() needs an observation; call observe() first")
         belief = self._belief
         steps = horizon_steps or self.forecaster.horizon_steps
-        states = self.forecaster.rollout(belief, steps, num_samples, generator)
+        states = self.forecaster.rollout(belief, steps, num_samples, generator).states
         # float32 relative to the ego: the origin that observe() removed is the ego's own position on "ego" axes
         axes = self.forecaster.spec.position_dim
         ego_now = belief.states[:, None, :1, None, :axes] * float(self.forecaster.spec.has_ego)

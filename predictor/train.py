@@ -1,6 +1,7 @@
 """Trains a forecaster: `python -m predictor.train --data data/roundabout --out runs/roundabout`.
 
-The best checkpoint is chosen by free-running minADE on held-out episodes, not by one-step error.
+The best checkpoint is chosen by the energy score of free-running samples on held-out episodes: it rewards accuracy and
+a spread like the truth's, whereas one-step errors reward neither.
 """
 
 import json
@@ -82,13 +83,17 @@ def _run(trainer: Trainer, state_file: Path, made: dict[str, Any]) -> None:
 
 def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, Any]) -> str:
     accuracy, std_m = trainer.validate()
-    writer.add_scalar("val/min_ade_m", accuracy.min_ade_m, trainer.step)
-    writer.add_scalar("val/min_fde_m", accuracy.min_fde_m, trainer.step)
+    for name in ("energy_m", "ade_m", "fde_m", "min_ade_m", "min_joint_ade_m"):
+        writer.add_scalar(f"val/{name}", getattr(accuracy, name), trainer.step)
     writer.add_scalar("val/constant_velocity_ade_m", trainer.baseline_m, trainer.step)
-    if accuracy.min_ade_m < trainer.best:
-        trainer.best, trainer.stale = accuracy.min_ade_m, 0
+    if accuracy.energy_m < trainer.best:
+        trainer.best, trainer.stale = accuracy.energy_m, 0
         result = {
             "step": trainer.step,
+            "val_energy_m": accuracy.energy_m,
+            "val_ade_m": accuracy.ade_m,
+            "val_fde_m": accuracy.fde_m,
+            "val_samples": accuracy.num_samples,
             "val_min_ade_m": accuracy.min_ade_m,
             "val_min_fde_m": accuracy.min_fde_m,
             "val_constant_velocity_ade_m": trainer.baseline_m,
@@ -106,7 +111,8 @@ def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, 
     else:
         trainer.stale += 1
     return (
-        f"| val minADE {accuracy.min_ade_m:.3f} m (best {trainer.best:.3f}, constant velocity {trainer.baseline_m:.3f})"
+        f"| val energy {accuracy.energy_m:.3f} m (best {trainer.best:.3f}), ADE {accuracy.ade_m:.3f} "
+        f"(constant velocity {trainer.baseline_m:.3f})"
     )
 
 

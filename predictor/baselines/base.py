@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from predictor.forecaster import Belief, Memory, WindowOutput
+from predictor.forecaster import Belief, Futures, Memory, WindowOutput
 from predictor.graph import pair_mask
 from predictor.layers.state_codec import Residual, StateCodec
 from predictor.noise import Noise
@@ -151,13 +151,13 @@ class UnrolledForecaster(nn.Module, ABC):
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
-    ) -> Float[Tensor, "batch samples agents horizon state"]:
+    ) -> Futures:
         """Rolls out from the belief; all samples are equal."""
         now: Internal = belief.internal
         future = self.continue_from(
             now.next_states, belief.valid, now.pairs, now.scores, now.nodes, horizon_steps, self.expected
         )
-        return future[:, None].expand(-1, num_samples, -1, -1, -1)
+        return Futures(future[:, None].expand(-1, num_samples, -1, -1, -1))
 
     # --- Training -----------------------------------------------------------------------------------------------
 

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from predictor.forecaster import Belief, Memory, edgeless_belief
+from predictor.forecaster import Belief, Futures, Memory, edgeless_belief
 from predictor.noise import Noise
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
@@ -41,14 +41,14 @@ class ConstantVelocity:
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
-    ) -> Float[Tensor, "batch samples agents horizon state"]:
+    ) -> Futures:
         """Computes x + v·t; all samples are equal."""
         states = belief.states
         time_s = self.spec.dt_s * torch.arange(1, horizon_steps + 1, dtype=states.dtype, device=states.device)
         future = states[:, :, None].repeat(1, 1, horizon_steps, 1)
         axes = self.spec.position_dim
         future[..., :axes] += states[:, :, None, axes : 2 * axes] * time_s[:, None]
-        return future[:, None].expand(-1, num_samples, -1, -1, -1)
+        return Futures(future[:, None].expand(-1, num_samples, -1, -1, -1))
 
 
 class NoisyConstantVelocity(ConstantVelocity):
@@ -94,7 +94,7 @@ class NoisyConstantVelocity(ConstantVelocity):
         horizon_steps: int,
         num_samples: int = 1,
         generator: torch.Generator | Sequence[np.random.Generator] | None = None,
-    ) -> Float[Tensor, "batch samples agents horizon state"]:
+    ) -> Futures:
         """Returns constant velocity as sample 0, and samples with noise; each one's velocity follows its positions.
 
         With one generator per scene of the batch, a scene's samples depend on no other scene.
@@ -102,7 +102,7 @@ class NoisyConstantVelocity(ConstantVelocity):
         Raises:
             UserError: the number of generators is not the number of scenes.
         """
-        future = super().rollout(belief, horizon_steps, num_samples).clone()
+        future = super().rollout(belief, horizon_steps, num_samples).states.clone()
         axes = self.spec.position_dim
         drawn = _normal(belief.valid, num_samples - 1, axes, generator).to(future)[..., None, :]
         time_s = self.spec.dt_s * torch.arange(1, horizon_steps + 1, dtype=future.dtype, device=future.device)
@@ -110,7 +110,7 @@ class NoisyConstantVelocity(ConstantVelocity):
         added_m = spread_m.diff(prepend=spread_m.new_zeros(1))
         future[:, 1:, ..., :axes] += drawn * spread_m[:, None]
         future[:, 1:, ..., axes : 2 * axes] += drawn * added_m[:, None] / self.spec.dt_s
-        return future
+        return Futures(future)
 
 
 def _normal(

@@ -29,7 +29,7 @@ from predictor.baselines.base import (
 )
 from predictor.baselines.nri_blocks import FrameEncoder, HiddenDecoder, PairLSTM, elu_head
 from predictor.dgvae.networks import concrete_sample, no_edge_where_absent
-from predictor.forecaster import Belief, WindowOutput
+from predictor.forecaster import Belief, Futures, WindowOutput
 from predictor.graph import pair_mask
 from predictor.layers.state_codec import Residual
 from predictor.noise import Noise, PairNoise, noise_of_pairs
@@ -189,7 +189,7 @@ class DNRI(UnrolledForecaster):
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
-    ) -> Float[Tensor, "batch samples agents horizon state"]:
+    ) -> Futures:
         """Rolls out, encoding the predictions; sample 0 uses edge probabilities, the others draw edge types."""
         expected = super().rollout(belief, horizon_steps)
         if num_samples == 1:
@@ -204,7 +204,8 @@ class DNRI(UnrolledForecaster):
         states, valid, scores = repeat(belief.states, belief.valid, now.scores)
         memory, before, draw = repeat(*now.pairs), repeat(*now.before), self.drawn(noise)
         futures = self._branch(states, valid, memory, scores, before, horizon_steps, draw)
-        return torch.cat([expected, futures.unflatten(0, (len(belief.states), draws))], dim=1)
+        drawn = futures.unflatten(0, (len(belief.states), draws))
+        return Futures(torch.cat([expected.states, drawn], dim=1))
 
     # --- Training -----------------------------------------------------------------------------------------------
 

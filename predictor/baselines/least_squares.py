@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from predictor.data.springs import Physics, simulate
-from predictor.forecaster import Belief, Memory
+from predictor.forecaster import Belief, Futures, Memory
 from predictor.graph import pair_mask
 from predictor.noise import Noise
 from predictor.scene import SceneSpec
@@ -78,7 +78,7 @@ class SpringLeastSquares:
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
-    ) -> Float[Tensor, "batch samples agents horizon state"]:
+    ) -> Futures:
         """Integrates the law; all samples are equal."""
         physics = Physics(
             num_agents=belief.states.shape[1],
@@ -90,7 +90,7 @@ class SpringLeastSquares:
         states = belief.states.double()
         rolled = simulate(physics, belief.internal.constants, states[..., :2], states[..., 2:])
         future = rolled[:, 1:].transpose(1, 2).to(belief.states.dtype)
-        return future[:, None].expand(-1, num_samples, -1, -1, -1)
+        return Futures(future[:, None].expand(-1, num_samples, -1, -1, -1))
 
     def _near_wall(self, states: Tensor) -> Tensor:
         reach = states[..., 2:4].abs() * self.spec.dt_s

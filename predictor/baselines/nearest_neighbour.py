@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from predictor.data.store import Episode, read_store
 from predictor.data.windows import visible
-from predictor.forecaster import Belief, Memory, edgeless_belief
+from predictor.forecaster import Belief, Futures, Memory, edgeless_belief
 from predictor.noise import Noise
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
@@ -128,7 +128,7 @@ class NearestNeighbour(nn.Module):
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
-    ) -> Float[Tensor, "batch samples agents horizon state"]:
+    ) -> Futures:
         """Computes sample 0 from the mean motion of the neighbours, sample s from the s-th nearest one, cyclically.
 
         Velocities are finite differences of positions; other features are constant. Nothing is drawn. Absent agents
@@ -154,7 +154,7 @@ class NearestNeighbour(nn.Module):
         future[..., axes : 2 * axes] = steps / self.spec.dt_s
         all_agents = states.new_zeros(*valid.shape, num_samples, horizon_steps, states.shape[-1])
         all_agents[valid] = future
-        return all_agents.transpose(1, 2)
+        return Futures(all_agents.transpose(1, 2))
 
     def nearest(
         self, features: Float[Tensor, "queries features"]

@@ -9,6 +9,9 @@ layers and differ only in the number of steps that they compute at once. Without
 Two things that the paper leaves open are settled here. Without edges an agent's own state would be no input of its
 decoder, so a linear term of that state is added to the messages. And during the observed history the edges' weights are
 the prior's probabilities, so that one history gives one memory; samples are drawn from the first forecast step on.
+
+With `num_modes`, each agent has an edge to itself whose types are its possible futures (`predictor.dgvae.self_edges`).
+Scene k of a roll-out follows type k of every agent, so the scenes are enumerated and nothing is drawn.
 """
 
 from collections.abc import Callable
@@ -18,6 +21,7 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
+from torch.nn import functional
 
 from predictor.dgvae.networks import (
     PRESETS,
@@ -30,17 +34,17 @@ from predictor.dgvae.networks import (
     no_edge_where_absent,
 )
 from predictor.dgvae.packing import Packed, Padded
+from predictor.dgvae.motion import Context, Motion
 from predictor.dgvae.pair_matching import running_mean, running_mean_step, window_mean
+from predictor.dgvae.self_edges import HeldType, SelfEdges
 from predictor.dgvae.single_step import Encoding, Internal, Layers, Modules, Past, Stepper, differentiable, unpacked
-from predictor.forecaster import Belief, Memory, WindowOutput
-from predictor.graph import NO_AGENT, among_nearest, nearest, off_diagonal, others, pair_mask, with_diagonal
+from predictor.forecaster import Belief, Futures, Memory, WindowOutput
+from predictor.graph import NO_AGENT, among_nearest, nearest, off_diagonal, others, pair_mask, self_pairs, with_diagonal
 from predictor.layers.rnn import masked_gru
 from predictor.layers.state_codec import StateCodec
-from predictor.noise import Noise, PairNoise, noise_of_pairs
+from predictor.noise import Noise, PairNoise, noise_of_pairs, uniform_of_agents
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
-
-__all__ = ["DGVAE", "PRESETS", "DGVAEConfig", "Decoder", "Edges", "Encoder", "WindowOutput", "concrete_sample"]
 
 
 class DGVAE(nn.Module):
@@ -50,7 +54,7 @@ class DGVAE(nn.Module):
 
         >>> model = DGVAE(SceneSpec(dt_s=1.0, max_agents=3), PRESETS["fast"]).double().eval()
         >>> observe = lambda states: model.observe(model.empty_memory(1, 3), states, torch.ones(1, 3).bool())[1]
-        >>> forecast = lambda states: model.rollout(observe(states), horizon_steps=2)[0, 0]
+        >>> forecast = lambda states: model.rollout(observe(states), horizon_steps=2).states[0, 0]
         >>> torch.func.jacrev(forecast)(torch.ones(1, 3, 4).double()).shape  # (agent, step, state) by observed state
         torch.Size([3, 2, 4, 1, 3, 4])
 
@@ -73,6 +77,10 @@ class DGVAE(nn.Module):
         inputs = self.codec.num_inputs
         self.encoder = Encoder(config, inputs + spec.num_features * self.sees_changes)
         self.decoder = Decoder(config, inputs, spec.num_features)
+        self.self_edges: SelfEdges | None = None
+        if config.num_modes:
+            sizes = (config.rnn_dim, config.head_dim, config.message_dim, config.decoder_dim)
+            self.self_edges = SelfEdges(inputs, *sizes, config.num_modes, spec.position_dim)
         self._per_change: Tensor
         per_change = self.codec.scales / torch.tensor(config.change_scales) if self.sees_changes else torch.ones(0)
         self.register_buffer("_per_change", per_change, persistent=False)
@@ -87,6 +95,12 @@ class DGVAE(nn.Module):
     def edge_feature_dim(self) -> int:
         """Number of features of an edge."""
         return self.config.edge_feature_dim
+
+    @property
+    def _slots(self) -> int:
+        """Number of listed senders of an agent; 0 where slot j is agent j."""
+        near = self.config.num_neighbours
+        return near + (self.self_edges is not None) if near else 0
 
     def variant(self, **changes: Any) -> "DGVAE":
         """Returns a model with these weights and a changed config.
@@ -116,9 +130,9 @@ class DGVAE(nn.Module):
 
     def empty_memory(self, batch: int, agents: int) -> Memory:
         """Returns zeros on the model's device."""
-        near = self.config.num_neighbours
-        nodes, pairs = self._zero_memory(batch, agents, near or agents)
-        senders = torch.full((batch, agents, near), NO_AGENT, device=nodes[0].device) if near else None
+        listed = self._slots
+        nodes, pairs = self._zero_memory(batch, agents, listed or agents)
+        senders = torch.full((batch, agents, listed), NO_AGENT, device=nodes[0].device) if listed else None
         return Memory(nodes, pairs, senders)
 
     def observe(
@@ -129,31 +143,44 @@ class DGVAE(nn.Module):
         if padded.senders is not None:
             memory = memory.to_slots(padded.senders, padded.present)
         layers = self._layers()
-        graph: Padded | Packed = Packed.of(padded, valid) if isinstance(layers, Stepper) else padded
+        graph: Padded | Packed = padded
+        if isinstance(layers, Stepper):
+            graph = Packed.of(padded, valid, self.self_edges is not None)
         (node, seen), pairs = memory.nodes, memory.pairs
         node_before, (hidden, cell, static) = graph.pack_nodes(node), map(graph.pack_pairs, pairs)
         past, logits, features = self._encode_step(layers, states, valid, graph, Past(hidden, cell, static, seen))
         probs = edge_probabilities(logits)
-        node_after, next_states = self._move(layers, states, valid, graph, probs, features, node_before)
-        known = Internal(layers, graph, past, logits, probs, features, node_before, node_after, next_states)
+        own = None if self.self_edges is None else functional.elu(graph.own(past.hidden))
+        held = None if self.self_edges is None or own is None else self.self_edges.hold(own)
+        context = Context(graph, probs, features, held)
+        node_after, next_states = self._motion.step(layers, states, valid, context, node_before)
+        known = Internal(layers, graph, past, logits, probs, features, node_before, node_after, next_states, own)
         remembered = tuple(graph.unpack_pairs(t) for t in (past.hidden, past.cell, past.static))
         after = Memory((graph.unpack_nodes(node_after), past.seen), remembered, memory.senders)
-        shown = graph.unpack_pairs(probs, no_edge=True), graph.unpack_pairs(features)
-        return after, Belief(states, valid, *shown, known, memory.senders)
+        near = self.config.num_neighbours
+        shown = [t[:, :, : near or None] for t in (graph.unpack_pairs(probs, no_edge=True), graph.unpack_pairs(features))]
+        senders = None if memory.senders is None else memory.senders[:, :, :near]
+        return after, Belief(states, valid, *shown, known, senders)
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
-    ) -> Float[Tensor, "batch samples agents horizon state"]:
-        """Rolls out, encoding predictions so that edges evolve; sample 0 uses edge probabilities, others draw types."""
+    ) -> Futures:
+        """Rolls out from a belief; sample 0 uses edge probabilities and type 0 of every self-edge.
+
+        With at least `num_samples` modes, sample k follows type k of every agent and nothing is drawn; with fewer, the
+        other samples draw each agent's type. Without modes, edge types are drawn, and predictions are encoded.
+        """
         known: Internal = belief.internal
         if differentiable():  # the history may have been observed without gradients
             known = unpacked(known, self._plain())
+        if self.self_edges is not None:
+            return self._modes(belief, known, horizon_steps, num_samples, generator)
         layers, graph, edges = known.layers, known.graph, (known.probs, known.features)
         future = self._continue(
             layers, known.next_states, belief.valid, graph, known.past, known.node_after, edges, horizon_steps, None
         )
         if num_samples == 1:
-            return future[:, None]
+            return Futures(future[:, None])
         draws = num_samples - 1
         steps = horizon_steps if self.config.rollout_graph == "evolving" else 1
         noise = noise_of_pairs(generator, graph.pairs_there, draws, steps, self.num_edge_types)
@@ -169,7 +196,45 @@ class DGVAE(nn.Module):
             layers, states, valid, graph.repeat(draws), features, Past(hidden, cell, static, seen), node, logits,
             horizon_steps, self._sampler(noise),
         )  # fmt: skip
-        return torch.cat([future[:, None], drawn.unflatten(0, (len(future), draws))], dim=1)
+        return Futures(torch.cat([future[:, None], drawn.unflatten(0, (len(future), draws))], dim=1))
+
+    def _modes(
+        self, belief: Belief, known: Internal, horizon_steps: int, num_samples: int, generator: Noise | None
+    ) -> Futures:
+        """Rolls out scenes that hold their types: enumerated ones, or draws if there are fewer types than samples."""
+        assert self.self_edges is not None and known.own is not None
+        layers, graph, valid, motion = known.layers, known.graph, belief.valid, self._motion
+        if num_samples == 1:
+            context = Context(graph, known.probs, known.features, self.self_edges.hold(known.own))
+            first = graph.unpack_nodes(self.self_edges.growth(known.node_after))
+            states, growth = motion.held_run(
+                layers, known.next_states, valid, context, known.node_after, horizon_steps - 1
+            )
+            states = torch.cat([known.next_states[:, :, None], states], dim=2)
+            growth = torch.cat([first[:, :, None], growth], dim=2)
+            return Futures(states[:, None], torch.ones_like(states[:, None, :, 0, 0]), motion.spread(growth)[:, None])
+        logits = graph.unpack_nodes(self.self_edges.prior_head(known.own))
+        probs = torch.softmax(logits.masked_fill(~valid[..., None], 0.0), dim=-1)
+        types = torch.arange(num_samples, device=valid.device)[None, :, None].expand(len(valid), -1, valid.shape[1])
+        mode_probs: Tensor | None
+        if num_samples <= self.config.num_modes:
+            mode_probs = (probs[..., :num_samples] / probs[..., :num_samples].sum(-1, keepdim=True)).transpose(1, 2)
+        else:
+            uniform = uniform_of_agents(generator, valid, num_samples).to(probs)
+            types = (uniform[..., None] >= probs.cumsum(-1)[:, None, :, :-1]).sum(-1)
+            types[:, 0] = 0
+            mode_probs = None
+        more = graph.repeat(num_samples)
+        own = graph.repeat_nodes(known.own, num_samples)
+        held = self.self_edges.hold(own, more.pack_nodes(types.flatten(0, 1)[..., None])[..., 0])
+        weights, features = (graph.repeat_pairs(t, num_samples) for t in (known.probs, known.features))
+        context = Context(more, weights, features, held)
+        states, valid = (t.repeat_interleave(num_samples, dim=0) for t in (belief.states, valid))
+        node = graph.repeat_nodes(known.node_before, num_samples)
+        states, growth = motion.held_run(layers, states, valid, context, node, horizon_steps)
+        futures = (t.unflatten(0, (len(belief.states), num_samples)) for t in (states, motion.spread(growth)))
+        future, spread = futures
+        return Futures(future, mode_probs, spread)
 
     # --- Training -----------------------------------------------------------------------------------------------
 
@@ -180,19 +245,26 @@ class DGVAE(nn.Module):
         last_observed: Int[Tensor, " batch"],
         rollout_steps: int,
         generator: torch.Generator | None = None,
+        num_modes: int = 1,
     ) -> WindowOutput:
-        """Runs a teacher-forced pass under the posterior and a roll-out under the prior, from the same encoding."""
+        """Runs a teacher-forced pass under the posterior and a roll-out under the prior, from the same encoding.
+
+        A model with modes rolls out the first `num_modes` of them.
+        """
         inputs, graph = self.codec.inputs(states, valid), self._graph_of_window(states, valid)
         (node, seen), pairs = self._zero_memory(states.shape[0], states.shape[2], graph.present.shape[-1])
         edges, features, past = self._encode(inputs, valid, graph, Past(*pairs, seen))
-        posterior = self.encoder.posterior_logits(edges, graph.present)
+        posterior = self.encoder.posterior_logits(edges, graph.present, graph.senders)
         sampled = self._sampler(generator)(posterior)
         shown = self._match_window(edges.features, features, graph.present)
+        own = None if self.self_edges is None else functional.elu(graph.own(past.hidden))
+        held = None if self.self_edges is None or own is None else self.self_edges.hold(own)
         layer = self.decoder.pair_layer(inputs, shown, graph.senders)
-        messages = self.decoder.combine(inputs, layer, graph.present, sampled)
+        to_itself = self._to_itself(inputs, held)
+        messages = self.decoder.combine(inputs, layer, graph.present, sampled) + to_itself
         nodes = masked_gru(messages, self.decoder.gru, valid, node)
-        change = self.decoder.change(nodes)
-        one_step = self._integrate(self._plain(), states, valid, graph, sampled, shown, change, messages)
+        context = Context(graph, sampled, shown, held)
+        one_step = self._motion.integrate(self._plain(), states, valid, context, self.decoder.change(nodes), messages)
         outputs = self._dense(graph, edges.prior_logits, posterior, shown)
         if not rollout_steps:
             return WindowOutput(one_step, states.new_zeros(len(states), states.shape[2], 0, states.shape[3]), *outputs)
@@ -203,21 +275,63 @@ class DGVAE(nn.Module):
         if shown is not features:
             layer = self.decoder.pair_layer(inputs, features, graph.senders)
         messages = self.decoder.combine(inputs[:, :steps], layer[:, :steps], graph.present[:, :steps], expected)
-        remembered = masked_gru(messages, self.decoder.gru, valid[:, :steps], node)
+        remembered = masked_gru(messages + to_itself[:, :steps], self.decoder.gru, valid[:, :steps], node)
         burned_in = torch.cat([node[:, None], remembered], dim=1)
         now = (torch.arange(len(states), device=states.device), last_observed)
+        begin = Padded(graph.present[now], graph.senders)
+        if self.self_edges is not None and own is not None:
+            modes = self._window_modes(
+                states[now], valid[now], begin, edges.prior_logits[now], features[now], own[now], burned_in[now],
+                rollout_steps, num_modes, generator,
+            )  # fmt: skip
+            return WindowOutput(one_step, modes.states[:, 0], *outputs, modes)
         future = self._free_run(
-            self._plain(), states[now], valid[now], Padded(graph.present[now], graph.senders), features[now],
+            self._plain(), states[now], valid[now], begin, features[now],
             Past(*(t[now] for t in past)), burned_in[now], edges.prior_logits[now], rollout_steps,
             self._sampler(generator),
         )  # fmt: skip
         return WindowOutput(one_step, future, *outputs)
+
+    def _to_itself(self, inputs: Tensor, held: HeldType | None) -> Tensor:
+        """Computes each agent's message to itself along its held type; zeros for a model without self-edges."""
+        if self.self_edges is None or held is None:
+            return inputs.new_zeros(())
+        message: Tensor = self.self_edges.out(self.self_edges.layer(inputs, held))
+        return message
+
+    def _window_modes(
+        self,
+        states: Tensor,
+        valid: Tensor,
+        graph: Padded,
+        logits: Tensor,
+        features: Tensor,
+        own: Tensor,
+        node: Tensor,
+        horizon_steps: int,
+        num_modes: int,
+        generator: torch.Generator | None,
+    ) -> Futures:
+        """Rolls out the first `num_modes` types of all agents along one draw of the edges."""
+        assert self.self_edges is not None
+        weights = self._sampler(generator)(logits)
+        types = torch.arange(num_modes, device=states.device).repeat(len(states))[:, None].expand(-1, states.shape[1])
+        repeated = [t.repeat_interleave(num_modes, dim=0) for t in (states, valid, weights, features, own, node)]
+        states_, valid_, weights, features, own_, node = repeated
+        context = Context(graph.repeat(num_modes), weights, features, self.self_edges.hold(own_, types))
+        future, growth = self._motion.held_run(self._plain(), states_, valid_, context, node, horizon_steps)
+        probs = torch.softmax(self.self_edges.prior_head(own)[..., :num_modes], dim=-1).transpose(1, 2)
+        shape = (len(states), num_modes)
+        return Futures(future.unflatten(0, shape), probs, self._motion.spread(growth).unflatten(0, shape))
 
     def _graph_of_window(self, states: Tensor, valid: Tensor) -> Padded:
         """Returns the pairs of each step: each agent with all others, or dense where the encoder needs that."""
         present, near = pair_mask(valid), self.config.num_neighbours
         if near:
             present = present & among_nearest(states[..., : self.spec.position_dim].detach(), valid, near)
+        if self.self_edges is not None:
+            present = present | (self_pairs(valid.shape[-1], None, valid.device) & valid[..., None])
+            return Padded(present, None)
         if self.config.innovation_rounds or valid.shape[-1] == 1:
             return Padded(present, None)
         return Padded(off_diagonal(present), others(valid.shape[-1], valid.device))
@@ -233,10 +347,15 @@ class DGVAE(nn.Module):
     # --- Shared -------------------------------------------------------------------------------------------------
 
     def _graph_now(self, states: Tensor, valid: Tensor) -> Padded:
-        near = self.config.num_neighbours
+        near, to_itself = self.config.num_neighbours, self.self_edges is not None
+        agents = valid.shape[1]
         if not near:
-            return Padded(pair_mask(valid), None)
+            present = pair_mask(valid)
+            return Padded(present | torch.diag_embed(valid) if to_itself else present, None)
         senders, present = nearest(states[..., : self.spec.position_dim].detach(), valid, near)
+        if to_itself:  # in the last slot
+            own = torch.arange(agents, device=valid.device).expand(len(valid), -1)[..., None]
+            senders, present = torch.cat([senders, own], dim=-1), torch.cat([present, valid[..., None]], dim=-1)
         return Padded(present, senders)
 
     def _zero_memory(
@@ -253,15 +372,19 @@ class DGVAE(nn.Module):
         return lambda logits: concrete_sample(logits, self.config.temperature, noise, self.config.hard_samples)
 
     def _plain(self) -> Layers:
-        return Modules(self.encoder, self.decoder)
+        return Modules(self.encoder, self.decoder, self.self_edges)
+
+    @property
+    def _motion(self) -> Motion:
+        return Motion(self.codec, self.decoder, self.self_edges, self.config.substeps)
 
     def _layers(self) -> Layers:
         """Returns the layers for single steps: with gradients the modules themselves, else folded weights."""
         dropout = self.encoder.dropout.training and self.config.dropout > 0
         if differentiable() or dropout or self.config.innovation_rounds:
             return self._plain()
-        if self._stepper is None or not self._stepper.is_current(self.encoder, self.decoder):
-            self._stepper = Stepper(self.encoder, self.decoder)
+        if self._stepper is None or not self._stepper.is_current(self.encoder, self.decoder, self.self_edges):
+            self._stepper = Stepper(self.encoder, self.decoder, self.self_edges)
         return self._stepper
 
     def _encode(self, inputs: Tensor, valid: Tensor, graph: Padded, past: Past) -> Encoding:
@@ -314,47 +437,6 @@ class DGVAE(nn.Module):
             return causal
         return torch.cat([window_mean(features[..., :static], present), features[..., static:]], dim=-1)
 
-    def _move(
-        self,
-        layers: Layers,
-        states: Tensor,
-        valid: Tensor,
-        graph: Padded | Packed,
-        weights: Tensor,
-        features: Tensor,
-        node: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        """Computes one decoder step: GRU states after it, and the next states."""
-        inputs = graph.pack_nodes(self.codec.inputs(states, valid))
-        node, messages = layers.decode(inputs, graph, weights, features, node)
-        node = graph.forget_absent(node, valid)
-        change = graph.unpack_nodes(self.decoder.change(node))
-        return node, self._integrate(layers, states, valid, graph, weights, features, change, messages)
-
-    def _integrate(
-        self,
-        layers: Layers,
-        states: Tensor,
-        valid: Tensor,
-        graph: Padded | Packed,
-        weights: Tensor,
-        features: Tensor,
-        change: Tensor,
-        messages: Tensor | None,
-    ) -> Float[Tensor, "*batch agents state"]:
-        """Computes the states one step later; with substeps, messages are evaluated again as the agents move."""
-        substeps = self.config.substeps
-        if not substeps:
-            return self.codec.advance(states, change)
-        assert messages is not None
-        for substep in range(substeps):
-            if substep:
-                inputs = graph.pack_nodes(self.codec.inputs(states, valid))
-                messages = layers.messages(inputs, graph, weights, features)
-            pushed = graph.unpack_nodes(self.decoder.direct(messages))
-            states = self.codec.advance(states, change + pushed, 1 / substeps)
-        return states
-
     def _free_run(
         self,
         layers: Layers,
@@ -370,7 +452,7 @@ class DGVAE(nn.Module):
     ) -> Float[Tensor, "batch agents horizon state"]:
         """Rolls out from an observation before its decoder step."""
         drawn = graph.per_pair(sampler, logits)
-        node, states = self._move(layers, states, valid, graph, drawn, features, node)
+        node, states = self._motion.step(layers, states, valid, Context(graph, drawn, features), node)
         return self._continue(layers, states, valid, graph, past, node, (drawn, features), horizon_steps, sampler)
 
     def _continue(
@@ -394,6 +476,6 @@ class DGVAE(nn.Module):
             if self.config.rollout_graph == "evolving":
                 past, logits, features = self._encode_step(layers, states, valid, graph, past)
                 weights = edge_probabilities(logits) if sampler is None else graph.per_pair(sampler, logits)
-            node, states = self._move(layers, states, valid, graph, weights, features, node)
+            node, states = self._motion.step(layers, states, valid, Context(graph, weights, features), node)
             future.append(states)
         return torch.stack(future, dim=2)[:, :, :horizon_steps]

@@ -6,7 +6,7 @@ senders; both are identities.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from predictor.dgvae.innovation import Innovation
+from predictor.graph import self_pairs
 from predictor.layers.pairs import PairLinear, folded, sum_over_senders
 from predictor.layers.rnn import Correction, masked_lstm
 from predictor.layers.state_codec import Residual
@@ -82,9 +83,17 @@ class DGVAEConfig:
     """Whether a roll-out encodes its predictions ("evolving"), or keeps the edges and features that it starts with
     ("frozen"): faster, and less accurate unless trained so."""
 
+    num_modes: int = 0
+    """Number of types of an agent's edge to itself, each of which is a possible future (`predictor.dgvae.self_edges`);
+    0 is the paper's model, which has none. Needs rollout_graph="frozen": what is drawn is held for the roll-out."""
+
     def __post_init__(self) -> None:
         """Checks choices and ranges."""
         check_choices(self)
+        if self.num_modes < 0 or self.num_modes == 1:
+            raise UserError(f"num_modes must be 0 or at least 2, got {self.num_modes}")
+        if self.num_modes and self.rollout_graph != "frozen":
+            raise UserError("num_modes needs rollout_graph=frozen: what is drawn is held for the whole roll-out")
         check_at_least(self, 1, "hidden_dim", "rnn_dim", "head_dim", "message_dim", "decoder_dim", "innovation_dim")
         check_at_least(self, 0, "edge_feature_dim", "innovation_rounds", "static_dim", "substeps", "num_neighbours")
         if self.num_neighbours and self.innovation_rounds:
@@ -99,19 +108,27 @@ class DGVAEConfig:
             raise UserError(f"need temperature > 0 and 0 <= dropout < 1, got {self.temperature}, {self.dropout}")
 
 
+_FAST = DGVAEConfig(
+    hidden_dim=48,
+    rnn_dim=24,
+    head_dim=48,
+    message_dim=64,
+    decoder_dim=96,
+    edge_feature_dim=8,
+    residual="constant_velocity",
+)
+
 PRESETS: dict[str, DGVAEConfig] = {
     "paper": DGVAEConfig(),
-    "fast": DGVAEConfig(
-        hidden_dim=48,
-        rnn_dim=24,
-        head_dim=48,
-        message_dim=64,
-        decoder_dim=96,
-        edge_feature_dim=8,
-        residual="constant_velocity",
-    ),
+    "fast": _FAST,
+    "plural": replace(_FAST, num_modes=20, rollout_graph="frozen"),
 }
-"""Named sizes: "paper" for accuracy studies, "fast" for policies on a CPU."""
+"""Named sizes: "paper" is the paper's model, "fast" a small one for policies on a CPU, "plural" the small one with
+modes: its samples are enumerated futures with probabilities."""
+
+
+NO_EDGE_LOGIT = -1e4
+"""Logit of every type but "no edge" where there is no edge."""
 
 
 class Edges(NamedTuple):
@@ -215,17 +232,25 @@ class Encoder(nn.Module):
     ) -> Edges:
         """Runs the forward LSTM from a given memory; the memory of an absent pair is set to zero."""
         hidden_layer = _time_first(lambda x, mask: self.embed_edges(x, mask, senders), inputs, pairs)
-        correct = self._correction(inputs, pairs) if self.config.innovation_rounds else None
+        between = self._between(pairs, senders)
+        correct = self._correction(inputs, between) if self.config.innovation_rounds else None
         gates = self._gates(self.forward_input, hidden_layer)
         hiddens, cells = masked_lstm(gates, self.forward_hidden, pairs, hidden, cell, correct=correct)
         past = self.dropout(functional.elu(hiddens))
-        present = pairs[..., None]
+        present = between[..., None]
         if self.config.edge_feature_dim:
             features = _time_first(self.feature_head, past) * present
         else:
             features = past.new_zeros(*pairs.shape, 0)
         logits = no_edge_where_absent(_time_first(self.prior_head, past), present)
         return Edges(hiddens, cells, logits, features, hidden_layer)
+
+    def _between(self, pairs: Tensor, senders: Tensor | None) -> Tensor:
+        """Returns the pairs of two agents: all but self-edges."""
+        if not self.config.num_modes:
+            return pairs
+        own = self_pairs(pairs.shape[-2], senders, pairs.device)
+        return pairs & ~(own if own.ndim == 2 else own[:, None])
 
     def _correction(self, inputs: Tensor, pairs: Tensor) -> Correction:
         regressors, targets = self.innovation.prepare(inputs, pairs)
@@ -238,14 +263,18 @@ class Encoder(nn.Module):
         return gates
 
     def posterior_logits(
-        self, edges: Edges, pairs: Bool[Tensor, "batch time agents slots"]
+        self,
+        edges: Edges,
+        pairs: Bool[Tensor, "batch time agents slots"],
+        senders: Int[Tensor, "*some agents slots"] | None = None,
     ) -> Float[Tensor, "batch time agents slots types"]:
         """Computes the posterior logits, from past and future; training only."""
         zeros = torch.zeros_like(edges.hidden[:, 0])
         gates = self._gates(self.backward_input, edges.hidden_layer)
         backward, _ = masked_lstm(gates, self.backward_hidden, pairs, zeros, zeros, reverse=True)
         both = self.dropout(functional.elu(torch.cat([edges.hidden, backward], dim=-1)))
-        return no_edge_where_absent(_time_first(self.posterior_head, both), pairs[..., None])
+        between = self._between(pairs, senders)[..., None]
+        return no_edge_where_absent(_time_first(self.posterior_head, both), between)
 
 
 def _time_first(layer: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
@@ -265,7 +294,7 @@ def no_edge_where_absent(
     logits: Float[Tensor, "*batch types"], present: Bool[Tensor, "*batch 1"]
 ) -> Float[Tensor, "*batch types"]:
     """Returns the logits with certainty of "no edge" for absent pairs."""
-    absent = torch.full_like(logits, -1e4)
+    absent = torch.full_like(logits, NO_EDGE_LOGIT)
     absent[..., 0] = 0.0
     return torch.where(present, logits, absent)
 

@@ -38,6 +38,12 @@ class Padded(NamedTuple):
         """Returns `nodes` unchanged."""
         return nodes
 
+    def own(self, pairs: Tensor) -> Tensor:
+        """Returns the entry of each agent's pair with itself, which is the last slot where senders are listed."""
+        if self.senders is None:
+            return torch.diagonal(pairs, dim1=-3, dim2=-2).movedim(-1, -2)
+        return pairs[..., -1, :]
+
     def pack_pairs(self, pairs: Tensor) -> Tensor:
         """Returns `pairs` unchanged."""
         return pairs
@@ -98,10 +104,12 @@ class Packed:
     """Index of each pair: 0, 1, 2, …"""
     counts: Int[Tensor, "listed 1"]
     """Number of each agent's senders."""
+    selves: Int[Tensor, " agents_there"] | None = None
+    """Index of each listed agent's pair with itself; None if no agent has one."""
 
     @staticmethod
-    def of(padded: Padded, valid: Bool[Tensor, "batch agents"]) -> "Packed":
-        """Lists the present agents and pairs."""
+    def of(padded: Padded, valid: Bool[Tensor, "batch agents"], self_edges: bool = False) -> "Packed":
+        """Lists the present agents and pairs; with `self_edges`, every agent must have a pair with itself."""
         present = padded.present
         width, slots_each = valid.shape[1], present.shape[2]
         place = valid.flatten().cumsum(0) - 1  # in the list of agents
@@ -128,6 +136,7 @@ class Packed:
             offsets=torch.cat([offsets, offsets[-1:].expand(beyond)]),
             each=torch.arange(len(slots), device=slots.device),
             counts=functional.pad(count[:, None], (0, 0, 0, beyond)),
+            selves=(receivers == senders).nonzero()[:, 0] if self_edges else None,
         )
 
     @property
@@ -142,6 +151,11 @@ class Packed:
     def pack_pairs(self, pairs: Float[Tensor, "batch agents slots pair"]) -> Float[Tensor, "pairs pair"]:
         """Returns the entries of the listed pairs."""
         return pairs.flatten(0, 2).index_select(0, _lengthened(self.slots))
+
+    def own(self, pairs: Float[Tensor, "pairs pair"]) -> Float[Tensor, "listed pair"]:
+        """Returns the entry of each listed agent's pair with itself."""
+        assert self.selves is not None
+        return pairs.index_select(0, _lengthened(self.selves))
 
     def among_pairs(self, pairs: Float[Tensor, "pairs pair"]) -> Bool[Tensor, " pairs"]:
         """Returns a mask that is True everywhere: only present pairs are listed."""
@@ -187,7 +201,8 @@ class Packed:
 
     def repeat(self, times: int) -> "Packed":
         """Returns the lists of a batch in which each scene is repeated `times` times."""
-        return Packed.of(self.padded.repeat(times), self.valid.repeat_interleave(times, dim=0))
+        valid = self.valid.repeat_interleave(times, dim=0)
+        return Packed.of(self.padded.repeat(times), valid, self.selves is not None)
 
     def spread(self, shares: Float[Tensor, "listed two_out"]) -> Float[Tensor, "pairs out"]:
         """Computes receiver's plus sender's share of each pair; an agent's two shares are side by side."""

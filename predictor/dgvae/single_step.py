@@ -15,8 +15,9 @@ from torch import Tensor, nn
 from torch.autograd import forward_ad
 from torch.nn import functional
 
-from predictor.dgvae.networks import Decoder, Edges, Encoder, no_edge_where_absent
+from predictor.dgvae.networks import NO_EDGE_LOGIT, Decoder, Edges, Encoder, no_edge_where_absent
 from predictor.dgvae.packing import Packed, Padded
+from predictor.dgvae.self_edges import SelfEdges
 from predictor.layers.pairs import PairLinear, folded
 from predictor.layers.rnn import elu, elu_, gru_step_, lstm_step_
 
@@ -46,12 +47,12 @@ class Layers(Protocol):
         """Computes the memory of each pair after a step (hidden, cell), prior logits and features."""
 
     def decode(
-        self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, node: Tensor
+        self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, node: Tensor, own: Tensor | None
     ) -> tuple[Tensor, Tensor | None]:
         """Computes GRU states after a step along weighted edges; and the messages, unless only the GRU needs them."""
 
-    def messages(self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor) -> Tensor:
-        """Computes the sum of messages to each agent along weighted edges."""
+    def messages(self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, own: Tensor | None) -> Tensor:
+        """Computes the sum of messages to each agent; `own` is the hidden layer of its message to itself."""
 
 
 class Internal(NamedTuple):
@@ -66,6 +67,7 @@ class Internal(NamedTuple):
     node_before: Tensor  # GRU state before the latest observation was decoded
     node_after: Tensor  # … and after, under the prior's expectation
     next_states: Tensor
+    own: Tensor | None = None  # activated memory of each self-edge
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,7 @@ class Modules:
 
     encoder: Encoder
     decoder: Decoder
+    self_edges: SelfEdges | None = None
 
     def encode(self, inputs: Tensor, graph: Any, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Computes the memory of each pair after a step (hidden, cell), prior logits and features."""
@@ -81,15 +84,19 @@ class Modules:
         return edges.hidden[:, 0], edges.cell[:, 0], edges.prior_logits[:, 0], edges.features[:, 0]
 
     def decode(
-        self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, node: Tensor
+        self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, node: Tensor, own: Tensor | None
     ) -> tuple[Tensor, Tensor | None]:
         """Computes GRU states after a step along weighted edges, and the messages."""
-        messages = self.messages(inputs, graph, weights, features)
+        messages = self.messages(inputs, graph, weights, features, own)
         return self.decoder.step(messages, node), messages
 
-    def messages(self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor) -> Tensor:
-        """Computes the sum of messages to each agent along weighted edges."""
-        return self.decoder.messages(inputs, graph.present, weights, features, graph.senders)
+    def messages(self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, own: Tensor | None) -> Tensor:
+        """Computes the sum of messages to each agent along weighted edges, with its message to itself."""
+        summed = self.decoder.messages(inputs, graph.present, weights, features, graph.senders)
+        if self.self_edges is None or own is None:
+            return summed
+        total: Tensor = summed + self.self_edges.out(own)
+        return total
 
 
 def differentiable() -> bool:
@@ -108,7 +115,8 @@ def unpacked(known: Internal, layers: Layers) -> Internal:
     logits = no_edge_where_absent(graph.unpack_pairs(known.logits), graph.padded.present[..., None])
     probs, features = graph.unpack_pairs(known.probs, no_edge=True), graph.unpack_pairs(known.features)
     nodes = graph.unpack_nodes(known.node_before), graph.unpack_nodes(known.node_after)
-    return Internal(layers, graph.padded, past, logits, probs, features, *nodes, known.next_states)
+    own = None if known.own is None else graph.unpack_nodes(known.own)
+    return Internal(layers, graph.padded, past, logits, probs, features, *nodes, known.next_states, own)
 
 
 Layer = tuple[Tensor, Tensor]
@@ -129,21 +137,22 @@ class Stepper:
     Args:
         encoder: encoder without innovation rounds and with dropout off.
         decoder: decoder of the network.
+        self_edges: self-edges of the network, if it has any.
     """
 
-    def __init__(self, encoder: Encoder, decoder: Decoder) -> None:
+    def __init__(self, encoder: Encoder, decoder: Decoder, self_edges: SelfEdges | None = None) -> None:
         """Folds the weights."""
-        self._snapshot = _versions(encoder, decoder)
+        self._snapshot = _versions(encoder, decoder, self_edges)
         with torch.no_grad():
             self._take_encoder(encoder)
-            self._take_decoder(decoder)
+            self._take_decoder(decoder, None if self_edges is None else _layer(self_edges.out))
 
-    def is_current(self, encoder: Encoder, decoder: Decoder) -> bool:
+    def is_current(self, encoder: Encoder, decoder: Decoder, self_edges: SelfEdges | None = None) -> bool:
         """Returns whether these modules still have the weights that were folded.
 
         Changes that autograd does not count are not noticed: through `.data`, or by the replay of a CUDA graph.
         """
-        return self._snapshot == _versions(encoder, decoder)
+        return self._snapshot == _versions(encoder, decoder, self_edges)
 
     def encode(
         self,
@@ -165,10 +174,16 @@ class Stepper:
         gates = _product(edges, self._gates, _product(hidden, self._recurrent))
         hidden, cell = lstm_step_(gates, cell)
         heads = elu_(_product(elu(hidden), self._heads))
+        width = heads.shape[1] // (1 if self._features is None else 2)
+        logits = _product(heads[:, :width], self._logits)
         if self._features is None:
-            return hidden, cell, _product(heads, self._logits), heads.new_zeros(len(heads), 0)
-        width = heads.shape[1] // 2
-        return hidden, cell, _product(heads[:, :width], self._logits), _product(heads[:, width:], self._features)
+            features = heads.new_zeros(len(heads), 0)
+        else:
+            features = _product(heads[:, width:], self._features)
+        if graph.selves is not None:  # an agent's pair with itself is no edge between two
+            logits.index_fill_(0, graph.selves, NO_EDGE_LOGIT)[:, 0].index_fill_(0, graph.selves, 0.0)
+            features.index_fill_(0, graph.selves, 0.0)
+        return hidden, cell, logits, features
 
     def decode(
         self,
@@ -177,14 +192,15 @@ class Stepper:
         weights: Float[Tensor, "pairs types"],
         features: Float[Tensor, "pairs feature"],
         node: Float[Tensor, "listed decoder"],
+        own: Float[Tensor, "listed message"] | None,
     ) -> tuple[Float[Tensor, "listed decoder"], Float[Tensor, "listed message"] | None]:
         """Computes GRU states after a step along weighted edges; and the messages, if substeps need them."""
         if self._to_gates is None:
-            messages = self.messages(inputs, graph, weights, features)
+            messages = self.messages(inputs, graph, weights, features, own)
             gates = _product(messages, self._gru)
         else:
             messages = None
-            gates = self._along(inputs, graph, weights, features, *self._to_gates)
+            gates = self._along(inputs, graph, weights, features, own, *self._to_gates)
         return gru_step_(gates, _product(node, self._remembered), node), messages
 
     def messages(
@@ -193,12 +209,21 @@ class Stepper:
         graph: Packed,
         weights: Float[Tensor, "pairs types"],
         features: Float[Tensor, "pairs feature"],
+        own: Float[Tensor, "listed message"] | None,
     ) -> Float[Tensor, "listed message"]:
-        """Computes the sum of messages to each agent along weighted edges, its own term included."""
-        return self._along(inputs, graph, weights, features, self._own, self._out)
+        """Computes the sum of messages to each agent along weighted edges, its own terms included."""
+        return self._along(inputs, graph, weights, features, own, self._own, self._out, self._self_out)
 
     def _along(
-        self, inputs: Tensor, graph: Packed, weights: Tensor, features: Tensor, own: Layer, out: list[Layer]
+        self,
+        inputs: Tensor,
+        graph: Packed,
+        weights: Tensor,
+        features: Tensor,
+        own: Tensor | None,
+        own_term: Layer,
+        out: list[Layer],
+        self_out: Layer | None,
     ) -> Tensor:
         layer = _spread(inputs, self._message, graph)
         if self._feature is None:
@@ -207,7 +232,9 @@ class Stepper:
             elu_(layer).mul_(_product(features, self._feature).add_(1))
         else:
             elu_(layer.addmm_(features, self._feature[0].t()))
-        total = _product(inputs, own)
+        total = _product(inputs, own_term)
+        if own is not None and self_out is not None:
+            total = _product(own, self_out, total)
         for k, (block, (matrix, bias)) in enumerate(zip(layer.chunk(len(out), -1), out, strict=True)):
             weight = weights[:, k + 1].contiguous()
             total = _product(graph.gather(block.contiguous(), weight), (matrix, None), total)
@@ -226,7 +253,7 @@ class Stepper:
         self._logits = layers[0][1]
         self._features = layers[1][1] if len(layers) > 1 else None
 
-    def _take_decoder(self, decoder: Decoder) -> None:
+    def _take_decoder(self, decoder: Decoder, self_out: Layer | None) -> None:
         gru, types = decoder.gru, decoder.types
         self._message, self._gated = _roles(decoder.message_pair), decoder.gated
         self._feature = (decoder.message_feature.weight.detach(), None) if decoder.has_features else None
@@ -235,15 +262,18 @@ class Stepper:
         self._out: list[Layer] = list(zip(*parts, strict=True))
         self._gru = (gru.weight_ih.detach(), gru.bias_ih.detach())
         self._remembered = (gru.weight_hh.detach(), gru.bias_hh.detach())
-        self._to_gates: tuple[Layer, list[Layer]] | None = None
+        self._self_out = self_out
+        self._to_gates: tuple[Layer, list[Layer], Layer | None] | None = None
         if not hasattr(decoder, "direct"):  # nothing but the GRU needs the messages
             weight, bias = self._gru
             own = (weight @ self._own[0], weight @ self._own[1] + bias)
-            self._to_gates = (own, [(weight @ matrix, weight @ share) for matrix, share in self._out])
+            to_itself = None if self_out is None else (weight @ self_out[0], weight @ self_out[1])
+            self._to_gates = (own, [(weight @ matrix, weight @ share) for matrix, share in self._out], to_itself)
 
 
-def _versions(*modules: nn.Module) -> list[tuple[int, int]]:
-    parameters = (p for part in modules for m in part.modules() for p in m._parameters.values() if p is not None)
+def _versions(*modules: nn.Module | None) -> list[tuple[int, int]]:
+    there = [part for part in modules if part is not None]
+    parameters = (p for part in there for m in part.modules() for p in m._parameters.values() if p is not None)
     return [(p.data_ptr(), 0 if p.is_inference() else p._version) for p in parameters]
 
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from predictor.evaluation import displacement as metrics
+from predictor.evaluation.energy_score import energy_score
 from predictor.evaluation.outcomes import Outcome, run_sequence_batch, run_window_batch, run_windows, sequence_indices
 from predictor.evaluation.standard_errors import (
     NUM_SUBSETS,
@@ -36,7 +37,7 @@ __all__ = [
     "summarise",
 ]
 
-OPTIONAL = ("coverage",)
+OPTIONAL = ("coverage", "mixture_nll")
 """Names of quantities that are left out, not NaN, if they could not be measured."""
 SCALAR_NAMES = {"rmse_m": "overall_rmse_m", "coverage": "coverage"}
 """Names of the numbers over all steps, by name of the quantity at each step."""
@@ -77,6 +78,14 @@ class Accuracy:
     """Share of agents whose best sample has a displacement above the threshold at each step."""
     miss_threshold_m: float = metrics.MISS_THRESHOLD_M
     """Threshold of `miss_rate` and `miss_by_step` [m]."""
+    ade_m: float = math.nan
+    """Mean displacement of the single forecast, sample 0 [m]; mean over the agents of `min_ade_m`."""
+    fde_m: float = math.nan
+    """Displacement of the single forecast at the last step [m]."""
+    energy_m: float = math.nan
+    """Energy score of the samples [m], a proper score; mean over the agents of `min_ade_m`."""
+    mixture_nll: list[float] = field(default_factory=list)
+    """Negative log-likelihood [nats] under the predicted mixture at each step; empty without predicted scales."""
     scenes: int = 0
     """Number of scenes behind `min_joint_ade_m`."""
     axes: int = 2
@@ -182,7 +191,11 @@ class Tally:
             scenes=int(counts["min_joint_ade_m"].sum()),
             axes=axes,
             **{
-                key: whole[key] for key in ("min_ade_m", "min_fde_m", "min_joint_ade_m", "min_joint_fde_m", "miss_rate")
+                key: whole[key]
+                for key in (
+                    "min_ade_m", "min_fde_m", "min_joint_ade_m", "min_joint_fde_m", "miss_rate", "ade_m", "fde_m",
+                    "energy_m",
+                )
             },
             overall_rmse_m=math.sqrt(whole["rmse_m"]),
             by_step_m=steps["by_step_m"],
@@ -191,6 +204,7 @@ class Tally:
             rmse_m=[math.sqrt(value) for value in steps["rmse_m"]],
             nll=steps.get("nll", []),
             coverage=steps.get("coverage", []),
+            mixture_nll=steps.get("mixture_nll", []),
             statistics=statistics,
             step_errors=step_errors,
             intervals=intervals,
@@ -229,9 +243,17 @@ class Tally:
             "min_joint_fde_m": metrics.min_joint_fde(forecast, future, counted),
             "by_step_m": metrics.min_displacement(forecast, future, valid),
             "miss_by_step": self._missed(forecast, future, valid),
-            "rmse_m": metrics.squared_error(forecast, future, valid),
-            "coverage": metrics.coverage(forecast, future, valid),
+            "rmse_m": metrics.squared_error(forecast, future, valid, outcome.mode_probs),
+            "coverage": metrics.coverage(forecast, future, valid, mode_probs=outcome.mode_probs),
+            "ade_m": metrics.min_ade(forecast[:, :1], future, counted),
+            "fde_m": metrics.min_fde(forecast[:, :1], future, counted),
+            "energy_m": energy_score(forecast, future, counted, outcome.mode_probs),
         }
+        if outcome.scale is not None:
+            probs = outcome.mode_probs
+            if probs is None:
+                probs = forecast.new_full(forecast.shape[:3], 1 / forecast.shape[1])
+            values["mixture_nll"] = metrics.mixture_nll(forecast, future, valid, probs, outcome.scale)
         if len(self._std_m) >= max(1, horizon):
             std_m = torch.tensor(self._std_m[:horizon], device=forecast.device)
             values["nll"] = metrics.gaussian_mixture_nll(forecast, future, valid, std_m)

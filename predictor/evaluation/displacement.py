@@ -102,9 +102,11 @@ def squared_error(
     forecast: Float[Tensor, "batch samples agents horizon axes"],
     future: Float[Tensor, "batch agents horizon axes"],
     valid: Bool[Tensor, "batch agents horizon"],
+    mode_probs: Float[Tensor, "batch samples agents"] | None = None,
 ) -> tuple[Float[Tensor, "batch agents horizon"], Bool[Tensor, "batch agents horizon"]]:
     """Computes the squared displacement of the samples' mean [m²], summed over axes (its root mean is the RMSE)."""
-    return (forecast.mean(dim=1) - future).square().sum(-1), valid
+    mean = forecast.mean(dim=1) if mode_probs is None else (mode_probs[..., None, None] * forecast).sum(1)
+    return (mean - future).square().sum(-1), valid
 
 
 def gaussian_mixture_nll(
@@ -127,26 +129,58 @@ def gaussian_mixture_nll(
     return math.log(forecast.shape[1]) - torch.logsumexp(log_density, dim=1), valid
 
 
+LEAST_STD_M = 1e-3
+"""Smallest standard deviation of a mode that counts [m]: a likelihood has no upper bound as it goes to zero."""
+
+
+def mixture_nll(
+    forecast: Float[Tensor, "batch samples agents horizon axes"],
+    future: Float[Tensor, "batch agents horizon axes"],
+    valid: Bool[Tensor, "batch agents horizon"],
+    mode_probs: Float[Tensor, "batch samples agents"],
+    scale: Float[Tensor, "batch samples agents horizon axes"],
+) -> tuple[Float[Tensor, "batch agents horizon"], Bool[Tensor, "batch agents horizon"]]:
+    """Computes the negative log-likelihood [nats] of the truth under the predicted mixture of Gaussians at each step.
+
+    Args:
+        forecast: mean of each mode [m].
+        future: true positions [m].
+        valid: which entries count.
+        mode_probs: probability of each mode.
+        scale: standard deviation of each mode [m].
+    """
+    std_m = scale.clamp(min=LEAST_STD_M)
+    error = torch.where(valid[:, None, ..., None], forecast - future[:, None], 0.0) / std_m
+    log_density = -0.5 * error.square().sum(-1) - torch.log(std_m).sum(-1)
+    log_density = log_density - 0.5 * forecast.shape[-1] * math.log(2 * math.pi)
+    log_probs = torch.log(mode_probs.clamp(min=torch.finfo(mode_probs.dtype).tiny))
+    return -torch.logsumexp(log_density + log_probs[..., None], dim=1), valid
+
+
 def coverage(
     forecast: Float[Tensor, "batch samples agents horizon axes"],
     future: Float[Tensor, "batch agents horizon axes"],
     valid: Bool[Tensor, "batch agents horizon"],
     share: float = COVERAGE_SHARE,
+    mode_probs: Float[Tensor, "batch samples agents"] | None = None,
 ) -> tuple[Float[Tensor, "batch agents horizon"], Bool[Tensor, "batch agents horizon"]]:
     """Returns 1 where the truth is as near to the samples' mean as the central `share` of the samples, else 0.
 
     The mean is `share` if the samples are spread like the truth, less if their spread is too small, more if it is too
     large. The distance of the truth to the samples' mean is compared with the `share`-quantile of the samples'
-    distances. For small K, a sample's distance is to the mean of the *other* samples, since the mean does not include
+    distances. For few draws, a draw's distance is to the mean of the *other* draws, since the mean does not include
     the truth either (K/(K−1) times the distance to the mean of all), and the quantile is the value of rank share·(K+1),
-    linear between ranks (Hyndman & Fan 1996, type 6: unbiased coverage).
+    linear between ranks (Hyndman & Fan 1996, type 6: unbiased coverage). Modes with probabilities are no draws but the
+    distribution itself: the mean is weighted, and the truth is inside if less than `share` of the probability is nearer
+    to the mean.
 
     Args:
         forecast: sampled positions [m].
         future: true positions [m].
         valid: which entries count.
-        share: share between 0 and 1. K samples give quantiles of rank 1 to K: if share·(K+1) is outside (one sample;
+        share: share between 0 and 1. K draws give quantiles of rank 1 to K: if share·(K+1) is outside (one sample;
             fewer than 9 for 0.9), all entries are invalid.
+        mode_probs: probability of each sample; None for draws.
 
     Raises:
         ValueError: `share` is not between 0 and 1.
@@ -154,6 +188,11 @@ def coverage(
     if not 0 < share < 1:
         raise ValueError(f"share must be between 0 and 1, got {share}")
     samples = forecast.shape[1]
+    if mode_probs is not None and samples > 1:
+        centre = (mode_probs[..., None, None] * forecast).sum(1)
+        apart = torch.linalg.vector_norm(future - centre, dim=-1)
+        nearer = displacement(forecast, centre) < apart[:, None]
+        return ((nearer * mode_probs[..., None]).sum(1) < share).to(future.dtype), valid
     rank = round(share * (samples + 1), 9)  # 0.7 · 10 is to be 7
     if samples < 2 or not 1 <= rank <= samples:
         return torch.zeros_like(future[..., 0]), torch.zeros_like(valid)

@@ -38,6 +38,19 @@ class Outcome:
     """True type of each edge at the last observed step, -1 where unknown."""
     edge_attributes: Float[Tensor, "batch agents agents attributes"] | None = None
     """Known properties of each edge at that step, zeros where unknown or absent."""
+    mode_probs: Float[Tensor, "batch samples agents"] | None = None
+    """Probability of each sample; None if the samples are draws."""
+    scale: Float[Tensor, "batch samples agents horizon axes"] | None = None
+    """Standard deviation around each sample [m]; None if the forecaster has no such estimate."""
+
+    def single(self) -> "Outcome":
+        """Returns the single forecast alone: sample 0."""
+        return replace(
+            self,
+            forecast=self.forecast[:, :1],
+            mode_probs=None,
+            scale=None if self.scale is None else self.scale[:, :1],
+        )
 
     def tail(self, steps: int) -> "Outcome":
         """Returns the last steps only: the horizon-only view of a whole sequence.
@@ -52,6 +65,7 @@ class Outcome:
             forecast=self.forecast[..., -steps:, :],
             future=self.future[..., -steps:, :],
             valid=self.valid[..., -steps:],
+            scale=None if self.scale is None else self.scale[..., -steps:, :],
         )
 
 
@@ -103,7 +117,7 @@ def run_sequence_batch(
     predicted, truth, valid = [], [], []
     belief: Belief | None = None
     for step, belief in _observed(forecaster, batch):
-        predicted.append(forecaster.rollout(belief, 1, 1)[:, 0, :, 0, :axes])
+        predicted.append(forecaster.rollout(belief, 1, 1).states[:, 0, :, 0, :axes])
         ahead = (step + 1).clamp(min=0)
         truth.append(batch.states[window, ahead][..., :axes])
         valid.append(_without_ego(forecaster, batch.valid[window, ahead] & belief.valid))
@@ -118,6 +132,7 @@ def run_sequence_batch(
         forecast=torch.cat([one_step, free.forecast], dim=3),
         future=torch.cat([torch.stack(truth[:-1], dim=2), free.future], dim=2),
         valid=torch.cat([torch.stack(valid[:-1], dim=2), free.valid], dim=2),
+        scale=None,  # one-step predictions have none
     )
 
 
@@ -187,11 +202,17 @@ def _free_run(
 ) -> Outcome:
     axes = forecaster.spec.position_dim
     window = torch.arange(len(batch.states), device=batch.states.device)
-    forecast = forecaster.rollout(belief, horizon_steps, num_samples, generator)[..., :axes]
+    futures = forecaster.rollout(belief, horizon_steps, num_samples, generator)
     steps = batch.last_observed[:, None] + torch.arange(1, horizon_steps + 1, device=window.device)
     truth = batch.states[window[:, None], steps].transpose(1, 2)[..., :axes]
     valid = batch.valid[window[:, None], steps].transpose(1, 2) & belief.valid[..., None]
-    outcome = Outcome(forecast, truth, _without_ego(forecaster, valid))
+    outcome = Outcome(
+        futures.states[..., :axes],
+        truth,
+        _without_ego(forecaster, valid),
+        mode_probs=futures.mode_probs,
+        scale=futures.scale,
+    )
     if not keep_beliefs:
         return outcome
     now, belief = (window, batch.last_observed), belief.dense()

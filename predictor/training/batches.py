@@ -38,6 +38,8 @@ class Plan:
     """Number of observed steps of the batch, at most."""
     rollout_steps: int
     """Number of roll-out steps; 0 skips the roll-out."""
+    num_modes: int
+    """Number of modes that are rolled out, by models that have any."""
     kl_scale: float
     """Share of the KL's full weight."""
     lr: float
@@ -46,13 +48,15 @@ class Plan:
     """Indices of the drawn windows of each store."""
 
 
-def plan(config: TrainConfig, sizes: Sequence[int], step: int) -> Plan:
+def plan(config: TrainConfig, sizes: Sequence[int], step: int, num_modes: int = 1) -> Plan:
     """Draws the random quantities of a step and computes the scheduled ones.
 
     Args:
         config: options of the run.
         sizes: number of windows of each store; batches are mixed in this proportion.
         step: index of the step.
+        num_modes: number of modes of the model. Every other step rolls out the first third of them, so that a few
+            modes are a forecast as well.
     """
     rng = np.random.default_rng([config.seed, 1, step])
     dropout, noise = int(rng.integers(2**62)), int(rng.integers(2**62))
@@ -64,7 +68,8 @@ def plan(config: TrainConfig, sizes: Sequence[int], step: int) -> Plan:
     drawn = [rng.integers(n, size=c) if c else np.zeros(0, dtype=np.int64) for n, c in zip(sizes, counts, strict=True)]
     warm = min(1.0, (step + 1) / config.kl_warmup_steps) if config.kl_warmup_steps else 1.0
     lr = config.lr * _schedule(step, config.steps)
-    return Plan(step, dropout, noise, history, _rollout_steps(config, step), warm, lr, tuple(drawn))
+    modes = num_modes if step % 2 else max(min(2, num_modes), num_modes // 3)
+    return Plan(step, dropout, noise, history, _rollout_steps(config, step), modes, warm, lr, tuple(drawn))
 
 
 def _rollout_steps(config: TrainConfig, step: int) -> int:

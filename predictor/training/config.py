@@ -29,8 +29,9 @@ class TrainConfig:
     """Episode stores for model selection; none given, episodes of `data` are held out."""
     model: ModelName = "dgvae"
     """Network to train."""
-    preset: Literal["fast", "paper"] = "fast"
-    """Network size."""
+    preset: Literal["plural", "fast", "paper"] = "fast"
+    """Network: "plural" has modes, so that its samples are enumerated futures with probabilities; "fast" has the same
+    sizes without modes; "paper" is the paper's network. Of other models, "paper" has their published sizes."""
     set: tuple[str, ...] = ()
     """Fields of the network's config to change, as field=value: --set hidden_dim=64 static_dim=16."""
     input_changes: bool = False
@@ -58,6 +59,10 @@ class TrainConfig:
     """Weight of the teacher-forced one-step likelihood."""
     rollout_weight: float = 1.0
     """Weight of the likelihood of the roll-out; 0 trains teacher-forced only, as the NRI family does."""
+    energy_weight: float = 2.0
+    """Weight of the energy score of each agent's modes; only models with modes have it."""
+    joint_energy_weight: float = 0.3
+    """Weight of the energy score of whole scenes, whose modes are those of all agents together."""
     kl_weight: float = 1.0
     """Weight of KL(posterior ‖ prior)."""
     kl_warmup_steps: int = 0
@@ -115,7 +120,7 @@ class TrainConfig:
         check_positive(self, "lr", "variance", "clip_norm")
         check_at_least(
             self, 0, "one_step_weight", "rollout_weight", "kl_weight", "seed", "threads", "curriculum_steps",
-            "kl_warmup_steps", "edge_cost", "label_weight", "type_label_weight", "min_history_steps", "max_episodes",
+            "kl_warmup_steps", "energy_weight", "joint_energy_weight", "edge_cost", "label_weight", "type_label_weight", "min_history_steps", "max_episodes",
         )  # fmt: skip
         if self.one_step_weight == self.rollout_weight == 0:
             raise UserError("one_step_weight and rollout_weight are both 0; nothing would be learned")

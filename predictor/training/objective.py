@@ -10,12 +10,13 @@ from torch.nn import functional
 
 from predictor.data.windows import WindowBatch
 from predictor.evaluation.graph_accuracy import edge_entropy
-from predictor.forecaster import TrainableForecaster, WindowOutput
+from predictor.forecaster import Futures, TrainableForecaster, WindowOutput
 from predictor.graph import pair_mask
 from predictor.layers.pairs import masked_mean
 from predictor.support.config_checks import check_choice
 from predictor.support.errors import UserError
 from predictor.training.config import Likelihood, TrainConfig
+from predictor.training.mode_loss import energy_terms, spread_nll, unit
 
 
 def nll(
@@ -97,11 +98,25 @@ def window_loss(
         rollout = nll(output.rollout, truth, valid, scales, config.variance, config.likelihood)
         total = total + config.rollout_weight * rollout
         terms["nll_rollout"] = rollout
+        if output.modes is not None:
+            extra, mode_terms = _mode_loss(model.spec.position_dim, output.modes, truth, valid, scales, config)
+            total = total + extra
+            terms |= mode_terms
     if output.prior_logits is not None:
         extra, graph_terms = _graph_loss(batch, output, config, kl_scale)
         total = total + extra
         terms |= graph_terms
     return total, {k: v.detach() for k, v in terms.items()}
+
+
+def _mode_loss(
+    axes: int, modes: Futures, truth: Tensor, valid: Tensor, scales: Tensor, config: TrainConfig
+) -> tuple[Tensor, Terms]:
+    scale = unit(config.variance)
+    agents, scenes = (scale * term for term in energy_terms(modes, truth, valid, scales, axes))
+    spread = spread_nll(modes, truth, valid, axes)
+    total = config.energy_weight * agents + config.joint_energy_weight * scenes + spread
+    return total, {"energy": agents, "joint_energy": scenes, "nll_spread": spread}
 
 
 def _graph_loss(

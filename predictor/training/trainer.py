@@ -41,6 +41,8 @@ from predictor.training.cuda_graph import (
 )
 from predictor.training.objective import window_loss
 
+VALIDATION_DRAWS = 5
+"""Number of samples for model selection, of models without modes."""
 LOG_EVERY = 25
 """Number of steps between two points of the training curves; on a CUDA device also between readings of results."""
 
@@ -238,15 +240,20 @@ class Trainer:
         self._kl_scale.fill_(now.kl_scale)
         self.model.train()
         if self._recorder is not None:
-            terms = self._replayed(self._recorder, batch, now.rollout_steps)
+            terms = self._replayed(self._recorder, batch, now.rollout_steps, now.num_modes)
         else:
-            terms = self._optimise(batch, now.rollout_steps)
+            terms = self._optimise(batch, now.rollout_steps, now.num_modes)
         self.step += 1
         return terms
 
     def plan(self, step: int) -> Plan:
         """Returns batch, seeds and schedules of a step."""
-        return plan(self.config, [len(w) for w in self.data.train], step)
+        return plan(self.config, [len(w) for w in self.data.train], step, self.num_modes)
+
+    @property
+    def num_modes(self) -> int:
+        """Number of modes of the model; 1 for a model without modes."""
+        return getattr(self.model.config, "num_modes", 0) or 1
 
     def read(self, terms: Mapping[str, Tensor]) -> dict[str, float]:
         """Returns the terms of the latest step as numbers; waits for the device.
@@ -262,13 +269,16 @@ class Trainer:
             )
         return dict(zip(terms, values, strict=True))
 
-    def _optimise(self, batch: WindowBatch, rollout_steps: int) -> Mapping[str, Tensor]:
+    def _optimise(self, batch: WindowBatch, rollout_steps: int, num_modes: int) -> Mapping[str, Tensor]:
         """Computes forward, loss, backward, clipping and update; on a CUDA device the host reads no result."""
         kind = self.config.precision
         with _tensor_cores(kind == "tf32"):
             with precision("bfloat16" if kind == "bfloat16" else "float32", self.device.type):
-                output = self.model.window(batch.states, batch.valid, batch.last_observed, rollout_steps, self.noise)
-            exact = WindowOutput(*(None if t is None else t.float() for t in output))  # type: ignore[arg-type]
+                more = {"num_modes": num_modes} if num_modes > 1 else {}
+                output = self.model.window(
+                    batch.states, batch.valid, batch.last_observed, rollout_steps, self.noise, **more
+                )
+            exact = output.float()
             loss, terms = window_loss(self.model, batch, exact, self.config, self._kl_scale, self._scales)
             if self._checks_each_loss and not torch.isfinite(loss):
                 raise UserError(f"the loss is {float(loss.detach())} at step {self.step}; lower --lr or check the data")
@@ -279,15 +289,17 @@ class Trainer:
         self._finite.logical_and_(torch.isfinite(loss.detach()))
         return {"loss": loss.detach(), "grad_norm": norm, **terms}
 
-    def _replayed(self, recorder: Recorder, batch: WindowBatch, rollout_steps: int) -> Mapping[str, Tensor]:
+    def _replayed(
+        self, recorder: Recorder, batch: WindowBatch, rollout_steps: int, num_modes: int
+    ) -> Mapping[str, Tensor]:
         """Replays a step; records it first if there is no recording for these shapes."""
-        key = (rollout_steps, signature(batch))
+        key = (rollout_steps, num_modes, signature(batch))
         if key not in self._recorded:
-            if any(steps != rollout_steps for steps, _ in self._recorded):  # the roll-out has grown, and never shrinks
+            if any(steps != rollout_steps for steps, *_ in self._recorded):  # the roll-out has grown, and never shrinks
                 self._forget()
             try:
                 self._recorded[key] = CapturedStep(
-                    partial(self._optimise, rollout_steps=rollout_steps),
+                    partial(self._optimise, rollout_steps=rollout_steps, num_modes=num_modes),
                     batch,
                     self._state,
                     (self.noise, default_generator(self.device)),
@@ -296,7 +308,7 @@ class Trainer:
             except NotCapturableError as error:
                 self._recorder = None
                 self.notes = (*self.notes, f"steps are not captured: {error}")
-                return self._optimise(batch, rollout_steps)
+                return self._optimise(batch, rollout_steps, num_modes)
         return self._recorded[key](batch)
 
     def _state(self) -> list[Tensor]:
@@ -318,10 +330,11 @@ class Trainer:
         return optimizer
 
     def validate(self) -> tuple[Accuracy, tuple[float, ...]]:
-        """Returns accuracy of the most likely forecast on held-out episodes, and its spread per step and axis [m]."""
+        """Returns accuracy on held-out episodes, and the spread of the single forecast per step and axis [m]."""
         self.model.eval()
+        samples = self.num_modes if self.num_modes > 1 else VALIDATION_DRAWS
         outcomes = [o for w, i in self._val_indices() for o in run_windows(
-            self.model, w, i, self.config.horizon_steps, device=self.config.device)]  # fmt: skip
+            self.model, w, i, self.config.horizon_steps, samples, device=self.config.device)]  # fmt: skip
         return summarise(self.config.model, outcomes), fitted_std_m(outcomes)
 
     def save(self, path: Path) -> None:

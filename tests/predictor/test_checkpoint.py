@@ -93,7 +93,7 @@ def test_loaded_model_forecasts_what_the_saved_one_did(path: Path):
     forecasts = []
     for forecaster in (made().eval(), load_checkpoint(path)[0]):
         belief = forecaster.observe(forecaster.empty_memory(2, 3), states, valid)[1]
-        forecasts.append(forecaster.rollout(belief, 4))
+        forecasts.append(forecaster.rollout(belief, 4).states)
     assert torch.equal(*forecasts)
 
 
@@ -278,7 +278,7 @@ def test_everything_that_ships_is_small_and_forecasts():
         states = torch.zeros(1, agents, info.spec.num_features)  # what lies beyond velocity is a role or a size
         states[..., :4] = random_states(0, 1, agents, 4)
         belief = forecaster.observe(forecaster.empty_memory(1, agents), states, torch.ones(1, agents).bool())[1]
-        assert torch.isfinite(forecaster.rollout(belief, info.horizon_steps)).all(), name
+        assert torch.isfinite(forecaster.rollout(belief, info.horizon_steps).states).all(), name
         assert len(info.std_m) == info.horizon_steps and info.provenance["command"], name
         assert (resolve(name) / "README.md").is_file(), name  # the model card
         assert sum(p.stat().st_size for p in resolve(name).iterdir()) < 5_000_000, name
@@ -350,7 +350,7 @@ def test_every_model_comes_back_and_forecasts_the_same(tmp_path: Path, kind: str
         for now, present in zip(states, valid, strict=True):
             memory, belief = forecaster.observe(memory, now, present)
         beliefs.append(belief)
-        forecasts.append(forecaster.rollout(belief, 3, 2, torch.Generator().manual_seed(0)))
+        forecasts.append(forecaster.rollout(belief, 3, 2, torch.Generator().manual_seed(0)).states)
     assert torch.equal(*forecasts)
     assert torch.equal(beliefs[0].edge_probs, beliefs[1].edge_probs)
     assert torch.equal(beliefs[0].edge_features, beliefs[1].edge_features)

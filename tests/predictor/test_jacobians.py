@@ -61,7 +61,7 @@ def streamed(model: TrainableForecaster, num_samples: int = 1, noise: Callable[[
         memory = model.empty_memory(1, AGENTS)
         for t in range(TIME):
             memory, belief = model.observe(memory, states[:, t], VALID[:, t])
-        return model.rollout(belief, HORIZON, num_samples, noise())[0, -1]
+        return model.rollout(belief, HORIZON, num_samples, noise()).states[0, -1]
 
     return forecast
 
@@ -129,7 +129,7 @@ def test_only_the_latest_observation_may_be_differentiated(kind: str):
 
     def forecast(latest: Tensor) -> Tensor:
         _, belief = model.observe(memory, latest, VALID[:, -1])
-        return model.rollout(belief, HORIZON)[0, 0]
+        return model.rollout(belief, HORIZON).states[0, 0]
 
     latest = torch.func.jacrev(forecast)(states[:, -1])
     whole = torch.func.jacrev(streamed(model))(states)[..., -1, :, :]

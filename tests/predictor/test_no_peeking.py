@@ -42,7 +42,7 @@ def streamed(forecaster: Any, states: Tensor, valid: Tensor, last_observed: Tens
     memory, beliefs = forecaster.empty_memory(BATCH, AGENTS), []
     for now, present in zip(states.unbind(1), valid.unbind(1), strict=True):
         memory, belief = forecaster.observe(memory, now, present)
-        forecast = forecaster.rollout(belief, HORIZON, 2, torch.Generator().manual_seed(3))
+        forecast = forecaster.rollout(belief, HORIZON, 2, torch.Generator().manual_seed(3)).states
         beliefs.append((belief.edge_probs, belief.edge_features, forecast))
     return [torch.stack([beliefs[t][i][window] for window, t in enumerate(last_observed.tolist())]) for i in range(3)]
 

@@ -374,7 +374,7 @@ def test_forecast_of_the_model_is_relative_to_the_ego_too():
     memory = on_map.empty_memory(1, AGENTS)
     for now, present in zip(tensor.unbind(1), valid.unbind(1), strict=True):
         memory, belief = on_map.observe(memory, now, present)
-    expected = (on_map.rollout(belief, 3)[..., :2] - tensor[0, -1, 0, :2]) * valid[0, -1, :, None, None]
+    expected = (on_map.rollout(belief, 3).states[..., :2] - tensor[0, -1, 0, :2]) * valid[0, -1, :, None, None]
     torch.testing.assert_close(after(on_map, *history).xy, expected, rtol=1e-5, atol=1e-4)
 
 

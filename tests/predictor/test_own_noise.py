@@ -104,7 +104,7 @@ def test_samples_with_gradients_are_those_without(kind: str):
     for gradients in (False, True):
         with torch.set_grad_enabled(gradients):
             _, belief = model.observe(model.empty_memory(2, AGENTS), states, valid)
-            rolled = model.rollout(belief, 3, SAMPLES, [np.random.default_rng(i) for i in (4, 5)])
+            rolled = model.rollout(belief, 3, SAMPLES, [np.random.default_rng(i) for i in (4, 5)]).states
             found.append(rolled * valid[:, None, :, None, None])
     torch.testing.assert_close(found[1].detach(), found[0], **CLOSE)
 

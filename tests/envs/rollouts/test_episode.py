@@ -35,7 +35,7 @@ from predictor.checkpoint import load_forecaster
 from predictor.data.store import StoreInfo, write_store
 from predictor.evaluation.accuracy import summarise
 from predictor.evaluation.outcomes import Outcome
-from predictor.forecaster import Belief
+from predictor.forecaster import Belief, Futures
 from predictor.online import OnlineForecaster
 from predictor.scene import PADDING_ID, Scene, SceneBatch, SceneSpec
 from tests.envs.evaluation import TAG, forget, save_tag, tag_spec
@@ -51,10 +51,10 @@ class Drifting(ConstantVelocity):
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
-    ) -> torch.Tensor:
-        future = super().rollout(belief, horizon_steps, num_samples, generator).clone()
+    ) -> Futures:
+        future = super().rollout(belief, horizon_steps, num_samples, generator).states.clone()
         future[..., :2] += torch.arange(1.0, num_samples + 1)[:, None, None, None] * OFFSET_M
-        return future
+        return Futures(future)
 
 
 @pytest.fixture(autouse=True)

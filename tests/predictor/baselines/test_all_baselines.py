@@ -56,7 +56,7 @@ def everything(forecaster: Any, states: Tensor, valid: Tensor) -> dict[str, Tens
     outputs = {
         "one_step": window.one_step,
         "rollout": window.rollout[:, None],
-        "streamed": forecaster.rollout(belief, HORIZON),
+        "streamed": forecaster.rollout(belief, HORIZON).states,
         "pair edges": belief.edge_probs[:, None],
     }
     if window.prior_logits is not None:
@@ -109,7 +109,7 @@ def test_three_dimensions(kind: str, has_ego: bool):
     valid = torch.ones(BATCH, TIME, AGENTS).bool()
     window = quiet_window(forecaster, states, valid, torch.tensor([2, 3]))
     assert window.one_step.shape == (BATCH, TIME, AGENTS, 6)
-    streamed = forecaster.rollout(list(stream(forecaster, states, valid))[2][1], HORIZON)
+    streamed = forecaster.rollout(list(stream(forecaster, states, valid))[2][1], HORIZON).states
     torch.testing.assert_close(streamed[0, 0], window.rollout[0], **METRES)
 
 
@@ -153,11 +153,11 @@ def test_streaming_forecasts_what_the_window_does(kind: str, valid: Tensor, seed
     window = quiet_window(forecaster, states, valid, torch.tensor(last_observed))
     beliefs = [belief for _, belief in stream(forecaster, states, valid)]
     for index, t in enumerate(last_observed):
-        streamed = forecaster.rollout(beliefs[t], HORIZON)
+        streamed = forecaster.rollout(beliefs[t], HORIZON).states
         torch.testing.assert_close(streamed[index, 0], window.rollout[index], **METRES)
     for t, belief in enumerate(beliefs):
         if window.prior_logits is None:  # teacher forcing follows the same graph as streaming
-            torch.testing.assert_close(forecaster.rollout(belief, 1)[:, 0, :, 0], window.one_step[:, t], **METRES)
+            torch.testing.assert_close(forecaster.rollout(belief, 1).states[:, 0, :, 0], window.one_step[:, t], **METRES)
         else:
             torch.testing.assert_close(belief.edge_probs, window.prior_logits[:, t].softmax(-1), **TOLERANCE)
 
@@ -167,7 +167,7 @@ def test_history_matters_to_all_but_the_mlp(kind: str):
     """Without this, the equality above would hold for a model that remembers nothing."""
     forecaster, states, valid = tiny(kind), scenes(), torch.ones(BATCH, TIME, AGENTS).bool()
     long, short = last(forecaster, states, valid), last(forecaster, states[:, -1:], valid[:, -1:])
-    difference = (forecaster.rollout(long, HORIZON) - forecaster.rollout(short, HORIZON)).abs().max()
+    difference = (forecaster.rollout(long, HORIZON).states - forecaster.rollout(short, HORIZON).states).abs().max()
     assert difference == 0 if kind == "mlp" else difference > 1e-2
     if kind in WITH_GRAPH:
         assert (long.edge_probs - short.edge_probs)[pair_mask(valid[:, -1])].abs().max() > 1e-3
@@ -196,9 +196,9 @@ def test_no_rollout_is_no_work(kind: str, monkeypatch: pytest.MonkeyPatch):
 def test_longer_horizons_continue_shorter_ones(kind: str):
     forecaster = tiny(kind)
     belief = last(forecaster, scenes(), torch.ones(BATCH, TIME, AGENTS).bool())
-    longest = forecaster.rollout(belief, 5)
+    longest = forecaster.rollout(belief, 5).states
     for steps in (0, 1, 3):
-        assert torch.equal(longest[..., :steps, :], forecaster.rollout(belief, steps))
+        assert torch.equal(longest[..., :steps, :], forecaster.rollout(belief, steps).states)
 
 
 # --- No peeking -------------------------------------------------------------------------------------------------------
@@ -320,7 +320,7 @@ def test_memory_moves_with_agents_that_change_places(kind: str):
     (memory, _), (_, expected) = list(stream(forecaster, states, valid))[-2:]
     moved = memory.reorder(order, torch.ones(BATCH, AGENTS).bool())
     belief = forecaster.observe(moved, states[envs, -1, order], valid[:, -1])[1]
-    ours, plain = forecaster.rollout(belief, HORIZON), forecaster.rollout(expected, HORIZON)
+    ours, plain = forecaster.rollout(belief, HORIZON).states, forecaster.rollout(expected, HORIZON).states
     torch.testing.assert_close(ours[:, 0], plain[envs, 0, order], **METRES)
 
 
@@ -331,9 +331,9 @@ def test_a_new_agent_has_no_memory_of_the_one_at_its_place_before(kind: str):
     known = torch.tensor([[True, True, False, True]] * BATCH)
     memory = list(stream(forecaster, states, valid))[-2][0]
     kept = memory.reorder(torch.arange(AGENTS).expand(BATCH, -1), known)
-    future = forecaster.rollout(forecaster.observe(kept, states[:, -1], valid[:, -1])[1], HORIZON)
+    future = forecaster.rollout(forecaster.observe(kept, states[:, -1], valid[:, -1])[1], HORIZON).states
     assert torch.isfinite(future).all()
-    original = forecaster.rollout(last(forecaster, states, valid), HORIZON)
+    original = forecaster.rollout(last(forecaster, states, valid), HORIZON).states
     if kind == "lstm":
         torch.testing.assert_close(future[:, 0, known[0]], original[:, 0, known[0]], **METRES)
     if kind not in ("mlp", "lstm-joint"):
@@ -353,10 +353,10 @@ def test_envs_of_memory_are_selected_replaced_and_joined(kind: str):
     now = states[torch.tensor([2, 0, 1]), -1]
 
     def forecast(from_memory: Memory) -> Tensor:
-        return forecaster.rollout(forecaster.observe(from_memory, now, valid[:, -1])[1], HORIZON)[:, 0]
+        return forecaster.rollout(forecaster.observe(from_memory, now, valid[:, -1])[1], HORIZON).states[:, 0]
 
-    continued = forecaster.rollout(last(forecaster, states, valid), HORIZON)[:, 0]
-    new = forecaster.rollout(last(forecaster, now[:, None], valid[:, -1:]), HORIZON)[:, 0]
+    continued = forecaster.rollout(last(forecaster, states, valid), HORIZON).states[:, 0]
+    new = forecaster.rollout(last(forecaster, now[:, None], valid[:, -1:]), HORIZON).states[:, 0]
     torch.testing.assert_close(forecast(joined), torch.stack([continued[2], continued[0], new[2]]), **METRES)
     torch.testing.assert_close(forecast(replaced), torch.stack([new[0], continued[0], new[2]]), **METRES)
 
@@ -369,8 +369,8 @@ def test_padded_memory_has_room_for_newcomers(kind: str):
     short = list(stream(forecaster, states[:, :-1, :-1], valid[:, :-1, :-1]))[-1][0].padded(AGENTS)
     for ours, theirs in zip((*short.nodes, *short.pairs), (*memory.nodes, *memory.pairs), strict=True):
         torch.testing.assert_close(ours, theirs, **TOLERANCE)
-    ours = forecaster.rollout(forecaster.observe(short, states[:, -1], valid[:, -1])[1], HORIZON)
-    torch.testing.assert_close(ours, forecaster.rollout(expected, HORIZON), **METRES)
+    ours = forecaster.rollout(forecaster.observe(short, states[:, -1], valid[:, -1])[1], HORIZON).states
+    torch.testing.assert_close(ours, forecaster.rollout(expected, HORIZON).states, **METRES)
 
 
 # --- Samples ----------------------------------------------------------------------------------------------------------
@@ -381,9 +381,9 @@ def test_sample_0_draws_nothing_and_does_not_depend_on_the_others(kind: str):
     forecaster, generator = tiny(kind), torch.Generator().manual_seed(0)
     belief = last(forecaster, scenes(), random_presence(0, BATCH, TIME, AGENTS))
     before = generator.get_state()
-    first = forecaster.rollout(belief, HORIZON, 1, generator)
+    first = forecaster.rollout(belief, HORIZON, 1, generator).states
     assert torch.equal(generator.get_state(), before)
-    many = forecaster.rollout(belief, HORIZON, 5, generator)
+    many = forecaster.rollout(belief, HORIZON, 5, generator).states
     assert many.shape == (BATCH, 5, AGENTS, HORIZON, 4)
     assert torch.equal(many[:, :1], first)
     if kind not in DRAWN:

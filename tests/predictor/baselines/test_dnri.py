@@ -142,7 +142,7 @@ def test_the_first_type_is_silent():
     moved[..., 1:, :] += 3.0
 
     def first_agent() -> list[Tensor]:
-        return [forecaster.rollout(last(forecaster, s, valid), 3)[0, 0, 0] for s in (states, moved)]
+        return [forecaster.rollout(last(forecaster, s, valid), 3).states[0, 0, 0] for s in (states, moved)]
 
     torch.testing.assert_close(*first_agent(), **TOLERANCE)
     head.bias.copy_(torch.tensor([0.0, 0.0, 1e4]))
@@ -168,7 +168,7 @@ def test_samples_depend_on_the_generator_alone(forecaster: DNRI):
 
     def draw(seed: int, everywhere: int) -> Tensor:
         torch.manual_seed(everywhere)
-        return forecaster.rollout(belief, HORIZON, 4, torch.Generator().manual_seed(seed))
+        return forecaster.rollout(belief, HORIZON, 4, torch.Generator().manual_seed(seed)).states
 
     assert torch.equal(draw(5, everywhere=1), draw(5, everywhere=2))
     one, other = draw(5, everywhere=1), draw(6, everywhere=1)
@@ -183,7 +183,7 @@ def test_samples_belong_to_their_scene():
     forecaster = tiny("dnri")
     belief = last(forecaster, random_states(0, BATCH, TIME, AGENTS, 4), torch.ones(BATCH, TIME, AGENTS).bool())
     with no_noise():
-        drawn = forecaster.rollout(belief, HORIZON, 4)
+        drawn = forecaster.rollout(belief, HORIZON, 4).states
     torch.testing.assert_close(drawn, drawn[:, :1].expand_as(drawn), **METRES)
     assert not torch.allclose(drawn[0], drawn[1], atol=1.0)
 

@@ -116,7 +116,7 @@ def graph_while_forecasting(kind: str, monkeypatch: pytest.MonkeyPatch) -> list[
     monkeypatch.setattr(
         IMMA, "recur", lambda self, x, v, graph, nodes: graphs.append(graph) or inner(self, x, v, graph, nodes)
     )
-    forecaster.rollout(belief, 4)
+    forecaster.rollout(belief, 4).states
     return [belief.internal.scores, *graphs]
 
 
@@ -154,7 +154,7 @@ def test_weight_of_an_added_layer_is_raised_from_0_to_1():
 
     def forecast(layer: int | None, weight: float) -> Tensor:
         forecaster.train_layer(layer, weight)
-        return forecaster.rollout(last(forecaster, states, valid), HORIZON)
+        return forecaster.rollout(last(forecaster, states, valid), HORIZON).states
 
     everything = forecast(None, 1.0)
     torch.testing.assert_close(forecast(0, 1.0), everything, **TOLERANCE)

@@ -116,15 +116,15 @@ def test_joint_sees_the_others_and_knows_columns_apart():
     states, valid = random_states(0, 1, TIME, 3, 4), torch.ones(1, TIME, 3).bool()
     moved = states.clone()
     moved[..., 1:, :] += 3.0
-    plain, others = (forecaster.rollout(last(forecaster, s, valid), 2)[0, 0] for s in (states, moved))
+    plain, others = (forecaster.rollout(last(forecaster, s, valid), 2).states[0, 0] for s in (states, moved))
     assert not torch.allclose(plain[0], others[0], atol=1e-2)
     order = [0, 2, 1]
-    permuted = forecaster.rollout(last(forecaster, states[:, :, order], valid), 2)[0, 0]
+    permuted = forecaster.rollout(last(forecaster, states[:, :, order], valid), 2).states[0, 0]
     assert not torch.allclose(permuted[order], plain, atol=1e-2)
 
 
 def one_step(forecaster: LSTM, memory: Memory, states: Tensor, valid: Tensor) -> Tensor:
-    return forecaster.rollout(forecaster.observe(memory, states, valid)[1], 1)
+    return forecaster.rollout(forecaster.observe(memory, states, valid)[1], 1).states
 
 
 def test_the_scene_is_remembered_while_anybody_stays():
@@ -152,7 +152,7 @@ def test_joint_takes_no_more_agents_than_it_has_columns():
     assert forecaster.columns == 3
     memory, states = forecaster.empty_memory(1, 5), random_states(0, 1, 5, 4)
     three, four = torch.tensor([[True, True, True, False, False]]), torch.tensor([[True, False, False, True, False]])
-    assert forecaster.rollout(forecaster.observe(memory, states, three)[1], 2).shape == (1, 1, 5, 2, 4)
+    assert forecaster.rollout(forecaster.observe(memory, states, three)[1], 2).states.shape == (1, 1, 5, 2, 4)
     with pytest.raises(UserError, match="agents at fixed places, but place 3 holds one too; .* num_agents=4 or"):
         forecaster.observe(memory, states, four)
     with pytest.raises(UserError, match="takes 3 agents"):

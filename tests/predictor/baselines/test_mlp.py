@@ -40,7 +40,7 @@ def test_hand_computed():
     forecaster.readout.bias.zero_()
     states = torch.tensor([[[7.0, 3.0, 6.0, 0.0], [7.0, 3.0, 2.0, 0.0]]])  # the second is below the unit's threshold
     belief = last(forecaster, states[:, None], torch.ones(1, 1, 2).bool())
-    future = forecaster.rollout(belief, 2)[0, 0]
+    future = forecaster.rollout(belief, 2).states[0, 0]
     assert future[0].tolist() == [[7.0, 4.0, 6.0, 0.0], [7.0, 5.0, 6.0, 0.0]]
     assert future[1].tolist() == [[7.0, 3.0, 2.0, 0.0]] * 2
 
@@ -50,7 +50,7 @@ def test_others_are_not_seen():
     valid = torch.ones(1, 1, 3).bool()
     moved = states.clone()
     moved[..., 1:, :] += 3.0
-    one, other = (forecaster.rollout(last(forecaster, s, valid), 2)[0, 0] for s in (states, moved))
+    one, other = (forecaster.rollout(last(forecaster, s, valid), 2).states[0, 0] for s in (states, moved))
     torch.testing.assert_close(one[0], other[0], **TOLERANCE)
     assert not torch.allclose(one[1:], other[1:], atol=1e-2)
 

@@ -119,13 +119,13 @@ def test_history_leaves_no_trace(fitted: NearestNeighbour):
     for now, present in zip(states, valid, strict=True):
         memory, belief = fitted.observe(memory, now, present)
     assert memory == Memory()
-    alone = fitted.rollout(observe(fitted, states[-1], valid[-1]), HORIZON)
-    assert torch.equal(fitted.rollout(belief, HORIZON), alone)
+    alone = fitted.rollout(observe(fitted, states[-1], valid[-1]), HORIZON).states
+    assert torch.equal(fitted.rollout(belief, HORIZON).states, alone)
 
 
 def test_forecasting_leaves_the_belief_alone(fitted: NearestNeighbour):
     states = random_states(0, 2, 3, 4)
-    fitted.rollout(observe(fitted, states), HORIZON, 4)
+    fitted.rollout(observe(fitted, states), HORIZON, 4).states
     assert torch.equal(states, random_states(0, 2, 3, 4))
 
 
@@ -136,7 +136,7 @@ def test_what_is_repeated_is_forecast_exactly():
     """Five recordings of the same two agents on circles: the mean of five equal futures."""
     recorded = circling_episode(3)
     forecaster = NearestNeighbour.fit([recorded] * 5, spec(), HORIZON)
-    future = forecaster.rollout(observe(forecaster, torch.from_numpy(recorded.states[2:3])), HORIZON)[0, 0, 1]
+    future = forecaster.rollout(observe(forecaster, torch.from_numpy(recorded.states[2:3])), HORIZON).states[0, 0, 1]
     positions = torch.from_numpy(recorded.states[2:6, 1, :2])
     torch.testing.assert_close(future[:, :2], positions[1:], **METRES)
     torch.testing.assert_close(future[:, 2:], positions.diff(dim=0), **METRES)
@@ -164,7 +164,7 @@ def test_straight_motion_between_two_examples():
     states = np.stack([speeds * time_s, 0 * speeds * time_s, speeds + 0 * time_s, 0 * speeds * time_s], axis=-1)
     forecaster = NearestNeighbour.fit([episode(states)], layout, 2, k=2)
     assert forecaster.num_examples == 3
-    future = forecaster.rollout(observe(forecaster, torch.tensor([[[100.0, 7.0, 5.0, 0.0]]])), 2)
+    future = forecaster.rollout(observe(forecaster, torch.tensor([[[100.0, 7.0, 5.0, 0.0]]])), 2).states
     torch.testing.assert_close(future[0, 0, 0], torch.tensor([[102.5, 7.0, 5.0, 0.0], [105.0, 7.0, 5.0, 0.0]]))
 
 
@@ -181,21 +181,21 @@ def one_dimensional(*moves_m: float, horizon_steps: int = 1, k: int = 5) -> Near
 def test_samples_are_the_mean_and_then_single_neighbours_over_and_over():
     forecaster = one_dimensional(10.0, 20.0, 40.0, 80.0, k=3)
     belief = observe(forecaster, torch.tensor([[[1.9, 0.0, 0.0, 0.0]]]))
-    assert forecaster.rollout(belief, 1, 6)[0, :, 0, 0, 1].tolist() == pytest.approx([140 / 3, 40, 20, 80, 40, 20])
-    assert forecaster.rollout(belief, 1, 1).shape == (1, 1, 1, 1, 4)
-    assert torch.equal(forecaster.rollout(belief, 1, 6), forecaster.rollout(belief, 1, 6, torch.Generator()))
+    assert forecaster.rollout(belief, 1, 6).states[0, :, 0, 0, 1].tolist() == pytest.approx([140 / 3, 40, 20, 80, 40, 20])
+    assert forecaster.rollout(belief, 1, 1).states.shape == (1, 1, 1, 1, 4)
+    assert torch.equal(forecaster.rollout(belief, 1, 6).states, forecaster.rollout(belief, 1, 6, torch.Generator()).states)
 
 
 def test_with_fewer_examples_than_k_all_are_averaged():
     forecaster = one_dimensional(10.0, 30.0)
     belief = observe(forecaster, torch.tensor([[[50.0, 0.0, 0.0, 0.0]]]))
-    assert forecaster.rollout(belief, 1, 4)[0, :, 0, 0, 1].tolist() == [20.0, 30.0, 10.0, 30.0]
+    assert forecaster.rollout(belief, 1, 4).states[0, :, 0, 0, 1].tolist() == [20.0, 30.0, 10.0, 30.0]
 
 
 def test_other_features_stay_as_they_are():
     layout = LAYOUTS["roles"]
     forecaster, states = fit_random(layout), scene_of(LAYOUTS["roles"], 0)
-    future = forecaster.rollout(observe(forecaster, states), HORIZON, 3)
+    future = forecaster.rollout(observe(forecaster, states), HORIZON, 3).states
     assert torch.equal(future[..., 4:], states[:, None, :, None, 4:].expand(-1, 3, -1, HORIZON, -1))
     assert not torch.equal(future[..., :2], states[:, None, :, None, :2].expand(-1, 3, -1, HORIZON, -1))
 
@@ -208,7 +208,7 @@ def test_another_role_is_far_away():
     states[1, :, 0] += [1, 2]
     forecaster = NearestNeighbour.fit([episode(states)], layout, 1, k=1)
     query = torch.tensor([[[1.0, 0, 0, 0, 0, 1.0], [1.0, 0, 0, 0, 0, 0.0]]])
-    assert forecaster.rollout(observe(forecaster, query), 1)[0, 0, :, 0, 0].tolist() == [3.0, 2.0]
+    assert forecaster.rollout(observe(forecaster, query), 1).states[0, 0, :, 0, 0].tolist() == [3.0, 2.0]
 
 
 def test_scales_are_mean_absolute_deviations_but_never_noise():
@@ -222,11 +222,11 @@ def test_scales_are_mean_absolute_deviations_but_never_noise():
 
 def test_a_horizon_goes_as_far_as_it_was_fitted(fitted: NearestNeighbour):
     belief = observe(fitted, random_states(0, 2, 3, 4))
-    longest = fitted.rollout(belief, HORIZON, 2)
+    longest = fitted.rollout(belief, HORIZON, 2).states
     for steps in range(HORIZON):
-        assert torch.equal(longest[..., :steps, :], fitted.rollout(belief, steps, 2))
+        assert torch.equal(longest[..., :steps, :], fitted.rollout(belief, steps, 2).states)
     with pytest.raises(UserError, match="fitted to horizon_steps=3 but 4 steps were asked for; fit them with"):
-        fitted.rollout(belief, HORIZON + 1)
+        fitted.rollout(belief, HORIZON + 1).states
 
 
 # --- Against plain loops ----------------------------------------------------------------------------------------------
@@ -283,7 +283,7 @@ def test_forecasts_are_those_of_plain_loops(layout: SceneSpec, seed: int, k: int
     states, valid, axes = scene_of(layout, seed), random_presence(seed, 2, 4), layout.position_dim
     valid[1, 0] = False  # of the second scene, the ego where there is one
     states[..., -1] = states[..., -1].round().clamp(0, 1) if layout.constant_features else states[..., -1]
-    ours = forecaster.rollout(observe(forecaster, states * valid[..., None], valid), HORIZON, 3).numpy()
+    ours = forecaster.rollout(observe(forecaster, states * valid[..., None], valid), HORIZON, 3).states.numpy()
     for env, agent in valid.nonzero().tolist():
         now = states[env].numpy().astype(np.float64) * valid[env].numpy()[:, None]
         query = np.array(loop_features(layout, now, valid[env].numpy(), agent))
@@ -436,8 +436,8 @@ def test_padding_is_invisible_and_absent_agents_are_zeros(layout: SceneSpec, see
     padded_valid = functional.pad(valid, (0, padding))
     padded_states = torch.full((2, 4 + padding, layout.num_features), torch.nan)
     padded_states[:, :4][valid] = states[valid]
-    plain = forecaster.rollout(observe(forecaster, states, valid), HORIZON, 2)
-    padded = forecaster.rollout(observe(forecaster, padded_states, padded_valid), HORIZON, 2)
+    plain = forecaster.rollout(observe(forecaster, states, valid), HORIZON, 2).states
+    padded = forecaster.rollout(observe(forecaster, padded_states, padded_valid), HORIZON, 2).states
     torch.testing.assert_close(padded[:, :, :4], plain, **METRES)
     assert not padded.transpose(1, 2)[~padded_valid].any()
     assert padded.transpose(1, 2)[padded_valid].any() or not valid.any()
@@ -449,23 +449,23 @@ def test_padding_is_invisible_and_absent_agents_are_zeros(layout: SceneSpec, see
 def test_permuting_agents_permutes_forecasts(layout: SceneSpec, seed: int, order: list[int]):
     forecaster, states, valid = fit_random(layout), scene_of(layout, seed), random_presence(seed, 2, 4)
     order = [0, *order] if layout.has_ego else [order[0], 0, *order[1:]]
-    plain = forecaster.rollout(observe(forecaster, states, valid), HORIZON, 2)
-    permuted = forecaster.rollout(observe(forecaster, states[:, order], valid[:, order]), HORIZON, 2)
+    plain = forecaster.rollout(observe(forecaster, states, valid), HORIZON, 2).states
+    permuted = forecaster.rollout(observe(forecaster, states[:, order], valid[:, order]), HORIZON, 2).states
     torch.testing.assert_close(permuted, plain[:, :, order], **METRES)
 
 
 def test_scenes_of_a_batch_are_independent(fitted: NearestNeighbour):
     states, valid = random_states(0, 3, 4, 4), random_presence(0, 3, 4)
-    together = fitted.rollout(observe(fitted, states, valid), HORIZON)
+    together = fitted.rollout(observe(fitted, states, valid), HORIZON).states
     for env in range(3):
-        alone = fitted.rollout(observe(fitted, states[[env]], valid[[env]]), HORIZON)
+        alone = fitted.rollout(observe(fitted, states[[env]], valid[[env]]), HORIZON).states
         torch.testing.assert_close(alone[0], together[env], **METRES)
 
 
 def test_no_agents_have_empty_forecasts(fitted: NearestNeighbour):
     states = random_states(0, 2, 3, 4)
-    assert not fitted.rollout(observe(fitted, states, torch.zeros(2, 3).bool()), HORIZON, 2).any()
-    assert fitted.rollout(observe(fitted, states[:, :0]), HORIZON, 2).shape == (2, 2, 0, HORIZON, 4)
+    assert not fitted.rollout(observe(fitted, states, torch.zeros(2, 3).bool()), HORIZON, 2).states.any()
+    assert fitted.rollout(observe(fitted, states[:, :0]), HORIZON, 2).states.shape == (2, 2, 0, HORIZON, 4)
 
 
 # --- Frames -----------------------------------------------------------------------------------------------------------
@@ -494,7 +494,7 @@ def test_streamed_scenes_are_forecast_as_given_ones():
     for frame in (WORLD, ROAD):
         forecaster = fit_random(spec(frame))
         states = torch.tensor([[[0.0, 0.0, 9.0, 0.0], [12.5, 4.0, 7.0, 0.5], [-6.25, 0.0, 11.0, 0.0]]])
-        expected = forecaster.rollout(observe(forecaster, states), HORIZON, 2)[..., :2]
+        expected = forecaster.rollout(observe(forecaster, states), HORIZON, 2).states[..., :2]
         torch.testing.assert_close(live(forecaster, 0.0)[:, :, :3], expected, **METRES)
 
 
@@ -532,4 +532,4 @@ def test_a_store_without_an_ego_is_fitted(tmp_path: Path):
     write_store(tmp_path / "store", StoreInfo(layout, "circles"), [circling_episode(i, agents=3) for i in range(4)])
     forecaster = fit_from_stores([tmp_path / "store"], layout, HORIZON)
     assert forecaster.num_examples == 4 * 3 * 7
-    assert torch.isfinite(forecaster.rollout(observe(forecaster, random_states(0, 1, 3, 4)), HORIZON)).all()
+    assert torch.isfinite(forecaster.rollout(observe(forecaster, random_states(0, 1, 3, 4)), HORIZON).states).all()

@@ -96,7 +96,7 @@ def test_streaming_forecasts_what_the_window_does(
     window = window_without_noise(forecaster, states, valid, torch.tensor(last_observed))
     beliefs = [belief for _, belief in stream(forecaster, states, valid)]
     for index, t in enumerate(last_observed):
-        streamed = forecaster.rollout(beliefs[t], forecaster.horizon_steps)
+        streamed = forecaster.rollout(beliefs[t], forecaster.horizon_steps).states
         torch.testing.assert_close(
             streamed[index, 0], window.rollout[index], rtol=1e-5, atol=1e-4
         )  # positions: tens of m
@@ -123,7 +123,7 @@ def test_history_matters():
     pairs = pair_mask(valid[:, -1])
     assert (long.edge_probs - short.edge_probs)[pairs].abs().max() > 1e-2
     assert (long.edge_features - short.edge_features)[pairs].abs().max() > 1e-2
-    assert (forecaster.rollout(long, 3) - forecaster.rollout(short, 3)).abs().max() > 1e-2
+    assert (forecaster.rollout(long, 3).states - forecaster.rollout(short, 3).states).abs().max() > 1e-2
 
 
 def test_memory_does_not_grow():
@@ -178,7 +178,7 @@ def everything(forecaster: DGVAE, states: Tensor, valid: Tensor) -> dict[str, Te
         "rollout": window.rollout[:, None],
         "streamed_probs": belief.edge_probs[:, None],
         "streamed_features": belief.edge_features[:, None],
-        "streamed": forecaster.rollout(belief, 3),
+        "streamed": forecaster.rollout(belief, 3).states,
     }
 
 
@@ -340,7 +340,7 @@ def test_substeps_against_a_loop():
         pushed = forecaster.decoder.direct(messages)
         assert pushed.abs().max() > 1e-2
         moved = forecaster.codec.advance(moved, change + pushed, 0.5)
-    torch.testing.assert_close(forecaster.rollout(belief, 1)[:, 0, :, 0], moved, **EXACT)
+    torch.testing.assert_close(forecaster.rollout(belief, 1).states[:, 0, :, 0], moved, **EXACT)
     window = forecaster.window(states, valid, torch.full((BATCH,), TIME - 1), 1)
     assert window.one_step.shape == states.shape and window.rollout.shape == (BATCH, AGENTS, 1, 4)
 
@@ -414,9 +414,9 @@ def test_sample_0_draws_nothing(belief: Belief):
     forecaster = model(num_edge_types=3)
     generator = torch.Generator().manual_seed(0)
     before = generator.get_state()
-    first = forecaster.rollout(belief, 3, 1, generator)
+    first = forecaster.rollout(belief, 3, 1, generator).states
     assert torch.equal(generator.get_state(), before)
-    many = forecaster.rollout(belief, 3, 4, generator)
+    many = forecaster.rollout(belief, 3, 4, generator).states
     assert torch.equal(many[:, :1], first)
     assert many.shape == (BATCH, 4, AGENTS, 3, 4)
 
@@ -426,7 +426,7 @@ def test_samples_depend_on_the_generator_alone(belief: Belief):
 
     def draw(seed: int, everywhere: int) -> Tensor:
         torch.manual_seed(everywhere)
-        return forecaster.rollout(belief, 3, 4, torch.Generator().manual_seed(seed))
+        return forecaster.rollout(belief, 3, 4, torch.Generator().manual_seed(seed)).states
 
     assert torch.equal(draw(5, everywhere=1), draw(5, everywhere=2))
     one, other = draw(5, everywhere=1), draw(6, everywhere=1)
@@ -435,7 +435,7 @@ def test_samples_depend_on_the_generator_alone(belief: Belief):
 
 
 def test_samples_differ_from_each_other_and_between_scenes(belief: Belief):
-    drawn = model(num_edge_types=3).rollout(belief, 3, 5, torch.Generator().manual_seed(0))
+    drawn = model(num_edge_types=3).rollout(belief, 3, 5, torch.Generator().manual_seed(0)).states
     distance = (drawn[:, :, None] - drawn[:, None]).abs().amax((-1, -2, -3)) + torch.eye(5)
     assert distance.min() > 1e-4
 
@@ -445,14 +445,14 @@ def test_samples_belong_to_their_scene(belief: Belief):
     forecaster = model(num_edge_types=3)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dgvae, "concrete_sample", lambda logits, *_: torch.softmax(logits, dim=-1))
-        drawn = forecaster.rollout(belief, 3, 4)
+        drawn = forecaster.rollout(belief, 3, 4).states
     torch.testing.assert_close(drawn, drawn[:, :1].expand_as(drawn), rtol=1e-5, atol=1e-5)
     assert not torch.allclose(drawn[0], drawn[1], atol=1.0)
 
 
 def test_longer_horizons_continue_shorter_ones(belief: Belief):
     forecaster = model(num_edge_types=3)
-    torch.testing.assert_close(forecaster.rollout(belief, 5)[..., :3, :], forecaster.rollout(belief, 3), **TOLERANCE)
+    torch.testing.assert_close(forecaster.rollout(belief, 5).states[..., :3, :], forecaster.rollout(belief, 3).states, **TOLERANCE)
 
 
 # --- Training pass and config -----------------------------------------------------------------------------------------

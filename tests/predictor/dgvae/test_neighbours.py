@@ -94,7 +94,7 @@ def streamed(forecaster: DGVAE, states: Tensor, valid: Tensor) -> dict[str, Tens
     return {
         "probs": torch.stack([b.edge_probs for b in dense], dim=1),
         "features": torch.stack([b.edge_features for b in dense], dim=1),
-        "rollout": torch.stack([forecaster.rollout(b, HORIZON)[:, 0] for b in beliefs], dim=1) * valid[..., None, None],
+        "rollout": torch.stack([forecaster.rollout(b, HORIZON).states[:, 0] for b in beliefs], dim=1) * valid[..., None, None],
     }
 
 
@@ -277,7 +277,7 @@ def test_without_others_there_are_no_edges(present: int):
     assert torch.equal(belief.edge_probs[..., 0], torch.ones(BATCH, AGENTS, 2).double())
     assert not belief.edge_features.any() and not any(m.any() for m in memory.pairs)
     assert not memory.nodes[0][:, present:].any()
-    assert torch.isfinite(forecaster.rollout(belief, HORIZON, 3, torch.Generator().manual_seed(0))).all()
+    assert torch.isfinite(forecaster.rollout(belief, HORIZON, 3, torch.Generator().manual_seed(0)).states).all()
 
 
 @every_config
@@ -317,10 +317,10 @@ def test_cost_grows_with_agents_and_not_with_pairs(name: str):
     forecaster, held, largest = precise(name, 3), [], []
     for agents in (32, 64, 128):
         states, valid = random_states(0, 1, 2, agents, 4).double(), torch.ones(1, 2, agents).bool()
-        forecaster.rollout(list(stream(forecaster, states, valid))[-1][1], 2)  # the weights are folded by now
+        forecaster.rollout(list(stream(forecaster, states, valid))[-1][1], 2).states  # the weights are folded by now
         with Sizes(agents) as sizes:
             memory, belief = list(stream(forecaster, states, valid))[-1]
-            forecaster.rollout(belief, 2, 2, torch.Generator().manual_seed(0))
+            forecaster.rollout(belief, 2, 2, torch.Generator().manual_seed(0)).states
         held.append(sum(t.numel() for t in tensors([memory, belief])))
         largest.append(sizes.largest)
     for sizes_of in (held, largest):
@@ -353,7 +353,7 @@ def test_samples_belong_to_their_scene(frozen: bool):
     _, belief = list(stream(forecaster, states, random_presence(0, BATCH, TIME, AGENTS)))[-1]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dgvae, "concrete_sample", lambda logits, *_: torch.softmax(logits, dim=-1))
-        drawn = forecaster.rollout(belief, HORIZON, 3)
+        drawn = forecaster.rollout(belief, HORIZON, 3).states
     torch.testing.assert_close(drawn, drawn[:, :1].expand_as(drawn), **EXACT)
     assert not torch.allclose(drawn[0], drawn[1], atol=1.0)
 
@@ -366,7 +366,7 @@ def test_a_dense_belief_rolls_out_as_the_original(near: int, frozen: bool, sampl
     forecaster = precise("fast", near, frozen=frozen)
     _, belief = list(stream(forecaster, scenes(0), torch.ones(BATCH, TIME, AGENTS).bool()))[-1]
     ours, expected = (
-        forecaster.rollout(b, HORIZON, samples, torch.Generator().manual_seed(0)) for b in (belief.dense(), belief)
+        forecaster.rollout(b, HORIZON, samples, torch.Generator().manual_seed(0)).states for b in (belief.dense(), belief)
     )
     torch.testing.assert_close(ours, expected, **EXACT)
 
@@ -472,7 +472,7 @@ every_near = pytest.mark.parametrize("near", [0, 2], ids=["dense", "neighbours"]
 @every_near
 def test_frozen_begins_as_evolving_does(name: str, near: int):
     frozen, evolving = (
-        forecaster.rollout(last(forecaster), HORIZON, 3, torch.Generator().manual_seed(0))
+        forecaster.rollout(last(forecaster), HORIZON, 3, torch.Generator().manual_seed(0)).states
         for forecaster in (precise(name, near, frozen=f) for f in (True, False))
     )
     torch.testing.assert_close(frozen[..., 0, :], evolving[..., 0, :], **EXACT)
@@ -491,9 +491,9 @@ def test_frozen_graphs_are_drawn_once(frozen: bool, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(dgvae, "concrete_sample", sample)
     forecaster = precise("rich", 2, frozen=frozen)
     times = 1 if frozen else HORIZON
-    forecaster.rollout(last(forecaster), HORIZON, 1)
+    forecaster.rollout(last(forecaster), HORIZON, 1).states
     assert not drawn
-    forecaster.rollout(last(forecaster), HORIZON, 4)
+    forecaster.rollout(last(forecaster), HORIZON, 4).states
     assert len(drawn) == times
     drawn.clear()
     forecaster.window(scenes(0), random_presence(0, BATCH, TIME, AGENTS), torch.tensor([1, 3]), HORIZON)
@@ -513,7 +513,7 @@ def test_frozen_steps_have_the_same_graph_and_features(samples: int, monkeypatch
     forecaster = precise("fast", 2, frozen=True)
     belief = last(forecaster)
     monkeypatch.setattr(Decoder, "messages", watched)
-    forecaster.rollout(belief, HORIZON, samples, torch.Generator().manual_seed(0))
+    forecaster.rollout(belief, HORIZON, samples, torch.Generator().manual_seed(0)).states
     expected, drawn = shown[: HORIZON - 1], shown[HORIZON - 1 :]  # the expected run's first step was taken before
     for graph, features in expected:
         assert torch.equal(graph, belief.edge_probs) and torch.equal(features, belief.edge_features)
@@ -530,13 +530,13 @@ def test_frozen_roll_out_against_a_loop(near: int):
     valid = random_presence(0, BATCH, TIME, AGENTS)
     memory, belief = list(stream(forecaster, states, valid))[-1]
     dense, decoder, node = belief.dense(), forecaster.decoder, memory.nodes[0]
-    expected = [forecaster.rollout(belief, 1)[:, 0, :, 0]]
+    expected = [forecaster.rollout(belief, 1).states[:, 0, :, 0]]
     for _ in range(HORIZON - 1):
         inputs = forecaster.codec.inputs(expected[-1], belief.valid)
         messages = decoder.messages(inputs, pair_mask(belief.valid), dense.edge_probs, dense.edge_features)
         node = decoder.gru(messages.flatten(0, 1), node.flatten(0, 1)).view(node.shape)
         expected.append(forecaster.codec.advance(expected[-1], decoder.change(node)))
-    ours, there = forecaster.rollout(belief, HORIZON)[:, 0], belief.valid
+    ours, there = forecaster.rollout(belief, HORIZON).states[:, 0], belief.valid
     torch.testing.assert_close(ours[there], torch.stack(expected, dim=2)[there], **EXACT)
 
 
@@ -586,7 +586,7 @@ def test_a_variant_may_change_how_graphs_are_drawn():
     original = precise("fast")
     for change in ({"temperature": 5.0}, {"hard_samples": True}):
         forecasts = [
-            forecaster.rollout(last(forecaster), HORIZON, 2, torch.Generator().manual_seed(0))
+            forecaster.rollout(last(forecaster), HORIZON, 2, torch.Generator().manual_seed(0)).states
             for forecaster in (original, original.variant(**change))
         ]
         assert torch.equal(forecasts[0][:, 0], forecasts[1][:, 0])

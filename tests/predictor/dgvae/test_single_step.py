@@ -91,7 +91,7 @@ def run(
     with context(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(dgvae, "concrete_sample", lambda logits, *_: torch.softmax(3 * logits, dim=-1))
         steps = list(stream(forecaster, states, valid))
-        forecast = forecaster.rollout(steps[-1][1], HORIZON, SAMPLES)
+        forecast = forecaster.rollout(steps[-1][1], HORIZON, SAMPLES).states
     public = [(memory, belief.edge_probs, belief.edge_features, belief.senders) for memory, belief in steps]
     return [t.detach() for t in [*tensors(public), forecast * valid[:, -1, None, :, None, None]]]
 
@@ -185,7 +185,7 @@ def test_where_every_slot_is_taken_the_same_graphs_are_drawn():
     for context in (torch.no_grad, torch.enable_grad):
         with context():
             *_, (_, belief) = stream(forecaster, states, torch.ones(BATCH, TIME, AGENTS).bool())
-            forecasts.append(forecaster.rollout(belief, HORIZON, SAMPLES, torch.Generator().manual_seed(0)))
+            forecasts.append(forecaster.rollout(belief, HORIZON, SAMPLES, torch.Generator().manual_seed(0)).states)
     torch.testing.assert_close(*forecasts, **EXACT)
     assert (forecasts[0][:, 1:] - forecasts[0][:, :1]).abs().amax((0, 2, 3, 4)).min() > 1e-3
 
@@ -199,7 +199,7 @@ def test_samples_do_not_depend_on_padding(name: str):
     forecasts = []
     for shown in ((states, valid), wide):
         *_, (_, belief) = stream(forecaster, *shown)
-        drawn = forecaster.rollout(belief, HORIZON, SAMPLES, torch.Generator().manual_seed(0))
+        drawn = forecaster.rollout(belief, HORIZON, SAMPLES, torch.Generator().manual_seed(0)).states
         forecasts.append(drawn[:, :, :AGENTS] * valid[:, -1, None, :, None, None])
     torch.testing.assert_close(*forecasts, **EXACT)
 
@@ -209,7 +209,7 @@ def test_a_belief_from_without_gradients_is_rolled_out_with_them():
     forecaster, (states, valid) = made(FAST_LIKE), scenes()
     with torch.no_grad():
         *_, (_, belief) = stream(forecaster, states, valid)
-    forecaster.rollout(belief, HORIZON).square().mean().backward()
+    forecaster.rollout(belief, HORIZON).states.square().mean().backward()
     for name in ("encoder.embed", "encoder.prior_head.0", "decoder.message_out", "decoder.readout"):
         gradient = forecaster.get_submodule(name).weight.grad
         assert gradient is not None and gradient.abs().max() > 0, name
@@ -227,7 +227,7 @@ def test_gradients_are_not_lost_by_an_earlier_run_without_them():
 def gradients(forecaster: DGVAE) -> list[Tensor]:
     states, valid = scenes()
     *_, (_, belief) = stream(forecaster, states, valid)
-    forecaster.rollout(belief, HORIZON).square().mean().backward()
+    forecaster.rollout(belief, HORIZON).states.square().mean().backward()
     return [p.grad for p in forecaster.parameters() if p.grad is not None]
 
 
@@ -405,7 +405,7 @@ def test_nothing_that_goes_in_is_changed(name: str):
         held = tensors([after, belief])
         assert len(held) > 10  # the belief's insides too
         copies = [t.clone() for t in held]
-        forecaster.rollout(belief, HORIZON, SAMPLES, torch.Generator().manual_seed(0))
+        forecaster.rollout(belief, HORIZON, SAMPLES, torch.Generator().manual_seed(0)).states
         forecaster.observe(after, states[:, 0], valid[:, 0])
         assert all(torch.equal(t, copy) for t, copy in zip(held, copies, strict=True))
 

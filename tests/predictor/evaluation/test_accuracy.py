@@ -319,7 +319,7 @@ def test_streamed_windows_against_a_loop():
         memory = forecaster.empty_memory(1, batch.states.shape[2])
         for t in range(last + 1):
             memory, belief = forecaster.observe(memory, batch.states[window, t][None], batch.valid[window, t][None])
-        expected = forecaster.rollout(belief, 3)[0, ..., :2]
+        expected = forecaster.rollout(belief, 3).states[0, ..., :2]
         now = batch.valid[window, last]
         torch.testing.assert_close(ours.forecast[window][:, now], expected[:, now], rtol=1e-5, atol=1e-4)
         for agent in range(batch.states.shape[2]):

@@ -9,7 +9,7 @@ from predictor.data.store import Episode
 from predictor.data.windows import WindowBatch, Windows
 from predictor.evaluation.graph_accuracy import graph_accuracy
 from predictor.evaluation.outcomes import Outcome, run_sequence_batch, run_window_batch, run_windows, sequence_indices
-from predictor.forecaster import Belief, Memory
+from predictor.forecaster import Belief, Futures, Memory
 from predictor.graph import pair_mask
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from predictor.support.errors import UserError
@@ -40,10 +40,10 @@ class Marking:
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: torch.Generator | None = None
-    ) -> Tensor:
+    ) -> Futures:
         mark = 100 * belief.internal[:, None, :, None]
         ahead = 10 * torch.arange(1, horizon_steps + 1)[:, None] + torch.arange(num_samples)[:, None, None, None]
-        return belief.states[:, None, :, None] + mark + ahead
+        return Futures(belief.states[:, None, :, None] + mark + ahead)
 
 
 def moving(spec_: SceneSpec, windows: int = 2, steps: int = 6, agents: int = 3) -> Tensor:
@@ -131,7 +131,7 @@ def test_one_step_part_of_a_model_against_a_loop():
     memory = forecaster.empty_memory(1, batch.states.shape[2])
     for t in range(last):
         memory, belief = forecaster.observe(memory, batch.states[:, t], batch.valid[:, t])
-        expected = forecaster.rollout(belief, 3)[0, 0, :, 0, :2]
+        expected = forecaster.rollout(belief, 3).states[0, 0, :, 0, :2]
         for sample in range(2):
             now = batch.valid[0, t]
             torch.testing.assert_close(given.forecast[0, sample, now, t], expected[now])

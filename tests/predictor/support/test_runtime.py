@@ -228,7 +228,7 @@ def edit(path: Path, **fields: Any) -> None:
 def forecast(forecaster: DGVAE) -> torch.Tensor:
     states = random_states(0, 2, 4, 4)
     belief = forecaster.observe(forecaster.empty_memory(2, 4), states, torch.ones(2, 4).bool())[1]
-    return forecaster.rollout(belief, 3, 2, torch.Generator().manual_seed(0))
+    return forecaster.rollout(belief, 3, 2, torch.Generator().manual_seed(0)).states
 
 
 def test_checkpoints_keep_neighbours_and_graph(tmp_path: Path):
