@@ -1,7 +1,8 @@
 """Features extractor of the policy's network: the ego attends over the agents around it.
 
 Reads the Dict observation of `ForecastObservation` / `VecForecast`: the env's own observation becomes the ego's
-embedding (the query); each agent's state, forecast, edge probabilities and edge features become a token (key, value).
+embedding (the query); each agent's state, futures with their probabilities and standard deviations, edge probabilities
+and edge features become a token (key, value).
 The result does not depend on the order of agents, and padded agents (`valid` = 0) change nothing. A learned null token
 is always present, so an empty scene works. It is not recurrent: only the forecaster keeps a history.
 """
@@ -22,7 +23,7 @@ from predictor.support.errors import UserError
 
 EGO_KEY = "observation"
 VALID_KEY = "valid"
-TOKEN_KEYS = ("agents", "forecast", "edge_probs", "edge_features")
+TOKEN_KEYS = ("agents", "forecast", "mode_probs", "xy_scale", "edge_probs", "edge_features")
 
 NEAR, FAR, SPEED = 0.1, 0.5, 1.0
 """Scales for near positions, far positions and velocities, as fractions of a scene's `feature_scales`."""
@@ -74,8 +75,8 @@ class ForecastAttention(BaseFeaturesExtractor):
         >>> model = PPO("MultiInputPolicy", env, policy_kwargs={"features_extractor_class": ForecastAttention})
 
     Args:
-        observation_space: Dict space with the keys `observation` and some of `agents`, `forecast`, `edge_probs`,
-            `edge_features`, `valid`.
+        observation_space: Dict space with the keys `observation` and some of `agents`, `forecast`, `mode_probs`,
+            `xy_scale`, `edge_probs`, `edge_features`, `valid`.
         config: sizes and scales.
     """
 
@@ -152,7 +153,10 @@ class ForecastAttention(BaseFeaturesExtractor):
                 now = present["agents"][:, :2]
                 now = now.reshape(len(now), *(1,) * (forecast.ndim - 2), 2)
                 parts.append(self._squash(forecast - now).flatten(1))
-        parts += [present[k].flatten(1) for k in ("edge_probs", "edge_features") if k in self._keys]
+        if "xy_scale" in self._keys:
+            parts.append(torch.tanh(present["xy_scale"] / self.config.near_m).flatten(1))
+        plain = ("mode_probs", "edge_probs", "edge_features")
+        parts += [present[k].flatten(1) for k in plain if k in self._keys]
         return torch.cat(parts, dim=-1)
 
     def _squash(self, metres: Float[Tensor, "*axes 2"]) -> Float[Tensor, "*axes 4"]:

@@ -22,7 +22,18 @@ from rich.progress import track
 
 from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, checkpoint_for
 from envs.rollouts import report
-from envs.rollouts.episode import MODEL, NEIGHBOURS, STRAIGHT, Case, Episode, EpisodeTask, memory_key, play
+from envs.rollouts.episode import (
+    MODEL,
+    NEIGHBOURS,
+    NOISY,
+    RESIDUAL,
+    STRAIGHT,
+    Case,
+    Episode,
+    EpisodeTask,
+    memory_key,
+    play,
+)
 from envs.rollouts.report import EnvAccuracy
 from envs.rollouts.world import default_drivers, open_world
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, name_of_folder, read_info, resolve
@@ -43,6 +54,8 @@ from predictor.support.runtime import keep_freed_memory
 
 PACKAGES = ("highway-env", "mpe2", "pettingzoo", "envpool", "gymnasium", "torch", "numpy")
 
+CONTROLS = (RESIDUAL, NEIGHBOURS, NOISY)
+"""Keys of the controls, in the order of the table's lines."""
 GALLERY_CASES = 6
 """Number of worst forecasts that are drawn, at most one per episode."""
 
@@ -70,9 +83,10 @@ class EvaluateConfig:
     """Number of steps to forecast; None takes each checkpoint's."""
     memory_steps: Annotated[tuple[int, ...], Renamed("history_steps")] = ()
     """Numbers of steps to which the model's memory is limited, each measured as well: the value of its memory."""
-    neighbours: tuple[Path, ...] = ()
-    """Recorded data for the nearest-neighbour forecaster: stores, or folders of stores named by env id; stores of other
-    environments are left out."""
+    data: Annotated[tuple[Path, ...], Renamed("neighbours")] = ()
+    """Recorded data to which the controls are fitted (constant velocity with noise, the model's single forecast with
+    noise, nearest neighbours): stores, or folders of stores named by env id; stores of other environments are left
+    out."""
     miss_m: float | None = None
     """Final displacement above which a forecast misses [m]; None: 2 m on roads, a tenth of a small arena's scale."""
     max_steps: int = 200
@@ -127,11 +141,11 @@ def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = N
 
 
 def _play_all(config: EvaluateConfig, env_id: str, checkpoint: str, driver: str, horizon: int) -> list[Episode]:
-    neighbours = _neighbour_stores(config.neighbours, env_id)
+    stores = _stores_of(config.data, env_id)
     tasks = [
         EpisodeTask(
             env_id, checkpoint, driver, config.seed + i, config.num_samples, horizon, config.max_steps,
-            neighbours, config.memory_steps,
+            stores, config.memory_steps,
         )
         for i in range(config.episodes)
     ]  # fmt: skip
@@ -140,7 +154,7 @@ def _play_all(config: EvaluateConfig, env_id: str, checkpoint: str, driver: str,
         return list(track(pool.imap(play, tasks, chunksize=2), f"evaluate {env_id}", total=len(tasks)))
 
 
-def _neighbour_stores(roots: Sequence[Path], env_id: str) -> tuple[str, ...]:
+def _stores_of(roots: Sequence[Path], env_id: str) -> tuple[str, ...]:
     """Returns the stores that were recorded in this environment."""
     found = []
     for root in roots:
@@ -151,7 +165,7 @@ def _neighbour_stores(roots: Sequence[Path], env_id: str) -> tuple[str, ...]:
             found.append(str(store))
     if roots and not found:
         raise UserError(
-            f"neighbours: no store of {env_id} in {', '.join(map(str, roots))}; record one with python -m envs.collect"
+            f"data: no store of {env_id} in {', '.join(map(str, roots))}; record one with python -m envs.collect"
         )
     return tuple(found)
 
@@ -161,7 +175,7 @@ def _summary(
 ) -> EnvAccuracy:
     miss_m = config.miss_m or (MISS_THRESHOLD_M if spec.feature_scales[0] >= 50 else 0.1 * spec.feature_scales[0])
     outcomes = {key: [e.outcomes[key] for e in episodes] for key in episodes[0].outcomes}
-    first = [Outcome(o.forecast[:, :1], o.future, o.valid) for o in outcomes[MODEL]]
+    first = [outcome.single() for outcome in outcomes[MODEL]]
     learned = checkpoint != CONSTANT_VELOCITY
     std_m = read_info(Path(checkpoint)).std_m if learned else fitted_std_m(first)
     name = MODEL_NAMES.get(read_info(Path(checkpoint)).model, "model") if learned else "constant velocity (deployed)"
@@ -174,7 +188,6 @@ def _summary(
 
     # The spread of the baselines is fitted on these very errors, in their favour: they have no validation data.
     straight = line("constant velocity", outcomes[STRAIGHT], fitted_std_m(outcomes[STRAIGHT]))
-    near = outcomes.get(NEIGHBOURS)
     reduction, interval = _reduction(first, outcomes[STRAIGHT])
     latencies_ms = 1e3 * np.concatenate([e.latencies_s[1:] or e.latencies_s for e in episodes])  # the first warms up
     return EnvAccuracy(
@@ -187,7 +200,7 @@ def _summary(
         straight,
         reduction,
         interval,
-        None if near is None else line(NEIGHBOURS, near, fitted_std_m(near)),
+        {key: line(key, outcomes[key], fitted_std_m(outcomes[key])) for key in CONTROLS if key in outcomes},
         {
             n: line(f"{name}, {n} step{'s' * (n > 1)} of history", outcomes[memory_key(n)], std_m)
             for n in config.memory_steps
@@ -238,7 +251,7 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
     results: list[EnvAccuracy] = []
     misfits: dict[tuple[str, str], str] = {}
     for env_id in config.env_ids:
-        _neighbour_stores(config.neighbours, env_id)  # an error for all checkpoints is no misfit of one
+        _stores_of(config.data, env_id)  # an error for all checkpoints is no misfit of one
         for checkpoint in config.checkpoint or (None,):
             try:
                 result, cases = evaluate_env(config, env_id, checkpoint)

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Int
 from numpy.typing import NDArray
+from torch import Tensor
 
 from envs.observation import ego_entries, entry_spaces
 from envs.readers.base import MultiagentScene
@@ -95,14 +96,14 @@ class MultiagentStream(SceneStream):
         self, scenes: Sequence[MultiagentScene], envs: Int[np.ndarray, " some"] | None = None
     ) -> list[AgentEntries]:
         """Takes in one scene for each environment (of `envs`, if given); returns the learners' entries for each."""
-        return view_entries(scenes, self.take(_batch(scenes), envs), self.view_spec)
+        return view_entries(scenes, self.take(_batch(scenes), envs), self.view_spec, self.config.shows_uncertainty)
 
     def observe_boundary(
         self, scenes: Sequence[MultiagentScene], ended: Int[np.ndarray, " ended"], successors: Sequence[MultiagentScene]
     ) -> list[AgentEntries]:
         """Takes in scenes like `observe_each`, ended episodes with their last; appends their successors' entries."""
         forecast = self.take_boundary(_batch(scenes), ended, _batch(successors))
-        return view_entries([*scenes, *successors], forecast, self.view_spec)
+        return view_entries([*scenes, *successors], forecast, self.view_spec, self.config.shows_uncertainty)
 
     def _given(self, scenes: SceneBatch) -> SceneBatch:
         front = (0, 0), (self._front, 0)
@@ -120,6 +121,8 @@ class MultiagentStream(SceneStream):
             dense.edge_probs[:, front:, front:],
             dense.edge_features[:, front:, front:],
             dense.valid[:, front:],
+            mode_probs=None if dense.mode_probs is None else dense.mode_probs[:, :, front:],
+            xy_scale=None if dense.xy_scale is None else dense.xy_scale[:, :, front:],
         )
 
 
@@ -127,22 +130,27 @@ def _batch(scenes: Sequence[MultiagentScene]) -> SceneBatch:
     return SceneBatch.stack([one.scene for one in scenes])
 
 
-def agent_entries(scene: MultiagentScene, forecast: Forecast, view: SceneSpec) -> AgentEntries:
+def agent_entries(
+    scene: MultiagentScene, forecast: Forecast, view: SceneSpec, uncertainty: bool = False
+) -> AgentEntries:
     """Returns each agent's forecast entries, cut from one forecast; `envs.observation.ego_entries` gives the shapes.
 
     Args:
         scene: scene that was forecast.
         forecast: forecast of it, a batch of one, agents as in the scene, world coordinates.
         view: spec whose `perception_m` and `max_agents` bound an agent's view.
+        uncertainty: whether probabilities and standard deviations of the samples are among the entries.
 
     Returns:
         The entries of each agent in `scene.index_of`, by name.
     """
-    [entries] = view_entries([scene], forecast, view)
+    [entries] = view_entries([scene], forecast, view, uncertainty)
     return entries
 
 
-def view_entries(scenes: Sequence[MultiagentScene], forecast: Forecast, view: SceneSpec) -> list[AgentEntries]:
+def view_entries(
+    scenes: Sequence[MultiagentScene], forecast: Forecast, view: SceneSpec, uncertainty: bool = False
+) -> list[AgentEntries]:
     """Returns `agent_entries` for each of several scenes, whose forecasts are one batch."""
     named = [(env, name) for env, one in enumerate(scenes) for name in one.index_of]
     entries: list[AgentEntries] = [{} for _ in scenes]
@@ -161,13 +169,21 @@ def view_entries(scenes: Sequence[MultiagentScene], forecast: Forecast, view: Sc
     agents = torch.from_numpy(np.concatenate(orders)).to(device)
     origin = torch.from_numpy(np.concatenate(origins)).to(forecast.xy)
     pairs = env[:, None, None], agents[:, :, None], agents[:, None, :]
+
+    def of_views(samples: Tensor | None) -> Tensor | None:
+        return None if samples is None else samples.transpose(1, 2)[env[:, None], agents].transpose(1, 2)
+
+    xy = of_views(forecast.xy)
+    assert xy is not None
     seen_by_each = Forecast(
-        forecast.xy.transpose(1, 2)[env[:, None], agents].transpose(1, 2) - origin[:, None, None, None],
+        xy - origin[:, None, None, None],
         forecast.edge_probs[pairs],
         forecast.edge_features[pairs],
         torch.from_numpy(views.valid).to(device),
+        mode_probs=of_views(forecast.mode_probs),
+        xy_scale=of_views(forecast.xy_scale),
     )
-    for key, values in ego_entries(views, seen_by_each).items():
+    for key, values in ego_entries(views, seen_by_each, uncertainty).items():
         for (place, name), value in zip(named, values, strict=True):
             entries[place].setdefault(name, {})[key] = value
     return entries

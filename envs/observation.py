@@ -12,7 +12,7 @@ from torch import Tensor
 from envs.registry import checkpoint_for
 from envs.scene_stream import ForecastConfig, SceneStream
 from predictor.checkpoint import load_forecaster
-from predictor.forecaster import Forecaster
+from predictor.forecaster import Forecaster, has_scale
 from predictor.online import use_one_thread_after_fork
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 from predictor.support.errors import UserError
@@ -21,7 +21,7 @@ Observations = dict[str, NDArray[Any]]
 
 
 SCENE_KEYS = ("scene_states", "scene_ids", "scene_valid", "scene_heading_rad")
-FORECAST_KEYS = ("agents", "forecast", "edge_probs", "edge_features", "valid")
+FORECAST_KEYS = ("agents", "forecast", "mode_probs", "xy_scale", "edge_probs", "edge_features", "valid")
 
 
 def scene_spaces(spec: SceneSpec) -> dict[str, gym.Space]:
@@ -131,14 +131,14 @@ class ForecastStream(SceneStream):
         self, scenes: SceneBatch, envs: Int[np.ndarray, " some"] | None = None
     ) -> dict[str, NDArray[np.float32]]:
         """Takes in one scene for each environment (of `envs`, if given); returns the forecast entries for each."""
-        return ego_entries(scenes, self.take(scenes, envs))
+        return ego_entries(scenes, self.take(scenes, envs), self.config.shows_uncertainty)
 
     def observe_boundary(
         self, scenes: SceneBatch, ended: Int[np.ndarray, " ended"], successors: SceneBatch
     ) -> dict[str, NDArray[np.float32]]:
         """Takes in scenes like `observe`, ended episodes with their last; appends their successors' entries."""
         forecast = self.take_boundary(scenes, ended, successors)
-        return ego_entries(SceneBatch.concatenate(scenes, successors), forecast)
+        return ego_entries(SceneBatch.concatenate(scenes, successors), forecast, self.config.shows_uncertainty)
 
 
 def entry_spaces(forecaster: Forecaster, view: SceneSpec, config: ForecastConfig) -> dict[str, gym.Space]:
@@ -155,21 +155,33 @@ def entry_spaces(forecaster: Forecaster, view: SceneSpec, config: ForecastConfig
     def unbounded(*shape: int) -> gym.Space:
         return gym.spaces.Box(-np.inf, np.inf, shape, np.float32)
 
+    horizon = config.horizon_steps or forecaster.horizon_steps
+    uncertain: dict[str, gym.Space] = {}
+    if config.shows_uncertainty:
+        uncertain["mode_probs"] = gym.spaces.Box(0, 1, (others, *samples), np.float32)
+        if has_scale(forecaster):
+            uncertain["xy_scale"] = gym.spaces.Box(0, np.inf, (others, *samples, horizon, 2), np.float32)
     return {
         "agents": unbounded(others, view.num_features),
-        "forecast": unbounded(others, *samples, config.horizon_steps or forecaster.horizon_steps, 2),
+        "forecast": unbounded(others, *samples, horizon, 2),
+        **uncertain,
         "edge_probs": gym.spaces.Box(0, 1, (others, 2 * (forecaster.num_edge_types - 1)), np.float32),
         "edge_features": unbounded(others, 2 * forecaster.edge_feature_dim),
         "valid": gym.spaces.Box(0, 1, (others,), np.float32),
     }
 
 
-def ego_entries(scenes: SceneBatch, forecast: Forecast) -> dict[str, NDArray[np.float32]]:
+def ego_entries(scenes: SceneBatch, forecast: Forecast, uncertainty: bool = False) -> dict[str, NDArray[np.float32]]:
     """Returns the ego's view of scenes and forecasts: origin at the ego, x along its heading, others by distance.
+
+    Each agent's K futures are sorted by their probability, the most probable first; draws keep their order.
 
     Returns:
         agents: (B, A−1, F) relative states [m, m/s]; features beyond velocity are not changed.
         forecast: (B, A−1, [K,] H, 2) future positions relative to the ego's position now [m].
+        mode_probs: (B, A−1, [K]) probability of each future; only with `uncertainty`.
+        xy_scale: (B, A−1, [K,] H, 2) standard deviation around each future along the ego's axes [m]; only with
+            `uncertainty`, and if the forecaster estimates it.
         edge_probs: (B, A−1, 2(E−1)) probability of each edge type but "no edge": agent → ego, then ego → agent.
         edge_features: (B, A−1, 2D) in the same order.
         valid: (B, A−1) 1 where there is an agent; all other entries are zero where it is 0.
@@ -182,7 +194,11 @@ def ego_entries(scenes: SceneBatch, forecast: Forecast) -> dict[str, NDArray[np.
     agents = scenes.states[env, agent]
     agents[:, :4] -= scenes.states[env, 0, :4]
     agents[:, :4] = _turned(agents[:, :4].reshape(-1, 2, 2), cos, sin).reshape(-1, 4)
-    xy = _turned(forecast.xy.cpu().numpy()[env, :, agent], cos, sin)
+    xy = forecast.xy.cpu().numpy()[env, :, agent]
+    share = forecast.sample_probs().cpu().numpy()[env, :, agent]
+    by_probability = np.argsort(-share, axis=1, kind="stable")
+    listed = np.arange(len(xy))[:, None]
+    xy = _turned(xy[listed, by_probability], cos, sin)
 
     def of_edges(edges: Tensor) -> NDArray[np.float32]:
         both: NDArray[np.float32] = edges.flatten(2).cpu().numpy()[env, agent]
@@ -193,10 +209,20 @@ def ego_entries(scenes: SceneBatch, forecast: Forecast) -> dict[str, NDArray[np.
         entries[env, place] = values
         return entries
 
+    def of_samples(values: NDArray[Any]) -> NDArray[np.float32]:
+        return padded(values[:, 0] if values.shape[1] == 1 else values)
+
+    uncertain: dict[str, NDArray[np.float32]] = {}
+    if uncertainty:
+        uncertain["mode_probs"] = of_samples(share[listed, by_probability])
+        if forecast.xy_scale is not None:
+            scale = forecast.xy_scale.cpu().numpy()[env, :, agent][listed, by_probability]
+            uncertain["xy_scale"] = of_samples(_turned_scale(scale, cos, sin))
     probs, features = forecast.ego_edges()
     return {
         "agents": padded(agents),
-        "forecast": padded(xy[:, 0] if xy.shape[1] == 1 else xy),
+        "forecast": of_samples(xy),
+        **uncertain,
         "edge_probs": padded(of_edges(probs[..., 1:])),
         "edge_features": padded(of_edges(features)),
         "valid": valid.astype(np.float32),
@@ -212,6 +238,18 @@ def _turned(
     turned = np.empty_like(vectors)
     np.add(cos * x, sin * y, out=turned[..., 0])
     np.subtract(cos * y, sin * x, out=turned[..., 1])
+    return turned
+
+
+def _turned_scale(
+    scale: Float[np.ndarray, "agents *_ 2"], cos: Float[np.ndarray, " agents"], sin: Float[np.ndarray, " agents"]
+) -> Float[np.ndarray, "agents *_ 2"]:
+    """Returns standard deviations along turned axes, of errors that are independent along the given ones."""
+    cos, sin = (part.astype(scale.dtype).reshape(-1, *(1,) * (scale.ndim - 2)) for part in (cos, sin))
+    x, y = np.square(scale[..., 0]), np.square(scale[..., 1])
+    turned: Float[np.ndarray, "agents *_ 2"] = np.sqrt(
+        np.stack([cos**2 * x + sin**2 * y, sin**2 * x + cos**2 * y], axis=-1)
+    )
     return turned
 
 

@@ -26,13 +26,21 @@ class ForecastConfig:
     horizon_steps: int | None = None
     """Number of steps to forecast; None takes what the checkpoint was trained for."""
     num_samples: int = 1
-    """Number of sampled futures per agent; 1 gives the most likely one, without a samples axis."""
+    """Number of futures per agent, sorted by probability; 1 gives the single forecast, without a samples axis."""
     device: str = "cpu"
     """Device of the forecaster: cpu, cuda or auto."""
     seed: int = 0
     """Random seed of the samples' noise: environment i gets seed + i, until a reset gives another seed."""
     flatten: bool = False
     """Whether an observation is one Box instead of a Dict, in the Dict's key order."""
+    uncertainty: bool | None = None
+    """Whether probabilities of the samples and their standard deviations are in the observation; None: with several
+    samples."""
+
+    @property
+    def shows_uncertainty(self) -> bool:
+        """Whether probabilities and standard deviations are in the observation."""
+        return self.num_samples > 1 if self.uncertainty is None else self.uncertainty
 
     def __post_init__(self) -> None:
         """Checks ranges, and replaces `device="auto"` by the device that it stands for."""
@@ -82,6 +90,13 @@ class SceneStream:
     def forecast_of(self, env: int) -> Forecast | None:
         """Returns the latest forecast of one environment, a batch of one; None before the first."""
         return None if self.forecast is None else _changed(lambda field: field[env : env + 1], self.forecast)
+
+    def again(self, num_samples: int) -> Forecast:
+        """Forecasts the latest scene of each environment again, with another number of samples.
+
+        What observations hold does not change; draws, if the forecaster draws, come from the same noise.
+        """
+        return self._shown(self._online.forecast(self.horizon_steps, num_samples, self._noise))
 
     def continue_noise(self, streams: "Sequence[SceneStream]") -> None:
         """Takes over the noise generators of one stream per environment, in their current state."""

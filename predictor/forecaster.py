@@ -134,6 +134,11 @@ class Belief:
         return Belief(self.states, self.valid, probs, features, self.internal)
 
 
+def has_scale(forecaster: "Forecaster") -> bool:
+    """Returns whether roll-outs of a forecaster come with `Futures.scale`."""
+    return bool(getattr(forecaster, "has_scale", False))
+
+
 def edgeless_belief(
     states: Float[Tensor, "batch agents state"],
     valid: Bool[Tensor, "batch agents"],
@@ -218,7 +223,13 @@ class WindowOutput(NamedTuple):
         """Returns the output in float32."""
 
         def exact(value: Any) -> Any:
-            return type(value)(*map(exact, value)) if isinstance(value, tuple) else None if value is None else value.float()
+            return (
+                type(value)(*map(exact, value))
+                if isinstance(value, tuple)
+                else None
+                if value is None
+                else value.float()
+            )
 
         return WindowOutput(*map(exact, self))
 

@@ -5,7 +5,7 @@ the batch, their order and padding change nothing. All numbers of a roll-out are
 generator that is listed for two scenes of a batch draws for the first one before it draws for the second.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -75,7 +75,7 @@ def noise_of_pairs(
 def uniform_of_agents(
     noise: Noise | None, valid: Bool[Tensor, "scenes agents"], draws: int
 ) -> Float[Tensor, "scenes draws agents"]:
-    """Draws uniform numbers in [0, 1) for the present agents of each scene; 0.5 for absent ones.
+    """Draws uniform numbers in [0, 1) for each agent; with one generator per scene, only for present agents.
 
     Raises:
         UserError: the number of generators is not the number of scenes.
@@ -83,9 +83,33 @@ def uniform_of_agents(
     shape = (len(valid), draws, valid.shape[1])
     if noise is None or isinstance(noise, torch.Generator):
         return torch.rand(shape, device=valid.device, generator=noise)
+    return _of_present(noise, valid, shape, lambda own, size: own.random(size, dtype=np.float32))
+
+
+def normal_of_agents(
+    noise: Noise | None, valid: Bool[Tensor, "scenes agents"], draws: int, numbers: int
+) -> Float[Tensor, "scenes draws agents numbers"]:
+    """Draws standard normal numbers for each agent; with one generator per scene, only for present agents.
+
+    Raises:
+        UserError: the number of generators is not the number of scenes.
+    """
+    shape = (len(valid), draws, valid.shape[1], numbers)
+    if noise is None or isinstance(noise, torch.Generator):
+        return torch.randn(shape, device=valid.device, generator=noise)
+    return _of_present(noise, valid, shape, lambda own, size: own.standard_normal(size, dtype=np.float32))
+
+
+def _of_present(
+    noise: Sequence[np.random.Generator],
+    valid: Tensor,
+    shape: tuple[int, ...],
+    draw: Callable[[np.random.Generator, tuple[int, ...]], np.ndarray],
+) -> Tensor:
     if len(noise) != len(valid):
         raise UserError(f"samples need one generator per scene, got {len(noise)} generators for {len(valid)} scenes")
-    drawn = torch.full(shape, 0.5)
+    drawn = torch.zeros(shape)
     for scene, (own, present) in enumerate(zip(noise, valid.cpu(), strict=True)):
-        drawn[scene, :, present] = torch.from_numpy(own.random((draws, int(present.sum())), dtype=np.float32))
+        numbers = draw(own, (shape[1], int(present.sum()), *shape[3:]))
+        drawn[scene, :, present] = torch.from_numpy(numbers)
     return drawn.to(valid.device)

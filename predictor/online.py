@@ -120,7 +120,7 @@ class OnlineForecaster:
         num_samples: int = 1,
         generator: Noise | None = None,
     ) -> Forecast:
-        """Forecasts from the latest observation; sample 0 follows the most likely graph.
+        """Forecasts from the latest observation; sample 0 is the single forecast.
 
         Args:
             horizon_steps: number of steps; None takes the forecaster's.
@@ -135,11 +135,11 @@ class OnlineForecaster:
             raise ProtocolError("forecast() needs an observation; call observe() first")
         belief = self._belief
         steps = horizon_steps or self.forecaster.horizon_steps
-        states = self.forecaster.rollout(belief, steps, num_samples, generator).states
+        futures = self.forecaster.rollout(belief, steps, num_samples, generator)
         # float32 relative to the ego: the origin that observe() removed is the ego's own position on "ego" axes
         axes = self.forecaster.spec.position_dim
         ego_now = belief.states[:, None, :1, None, :axes] * float(self.forecaster.spec.has_ego)
-        xy = (states[..., :axes] - ego_now).masked_fill(~belief.valid[:, None, :, None, None], 0.0)
+        xy = (futures.states[..., :axes] - ego_now).masked_fill(~belief.valid[:, None, :, None, None], 0.0)
         missing = self._ids.shape[1] - belief.valid.shape[1]
         senders = belief.senders
         pairs = (0, 0, 0, missing if senders is None else 0, 0, missing)
@@ -152,6 +152,10 @@ class OnlineForecaster:
             functional.pad(belief.edge_features, pairs),
             functional.pad(belief.valid, (0, missing)),
             None if senders is None else functional.pad(senders, (0, 0, 0, missing), value=NO_AGENT),
+            None
+            if futures.mode_probs is None
+            else functional.pad(futures.mode_probs, (0, missing), value=1 / num_samples),
+            None if futures.scale is None else functional.pad(futures.scale, (0, 0, 0, 0, 0, missing)),
         )
 
     def _take(

@@ -5,7 +5,7 @@ States are in the world frame and SI units. Where a scene has an ego, it is agen
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -273,12 +273,23 @@ class Forecast:
     """Which agents are forecast."""
     senders: Int[Tensor, "batch agents slots"] | None = None
     """Index of the sender in each slot (`predictor.graph.NO_AGENT` where empty); None if slot j is agent j's."""
+    mode_probs: Float[Tensor, "batch samples agents"] | None = None
+    """Probability of each sample for each agent, which sum to 1 over the samples; None if the samples are draws."""
+    xy_scale: Float[Tensor, "batch samples agents horizon axes"] | None = None
+    """Standard deviation of the position around each sample [m], world axes; None without an estimate."""
 
     def dense(self) -> "Forecast":
         """Returns the forecast with slot j for agent j; of use where scenes are small."""
         if self.senders is None:
             return self
-        return Forecast(self.xy, *dense_edges(self.edge_probs, self.edge_features, self.senders), self.valid)
+        probs, features = dense_edges(self.edge_probs, self.edge_features, self.senders)
+        return replace(self, edge_probs=probs, edge_features=features, senders=None)
+
+    def sample_probs(self) -> Float[Tensor, "batch samples agents"]:
+        """Returns the probability of each sample, which is the same for all draws."""
+        if self.mode_probs is not None:
+            return self.mode_probs
+        return self.xy.new_full(self.xy.shape[:3], 1 / self.xy.shape[1])
 
     def ego_edges(self) -> tuple[Float[Tensor, "batch agents 2 types"], Float[Tensor, "batch agents 2 feature"]]:
         """Returns probabilities and features of the edges from each agent to agent 0, and of those back."""

@@ -1,15 +1,15 @@
 """Plays an episode with forecasts and pairs them with the true futures, for `envs.evaluate`, which aggregates them.
 
-With one ego, the measured forecast is read from the policy's own observation; measured are the agents that the ego
-perceives, not the ego itself. In a PettingZoo environment it is the one forecast from which the views of all agents
-are cut; measured are all agents, since none is the ego. Landmarks are not measured. Baselines and ablations forecast
-the same scenes.
+Measured is what the deployed wrapper forecasts from its own memory, with K samples; the policy's observation is cut from
+the same stream. With one ego, the agents that it perceives are measured, not the ego itself; in a PettingZoo
+environment all agents, since none is the ego. Landmarks are not measured. Controls, with as many samples, and ablations
+forecast the same scenes.
 """
 
 import functools
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +18,23 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from envs.multiagent_observation import MultiagentStream
-from envs.observation import ForecastConfig, ForecastStream, into_ego_axes, others_by_distance
+from envs.observation import ForecastStream
 from envs.readers.highway_labels import SceneLabels
 from envs.rollouts.world import EgoWorld, MultiagentWorld, World, open_world
+from envs.scene_stream import ForecastConfig
 from envs.wrappers import ForecastObservation
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.baselines.nearest_neighbour import NearestNeighbour, fit_from_stores
+from predictor.baselines.nearest_neighbour import fit_from_stores
 from predictor.checkpoint import load_forecaster
+from predictor.evaluation.controls import fit_noise, fit_residual, training_windows
 from predictor.evaluation.displacement import displacement
 from predictor.evaluation.outcomes import Outcome
 from predictor.forecaster import Forecaster
 from predictor.online import OnlineForecaster
-from predictor.scene import Scene, SceneBatch, SceneSpec
+from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 
 MODEL, STRAIGHT, NEIGHBOURS = "model", "constant velocity", "nearest neighbours"
+NOISY, RESIDUAL = "constant velocity + noise", "model + Gaussian noise"
 """Keys of the forecasters of an episode; `memory_key(steps)` gives those of the memory ablations."""
 LANDMARK = "landmark"
 """Feature that marks agents that never move."""
@@ -62,8 +65,8 @@ class EpisodeTask:
     """Number of steps forecast."""
     max_steps: int
     """Largest length of an episode [policy steps]."""
-    neighbours: tuple[str, ...] = ()
-    """Stores to fit the nearest-neighbour forecaster to; empty leaves it out."""
+    stores: tuple[str, ...] = ()
+    """Stores to fit the controls to; empty leaves them out."""
     histories: tuple[int, ...] = ()
     """Numbers of steps to which the model's memory is limited in ablations."""
 
@@ -109,13 +112,22 @@ class Episode:
 class _Baseline:
     """Forecaster of the same scenes as the measured one, with all history or the last `history_steps` only."""
 
-    def __init__(self, forecaster: Forecaster, spec: SceneSpec, horizon_steps: int, history_steps: int = 0) -> None:
+    def __init__(
+        self,
+        forecaster: Forecaster,
+        spec: SceneSpec,
+        horizon_steps: int,
+        history_steps: int = 0,
+        samples: int = 1,
+        seed: int = 0,
+    ) -> None:
         self._front = int(forecaster.spec.has_ego and not spec.has_ego)
         self._online = OnlineForecaster(forecaster, 1, spec.max_agents + self._front)
-        self._horizon, self._limit = horizon_steps, history_steps
+        self._horizon, self._limit, self._samples = horizon_steps, history_steps, samples
+        self._noise = [np.random.default_rng([seed, samples])]
         self._recent: list[SceneBatch] = []
 
-    def __call__(self, scene: Scene) -> torch.Tensor:
+    def __call__(self, scene: Scene) -> Forecast:
         batch = SceneBatch.stack([scene.behind_absent(self._front)])
         if self._limit:
             self._recent = [*self._recent, batch][-self._limit :]
@@ -124,7 +136,7 @@ class _Baseline:
                 self._online.observe(past)
         else:
             self._online.observe(batch)
-        return self._online.forecast(self._horizon).xy[0, :, self._front :]
+        return _behind(self._online.forecast(self._horizon, self._samples, self._noise), self._front)
 
 
 def play(task: EpisodeTask) -> Episode:
@@ -135,12 +147,12 @@ def play(task: EpisodeTask) -> Episode:
     probe = _Probe(task, world)
     scenes: list[Scene] = []
     truths = [world.full_scene()]
-    forecasts: dict[str, list[torch.Tensor]] = {key: [] for key in (MODEL, *others)}
+    forecasts: dict[str, list[Forecast]] = {key: [] for key in (MODEL, *others)}
     episode = Episode({}, [])
     for step in range(task.max_steps + 1):
         scene = world.perceived()
         scenes.append(scene)
-        forecasts[MODEL].append(_measured(world, task.samples))
+        forecasts[MODEL].append(world.env.stream.again(task.samples))
         for key, forecaster in others.items():
             forecasts[key].append(forecaster(scene))
         episode.latencies_s.append(probe())
@@ -152,19 +164,18 @@ def play(task: EpisodeTask) -> Episode:
         if ended:
             break
     future, valid = futures(scenes, truths, task.horizon_steps, world.spec)
-    episode.outcomes = {key: Outcome(torch.stack(found), future, valid) for key, found in forecasts.items()}
+    episode.outcomes = {key: _outcome(found, future, valid) for key, found in forecasts.items()}
     episode.worst = _worst(episode.outcomes, scenes, task.seed, world.spec.has_ego)
     return episode
 
 
 @functools.lru_cache(maxsize=4)
-def _kept_world(env_id: str, driver: str, checkpoint: str, horizon_steps: int, samples: int) -> World:
-    # two samples at least keep the samples axis; the first is the most likely
-    return open_world(env_id, driver, checkpoint, horizon_steps=horizon_steps, num_samples=max(2, samples))
+def _kept_world(env_id: str, driver: str, checkpoint: str, horizon_steps: int) -> World:
+    return open_world(env_id, driver, checkpoint, horizon_steps=horizon_steps)
 
 
 def _world(task: EpisodeTask) -> World:
-    return _kept_world(task.env_id, task.driver, task.checkpoint, task.horizon_steps, task.samples)
+    return _kept_world(task.env_id, task.driver, task.checkpoint, task.horizon_steps)
 
 
 @functools.lru_cache(maxsize=4)
@@ -173,20 +184,54 @@ def _kept_forecaster(checkpoint: str, spec: SceneSpec, source: str) -> Forecaste
 
 
 @functools.lru_cache(maxsize=2)
-def _kept_neighbours(stores: tuple[str, ...], spec: SceneSpec, horizon_steps: int) -> NearestNeighbour:
-    return fit_from_stores([Path(store) for store in stores], spec, horizon_steps)
+def _kept_controls(
+    stores: tuple[str, ...], checkpoint: str, spec: SceneSpec, source: str, horizon_steps: int
+) -> dict[str, Forecaster]:
+    """Returns the controls that are fitted to recorded data, by key."""
+    paths = [Path(store) for store in stores]
+    model = _kept_forecaster(checkpoint, spec, source)
+    windows = training_windows(paths, spec, horizon_steps)
+    return {
+        RESIDUAL: fit_residual(model, training_windows(paths, model.spec, horizon_steps), horizon_steps),
+        NEIGHBOURS: fit_from_stores(paths, spec, horizon_steps),
+        NOISY: fit_noise(windows, horizon_steps),
+    }
 
 
 def _baselines(task: EpisodeTask, spec: SceneSpec) -> dict[str, _Baseline]:
-    """Returns new baselines for an episode, by key."""
+    """Returns new controls and ablations for an episode, by key."""
     found = {STRAIGHT: _Baseline(ConstantVelocity(spec), spec, task.horizon_steps)}
-    if task.neighbours:
-        fitted = _kept_neighbours(task.neighbours, spec, task.horizon_steps)
-        found[NEIGHBOURS] = _Baseline(fitted, spec, task.horizon_steps)
+    if task.stores:
+        fitted = _kept_controls(task.stores, task.checkpoint, spec, task.env_id, task.horizon_steps)
+        for key, control in fitted.items():
+            found[key] = _Baseline(control, spec, task.horizon_steps, samples=task.samples, seed=task.seed)
     for steps in task.histories:
         model = _kept_forecaster(task.checkpoint, spec, task.env_id)
         found[memory_key(steps)] = _Baseline(model, spec, task.horizon_steps, steps)
     return found
+
+
+def _behind(forecast: Forecast, front: int) -> Forecast:
+    """Returns positions, probabilities and scales of the agents from `front` on; edges are not needed here."""
+    probs, scale = forecast.mode_probs, forecast.xy_scale
+    return replace(
+        forecast,
+        xy=forecast.xy[:, :, front:],
+        mode_probs=None if probs is None else probs[:, :, front:],
+        xy_scale=None if scale is None else scale[:, :, front:],
+    )
+
+
+def _outcome(forecasts: Sequence[Forecast], future: torch.Tensor, valid: torch.Tensor) -> Outcome:
+    """Returns the forecasts of an episode's steps with the truth."""
+
+    def joined(name: str) -> torch.Tensor | None:
+        found = [getattr(forecast, name) for forecast in forecasts]
+        return None if found[0] is None else torch.cat(found).cpu()
+
+    xy = joined("xy")
+    assert xy is not None
+    return Outcome(xy, future, valid, mode_probs=joined("mode_probs"), scale=joined("xy_scale"))
 
 
 class _Probe:
@@ -208,24 +253,6 @@ class _Probe:
         start = time.perf_counter()
         self._stream.observe(scene)
         return time.perf_counter() - start
-
-
-def _measured(world: World, samples: int) -> torch.Tensor:
-    """Returns the deployed forecast (K, A, H, 2): agents as in the perceived scene, world axes, relative to an ego."""
-    if isinstance(world, MultiagentWorld):
-        return world.env.forecast.xy[0, :samples].cpu()
-    assert isinstance(world, EgoWorld)
-    return world_forecast(world.observation["forecast"], world.perceived())[:samples]
-
-
-def world_forecast(forecast: Float[np.ndarray, "others samples horizon 2"], scene: Scene) -> torch.Tensor:
-    """Returns an observation's forecast (K, A, H, 2): agents as in the scene, world axes, relative to the ego."""
-    batch = SceneBatch.stack([scene])
-    world = forecast.astype(np.float64) @ into_ego_axes(batch.heading_rad)[0]
-    samples, horizon = world.shape[1], world.shape[2]
-    xy = np.zeros((samples, len(scene.ids), horizon, 2))
-    xy[:, 1 + others_by_distance(batch)[0]] = world.swapaxes(0, 1)
-    return torch.from_numpy(xy).float()
 
 
 def futures(

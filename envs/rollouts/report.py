@@ -10,7 +10,7 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from rich.table import Table
 
-from envs.rollouts.episode import MODEL, NEIGHBOURS, STRAIGHT, Case
+from envs.rollouts.episode import MODEL, NEIGHBOURS, RESIDUAL, STRAIGHT, Case
 from predictor.evaluation.accuracy import Accuracy
 from predictor.evaluation.graph_accuracy import GraphAccuracy
 from predictor.reports.tables import markdown_table
@@ -39,8 +39,8 @@ class EnvAccuracy:
     """1 − minADE(K = 1) / ADE of constant velocity."""
     reduction_interval: tuple[float, float]
     """95 % bootstrap interval of the reduction over episodes."""
-    nearest_neighbours: Accuracy | None = None
-    """Accuracy of the memoryless nearest-neighbour forecaster on the same scenes, where recorded data was given."""
+    controls: dict[str, Accuracy] = field(default_factory=dict)
+    """Accuracy of controls with as many samples, fitted to recorded data, by key; empty without such data."""
     histories: dict[int, Accuracy] = field(default_factory=dict)
     """Accuracy of the model (K = 1) by the number of steps to which its memory is limited."""
     graph: GraphAccuracy | None = None
@@ -52,13 +52,18 @@ class EnvAccuracy:
 
     @property
     def lines(self) -> list[Accuracy]:
-        """All lines of its table."""
-        extra = [] if self.nearest_neighbours is None else [self.nearest_neighbours]
-        return [self.model, self.model_samples, *self.histories.values(), *extra, self.constant_velocity]
+        """All lines of its table, with equal numbers of samples where samples differ."""
+        return [self.model_samples, *(self.controls.values() or [self.constant_velocity])]
+
+    @property
+    def nearest_neighbours(self) -> Accuracy | None:
+        """Accuracy of the memoryless nearest-neighbour forecaster; None without recorded data."""
+        return self.controls.get(NEIGHBOURS)
 
 
 HEADS = (
-    "env", "checkpoint", "dt [s]", "steps", "minADE₁ [m]", "minFDE₁ [m]", "minADE_K [m]", "neighbours ADE [m]",
+    "env", "checkpoint", "dt [s]", "steps", "minADE₁ [m]", "minFDE₁ [m]", "minADE_K [m]", "joint ADE_K [m]", "energy [m]", "cover",
+    "model + noise minADE_K [m]", "neighbours ADE [m]",
     "CV ADE / FDE [m]", "ADE below CV", "95 % interval", "forecasts", "latency [ms]",
 )  # fmt: skip
 """Columns of the overview."""
@@ -139,10 +144,12 @@ def _cells(result: "EnvAccuracy") -> list[str]:
     one, many, straight, near = (
         result.model, result.model_samples, result.constant_velocity, result.nearest_neighbours,
     )  # fmt: skip
+    noisy, covered = result.controls.get(RESIDUAL), many.statistics.get("coverage")
     return [
         result.env_id, result.checkpoint, f"{result.dt_s:g}", str(len(one.by_step_m)),
-        _metres(one.min_ade_m), _metres(one.min_fde_m), _metres(many.min_ade_m),
-        "–" if near is None else _metres(near.min_ade_m),
+        _metres(one.min_ade_m), _metres(one.min_fde_m), _metres(many.min_ade_m), _metres(many.min_joint_ade_m),
+        _metres(many.energy_m), "–" if covered is None else f"{100 * covered.mean:.0f} %",
+        "–" if noisy is None else _metres(noisy.min_ade_m), "–" if near is None else _metres(near.ade_m),
         f"{_metres(straight.min_ade_m)} / {_metres(straight.min_fde_m)}",
         f"{100 * result.reduction:.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %", str(one.agents),
         f"{result.latency_median_ms:.1f}",
@@ -163,7 +170,7 @@ def write_pictures(out: Path, result: "EnvAccuracy", cases: Sequence[Case]) -> N
     for ax, quantity, label in (
         (axes[0, 0], "by_step_m", "displacement of the best sample [m]"),
         (axes[0, 1], "rmse_m", "RMSE of the samples' mean [m]"),
-        (axes[1, 0], "nll", "negative log-likelihood [nats]"),
+        (axes[1, 0], "coverage", "share of truths within the central 90 % of the samples"),
         (axes[1, 1], "miss_by_step", f"share more than {threshold_m:g} m off"),
     ):
         plot_by_horizon(ax, [a for a in result.lines if getattr(a, quantity)], result.dt_s, quantity, label)

@@ -115,11 +115,8 @@ class EgoWorld:
         self.env.close()
 
     def _seen(self) -> Any:
-        """Returns the driver's observation: the env's own, or with forecasts (the most likely of several)."""
-        if not self._whole:
-            return self.observation["observation"]
-        forecast = self.observation["forecast"]
-        return {**self.observation, "forecast": forecast[:, 0] if forecast.ndim == 4 else forecast}
+        """Returns the driver's observation: the env's own, or with forecasts."""
+        return self.observation if self._whole else self.observation["observation"]
 
 
 class MultiagentWorld:
@@ -183,7 +180,6 @@ def open_world(
     checkpoint: str | None = None,
     *,
     horizon_steps: int | None = None,
-    num_samples: int = 1,
 ) -> World:
     """Makes an environment with a driver, and with forecasts if a checkpoint is given.
 
@@ -194,16 +190,13 @@ def open_world(
         checkpoint: checkpoint of the forecasts; None makes no forecasts for an ego, and for many learners those that
             the driver was trained on, or constant velocity.
         horizon_steps: number of steps to forecast.
-        num_samples: number of forecasts per agent.
 
     Raises:
         UserError: unknown env, driver or checkpoint, or ones that do not fit together.
     """
     if is_multiagent_id(env_id):
         checkpoint = checkpoint or _forecaster_for(env_id, driver)
-        wrapped = ForecastParallelEnv(
-            make_multiagent_env(env_id), checkpoint, horizon_steps=horizon_steps, num_samples=num_samples
-        )
+        wrapped = ForecastParallelEnv(make_multiagent_env(env_id), checkpoint, horizon_steps=horizon_steps)
         multiagent = MultiagentWorld(wrapped, driver)
         if sees_forecasts(driver):
             space: Any = wrapped.observation_space(wrapped.possible_agents[0])
@@ -221,9 +214,7 @@ def open_world(
             require_forecaster(driver, checkpoint, space, seen.get_wrapper_attr("scene_spec"))
         else:
             require_view(env, driver)
-        world = EgoWorld(
-            ForecastObservation(env, checkpoint, horizon_steps=horizon_steps, num_samples=num_samples), driver
-        )
+        world = EgoWorld(ForecastObservation(env, checkpoint, horizon_steps=horizon_steps), driver)
     make_ego_driver(driver, world.env, np.random.default_rng(0))
     return world
 

@@ -12,9 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from predictor.forecaster import Belief, Futures, Memory, edgeless_belief
-from predictor.noise import Noise
+from predictor.noise import Noise, normal_of_agents
 from predictor.scene import SceneSpec
-from predictor.support.errors import UserError
 
 
 class ConstantVelocity:
@@ -93,7 +92,7 @@ class NoisyConstantVelocity(ConstantVelocity):
         belief: Belief,
         horizon_steps: int,
         num_samples: int = 1,
-        generator: torch.Generator | Sequence[np.random.Generator] | None = None,
+        generator: Noise | None = None,
     ) -> Futures:
         """Returns constant velocity as sample 0, and samples with noise; each one's velocity follows its positions.
 
@@ -104,31 +103,10 @@ class NoisyConstantVelocity(ConstantVelocity):
         """
         future = super().rollout(belief, horizon_steps, num_samples).states.clone()
         axes = self.spec.position_dim
-        drawn = _normal(belief.valid, num_samples - 1, axes, generator).to(future)[..., None, :]
+        drawn = normal_of_agents(generator, belief.valid, num_samples - 1, axes).to(future)[..., None, :]
         time_s = self.spec.dt_s * torch.arange(1, horizon_steps + 1, dtype=future.dtype, device=future.device)
         spread_m = self.noise_m * time_s**self.growth
         added_m = spread_m.diff(prepend=spread_m.new_zeros(1))
         future[:, 1:, ..., :axes] += drawn * spread_m[:, None]
         future[:, 1:, ..., axes : 2 * axes] += drawn * added_m[:, None] / self.spec.dt_s
         return Futures(future)
-
-
-def _normal(
-    valid: Bool[Tensor, "batch agents"],
-    samples: int,
-    axes: int,
-    generator: torch.Generator | Sequence[np.random.Generator] | None,
-) -> Float[Tensor, "batch samples agents axes"]:
-    """Draws standard normal numbers; with one generator per scene, only for present agents."""
-    shape = (len(valid), samples, valid.shape[1], axes)
-    if generator is None or isinstance(generator, torch.Generator):
-        return torch.randn(shape, device=valid.device, generator=generator)
-    if len(generator) != len(valid):
-        raise UserError(
-            f"noise needs one generator per scene, got {len(generator)} for {len(valid)}; pass one for each"
-        )
-    drawn = torch.zeros(shape)
-    for scene, (own, present) in enumerate(zip(generator, valid.cpu(), strict=True)):
-        numbers = own.standard_normal((samples, int(present.sum()), axes), dtype=np.float32)
-        drawn[scene, :, present] = torch.from_numpy(numbers)
-    return drawn

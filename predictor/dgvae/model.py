@@ -35,9 +35,9 @@ from predictor.dgvae.networks import (
 )
 from predictor.dgvae.packing import Packed, Padded
 from predictor.dgvae.motion import Context, Motion
-from predictor.dgvae.pair_matching import running_mean, running_mean_step, window_mean
+from predictor.dgvae.reading import Reading
 from predictor.dgvae.self_edges import HeldType, SelfEdges
-from predictor.dgvae.single_step import Encoding, Internal, Layers, Modules, Past, Stepper, differentiable, unpacked
+from predictor.dgvae.single_step import Internal, Layers, Modules, Past, Stepper, differentiable, unpacked
 from predictor.forecaster import Belief, Futures, Memory, WindowOutput
 from predictor.graph import NO_AGENT, among_nearest, nearest, off_diagonal, others, pair_mask, self_pairs, with_diagonal
 from predictor.layers.rnn import masked_gru
@@ -97,6 +97,11 @@ class DGVAE(nn.Module):
         return self.config.edge_feature_dim
 
     @property
+    def has_scale(self) -> bool:
+        """Whether roll-outs come with a standard deviation around each sample."""
+        return self.self_edges is not None
+
+    @property
     def _slots(self) -> int:
         """Number of listed senders of an agent; 0 where slot j is agent j."""
         near = self.config.num_neighbours
@@ -148,7 +153,7 @@ class DGVAE(nn.Module):
             graph = Packed.of(padded, valid, self.self_edges is not None)
         (node, seen), pairs = memory.nodes, memory.pairs
         node_before, (hidden, cell, static) = graph.pack_nodes(node), map(graph.pack_pairs, pairs)
-        past, logits, features = self._encode_step(layers, states, valid, graph, Past(hidden, cell, static, seen))
+        past, logits, features = self._reading.step(layers, states, valid, graph, Past(hidden, cell, static, seen))
         probs = edge_probabilities(logits)
         own = None if self.self_edges is None else functional.elu(graph.own(past.hidden))
         held = None if self.self_edges is None or own is None else self.self_edges.hold(own)
@@ -158,7 +163,9 @@ class DGVAE(nn.Module):
         remembered = tuple(graph.unpack_pairs(t) for t in (past.hidden, past.cell, past.static))
         after = Memory((graph.unpack_nodes(node_after), past.seen), remembered, memory.senders)
         near = self.config.num_neighbours
-        shown = [t[:, :, : near or None] for t in (graph.unpack_pairs(probs, no_edge=True), graph.unpack_pairs(features))]
+        shown = [
+            t[:, :, : near or None] for t in (graph.unpack_pairs(probs, no_edge=True), graph.unpack_pairs(features))
+        ]
         senders = None if memory.senders is None else memory.senders[:, :, :near]
         return after, Belief(states, valid, *shown, known, senders)
 
@@ -253,10 +260,10 @@ class DGVAE(nn.Module):
         """
         inputs, graph = self.codec.inputs(states, valid), self._graph_of_window(states, valid)
         (node, seen), pairs = self._zero_memory(states.shape[0], states.shape[2], graph.present.shape[-1])
-        edges, features, past = self._encode(inputs, valid, graph, Past(*pairs, seen))
+        edges, features, past = self._reading.steps(inputs, valid, graph, Past(*pairs, seen))
         posterior = self.encoder.posterior_logits(edges, graph.present, graph.senders)
         sampled = self._sampler(generator)(posterior)
-        shown = self._match_window(edges.features, features, graph.present)
+        shown = self._reading.match_window(edges.features, features, graph.present)
         own = None if self.self_edges is None else functional.elu(graph.own(past.hidden))
         held = None if self.self_edges is None or own is None else self.self_edges.hold(own)
         layer = self.decoder.pair_layer(inputs, shown, graph.senders)
@@ -375,6 +382,10 @@ class DGVAE(nn.Module):
         return Modules(self.encoder, self.decoder, self.self_edges)
 
     @property
+    def _reading(self) -> Reading:
+        return Reading(self.codec, self.encoder, self.config, self._per_change)
+
+    @property
     def _motion(self) -> Motion:
         return Motion(self.codec, self.decoder, self.self_edges, self.config.substeps)
 
@@ -386,56 +397,6 @@ class DGVAE(nn.Module):
         if self._stepper is None or not self._stepper.is_current(self.encoder, self.decoder, self.self_edges):
             self._stepper = Stepper(self.encoder, self.decoder, self.self_edges)
         return self._stepper
-
-    def _encode(self, inputs: Tensor, valid: Tensor, graph: Padded, past: Past) -> Encoding:
-        """Encodes several steps after `past`."""
-        inputs, seen = self._with_changes(inputs, valid, past.seen)
-        edges = self.encoder(inputs, graph.present, past.hidden, past.cell, graph.senders)
-        features, static = self._match(edges.features, graph.present, past.static)
-        return Encoding(edges, features, Past(edges.hidden, edges.cell, static, seen))
-
-    def _encode_step(
-        self, layers: Layers, states: Tensor, valid: Tensor, graph: Padded | Packed, past: Past
-    ) -> tuple[Past, Tensor, Tensor]:
-        """Encodes one step: returns memory, prior logits and features after it."""
-        inputs, seen = self.codec.inputs(states, valid), past.seen
-        if self.sees_changes:
-            steps, after = self._with_changes(inputs[:, None], valid[:, None], seen)
-            inputs, seen = steps[:, 0], after[:, 0]
-        inputs = graph.pack_nodes(inputs)
-        hidden, cell, logits, features = layers.encode(inputs, graph, past.hidden, past.cell)
-        static = past.static
-        if self.config.static_dim:
-            first = features[..., : self.config.static_dim]
-            static = running_mean_step(first, graph.among_pairs(static), static)
-            features = torch.cat([static[..., :-1], features[..., self.config.static_dim :]], dim=-1)
-        return Past(hidden, cell, static, seen), logits, features
-
-    def _with_changes(self, inputs: Tensor, valid: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the encoder's inputs at several steps, and its memory of each one for the next."""
-        if not self.sees_changes:
-            return inputs, inputs.new_zeros(*inputs.shape[:-1], 0)
-        seen = torch.cat([inputs, torch.ones_like(inputs[..., :1])], dim=-1) * valid[..., None]
-        earlier = torch.cat([before[:, None], seen[:, :-1]], dim=1)
-        known = earlier[..., -1:] * valid[..., None]
-        features = self.spec.num_features
-        changes = (inputs[..., :features] - earlier[..., :features]) * self._per_change * known
-        return torch.cat([inputs, changes], dim=-1), seen
-
-    def _match(self, features: Tensor, present: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
-        """Computes causal pair matching: features with running means as static dimensions, and these means."""
-        static = self.config.static_dim
-        if not static:
-            return features, features.new_zeros(*present.shape, 0)
-        mean = running_mean(features[..., :static], present, before)
-        return torch.cat([mean[..., :-1], features[..., static:]], dim=-1), mean
-
-    def _match_window(self, features: Tensor, causal: Tensor, present: Tensor) -> Tensor:
-        """Returns features for the teacher-forced pass, with static ones from the whole window if so configured."""
-        static = self.config.static_dim
-        if not static or self.config.pair_matching == "causal":
-            return causal
-        return torch.cat([window_mean(features[..., :static], present), features[..., static:]], dim=-1)
 
     def _free_run(
         self,
@@ -474,7 +435,7 @@ class DGVAE(nn.Module):
         future, (weights, features) = [states], edges
         for _ in range(horizon_steps - 1):
             if self.config.rollout_graph == "evolving":
-                past, logits, features = self._encode_step(layers, states, valid, graph, past)
+                past, logits, features = self._reading.step(layers, states, valid, graph, past)
                 weights = edge_probabilities(logits) if sampler is None else graph.per_pair(sampler, logits)
             node, states = self._motion.step(layers, states, valid, Context(graph, weights, features), node)
             future.append(states)

@@ -41,9 +41,7 @@ class SelfEdges(nn.Module):
         axes: number of axes of a position.
     """
 
-    def __init__(
-        self, inputs: int, memory: int, head: int, message: int, decoder: int, types: int, axes: int
-    ) -> None:
+    def __init__(self, inputs: int, memory: int, head: int, message: int, decoder: int, types: int, axes: int) -> None:
         """Creates the layers, in the order in which data passes them."""
         super().__init__()
         self.prior_head = nn.Sequential(nn.Linear(memory, head), nn.ELU(), nn.Linear(head, types))
@@ -54,9 +52,7 @@ class SelfEdges(nn.Module):
         self.out = nn.Linear(message, message)
         self.spread = nn.Linear(decoder, axes)
 
-    def hold(
-        self, past: Float[Tensor, "*agents memory"], types: Int[Tensor, "*agents"] | None = None
-    ) -> HeldType:
+    def hold(self, past: Float[Tensor, "*agents memory"], types: Int[Tensor, "*agents"] | None = None) -> HeldType:
         """Returns what the given types (None: type 0 for all) add, from the activated memory of each self-edge."""
         chosen: Tensor | int = 0 if types is None else types
         return HeldType(self.past(past), self.shift[chosen], self.gain[chosen])

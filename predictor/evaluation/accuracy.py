@@ -39,7 +39,12 @@ __all__ = [
 
 OPTIONAL = ("coverage", "mixture_nll")
 """Names of quantities that are left out, not NaN, if they could not be measured."""
-SCALAR_NAMES = {"rmse_m": "overall_rmse_m", "coverage": "coverage"}
+SCALAR_NAMES = {
+    "rmse_m": "overall_rmse_m",
+    "coverage": "coverage",
+    "overlap": "overlap",
+    "true_overlap": "true_overlap",
+}
 """Names of the numbers over all steps, by name of the quantity at each step."""
 
 
@@ -84,6 +89,10 @@ class Accuracy:
     """Displacement of the single forecast at the last step [m]."""
     energy_m: float = math.nan
     """Energy score of the samples [m], a proper score; mean over the agents of `min_ade_m`."""
+    overlap: float = math.nan
+    """Share of an agent's steps at which it is nearer than `miss_threshold_m` to another agent of the same sample."""
+    true_overlap: float = math.nan
+    """The same share of the truth."""
     mixture_nll: list[float] = field(default_factory=list)
     """Negative log-likelihood [nats] under the predicted mixture at each step; empty without predicted scales."""
     scenes: int = 0
@@ -193,11 +202,19 @@ class Tally:
             **{
                 key: whole[key]
                 for key in (
-                    "min_ade_m", "min_fde_m", "min_joint_ade_m", "min_joint_fde_m", "miss_rate", "ade_m", "fde_m",
+                    "min_ade_m",
+                    "min_fde_m",
+                    "min_joint_ade_m",
+                    "min_joint_fde_m",
+                    "miss_rate",
+                    "ade_m",
+                    "fde_m",
                     "energy_m",
                 )
             },
             overall_rmse_m=math.sqrt(whole["rmse_m"]),
+            overlap=whole["overlap"],
+            true_overlap=whole["true_overlap"],
             by_step_m=steps["by_step_m"],
             miss_by_step=steps["miss_by_step"],
             miss_threshold_m=self._threshold_m,
@@ -249,6 +266,8 @@ class Tally:
             "fde_m": metrics.min_fde(forecast[:, :1], future, counted),
             "energy_m": energy_score(forecast, future, counted, outcome.mode_probs),
         }
+        values["overlap"] = metrics.overlap(forecast, valid, self._threshold_m, outcome.mode_probs)
+        values["true_overlap"] = metrics.overlap(future[:, None], valid, self._threshold_m)
         if outcome.scale is not None:
             probs = outcome.mode_probs
             if probs is None:

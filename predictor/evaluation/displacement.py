@@ -203,6 +203,29 @@ def coverage(
     return (torch.linalg.vector_norm(future - centre, dim=-1) <= limit).to(future.dtype), valid
 
 
+def overlap(
+    positions: Float[Tensor, "batch samples agents horizon axes"],
+    valid: Bool[Tensor, "batch agents horizon"],
+    distance_m: float,
+    mode_probs: Float[Tensor, "batch samples agents"] | None = None,
+) -> tuple[Float[Tensor, "batch agents horizon"], Bool[Tensor, "batch agents horizon"]]:
+    """Computes the probability that an agent is nearer to another one of the same sample than `distance_m`.
+
+    Args:
+        positions: sampled positions [m].
+        valid: which entries count.
+        distance_m: distance of two centres below which agents overlap [m].
+        mode_probs: probability of each sample; None for draws.
+    """
+    at_step = positions.transpose(2, 3)
+    apart = torch.cdist(at_step, at_step, compute_mode="donot_use_mm_for_euclid_dist")
+    there = valid.transpose(1, 2)[:, None]
+    alone = torch.eye(positions.shape[2], dtype=torch.bool, device=positions.device)
+    apart = apart.masked_fill(~(there[..., None] & there[..., None, :]) | alone, torch.inf)
+    hit = (apart.min(-1).values < distance_m).transpose(2, 3).to(positions.dtype)
+    return hit.mean(1) if mode_probs is None else (hit * mode_probs[..., None]).sum(1), valid
+
+
 def _mean_displacement(
     forecast: Float[Tensor, "batch samples agents horizon axes"],
     future: Float[Tensor, "batch agents horizon axes"],

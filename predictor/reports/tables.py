@@ -12,13 +12,17 @@ from predictor.evaluation.displacement import COVERAGE_SHARE
 from predictor.support import markdown
 
 SCALARS = (
+    "ADE₁ [m]",
+    "FDE₁ [m]",
     "minADE [m]",
     "minFDE [m]",
     "joint ADE [m]",
     "joint FDE [m]",
+    "energy [m]",
     "RMSE [m]",
     "missed",
     "cover",
+    "overlap",
 )
 """Headings of both accuracy tables between K and the steps."""
 
@@ -310,7 +314,9 @@ def accuracy_table(accuracies: Sequence[Accuracy], dt_s: float, title: str) -> T
         r"by time ahead: displacement of the best sample \[m] / RMSE of the mean \[m] / NLL \[nats], top to bottom; "
         f"± standard error over subsets of the windows; missed: final displacement above "
         f"{accuracies[0].miss_threshold_m:g} m; "
-        f"cover: truths within the central {100 * COVERAGE_SHARE:g} % of the samples"
+        f"ADE₁, FDE₁: single forecast; energy: energy score, lower is better; "
+        f"cover: truths within the central {100 * COVERAGE_SHARE:g} % of the samples; "
+        f"overlap: agents nearer than that to another one of the same sample (in truth)"
     )
     return table
 
@@ -347,9 +353,14 @@ def _scalar_cells(accuracy: Accuracy) -> list[str]:
         return _rounded_number(value, 3) + ("" if error is None else f" ± {_rounded_number(error, 3)}")
 
     lengths = [
-        metres(name) for name in ("min_ade_m", "min_fde_m", "min_joint_ade_m", "min_joint_fde_m", "overall_rmse_m")
-    ]
+        metres(name)
+        for name in (
+            "ade_m", "fde_m", "min_ade_m", "min_fde_m", "min_joint_ade_m", "min_joint_fde_m", "energy_m",
+            "overall_rmse_m",
+        )
+    ]  # fmt: skip
     miss = "–" if math.isnan(accuracy.miss_rate) else f"{100 * accuracy.miss_rate:.1f} %"
     share = accuracy.statistics.get("coverage")
     covered = "–" if share is None else f"{100 * share.mean:.0f} %"
-    return [*lengths, miss, covered]
+    hit = "–" if math.isnan(accuracy.overlap) else f"{100 * accuracy.overlap:.1f} ({100 * accuracy.true_overlap:.1f}) %"
+    return [*lengths, miss, covered, hit]

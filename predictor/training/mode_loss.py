@@ -46,6 +46,7 @@ def energy_terms(
     samples = torch.where(valid[:, None, :, :, None], samples, 0.0)
     target = torch.where(valid[..., None], truth / scales, 0.0)
     steps, there = valid.sum(-1).clamp(min=1), valid.any(-1)
+
     # per agent: [batch modes agents horizon state] -> [batch modes agents]
     def apart(first: Tensor, second: Tensor) -> Tensor:
         squared = (first - second).square()

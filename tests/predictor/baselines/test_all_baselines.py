@@ -157,7 +157,9 @@ def test_streaming_forecasts_what_the_window_does(kind: str, valid: Tensor, seed
         torch.testing.assert_close(streamed[index, 0], window.rollout[index], **METRES)
     for t, belief in enumerate(beliefs):
         if window.prior_logits is None:  # teacher forcing follows the same graph as streaming
-            torch.testing.assert_close(forecaster.rollout(belief, 1).states[:, 0, :, 0], window.one_step[:, t], **METRES)
+            torch.testing.assert_close(
+                forecaster.rollout(belief, 1).states[:, 0, :, 0], window.one_step[:, t], **METRES
+            )
         else:
             torch.testing.assert_close(belief.edge_probs, window.prior_logits[:, t].softmax(-1), **TOLERANCE)
 

@@ -31,9 +31,11 @@ def test_other_features_stay_as_they_are():
 
 def test_three_dimensions():
     layout = SceneSpec(0.5, ("world",) * 3, KINEMATIC_FEATURES_3D, (1.0,) * 6)
-    future = ConstantVelocity(layout).rollout(
-        observe(ConstantVelocity(layout), torch.tensor([[[1.0, 2.0, 3.0, 4.0, 0.0, -2.0]]])), 2
-    ).states
+    future = (
+        ConstantVelocity(layout)
+        .rollout(observe(ConstantVelocity(layout), torch.tensor([[[1.0, 2.0, 3.0, 4.0, 0.0, -2.0]]])), 2)
+        .states
+    )
     assert future[0, 0, 0].tolist() == [[3.0, 2.0, 2.0, 4.0, 0.0, -2.0], [5.0, 2.0, 1.0, 4.0, 0.0, -2.0]]
 
 

@@ -181,9 +181,13 @@ def one_dimensional(*moves_m: float, horizon_steps: int = 1, k: int = 5) -> Near
 def test_samples_are_the_mean_and_then_single_neighbours_over_and_over():
     forecaster = one_dimensional(10.0, 20.0, 40.0, 80.0, k=3)
     belief = observe(forecaster, torch.tensor([[[1.9, 0.0, 0.0, 0.0]]]))
-    assert forecaster.rollout(belief, 1, 6).states[0, :, 0, 0, 1].tolist() == pytest.approx([140 / 3, 40, 20, 80, 40, 20])
+    assert forecaster.rollout(belief, 1, 6).states[0, :, 0, 0, 1].tolist() == pytest.approx(
+        [140 / 3, 40, 20, 80, 40, 20]
+    )
     assert forecaster.rollout(belief, 1, 1).states.shape == (1, 1, 1, 1, 4)
-    assert torch.equal(forecaster.rollout(belief, 1, 6).states, forecaster.rollout(belief, 1, 6, torch.Generator()).states)
+    assert torch.equal(
+        forecaster.rollout(belief, 1, 6).states, forecaster.rollout(belief, 1, 6, torch.Generator()).states
+    )
 
 
 def test_with_fewer_examples_than_k_all_are_averaged():

@@ -452,7 +452,9 @@ def test_samples_belong_to_their_scene(belief: Belief):
 
 def test_longer_horizons_continue_shorter_ones(belief: Belief):
     forecaster = model(num_edge_types=3)
-    torch.testing.assert_close(forecaster.rollout(belief, 5).states[..., :3, :], forecaster.rollout(belief, 3).states, **TOLERANCE)
+    torch.testing.assert_close(
+        forecaster.rollout(belief, 5).states[..., :3, :], forecaster.rollout(belief, 3).states, **TOLERANCE
+    )
 
 
 # --- Training pass and config -----------------------------------------------------------------------------------------

@@ -94,7 +94,8 @@ def streamed(forecaster: DGVAE, states: Tensor, valid: Tensor) -> dict[str, Tens
     return {
         "probs": torch.stack([b.edge_probs for b in dense], dim=1),
         "features": torch.stack([b.edge_features for b in dense], dim=1),
-        "rollout": torch.stack([forecaster.rollout(b, HORIZON).states[:, 0] for b in beliefs], dim=1) * valid[..., None, None],
+        "rollout": torch.stack([forecaster.rollout(b, HORIZON).states[:, 0] for b in beliefs], dim=1)
+        * valid[..., None, None],
     }
 
 
@@ -366,7 +367,8 @@ def test_a_dense_belief_rolls_out_as_the_original(near: int, frozen: bool, sampl
     forecaster = precise("fast", near, frozen=frozen)
     _, belief = list(stream(forecaster, scenes(0), torch.ones(BATCH, TIME, AGENTS).bool()))[-1]
     ours, expected = (
-        forecaster.rollout(b, HORIZON, samples, torch.Generator().manual_seed(0)).states for b in (belief.dense(), belief)
+        forecaster.rollout(b, HORIZON, samples, torch.Generator().manual_seed(0)).states
+        for b in (belief.dense(), belief)
     )
     torch.testing.assert_close(ours, expected, **EXACT)
 

@@ -1,0 +1,98 @@
+"""Another forecaster's single forecast plus Gaussian noise: the control of every model that claims to be stochastic.
+
+A model's samples are worth something only if they are better than its own best guess with noise of the right size.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from predictor.forecaster import Belief, Forecaster, Futures, Memory
+from predictor.noise import Noise, normal_of_agents
+from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
+
+LEAST_STD_M = 1e-6
+"""Standard deviation that is added to every coordinate, so that the covariance has a root [m]."""
+
+
+class GaussianResidual:
+    """Forecaster whose samples are another one's single forecast plus noise of one fitted covariance.
+
+    The covariance is that of the errors over all steps and axes, so noise is correlated in time as errors are. Agents
+    draw independently. Velocities follow the positions' noise; other features are those of the single forecast.
+
+    Args:
+        forecaster: source of the single forecast, memory and beliefs.
+        covariance: covariance of an agent's error [m²], steps × axes in this order.
+    """
+
+    def __init__(self, forecaster: Forecaster, covariance: Float[np.ndarray, "steps_and_axes steps_and_axes"]) -> None:
+        """Computes the root of the covariance."""
+        self.forecaster = forecaster
+        axes = forecaster.spec.position_dim
+        self.horizon_steps = len(covariance) // axes
+        root = np.linalg.cholesky(covariance + LEAST_STD_M**2 * np.eye(len(covariance)))
+        self._root = torch.from_numpy(root).float()
+
+    @classmethod
+    def fit(
+        cls,
+        forecaster: Forecaster,
+        errors_m: Float[np.ndarray, "examples horizon axes"],
+    ) -> "GaussianResidual":
+        """Fits the covariance to errors of the single forecast on training data.
+
+        Raises:
+            UserError: there are fewer errors than coordinates.
+        """
+        flat = errors_m.reshape(len(errors_m), -1).astype(np.float64)
+        if len(flat) <= flat.shape[1]:
+            raise UserError(f"a covariance of {flat.shape[1]} coordinates needs more examples, got {len(flat)}")
+        return cls(forecaster, flat.T @ flat / len(flat))
+
+    @property
+    def spec(self) -> SceneSpec:
+        """Layout of the scenes."""
+        return self.forecaster.spec
+
+    @property
+    def num_edge_types(self) -> int:
+        """Number of edge types."""
+        return self.forecaster.num_edge_types
+
+    @property
+    def edge_feature_dim(self) -> int:
+        """Number of features of an edge."""
+        return self.forecaster.edge_feature_dim
+
+    def empty_memory(self, batch: int, agents: int) -> Memory:
+        """Returns the forecaster's memory before any observation."""
+        return self.forecaster.empty_memory(batch, agents)
+
+    def observe(
+        self, memory: Memory, states: Float[Tensor, "batch agents state"], valid: Bool[Tensor, "batch agents"]
+    ) -> tuple[Memory, Belief]:
+        """Lets the forecaster observe."""
+        return self.forecaster.observe(memory, states, valid)
+
+    def rollout(
+        self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
+    ) -> Futures:
+        """Returns the single forecast as sample 0, and draws around it.
+
+        Raises:
+            UserError: `horizon_steps` is larger than the fitted one.
+        """
+        if horizon_steps > self.horizon_steps:
+            raise UserError(f"the noise was fitted to {self.horizon_steps} steps, got horizon_steps={horizon_steps}")
+        single = self.forecaster.rollout(belief, horizon_steps, 1).states
+        axes = self.spec.position_dim
+        future = single.repeat(1, num_samples, 1, 1, 1)
+        drawn = normal_of_agents(generator, belief.valid, num_samples - 1, len(self._root)).to(future)
+        noise = (drawn @ self._root.to(future).T).unflatten(-1, (self.horizon_steps, axes))[..., :horizon_steps, :]
+        future[:, 1:, ..., :axes] += noise
+        change = noise.diff(dim=-2, prepend=torch.zeros_like(noise[..., :1, :]))
+        future[:, 1:, ..., axes : 2 * axes] += change / self.spec.dt_s
+        return Futures(future)

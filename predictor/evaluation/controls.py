@@ -1,0 +1,48 @@
+"""Fits the stochastic controls to training data: constant velocity with noise, and a forecast with Gaussian noise."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
+from predictor.baselines.gaussian_residual import GaussianResidual
+from predictor.data.store import Episode, read_store
+from predictor.data.windows import Windows
+from predictor.evaluation.accuracy import fitted_std_m
+from predictor.evaluation.outcomes import run_windows
+from predictor.forecaster import Forecaster
+from predictor.scene import SceneSpec
+
+MOST_WINDOWS = 2000
+"""Largest number of windows to which a control is fitted; of more, this many are drawn."""
+HISTORY_STEPS = 10
+"""Number of observed steps of these windows."""
+
+
+def training_windows(stores: Sequence[Path], spec: SceneSpec, horizon_steps: int) -> Windows:
+    """Returns windows of recorded episodes whose future is known over the whole horizon."""
+    episodes: list[Episode] = [episode for store in stores for episode in read_store(store).episodes]
+    return Windows(episodes, spec, HISTORY_STEPS, horizon_steps, min_future_steps=horizon_steps)
+
+
+def fit_noise(windows: Windows, horizon_steps: int, seed: int = 0) -> NoisyConstantVelocity:
+    """Fits the two parameters of constant velocity with noise."""
+    straight = ConstantVelocity(windows.spec, horizon_steps)
+    outcomes = run_windows(straight, windows, _drawn(windows, seed), horizon_steps)
+    return NoisyConstantVelocity.fit(windows.spec, fitted_std_m(outcomes))
+
+
+def fit_residual(
+    forecaster: Forecaster, windows: Windows, horizon_steps: int, seed: int = 0, device: str = "cpu"
+) -> GaussianResidual:
+    """Fits the covariance of a forecaster's errors."""
+    errors = []
+    for outcome in run_windows(forecaster, windows, _drawn(windows, seed), horizon_steps, device=device):
+        whole = outcome.valid.all(-1)
+        errors.append((outcome.future - outcome.forecast[:, 0])[whole].cpu().numpy())
+    return GaussianResidual.fit(forecaster, np.concatenate(errors))
+
+
+def _drawn(windows: Windows, seed: int) -> np.ndarray:
+    return np.random.default_rng([seed, 3]).permutation(len(windows))[:MOST_WINDOWS]
