@@ -250,6 +250,14 @@ def test_run_folder_says_how_it_was_made(tiny: None, circles: Path, tmp_path: Pa
     assert sorted(p.name for p in out.iterdir()) == ["checkpoint", "config.json", "tb", "train_state.pt"]
 
 
+def test_what_a_killed_save_left_is_deleted(tiny: None, circles: Path, tmp_path: Path):
+    out = tmp_path / "run"
+    (out / ".checkpoint.0a1b2c3d.partial").mkdir(parents=True)
+    (out / ".train_state.pt.0a1b2c3d.partial.pt").write_text("half")
+    train(config(circles, out, steps=2))
+    assert not list(out.glob(".*"))
+
+
 def test_finished_run_is_left_as_it_is(tiny: None, circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     settings = config(circles, tmp_path / "run")
     train(settings)
