@@ -35,7 +35,7 @@ from predictor.dgvae.single_step import Encoding, Internal, Layers, Modules, Pas
 from predictor.forecaster import Belief, Memory, WindowOutput
 from predictor.graph import NO_AGENT, among_nearest, nearest, off_diagonal, others, pair_mask, with_diagonal
 from predictor.layers.rnn import masked_gru
-from predictor.layers.state_codec import StateCodec
+from predictor.layers.state_codec import StateCodec, check_scales
 from predictor.noise import Noise, PairNoise, noise_of_pairs
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
@@ -68,8 +68,8 @@ class DGVAE(nn.Module):
         self.horizon_steps = horizon_steps
         self.codec = StateCodec(spec, config.delta_scales, config.residual, config.input_scales)
         self.sees_changes = bool(config.change_scales)
-        if self.sees_changes and len(config.change_scales) != spec.num_features:
-            raise UserError(f"change_scales needs {spec.num_features} numbers, got {config.change_scales}")
+        if self.sees_changes:
+            check_scales("change_scales", config.change_scales, spec)
         inputs = self.codec.num_inputs
         self.encoder = Encoder(config, inputs + spec.num_features * self.sees_changes)
         self.decoder = Decoder(config, inputs, spec.num_features)

@@ -79,7 +79,7 @@ def linear_r2(
     order = np.random.default_rng(seed).permutation(len(valid))
     fit, score = order[: len(order) // 2], order[len(order) // 2 :]
     known, answers = features[fit][valid[fit]].astype(np.float64), target[fit][valid[fit]].astype(np.float64)
-    if len(answers) < 2:
+    if min(len(answers), int(valid[score].sum())) < 2:
         return None
     scaler, penalty = sklearn("preprocessing").StandardScaler(), ridge * len(known)
     model = sklearn("pipeline").make_pipeline(scaler, sklearn("linear_model").Ridge(penalty)).fit(known, answers)
