@@ -115,7 +115,8 @@ class Scene:
     """All agents at one instant, padded to a fixed number."""
 
     states: Float[np.ndarray, "agents state"]
-    """States in the world frame, SI units, float64; agent 0 is the ego. Finite, padded agents included."""
+    """States in the world frame, SI units, float64; agent 0 is the ego where there is one. Finite, also those of padded
+    agents."""
     ids: Int[np.ndarray, " agents"]
     """Identity of each agent, constant from step to step; -1 for padded agents."""
     valid: Bool[np.ndarray, " agents"]

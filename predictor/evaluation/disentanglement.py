@@ -6,7 +6,7 @@ the mean alone. A number that is not defined (nothing valid, a constant target) 
 
 Sources: DCI, Eastwood & Williams, "A Framework for the Quantitative Evaluation of Disentangled Representations", ICLR
 2018; MIG, Chen et al., "Isolating Sources of Disentanglement in VAEs", NeurIPS 2018 (histograms as in Locatello et al.,
-ICML 2019). All but `direct_r2` needs scikit-learn (the `scores` extra).
+ICML 2019). All functions but `direct_r2` need scikit-learn (the `scores` extra).
 """
 
 import importlib

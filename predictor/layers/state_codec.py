@@ -1,6 +1,6 @@
 """Conversion of states to network inputs and back: scaling, frames, and how a predicted change is added.
 
-All forecasters share it, so that a comparison of models is not a comparison of normalisations.
+All trainable models share it, so that a comparison of models is not a comparison of normalisations.
 """
 
 import math
