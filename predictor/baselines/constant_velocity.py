@@ -93,7 +93,7 @@ class NoisyConstantVelocity(ConstantVelocity):
         belief: Belief,
         horizon_steps: int,
         num_samples: int = 1,
-        generator: torch.Generator | Sequence[np.random.Generator] | None = None,
+        generator: Noise | None = None,
     ) -> Float[Tensor, "batch samples agents horizon state"]:
         """Returns constant velocity as sample 0, and samples with noise; each one's velocity follows its positions.
 
@@ -117,7 +117,7 @@ def _normal(
     valid: Bool[Tensor, "batch agents"],
     samples: int,
     axes: int,
-    generator: torch.Generator | Sequence[np.random.Generator] | None,
+    generator: Noise | None,
 ) -> Float[Tensor, "batch samples agents axes"]:
     """Draws standard normal numbers; with one generator per scene, only for present agents."""
     shape = (len(valid), samples, valid.shape[1], axes)

@@ -23,7 +23,6 @@ from predictor.dgvae.networks import (
     PRESETS,
     Decoder,
     DGVAEConfig,
-    Edges,
     Encoder,
     concrete_sample,
     edge_probabilities,
@@ -39,8 +38,6 @@ from predictor.layers.state_codec import StateCodec, check_scales
 from predictor.noise import Noise, PairNoise, noise_of_pairs
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
-
-__all__ = ["DGVAE", "PRESETS", "DGVAEConfig", "Decoder", "Edges", "Encoder", "WindowOutput", "concrete_sample"]
 
 
 class DGVAE(nn.Module):

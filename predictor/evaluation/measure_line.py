@@ -104,7 +104,7 @@ def _measure_store(
         horizon_only.add(outcome.tail(HORIZON_STEPS))
         assert outcome.edge_probs is not None and outcome.present is not None
         pairs = pair_mask(outcome.present)
-        graph.add(outcome.edge_probs, _binary(outcome, forecaster.num_edge_types), pairs)
+        graph.add(outcome.edge_probs, _known_types(outcome, forecaster.num_edge_types), pairs)
         entropies.append(edge_entropy(outcome.edge_probs, pairs)[0][pairs].cpu())
         if line.model in FEATURED:
             features.add(outcome)
@@ -129,7 +129,7 @@ def _peak_memory_mb(device: str) -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def _binary(outcome: Outcome, num_types: int) -> torch.Tensor | None:
+def _known_types(outcome: Outcome, num_types: int) -> torch.Tensor | None:
     """Returns the true types, limited to those that the model has."""
     return None if outcome.edge_types is None else outcome.edge_types.clamp(-1, num_types - 1)
 
