@@ -12,6 +12,7 @@ from predictor.checkpoint import WEIGHTS, CheckpointInfo, load_checkpoint, name_
 from predictor.data.store import EpisodeStore, read_store
 from predictor.evaluation.in_env_record import measurements_of, update_record
 from predictor.reports.in_env_tables import card_section
+from predictor.reports.tables import MODEL_NAMES
 from predictor.support.command_line import parse
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_text
@@ -33,7 +34,8 @@ def write_card(config: CardConfig) -> Path:
     """Writes the card and the record of measurements; returns the card's path.
 
     Raises:
-        UserError: an input is unreadable, or the accuracy has no result for this checkpoint.
+        UserError: an input is unreadable, the accuracy has no result for this checkpoint, or the checkpoint does not
+            say how it was trained. Nothing is written then.
     """
     model, info = load_checkpoint(config.checkpoint)
     folder, name = resolve(config.checkpoint), name_of_folder(config.checkpoint)
@@ -45,15 +47,18 @@ def write_card(config: CardConfig) -> Path:
         raise UserError(f"{config.accuracy} is not an accuracy.json of envs.evaluate ({error})") from error
     if not found:
         raise UserError(f"{config.accuracy} has no result of checkpoint '{name}'; run envs.evaluate on it")
+    stores = "\n".join(_store_line(path, read_store(path)) for path in config.data)
+    training = _training(name, info)
+    # only now that all inputs are read: a new record beside an old card would contradict it
     measured = [m for m in update_record(folder, found) if m.samples == found[0].samples]
     ego = "the ego included" if info.spec.has_ego else "no ego"
     left_out = "the ego itself is not counted" if info.spec.has_ego else "what never moves is not counted"
-    parameters = sum(p.numel() for p in model.parameters())
+    kind, parameters = MODEL_NAMES.get(info.model, info.model), sum(p.numel() for p in model.parameters())
     size_kb = (folder / WEIGHTS).stat().st_size / 1000
     text = "\n\n".join(
         [
             f"# Predictor checkpoint `{name}`",
-            f"dG-VAE, {parameters:,} parameters, {size_kb:.0f} kB of safetensors. Trained on recorded "
+            f"{kind}, {parameters:,} parameters, {size_kb:.0f} kB of safetensors. Trained on recorded "
             f"{', '.join(info.sources)}; forecasts {info.horizon_steps} steps of {info.spec.dt_s:g} s. Sees at most "
             f"{info.spec.max_agents} agents ({ego}) within {info.spec.perception_m:g} m.",
             "## Accuracy in the live environment",
@@ -61,9 +66,9 @@ def write_card(config: CardConfig) -> Path:
             "memoryless nearest neighbours on the training data. Intervals: bootstrap over episodes.",
             f"<!-- table: accuracy -->\n\n{card_section(measured)}\n\n<!-- end -->",
             "## Data",
-            "\n".join(_store_line(path, read_store(path)) for path in config.data),
+            stores,
             "## Training",
-            _training(info),
+            training,
             "## Limits",
             "It knows the traffic of the simulator named above and nothing else: fixed maps are memorised, drivers are "
             "those of the simulator. The spread of its samples is not calibrated; where a driver's route is free, the "
@@ -80,8 +85,13 @@ def _store_line(path: Path, store: EpisodeStore) -> str:
     return f"* {store.info.source}: {len(store.episodes)} episodes, {store.num_steps} scenes. `{made.get('command')}`"
 
 
-def _training(info: CheckpointInfo) -> str:
-    made, result = info.provenance, info.provenance["result"]
+def _training(name: str, info: CheckpointInfo) -> str:
+    made = info.provenance
+    if "result" not in made:
+        raise UserError(
+            f"checkpoint '{name}' does not say how it was trained; write cards of checkpoints of predictor.train"
+        )
+    result = made["result"]
     versions = ", ".join(f"{k} {v}" for k, v in made["versions"].items())
     return (
         f"`{made['command']}`\n\nSeed {made['train_config']['seed']}, commit {made['commit']}, {versions}. Best "

@@ -94,16 +94,18 @@ def load_checkpoint(name: str | Path, device: str = "cpu") -> tuple[Any, Checkpo
     """Loads a model for inference, by a shipped name or a folder.
 
     Raises:
-        UserError: the folder is not there, is not a predictor checkpoint, has another version, is truncated, or does
-            not fit its own config.
+        UserError: the name is "constant-velocity", which has no weights, or the folder is not there, is not a predictor
+            checkpoint, has another version, is truncated, or does not fit its own config.
     """
+    if str(name) == CONSTANT_VELOCITY:
+        raise UserError(f"'{name}' has no weights; pass a checkpoint")
     path = resolve(name)
     info = read_info(path)
     model = build(info.model, info.spec, info.config, info.horizon_steps)
     try:
         tensors = load_file(path / WEIGHTS)
     except (safetensors.SafetensorError, OSError) as error:
-        raise UserError(f"{path / 'model.safetensors'} cannot be read ({error}); copy or train it again") from error
+        raise UserError(f"{path / WEIGHTS} cannot be read ({error}); copy or train it again") from error
     expected = {k: tuple(v.shape) for k, v in model.state_dict().items()}
     found = {k: tuple(v.shape) for k, v in tensors.items()}
     if expected != found:

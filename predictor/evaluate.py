@@ -31,7 +31,7 @@ from predictor.scene import SceneSpec
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import write_json, write_text
+from predictor.support.files import check_out, write_json, write_text
 from predictor.support.provenance import provenance
 from predictor.support.runtime import resolve_device, tune
 
@@ -84,12 +84,15 @@ def evaluate(config: EvaluateConfig) -> list[Accuracy]:
     """Returns the accuracy of the model (K = 1 and `num_samples`) and of constant velocity without and with noise.
 
     Raises:
-        UserError: checkpoint or store is unreadable, their specs differ, or no episode is as long as the horizon.
+        UserError: `out` is a file, checkpoint or store is unreadable, their specs differ, or no episode is as long as
+            the horizon.
     """
     return _evaluate(config, _load(config))
 
 
 def _load(config: EvaluateConfig) -> _Subject:
+    if config.out is not None:
+        check_out(config.out)
     if config.checkpoint == CONSTANT_VELOCITY:
         store = read_store(config.data)
         spec = store.info.spec

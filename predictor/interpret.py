@@ -34,7 +34,7 @@ from predictor.scene import SceneSpec
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import scratch_folder, write_json, write_text
+from predictor.support.files import check_out, scratch_folder, write_json, write_text
 from predictor.support.provenance import provenance
 from predictor.support.runtime import resolve_device
 
@@ -86,8 +86,7 @@ def interpret(config: InterpretConfig) -> Findings:
         UserError: `out` is a file, the model has no edge features, the store does not fit it, or no window is long
             enough.
     """
-    if config.out.exists() and not config.out.is_dir():
-        raise UserError(f"out must be a folder, but {config.out} is a file; choose another path")
+    check_out(config.out)
     model, info = _load_model(config.checkpoint, config.device)
     store = read_store(config.data)
     info.spec.check_compatible(store.info.spec, f"checkpoint '{config.checkpoint}'", f"store {config.data}")

@@ -1,6 +1,6 @@
 """Every trainable forecaster by name: its config class, its network, and how a config is put together.
 
-Checkpoints, training and the suite of tables build models here, so that a new model is one line.
+Checkpoints, training and the suite of tables build models here; a new model is added to `ModelName` and `KINDS`.
 """
 
 import dataclasses

@@ -58,7 +58,8 @@ class SceneSpec:
         if len(self.frame) != self.position_dim or not set(self.frame) <= {"ego", "world", "centroid"}:
             axes = {2: "two", 3: "three"}[self.position_dim]
             raise UserError(f"frame must be 'ego', 'world' or 'centroid' for each of {axes} axes, got {self.frame}")
-        if len(self.feature_scales) != len(self.feature_names) or min(self.feature_scales) <= 0:
+        positive = all(0 < scale < float("inf") for scale in self.feature_scales)
+        if len(self.feature_scales) != len(self.feature_names) or not positive:
             raise UserError(
                 f"feature_scales needs one positive number per feature ({len(self.feature_names)}), "
                 f"got {self.feature_scales}"
@@ -69,7 +70,7 @@ class SceneSpec:
                 f"constant_features must be among the features beyond velocity, got {self.constant_features} of "
                 f"{self.feature_names}"
             )
-        if self.max_agents < 1 or self.perception_m <= 0:
+        if self.max_agents < 1 or not self.perception_m > 0:
             raise UserError(
                 f"max_agents must be at least 1 and perception_m positive, got {self.max_agents}, {self.perception_m}"
             )
@@ -114,7 +115,8 @@ class Scene:
     """All agents at one instant, padded to a fixed number."""
 
     states: Float[np.ndarray, "agents state"]
-    """States in the world frame, SI units, float64; agent 0 is the ego. Finite, padded agents included."""
+    """States in the world frame, SI units, float64; agent 0 is the ego where there is one. Finite, also those of padded
+    agents."""
     ids: Int[np.ndarray, " agents"]
     """Identity of each agent, constant from step to step; -1 for padded agents."""
     valid: Bool[np.ndarray, " agents"]

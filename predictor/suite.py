@@ -21,7 +21,7 @@ from rich.progress import Progress
 
 from predictor.data.store import read_info_of
 from predictor.evaluation.disentanglement import sklearn
-from predictor.evaluation.measure_line import measure_line
+from predictor.evaluation.measure_line import FEATURED, measure_line
 from predictor.evaluation.paper_tables import BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, TABLES, Budget, Line, Sizes
 from predictor.reports.plots import plot_results_by_step
 from predictor.reports.tables import latex_table, markdown_report
@@ -160,7 +160,7 @@ def line_folder(config: SuiteConfig, line: Line) -> Path:
 
 def run_line(config: SuiteConfig, line: Line) -> dict[str, Any]:
     """Trains (or resumes) and measures one line; writes and returns its result."""
-    if read_info_of(config.data / TABLES[config.table].train).edge_attribute_names:
+    if line.model in FEATURED and read_info_of(config.data / TABLES[config.table].train).edge_attribute_names:
         sklearn("linear_model")  # raises before training, not after it
     folder = line_folder(config, line)
     folder.mkdir(parents=True, exist_ok=True)

@@ -14,10 +14,10 @@ import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch.utils.tensorboard import SummaryWriter
 
-from predictor.checkpoint import CheckpointInfo, save_checkpoint
+from predictor.checkpoint import BEST_OF_RUN, CheckpointInfo, save_checkpoint
 from predictor.support.command_line import parse
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import write_json
+from predictor.support.files import check_out, delete_leftovers, write_json
 from predictor.support.provenance import provenance
 from predictor.support.runtime import tune
 from predictor.training.config import TrainConfig
@@ -34,6 +34,7 @@ def train(config: TrainConfig) -> Path:
     data = load_data(config)
     trainer = Trainer(config, data)
     config.out.mkdir(parents=True, exist_ok=True)
+    delete_leftovers(config.out)  # of a run that was killed while it saved
     if config.resume and state_file.exists():
         trainer.restore(state_file)
     made = provenance(("torch", "numpy", "zarr", "safetensors"))
@@ -42,12 +43,12 @@ def train(config: TrainConfig) -> Path:
         _run(trainer, state_file, made)
     finally:
         trainer.close()
-    if not (config.out / "checkpoint").exists():
+    if not (config.out / BEST_OF_RUN).exists():
         raise UserError(
             f"no validation episode has {config.horizon_steps} steps of future, so no checkpoint was chosen; "
             "lower --horizon-steps or collect longer episodes"
         )
-    return config.out / "checkpoint"
+    return config.out / BEST_OF_RUN
 
 
 def _run(trainer: Trainer, state_file: Path, made: dict[str, Any]) -> None:
@@ -107,7 +108,7 @@ def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, 
             sources=trainer.data.sources,
             provenance=made | {"train_config": _comparable(trainer.config), "result": result},
         )
-        save_checkpoint(trainer.config.out / "checkpoint", trainer.model, info)
+        save_checkpoint(trainer.config.out / BEST_OF_RUN, trainer.model, info)
     else:
         trainer.stale += 1
     return (
@@ -128,6 +129,7 @@ def _comparable(config: TrainConfig) -> dict[str, Any]:
 
 
 def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
+    check_out(config.out)
     if not config_file.exists():
         if config.out.exists() and any(not p.name.startswith(".") for p in config.out.iterdir()):
             raise UserError(f"{config.out} is not empty and not a training run; choose another --out")

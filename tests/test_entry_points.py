@@ -31,6 +31,7 @@ ROOT = Path(__file__).resolve().parents[1]
 REFUSED: dict[str, list[tuple[str, str]]] = {
     "predictor.train": [
         ("--data absent --out new", "no episode store at absent"),
+        ("--data absent --out file", "file is a file; choose another --out"),
         ("--data absent --out new --steps -1", "steps must be at least 1, got -1"),
         ("--data absent --out new --likelihood gausian", "invalid choice 'gausian' for argument '--likelihood'"),
         ("--data absent --out new --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
@@ -39,6 +40,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     "predictor.evaluate": [
         ("--checkpoint absent --data absent", "no checkpoint 'absent'"),
         ("--checkpoint highway --data absent", "no episode store at absent"),
+        ("--checkpoint highway --data absent --out file", "file is a file; choose another --out"),
         ("--checkpoint highway --data absent --num-samples 0", "num_samples must be at least 1, got 0"),
         ("--checkpoint highway --data absent --seed -1", "seed must not be negative, got -1"),
         ("--checkpoint highway --data absent --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
@@ -53,12 +55,13 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     ],
     "predictor.interpret": [
         ("--checkpoint absent --data absent --out new", "no checkpoint 'absent'"),
-        ("--checkpoint highway --data absent --out file", "out must be a folder, but file is a file"),
+        ("--checkpoint highway --data absent --out file", "file is a file; choose another --out"),
         ("--checkpoint highway --data absent --out new --burn-in-steps 0", "burn_in_steps must be at least 1, got 0"),
         ("--checkpoint highway --data absent --out new --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
     ],
     "predictor.card": [("--checkpoint absent --data absent --accuracy absent", "no checkpoint 'absent'")],
     "predictor.data.springs": [
+        ("--out file", "file is a file; choose another --out"),
         ("--out new --train -1", "train must not be negative, got -1"),
         ("--out new --physics.num-agents 0", "num_agents must be positive, got 0"),
         ("--out new --physics.kind spring", "invalid choice 'spring' for argument '--physics.kind'"),

@@ -1,9 +1,9 @@
 """Plays an episode with forecasts and pairs them with the true futures, for `envs.evaluate`, which aggregates them.
 
-Measured is what the deployed wrapper forecasts from its own memory, with K samples; the policy's observation is cut from
-the same stream. With one ego, the agents that it perceives are measured, not the ego itself; in a PettingZoo
-environment all agents, since none is the ego. Landmarks are not measured. Controls, with as many samples, and ablations
-forecast the same scenes.
+Measured is what the deployed wrapper forecasts from its own memory, with K samples; the policy's observation is cut
+from the same stream. With one ego, the agents that it perceives are measured, not the ego itself; in a PettingZoo
+environment all agents, since none is the ego. Landmarks are not measured. Controls, with as many samples, and
+ablations forecast the same scenes.
 """
 
 import functools
@@ -152,7 +152,7 @@ def play(task: EpisodeTask) -> Episode:
     for step in range(task.max_steps + 1):
         scene = world.perceived()
         scenes.append(scene)
-        forecasts[MODEL].append(world.env.stream.again(task.samples))
+        forecasts[MODEL].append(world.forecast(task.samples))
         for key, forecaster in others.items():
             forecasts[key].append(forecaster(scene))
         episode.latencies_s.append(probe())

@@ -35,7 +35,7 @@ from envs.registry import (
 from envs.seeding import driver_rng
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import CONSTANT_VELOCITY
-from predictor.scene import Scene, SceneSpec
+from predictor.scene import Forecast, Scene, SceneSpec
 from predictor.support.errors import UserError
 
 
@@ -61,6 +61,9 @@ class World(Protocol):
 
     def labels(self) -> SceneLabels | None:
         """Returns the true edges between the agents of `full_scene`; None where the simulator has none."""
+
+    def forecast(self, num_samples: int) -> Forecast:
+        """Returns the deployed forecast of the perceived scene with this number of samples: a batch of one."""
 
     def close(self) -> None:
         """Closes the environment."""
@@ -105,6 +108,11 @@ class EgoWorld:
     def full_scene(self) -> Scene:
         """Returns all agents, ego first."""
         return self._reader.read_all(self.env)
+
+    def forecast(self, num_samples: int) -> Forecast:
+        """Returns the forecast of the perceived scene, from the wrapper's own stream."""
+        assert isinstance(self.env, ForecastObservation)
+        return self.env.stream.again(num_samples)
 
     def labels(self) -> SceneLabels | None:
         """Returns leaders and followers in highway-env; None elsewhere."""
@@ -160,6 +168,10 @@ class MultiagentWorld:
         """Returns all agents."""
         scene = self.env.scene.scene
         return Scene(scene.states[scene.valid], scene.ids[scene.valid], scene.valid[scene.valid])
+
+    def forecast(self, num_samples: int) -> Forecast:
+        """Returns the forecast of all agents, from the wrapper's own stream."""
+        return self.env.stream.again(num_samples)
 
     def labels(self) -> SceneLabels | None:
         """Returns None: no simulator with many learners has true edges."""

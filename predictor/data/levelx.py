@@ -20,7 +20,7 @@ from typing import Literal
 
 from predictor.data.dataset_card import DatasetNotes, most_present, save_dataset, summary
 from predictor.data.levelx_files import CLASS_FEATURES, Features, Layout, layout_of, open_recording, read_tracks
-from predictor.data.loading import NO_LIMIT_M, LoaderConfig, find_files, in_split, progressed, steps_per_frame
+from predictor.data.loading import NO_LIMIT_M, LoaderConfig, find_files, frames_per_step, in_split, progressed
 from predictor.data.store import Episode
 from predictor.data.tracks import cut_episodes
 from predictor.scene import KINEMATIC_FEATURES, SceneSpec
@@ -112,7 +112,7 @@ def load(config: LevelxConfig) -> tuple[Layout, list[Episode], DatasetNotes, lis
     )
     episodes: list[Episode] = []
     for recording in progressed(chosen, "levelx"):
-        stride = steps_per_frame(config.dt_s, recording.frames_per_s, f"recording {recording.name}")
+        stride = frames_per_step(config.dt_s, recording.frames_per_s, f"recording {recording.name}")
         points = read_tracks(recording, config.features, stride)
         counts["points kept"] += len(points)
         episodes += cut_episodes(points, config.episode_steps, f"{recording.location}/{recording.name}", counts)

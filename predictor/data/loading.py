@@ -114,7 +114,7 @@ def whole(text: str, name: str, path: Path, line: int, least: int | None = None)
     return number
 
 
-def steps_per_frame(dt_s: float, frames_per_s: float, source: str) -> int:
+def frames_per_step(dt_s: float, frames_per_s: float, source: str) -> int:
     """Returns the number of recorded frames in one step.
 
     Args:

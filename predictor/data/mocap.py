@@ -10,7 +10,7 @@ training. Of the 23 walking trials of subject 35 that are usually used (01–16,
 35_04, 35_14 and 35_29 for validation.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -140,7 +140,7 @@ def load(config: MocapConfig) -> tuple[Skeleton, list[Episode], DatasetNotes, li
         f"trials of split '{config.split}'": len(chosen),
         f"trials skipped, shorter than {config.min_steps} steps": skipped,
     }
-    numbered = [Episode(e.states, e.valid, e.ids, e.label, i) for i, e in enumerate(episodes)]
+    numbered = [replace(episode, seed=i) for i, episode in enumerate(episodes)]
     return skeleton, numbered, _notes(config, skeleton, counts), [*skeletons, *trials]
 
 

@@ -214,8 +214,6 @@ class Motion:
 
     values: Float[np.ndarray, "time channels"]
     """Angles [deg]; root translations in the file's unit."""
-    first_frame: int
-    """Number of the first frame; a trial may begin after frame 1."""
 
 
 def read_motion(path: Path, skeleton: Skeleton) -> Motion:
@@ -251,7 +249,7 @@ def read_motion(path: Path, skeleton: Skeleton) -> Motion:
     _check_frame(path, number, flags, set(columns) - seen)
     if not frames:
         raise UserError(f"{path} holds no frame; get the file anew")
-    return Motion(np.array(frames), first)
+    return Motion(np.array(frames))
 
 
 def _columns(skeleton: Skeleton) -> dict[str, slice]:

@@ -7,7 +7,7 @@ Position and velocity [m, m/s] from the middle of the court, x along it, and a c
 * `sportvu`: raw JSON of one game per file, in feet, 25 Hz; every third moment is kept, so a step is 0.12 s as well.
 
 Velocity is the backward difference over one step, so the first frame of a passage is dropped. Passages are cut into
-non-overlapping windows of `--window-steps` steps. Splits are by game: the position of SHA-256("3:<game>") in [0, 1)
+non-overlapping episodes of `--episode-steps` steps. Splits are by game: the position of SHA-256("3:<game>") in [0, 1)
 decides, below 0.1 test, below 0.2 validation, else training; the text files' own folders `train` and `test` share
 games.
 """
@@ -298,16 +298,16 @@ def game_of(path: Path, format: str) -> str:
     return "_".join(path.stem.split("_")[:3]) if format == "score" else path.stem
 
 
-def windows_of(passage: Passage, window_steps: int) -> list[Episode]:
-    """Cuts windows that do not overlap; the first frame of the passage is used for the first velocity only."""
+def episodes_of(passage: Passage, episode_steps: int) -> list[Episode]:
+    """Cuts episodes that do not overlap; the first frame of the passage is used for the first velocity only."""
     velocities_mps = np.diff(passage.positions_m, axis=0) / DT_S
     is_ball = np.zeros((*velocities_mps.shape[:2], 1))
     is_ball[:, 0] = 1.0
     states = np.concatenate([passage.positions_m[1:], velocities_mps, is_ball], axis=-1).astype(np.float32)
-    valid = np.ones((window_steps, ENTITIES), dtype=np.bool_)
+    valid = np.ones((episode_steps, ENTITIES), dtype=np.bool_)
     return [
-        Episode(states[begin : begin + window_steps], valid, passage.ids, passage.label)
-        for begin in range(0, len(states) - window_steps + 1, window_steps)
+        Episode(states[begin : begin + episode_steps], valid, passage.ids, passage.label)
+        for begin in range(0, len(states) - episode_steps + 1, episode_steps)
     ]
 
 
@@ -327,7 +327,7 @@ def load(config: NbaConfig) -> tuple[list[Episode], DatasetNotes, list[Path]]:
     episodes: list[Episode] = []
     for path in progressed(chosen, "nba"):
         for passage in _passages(path, config, counts):
-            found = windows_of(passage, config.episode_steps)
+            found = episodes_of(passage, config.episode_steps)
             counts[f"passages skipped, shorter than {config.episode_steps} steps"] += not found
             counts["steps dropped at the end of passages"] += (len(passage.positions_m) - 1) % config.episode_steps
             episodes += found
@@ -360,7 +360,7 @@ def _notes(config: NbaConfig, counts: Counter[str]) -> DatasetNotes:
             "The ball's height is not kept.",
             f"A step is {DT_S} s (25/3 Hz).",
             "Velocity is the backward difference over one step; the first frame of each passage is dropped.",
-            f"Passages are cut into windows of {config.episode_steps} steps that do not overlap; rests are dropped.",
+            f"Passages are cut into episodes of {config.episode_steps} steps that do not overlap; rests are dropped.",
             f"Splits by game, hash with seed {SPLIT_SEED}; 'all' takes every file of the source.",
         ),
         dict(counts),

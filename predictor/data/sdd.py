@@ -25,10 +25,10 @@ from predictor.data.loading import (
     bad_line,
     find_files,
     finite,
+    frames_per_step,
     in_split,
     progressed,
     read_lines,
-    steps_per_frame,
     whole,
 )
 from predictor.data.store import Episode
@@ -73,7 +73,7 @@ class SddConfig(LoaderConfig):
             UserError: a value out of range.
         """
         super().__post_init__()
-        steps_per_frame(self.dt_s, FRAMES_PER_S, "the dataset")
+        frames_per_step(self.dt_s, FRAMES_PER_S, "the dataset")
         check_at_least(self, 2, "episode_steps")
 
 
@@ -128,7 +128,7 @@ def read_annotations(path: Path, scale: float, config: SddConfig, counts: Counte
     Raises:
         UserError: a line is broken or repeats a track and frame; names file and line.
     """
-    stride = steps_per_frame(config.dt_s, FRAMES_PER_S, "the dataset")
+    stride = frames_per_step(config.dt_s, FRAMES_PER_S, "the dataset")
     steps, tracks, positions, classes = [], [], [], []
     seen: dict[tuple[int, int], int] = {}
     for number, text in enumerate(read_lines(path), start=1):
@@ -211,7 +211,7 @@ def _notes(config: SddConfig, counts: Counter[str]) -> DatasetNotes:
         RIGHTS,
         (
             "Centre of the box in pixels times the video's estimated scale; x to the right, y down.",
-            f"A step is {config.dt_s:g} s: every {steps_per_frame(config.dt_s, FRAMES_PER_S, '')}th frame is kept.",
+            f"A step is {config.dt_s:g} s: every {frames_per_step(config.dt_s, FRAMES_PER_S, '')}th frame is kept.",
             "Lines marked lost are dropped; occluded and interpolated ones are kept.",
             "Velocity is the backward difference over one step; a track's first step is dropped, and the first after "
             "a gap.",

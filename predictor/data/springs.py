@@ -22,6 +22,7 @@ from predictor.scene import SceneSpec
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices, check_positive
 from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import check_out
 from predictor.support.provenance import provenance
 
 DT_S = 1 / 6
@@ -233,7 +234,12 @@ def spring_spec(physics: Physics) -> SceneSpec:
 
 
 def make(config: SpringsConfig) -> dict[str, float]:
-    """Simulates and writes every split that has rollouts; returns the time of each [s]."""
+    """Simulates and writes every split that has rollouts; returns the time of each [s].
+
+    Raises:
+        UserError: `out` is a file, a split exists, or no split has rollouts.
+    """
+    check_out(config.out)
     took: dict[str, float] = {}
     attribute = "spring_constant" if config.physics.kind == "springs" else "charge_product"
     made = provenance(("torch", "numpy", "zarr"))

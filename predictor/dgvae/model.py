@@ -23,25 +23,24 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
+from predictor.dgvae.free_run import free_run, proceed
+from predictor.dgvae.motion import Context, Motion
 from predictor.dgvae.networks import (
     PRESETS,
     Decoder,
     DGVAEConfig,
-    Edges,
     Encoder,
     concrete_sample,
     edge_probabilities,
-    no_edge_where_absent,
 )
 from predictor.dgvae.packing import Packed, Padded
-from predictor.dgvae.motion import Context, Motion
 from predictor.dgvae.reading import Reading
-from predictor.dgvae.self_edges import HeldType, SelfEdges
+from predictor.dgvae.self_edges import SelfEdges
 from predictor.dgvae.single_step import Internal, Layers, Modules, Past, Stepper, differentiable, unpacked
+from predictor.dgvae.training_pass import TrainingPass
 from predictor.forecaster import Belief, Futures, Memory, WindowOutput
-from predictor.graph import NO_AGENT, among_nearest, nearest, off_diagonal, others, pair_mask, self_pairs, with_diagonal
-from predictor.layers.rnn import masked_gru
-from predictor.layers.state_codec import StateCodec
+from predictor.graph import NO_AGENT, nearest, pair_mask
+from predictor.layers.state_codec import StateCodec, check_scales
 from predictor.noise import Noise, PairNoise, noise_of_pairs, uniform_of_agents
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
@@ -72,8 +71,8 @@ class DGVAE(nn.Module):
         self.horizon_steps = horizon_steps
         self.codec = StateCodec(spec, config.delta_scales, config.residual, config.input_scales)
         self.sees_changes = bool(config.change_scales)
-        if self.sees_changes and len(config.change_scales) != spec.num_features:
-            raise UserError(f"change_scales needs {spec.num_features} numbers, got {config.change_scales}")
+        if self.sees_changes:
+            check_scales("change_scales", config.change_scales, spec)
         inputs = self.codec.num_inputs
         self.encoder = Encoder(config, inputs + spec.num_features * self.sees_changes)
         self.decoder = Decoder(config, inputs, spec.num_features)
@@ -162,12 +161,10 @@ class DGVAE(nn.Module):
         known = Internal(layers, graph, past, logits, probs, features, node_before, node_after, next_states, own)
         remembered = tuple(graph.unpack_pairs(t) for t in (past.hidden, past.cell, past.static))
         after = Memory((graph.unpack_nodes(node_after), past.seen), remembered, memory.senders)
-        near = self.config.num_neighbours
-        shown = [
-            t[:, :, : near or None] for t in (graph.unpack_pairs(probs, no_edge=True), graph.unpack_pairs(features))
-        ]
+        near = self.config.num_neighbours or None  # self-edges, in the slot after these, are not shown
+        shown_probs, shown_features = graph.unpack_pairs(probs, no_edge=True), graph.unpack_pairs(features)
         senders = None if memory.senders is None else memory.senders[:, :, :near]
-        return after, Belief(states, valid, *shown, known, senders)
+        return after, Belief(states, valid, shown_probs[:, :, :near], shown_features[:, :, :near], known, senders)
 
     def rollout(
         self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Noise | None = None
@@ -182,10 +179,11 @@ class DGVAE(nn.Module):
             known = unpacked(known, self._plain())
         if self.self_edges is not None:
             return self._modes(belief, known, horizon_steps, num_samples, generator)
-        layers, graph, edges = known.layers, known.graph, (known.probs, known.features)
-        future = self._continue(
-            layers, known.next_states, belief.valid, graph, known.past, known.node_after, edges, horizon_steps, None
-        )
+        layers, graph, motion, edges = known.layers, known.graph, self._motion, (known.probs, known.features)
+        future = proceed(
+            self._reading, motion, layers, known.next_states, belief.valid, graph, known.past, known.node_after, edges,
+            horizon_steps, None,
+        )  # fmt: skip
         if num_samples == 1:
             return Futures(future[:, None])
         draws = num_samples - 1
@@ -199,9 +197,9 @@ class DGVAE(nn.Module):
             for t in (known.past.hidden, known.past.cell, known.past.static, known.features, known.logits)
         )
         node = graph.repeat_nodes(known.node_before, draws)
-        drawn = self._free_run(
-            layers, states, valid, graph.repeat(draws), features, Past(hidden, cell, static, seen), node, logits,
-            horizon_steps, self._sampler(noise),
+        drawn = free_run(
+            self._reading, motion, layers, states, valid, graph.repeat(draws), features,
+            Past(hidden, cell, static, seen), node, logits, horizon_steps, self._sampler(noise),
         )  # fmt: skip
         return Futures(torch.cat([future[:, None], drawn.unflatten(0, (len(future), draws))], dim=1))
 
@@ -258,98 +256,9 @@ class DGVAE(nn.Module):
 
         A model with modes rolls out the first `num_modes` of them.
         """
-        inputs, graph = self.codec.inputs(states, valid), self._graph_of_window(states, valid)
-        (node, seen), pairs = self._zero_memory(states.shape[0], states.shape[2], graph.present.shape[-1])
-        edges, features, past = self._reading.steps(inputs, valid, graph, Past(*pairs, seen))
-        posterior = self.encoder.posterior_logits(edges, graph.present, graph.senders)
-        sampled = self._sampler(generator)(posterior)
-        shown = self._reading.match_window(edges.features, features, graph.present)
-        own = None if self.self_edges is None else functional.elu(graph.own(past.hidden))
-        held = None if self.self_edges is None or own is None else self.self_edges.hold(own)
-        layer = self.decoder.pair_layer(inputs, shown, graph.senders)
-        to_itself = self._to_itself(inputs, held)
-        messages = self.decoder.combine(inputs, layer, graph.present, sampled) + to_itself
-        nodes = masked_gru(messages, self.decoder.gru, valid, node)
-        context = Context(graph, sampled, shown, held)
-        one_step = self._motion.integrate(self._plain(), states, valid, context, self.decoder.change(nodes), messages)
-        outputs = self._dense(graph, edges.prior_logits, posterior, shown)
-        if not rollout_steps:
-            return WindowOutput(one_step, states.new_zeros(len(states), states.shape[2], 0, states.shape[3]), *outputs)
-
-        # the longest history; reading it from a GPU would wait for the device
-        steps = states.shape[1] if last_observed.is_cuda else int(last_observed.max())
-        expected = edge_probabilities(edges.prior_logits[:, :steps])
-        if shown is not features:
-            layer = self.decoder.pair_layer(inputs, features, graph.senders)
-        messages = self.decoder.combine(inputs[:, :steps], layer[:, :steps], graph.present[:, :steps], expected)
-        remembered = masked_gru(messages + to_itself[:, :steps], self.decoder.gru, valid[:, :steps], node)
-        burned_in = torch.cat([node[:, None], remembered], dim=1)
-        now = (torch.arange(len(states), device=states.device), last_observed)
-        begin = Padded(graph.present[now], graph.senders)
-        if self.self_edges is not None and own is not None:
-            modes = self._window_modes(
-                states[now], valid[now], begin, edges.prior_logits[now], features[now], own[now], burned_in[now],
-                rollout_steps, num_modes, generator,
-            )  # fmt: skip
-            return WindowOutput(one_step, modes.states[:, 0], *outputs, modes)
-        future = self._free_run(
-            self._plain(), states[now], valid[now], begin, features[now],
-            Past(*(t[now] for t in past)), burned_in[now], edges.prior_logits[now], rollout_steps,
-            self._sampler(generator),
-        )  # fmt: skip
-        return WindowOutput(one_step, future, *outputs)
-
-    def _to_itself(self, inputs: Tensor, held: HeldType | None) -> Tensor:
-        """Computes each agent's message to itself along its held type; zeros for a model without self-edges."""
-        if self.self_edges is None or held is None:
-            return inputs.new_zeros(())
-        message: Tensor = self.self_edges.out(self.self_edges.layer(inputs, held))
-        return message
-
-    def _window_modes(
-        self,
-        states: Tensor,
-        valid: Tensor,
-        graph: Padded,
-        logits: Tensor,
-        features: Tensor,
-        own: Tensor,
-        node: Tensor,
-        horizon_steps: int,
-        num_modes: int,
-        generator: torch.Generator | None,
-    ) -> Futures:
-        """Rolls out the first `num_modes` types of all agents along one draw of the edges."""
-        assert self.self_edges is not None
-        weights = self._sampler(generator)(logits)
-        types = torch.arange(num_modes, device=states.device).repeat(len(states))[:, None].expand(-1, states.shape[1])
-        repeated = [t.repeat_interleave(num_modes, dim=0) for t in (states, valid, weights, features, own, node)]
-        states_, valid_, weights, features, own_, node = repeated
-        context = Context(graph.repeat(num_modes), weights, features, self.self_edges.hold(own_, types))
-        future, growth = self._motion.held_run(self._plain(), states_, valid_, context, node, horizon_steps)
-        probs = torch.softmax(self.self_edges.prior_head(own)[..., :num_modes], dim=-1).transpose(1, 2)
-        shape = (len(states), num_modes)
-        return Futures(future.unflatten(0, shape), probs, self._motion.spread(growth).unflatten(0, shape))
-
-    def _graph_of_window(self, states: Tensor, valid: Tensor) -> Padded:
-        """Returns the pairs of each step: each agent with all others, or dense where the encoder needs that."""
-        present, near = pair_mask(valid), self.config.num_neighbours
-        if near:
-            present = present & among_nearest(states[..., : self.spec.position_dim].detach(), valid, near)
-        if self.self_edges is not None:
-            present = present | (self_pairs(valid.shape[-1], None, valid.device) & valid[..., None])
-            return Padded(present, None)
-        if self.config.innovation_rounds or valid.shape[-1] == 1:
-            return Padded(present, None)
-        return Padded(off_diagonal(present), others(valid.shape[-1], valid.device))
-
-    def _dense(self, graph: Padded, prior: Tensor, posterior: Tensor, features: Tensor) -> tuple[Tensor, ...]:
-        """Converts a window's pair outputs to dense ones; diagonal entries are "no edge" and zeros."""
-        if graph.senders is None:
-            return prior, posterior, features
-        nothing = features.new_zeros(features.shape[-1])
-        no_edge = no_edge_where_absent(prior.new_zeros(prior.shape[-1]), graph.present.new_zeros(1))
-        return with_diagonal(prior, no_edge), with_diagonal(posterior, no_edge), with_diagonal(features, nothing)
+        training = TrainingPass(self._reading, self._motion, self._plain(), self._sampler(generator))
+        memory = self._zero_memory(states.shape[0], states.shape[2], training.slots(valid))
+        return training.run(states, valid, last_observed, rollout_steps, num_modes, *memory)
 
     # --- Shared -------------------------------------------------------------------------------------------------
 
@@ -378,7 +287,7 @@ class DGVAE(nn.Module):
     def _sampler(self, noise: torch.Generator | PairNoise | None) -> Callable[[Tensor], Tensor]:
         return lambda logits: concrete_sample(logits, self.config.temperature, noise, self.config.hard_samples)
 
-    def _plain(self) -> Layers:
+    def _plain(self) -> Modules:
         return Modules(self.encoder, self.decoder, self.self_edges)
 
     @property
@@ -397,46 +306,3 @@ class DGVAE(nn.Module):
         if self._stepper is None or not self._stepper.is_current(self.encoder, self.decoder, self.self_edges):
             self._stepper = Stepper(self.encoder, self.decoder, self.self_edges)
         return self._stepper
-
-    def _free_run(
-        self,
-        layers: Layers,
-        states: Tensor,
-        valid: Tensor,
-        graph: Padded | Packed,
-        features: Tensor,
-        past: Past,
-        node: Tensor,
-        logits: Tensor,
-        horizon_steps: int,
-        sampler: Callable[[Tensor], Tensor],
-    ) -> Float[Tensor, "batch agents horizon state"]:
-        """Rolls out from an observation before its decoder step."""
-        drawn = graph.per_pair(sampler, logits)
-        node, states = self._motion.step(layers, states, valid, Context(graph, drawn, features), node)
-        return self._continue(layers, states, valid, graph, past, node, (drawn, features), horizon_steps, sampler)
-
-    def _continue(
-        self,
-        layers: Layers,
-        states: Tensor,
-        valid: Tensor,
-        graph: Padded | Packed,
-        past: Past,
-        node: Tensor,
-        edges: tuple[Tensor, Tensor],
-        horizon_steps: int,
-        sampler: Callable[[Tensor], Tensor] | None,
-    ) -> Float[Tensor, "batch agents horizon state"]:
-        """Rolls out from predicted states; without a sampler along edge probabilities.
-
-        The observed pairs stay; `edges` are weights and features, kept if frozen.
-        """
-        future, (weights, features) = [states], edges
-        for _ in range(horizon_steps - 1):
-            if self.config.rollout_graph == "evolving":
-                past, logits, features = self._reading.step(layers, states, valid, graph, past)
-                weights = edge_probabilities(logits) if sampler is None else graph.per_pair(sampler, logits)
-            node, states = self._motion.step(layers, states, valid, Context(graph, weights, features), node)
-            future.append(states)
-        return torch.stack(future, dim=2)[:, :, :horizon_steps]

@@ -104,8 +104,8 @@ class DGVAEConfig:
             )
         if self.num_edge_types < 2:
             raise UserError(f"num_edge_types must be at least 2 (the first is 'no edge'), got {self.num_edge_types}")
-        if not 0 < self.temperature or not 0 <= self.dropout < 1:
-            raise UserError(f"need temperature > 0 and 0 <= dropout < 1, got {self.temperature}, {self.dropout}")
+        if not 0 < self.temperature < float("inf") or not 0 <= self.dropout < 1:
+            raise UserError(f"need 0 < temperature < inf and 0 <= dropout < 1, got {self.temperature}, {self.dropout}")
 
 
 _FAST = DGVAEConfig(

@@ -1,7 +1,6 @@
-"""Disentangled edge features (paper Sec. IV): restricted labelling and pair matching.
+"""Pair matching (paper Sec. IV): the first edge-feature dimensions are averaged over time, to hold what is constant.
 
-Restricted labelling is supervised: the first feature dimensions are regressed on known edge attributes. Pair matching
-is not: the first dimensions are averaged over time, so they can only hold what is constant.
+Restricted labelling, the supervised alternative, is in `predictor.training.objective`.
 """
 
 import torch

@@ -14,28 +14,8 @@ from torch import Tensor
 
 from predictor.evaluation import displacement as metrics
 from predictor.evaluation.energy_score import energy_score
-from predictor.evaluation.outcomes import Outcome, run_sequence_batch, run_window_batch, run_windows, sequence_indices
-from predictor.evaluation.standard_errors import (
-    NUM_SUBSETS,
-    Statistic,
-    batch_interval,
-    ratio_statistics,
-    subset_statistics,
-)
-
-__all__ = [
-    "Accuracy",
-    "Outcome",
-    "Statistic",
-    "Tally",
-    "fitted_std_m",
-    "run_sequence_batch",
-    "run_window_batch",
-    "run_windows",
-    "sequence_indices",
-    "subset_statistics",
-    "summarise",
-]
+from predictor.evaluation.outcomes import Outcome
+from predictor.evaluation.standard_errors import NUM_SUBSETS, Statistic, batch_interval, ratio_statistics
 
 OPTIONAL = ("coverage", "mixture_nll")
 """Names of quantities that are left out, not NaN, if they could not be measured."""

@@ -6,7 +6,7 @@ the mean alone. A number that is not defined (nothing valid, a constant target) 
 
 Sources: DCI, Eastwood & Williams, "A Framework for the Quantitative Evaluation of Disentangled Representations", ICLR
 2018; MIG, Chen et al., "Isolating Sources of Disentanglement in VAEs", NeurIPS 2018 (histograms as in Locatello et al.,
-ICML 2019). All but `direct_r2` needs scikit-learn (the `scores` extra).
+ICML 2019). All functions but `direct_r2` need scikit-learn (the `scores` extra).
 """
 
 import importlib
@@ -79,7 +79,7 @@ def linear_r2(
     order = np.random.default_rng(seed).permutation(len(valid))
     fit, score = order[: len(order) // 2], order[len(order) // 2 :]
     known, answers = features[fit][valid[fit]].astype(np.float64), target[fit][valid[fit]].astype(np.float64)
-    if len(answers) < 2:
+    if min(len(answers), int(valid[score].sum())) < 2:
         return None
     scaler, penalty = sklearn("preprocessing").StandardScaler(), ridge * len(known)
     model = sklearn("pipeline").make_pipeline(scaler, sklearn("linear_model").Ridge(penalty)).fit(known, answers)

@@ -36,11 +36,11 @@ def energy_score(
 
 
 def weighted_score(
-    samples: Float[Tensor, "batch samples *event"],
-    truth: Float[Tensor, "batch *event"],
-    probs: Float[Tensor, "batch samples *units"] | None,
+    samples: Float[Tensor, "batch samples *_"],
+    truth: Float[Tensor, "batch *_"],
+    probs: Float[Tensor, "batch samples *_"] | None,
     distance: Callable[[Tensor, Tensor], Tensor],
-) -> Float[Tensor, "batch *units"]:
+) -> Float[Tensor, "batch *_"]:
     """Computes Σ_k p_k d(s_k, x) − Σ_{k<l} p_k p_l d(s_k, s_l).
 
     Args:

@@ -182,36 +182,14 @@ def graph_accuracy(
 
     Arguments and errors are those of `GraphTally.add`.
     """
-    return _tallied(predicted, true_types, valid).results(matched, num_subsets=1).accuracy
-
-
-def graph_f1(
-    predicted: Predicted,
-    true_types: PairTypes,
-    valid: PairMask,
-    matched: bool = False,
-) -> float | None:
-    """Computes F1 of "is an edge"; None if neither the truth nor the model has an edge.
-
-    Arguments and errors are those of `GraphTally.add`.
-    """
-    return _tallied(predicted, true_types, valid).results(matched, num_subsets=1).f1
-
-
-def connectivity(predicted: Predicted, valid: PairMask) -> float | None:
-    """Computes the share of valid pairs whose most likely type is an edge (not 0); None without a valid pair."""
-    return _tallied(predicted, None, valid).results(num_subsets=1).connectivity
-
-
-def _tallied(predicted: Tensor, true_types: Tensor | None, valid: Tensor) -> GraphTally:
     if predicted.is_floating_point():
         num_types = predicted.shape[-1]
     else:
-        known = [types[valid] for types in (predicted, true_types) if types is not None and valid.any()]
+        known = [types[valid] for types in (predicted, true_types) if valid.any()]
         num_types = 1 + max((int(types.max()) for types in known), default=0)
     tally = GraphTally(num_types)
     tally.add(predicted, true_types, valid)
-    return tally
+    return tally.results(matched, num_subsets=1).accuracy
 
 
 def _count(types: Tensor, valid: Tensor, num_types: int) -> Int[np.ndarray, "batch types"]:

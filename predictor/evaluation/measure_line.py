@@ -22,6 +22,8 @@ from predictor.evaluation.paper_tables import BURN_IN_STEPS, HORIZON_STEPS, Line
 from predictor.graph import pair_mask
 from predictor.support.errors import UserError
 
+FEATURED = ("dgvae", "least-squares")
+"""Models whose edge features are scored; those of the others are placeholders."""
 PAIR_BUDGET = 60_000
 """Largest number of pairs × samples per batch; it limits memory for scenes of any size."""
 
@@ -40,7 +42,7 @@ def measure_line(
     elif line.model == "constant-velocity-noise":
         forecaster = _fitted_noise(read_store(data / table.train), sizes)
     elif line.model == "least-squares":
-        forecaster = SpringLeastSquares(spec, HORIZON_STEPS)
+        forecaster, device = SpringLeastSquares(spec, HORIZON_STEPS), "cpu"  # it works there only
     else:
         assert checkpoint is not None
         forecaster, info = load_checkpoint(checkpoint, device)
@@ -102,9 +104,9 @@ def _measure_store(
         horizon_only.add(outcome.tail(HORIZON_STEPS))
         assert outcome.edge_probs is not None and outcome.present is not None
         pairs = pair_mask(outcome.present)
-        graph.add(outcome.edge_probs, _binary(outcome, forecaster.num_edge_types), pairs)
+        graph.add(outcome.edge_probs, _known_types(outcome, forecaster.num_edge_types), pairs)
         entropies.append(edge_entropy(outcome.edge_probs, pairs)[0][pairs].cpu())
-        if line.model in ("dgvae", "least-squares"):  # features of the others are placeholders
+        if line.model in FEATURED:
             features.add(outcome)
     result: dict[str, Any] = {
         "windows": len(chosen),
@@ -127,7 +129,7 @@ def _peak_memory_mb(device: str) -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def _binary(outcome: Outcome, num_types: int) -> torch.Tensor | None:
+def _known_types(outcome: Outcome, num_types: int) -> torch.Tensor | None:
     """Returns the true types, limited to those that the model has."""
     return None if outcome.edge_types is None else outcome.edge_types.clamp(-1, num_types - 1)
 

@@ -33,7 +33,7 @@ class Line:
     train: dict[str, Any] = field(default_factory=dict)
     """Fields of the training config that differ from those of the table."""
     paper: dict[str, float] = field(default_factory=dict)
-    """The paper's figures, by column: "rmse", "ade", "fde", "ood_ade", "ood_fde", "graph" [m]."""
+    """The paper's figures, by column: "rmse", "ade", "fde", "ood_ade", "ood_fde" [m], and "graph", an accuracy."""
 
     @property
     def is_trained(self) -> bool:
@@ -84,8 +84,6 @@ class Table:
     """Validation store; None holds out training episodes."""
     test_stride: int = 1
     """Number of steps between two test windows of one episode."""
-    unit: str = "m"
-    """Unit of errors."""
     commands: tuple[str, ...] = ()
     """Commands that make the stores."""
 

@@ -9,7 +9,7 @@ not on the seed of training; it is too small if windows overlap in time, since t
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 NUM_SUBSETS = 20
 """Number of subsets, as in the paper."""
@@ -29,30 +29,6 @@ class Statistic:
     """Number of subsets with at least one valid entry; fewer than requested if there are fewer windows."""
 
 
-def subset_statistics(
-    values: Float[np.ndarray, " windows *entries"],
-    valid: Bool[np.ndarray, " windows *entries"],
-    num_subsets: int = NUM_SUBSETS,
-    seed: int = 0,
-    root: bool = False,
-) -> Statistic | None:
-    """Computes the mean over the valid entries of each subset of windows, then mean and standard error over subsets.
-
-    Args:
-        values: any metric, windows first; used where `valid`.
-        valid: entries that count.
-        num_subsets: number of subsets, at least 1; limited to the number of windows.
-        seed: random seed of the subsets.
-        root: whether to take the root of each subset's mean (squared errors become an RMSE).
-
-    Returns:
-        Mean and standard error, or None if nothing is valid.
-    """
-    rest = tuple(range(1, values.ndim))
-    sums = np.where(valid, values, 0.0).astype(np.float64).sum(axis=rest)
-    return ratio_statistics(sums, valid.sum(axis=rest).astype(np.float64), num_subsets, seed, root)
-
-
 def ratio_statistics(
     sums: Float[np.ndarray, " windows"],
     counts: Float[np.ndarray, " windows"],
@@ -60,7 +36,18 @@ def ratio_statistics(
     seed: int = 0,
     root: bool = False,
 ) -> Statistic | None:
-    """Computes the statistic of `subset_statistics` from the sum and the number of valid entries of each window."""
+    """Computes Σ sums / Σ counts of each subset of windows, then mean and standard error over subsets.
+
+    Args:
+        sums: sum of the metric over the valid entries of each window.
+        counts: number of valid entries of each window.
+        num_subsets: number of subsets, at least 1; limited to the number of windows.
+        seed: random seed of the subsets.
+        root: whether to take the root of each subset's ratio (squared errors become an RMSE).
+
+    Returns:
+        Mean and standard error, or None if nothing is valid.
+    """
     values = subset_ratios(sums, counts, num_subsets, seed)
     values = np.sqrt(values[~np.isnan(values)]) if root else values[~np.isnan(values)]
     if not len(values):

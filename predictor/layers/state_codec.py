@@ -1,8 +1,9 @@
 """Conversion of states to network inputs and back: scaling, frames, and how a predicted change is added.
 
-All forecasters share it, so that a comparison of models is not a comparison of normalisations.
+All trainable models share it, so that a comparison of models is not a comparison of normalisations.
 """
 
+import math
 from typing import Literal
 
 import torch
@@ -40,6 +41,16 @@ def drift(
     return velocity * (spec.dt_s * fraction)
 
 
+def check_scales(name: str, scales: tuple[float, ...], spec: SceneSpec) -> None:
+    """Checks that there is a positive, finite number for each feature.
+
+    Raises:
+        UserError: there is not.
+    """
+    if len(scales) != spec.num_features or not all(0 < scale < math.inf for scale in scales):
+        raise UserError(f"{name} needs {spec.num_features} positive numbers, got {scales}")
+
+
 class StateCodec(nn.Module):
     """Computes scaled features in the spec's frame, and next states from a network's output.
 
@@ -61,8 +72,7 @@ class StateCodec(nn.Module):
         super().__init__()
         deltas, inputs = delta_scales or spec.feature_scales, input_scales or spec.feature_scales
         for name, scales in (("delta_scales", deltas), ("input_scales", inputs)):
-            if len(scales) != spec.num_features:
-                raise UserError(f"{name} needs {spec.num_features} numbers, got {scales}")
+            check_scales(name, scales, spec)
         if residual not in ("state", "constant_velocity", "trapezoid"):
             raise UserError(f"residual must be 'state', 'constant_velocity' or 'trapezoid', got '{residual}'")
         self.spec = spec

@@ -33,7 +33,7 @@ def plot_results_by_step(ax: Axes, results: Sequence[dict[str, Any]], kind: str,
     Args:
         ax: axis to draw on.
         results: results of a suite's table.json, one per line of the table.
-        kind: test store, "test" or "ood".
+        kind: test store, "test", "ood" or "crowd".
         dt_s: length of a step [s].
     """
     for i, result in enumerate(results):

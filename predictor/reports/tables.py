@@ -130,7 +130,7 @@ def _graph_table(content: dict[str, Any]) -> str:
             coverage = test["horizon_only"]["statistics"].get("coverage")
             numbers = [graph.get("accuracy"), graph.get("f1"), graph.get("connectivity"), test.get("prior_entropy")]
             numbers += [scores.get("direct_r2"), scores.get("linear_r2"), coverage and coverage["mean"]]
-            cells += [_number(x) for x in numbers]
+            cells += [plain(x) for x in numbers]
         if any(c != "–" for c in cells):
             lines.append([result["name"], _samples_of(result), *cells])
     if not lines:
@@ -146,10 +146,6 @@ def _graph_table(content: dict[str, Any]) -> str:
     ]
     headings = ["model", "K", *(n if kind == "test" else f"{kind} {n}" for kind in kinds for n in names)]
     return markdown.table(headings, lines, "-r")
-
-
-def _number(value: Any) -> str:
-    return "–" if value is None else f"{value:.3f}"
 
 
 def _size_line(content: dict[str, Any]) -> str:
@@ -260,7 +256,7 @@ def _disentanglement_lines(content: dict[str, Any]) -> str:
             f"{plain(dci['completeness'])}, informativeness {plain(dci['informativeness'])}"
         )
     if found["note"]:
-        lines.append(f"* DCI not available: {found['note']}")
+        lines.append(f"* MIG and DCI not available: {found['note']}")
     return "\n".join(lines)
 
 

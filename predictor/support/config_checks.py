@@ -40,11 +40,16 @@ def check_at_least(config: Any, least: int, *names: str) -> None:
     Raises:
         UserError: one is not.
     """
-    bound = f"be at least {least}" if least else "not be negative"
     for name in names:
         value = getattr(config, name)
         for number in value if isinstance(value, tuple) else (value,):
-            if number is not None and not least <= number < math.inf:
+            if number is None:
+                continue
+            if not -math.inf < number < math.inf:
+                bound = f"at least {least}" if least else "not negative"
+                raise UserError(f"{name} must be finite and {bound}, got {value}")
+            if number < least:
+                bound = f"be at least {least}" if least else "not be negative"
                 raise UserError(f"{name} must {bound}, got {value}")
 
 

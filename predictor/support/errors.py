@@ -3,6 +3,9 @@
 import sys
 from collections.abc import Callable
 
+_WRONG_PATH = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
+"""Errors of the operating system when a user gives a path that does not fit."""
+
 
 class UserError(ValueError):
     """Raised for bad input; the message names what was required, what was given and what to do."""
@@ -16,7 +19,7 @@ def run_entry_point(main: Callable[[], None]) -> None:
     """Runs `main`; turns user errors into one line on stderr and exit status 2, Ctrl-C into status 130."""
     try:
         main()
-    except (UserError, FileNotFoundError, PermissionError) as error:
+    except (UserError, *_WRONG_PATH) as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:

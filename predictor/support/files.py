@@ -1,9 +1,11 @@
 """Writing of files and folders so that a reader finds the old version or the whole new one, never a part.
 
-Unfinished files are beside their targets, under hidden names that end in ``.partial``.
+Unfinished files are beside their targets, under hidden names that end in ``.partial``. A folder that is replaced is
+absent for a moment; after a crash the old one may be beside it, as ``.NAME.old``.
 """
 
 import json
+import math
 import os
 import shutil
 import uuid
@@ -12,14 +14,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from predictor.support.errors import UserError
+
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
     """Yields a temporary path to write to; renames it to `path` at the end, or deletes it if the body raises.
 
     The content is flushed to disk before it is renamed, so that even a power cut leaves the old file or the new one.
-    The temporary name has the suffix of `path`, by which encoders choose their format.
+    The temporary name has the suffix of `path`, by which encoders choose their format. A missing parent folder is made.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
     partial = _beside(path, path.suffix)
     try:
         yield partial
@@ -65,6 +70,25 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, content: Any) -> None:
     """Writes JSON; values without a JSON type are written as strings."""
     write_text(path, json.dumps(content, indent=2, default=str) + "\n")
+
+
+def finite(content: Any) -> Any:
+    """Returns the content with None in place of NaN and infinity, which JSON does not have."""
+    if isinstance(content, dict):
+        return {key: finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
+
+
+def check_out(out: Path) -> None:
+    """Checks that the folder of a command's output is not a file; called before any work is done.
+
+    Raises:
+        UserError: it is one.
+    """
+    if out.exists() and not out.is_dir():
+        raise UserError(f"{out} is a file; choose another --out")
 
 
 def delete_leftovers(folder: Path) -> None:

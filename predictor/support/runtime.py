@@ -38,8 +38,11 @@ def resolve_device(device: str) -> str:
         kind = None
     if kind is None or kind.type not in ("cpu", "cuda"):
         raise UserError(f"device must be cpu, cuda or auto, got '{device}'")
-    if kind.type == "cuda" and not torch.cuda.is_available():
-        raise UserError(f"device '{device}' was asked for but torch finds no CUDA device; use --device cpu")
+    if kind.type == "cuda":
+        found = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        if (kind.index or 0) >= found:
+            devices = f"{found or 'no'} CUDA device{'s' if found > 1 else ''}"
+            raise UserError(f"device '{device}' was asked for but torch finds {devices}; use --device cpu")
     return device
 
 

@@ -120,7 +120,8 @@ class TrainConfig:
         check_positive(self, "lr", "variance", "clip_norm")
         check_at_least(
             self, 0, "one_step_weight", "rollout_weight", "kl_weight", "seed", "threads", "curriculum_steps",
-            "kl_warmup_steps", "energy_weight", "joint_energy_weight", "edge_cost", "label_weight", "type_label_weight", "min_history_steps", "max_episodes",
+            "kl_warmup_steps", "energy_weight", "joint_energy_weight", "edge_cost", "label_weight", "type_label_weight",
+            "min_history_steps", "max_episodes",
         )  # fmt: skip
         if self.one_step_weight == self.rollout_weight == 0:
             raise UserError("one_step_weight and rollout_weight are both 0; nothing would be learned")

@@ -42,12 +42,12 @@ def energy_terms(
         scales: divisors that make features comparable.
         axes: number of axes of a position.
     """
+    assert modes.mode_probs is not None
     samples = torch.cat([modes.states[:, :1].detach(), modes.states[:, 1:]], dim=1) / scales
     samples = torch.where(valid[:, None, :, :, None], samples, 0.0)
     target = torch.where(valid[..., None], truth / scales, 0.0)
     steps, there = valid.sum(-1).clamp(min=1), valid.any(-1)
 
-    # per agent: [batch modes agents horizon state] -> [batch modes agents]
     def apart(first: Tensor, second: Tensor) -> Tensor:
         squared = (first - second).square()
         moved = (squared[..., :axes].sum(-1) + _TINY).sqrt() + REST_SHARE * (squared[..., axes:].sum(-1) + _TINY).sqrt()
@@ -77,7 +77,7 @@ def spread_nll(
 
     The single forecast has a term of its own, since it is also shown alone.
     """
-    assert modes.scale is not None
+    assert modes.scale is not None and modes.mode_probs is not None
     positions, target = modes.states[..., :axes].detach(), truth[..., :axes]
     mixture, _ = mixture_nll(positions, target, valid, modes.mode_probs.detach(), modes.scale)
     alone, _ = mixture_nll(

@@ -22,7 +22,6 @@ from predictor.data.store import Episode, EpisodeStore, read_store
 from predictor.data.windows import WindowBatch, Windows, split_episodes
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import run_windows
-from predictor.forecaster import WindowOutput
 from predictor.layers.state_codec import Residual, StateCodec, drift
 from predictor.models import build, configure
 from predictor.scene import SceneSpec

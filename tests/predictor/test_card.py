@@ -1,14 +1,16 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from predictor.baselines.mlp import MLP, MLPConfig
 from predictor.card import CardConfig, write_card
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.evaluation.in_env_record import read_record
 from predictor.support.errors import UserError
-from tests.predictor.helpers import model, write_circles
+from tests.predictor.helpers import model, spec, write_circles
 
 ROW = {
     "checkpoint": "toy",
@@ -76,4 +78,29 @@ def test_card_without_its_accuracy_is_refused(config: CardConfig, content: Any, 
     config.accuracy.write_text(content)
     with pytest.raises(UserError, match=message):
         write_card(config)
-    assert not (config.checkpoint / "README.md").exists()
+    assert_nothing_is_written(config)
+
+
+def test_card_without_its_stores_is_refused(config: CardConfig):
+    """Nothing is written: a new record beside an old card would contradict it."""
+    with pytest.raises(UserError, match="no episode store at .*nowhere"):
+        write_card(replace(config, data=(config.checkpoint / "nowhere",)))
+    assert_nothing_is_written(config)
+
+
+def test_card_of_a_checkpoint_that_was_not_trained_is_refused(config: CardConfig):
+    save_checkpoint(config.checkpoint, model(), CheckpointInfo(model().spec, model().config, 3))
+    with pytest.raises(UserError, match="checkpoint 'toy' does not say how it was trained; write cards of checkpoints"):
+        write_card(config)
+    assert_nothing_is_written(config)
+
+
+def test_card_says_which_model_it_is(config: CardConfig):
+    info = CheckpointInfo(spec(), MLPConfig(), 3, (1.0,) * 3, ("toy-v0",), MADE, model="mlp")
+    assert "\ndG-VAE, " in write_card(config).read_text()
+    save_checkpoint(config.checkpoint, MLP(spec(), MLPConfig(), 3), info)
+    assert "\nMLP, " in write_card(config).read_text()
+
+
+def assert_nothing_is_written(config: CardConfig) -> None:
+    assert sorted(path.name for path in config.checkpoint.iterdir()) == ["config.json", "model.safetensors"]

@@ -321,6 +321,11 @@ def test_scenes_of_its_own_spec_are_taken(path: Path):
     assert load_forecaster(path, INFO.spec, "env 'a'").horizon_steps == 4
 
 
+def test_constant_velocity_has_no_weights():
+    with pytest.raises(UserError, match="^'constant-velocity' has no weights; pass a checkpoint$"):
+        load_checkpoint("constant-velocity")
+
+
 def test_constant_velocity_takes_every_spec():
     forecaster = load_forecaster("constant-velocity", spec(dt_s=0.2), "env 'a'")
     assert isinstance(forecaster, ConstantVelocity) and forecaster.spec.dt_s == 0.2

@@ -578,7 +578,7 @@ def out_is_a_file(springs: Path, folder: Path) -> list[Any]:
         ),
         (lambda s, f: [*fitting(f), "--max-windows", 0], "max_windows must be at least 1, got 0"),
         (lambda s, f: [*fitting(f), "--num-samples", -1], "num_samples must be at least 1, got -1"),
-        (out_is_a_file, "file is a file; choose another path"),
+        (out_is_a_file, "file is a file; choose another --out"),
     ],
 )
 def test_bad_input_is_one_line(

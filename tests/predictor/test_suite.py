@@ -14,6 +14,7 @@ from predictor import suite
 from predictor.data.springs import SpringsConfig, make
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.data.windows import Windows
+from predictor.evaluation import measure_line as measuring
 from predictor.evaluation import paper_tables as tables
 from predictor.evaluation.measure_line import protocol_indices
 from predictor.evaluation.paper_tables import NUM_SAMPLES, TABLES, Line
@@ -67,11 +68,27 @@ def test_every_kind_of_line_is_trained_and_measured(data: Path, tmp_path: Path, 
     assert saved["tests"]["test"]["horizon_only"]["min_ade_m"] == horizon["min_ade_m"]
 
 
-def test_a_line_on_labelled_data_needs_scikit_learn_before_it_is_trained(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_least_squares_runs_on_the_cpu_whatever_the_device(data: Path, monkeypatch: pytest.MonkeyPatch):
+    devices = []
+    monkeypatch.setattr(measuring, "_measure_store", lambda *arguments: devices.append(arguments[-1]))
+    for key in ("least-squares", "constant-velocity"):
+        suite.measure_line(TABLES["springs"], line(key), data, TABLES["springs"].budgets["smoke"], None, 0, "cuda")
+    assert devices == ["cpu", "cpu", "cuda", "cuda"]
+
+
+@pytest.fixture
+def without_sklearn(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [name for name in sys.modules if name.split(".")[0] == "sklearn"]:
         monkeypatch.setitem(sys.modules, name, None)
+
+
+def test_a_line_whose_features_are_not_scored_needs_no_scikit_learn(without_sklearn: None, data: Path, tmp_path: Path):
+    assert run_line(config(data, tmp_path), line("constant-velocity"))["tests"]["test"]["features"] is None
+
+
+def test_a_line_on_labelled_data_needs_scikit_learn_before_it_is_trained(
+    without_sklearn: None, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr(suite, "train", lambda _: pytest.fail("trained"))
     with pytest.raises(UserError, match=r"need scikit-learn: pip install 'dgvae-rl\[scores\]'"):
         run_line(config(data, tmp_path), line("dgvae-rl"))

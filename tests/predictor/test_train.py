@@ -250,6 +250,14 @@ def test_run_folder_says_how_it_was_made(tiny: None, circles: Path, tmp_path: Pa
     assert sorted(p.name for p in out.iterdir()) == ["checkpoint", "config.json", "tb", "train_state.pt"]
 
 
+def test_what_a_killed_save_left_is_deleted(tiny: None, circles: Path, tmp_path: Path):
+    out = tmp_path / "run"
+    (out / ".checkpoint.0a1b2c3d.partial").mkdir(parents=True)
+    (out / ".train_state.pt.0a1b2c3d.partial.pt").write_text("half")
+    train(config(circles, out, steps=2))
+    assert not list(out.glob(".*"))
+
+
 def test_finished_run_is_left_as_it_is(tiny: None, circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     settings = config(circles, tmp_path / "run")
     train(settings)
@@ -414,12 +422,12 @@ def test_bad_input_ends_a_real_process_with_one_line(tmp_path: Path):
         (["--val-history-steps", "11"], "val_history_steps must lie between 1 and 10, got 11"),
         (["--one-step-weight", "0", "--rollout-weight", "0"], "both 0; nothing would be learned"),
         (["--edge-cost", "-0.1"], "edge_cost must not be negative, got -0.1"),
-        (["--label-weight", "nan"], "label_weight must not be negative, got nan"),
+        (["--label-weight", "nan"], "label_weight must be finite and not negative, got nan"),
         (["--curriculum-steps", "-1"], "curriculum_steps must not be negative, got -1"),
         (["--set", "width=3"], "--set takes field=value with a field of DGVAEConfig (hidden_dim, "),
         (["--set", "rnn_dim=wide"], "rnn_dim of DGVAEConfig must be of type int, got 'wide'"),
         (["--set", "rnn_dim=0"], "rnn_dim must be at least 1, got 0"),
-        (["--set", "delta_scales=1,2"], "delta_scales needs 4 numbers, got (1.0, 2.0)"),
+        (["--set", "delta_scales=1,2"], "delta_scales needs 4 positive numbers, got (1.0, 2.0)"),
         (
             ["--model", "mlp", "--input-changes"],
             "--input-changes belongs to the dG-VAE; leave it out for --model mlp",

@@ -117,7 +117,7 @@ def test_three_dimensions(kind: str, has_ego: bool):
 def test_sizes_must_fit(kind: str):
     forecaster = fresh(kind)
     config = type(forecaster.config)
-    with pytest.raises(UserError, match=r"delta_scales needs 4 numbers, got \(1.0, 2.0\)"):
+    with pytest.raises(UserError, match=r"delta_scales needs 4 positive numbers, got \(1.0, 2.0\)"):
         type(forecaster)(forecaster.spec, config(delta_scales=(1.0, 2.0)))
     width = {"mlp": "hidden_dim", "lstm": "embed_dim"}.get(kind.split("-")[0], "rnn_dim")
     with pytest.raises(UserError, match=f"{width} must be at least 1, got 0"):
@@ -130,7 +130,7 @@ def test_sizes_must_fit(kind: str):
 def test_a_silent_network_leaves_the_residual(kind: str, residual: Any, x_m: float):
     """With a readout that says +1 in every unit and delta scales that say how much that is: x 1 → 1 + 2, + drift."""
     template = fresh(kind)
-    config = type(template.config)(residual=residual, delta_scales=(2.0, 0.0, 1.0, 0.0))
+    config = type(template.config)(residual=residual, delta_scales=(2.0, 1e-9, 1.0, 1e-9))
     forecaster = type(template)(SceneSpec(2.0, has_ego=False), config, HORIZON)
     readout = forecaster.decoder.readout[-1] if kind in WITH_GRAPH else forecaster.readout
     torch.nn.init.zeros_(readout.weight)

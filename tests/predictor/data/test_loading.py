@@ -11,10 +11,10 @@ from predictor.data.loading import (
     checksum,
     find_files,
     finite,
+    frames_per_step,
     in_split,
     read_lines,
     split_of,
-    steps_per_frame,
     whole,
 )
 from predictor.data.store import Episode, read_store
@@ -60,11 +60,11 @@ def test_bad_line_says_what_to_do():
 
 
 def test_steps_are_whole_frames():
-    assert steps_per_frame(0.4, 30.0, "it") == 12
-    assert steps_per_frame(1 / 30, 30.0, "it") == 1
+    assert frames_per_step(0.4, 30.0, "it") == 12
+    assert frames_per_step(1 / 30, 30.0, "it") == 1
     for dt_s in (0.41, 0.01, 0.0, -0.4, float("nan"), float("inf")):
         with pytest.raises(UserError, match=r"whole number of frames: it has 30 per second"):
-            steps_per_frame(dt_s, 30.0, "it")
+            frames_per_step(dt_s, 30.0, "it")
 
 
 def test_missing_files_are_named(tmp_path: Path):

@@ -1,5 +1,6 @@
 """The dG-VAE against plain loops, and what it must keep: streaming, no peeking, padding, symmetry, sampling."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
@@ -322,9 +323,10 @@ def test_encoder_sees_what_changed_since_the_last_step():
         torch.testing.assert_close(shown.pop(), inputs[:, [t]])
 
 
-def test_change_scales_must_fit_the_features():
-    with pytest.raises(UserError, match=r"change_scales needs 4 numbers, got \(1.0, 2.0\)"):
-        DGVAE(spec(), replace(FAST_LIKE, change_scales=(1.0, 2.0)))
+@pytest.mark.parametrize("scales", [(1.0, 2.0), (1.0, 0.0, 1.0, 1.0)], ids=["too_few", "zero"])
+def test_change_scales_must_fit_the_features(scales: tuple[float, ...]):
+    with pytest.raises(UserError, match=rf"change_scales needs 4 positive numbers, got {re.escape(str(scales))}"):
+        DGVAE(spec(), replace(FAST_LIKE, change_scales=scales))
 
 
 def test_substeps_against_a_loop():
@@ -495,5 +497,5 @@ def test_dropout_acts_in_training_only():
 
 
 def test_delta_scales_must_fit_the_features():
-    with pytest.raises(UserError, match=r"delta_scales needs 4 numbers, got \(1.0, 2.0\)"):
+    with pytest.raises(UserError, match=r"delta_scales needs 4 positive numbers, got \(1.0, 2.0\)"):
         DGVAE(spec(), DGVAEConfig(delta_scales=(1.0, 2.0)))

@@ -1,5 +1,6 @@
 """The layers of the dG-VAE against plain loops, and the concrete distribution."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
@@ -181,8 +182,9 @@ def test_hard_samples_are_one_hot_and_pass_the_soft_gradient():
     [
         ({"rnn_dim": 0}, "rnn_dim must be at least 1, got 0"),
         ({"num_edge_types": 1}, r"num_edge_types must be at least 2 \(the first is 'no edge'\), got 1"),
-        ({"temperature": 0.0}, "need temperature > 0 and 0 <= dropout < 1, got 0.0, 0.0"),
-        ({"dropout": 1.0}, "need temperature > 0 and 0 <= dropout < 1, got 0.5, 1.0"),
+        ({"temperature": 0.0}, "need 0 < temperature < inf and 0 <= dropout < 1, got 0.0, 0.0"),
+        ({"temperature": math.inf}, "need 0 < temperature < inf and 0 <= dropout < 1, got inf, 0.0"),
+        ({"dropout": 1.0}, "need 0 < temperature < inf and 0 <= dropout < 1, got 0.5, 1.0"),
         ({"innovation_dim": 0}, "innovation_dim must be at least 1, got 0"),
         ({"innovation_rounds": -1}, "innovation_rounds must not be negative, got -1"),
         ({"substeps": -1}, "substeps must not be negative, got -1"),

@@ -131,6 +131,13 @@ def test_linear_r2_of_too_little_is_none(points: int):
     assert linear_r2(target[:, None], target, every(target)) is None
 
 
+@pytest.mark.parametrize("half", [0, 1], ids=["fitted", "scored"])
+def test_linear_r2_of_a_half_without_a_valid_entry_is_none(half: int):
+    target, valid = np.arange(8.0), np.ones(8, dtype=np.bool_)
+    valid[np.array_split(np.random.default_rng(0).permutation(8), 2)[half]] = False
+    assert linear_r2(target[:, None], target, valid) is None
+
+
 # --- DCI --------------------------------------------------------------------------------------------------------------
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from sklearn.metrics import accuracy_score, brier_score_loss, f1_score, precision_score, recall_score
 from torch import Tensor
 
-from predictor.evaluation.graph_accuracy import GraphAccuracy, GraphTally, connectivity, graph_accuracy, graph_f1
+from predictor.evaluation.graph_accuracy import GraphAccuracy, GraphTally, graph_accuracy
 from predictor.graph import pair_mask
 
 PAIRS = pair_mask(torch.ones(1, 3).bool())
@@ -49,8 +49,8 @@ sets = st.builds(drawn, st.integers(0, 10**6), types=st.just(3))
 )
 def test_closed_form(predicted: Tensor, accuracy: float, f1: float, connected: float):
     assert graph_accuracy(predicted, ASYMMETRIC, PAIRS) == pytest.approx(accuracy)
-    assert graph_f1(predicted, ASYMMETRIC, PAIRS) == pytest.approx(f1)
-    assert connectivity(predicted, PAIRS) == pytest.approx(connected)
+    found = tallied((predicted, ASYMMETRIC, PAIRS), types=2).results()
+    assert (found.f1, found.connectivity) == pytest.approx((f1, connected))
 
 
 def test_symmetric_graphs_are_counted_in_both_directions():
@@ -98,8 +98,8 @@ def test_against_scikit_learn(batch: tuple[Tensor, Tensor, Tensor]):
 def test_swapped_types_are_matched():
     opposite = 1 - ASYMMETRIC
     assert graph_accuracy(opposite, ASYMMETRIC, PAIRS, matched=True) == 1.0
-    assert graph_f1(opposite, ASYMMETRIC, PAIRS, matched=True) == 1.0
     found = tallied((opposite, ASYMMETRIC, PAIRS), types=2).results(matched=True)
+    assert found.f1 == 1.0
     assert found.permutation == (1, 0)
     assert found.confusion == [[3, 0], [0, 3]]
     assert found.brier == 0.0
@@ -191,8 +191,6 @@ def test_no_valid_pair_is_none_and_not_nan(windows: int):
     nothing = torch.zeros(windows, 3, 3).bool()
     types = torch.zeros(windows, 3, 3, dtype=torch.int64)
     assert graph_accuracy(types, types, nothing) is None
-    assert graph_f1(types, types, nothing) is None
-    assert connectivity(types, nothing) is None
     for matched in (False, True):
         found = tallied((types, types, nothing), types=2).results(matched)
         assert found == GraphAccuracy(0, None, permutation=(0, 1))

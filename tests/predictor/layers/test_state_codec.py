@@ -191,11 +191,19 @@ def test_nothing_is_learned_or_saved():
 
 
 def test_delta_scales_must_fit_the_features():
-    with pytest.raises(UserError, match=r"delta_scales needs 4 numbers, got \(1.0, 2.0\)"):
+    with pytest.raises(UserError, match=r"delta_scales needs 4 positive numbers, got \(1.0, 2.0\)"):
         StateCodec(spec(), (1.0, 2.0))
     space = SceneSpec(1.0, ("world",) * 3, KINEMATIC_FEATURES_3D, (1.0,) * 6)
-    with pytest.raises(UserError, match=r"delta_scales needs 6 numbers, got \(1.0, 2.0, 3.0, 4.0\)"):
+    with pytest.raises(UserError, match=r"delta_scales needs 6 positive numbers, got \(1.0, 2.0, 3.0, 4.0\)"):
         StateCodec(space, (1.0, 2.0, 3.0, 4.0))
+
+
+@pytest.mark.parametrize("wrong", [0.0, -1.0, float("inf"), float("nan")])
+@pytest.mark.parametrize("name", ["delta_scales", "input_scales"])
+def test_scales_must_be_positive_and_finite(name: str, wrong: float):
+    scales: dict[str, Any] = {name: (1.0, wrong, 1.0, 1.0)}
+    with pytest.raises(UserError, match=rf"{name} needs 4 positive numbers, got \(1.0, {wrong}, 1.0, 1.0\)"):
+        StateCodec(spec(), **scales)
 
 
 def test_unknown_residuals_are_refused():

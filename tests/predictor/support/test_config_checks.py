@@ -65,8 +65,9 @@ def test_a_choice_that_is_not_listed_is_named(cls: type, given: dict[str, Any], 
         ({"count": 0}, 1, "count must be at least 1, got 0"),
         ({"count": -1}, 0, "count must not be negative, got -1"),
         ({"counts": (3, 0)}, 1, r"counts must be at least 1, got \(3, 0\)"),
-        ({"rate": float("nan")}, 0, "rate must not be negative, got nan"),
-        ({"rate": float("inf")}, 0, "rate must not be negative, got inf"),
+        ({"rate": float("nan")}, 0, "rate must be finite and not negative, got nan"),
+        ({"rate": float("inf")}, 0, "rate must be finite and not negative, got inf"),
+        ({"rate": -float("inf")}, 1, "rate must be finite and at least 1, got -inf"),
     ],
 )
 def test_numbers_below_a_bound_are_named(values: dict[str, Any], least: int, message: str):

@@ -15,10 +15,13 @@ def raises(error: BaseException):
     [
         (UserError("steps must be at least 1, got -3"), 2, "error: steps must be at least 1, got -3\n"),
         (FileNotFoundError("no such file"), 2, "error: no such file\n"),
+        (FileExistsError("there already"), 2, "error: there already\n"),
+        (NotADirectoryError("a file"), 2, "error: a file\n"),
+        (IsADirectoryError("a folder"), 2, "error: a folder\n"),
         (PermissionError("not yours"), 2, "error: not yours\n"),
         (KeyboardInterrupt(), 130, "interrupted; continue with --resume where the command has it\n"),
     ],
-    ids=["user", "missing", "forbidden", "interrupted"],
+    ids=["user", "missing", "exists", "file", "folder", "forbidden", "interrupted"],
 )
 def test_what_a_user_can_cause_is_one_line(
     capsys: pytest.CaptureFixture[str], error: BaseException, status: int, line: str

@@ -1,6 +1,7 @@
 """Files and folders are replaced whole or not at all."""
 
 import json
+import math
 import os
 import stat
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from predictor.support.files import (
     copy_file,
     delete_leftovers,
+    finite,
     new_file,
     new_folder,
     scratch_folder,
@@ -76,6 +78,16 @@ def test_leftovers_of_a_killed_process_are_deleted_and_nothing_else(tmp_path: Pa
     assert len(names(tmp_path)) == 3
     delete_leftovers(tmp_path)
     assert names(tmp_path) == ["a.partial"]
+
+
+def test_missing_folders_of_a_file_are_made(tmp_path: Path):
+    write_text(tmp_path / "deep" / "er" / "a", "x")
+    assert (tmp_path / "deep" / "er" / "a").read_text() == "x"
+
+
+def test_numbers_that_json_does_not_have_become_none():
+    content = {"a": [1.5, math.nan, (math.inf, "nan")], "b": {"c": -math.inf, "d": None}, "e": 2, "f": True}
+    assert finite(content) == {"a": [1.5, None, [None, "nan"]], "b": {"c": None, "d": None}, "e": 2, "f": True}
 
 
 @pytest.mark.skipif(os.name != "posix", reason="file modes")

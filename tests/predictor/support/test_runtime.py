@@ -46,6 +46,11 @@ def test_precision_is_restored_after_an_exception():
 # --- Devices ----------------------------------------------------------------------------------------------------------
 
 
+def pretend_devices(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: number > 0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: number)
+
+
 @pytest.mark.parametrize(
     ("name", "there", "taken"),
     [
@@ -57,7 +62,7 @@ def test_precision_is_restored_after_an_exception():
     ],
 )
 def test_names_of_devices(name: str, there: bool, taken: str, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
+    pretend_devices(monkeypatch, 2 if there else 0)
     assert resolve_device(name) == taken
 
 
@@ -67,12 +72,14 @@ def test_other_devices_are_refused(name: str):
         resolve_device(name)
 
 
-def test_an_absent_device_is_refused(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(
-        UserError, match="device 'cuda:1' was asked for but torch finds no CUDA device; use --device cpu"
-    ):
-        resolve_device("cuda:1")
+@pytest.mark.parametrize(
+    ("name", "there", "found"),
+    [("cuda", 0, "no CUDA device"), ("cuda:1", 1, "1 CUDA device"), ("cuda:9", 2, "2 CUDA devices")],
+)
+def test_an_absent_device_is_refused(name: str, there: int, found: str, monkeypatch: pytest.MonkeyPatch):
+    pretend_devices(monkeypatch, there)
+    with pytest.raises(UserError, match=f"device '{name}' was asked for but torch finds {found}; use --device cpu"):
+        resolve_device(name)
 
 
 # --- Memory and machine -----------------------------------------------------------------------------------------------

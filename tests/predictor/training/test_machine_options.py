@@ -195,6 +195,7 @@ def test_wrong_choices_are_named(
 
 def test_a_card_without_bfloat16_is_refused(circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: False)
     config(circles, tmp_path, device="cuda")
     with pytest.raises(UserError, match="device 'cuda' has no bfloat16 arithmetic; use --precision float32"):
@@ -210,6 +211,7 @@ def test_the_process_is_tuned_for_its_device(
 ):
     called: list[str] = []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(training, "tune", called.append)
     monkeypatch.setattr(training, "load_data", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
@@ -231,6 +233,7 @@ def test_background_work_ends_with_the_run(circles: Path, tmp_path: Path, monkey
 def test_precision_is_part_of_a_line_and_the_machine_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("predictor.suite._fingerprint", str)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: True)
     line = next(r for r in TABLES["springs"].lines if r.key == "dgvae")
     suite = SuiteConfig("springs", tmp_path, tmp_path)
