@@ -36,11 +36,11 @@ def energy_score(
 
 
 def weighted_score(
-    samples: Float[Tensor, "batch samples *_"],
-    truth: Float[Tensor, "batch *_"],
-    probs: Float[Tensor, "batch samples *_"] | None,
+    samples: Float[Tensor, "batch samples ..."],
+    truth: Float[Tensor, "batch ..."],
+    probs: Float[Tensor, "batch samples ..."] | None,
     distance: Callable[[Tensor, Tensor], Tensor],
-) -> Float[Tensor, "batch *_"]:
+) -> Float[Tensor, "batch ..."]:
     """Computes Σ_k p_k d(s_k, x) − Σ_{k<l} p_k p_l d(s_k, s_l).
 
     Args:
