@@ -50,7 +50,8 @@ def energy_terms(
 
     def apart(first: Tensor, second: Tensor) -> Tensor:
         squared = (first - second).square()
-        moved = (squared[..., :axes].sum(-1) + _TINY).sqrt() + REST_SHARE * (squared[..., axes:].sum(-1) + _TINY).sqrt()
+        position, rest = ((part.sum(-1) + _TINY).sqrt() for part in (squared[..., :axes], squared[..., axes:]))
+        moved = position + REST_SHARE * rest
         return torch.where(valid[:, None], moved, 0.0).sum(-1) / steps[:, None]
 
     agents = masked_mean(weighted_score(samples, target, modes.mode_probs, apart), there)
