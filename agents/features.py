@@ -23,6 +23,7 @@ from predictor.support.errors import UserError
 EGO_KEY = "observation"
 VALID_KEY = "valid"
 TOKEN_KEYS = ("agents", "forecast", "edge_probs", "edge_features")
+"""Entries of an observation that become tokens; others are not read. Those without a scale here are of order one."""
 
 NEAR, FAR, SPEED = 0.1, 0.5, 1.0
 """Scales for near positions, far positions and velocities, as fractions of a scene's `feature_scales`."""
@@ -152,7 +153,7 @@ class ForecastAttention(BaseFeaturesExtractor):
                 now = present["agents"][:, :2]
                 now = now.reshape(len(now), *(1,) * (forecast.ndim - 2), 2)
                 parts.append(self._squash(forecast - now).flatten(1))
-        parts += [present[k].flatten(1) for k in ("edge_probs", "edge_features") if k in self._keys]
+        parts += [present[k].flatten(1) for k in self._keys if k not in ("agents", "forecast")]
         return torch.cat(parts, dim=-1)
 
     def _squash(self, metres: Float[Tensor, "*axes 2"]) -> Float[Tensor, "*axes 4"]:

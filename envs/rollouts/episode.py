@@ -18,9 +18,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from envs.multiagent_observation import MultiagentStream
-from envs.observation import ForecastConfig, ForecastStream, into_ego_axes, others_by_distance
+from envs.observation import ForecastStream, into_ego_axes, others_by_distance
 from envs.readers.highway_labels import SceneLabels
 from envs.rollouts.world import EgoWorld, MultiagentWorld, World, open_world
+from envs.scene_stream import ForecastConfig
 from envs.wrappers import ForecastObservation
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.baselines.nearest_neighbour import NearestNeighbour, fit_from_stores
