@@ -122,12 +122,3 @@ def _replace_folder(new: Path, target: Path) -> None:
     target.rename(old)
     os.replace(new, target)
     shutil.rmtree(old, ignore_errors=True)
-
-
-def finite(value: Any) -> Any:
-    """Returns the value with None in place of NaN and infinity, which JSON does not have, at any depth."""
-    if isinstance(value, dict):
-        return {key: finite(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
