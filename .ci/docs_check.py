@@ -290,6 +290,9 @@ def main() -> int:
     parser.add_argument("--limit-s", type=float, default=LIMIT_S, help="seconds that a block may take")
     arguments = parser.parse_args()
     pages = [page.resolve() for page in arguments.pages] or [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    outside = [str(page) for page in pages if not page.is_relative_to(ROOT)]
+    if outside:
+        parser.error(f"pages must be of this repository, {', '.join(outside)} is not")
     results = []
     try:
         for result in check(pages, arguments.limit_s):

@@ -5,17 +5,15 @@ from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from pettingzoo import ParallelEnv
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.task import Task
 from agents.vec_envs import EPISODE_INFO, EpisodeResult, make_multiagent_venv, make_venv, own_observations
-from envs.drivers.all_agents import make_driver
+from envs.drivers.all_agents import has_heuristic, make_driver
 from envs.readers.base import role_of
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.seeding import driver_rng
-from predictor.support.errors import UserError
 
 
 @runtime_checkable
@@ -121,7 +119,7 @@ class MultiagentArena:
         assert isinstance(venv, ParallelVecEnv)
         self._venv = venv
         self._env: Any = venv.envs[0]  # has what `DrivenEnv` has
-        self.baselines = ("random", "heuristic" if _has_heuristic(self._env) else "idle")
+        self.baselines = ("random", "heuristic" if has_heuristic(self._env) else "idle")
 
     def play(
         self, policy: BaseAlgorithm | str, seeds: Sequence[int], on_episode: Callable[[], None] = lambda: None
@@ -177,14 +175,6 @@ def actions_of_others(env: Any, own: Mapping[str, Any], learners: Collection[str
     """
     others = {agent: seen for agent, seen in own.items() if agent not in learners}
     return env.driver(others) if others else {}
-
-
-def _has_heuristic(env: ParallelEnv) -> bool:
-    try:
-        make_driver("heuristic", env, np.random.default_rng(0))
-    except UserError:
-        return False
-    return True
 
 
 def _result(seed: int, steps: int, returns: Mapping[str, float]) -> EpisodeResult:

@@ -28,7 +28,7 @@ from predictor.support import markdown
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import write_json, write_text
+from predictor.support.files import finite, write_json, write_text
 from predictor.support.provenance import provenance
 from predictor.support.runtime import keep_freed_memory, resolve_device
 
@@ -92,11 +92,11 @@ class Evaluation:
             "env_id": self.env_id,
             "first_seed": self.first_seed,
             **extra,
-            "policies": [_finite(asdict(summary)) for summary in self.summaries],
-            "episodes": {name: [_finite(asdict(e)) for e in found] for name, found in self.results.items()},
+            "policies": [asdict(summary) for summary in self.summaries],
+            "episodes": {name: [asdict(e) for e in found] for name, found in self.results.items()},
             "provenance": provenance(PACKAGES),
         }
-        write_json(folder / "summary.json", content)
+        write_json(folder / "summary.json", finite(content))
         write_text(folder / "summary.md", self.markdown())
 
     def markdown(self) -> str:
@@ -115,7 +115,7 @@ class Evaluation:
         return table
 
     def _cells(self) -> tuple[list[str], list[list[str]]]:
-        """Returns the header and the cells of each line; a column that would be empty is left out."""
+        """Returns the header and the cells of each line; without an ego there are no columns of crashes and speed."""
         summaries = self.summaries
         roles = list(dict.fromkeys(role for summary in summaries for role in summary.role_returns))
         header = ["policy", "return", *(f"return of {role}" for role in roles), "length"]
@@ -255,11 +255,6 @@ def _plus_minus(error: float, digits: int) -> str:
     return "" if math.isnan(error) else f" ± {error:.{digits}f}"
 
 
-def _finite(fields: dict[str, Any]) -> dict[str, Any]:
-    """Replaces NaN by None, as JSON has no NaN."""
-    return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in fields.items()}
-
-
 @dataclass(frozen=True)
 class EvaluateConfig:
     """Evaluates the policy of a training run on held-out seeds, beside random and idle drivers."""
@@ -293,6 +288,9 @@ def main() -> None:
     keep_freed_memory()
     torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
     config = parse(EvaluateConfig, __doc__)
+    out = config.out or config.run_dir / "evaluation"
+    if out.is_file():
+        raise UserError(f"{out} is a file; choose another --out")
     run = read_config(config.run_dir)
     task = Task(
         run["env_id"],
@@ -307,13 +305,13 @@ def main() -> None:
     model = load_model(policy, run["algorithm"])
     note, now = read_policy_note(policy), task.note
     if note is None:
-        Console(stderr=True).print(NOT_PINNED.format(policy))
+        if now.forecaster is not None:
+            Console(stderr=True).print(NOT_PINNED.format(policy))
     elif note.forecaster is not None and now.forecaster is not None:
         note.forecaster.check(now.forecaster, f"policy {policy}")
     name = f"{run['algorithm']} ({run['observe']})"
-    evaluation = evaluate_with_progress(task, model, name, config.episodes, config.num_envs, config.seed)
-    out = config.out or config.run_dir / "evaluation"
     out.mkdir(parents=True, exist_ok=True)
+    evaluation = evaluate_with_progress(task, model, name, config.episodes, config.num_envs, config.seed)
     evaluation.write(out, algorithm=run["algorithm"], observe=run["observe"])
     Console().print(evaluation.table())
     Console().print(f"written to {out / 'summary.json'} and {out / 'summary.md'}")

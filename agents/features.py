@@ -24,6 +24,7 @@ from predictor.support.errors import UserError
 EGO_KEY = "observation"
 VALID_KEY = "valid"
 TOKEN_KEYS = ("agents", "forecast", "mode_probs", "xy_scale", "edge_probs", "edge_features")
+"""Entries of an observation that become tokens; others are not read. Those without a scale here are of order one."""
 
 NEAR, FAR, SPEED = 0.1, 0.5, 1.0
 """Scales for near positions, far positions and velocities, as fractions of a scene's `feature_scales`."""
@@ -155,8 +156,7 @@ class ForecastAttention(BaseFeaturesExtractor):
                 parts.append(self._squash(forecast - now).flatten(1))
         if "xy_scale" in self._keys:
             parts.append(torch.tanh(present["xy_scale"] / self.config.near_m).flatten(1))
-        plain = ("mode_probs", "edge_probs", "edge_features")
-        parts += [present[k].flatten(1) for k in plain if k in self._keys]
+        parts += [present[k].flatten(1) for k in self._keys if k not in ("agents", "forecast", "xy_scale")]
         return torch.cat(parts, dim=-1)
 
     def _squash(self, metres: Float[Tensor, "*axes 2"]) -> Float[Tensor, "*axes 4"]:

@@ -65,14 +65,8 @@ class DQNPreset:
 
 Preset = PPOPreset | DQNPreset
 
-_PPO: dict[str, PPOPreset] = {
-    "highway-v0": PPOPreset(),
-    "highway-fast-v0": PPOPreset(),
-}
-_DQN: dict[str, DQNPreset] = {
-    "highway-v0": DQNPreset(),
-    "highway-fast-v0": DQNPreset(),
-}
+PRESETS: dict[Algorithm, Preset] = {"ppo": PPOPreset(), "dqn": DQNPreset()}
+"""Algorithm → its preset where `preset_for` has no other."""
 # Racetracks step five times as often, so the same foresight needs a longer discount (their script: 0.9).
 _FIVE_HZ_GAMMA = 0.9
 
@@ -85,14 +79,11 @@ _PARTICLES = PPOPreset(n_steps=100, batch_size=300, n_epochs=8, learning_rate=7e
 
 
 def preset_for(env_id: str, algorithm: Algorithm, backend: Backend = "gymnasium") -> Preset:
-    """Returns the tuned preset of an env id, or the nearest published one."""
+    """Returns the preset of an algorithm that fits an env id and a backend."""
     if algorithm == "ppo" and is_multiagent_id(env_id):
         return _PARTICLES
     if algorithm == "ppo" and backend == "envpool":
         gamma = _FIVE_HZ_GAMMA if env_id.startswith("racetrack") else _ENVPOOL_PPO.gamma
         return replace(_ENVPOOL_PPO, gamma=gamma)
-    presets: dict[str, PPOPreset] | dict[str, DQNPreset] = _PPO if algorithm == "ppo" else _DQN
-    if env_id in presets:
-        return presets[env_id]
-    fallback: Preset = PPOPreset() if algorithm == "ppo" else DQNPreset()
-    return replace(fallback, gamma=_FIVE_HZ_GAMMA) if env_id.startswith("racetrack") else fallback
+    preset = PRESETS[algorithm]
+    return replace(preset, gamma=_FIVE_HZ_GAMMA) if env_id.startswith("racetrack") else preset

@@ -64,7 +64,7 @@ def read_config(run_dir: Path) -> dict[str, Any]:
     """Reads the config of a run.
 
     Raises:
-        UserError: the folder holds no run.
+        UserError: the folder holds no run of a policy.
     """
     return _read(run_dir / CONFIG_FILE)["config"]
 
@@ -121,7 +121,7 @@ def check_forecaster(run_dir: Path, found: ForecasterPin | None) -> bool:
     """
     if not (run_dir / CONFIG_FILE).exists():
         return True
-    stored = _read(run_dir / CONFIG_FILE).get("config", {})
+    stored = _read(run_dir / CONFIG_FILE)["config"]
     if FORECASTER not in stored:
         return found is None
     pinned = stored[FORECASTER]
@@ -132,17 +132,21 @@ def check_forecaster(run_dir: Path, found: ForecasterPin | None) -> bool:
 
 def _read(file: Path) -> dict[str, Any]:
     try:
-        return json.loads(file.read_text())
+        content = json.loads(file.read_text())
     except FileNotFoundError as error:
         raise UserError(f"{file.parent} holds no training run ({file.name} is missing)") from error
     except (json.JSONDecodeError, UnicodeDecodeError, NotADirectoryError) as error:
         raise UserError(f"{file} is not a run's config: {error}") from error
+    config = content.get("config") if isinstance(content, dict) else None
+    if not isinstance(config, dict) or "env_id" not in config:  # a predictor's run has none
+        raise UserError(f"{file} is not the config of a policy's run")
+    return content
 
 
 def _check_same(file: Path, config: dict[str, Any], free: Sequence[str]) -> list[Any]:
     """Compares with the stored config; returns the provenance of earlier starts."""
     stored = _read(file)
-    before = stored.get("config", {})
+    before = stored["config"]
     for name in config:
         if name not in free and before.get(name) != config[name]:
             raise UserError(

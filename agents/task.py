@@ -20,6 +20,7 @@ from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.sb3.padded_spaces import learners_named
 from envs.sb3.policy_file import PolicyNote, pin_forecaster
 from envs.wrappers import ForecastObservation
+from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.scene import SceneSpec
 from predictor.support.config_checks import check_choice, check_choices
 from predictor.support.errors import UserError
@@ -78,7 +79,7 @@ class Task:
     @property
     def forecaster(self) -> str | None:
         """Value for the argument `checkpoint` of the wrappers."""
-        return "constant-velocity" if self.observe == "constant-velocity" else self.checkpoint
+        return CONSTANT_VELOCITY if self.observe == CONSTANT_VELOCITY else self.checkpoint
 
     @property
     def scene_spec(self) -> SceneSpec | None:

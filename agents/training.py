@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
 from stable_baselines3.common.vec_env import VecEnv
@@ -23,7 +22,7 @@ from agents.presets import Algorithm, PPOPreset, Preset, preset_for
 from agents.runs import BEST_FILE, CHECKPOINT_FILE, POLICY_FILE, load_model, save_model
 from agents.task import SELECTION_SEED, Task
 from agents.vec_envs import make_venv
-from envs.sb3.policy_file import PolicyNote, read_note
+from envs.sb3.policy_file import ALGORITHMS, PolicyNote, read_note
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError
 from predictor.support.files import copy_file
@@ -150,8 +149,8 @@ def make_model(plan: TrainingPlan, venv: VecEnv, tensorboard_log: str | None = N
             "features_extractor_class": ForecastAttention,
             "features_extractor_kwargs": {"config": plan.attention},
         }
-    algorithm: type[PPO] | type[DQN] = PPO if isinstance(preset, PPOPreset) else DQN
-    return algorithm(
+    make: Any = ALGORITHMS[plan.algorithm]
+    model: BaseAlgorithm = make(
         policy,
         venv,
         policy_kwargs=policy_kwargs,
@@ -160,6 +159,7 @@ def make_model(plan: TrainingPlan, venv: VecEnv, tensorboard_log: str | None = N
         device=plan.device,
         **options,
     )
+    return model
 
 
 def _resume_or_make(plan: TrainingPlan, venv: VecEnv, run_dir: Path) -> BaseAlgorithm:

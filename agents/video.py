@@ -91,7 +91,7 @@ def film(task: Task, model: BaseAlgorithm, path: Path) -> Path | None:
         return path
     checkpoint = task.forecaster
     if task.observe == "none" and task.env_id not in CHECKPOINTS:
-        checkpoint = "constant-velocity"
+        checkpoint = CONSTANT_VELOCITY
     plain = make_env(task.env_id)
     drawn = is_highway_env(plain)
     plain.close()

@@ -27,7 +27,7 @@ class Case(NamedTuple):
 
     simulator: Literal["highway-env", "EnvPool"]
     envs: int
-    vec: Literal["dummy", "subproc", "native"]
+    vec: Literal["dummy", "subproc", "envpool"]
     paper: bool
     steps: int
     rounds: int
@@ -37,18 +37,18 @@ CASES: dict[str, tuple[Case, ...]] = {
     "quick": (
         Case("highway-env", 1, "dummy", False, 15, 5),
         Case("highway-env", 8, "dummy", True, 5, 5),
-        Case("EnvPool", 1, "native", False, 40, 7),
-        Case("EnvPool", 8, "native", False, 40, 7),
-        Case("EnvPool", 64, "native", False, 20, 7),
+        Case("EnvPool", 1, "envpool", False, 40, 7),
+        Case("EnvPool", 8, "envpool", False, 40, 7),
+        Case("EnvPool", 64, "envpool", False, 20, 7),
     ),
     "full": (
         Case("highway-env", 1, "dummy", False, 40, 15),
         Case("highway-env", 8, "dummy", True, 40, 11),
         Case("highway-env", 16, "dummy", False, 40, 7),
         Case("highway-env", 8, "subproc", False, 40, 11),
-        Case("EnvPool", 1, "native", False, 200, 15),
-        Case("EnvPool", 8, "native", True, 200, 15),
-        Case("EnvPool", 64, "native", False, 100, 15),
+        Case("EnvPool", 1, "envpool", False, 200, 15),
+        Case("EnvPool", 8, "envpool", True, 200, 15),
+        Case("EnvPool", 64, "envpool", False, 100, 15),
     ),
 }
 FEW = 16
@@ -118,6 +118,6 @@ def _environments(case: Case, env_id: str) -> Iterator[dict[str, VecEnv]]:
 
 
 def _venv(case: Case, env_id: str, scenes: bool) -> VecEnv:
-    if case.vec == "native":
+    if case.vec == "envpool":
         return EnvPoolVecEnv(envpool_task_of(env_id), case.envs, seed=0, scenes=scenes)
     return make_venv(env_id, case.envs, case.vec, scenes)

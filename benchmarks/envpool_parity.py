@@ -33,6 +33,8 @@ from predictor.support.provenance import provenance
 
 _SAME_M = 1e-6
 """Largest distance of two vehicles that count as being in the same place [m]."""
+_CONTINUOUS = "Intersection-v1"
+"""Task whose ego steers and accelerates; random actions are drawn from discrete ones here."""
 _DRIVER = ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN")
 
 
@@ -70,6 +72,8 @@ class ParityConfig:
         unknown = [t for t in self.task_ids if t not in HIGHWAY_ENV_OF or t.startswith("Racetrack")]
         if unknown:
             raise UserError(f"cannot compare {', '.join(unknown)}: unknown, or without other vehicles")
+        if _CONTINUOUS in self.task_ids:
+            raise UserError(f"cannot compare {_CONTINUOUS}: its actions are continuous; compare Intersection-v0")
 
 
 # --- The same state in both -------------------------------------------------------------------------------------------

@@ -119,7 +119,7 @@ def main() -> None:
             table.add_row(path.name, f"{agents:.0f}", trained_on, graph, *errors, seconds)
     Console(width=120).print(table)
     if config.out is not None:
-        write_json(config.out, {"rows": lines, "provenance": provenance(("torch",))})
+        write_json(config.out, {"lines": lines, "provenance": provenance(("torch",))})
 
 
 def _graph(config: DGVAEConfig) -> str:

@@ -16,6 +16,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
@@ -71,11 +72,17 @@ class OverheadConfig:
 
 
 def run_block(venv: VecEnv, steps: int, seed: int) -> float:
-    """Measures the seconds of one block, from a seeded reset; the reset itself is not timed."""
+    """Measures the seconds of one block, from a seeded reset; the reset itself is not timed.
+
+    Raises:
+        UserError: actions are not discrete.
+    """
+    if not isinstance(venv.action_space, spaces.Discrete):
+        raise UserError(f"blocks are of random discrete actions, the environment has {venv.action_space}; time another")
     rng = np.random.default_rng(seed)
     venv.seed(seed)
     venv.reset()
-    count = int(venv.action_space.n)  # type: ignore[attr-defined]
+    count = int(venv.action_space.n)
     actions = [rng.integers(count, size=venv.num_envs) for _ in range(steps)]
     began = time.perf_counter()
     for action in actions:

@@ -57,7 +57,7 @@ def pages(root: Path) -> dict[Path, tuple[str, str]]:
     """Returns every page with tables as it is, and as the records say.
 
     Raises:
-        UserError: a record cannot be read, or a page marks a table that is not known.
+        UserError: a record cannot be read or lacks a measurement, or a page marks a table that is not known.
     """
     folders = sorted(path.parent for path in (root / PRETRAINED).glob(f"*/{FILE_NAME}"))
     records = {folder.name: read_record(folder) for folder in folders}
@@ -91,6 +91,12 @@ def _transfer(records: Records) -> str:
     names = sorted({name for _, name in measured})
     lines = []
     for env_id in sorted({env_id for env_id, _ in measured}):
+        missing = [name for name in names if (env_id, name) not in measured]
+        if missing:
+            raise UserError(
+                f"transfer to {env_id}: no measurement with K = 1 in the records of {', '.join(missing)}; measure it "
+                "with envs.evaluate --num-samples 1, and record it with predictor.card"
+            )
         found = [measured[env_id, name] for name in names]
         episodes = {m.episodes for m in found}
         if len(episodes) > 1:

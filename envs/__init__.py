@@ -3,8 +3,8 @@
     >>> from envs import ForecastObservation, make_env
     >>> env = ForecastObservation(make_env("highway-fast-v0"))
 
-The names below are imported when they are used: gymnasium's wrappers need neither PettingZoo, Stable-Baselines3 nor
-EnvPool, and the wrappers for these need no more than the one they serve.
+The names below are imported when they are used: the wrappers for Gymnasium need neither PettingZoo, Stable-Baselines3
+nor EnvPool; `ForecastParallelEnv` needs no Stable-Baselines3; the names of `envs.sb3` need it.
 """
 
 from typing import TYPE_CHECKING

@@ -1,11 +1,13 @@
 """Forecasts many copies of a PettingZoo environment in one batch.
 
-A single environment forecasts at each step. A vector environment needs no forecast before its last copy has stepped:
-attached to a `BatchedForward`, the copies return observations without forecast entries, and `fill` adds these for all
-copies in one batch. Each copy's observations are those that it would return by itself.
+A vector environment needs no forecast before its last copy has stepped: within `collected`, copies that are attached to
+a `BatchedForward` return observations without forecast entries, and at the end of the block these are added to all of
+them in one batch. A copy that is stepped outside of it gets its forecast at once. Either way, each copy's observations
+are those that it would return by itself.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -36,10 +38,12 @@ class BatchedForward:
 
     Attributes:
         stream: history and noise of all environments.
+        collecting: whether observations wait for `fill`; otherwise each scene is forecast when it arrives.
     """
 
     def __init__(self, streams: Sequence[MultiagentStream]) -> None:
         """Starts with empty memory."""
+        self.collecting = False
         first = streams[0]
         view = first.view_spec
         self.stream = MultiagentStream(
@@ -49,24 +53,32 @@ class BatchedForward:
         self._stepped: dict[int, _Moment] = {}
         self._opened: dict[int, _Moment] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns the state of a copy or a pickle, which collects nothing: its owner may be one environment alone."""
+        return self.__dict__ | {"collecting": False}
+
     def begin(
         self, env: int, scene: MultiagentScene, observations: Mapping[str, dict[str, Any]], seed: int | None = None
     ) -> None:
-        """Notes the first scene of an environment's episode; a seed restarts its noise."""
+        """Takes in the first scene of an environment's episode; a seed restarts its noise."""
         if env in self._opened or seed is not None:
             self.fill()
         if seed is not None:
             self.stream.seed([seed if i == env else None for i in range(self.stream.num_envs)])
         self._opened[env] = _Moment(scene, observations)
+        if not self.collecting:
+            self.fill()
 
     def go_on(self, env: int, scene: MultiagentScene, observations: Mapping[str, dict[str, Any]]) -> None:
-        """Notes the next scene of an environment's episode."""
+        """Takes in the next scene of an environment's episode."""
         if env in self._stepped or env in self._opened:
             self.fill()
         self._stepped[env] = _Moment(scene, observations)
+        if not self.collecting:
+            self.fill()
 
     def fill(self) -> None:
-        """Adds the forecast entries to all noted observations; zeros for an agent that is not in the scene."""
+        """Adds the forecast entries to all waiting observations; zeros for an agent that is not in the scene."""
         stepped, opened = self._stepped, self._opened
         self._stepped, self._opened = {}, {}
         if opened.keys() <= stepped.keys() and len(stepped) == self.stream.num_envs:
@@ -96,6 +108,20 @@ class BatchedForward:
         for moment, seen in zip(moments, entries, strict=True):
             for agent, observation in moment.observations.items():
                 observation.update(seen[agent] if agent in seen else self.stream.nothing_seen())
+
+
+@contextmanager
+def collected(forward: BatchedForward | None) -> Iterator[None]:
+    """Forecasts all scenes that arrive within the block in one batch, at its end; does nothing for None."""
+    if forward is None:
+        yield
+        return
+    forward.collecting = True
+    try:
+        yield
+        forward.fill()
+    finally:
+        forward.collecting = False
 
 
 def can_share(streams: Sequence[MultiagentStream]) -> bool:

@@ -6,7 +6,6 @@ recorded data, so does a memoryless nearest-neighbour forecaster. Counted are al
 the policy's choice, and landmarks. Several checkpoints make a transfer matrix: trained on A, measured on B.
 """
 
-import math
 import multiprocessing
 import os
 from collections.abc import Sequence
@@ -48,7 +47,7 @@ from predictor.scene import SceneSpec
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_positive
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import write_json, write_text
+from predictor.support.files import finite, write_json, write_text
 from predictor.support.provenance import provenance
 from predictor.support.runtime import keep_freed_memory
 
@@ -268,20 +267,13 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
     return results, misfits
 
 
-def _finite(content: Any) -> Any:
-    """Returns the content with None in place of NaN and infinity, which JSON does not have."""
-    if isinstance(content, dict):
-        return {key: _finite(value) for key, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [_finite(value) for value in content]
-    return None if isinstance(content, float) and not math.isfinite(content) else content
-
-
 def main() -> None:
     """Entry point."""
     keep_freed_memory()
     config = parse(EvaluateConfig, __doc__)
     console = Console(width=170)
+    if config.out is not None and config.out.is_file():
+        raise UserError(f"{config.out} is a file; choose another --out")
     for env_id in config.env_ids:  # unknown ids and drivers raise before hours of work
         policy = config.driver is not None and config.driver.endswith(".zip")
         open_world(env_id, "idle" if policy else config.driver or default_drivers(env_id)[0]).close()
@@ -298,7 +290,7 @@ def main() -> None:
         made = provenance(PACKAGES)
         content: dict[str, Any] = {"config": asdict(config), "results": [asdict(r) for r in results]}
         misfit = [{"env_id": e, "checkpoint": c, "why": why} for (e, c), why in misfits.items()]
-        write_json(config.out / "accuracy.json", _finite(content | {"misfits": misfit, "provenance": made}))
+        write_json(config.out / "accuracy.json", finite(content | {"misfits": misfit, "provenance": made}))
         write_text(config.out / "accuracy.md", report.markdown(results, misfits))
 
 

@@ -17,13 +17,13 @@ import numpy as np
 from jaxtyping import Float
 from rich.progress import track
 
-from envs.drivers.ego import make_ego_driver
-from envs.readers.highway import HighwayReader, is_highway_env
+from envs.drivers.ego import EGO_DRIVER_NAMES, make_ego_driver
+from envs.readers.highway import HighwayReader, is_highway_env, vehicles_of
 from envs.registry import make_env
 from envs.seeding import driver_rng
 from predictor.data.store import Episode
 from predictor.support.command_line import Renamed, parse
-from predictor.support.config_checks import check_at_least
+from predictor.support.config_checks import check_at_least, check_choice
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import new_folder, write_json
 from predictor.support.provenance import provenance
@@ -64,10 +64,11 @@ class ExportConfig:
         """Checks ranges.
 
         Raises:
-            UserError: a value out of range.
+            UserError: a value out of range, or another driver.
         """
         check_at_least(self, 1, "episodes", "max_steps")
         check_at_least(self, 0, "seed")
+        check_choice("driver", self.driver, EGO_DRIVER_NAMES)  # a policy's wrapper would not see every frame
 
     def check_out(self) -> None:
         """Checks that `out` is free, or an export that may be replaced.
@@ -75,6 +76,8 @@ class ExportConfig:
         Raises:
             UserError: it is neither.
         """
+        if self.out.is_file():
+            raise UserError(f"{self.out} is a file; choose another --out")
         if self.out.exists() and not self.overwrite:
             raise UserError(f"{self.out} exists; choose another path or pass --overwrite")
         if self.out.exists() and not (self.out / "export.json").exists():
@@ -129,10 +132,8 @@ def roll_out(
 
 
 def _headings_rad(env: gym.Env) -> list[float]:
-    """Returns headings in the order of `HighwayReader.read_all`: the ego, then the road's list."""
-    unwrapped: Any = env.unwrapped
-    ego = unwrapped.vehicle
-    return [float(vehicle.heading) for vehicle in [ego, *(v for v in unwrapped.road.vehicles if v is not ego)]]
+    """Returns headings in the order of `HighwayReader.read_all`."""
+    return [float(vehicle.heading) for vehicle in vehicles_of(env)]
 
 
 def write_recording(

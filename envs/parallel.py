@@ -194,13 +194,14 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
 def batch_forwards(envs: Sequence[ParallelEnv]) -> BatchedForward | None:
     """Makes copies of one environment share one batched forward, if there are several and their wrappers are equal.
 
-    Their observations then lack forecasts until `BatchedForward.fill` is called. Their histories are empty: reset them.
+    Within `envs.batched_forward.collected`, their observations lack forecasts until the end of the block. Their
+    histories are empty: reset them.
 
     Args:
         envs: copies of the environment.
 
     Returns:
-        The forward, whose `fill` is called after the last copy's step or reset; None if each copy forecasts by itself.
+        The forward, for `collected`; None if each copy forecasts by itself.
     """
     copies = [env for env in envs if type(env) is ForecastParallelEnv and not env.stream.config.flatten]
     if len(copies) < len(envs) or len(copies) < 2 or not can_share([copy.stream for copy in copies]):

@@ -36,8 +36,8 @@ class EnvEntry:
     drivers: tuple[str, ...] = ("varied", "random", "idle")
     """Names of the drivers that take turns in data collection; the first one drives where accuracy is measured."""
     learners: tuple[str, ...] = ()
-    """Roles that learn by default (`agents.task.Task`); empty where all agents do. Set where the sides are opponents:
-    pursuers learn, against a prey that flees by rule."""
+    """Roles that learn in train_policy.py unless --learners is given; empty where all agents do. Set where the sides
+    are opponents: pursuers learn, against a prey that flees by rule."""
 
     @property
     def multiagent(self) -> bool:

@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 
-from envs.forecast_wrapper import ForecastWrapper, ObservationLayout
+from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
 from envs.observation import ForecastStream, carries_scenes, open_forecaster, scene_entries, scene_spaces
 from envs.readers import MakeReader, reader_for
 from envs.readers.base import build_reader, require_scene, show
@@ -132,10 +132,12 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         device: device of the forecaster.
         forecaster: forecaster on `device`, instead of a checkpoint.
         seed: random seed of the samples' noise, until `reset(seed=…)` gives another.
-        reader: function or class that makes a reader for the env; None picks one by env family.
+        reader: function or class that makes a reader for the env; None picks one by env family. Refused over a
+            `SceneObservation`, which has its own.
 
     Raises:
-        UserError: no reader, no checkpoint, or a forecaster of another spec (features, dt).
+        UserError: no reader, or one although the env is a `SceneObservation`; no checkpoint, or a forecaster of
+            another spec (features, dt).
     """
 
     def __init__(
@@ -157,12 +159,13 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         RecordConstructorArgs.__init__(
             self, checkpoint=checkpoint, horizon_steps=horizon_steps, num_samples=num_samples, flatten=flatten,
             perception_m=perception_m, max_agents=max_agents, device=device, forecaster=forecaster, seed=seed,
-            reader=reader, _disable_deepcopy=True,
-        )  # fmt: skip
+            _disable_deepcopy=True,
+        )  # the reader is recorded by the SceneObservation below  # fmt: skip
         config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten)
         ready = carries_scenes(env.observation_space)
         source = scene_source(env)
         if ready:
+            refuse_reader(reader, "ForecastObservation over a SceneObservation")
             spec: SceneSpec = env.get_wrapper_attr("scene_spec")
             if perception_m not in (None, spec.perception_m) or max_agents not in (None, spec.max_agents):
                 raise UserError(

@@ -173,3 +173,14 @@ def test_the_command_fails_with_the_block(tmp_path: Path):
     (tmp_path / "README.md").write_text("```bash\ntest -f NO_SUCH_FILE\n```\n")
     bad = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert bad.returncode == 1 and "README.md:1" in bad.stdout and "1 failed" in bad.stdout
+
+
+def test_a_page_of_another_folder_is_one_clear_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "page.md").write_text("no blocks")
+    monkeypatch.setattr(sys, "argv", ["docs_check.py", str(tmp_path / "page.md")])
+    with pytest.raises(SystemExit) as ended:
+        docs_check.main()
+    assert ended.value.code == 2
+    assert f"error: pages must be of this repository, {tmp_path / 'page.md'} is not" in capsys.readouterr().err

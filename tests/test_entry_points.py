@@ -96,14 +96,20 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint absent --env-ids merge-v1", "no checkpoint 'absent'"),
         ("--workers 0", "workers must be at least 1, got 0"),
         ("--memory-steps 3 0", "memory_steps must be at least 1, got (3, 0)"),
+        ("--env-ids merge-v1 --out file", "file is a file; choose another --out"),
         ("--checkpoint runs/a/checkpoint runs/a", "each checkpoint needs a name of its own, got a, a"),
     ],
     "envs.export_levelx": [
         ("--env-id nope-v0 --out new", "cannot make env 'nope-v0'"),
         ("--env-id merge-v1 --out new --max-steps 0", "max_steps must be at least 1, got 0"),
-        ("--env-id merge-v1 --out file", "file exists; choose another path or pass --overwrite"),
+        ("--env-id merge-v1 --out file", "file is a file; choose another --out"),
+        (
+            "--env-id merge-v1 --out new --driver policy.zip",
+            "driver must be one of random, idle, varied, keep-lane, got",
+        ),
     ],
     "agents.evaluate": [
+        ("--run-dir absent --out file", "file is a file; choose another --out"),
         ("--run-dir absent", "absent holds no training run"),
         ("--run-dir absent --num-envs 0", "num_envs must be at least 1, got 0"),
         ("--run-dir absent --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
@@ -125,6 +131,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     "benchmarks.wrapper_overhead": [
         ("--num-envs 0", "num_envs must be at least 1, got 0"),
         ("--vec thread", "invalid choice 'thread' for argument '--vec'"),
+        ("--env-id racetrack-v1 --num-envs 1", "blocks are of random discrete actions, the environment has Box("),
     ],
     "benchmarks.time_shares": [("--calls 0", "calls must be at least 1, got 0")],
     "benchmarks.graph_accuracy": [
@@ -140,7 +147,10 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint absent", "no checkpoint 'absent'"),
     ],
     "benchmarks.envpool_identity": [("--num-envs 0", "num_envs must be at least 1, got 0")],
-    "benchmarks.envpool_parity": [("--task-ids Nope-v0", "cannot compare Nope-v0: unknown")],
+    "benchmarks.envpool_parity": [
+        ("--task-ids Nope-v0", "cannot compare Nope-v0: unknown"),
+        ("--task-ids HighwayFast-v0 Intersection-v1", "cannot compare Intersection-v1: its actions are continuous"),
+    ],
     "benchmarks.envpool_training": [("--num-envpool-envs 0", "num_envpool_envs must be at least 1, got 0")],
 }
 """Words of a command line → how the one line begins after "error: ", for each command."""

@@ -20,6 +20,7 @@ import pytest
 
 import train_policy
 from agents import evaluate
+from agents.evaluate import Evaluation
 from agents.presets import Algorithm, PPOPreset, Preset, preset_for
 from agents.runs import load_model
 from agents.task import Backend
@@ -194,6 +195,23 @@ def test_a_policy_without_a_pin_is_evaluated_with_a_notice(
     run_entry_point(evaluate.main)
     assert "does not say which forecaster it was trained on" in " ".join(capsys.readouterr().err.split())
     assert (run / "evaluation" / "summary.json").exists()
+
+
+def test_a_policy_without_forecasts_needs_no_pin(
+    finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """One that was saved before notes existed has none, and is not told that it lacks a forecaster."""
+    run = with_note(finished[0], tmp_path / "run", lambda note: note.pop("policy"))
+    config = json.loads((run / "config.json").read_text())
+    config["config"]["observe"] = "none"
+    (run / "config.json").write_text(json.dumps(config))
+    played: list[Any] = []
+    monkeypatch.setattr(evaluate, "evaluate_with_progress", lambda *task: played.append(task) or Evaluation("", 0, {}))
+    monkeypatch.setattr(Evaluation, "write", lambda *folder, **extra: None)
+    monkeypatch.setattr(Evaluation, "table", lambda evaluation: "")
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--run-dir", str(run)])
+    run_entry_point(evaluate.main)
+    assert played and capsys.readouterr().err == ""
 
 
 @pytest.mark.usefixtures("short")

@@ -80,7 +80,7 @@ def _agent_drivers(name: str, env: Any, rng: np.random.Generator) -> DrawAgentDr
     if name == "heuristic":
         return _heuristic(env, rng)
     if name == "mixed":
-        kinds = ("random", "varied", "heuristic") if _has_heuristic(env) else ("random", "varied")
+        kinds = ("random", "varied", "heuristic") if has_heuristic(env) else ("random", "varied")
         draws = [_agent_drivers(kind, env, rng) for kind in kinds]
         return lambda agent, own: draws[own.integers(len(draws))](agent, own)
     raise UserError(f"driver must be one of {', '.join(DRIVER_NAMES)}, got '{name}'")
@@ -124,12 +124,13 @@ class Habits:
         )
 
 
-def _has_heuristic(env: Any) -> bool:
+def has_heuristic(env: Any) -> bool:
+    """Returns whether the driver "heuristic" knows this environment."""
     return is_pursuit_env(env) or mpe_scenario(env) in _AIMS
 
 
 def _heuristic(env: Any, rng: np.random.Generator) -> DrawAgentDriver:
-    if not _has_heuristic(env):
+    if not has_heuristic(env):
         raise UserError(
             f"no heuristic drives {multiagent_env_id(env)}, only pursuit and mpe2's {', '.join(_AIMS)}; use "
             + ", ".join(name for name in DRIVER_NAMES if name != "heuristic")

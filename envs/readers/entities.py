@@ -18,7 +18,6 @@ from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import ProtocolError, UserError
 
 _KINEMATIC = (("x", "y", "vx", "vy"), ("x", "y", "z", "vx", "vy", "vz"))
-_HEADINGS = ("heading", "cos_h", "sin_h")
 
 
 @dataclass(frozen=True)

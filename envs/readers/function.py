@@ -18,7 +18,7 @@ class FunctionReader:
         >>> def read_cars(env) -> Scene:
         ...     cars = env.unwrapped.road.vehicles  # the ego is the first
         ...     states = np.array([[*car.position, *car.velocity] for car in cars])
-        ...     return Scene(states, np.array([id(car) for car in cars]), np.ones(len(cars), dtype=bool))
+        ...     return Scene(states, np.arange(len(cars)), np.ones(len(cars), dtype=bool))  # none enters or leaves
         >>> reader = FunctionReader(read_cars, SceneSpec(dt_s=1.0))
         >>> env = ForecastObservation(make_env("highway-fast-v0"), "highway", reader=reader)
 

@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from envs.drivers.all_agents import Driver, make_driver
+from envs.drivers.all_agents import Driver, has_heuristic, make_driver
 from envs.drivers.ego import make_ego_driver
 from envs.drivers.trained import (
     env_for_driver,
@@ -36,7 +36,6 @@ from envs.seeding import driver_rng
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.scene import Forecast, Scene, SceneSpec
-from predictor.support.errors import UserError
 
 
 @runtime_checkable
@@ -246,16 +245,13 @@ def default_drivers(env_id: str) -> tuple[str, ...]:
     """
     if env_id in ENVS or not is_multiagent_id(env_id):
         return entry_for(env_id).drivers
-    return HEURISTIC_DRIVERS if _has_heuristic(env_id) else entry_for(env_id).drivers
+    return HEURISTIC_DRIVERS if _id_has_heuristic(env_id) else entry_for(env_id).drivers
 
 
 @functools.cache
-def _has_heuristic(env_id: str) -> bool:
+def _id_has_heuristic(env_id: str) -> bool:
     env = make_multiagent_env(env_id)
     try:
-        make_driver("heuristic", env, np.random.default_rng(0))
-    except UserError:
-        return False
+        return has_heuristic(env)
     finally:
         env.close()
-    return True

@@ -23,6 +23,7 @@ from pettingzoo import ParallelEnv
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+from envs.batched_forward import collected
 from envs.parallel import batch_forwards
 from envs.sb3.padded_spaces import PaddedObservation, own_action, roles_of, shared_action
 from envs.seeding import driver_rng
@@ -131,9 +132,10 @@ class ParallelVecEnv(VecEnv):
 
     def reset(self) -> VecEnvObs:
         """Resets all copies."""
-        for i, copy in enumerate(self._copies):
-            first = i * len(copy.learners)
-            self._keep_infos(first, copy, copy.reset(self._seeds[first], self._options[first]))
+        with collected(self._forward):
+            for i, copy in enumerate(self._copies):
+                first = i * len(copy.learners)
+                self._keep_infos(first, copy, copy.reset(self._seeds[first], self._options[first]))
         self._reset_seeds()
         self._reset_options()
         self._actions = None
@@ -153,21 +155,21 @@ class ParallelVecEnv(VecEnv):
             raise ProtocolError("step_wait() needs actions; call step_async() first")
         actions, self._actions = self._actions, None
         turns: list[_Turn] = []
-        for copy in self._copies:
-            first = len(turns)
-            own = {
-                agent: own_action(actions[first + i], self._own_actions[agent])
-                for i, agent in enumerate(copy.learners)
-                if copy.lives(agent)
-            }
-            turns += copy.step(own)
-            if copy.ended:
-                self._keep_infos(first, copy, copy.reset())
+        with collected(self._forward):
+            for copy in self._copies:
+                first = len(turns)
+                own = {
+                    agent: own_action(actions[first + i], self._own_actions[agent])
+                    for i, agent in enumerate(copy.learners)
+                    if copy.lives(agent)
+                }
+                turns += copy.step(own)
+                if copy.ended:
+                    self._keep_infos(first, copy, copy.reset())
         rewards = np.array([turn.reward for turn in turns], dtype=np.float32)
         dones = np.array([turn.done for turn in turns], dtype=np.bool_)
-        observations = self._observe()  # before the infos, whose last observations it completes with forecasts
         infos = [self._info(agent, turn) for agent, turn in zip(self.agents_of_envs, turns, strict=True)]
-        return observations, rewards, dones, infos
+        return self._observe(), rewards, dones, infos
 
     def padded_observation(self, agent: str, observation: Any) -> Any:
         """Returns a learner's own observation in the VecEnv's space: padded, with the indicator."""
@@ -220,8 +222,6 @@ class ParallelVecEnv(VecEnv):
 
     def _observe(self) -> VecEnvObs:
         """Returns the observation of each env."""
-        if self._forward is not None:
-            self._forward.fill()
         seen = [(copy.living or {}).get(agent) for copy in self._copies for agent in copy.learners]
         return self._observation.stack(list(zip(self.agents_of_envs, seen, strict=True)))
 

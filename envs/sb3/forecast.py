@@ -31,7 +31,7 @@ _CLASS_NOTES = "class_attributes"
 
 
 class VecForecast(ForecastWrapper, VecEnvWrapper):
-    """`ForecastObservation` for an SB3 VecEnv whose environments are wrapped in `SceneObservation`.
+    """`ForecastObservation` for an SB3 VecEnv that reports scenes: of `SceneObservation`s, or an `EnvPoolVecEnv`.
 
         >>> from stable_baselines3.common.env_util import make_vec_env
         >>> from envs.wrappers import SceneObservation
@@ -41,7 +41,7 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
     After each step, `scene` and `forecast` hold, in the world frame, what `observations[i]` shows of environment i.
 
     Args:
-        venv: SB3 vector environment (Dummy or Subproc).
+        venv: SB3 vector environment (Dummy or Subproc) of environments in `SceneObservation`, or an `EnvPoolVecEnv`.
         checkpoint: shipped name, folder, or "constant-velocity"; None takes the one that ships for the env's id.
         horizon_steps: number of steps to forecast; None takes the checkpoint's.
         num_samples: number of sampled futures per agent.

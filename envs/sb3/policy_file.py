@@ -26,7 +26,8 @@ from predictor.support.errors import UserError
 
 NOTE_ENTRY = "note.json"
 _POLICY_KEY = "policy"
-_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "dqn": DQN}
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "dqn": DQN}
+"""Algorithms by name."""
 _MARKS = {"ppo": "clip_range", "dqn": "exploration_rate"}
 """Parameter in SB3's JSON that only this algorithm has."""
 
@@ -177,7 +178,7 @@ def load_policy(path: Path, venv: VecEnv | None = None, device: str = "cpu") -> 
     """
     algorithm = algorithm_of(path)
     try:
-        return _ALGORITHMS[algorithm].load(path, env=venv, device=device)
+        return ALGORITHMS[algorithm].load(path, env=venv, device=device)
     except (ValueError, KeyError, TypeError, AttributeError, AssertionError, EOFError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"{path} is no {algorithm} policy that fits here: {reason}") from error

@@ -85,6 +85,14 @@ class HighwayParallelEnv(ParallelEnv):
         """Returns highway-env's space for this agent, the same object at each call."""
         return self._action_spaces[agent]
 
+    def idle_action(self, agent: str) -> Any:
+        """Returns the action that changes nothing: highway-env's IDLE, or the middle of steering and acceleration."""
+        space = self._action_spaces[agent]
+        if isinstance(space, gym.spaces.Discrete):
+            action_type = self.highway.action_type.agents_action_types[self.possible_agents.index(agent)]
+            return getattr(action_type, "actions_indexes", {}).get("IDLE", int(space.n) // 2)
+        return np.zeros(space.shape, dtype=space.dtype)
+
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -117,10 +125,8 @@ class HighwayParallelEnv(ParallelEnv):
         missing = [agent for agent in self.agents if agent not in actions]
         if missing:
             raise UserError(f"step needs an action for each living agent, {', '.join(missing)} had none")
-        action_types = self.highway.action_type.agents_action_types
         joint = tuple(
-            actions[agent] if agent in self.agents else _idle(self._action_spaces[agent], action_type)
-            for agent, action_type in zip(self.possible_agents, action_types, strict=True)
+            actions[agent] if agent in self.agents else self.idle_action(agent) for agent in self.possible_agents
         )
         observations, _, _, truncated, info = self.highway.step(joint)
         self._clear_abandoned()
@@ -175,10 +181,3 @@ def _make(env_id: str, **kwargs: Any) -> gym.Env:
         raise UserError(
             f"cannot make env '{env_id}': {error}; pass an intersection with several agents, such as '{INTERSECTION}'"
         ) from error
-
-
-def _idle(space: gym.Space, action_type: Any) -> Any:
-    """Returns the action that changes nothing: highway-env's IDLE, or the middle of steering and acceleration."""
-    if isinstance(space, gym.spaces.Discrete):
-        return getattr(action_type, "actions_indexes", {}).get("IDLE", int(space.n) // 2)
-    return np.zeros(space.shape, dtype=space.dtype)

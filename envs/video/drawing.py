@@ -47,7 +47,7 @@ class OverlayStyle:
     truth_width_px: float = 1.5
     """Width of the line of the true future [px]."""
     edge_color: Color = (235, 90, 220)
-    """Colour of edges from the ego to an agent."""
+    """Colour of edges from an agent to the ego, or to the agent in focus."""
     edge_width_px: float = 8.0
     """Width of an edge of probability 1 [px]."""
     edge_alpha: int = 150

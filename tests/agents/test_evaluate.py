@@ -65,14 +65,14 @@ def test_summary_of_episodes():
     assert line.crash_low < line.crash_rate < line.crash_high
 
 
+def refuse(constant: str) -> None:
+    raise AssertionError(f"{constant} is not JSON")
+
+
 def test_written_summary_is_valid_json_and_a_table(tmp_path: Path):
     silent = [EpisodeResult(seed=10, episode_return=1.0, length=2, crashed=False, mean_speed_mps=math.nan)]
     evaluation = Evaluation("toy-v0", 10, {"ppo": EPISODES, "silent": silent})
     evaluation.write(tmp_path, algorithm="ppo")
-
-    def refuse(constant: str) -> None:
-        raise AssertionError(f"{constant} is not JSON")
-
     content = json.loads((tmp_path / "summary.json").read_text(), parse_constant=refuse)
     assert content["algorithm"] == "ppo"
     assert [line["policy"] for line in content["policies"]] == ["ppo", "silent"]
@@ -100,10 +100,11 @@ def test_without_an_ego_there_are_roles_but_no_crashes(tmp_path: Path):
     assert lines[3] == "| random | 0.25 | 0.00 | 0.50 | 5.0 |"
     assert lines[-1].endswith("return: mean over the learners.")
     assert [column.header for column in evaluation.table().columns] == lines[0].strip("| ").split(" | ")
-    content = json.loads((tmp_path / "summary.json").read_text())
+    content = json.loads((tmp_path / "summary.json").read_text(), parse_constant=refuse)
     line = content["policies"][0]
     assert (line["crash_rate"], line["crash_low"], line["mean_speed_mps"]) == (None, None, None)
     assert line["role_returns"] == {"ant": [2.0, 1.0], "bee": [6.0, 2.0]}
+    assert content["policies"][1]["role_returns"] == {"ant": [0.0, None], "bee": [0.5, None]}  # a single episode
     assert content["episodes"]["ppo"][1]["returns_by_role"] == {"ant": 3.0, "bee": 8.0}
 
 

@@ -6,10 +6,11 @@ import torch
 from gymnasium import spaces
 from stable_baselines3 import PPO
 
-from agents.features import AttentionConfig, ForecastAttention
+from agents.features import TOKEN_KEYS, VALID_KEY, AttentionConfig, ForecastAttention
 from agents.task import Task
 from agents.training import TrainingPlan, make_model
 from agents.vec_envs import make_venv
+from envs.observation import FORECAST_KEYS
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
@@ -139,7 +140,21 @@ def test_empty_scene_is_finite_with_finite_gradients():
     assert extractor.null_token.grad is not None
 
 
-@pytest.mark.parametrize("key", ["agents", "forecast", "edge_probs", "edge_features"])
+def test_every_entry_of_the_wrappers_is_read():
+    """One that is added to the wrappers alone would change no policy, without a word."""
+    assert {*TOKEN_KEYS, VALID_KEY} == set(FORECAST_KEYS)
+
+
+def test_a_new_token_key_is_read(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("agents.features.TOKEN_KEYS", (*TOKEN_KEYS, "brake_lights"))
+    shapes = SHAPES | {"brake_lights": (AGENTS, 2)}
+    extractor, observations = make_extractor(shapes), make_observations(shapes)
+    before = extractor(observations)
+    observations["brake_lights"] += 1.0
+    assert (extractor(observations) - before).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("key", TOKEN_KEYS)
 def test_gradient_reaches_every_token_input(key: str):
     extractor, observations = make_extractor(SHAPES), make_observations(SHAPES)
     observations[key].requires_grad_()

@@ -8,7 +8,7 @@ import pytest
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from agents.runs import load_model, open_run, read_config, save_model
+from agents.runs import check_forecaster, load_model, open_run, read_config, save_model
 from envs.sb3.policy_file import read_note
 from predictor.support.errors import UserError
 
@@ -95,6 +95,22 @@ def test_truncated_config_is_one_clear_line(tmp_path: Path):
     (tmp_path / "config.json").write_text('{"config": {')
     with pytest.raises(UserError, match="is not a run's config"):
         open_run(tmp_path, CONFIG, MADE, resume=True)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [{"config": {"data": "store", "steps": 100}}, {"format": "dgvae-rl"}, ["config"]],
+    ids=["a predictor's run", "a checkpoint", "a list"],
+)
+def test_a_config_of_something_else_is_one_clear_line(tmp_path: Path, content: Any):
+    (tmp_path / "config.json").write_text(json.dumps(content))
+    for use in (
+        read_config,
+        lambda run: open_run(run, CONFIG, MADE, resume=True),
+        lambda run: check_forecaster(run, None),
+    ):
+        with pytest.raises(UserError, match="config.json is not the config of a policy's run$"):
+            use(tmp_path)
 
 
 def test_model_round_trip_with_note(tmp_path: Path, venv: VecEnv):

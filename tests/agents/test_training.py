@@ -2,7 +2,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -13,12 +13,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from agents.arena import EgoArena
 from agents.features import ForecastAttention
-from agents.presets import DQNPreset, PPOPreset, preset_for
+from agents.presets import PRESETS, Algorithm, DQNPreset, PPOPreset, preset_for
 from agents.runs import save_model
 from agents.task import EVALUATION_SEED, SELECTION_SEED, Task
 from agents.training import SaveCheckpoint, SelectBest, TrainingPlan, make_model, significantly_worse
 from agents.vec_envs import EpisodeResult, SeededEpisodes, make_venv
-from envs.sb3.policy_file import read_note
+from envs.sb3.policy_file import _MARKS, ALGORITHMS, read_note
 from predictor.support.errors import UserError
 
 CONSTANT_VELOCITY = Task("highway-fast-v0", "constant-velocity")
@@ -200,6 +200,16 @@ def test_models_follow_their_preset():
     dqn = make_model(plan(algorithm="dqn"), venv)
     assert isinstance(dqn, DQN)
     assert (dqn.buffer_size, dqn.learning_starts, dqn.target_update_interval) == (15_000, 200, 50)
+    venv.close()
+
+
+def test_every_algorithm_stands_in_every_table():
+    """One that lacks an entry raises, instead of being made as another one."""
+    names = set(get_args(Algorithm))
+    assert set(PRESETS) == set(ALGORITHMS) == set(_MARKS) == names
+    venv = make_venv(Task("highway-fast-v0", "none"), 1)
+    for name in names:
+        assert type(make_model(plan(algorithm=name), venv)) is ALGORITHMS[name]
     venv.close()
 
 

@@ -1,5 +1,7 @@
 """Every section that needs no simulator, shrunk to almost nothing."""
 
+import json
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -95,10 +97,17 @@ def test_data_is_read_and_cut_and_absent_simulators_are_skipped(monkeypatch: pyt
     assert [r.note for r in lines[-2:]] == ["skipped: needs highway_env", "skipped: needs envpool"]
 
 
+def test_the_committed_baseline_has_the_vector_environments_of_this_section():
+    """A kind that is called otherwise there would be compared with nothing."""
+    lines = json.loads((Path(wrappers.__file__).parent / "baseline.json").read_text())["lines"]
+    kinds = {key.rpartition("vec ")[2] for key in lines if key.startswith("wrappers |")}
+    assert kinds == {case.vec for case in wrappers.CASES["quick"]}
+
+
 def test_without_envpool_its_lines_are_skipped_in_one_line_each(monkeypatch: pytest.MonkeyPatch):
     for module in (wrappers, ppo):
         monkeypatch.setattr(module, "missing", lambda *modules: "needs envpool")
-    monkeypatch.setattr(wrappers, "CASES", {"quick": (wrappers.Case("EnvPool", 2, "native", False, 1, 1),)})
+    monkeypatch.setattr(wrappers, "CASES", {"quick": (wrappers.Case("EnvPool", 2, "envpool", False, 1, 1),)})
     for section in (wrappers, ppo):
         (line,) = section.run(QUICK)
         assert line.value is None and line.note == "skipped: needs envpool"

@@ -2,6 +2,7 @@
 
 import json
 import re
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -116,13 +117,32 @@ def test_benchmarks_are_run_as_modules(path: Path):
     assert not re.findall(r"python\d? benchmarks/\w+", path.read_text())
 
 
-def test_ten_tasks_lead_to_files_that_exist():
-    page = (ROOT / "docs" / "architecture.md").read_text().split("## Where does a line belong?")[1].split("\n## ")[0]
-    lines = next(tables(page))[1:]
+ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()
+
+
+def test_ten_tasks_lead_to_files_that_exist_and_hold_what_is_named():
+    lines = next(tables(ARCHITECTURE.split("## Where does a line belong?")[1]))[1:]
     assert len(lines) == 10
-    for task, where in lines:
-        named = re.findall(r"`((?:predictor|envs|agents|benchmarks)/[\w/.]*)`", where)
-        assert named and all((ROOT / path).exists() for path in named), task
+    paths = {
+        task: re.findall(r"`((?:predictor|envs|agents|benchmarks|tests)/[\w/.]*)`", f"{where} {also}")
+        for task, where, also in lines
+    }
+    assert all(paths.values())
+    every = {path for named in paths.values() for path in named}
+    assert [path for path in every if not (ROOT / path).exists()] == []
+    code = "".join((ROOT / path).read_text() for path in every if path.endswith((".py", ".json")))
+    for task, where, also in lines:
+        for name in re.findall(r"`(\w+)`", f"{where} {also}"):
+            assert re.search(rf"\b{name}\b", code), f"{task}: no file that is named has {name}"
+
+
+@pytest.mark.parametrize("package", ["predictor", "envs", "agents"])
+def test_the_tables_of_rooms_have_the_order_of_the_import_contracts(package: str):
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    layers = next(c["layers"] for c in contracts if c.get("containers") == [package])
+    table = next(tables(ARCHITECTURE.split(f"### `{package}/`")[1]))[1:]
+    rooms = [{name.rstrip("/") for name in re.findall(r"`([\w/]+)`", line[0])} for line in table]
+    assert rooms == [{name.strip() for name in layer.split("|")} for layer in layers]
 
 
 def test_every_link_to_a_file_leads_there():

@@ -65,6 +65,13 @@ def test_a_number_changed_by_hand_is_found_and_put_right(
         run(monkeypatch, "--fix")
 
 
+def test_a_missing_line_of_the_transfer_matrix_is_named():
+    env_id = next(m.env_id for m in RECORDS["highway"] if m.samples == 1)
+    lacking = RECORDS | {"highway": [m for m in RECORDS["highway"] if (m.env_id, m.samples) != (env_id, 1)]}
+    with pytest.raises(UserError, match=f"transfer to {env_id}: no measurement with K = 1 in the records of highway;"):
+        write_tables.tables(lacking)
+
+
 def test_every_id_with_a_checkpoint_has_a_line():
     measured = {
         m.env_id for name, found in RECORDS.items() for m in found if write_tables.SERVED_BY.get(m.env_id) == name

@@ -13,10 +13,11 @@ import torch
 from highway_env.vehicle.behavior import IDMVehicle
 from stable_baselines3 import PPO
 
-from envs.observation import ForecastConfig, ForecastStream
+from envs.observation import ForecastStream
 from envs.readers.highway import HighwayReader
 from envs.registry import make_env
 from envs.sb3.policy_file import PolicyNote, pin_forecaster, write_note
+from envs.scene_stream import ForecastConfig
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE

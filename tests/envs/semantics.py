@@ -20,13 +20,14 @@ import torch
 from pettingzoo import ParallelEnv
 
 from envs.multiagent_observation import MultiagentStream, agent_entries
-from envs.observation import FORECAST_KEYS, ForecastConfig, ForecastStream, ego_entries
+from envs.observation import FORECAST_KEYS, ForecastStream, ego_entries
 from envs.parallel import ForecastParallelEnv
 from envs.readers import multiagent_reader_for, reader_for
 from envs.readers.base import MultiagentScene, Reader, pad_multiagent_scene
 from envs.readers.entities import EntityRowsReader
 from envs.readers.function import FunctionReader
 from envs.registry import make_env, make_multiagent_env
+from envs.scene_stream import ForecastConfig
 from envs.wrappers import ForecastObservation
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE

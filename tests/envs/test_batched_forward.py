@@ -112,10 +112,68 @@ def test_a_copy_of_the_vector_environment_continues():
     assert_same_sequences(play(copy), play(venv), tolerance=0.0)
 
 
-def test_a_copy_that_is_stepped_by_itself_lacks_nothing_once_it_is_filled():
+def stepped_together() -> ParallelVecEnv:
+    venv = ParallelVecEnv(copies(num_samples=4))
+    venv.seed(0)
+    venv.reset()
+    play(venv, 3)
+    return venv
+
+
+@pytest.mark.parametrize("copied", [False, True], ids=["itself", "a deep copy"])
+@pytest.mark.parametrize("place", [0, 1])
+def test_an_environment_of_the_vector_environment_forecasts_when_it_is_stepped_directly(
+    place: int, copied: bool, monkeypatch: pytest.MonkeyPatch
+):
+    """Nobody else would fill its observations: a planner steps copies, a user `venv.envs[0]`."""
+    together, apart = stepped_together(), alone(monkeypatch, num_samples=4)
+    apart.seed(0)
+    apart.reset()
+    play(apart, 3)
+    one, other = together.envs[place], apart.envs[place]
+    if copied:
+        one = deepcopy(one)
+    for seen, expected in [
+        (one.step(act(one))[0], other.step(act(other))[0]),
+        (one.reset()[0], other.reset()[0]),
+        (one.reset(seed=3)[0], other.reset(seed=3)[0]),
+        (one.step(act(one))[0], other.step(act(other))[0]),
+    ]:
+        assert seen.keys() == expected.keys()
+        for agent in expected:
+            assert_same(seen[agent], expected[agent], 1e-3)
+
+
+def test_a_copy_that_is_made_within_a_step_forecasts_when_it_is_stepped():
+    """A partner may look ahead while the vector environment still collects."""
+    ahead: list[Any] = []
+
+    def partner(env: Any, observations: dict[str, Any], generator: np.random.Generator) -> dict[str, Any]:
+        twin = deepcopy(env)
+        ahead.append(twin.step(act(twin))[0])
+        return dict.fromkeys(observations, 0)
+
+    venv = ParallelVecEnv(copies(), agents=["one"], partner=partner)
+    venv.reset()
+    venv.step(np.zeros(venv.num_envs, dtype=np.int64))
+    assert len(ahead) == len(LASTS)
+    assert all(set(seen["one"]) == set(venv.observation_space) for seen in ahead)
+
+
+def test_after_an_error_within_a_step_each_environment_forecasts_again(monkeypatch: pytest.MonkeyPatch):
+    venv = stepped_together()
+    with monkeypatch.context() as patch:
+        patch.setattr(venv.envs[1], "step", lambda actions: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            venv.step(np.zeros(venv.num_envs, dtype=np.int64))
+    assert "forecast" in venv.envs[2].step(act(venv.envs[2]))[0]["one"]
+
+
+def test_an_environment_that_steps_twice_while_others_wait_lacks_nothing():
     first, second = (make() for make in copies((6, 6)))
     forward = batch_forwards([first, second])
     assert forward is not None
+    forward.collecting = True
     with pytest.raises(ProtocolError, match="no forecast yet"):
         _ = first.forecast
     first.reset(seed=0)
@@ -134,6 +192,7 @@ def test_a_seeded_reset_leaves_the_noise_of_what_came_before_alone():
     first, second, reference = (make() for make in copies((6, 6, 6), num_samples=4))
     forward = batch_forwards([first, second])
     assert forward is not None
+    forward.collecting = True
     found, expected = [], []
     for env, seen in ((first, found), (reference, expected)):
         seen.append(env.reset(seed=0)[0])

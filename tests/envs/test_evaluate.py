@@ -15,7 +15,7 @@ from matplotlib import pyplot as plt
 
 from envs import evaluate
 from envs.collect import CollectConfig, collect
-from envs.evaluate import EvaluateConfig, _finite, _graph, _reduction, _summary, evaluate_env
+from envs.evaluate import EvaluateConfig, _graph, _reduction, _summary, evaluate_env
 from envs.readers.highway import HighwayReader
 from envs.registry import make_env
 from envs.rollouts.episode import MODEL, STRAIGHT, Episode
@@ -139,11 +139,6 @@ def test_graph_accuracy_closed_form():
     assert found.true_connectivity == pytest.approx(3 / 5)
     assert found.f1 == pytest.approx(2 * 2 / (2 * 2 + 1 + 1))
     assert _graph([Episode({}, [0.1])]) is None
-
-
-def test_json_has_null_for_what_is_no_number():
-    content = {"a": [1.0, float("nan")], "b": {"c": (float("inf"), None, "nan", 3)}}
-    assert _finite(content) == {"a": [1.0, None], "b": {"c": [None, None, "nan", 3]}}
 
 
 # --- One environment --------------------------------------------------------------------------------------------------

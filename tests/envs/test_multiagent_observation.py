@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs.multiagent_observation import MultiagentStream, agent_entries, check_multiagent_scene
-from envs.observation import FORECAST_KEYS, ForecastConfig
+from envs.observation import FORECAST_KEYS
 from envs.readers.base import MultiagentScene
+from envs.scene_stream import ForecastConfig
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.scene import KINEMATIC_FEATURES_3D, PADDING_ID, Forecast, Scene, SceneSpec
 from predictor.support.errors import UserError

@@ -263,6 +263,12 @@ def test_spec_round_trips(arguments: dict[str, Any], highway_checkpoint: str):
     assert wrapper.kwargs["checkpoint"] == highway_checkpoint
 
 
+def test_the_spec_of_an_env_with_its_own_reader_round_trips(highway_checkpoint: str):
+    env = ForecastObservation(make_env("highway-fast-v0"), highway_checkpoint, reader=ShuffledReader)
+    assert env.spec is not None
+    assert_rebuilds(env, gym.make(env.spec))
+
+
 def assert_rebuilds(env: gym.Env, rebuilt: gym.Env) -> None:
     assert str(rebuilt) == str(env)
     assert rebuilt.spec == env.spec
@@ -392,6 +398,14 @@ def test_any_env_works_with_a_reader_of_its_own():
     obs, _ = env.reset(seed=0)
     assert obs["forecast"].shape == (2, 5, 2)
     assert obs in env.observation_space
+
+
+def test_a_reader_is_refused_over_scenes_that_have_theirs(highway_checkpoint: str):
+    env = SceneObservation(short_env(10))
+    with pytest.raises(
+        UserError, match="^ForecastObservation over a SceneObservation takes no reader: .* give reader="
+    ):
+        ForecastObservation(env, highway_checkpoint, reader=ShuffledReader)
 
 
 @pytest.mark.parametrize("fault", ["states must be finite", "ids must be unique", "agent 0 must be the ego"])

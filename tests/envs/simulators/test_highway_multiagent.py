@@ -7,6 +7,7 @@ from gymnasium.utils.env_checker import data_equivalence
 from highway_env.vehicle.kinematics import Vehicle
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
+from envs.drivers.all_agents import make_driver
 from envs.multiagent_observation import check_multiagent_scene
 from envs.parallel import ForecastParallelEnv
 from envs.readers import multiagent_reader_for
@@ -157,6 +158,18 @@ def test_off_the_road_ends_only_if_so_configured(config: bool):
     env.highway.controlled_vehicles[1].position += np.array([0.0, 30.0])
     _, _, terminations, _, _ = env.step(all_idle(env))
     assert terminations == {"vehicle_0": False, "vehicle_1": config}
+
+
+def test_the_idle_driver_neither_brakes_nor_accelerates():
+    """Its action is highway-env's IDLE; action 0 is SLOWER."""
+    env = empty_road()
+    driver = make_driver("idle", ForecastParallelEnv(env, "intersection"), np.random.default_rng(0))
+    target_mps = [vehicle.target_speed for vehicle in env.vehicles.values()]
+    for _ in range(2):
+        actions = driver(dict.fromkeys(env.agents))
+        assert actions == all_idle(env)
+        env.step(actions)
+    assert [vehicle.target_speed for vehicle in env.vehicles.values()] == target_mps
 
 
 def test_a_driver_with_pedals_and_wheel_idles_too():

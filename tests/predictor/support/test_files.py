@@ -101,3 +101,8 @@ def test_others_may_read_what_the_umask_lets_them_read(tmp_path: Path):
         os.umask(before)
     assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o644
     assert stat.S_IMODE((tmp_path / "b").stat().st_mode) == 0o755
+
+
+def test_what_json_does_not_have_becomes_none_at_any_depth():
+    nested = {"a": float("nan"), "b": {"c": (1.0, float("inf"))}, "d": [{"e": -float("inf")}], "f": "nan", "g": None}
+    assert finite(nested) == {"a": None, "b": {"c": [1.0, None]}, "d": [{"e": None}], "f": "nan", "g": None}
