@@ -62,8 +62,9 @@ class EnvAccuracy:
 
 
 HEADS = (
-    "env", "checkpoint", "dt [s]", "steps", "minADE₁ [m]", "minFDE₁ [m]", "minADE_K [m]", "joint ADE_K [m]",
-    "energy [m]", "cover", "model + noise minADE_K [m]", "neighbours ADE [m]", "CV ADE / FDE [m]", "ADE below CV", "95 % interval", "forecasts", "latency [ms]",
+    "env", "checkpoint", "dt [s]", "steps", "ADE₁ [m]", "FDE₁ [m]", "minADE_K [m]", "joint ADE_K [m]", "energy [m]",
+    "cover", "model + noise minADE_K [m]", "neighbours ADE₁ [m]", "CV ADE / FDE [m]", "ADE below CV", "95 % interval",
+    "forecasts", "latency [ms]",
 )  # fmt: skip
 """Columns of the overview."""
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 from torch.nn import functional
 
@@ -144,7 +144,7 @@ class Packed:
         """Mask of the slots of the padded array that hold a pair."""
         return self.padded.present
 
-    def pack_nodes(self, nodes: Float[Tensor, "batch agents node"]) -> Float[Tensor, "listed node"]:
+    def pack_nodes(self, nodes: Shaped[Tensor, "batch agents node"]) -> Shaped[Tensor, "listed node"]:
         """Returns the entries of the listed agents."""
         return nodes.flatten(0, 1).index_select(0, _lengthened(self.agents))
 

@@ -47,12 +47,16 @@ RICH = replace(
     substeps=2,
     gated_messages=True,
 )
+# An edge of each agent to itself, with types that are its futures; every other option that fits, too.
+PLURAL = replace(FAST_LIKE, num_modes=4, rollout_graph="frozen", change_scales=(3.0, 3.0, 2.0, 2.0), static_dim=2)
 SIZES = {"fast": FAST_LIKE, "paper": PAPER_LIKE, "rich": RICH}
 # Every kind of trainable forecaster: its name in `predictor.models`, and a small config.
 EVERY_MODEL: dict[str, tuple[str, Any]] = {
     "dgvae": ("dgvae", FAST_LIKE),
     "dgvae-rich": ("dgvae", RICH),
     "dgvae-window": ("dgvae", replace(RICH, pair_matching="window", hard_samples=True, num_edge_types=3)),
+    "dgvae-plural": ("dgvae", PLURAL),
+    "dgvae-plural-rich": ("dgvae", replace(RICH, num_modes=3, rollout_graph="frozen")),
     "dnri": ("dnri", DNRIConfig(hidden_dim=9, rnn_dim=5, head_dim=8, decoder_dim=13, message_dim=11)),
     "imma": ("imma", IMMAConfig(hidden_dim=9, rnn_dim=5, decoder_dim=13, message_dim=11)),
     "imma-dynamic": (

@@ -21,7 +21,7 @@ from predictor.dgvae.networks import DGVAEConfig
 from predictor.dgvae.packing import Packed
 from predictor.dgvae.single_step import Stepper
 from predictor.forecaster import Belief, Memory
-from tests.predictor.helpers import FAST_LIKE, RICH, random_presence, random_states, spec
+from tests.predictor.helpers import FAST_LIKE, PLURAL, RICH, random_presence, random_states, spec
 
 BATCH, TIME, AGENTS, HORIZON, SAMPLES = 2, 4, 4, 3, 3
 CHANGES = (3.0, 3.0, 2.0, 2.0)
@@ -36,6 +36,9 @@ CONFIGS = {
     "substeps": replace(FAST_LIKE, substeps=2, residual="trapezoid"),
     "neighbours": replace(FAST_LIKE, num_neighbours=2, num_edge_types=3),
     "frozen": replace(FAST_LIKE, rollout_graph="frozen"),
+    "modes": PLURAL,
+    "modes with substeps": replace(FAST_LIKE, num_modes=5, rollout_graph="frozen", substeps=2),
+    "modes of neighbours": replace(PLURAL, num_neighbours=2, num_edge_types=3),
     "everything": replace(RICH, innovation_rounds=0, num_edge_types=3, num_neighbours=2, rollout_graph="frozen"),
 }
 every_config = pytest.mark.parametrize("name", CONFIGS)
