@@ -20,8 +20,11 @@ from envs.video.highway import record_episode
 from envs.video.multiagent import MultiagentRecording, record_multiagent_episode
 from envs.wrappers import ForecastObservation
 from predictor.checkpoint import CONSTANT_VELOCITY
+from predictor.forecaster import Forecaster, has_scale
 from predictor.support.errors import UserError
 
+FAN = 6
+"""Number of futures that are drawn of a forecaster with modes."""
 MAX_VIDEO_STEPS = 200
 """Maximum length of a video [policy steps]; a racetrack episode has 1500."""
 
@@ -55,10 +58,17 @@ def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) ->
         return actions
 
     try:
-        return record_multiagent_episode(env, act, seed=seed, max_steps=max_steps)
+        return record_multiagent_episode(
+            env, act, seed=seed, max_steps=max_steps, num_samples=_num_drawn(env.forecaster)
+        )
     finally:
         env.close()
         venv.close()
+
+
+def _num_drawn(forecaster: Forecaster) -> int:
+    """Returns the number of futures drawn per agent: several only if they come with probabilities."""
+    return FAN if has_scale(forecaster) else 1
 
 
 def _has_reader(env_id: str) -> bool:
@@ -99,7 +109,14 @@ def film(task: Task, model: BaseAlgorithm, path: Path) -> Path | None:
         return None
     env = ForecastObservation(make_env(task.env_id, render_mode="rgb_array"), checkpoint)
     try:
-        record_episode(env, _act(task, model), seed=EVALUATION_SEED, max_steps=MAX_VIDEO_STEPS).write_video(path)
+        played = record_episode(
+            env,
+            _act(task, model),
+            seed=EVALUATION_SEED,
+            max_steps=MAX_VIDEO_STEPS,
+            num_samples=_num_drawn(env.forecaster),
+        )
+        played.write_video(path)
     finally:
         env.close()
     return path

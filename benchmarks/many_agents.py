@@ -95,7 +95,7 @@ def _times(preset: str, neighbours: int, settings: Settings) -> tuple[Costs, lis
 
 def _forecast(model: DGVAE, states: torch.Tensor, valid: torch.Tensor) -> None:
     _, belief = model.observe(model.empty_memory(*valid.shape), states, valid)
-    model.rollout(belief, HORIZON).states
+    model.rollout(belief, HORIZON)
 
 
 def _memory(preset: str, neighbours: int, settings: Settings, worker: WorkerProcess) -> tuple[Costs, list[Line]]:

@@ -21,6 +21,8 @@ from predictor.support.files import new_file
 Color = tuple[int, int, int]
 Polyline = Float[np.ndarray, "_ 2"]
 
+MIN_OPACITY = 0.12
+"""Opacity of a forecast without any probability."""
 SMOOTHING = 2
 """Factor by which pictures are drawn larger before they are scaled down."""
 MARGIN_PX = 8.0
@@ -68,6 +70,8 @@ class AgentOverlay:
     """Position in this picture."""
     forecast_m: tuple[Polyline, ...]
     """One line per sample, from its position when the forecast was made."""
+    shares: tuple[float, ...]
+    """Probability of each sample."""
     truth_m: Polyline
     """True future positions."""
     edge_prob: float
@@ -156,8 +160,8 @@ def draw_overlay(
     for agent in agents:
         pen.truth(view.pixels(agent.truth_m))
     for agent in agents:
-        for line in agent.forecast_m:
-            pen.forecast(view.pixels(line))
+        for line, share in fan(agent.forecast_m, agent.shares):
+            pen.forecast(view.pixels(line), opacity=share)
     _draw_captions(pen, picture.size, caption)
     smooth = overlay.resize(picture.size, Image.Resampling.BOX)
     result = picture.convert("RGB")
@@ -204,6 +208,15 @@ def write_picture(path: str | Path, picture: UInt8[np.ndarray, "height width 3"]
     Image.fromarray(picture).save(path, format="PNG")
 
 
+def fan(
+    lines: Sequence[Polyline], shares: Sequence[float] | Float[np.ndarray, " samples"]
+) -> list[tuple[Polyline, float]]:
+    """Returns the lines with their opacities, the faintest first: the likeliest is opaque, others by their share."""
+    listed = [float(share) for share in shares]
+    opacities = [MIN_OPACITY + (1 - MIN_OPACITY) * share / max(listed) for share in listed]
+    return sorted(zip(lines, opacities, strict=True), key=lambda drawn: drawn[1])
+
+
 def dashes(line: Polyline, dash: float) -> list[Polyline]:
     """Cuts a polyline into dashes of length `dash` with gaps of equal length; corners are kept."""
     lengths = np.hypot(*np.diff(line, axis=0).T)
@@ -234,13 +247,13 @@ class Pen:
         """Draws a true future: thin and solid."""
         self.line(line, self.style.truth_width_px, (*self.style.truth_color, 255))
 
-    def forecast(self, line: Polyline, color: Color | None = None) -> None:
+    def forecast(self, line: Polyline, color: Color | None = None, opacity: float = 1.0) -> None:
         """Draws a forecast: dashed, with a dot at each point but the first; None takes the style's colour."""
-        opaque = (*(color or self.style.forecast_color), 255)
+        paint = (*(color or self.style.forecast_color), round(255 * opacity))
         for piece in dashes(line, self.style.dash_px):
-            self.line(piece, self.style.forecast_width_px, opaque)
+            self.line(piece, self.style.forecast_width_px, paint)
         for point in line[1:]:
-            self.disc(point, 1.2 * self.style.forecast_width_px, opaque)
+            self.disc(point, 1.2 * self.style.forecast_width_px, paint)
 
     def disc(self, center: Float[np.ndarray, "2"], radius: float, color: tuple[int, int, int, int]) -> None:
         """Draws a filled disc."""

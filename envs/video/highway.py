@@ -54,6 +54,7 @@ class _Step:
     frame: int
     keys: tuple[int, ...]
     forecast_m: Float[np.ndarray, "agents samples horizon 2"]
+    shares: Float[np.ndarray, "agents samples"]
     edge_probs: Float[np.ndarray, " agents"]
 
 
@@ -103,6 +104,7 @@ class Recording:
             AgentOverlay(
                 now_m=frame.positions_m[key],
                 forecast_m=tuple(np.vstack([start.positions_m[key], sample]) for sample in step.forecast_m[i]),
+                shares=tuple(step.shares[i].tolist()),
                 truth_m=self._truth(key, step),
                 edge_prob=float(step.edge_probs[i]),
             )
@@ -135,6 +137,7 @@ def record_episode(
     *,
     seed: int = 0,
     max_steps: int | None = None,
+    num_samples: int = 1,
     style: OverlayStyle | None = None,
 ) -> Recording:
     """Plays one episode and records it for drawing.
@@ -144,6 +147,7 @@ def record_episode(
         act: function from its observation to an action.
         seed: seed of the reset.
         max_steps: largest number of policy steps.
+        num_samples: number of futures drawn for each agent, whatever the policy sees; the likelier, the more opaque.
         style: colours and widths of the drawing.
 
     Raises:
@@ -153,7 +157,7 @@ def record_episode(
         raise UserError(f"videos need a highway-env environment, got {env.unwrapped.__class__.__name__}")
     if env.render_mode != "rgb_array":
         raise UserError(f"videos need an env made with render_mode='rgb_array', got {env.render_mode!r}")
-    recorder = _Recorder(env, style or OverlayStyle())
+    recorder = _Recorder(env, num_samples, style or OverlayStyle())
     try:
         obs, _ = env.reset(seed=seed)
         recorder.begin()
@@ -172,8 +176,9 @@ class _Recorder:
 
     frames_per_sec: int = 0  # set by highway-env
 
-    def __init__(self, env: ForecastObservation, style: OverlayStyle) -> None:
+    def __init__(self, env: ForecastObservation, num_samples: int, style: OverlayStyle) -> None:
         self._env = env
+        self._samples = num_samples
         self._base = cast(Any, env.unwrapped)
         config: dict[str, Any] = self._base.config
         self.recording = Recording(
@@ -226,12 +231,13 @@ class _Recorder:
         self.recording._frames.append(frame)
 
     def _note_forecast(self) -> None:
-        scene, forecast = self._env.scene, self._env.forecast
+        scene, forecast = self._env.scene, self._env.stream.again(self._samples)
         others = np.flatnonzero(scene.valid)[1:]  # without the ego
         keys = tuple(scene.ids[others].tolist())
         xy_m = forecast.xy[0].double().cpu().numpy() + scene.states[0, :2]
         probs = 1 - forecast.ego_edges()[0][0, :, 0, 0].double().cpu().numpy()  # agent → ego
-        step = _Step(len(self.recording._frames), keys, xy_m[:, others].swapaxes(0, 1), probs[others])
+        shares = forecast.sample_probs()[0].double().cpu().numpy()[:, others].T
+        step = _Step(len(self.recording._frames), keys, xy_m[:, others].swapaxes(0, 1), shares, probs[others])
         self.recording._steps.append(step)
 
 

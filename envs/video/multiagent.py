@@ -19,7 +19,6 @@ from PIL import Image
 
 from envs.parallel import ForecastParallelEnv
 from envs.readers import multiagent_env_id
-from envs.readers.base import role_of
 from envs.readers.pursuit import is_pursuit_env
 from envs.simulators.highway_multiagent import HighwayParallelEnv
 from envs.video.drawing import (
@@ -31,11 +30,12 @@ from envs.video.drawing import (
     Polyline,
     blank,
     draw_page,
+    fan,
     page_width,
     write_picture,
     write_video,
 )
-from predictor.scene import SceneSpec
+from envs.video.roles import LANDMARK, OTHER, mean_by_role, named_role, unnamed_role
 from predictor.support.errors import UserError
 
 FPS = 20
@@ -45,10 +45,6 @@ LENGTH_S = 8.0
 MAX_FRAMES_PER_STEP = 8
 """Largest number of pictures per policy step."""
 
-LANDMARK = "landmark"
-"""Role of landmarks: drawn below all agents, without forecast."""
-OTHER = "other"
-"""Role of agents without a name or flag."""
 _AT_REST_MPS = 1e-3
 
 
@@ -105,6 +101,8 @@ class _Body:
     """Role, which sets the colour."""
     forecast_m: Float[np.ndarray, "samples horizon 2"]
     """Forecast positions."""
+    shares: Float[np.ndarray, " samples"]
+    """Probability of each sample."""
     acts: float
     """Probability that it acts on the focus agent."""
 
@@ -250,9 +248,10 @@ class MultiagentRecording:
         for key in moving:
             pen.truth(self._arena.view.pixels(self._truth_m(key, step)))
         for key in moving:
-            for sample in bodies[key].forecast_m:
-                line = self._arena.view.pixels(np.vstack([bodies[key].now_m, sample]))
-                pen.forecast(line, self._colors[bodies[key].role])
+            body = bodies[key]
+            for sample, opacity in fan(body.forecast_m, body.shares):
+                line = self._arena.view.pixels(np.vstack([body.now_m, sample]))
+                pen.forecast(line, self._colors[body.role], opacity)
         return picture
 
     def _draw_disc(self, pen: Pen, body: _Body, at: Float[np.ndarray, "2"], focused: bool = False) -> None:
@@ -290,6 +289,7 @@ def record_multiagent_episode(
     seed: int = 0,
     max_steps: int | None = None,
     focus: str | None = None,
+    num_samples: int = 1,
     style: MultiagentStyle | None = None,
 ) -> MultiagentRecording:
     """Plays one episode and records it for drawing.
@@ -300,12 +300,13 @@ def record_multiagent_episode(
         seed: seed of the reset.
         max_steps: largest number of policy steps.
         focus: name of the agent whose incoming edges are drawn; None takes the first one that lives.
+        num_samples: number of futures drawn for each agent, whatever the policy sees; the likelier, the more opaque.
         style: colours and sizes of the drawing.
 
     Raises:
         UserError: no agent is called `focus`, or the environment has no agents after its reset.
     """
-    recorder = _Recorder(env, focus, style or MultiagentStyle())
+    recorder = _Recorder(env, focus, num_samples, style or MultiagentStyle())
     observations, _ = env.reset(seed=seed)
     recorder.begin()
     while env.agents and recorder.recording.num_steps != max_steps:
@@ -318,11 +319,12 @@ def record_multiagent_episode(
 class _Recorder:
     """Records an episode; keeps the agents' names, also after the environment has dropped them."""
 
-    def __init__(self, env: ForecastParallelEnv, focus: str | None, style: MultiagentStyle) -> None:
+    def __init__(self, env: ForecastParallelEnv, focus: str | None, num_samples: int, style: MultiagentStyle) -> None:
         if focus is not None and focus not in env.possible_agents:
             raise UserError(f"focus must be one of {', '.join(env.possible_agents)}, got '{focus}'")
         self._env = env
         self._focus = focus
+        self._samples = num_samples
         # y points as in the simulators' own pictures.
         y_up = not (isinstance(env.unwrapped, HighwayParallelEnv) or is_pursuit_env(env))
         self.recording = MultiagentRecording(multiagent_env_id(env), env.scene_spec.dt_s, "", style, y_up)
@@ -347,12 +349,14 @@ class _Recorder:
         focus = scene.index_of.get(self.recording.focus)
         if focus is not None:
             self.recording._focus_id = int(scene.scene.ids[focus])
-        self.recording._moments.append(_Moment(self._bodies(focus), _mean_by_role(self._returns)))
+        self.recording._moments.append(_Moment(self._bodies(focus), mean_by_role(self._returns)))
 
     def _bodies(self, focus: int | None) -> dict[int, _Body]:
-        scene, forecast, spec = self._env.scene, self._env.forecast, self._env.scene_spec
+        scene, spec = self._env.scene, self._env.scene_spec
+        forecast = self._env.stream.again(self._samples)
         states = scene.scene.states
         xy_m = forecast.xy[0].double().cpu().numpy().swapaxes(0, 1)
+        shares = forecast.sample_probs()[0].double().cpu().numpy().T
         probs = 1 - forecast.edge_probs[0, :, :, 0].double().cpu().numpy()  # receiver first
         has_heading = bool(scene.heading_rad.any())
         sizes = spec.feature_names.index("radius_m") if "radius_m" in spec.feature_names else None
@@ -363,8 +367,9 @@ class _Recorder:
                 now_m=states[i, :2].copy(),
                 tick=_tick(states[i, 2:4], float(scene.heading_rad[i]) if has_heading else None),
                 radius_m=0.0 if sizes is None else float(states[i, sizes]),
-                role=_role(self._names[key]) if key in self._names else _unnamed_role(states[i], spec),
+                role=named_role(self._names[key]) if key in self._names else unnamed_role(states[i], spec),
                 forecast_m=xy_m[i],
+                shares=shares[i],
                 acts=0.0 if focus is None else float(probs[focus, i]),
             )
         return bodies
@@ -376,23 +381,3 @@ def _tick(velocity_mps: Float[np.ndarray, "2"], heading_rad: float | None) -> Fl
         return np.array([np.cos(heading_rad), np.sin(heading_rad)])
     speed_mps = float(np.hypot(*velocity_mps))
     return velocity_mps / speed_mps if speed_mps > _AT_REST_MPS else np.zeros(2)
-
-
-def _role(name: str) -> str:
-    """Returns the role of a named agent: its name without the number."""
-    role = role_of(name)
-    return OTHER if role.isdigit() else role
-
-
-def _unnamed_role(state: Float[np.ndarray, " features"], spec: SceneSpec) -> str:
-    """Returns the first flag that is set among the constant features ("landmark", "evader")."""
-    flags = [name for name in spec.constant_features if not name.endswith("_m")]
-    return next((name for name in flags if state[spec.feature_names.index(name)] == 1.0), OTHER)
-
-
-def _mean_by_role(returns: dict[str, float]) -> dict[str, float]:
-    """Returns the mean return of each role's agents."""
-    grouped: dict[str, list[float]] = {}
-    for name, value in returns.items():
-        grouped.setdefault(_role(name), []).append(value)
-    return {role: float(np.mean(values)) for role, values in grouped.items()}

@@ -49,7 +49,7 @@ def test_all_samples_are_the_same():
 def test_forecasting_leaves_the_belief_alone():
     forecaster, states = ConstantVelocity(spec()), random_states(0, 2, 3, 4)
     belief = observe(forecaster, states)
-    forecaster.rollout(belief, 3).states
+    forecaster.rollout(belief, 3)
     assert torch.equal(belief.states, random_states(0, 2, 3, 4))
 
 
@@ -130,4 +130,4 @@ def test_a_scene_with_its_own_generator_draws_the_same_in_any_batch_and_with_any
 def test_generators_must_be_as_many_as_scenes():
     noisy, states = NoisyConstantVelocity(spec(), 0.3, 1.0), random_states(0, 2, 3, 4)
     with pytest.raises(UserError, match="noise needs one generator per scene, got 1 for 2"):
-        noisy.rollout(observe(noisy, states), 3, 5, [np.random.default_rng(7)]).states
+        noisy.rollout(observe(noisy, states), 3, 5, [np.random.default_rng(7)])

@@ -116,7 +116,7 @@ def graph_while_forecasting(kind: str, monkeypatch: pytest.MonkeyPatch) -> list[
     monkeypatch.setattr(
         IMMA, "recur", lambda self, x, v, graph, nodes: graphs.append(graph) or inner(self, x, v, graph, nodes)
     )
-    forecaster.rollout(belief, 4).states
+    forecaster.rollout(belief, 4)
     return [belief.internal.scores, *graphs]
 
 

@@ -318,10 +318,10 @@ def test_cost_grows_with_agents_and_not_with_pairs(name: str):
     forecaster, held, largest = precise(name, 3), [], []
     for agents in (32, 64, 128):
         states, valid = random_states(0, 1, 2, agents, 4).double(), torch.ones(1, 2, agents).bool()
-        forecaster.rollout(list(stream(forecaster, states, valid))[-1][1], 2).states  # the weights are folded by now
+        forecaster.rollout(list(stream(forecaster, states, valid))[-1][1], 2)  # the weights are folded by now
         with Sizes(agents) as sizes:
             memory, belief = list(stream(forecaster, states, valid))[-1]
-            forecaster.rollout(belief, 2, 2, torch.Generator().manual_seed(0)).states
+            forecaster.rollout(belief, 2, 2, torch.Generator().manual_seed(0))
         held.append(sum(t.numel() for t in tensors([memory, belief])))
         largest.append(sizes.largest)
     for sizes_of in (held, largest):
@@ -493,9 +493,9 @@ def test_frozen_graphs_are_drawn_once(frozen: bool, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(dgvae, "concrete_sample", sample)
     forecaster = precise("rich", 2, frozen=frozen)
     times = 1 if frozen else HORIZON
-    forecaster.rollout(last(forecaster), HORIZON, 1).states
+    forecaster.rollout(last(forecaster), HORIZON, 1)
     assert not drawn
-    forecaster.rollout(last(forecaster), HORIZON, 4).states
+    forecaster.rollout(last(forecaster), HORIZON, 4)
     assert len(drawn) == times
     drawn.clear()
     forecaster.window(scenes(0), random_presence(0, BATCH, TIME, AGENTS), torch.tensor([1, 3]), HORIZON)
@@ -515,7 +515,7 @@ def test_frozen_steps_have_the_same_graph_and_features(samples: int, monkeypatch
     forecaster = precise("fast", 2, frozen=True)
     belief = last(forecaster)
     monkeypatch.setattr(Decoder, "messages", watched)
-    forecaster.rollout(belief, HORIZON, samples, torch.Generator().manual_seed(0)).states
+    forecaster.rollout(belief, HORIZON, samples, torch.Generator().manual_seed(0))
     expected, drawn = shown[: HORIZON - 1], shown[HORIZON - 1 :]  # the expected run's first step was taken before
     for graph, features in expected:
         assert torch.equal(graph, belief.edge_probs) and torch.equal(features, belief.edge_features)
