@@ -12,7 +12,7 @@ from torch import Tensor
 from predictor.data.windows import WindowBatch
 from predictor.dgvae import DGVAE
 from predictor.dgvae.networks import PRESETS, DGVAEConfig
-from predictor.forecaster import Belief, Memory, WindowOutput
+from predictor.forecaster import Belief, Memory
 from predictor.scene import AxisFrame, SceneSpec
 from predictor.support.runtime import Precision, precision
 from predictor.training.config import TrainConfig
@@ -114,7 +114,7 @@ class TrainingStep:
             output = self.model.window(
                 batch.states, batch.valid, batch.last_observed, self.rollout_steps, self._generator
             )
-        output = WindowOutput(*(None if t is None else t.float() for t in output))  # type: ignore[arg-type]
+        output = output.float()
         loss, _ = window_loss(self.model, batch, output, self._config, 1.0)
         self._optimizer.zero_grad(set_to_none=True)
         loss.backward()

@@ -70,12 +70,12 @@ class AgentOverlay:
     """Position in this picture."""
     forecast_m: tuple[Polyline, ...]
     """One line per sample, from its position when the forecast was made."""
-    shares: tuple[float, ...]
-    """Probability of each sample."""
     truth_m: Polyline
     """True future positions."""
     edge_prob: float
     """Probability that it interacts with the ego."""
+    shares: tuple[float, ...] = ()
+    """Probability of each sample; empty draws all of them opaque."""
 
 
 @dataclass(frozen=True)
@@ -208,13 +208,14 @@ def write_picture(path: str | Path, picture: UInt8[np.ndarray, "height width 3"]
     Image.fromarray(picture).save(path, format="PNG")
 
 
-def fan(
-    lines: Sequence[Polyline], shares: Sequence[float] | Float[np.ndarray, " samples"]
-) -> list[tuple[Polyline, float]]:
-    """Returns the lines with their opacities, the faintest first: the likeliest is opaque, others by their share."""
-    listed = [float(share) for share in shares]
+def fan(lines: Iterable[Polyline], shares: Iterable[float] = ()) -> list[tuple[Polyline, float]]:
+    """Returns lines with opacities, the faintest first: the likeliest is opaque, others by their share of its
+    probability; without shares all are opaque.
+    """
+    drawn = list(lines)
+    listed = [float(share) for share in shares] or [1.0] * len(drawn)
     opacities = [MIN_OPACITY + (1 - MIN_OPACITY) * share / max(listed) for share in listed]
-    return sorted(zip(lines, opacities, strict=True), key=lambda drawn: drawn[1])
+    return sorted(zip(drawn, opacities, strict=True), key=lambda pair: pair[1])
 
 
 def dashes(line: Polyline, dash: float) -> list[Polyline]:
