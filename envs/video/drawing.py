@@ -209,9 +209,7 @@ def write_picture(path: str | Path, picture: UInt8[np.ndarray, "height width 3"]
 
 
 def fan(lines: Iterable[Polyline], shares: Iterable[float] = ()) -> list[tuple[Polyline, float]]:
-    """Returns lines with opacities, the faintest first: the likeliest is opaque, others by their share of its
-    probability; without shares all are opaque.
-    """
+    """Returns lines with opacities, the faintest first: the likeliest is opaque; without shares, all are."""
     drawn = list(lines)
     listed = [float(share) for share in shares] or [1.0] * len(drawn)
     opacities = [MIN_OPACITY + (1 - MIN_OPACITY) * share / max(listed) for share in listed]

@@ -231,7 +231,8 @@ class _Recorder:
         self.recording._frames.append(frame)
 
     def _note_forecast(self) -> None:
-        scene, forecast = self._env.scene, self._env.stream.again(self._samples)
+        scene = self._env.scene
+        forecast = self._env.stream.again(self._samples) if self._samples > 1 else self._env.forecast
         others = np.flatnonzero(scene.valid)[1:]  # without the ego
         keys = tuple(scene.ids[others].tolist())
         xy_m = forecast.xy[0].double().cpu().numpy() + scene.states[0, :2]

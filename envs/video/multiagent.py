@@ -353,7 +353,7 @@ class _Recorder:
 
     def _bodies(self, focus: int | None) -> dict[int, _Body]:
         scene, spec = self._env.scene, self._env.scene_spec
-        forecast = self._env.stream.again(self._samples)
+        forecast = self._env.stream.again(self._samples) if self._samples > 1 else self._env.forecast
         states = scene.scene.states
         xy_m = forecast.xy[0].double().cpu().numpy().swapaxes(0, 1)
         shares = forecast.sample_probs()[0].double().cpu().numpy().T
