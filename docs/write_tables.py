@@ -10,7 +10,14 @@ from pathlib import Path
 
 from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS
 from predictor.evaluation.in_env_record import FILE_NAME, Measurement, read_record
-from predictor.reports.in_env_tables import COLUMNS, card_section, measurement_table, metres, replace_tables
+from predictor.reports.in_env_tables import (
+    COLUMNS,
+    card_section,
+    measurement_table,
+    metres,
+    replace_tables,
+    samples_table,
+)
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_text
 from predictor.support.markdown import table
@@ -48,6 +55,7 @@ def tables(records: Records) -> dict[str, str]:
     return {
         "forecasts": measurement_table(own, SHORT),
         "forecasts-long": measurement_table(own, LONG),
+        "samples": samples_table(own),
         "lent": _lent(at_k),
         "transfer": _transfer(records),
     }

@@ -46,6 +46,22 @@ class Measurement:
     """FDE of the most likely forecast [m]."""
     best_of_k_m: float | None = None
     """minADE of the best of K samples [m]."""
+    best_of_k_interval_m: Interval | None = None
+    """95 % bootstrap interval of `best_of_k_m` over episodes [m]."""
+    joint_best_of_k_m: float | None = None
+    """Joint minADE: of the best of K scenes [m]."""
+    joint_best_of_k_interval_m: Interval | None = None
+    """95 % bootstrap interval of `joint_best_of_k_m` over episodes [m]."""
+    energy_m: float | None = None
+    """Energy score of K samples [m]."""
+    energy_interval_m: Interval | None = None
+    """95 % bootstrap interval of `energy_m` over episodes [m]."""
+    coverage: Interval | None = None
+    """Smallest and largest share of truths within the central 90 % of the samples, over the steps."""
+    overlap: tuple[float, float] | None = None
+    """Share of agents' steps nearer to another agent than the miss threshold, in samples and in truth."""
+    controls: dict[str, dict[str, float | None]] | None = None
+    """Figures of each control at the same K, by its name: best_of_k_m, joint_best_of_k_m, energy_m, coverage."""
     one_step_m: float | None = None
     """ADE (K = 1) with a memory of one step [m]."""
     one_step_interval_m: Interval | None = None
@@ -114,7 +130,8 @@ def update_record(folder: Path, found: Sequence[Measurement]) -> list[Measuremen
 def _measurement(result: dict[str, Any], config: dict[str, Any], made: dict[str, Any]) -> Measurement:
     one, straight = result["model"], result["constant_velocity"]
     short = (result.get("histories") or {}).get("1") or {}
-    near = result.get("nearest_neighbours") or {}
+    controls = result.get("controls") or {}
+    near = controls.get("nearest neighbours") or result.get("nearest_neighbours") or {}
     median_ms, p95_ms = result.get("latency_median_ms"), result.get("latency_p95_ms")
     return Measurement(
         env_id=result["env_id"],
@@ -128,10 +145,10 @@ def _measurement(result: dict[str, Any], config: dict[str, Any], made: dict[str,
         min_ade_m=one["min_ade_m"],
         min_ade_interval_m=_frozen((one.get("intervals") or {}).get("min_ade_m")),
         min_fde_m=one["min_fde_m"],
-        best_of_k_m=result["model_samples"]["min_ade_m"],
+        **_of_samples(result),
         one_step_m=short.get("min_ade_m"),
         one_step_interval_m=_frozen((short.get("intervals") or {}).get("min_ade_m")),
-        neighbours_m=near.get("min_ade_m"),
+        neighbours_m=near.get("ade_m", near.get("min_ade_m")),
         below_cv=result["reduction"],
         below_cv_interval=_frozen(result["reduction_interval"]),
         latency_ms=None if median_ms is None or p95_ms is None else (median_ms, p95_ms),
@@ -139,6 +156,30 @@ def _measurement(result: dict[str, Any], config: dict[str, Any], made: dict[str,
         horizon_steps=len(one["by_step_m"]) if one.get("by_step_m") else None,
         dt_s=result.get("dt_s"),
     )
+
+
+def _of_samples(result: dict[str, Any]) -> dict[str, Any]:
+    """Returns the figures of K samples, and those of the controls."""
+    many = result["model_samples"]
+    intervals, covered = many.get("intervals") or {}, [c for c in many.get("coverage") or [] if c is not None]
+    found: dict[str, Any] = {"best_of_k_m": many["min_ade_m"]}
+    if many.get("energy_m") is None:
+        return found  # written before version 0.2
+    for name, key in (("best_of_k", "min_ade_m"), ("joint_best_of_k", "min_joint_ade_m"), ("energy", "energy_m")):
+        found[f"{name}_m"] = many[key]
+        found[f"{name}_interval_m"] = _frozen(intervals.get(key))
+    found["coverage"] = (min(covered), max(covered)) if covered else None
+    found["overlap"] = (many["overlap"], many["true_overlap"])
+    found["controls"] = {
+        key: {
+            "best_of_k_m": one["min_ade_m"],
+            "joint_best_of_k_m": one["min_joint_ade_m"],
+            "energy_m": one["energy_m"],
+            "coverage": (one["statistics"].get("coverage") or {}).get("mean"),
+        }
+        for key, one in (result.get("controls") or {}).items()
+    } or None
+    return found
 
 
 def _frozen(value: Any) -> Any:

@@ -77,6 +77,41 @@ def measurement_table(measurements: Sequence[Measurement], headings: Sequence[st
     return written + "".join(f"\n\n\\* {', '.join(envs)}: {note}." for note, envs in envs_of.items())
 
 
+SAMPLES_HEADINGS = (
+    "env", "K", "forecaster", "best of K (95 %) [m]", "joint best of K (95 %) [m]", "energy score (95 %) [m]",
+    "90 % covers, by step", "overlap (truth)",
+)  # fmt: skip
+
+
+def samples_table(measurements: Sequence[Measurement]) -> str:
+    """Returns a Markdown table of what K samples are worth: the model's line, then those of its controls."""
+    lines = []
+    for m in measurements:
+        if m.energy_m is None:
+            continue
+        covered = "–" if m.coverage is None else "{:.0f} to {:.0f} %".format(*(100 * c for c in m.coverage))
+        hit = "–" if m.overlap is None else "{:.1f} ({:.1f}) %".format(*(100 * o for o in m.overlap))
+        lines.append(
+            [
+                m.env_id,
+                str(m.samples),
+                "dG-VAE",
+                metres(m.best_of_k_m, m.best_of_k_interval_m),
+                metres(m.joint_best_of_k_m, m.joint_best_of_k_interval_m),
+                metres(m.energy_m, m.energy_interval_m),
+                covered,
+                hit,
+            ]
+        )
+        for name, control in (m.controls or {}).items():
+            figures = [metres(control[key]) for key in ("best_of_k_m", "joint_best_of_k_m", "energy_m")]
+            share = control["coverage"]
+            lines.append(
+                [m.env_id, str(m.samples), name, *figures, "–" if share is None else f"{100 * share:.0f} %", "–"]
+            )
+    return table(SAMPLES_HEADINGS, lines, "-r-r")
+
+
 def card_section(measurements: Sequence[Measurement]) -> str:
     """Returns the table of a checkpoint's card, and the command and commit of each line."""
     commands = "\n".join(f"* {m.env_id}: `{m.command}`, {_commit(m)}" for m in measurements)
