@@ -81,7 +81,7 @@ class _Subject:
 
 
 def evaluate(config: EvaluateConfig) -> list[Accuracy]:
-    """Returns the accuracy of the model (K = 1 and `num_samples`) and of constant velocity without and with noise.
+    """Returns the accuracy of the model and of constant velocity, with `num_samples` samples (noise, if several).
 
     Raises:
         UserError: `out` is a file, checkpoint or store is unreadable, their specs differ, or no episode is as long as
@@ -125,11 +125,14 @@ def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:
         )
     accuracies = []
     if subject.model is not None:
-        for samples in track(sorted({1, config.num_samples}), description="evaluate"):
-            made = run_windows(subject.model, windows, chosen, horizon, samples, config.seed, device=config.device)
-            accuracies.append(summarise(subject.name, made, subject.std_m))
-    accuracies.append(straight)
-    if config.num_samples > 1:
+        made = run_windows(
+            subject.model, windows, chosen, horizon, config.num_samples, config.seed, device=config.device
+        )
+        batches = track(made, "evaluate", total=-(-len(chosen) // 256))
+        accuracies.append(summarise(subject.name, batches, subject.std_m))
+    if config.num_samples == 1:
+        accuracies.append(straight)
+    else:
         noisy = NoisyConstantVelocity.fit(subject.spec, std_m)
         made = run_windows(noisy, windows, chosen, horizon, config.num_samples, config.seed)
         accuracies.append(summarise("constant velocity + noise", made, std_m))

@@ -19,12 +19,7 @@ from predictor.evaluation.standard_errors import NUM_SUBSETS, Statistic, batch_i
 
 OPTIONAL = ("coverage", "mixture_nll")
 """Names of quantities that are left out, not NaN, if they could not be measured."""
-SCALAR_NAMES = {
-    "rmse_m": "overall_rmse_m",
-    "coverage": "coverage",
-    "overlap": "overlap",
-    "true_overlap": "true_overlap",
-}
+SCALAR_NAMES = {"rmse_m": "overall_rmse_m", "coverage": "coverage"}
 """Names of the numbers over all steps, by name of the quantity at each step."""
 
 
@@ -72,7 +67,7 @@ class Accuracy:
     overlap: float = math.nan
     """Share of an agent's steps at which it is nearer than `miss_threshold_m` to another agent of the same sample."""
     true_overlap: float = math.nan
-    """The same share of the truth."""
+    """Share of the truth that `overlap` should have."""
     mixture_nll: list[float] = field(default_factory=list)
     """Negative log-likelihood [nats] under the predicted mixture at each step; empty without predicted scales."""
     scenes: int = 0

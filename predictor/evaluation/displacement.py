@@ -208,8 +208,8 @@ def overlap(
     valid: Bool[Tensor, "batch agents horizon"],
     distance_m: float,
     mode_probs: Float[Tensor, "batch samples agents"] | None = None,
-) -> tuple[Float[Tensor, "batch agents horizon"], Bool[Tensor, "batch agents horizon"]]:
-    """Computes the probability that an agent is nearer to another one of the same sample than `distance_m`.
+) -> tuple[Float[Tensor, "batch agents"], Bool[Tensor, "batch agents"]]:
+    """Computes the share of an agent's steps at which another agent of the same sample is nearer than `distance_m`.
 
     Args:
         positions: sampled positions [m].
@@ -220,10 +220,11 @@ def overlap(
     at_step = positions.transpose(2, 3)
     apart = torch.cdist(at_step, at_step, compute_mode="donot_use_mm_for_euclid_dist")
     there = valid.transpose(1, 2)[:, None]
-    alone = torch.eye(positions.shape[2], dtype=torch.bool, device=positions.device)
-    apart = apart.masked_fill(~(there[..., None] & there[..., None, :]) | alone, torch.inf)
+    itself = torch.eye(positions.shape[2], dtype=torch.bool, device=positions.device)
+    apart = apart.masked_fill(~(there[..., None] & there[..., None, :]) | itself, torch.inf)
     hit = (apart.min(-1).values < distance_m).transpose(2, 3).to(positions.dtype)
-    return hit.mean(1) if mode_probs is None else (hit * mode_probs[..., None]).sum(1), valid
+    share = hit.sum(-1) / valid.sum(-1).clamp(min=1)[:, None]
+    return share.mean(1) if mode_probs is None else (share * mode_probs).sum(1), valid.any(-1)
 
 
 def _mean_displacement(

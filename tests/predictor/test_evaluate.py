@@ -24,7 +24,10 @@ from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from predictor.support.errors import UserError, run_entry_point
 from tests.predictor.helpers import FAST_LIKE, spec, write_circles
 
-HEADING = "| forecaster | K | minADE [m] | minFDE [m] | joint ADE [m] | joint FDE [m] | RMSE [m] | missed | cover |"
+HEADING = (
+    "| forecaster | K | ADE₁ [m] | FDE₁ [m] | minADE [m] | minFDE [m] | joint ADE [m] | joint FDE [m] | energy [m] "
+    "| RMSE [m] | missed | cover | overlap |"
+)
 
 
 @pytest.fixture
@@ -73,20 +76,20 @@ def test_smoke(
     content = json.loads((out / "accuracy.json").read_text(), parse_constant=refuse)
     assert (content["source"], content["dt_s"]) == ("circles", 1.0)
     assert [(r["name"], r["num_samples"]) for r in content["rows"]] == [
-        ("dG-VAE", 1),
         ("dG-VAE", 3),
-        ("constant velocity", 1),
         ("constant velocity + noise", 3),
     ]
     assert all(len(r["by_step_m"]) == len(r["rmse_m"]) == len(r["nll"]) == 2 for r in content["rows"])
     lines = (out / "accuracy.md").read_text().splitlines()
     assert lines[0] == f"{HEADING} 1 s | 2 s |"
     names = [line.split("|")[1].strip() for line in lines[2:]]
-    assert names == ["dG-VAE", "dG-VAE", "constant velocity", "constant velocity + noise"]
+    assert names == ["dG-VAE", "constant velocity + noise"]
 
 
 def test_known_model_scores_what_it_must(data: Path, checkpoint: Path):
-    one, many, straight, _ = evaluate(EvaluateConfig(str(checkpoint), data, num_samples=4))
+    one, straight = evaluate(EvaluateConfig(str(checkpoint), data, num_samples=1))
+    many, noisy = evaluate(EvaluateConfig(str(checkpoint), data, num_samples=4))
+    assert (noisy.ade_m, noisy.fde_m) == (straight.min_ade_m, straight.min_fde_m)
     for found in (one, many):
         assert found.min_ade_m == pytest.approx(straight.min_ade_m, rel=1e-5)
         assert found.min_fde_m == pytest.approx(straight.min_fde_m, rel=1e-5)
@@ -105,7 +108,7 @@ def test_known_model_scores_what_it_must(data: Path, checkpoint: Path):
 def test_horizon_and_number_of_windows_can_be_chosen(data: Path, checkpoint: Path):
     accuracies = evaluate(EvaluateConfig(str(checkpoint), data, horizon_steps=4, max_windows=5))
     assert all(len(r.by_step_m) == 4 and r.agents <= 5 for r in accuracies)
-    assert [r.num_samples for r in accuracies] == [1, 20, 1, 20]
+    assert [r.num_samples for r in accuracies] == [20, 20]
 
 
 def test_one_sample_gives_one_line(data: Path, checkpoint: Path):
@@ -119,7 +122,7 @@ def test_rows_bear_the_name_of_the_model(data: Path, tmp_path: Path):
     torch.manual_seed(0)
     save_checkpoint(tmp_path / "mlp", MLP(spec(), MLPConfig(), 2), CheckpointInfo(spec(), MLPConfig(), 2, model="mlp"))
     accuracies = evaluate(EvaluateConfig(str(tmp_path / "mlp"), data, num_samples=2))
-    assert [r.name for r in accuracies] == ["MLP", "MLP", "constant velocity", "constant velocity + noise"]
+    assert [r.name for r in accuracies] == ["MLP", "constant velocity + noise"]
 
 
 def test_equal_seeds_give_equal_accuracies(data: Path, checkpoint: Path):
@@ -136,13 +139,19 @@ def test_markdown_closed_form():
         min_joint_fde_m=0.7,
         miss_rate=0.125,
         overall_rmse_m=0.25,
+        ade_m=0.3,
+        fde_m=0.6,
+        energy_m=0.22,
+        overlap=0.015,
+        true_overlap=0.005,
         statistics={"min_ade_m": Statistic(0.12, 0.004, 20), "coverage": Statistic(0.87, 0.01, 20)},
     )
     assert markdown_table([bare, full], 0.2) == (
         f"{HEADING} 0.2 s | 0.4 s |\n"
-        "|---|---|---|---|---|---|---|---|---|---|---|\n"
-        "| dG-VAE | 1 | 0.123 | 0.500 | – | – | – | – | – | 0.10 | 0.25 |\n"
-        "| dG-VAE | 20 | 0.123 ± 0.004 | 0.500 | 0.200 | 0.700 | 0.250 | 12.5 % | 87 % | 0.10 | 0.25 |\n"
+        f"|{15 * '---|'}\n"
+        "| dG-VAE | 1 | – | – | 0.123 | 0.500 | – | – | – | – | – | – | – | 0.10 | 0.25 |\n"
+        "| dG-VAE | 20 | 0.300 | 0.600 | 0.123 ± 0.004 | 0.500 | 0.200 | 0.700 | 0.220 | 0.250 | 12.5 % | 87 % "
+        "| 1.5 (0.5) % | 0.10 | 0.25 |\n"
     )
 
 
@@ -151,7 +160,7 @@ def test_small_errors_keep_two_digits():
     found = Accuracy("dG-VAE", 1, 0.01, 0.00987, errors, errors, [], 7)
     found = replace(found, statistics={"min_fde_m": Statistic(0.00987, 0.0000123, 20)})
     cells = [c.strip() for c in markdown_table([found], 1.0).splitlines()[-1].split("|")[1:-1]]
-    assert cells[2:4] == ["0.010", "0.0099 ± 1.2e-05"] and cells[-2:] == ["0.0012", "0.00"]
+    assert cells[4:6] == ["0.010", "0.0099 ± 1.2e-05"] and cells[-2:] == ["0.0012", "0.00"]
 
 
 def test_long_horizons_show_some_steps_and_the_last():
@@ -167,7 +176,7 @@ def test_constant_velocity_is_a_checkpoint_of_every_store(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], data: Path, checkpoint: Path, tmp_path: Path
 ):
     settings = EvaluateConfig("constant-velocity", data, horizon_steps=2)
-    found, noisy = evaluate(settings)
+    (noisy,), (found,) = evaluate(settings), evaluate(replace(settings, num_samples=1))
     assert (noisy.num_samples, noisy.agents) == (20, found.agents) and noisy.min_ade_m < found.min_ade_m
     assert found == evaluate(EvaluateConfig(str(checkpoint), data, num_samples=1))[-1]
     assert len(evaluate(EvaluateConfig("constant-velocity", data))[0].by_step_m) == 5
@@ -175,7 +184,7 @@ def test_constant_velocity_is_a_checkpoint_of_every_store(
     run(monkeypatch, "--checkpoint", "constant-velocity", "--data", data, "--horizon-steps", 2, "--out", out)
     assert "constant velocity" in capsys.readouterr().out
     content = json.loads((out / "accuracy.json").read_text(), parse_constant=refuse)
-    assert [r["name"] for r in content["rows"]] == ["constant velocity", "constant velocity + noise"]
+    assert [r["name"] for r in content["rows"]] == ["constant velocity + noise"]
     assert (out / "scenes.png").exists()
 
 
@@ -188,7 +197,9 @@ def test_three_axes(tmp_path: Path):
     states[:, :, 5] = 2 * np.arange(8.0)[:, None]
     episode = Episode(states, np.ones((8, 2), dtype=np.bool_), np.arange(2))
     write_store(tmp_path / "solid", StoreInfo(layout, "solid"), [episode])
-    found, _ = evaluate(EvaluateConfig("constant-velocity", tmp_path / "solid", horizon_steps=2, out=tmp_path / "out"))
+    (found,) = evaluate(
+        EvaluateConfig("constant-velocity", tmp_path / "solid", num_samples=1, horizon_steps=2, out=tmp_path / "out")
+    )
     assert found.axes == 3
     assert found.by_step_m == pytest.approx([1.0, 4.0])  # what v·t leaves out of (t + h)²
     assert (tmp_path / "out" / "scenes.png").exists()

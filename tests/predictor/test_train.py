@@ -282,14 +282,14 @@ def test_best_checkpoint_is_kept_and_a_stale_run_stops(
     def scripted(trainer: Trainer) -> Any:
         kept.append(weights(trainer))
         accuracy, std_m = validate(trainer)
-        return replace(accuracy, min_ade_m=next(errors)), std_m
+        return replace(accuracy, energy_m=next(errors)), std_m
 
     monkeypatch.setattr(Trainer, "validate", scripted)
     out = train(config(circles, tmp_path / "run", steps=100, eval_every=1, patience=2))
     assert state(tmp_path / "run")["step"] == 4  # two validations without a better one: as good is not better
     best = load_checkpoint(out)[0]
     assert all(torch.equal(a, b) for a, b in zip(best.parameters(), kept[1], strict=True))
-    assert load_checkpoint(out)[1].provenance["result"]["val_min_ade_m"] == 1.0
+    assert load_checkpoint(out)[1].provenance["result"]["val_energy_m"] == 1.0
 
 
 def test_resumed_run_remembers_its_best(tiny: None, circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -297,7 +297,7 @@ def test_resumed_run_remembers_its_best(tiny: None, circles: Path, tmp_path: Pat
 
     def scripted(trainer: Trainer) -> Any:
         accuracy, std_m = validate(trainer)
-        return replace(accuracy, min_ade_m=next(errors)), std_m
+        return replace(accuracy, energy_m=next(errors)), std_m
 
     monkeypatch.setattr(Trainer, "validate", scripted)
     settings = config(circles, tmp_path / "run", steps=100, eval_every=1, patience=3)

@@ -110,7 +110,10 @@ def test_statistics_are_those_of_the_subsets():
     accuracy = summarise("a", [whole])
     parts = np.array_split(np.random.default_rng(0).permutation(90), 20)
     of_parts = [summarise("a", [Outcome(whole.forecast[p], whole.future[p], whole.valid[p])]) for p in parts]
-    names = ("min_ade_m", "min_fde_m", "min_joint_ade_m", "min_joint_fde_m", "miss_rate", "overall_rmse_m")
+    names = (
+        "ade_m", "fde_m", "min_ade_m", "min_fde_m", "min_joint_ade_m", "min_joint_fde_m", "energy_m", "miss_rate",
+        "overall_rmse_m", "overlap", "true_overlap",
+    )  # fmt: skip
     assert set(accuracy.statistics) == set(names)
     for name in names:
         values = [getattr(r, name) for r in of_parts]
@@ -221,7 +224,7 @@ def test_an_iterator_is_enough_and_forecasts_are_not_kept():
     for _ in range(3):
         tally.add(gaussian(0, windows=50))
     kept = [a for parts in (*tally._sums.values(), *tally._counts.values()) for a in parts]
-    assert sum(a.size for a in kept) < 3 * 50 * 2 * 20  # far fewer numbers than the 240 per window of a forecast
+    assert sum(a.size for a in kept) < 3 * 50 * 2 * 25  # far fewer numbers than the 240 per window of a forecast
 
 
 def test_outcomes_of_different_shape_are_refused():

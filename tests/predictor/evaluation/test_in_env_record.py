@@ -53,5 +53,34 @@ def test_everything_that_accuracy_json_says_of_a_checkpoint_is_taken_over():
     (found,) = measurements_of(json.loads(json.dumps(content)), "toy")
     assert found == Measurement(
         "toy-v0", "varied", 6, 20, "python -m envs.evaluate", "abc", 4.0, 8.0, 1.0, (0.5, 1.5), 2.0, 0.75,
-        1.75, (0.5, 1.5), 3.0, 0.75, (0.5, 0.875), (3.0, 9.0), 7, 2, 0.5,
+        one_step_m=1.75, one_step_interval_m=(0.5, 1.5), neighbours_m=3.0, below_cv=0.75,
+        below_cv_interval=(0.5, 0.875), latency_ms=(3.0, 9.0), forecasts=7, horizon_steps=2, dt_s=0.5,
     )  # fmt: skip
+
+
+def test_samples_and_controls_are_taken_over():
+    one = {"min_ade_m": 1.0, "min_fde_m": 2.0}
+    many = {
+        "min_ade_m": 0.5, "min_joint_ade_m": 0.75, "energy_m": 0.625, "coverage": [0.75, 1.0, None], "overlap": 0.125,
+        "true_overlap": 0.0, "intervals": {"min_ade_m": [0.25, 0.75], "energy_m": [0.5, 1.0]},
+        "statistics": {"coverage": {"mean": 0.875}},
+    }  # fmt: skip
+    near = many | {"ade_m": 3.0, "statistics": {}}
+    result = {
+        "env_id": "toy-v0", "checkpoint": "toy", "driver": "varied", "dt_s": 0.5, "model": one, "model_samples": many,
+        "constant_velocity": one, "controls": {"nearest neighbours": near, "constant velocity + noise": many},
+        "reduction": None, "reduction_interval": None,
+    }  # fmt: skip
+    made = {"command": "c", "commit": "abc"}
+    (found,) = measurements_of(
+        {"config": {"episodes": 6, "num_samples": 20}, "results": [result], "provenance": made}, "toy"
+    )
+    assert (found.best_of_k_m, found.best_of_k_interval_m) == (0.5, (0.25, 0.75))
+    assert (found.joint_best_of_k_m, found.joint_best_of_k_interval_m) == (0.75, None)
+    assert (found.energy_m, found.energy_interval_m, found.coverage) == (0.625, (0.5, 1.0), (0.75, 1.0))
+    assert found.overlap == (0.125, 0.0) and found.neighbours_m == 3.0
+    figures = {"best_of_k_m": 0.5, "joint_best_of_k_m": 0.75, "energy_m": 0.625}
+    assert found.controls == {
+        "nearest neighbours": figures | {"coverage": None},
+        "constant velocity + noise": figures | {"coverage": 0.875},
+    }
