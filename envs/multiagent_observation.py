@@ -115,15 +115,7 @@ class MultiagentStream(SceneStream):
         )
 
     def _shown(self, forecast: Forecast) -> Forecast:
-        dense, front = forecast.dense(), self._front
-        return Forecast(
-            dense.xy[:, :, front:],
-            dense.edge_probs[:, front:, front:],
-            dense.edge_features[:, front:, front:],
-            dense.valid[:, front:],
-            mode_probs=None if dense.mode_probs is None else dense.mode_probs[:, :, front:],
-            xy_scale=None if dense.xy_scale is None else dense.xy_scale[:, :, front:],
-        )
+        return forecast.without_first(self._front)
 
 
 def _batch(scenes: Sequence[MultiagentScene]) -> SceneBatch:

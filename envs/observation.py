@@ -21,7 +21,10 @@ Observations = dict[str, NDArray[Any]]
 
 
 SCENE_KEYS = ("scene_states", "scene_ids", "scene_valid", "scene_heading_rad")
-FORECAST_KEYS = ("agents", "forecast", "mode_probs", "xy_scale", "edge_probs", "edge_features", "valid")
+FORECAST_KEYS = ("agents", "forecast", "edge_probs", "edge_features", "valid")
+"""Entries of every observation with forecasts."""
+UNCERTAINTY_KEYS = ("mode_probs", "xy_scale")
+"""Entries with several samples, or on request (`ForecastConfig.uncertainty`); the second, if the forecaster has it."""
 
 
 def scene_spaces(spec: SceneSpec) -> dict[str, gym.Space]:

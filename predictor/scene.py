@@ -287,6 +287,20 @@ class Forecast:
         probs, features = dense_edges(self.edge_probs, self.edge_features, self.senders)
         return replace(self, edge_probs=probs, edge_features=features, senders=None)
 
+    def without_first(self, agents: int) -> "Forecast":
+        """Returns the forecast of all agents but the first ones, dense."""
+        if not agents:
+            return self.dense()
+        dense = self.dense()
+        return Forecast(
+            dense.xy[:, :, agents:],
+            dense.edge_probs[:, agents:, agents:],
+            dense.edge_features[:, agents:, agents:],
+            dense.valid[:, agents:],
+            mode_probs=None if dense.mode_probs is None else dense.mode_probs[:, :, agents:],
+            xy_scale=None if dense.xy_scale is None else dense.xy_scale[:, :, agents:],
+        )
+
     def sample_probs(self) -> Float[Tensor, "batch samples agents"]:
         """Returns the probability of each sample, which is the same for all draws."""
         if self.mode_probs is not None:

@@ -9,7 +9,7 @@ ablations forecast the same scenes.
 import functools
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +136,8 @@ class _Baseline:
                 self._online.observe(past)
         else:
             self._online.observe(batch)
-        return _behind(self._online.forecast(self._horizon, self._samples, self._noise), self._front)
+        forecast = self._online.forecast(self._horizon, self._samples, self._noise)
+        return forecast.without_first(self._front)
 
 
 def play(task: EpisodeTask) -> Episode:
@@ -209,17 +210,6 @@ def _baselines(task: EpisodeTask, spec: SceneSpec) -> dict[str, _Baseline]:
         model = _kept_forecaster(task.checkpoint, spec, task.env_id)
         found[memory_key(steps)] = _Baseline(model, spec, task.horizon_steps, steps)
     return found
-
-
-def _behind(forecast: Forecast, front: int) -> Forecast:
-    """Returns positions, probabilities and scales of the agents from `front` on; edges are not needed here."""
-    probs, scale = forecast.mode_probs, forecast.xy_scale
-    return replace(
-        forecast,
-        xy=forecast.xy[:, :, front:],
-        mode_probs=None if probs is None else probs[:, :, front:],
-        xy_scale=None if scale is None else scale[:, :, front:],
-    )
 
 
 def _outcome(forecasts: Sequence[Forecast], future: torch.Tensor, valid: torch.Tensor) -> Outcome:

@@ -207,7 +207,8 @@ def plot_by_horizon(ax: Axes, accuracies: Sequence[Accuracy], dt_s: float, quant
     ax.set_xlabel("time ahead [s]")
     ax.set_ylabel(label)
     ax.grid(alpha=0.3)
-    ax.legend(frameon=False, fontsize=8)
+    if accuracies:
+        ax.legend(frameon=False, fontsize=8)
     return ax
 
 

@@ -10,7 +10,7 @@ from agents.features import TOKEN_KEYS, VALID_KEY, AttentionConfig, ForecastAtte
 from agents.task import Task
 from agents.training import TrainingPlan, make_model
 from agents.vec_envs import make_venv
-from envs.observation import FORECAST_KEYS
+from envs.observation import FORECAST_KEYS, UNCERTAINTY_KEYS
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
@@ -22,6 +22,11 @@ SHAPES = {
     "edge_probs": (AGENTS, 2),
     "edge_features": (AGENTS, 2 * FEATURES),
     "valid": (AGENTS,),
+}
+UNCERTAIN = SHAPES | {
+    "forecast": (AGENTS, 3, HORIZON, 2),
+    "mode_probs": (AGENTS, 3),
+    "xy_scale": (AGENTS, 3, HORIZON, 2),
 }
 
 
@@ -109,10 +114,10 @@ def test_order_of_agents_does_not_matter():
 
 
 def test_padded_agents_change_nothing_whatever_they_hold():
-    extractor, observations = make_extractor(SHAPES), make_observations(SHAPES)
+    extractor, observations = make_extractor(UNCERTAIN), make_observations(UNCERTAIN)
     observations["valid"][:, 3:] = 0
     expected = extractor(observations)
-    for key in ("agents", "forecast", "edge_probs", "edge_features"):
+    for key in TOKEN_KEYS:
         observations[key][:, 3:] = torch.nan
     torch.testing.assert_close(extractor(observations), expected)
 
@@ -142,7 +147,7 @@ def test_empty_scene_is_finite_with_finite_gradients():
 
 def test_every_entry_of_the_wrappers_is_read():
     """One that is added to the wrappers alone would change no policy, without a word."""
-    assert {*TOKEN_KEYS, VALID_KEY} == set(FORECAST_KEYS)
+    assert {*TOKEN_KEYS, VALID_KEY} == {*FORECAST_KEYS, *UNCERTAINTY_KEYS}
 
 
 def test_a_new_token_key_is_read(monkeypatch: pytest.MonkeyPatch):
@@ -156,7 +161,7 @@ def test_a_new_token_key_is_read(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.parametrize("key", TOKEN_KEYS)
 def test_gradient_reaches_every_token_input(key: str):
-    extractor, observations = make_extractor(SHAPES), make_observations(SHAPES)
+    extractor, observations = make_extractor(UNCERTAIN), make_observations(UNCERTAIN)
     observations[key].requires_grad_()
     extractor(observations).square().sum().backward()
     gradient = observations[key].grad

@@ -38,5 +38,5 @@ def save_tag(path: Path, has_ego: bool = False) -> str:
 
 def forget() -> None:
     """Drop what `envs.rollouts.episode` keeps from episode to episode: nothing of one test may serve in another."""
-    for kept in (live._kept_world, live._kept_forecaster, live._kept_neighbours):
+    for kept in (live._kept_world, live._kept_forecaster, live._kept_controls):
         kept.cache_clear()

@@ -163,7 +163,7 @@ def test_sb3_observations_lie_in_the_space(highway_checkpoint: str):
     venv = VecForecast(VecMonitor(DummyVecEnv(MAKERS)), highway_checkpoint, num_samples=2, horizon_steps=4)
     space = venv.observation_space
     assert isinstance(space, gym.spaces.Dict)
-    assert set(space) == {"observation", *FORECAST_KEYS}
+    assert set(space) == {"observation", *FORECAST_KEYS, "mode_probs"}
     observations: list[Any] = [one_of(venv.reset(), i) for i in range(3)]
     for t in range(3):
         obs, _, dones, infos = venv.step(ACTIONS[t])

@@ -10,7 +10,6 @@ import torch
 
 from envs.collect import CollectConfig, collect
 from envs.drivers.ego import idle_action, make_ego_driver
-from envs.observation import ego_entries
 from envs.readers.highway import HighwayReader
 from envs.readers.highway_labels import LEADER, SceneLabels
 from envs.readers.mpe import MPE_FEATURES
@@ -19,13 +18,14 @@ from envs.rollouts.episode import (
     CASE_HISTORY_STEPS,
     MODEL,
     NEIGHBOURS,
+    NOISY,
+    RESIDUAL,
     STRAIGHT,
     EpisodeTask,
     _types_of,
     futures,
     memory_key,
     play,
-    world_forecast,
 )
 from envs.rollouts.world import open_world
 from envs.seeding import driver_rng
@@ -39,7 +39,7 @@ from predictor.forecaster import Belief, Futures
 from predictor.online import OnlineForecaster
 from predictor.scene import PADDING_ID, Scene, SceneBatch, SceneSpec
 from tests.envs.evaluation import TAG, forget, save_tag, tag_spec
-from tests.envs.helpers import HIGHWAY_SPEC, HORIZON, cruising_env, random_forecast, random_scenes
+from tests.envs.helpers import HIGHWAY_SPEC, HORIZON, cruising_env
 from tests.envs.helpers import play as drive
 
 OFFSET_M = torch.tensor([3.0, 4.0])
@@ -175,20 +175,7 @@ def test_out_of_sight_is_not_out_of_truth():
         assert (model.valid[t, known].sum(-1) == min(HORIZON, steps - t)).all()
 
 
-# --- Forecasts, read out of the observation ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_way_back_undoes_the_ego_view(seed: int):
-    """For places in any order, with gaps, and any heading."""
-    rng = np.random.default_rng(seed)
-    scenes = random_scenes(rng, 1, 6)
-    forecast = random_forecast(rng, scenes, 3, HORIZON, 2, 4)
-    seen = ego_entries(scenes, forecast)["forecast"][0]
-    now = Scene(scenes.states[0], scenes.ids[0], scenes.valid[0], float(scenes.heading_rad[0]))
-    expected = forecast.xy[0] * forecast.valid[0][None, :, None, None]
-    expected[:, 0] = 0  # the ego has no entry
-    torch.testing.assert_close(world_forecast(seen, now), expected, rtol=0, atol=1e-5)
+# --- Forecasts of the deployed wrapper --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("env_id", ["highway-fast-v0", "intersection-v2", "racetrack-v1"])
@@ -300,10 +287,11 @@ def test_neighbours_that_lived_through_this_very_episode_are_exact(tmp_path: Pat
     (recorded,) = collect(config)
     store = tmp_path / "store"
     write_store(store, StoreInfo(HighwayReader(make_env(made.env_id)).spec, made.env_id), [recorded] * 6)
-    outcomes = play(replace(made, neighbours=(str(store),))).outcomes
+    outcomes = play(replace(made, stores=(str(store),))).outcomes
     near, straight = (summarise(key, [outcomes[key]]) for key in (NEIGHBOURS, STRAIGHT))
     assert near.agents == straight.agents > 0
-    assert near.min_ade_m == pytest.approx(0.0, abs=1e-3)
+    assert {outcomes[key].forecast.shape[1] for key in (MODEL, NEIGHBOURS, NOISY, RESIDUAL)} == {made.samples}
+    assert near.ade_m == pytest.approx(0.0, abs=1e-3)
     assert straight.min_ade_m > 0.1
 
 

@@ -8,7 +8,7 @@ from matplotlib import pyplot as plt
 from rich.console import Console
 
 from envs.rollouts import report
-from envs.rollouts.episode import MODEL, NEIGHBOURS, STRAIGHT, Case, memory_key
+from envs.rollouts.episode import MODEL, NEIGHBOURS, RESIDUAL, STRAIGHT, Case, memory_key
 from envs.rollouts.report import EnvAccuracy
 from predictor.evaluation.accuracy import Accuracy
 from predictor.evaluation.graph_accuracy import GraphAccuracy
@@ -21,7 +21,7 @@ def accuracy(name: str, ade_m: float, samples: int = 1) -> Accuracy:
     return Accuracy(
         name, samples, ade_m, 2 * ade_m, steps, steps, [1.0, 2.0, 3.0], 40,
         intervals={"min_ade_m": (0.9 * ade_m, 1.1 * ade_m)}, step_intervals={"by_step_m": band},
-        miss_by_step=[0.0, 0.5, 1.0],
+        miss_by_step=[0.0, 0.5, 1.0], min_joint_ade_m=ade_m, energy_m=ade_m, ade_m=ade_m,
     )  # fmt: skip
 
 
@@ -36,7 +36,8 @@ def result(env_id: str = "tag", checkpoint: str = "mine", reduction: float = 0.5
 def full() -> EnvAccuracy:
     graph = GraphAccuracy(120, 0.3, accuracy=0.875, f1=0.5, true_connectivity=0.25)
     histories = {1: accuracy("dG-VAE, 1 step of history", 1.5)}
-    return replace(result(), nearest_neighbours=accuracy(NEIGHBOURS, 1.25), histories=histories, graph=graph)
+    controls = {RESIDUAL: accuracy(RESIDUAL, 0.75, 20), NEIGHBOURS: accuracy(NEIGHBOURS, 1.25, 20)}
+    return replace(result(), controls=controls, histories=histories, graph=graph)
 
 
 def case(error_m: float = 1.0, agents: int = 3) -> Case:
@@ -71,9 +72,10 @@ def test_markdown_has_an_overview_and_a_table_per_environment():
     lines = report.markdown([full(), result("spread")], {}).splitlines()
     assert cells_of(lines[0]) == list(report.HEADS)
     assert cells_of(lines[2]) == [
-        "tag", "mine", "0.1", "3", "1.00", "2.00", "0.500", "1.25", "2.00 / 4.00", "50 %", "40 to 60 %", "40", "1.2",
+        "tag", "mine", "0.1", "3", "1.00", "2.00", "0.500", "0.500", "0.500", "–", "0.750", "1.25", "2.00 / 4.00",
+        "50 %", "40 to 60 %", "40", "1.2",
     ]  # fmt: skip
-    assert cells_of(lines[3])[:2] == ["spread", "mine"] and cells_of(lines[3])[7] == "–"
+    assert cells_of(lines[3])[:2] == ["spread", "mine"] and cells_of(lines[3])[11] == "–"
     titles = [line for line in lines if line.startswith("### ")]
     assert titles == [
         "### tag, checkpoint mine, driven heuristic",
@@ -109,16 +111,15 @@ def test_tables_of_a_terminal_have_units_and_dashes():
 
 def test_lines_by_horizon_carry_the_numbers():
     figure, ax = plt.subplots()
-    report.plot_by_horizon(ax, full().lines, 0.1, "by_step_m", "displacement [m]")
+    report.plot_by_horizon(ax, [*full().lines, full().constant_velocity], 0.1, "by_step_m", "displacement [m]")
     lines = {str(line.get_label()): line for line in ax.get_lines()}
     assert list(lines) == [
-        "dG-VAE, K = 1", "dG-VAE, K = 20", "dG-VAE, 1 step of history, K = 1", "nearest neighbours",
-        "constant velocity",
+        "dG-VAE, K = 20", "model + Gaussian noise, K = 20", "nearest neighbours", "constant velocity",
     ]  # fmt: skip
     np.testing.assert_allclose(lines["constant velocity"].get_xdata(), [0.1, 0.2, 0.3])
     np.testing.assert_allclose(lines["constant velocity"].get_ydata(), [1.0, 2.0, 4.0])
     assert lines["constant velocity"].get_color() == "grey"
-    assert len(ax.collections) == 5  # a band each
+    assert len(ax.collections) == 4  # a band each
     assert ax.get_ylabel() == "displacement [m]"
     plt.close(figure)
 

@@ -1,8 +1,6 @@
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
+import torch
 
 from envs.readers.highway_labels import LEADER
 from envs.rollouts.world import EgoWorld, MultiagentWorld, World, default_drivers, open_world
@@ -10,7 +8,6 @@ from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.scene import Scene
 from predictor.support.errors import UserError
 from tests.envs.evaluation import TAG
-from tests.envs.helpers import save_forecast_policy
 
 ROAD = "two-way-v0"
 
@@ -75,26 +72,17 @@ def test_edges_are_known_on_roads_in_the_order_of_all_agents():
 
 
 def test_one_ego_or_many_learners_with_forecasts_or_without(highway_checkpoint: str):
-    plain, forecast = open_world(ROAD, "idle"), open_world(ROAD, "idle", highway_checkpoint, num_samples=2)
+    plain, forecast = open_world(ROAD, "idle"), open_world(ROAD, "idle", highway_checkpoint)
     assert isinstance(plain, EgoWorld) and isinstance(plain.env, SceneObservation)
     assert isinstance(forecast, EgoWorld) and isinstance(forecast.env, ForecastObservation)
     forecast.reset(0)
-    assert forecast.observation["forecast"].ndim == 4
-    multi = open_world(TAG, "idle", "constant-velocity", horizon_steps=7, num_samples=2)
+    assert forecast.observation["forecast"].ndim == 3
+    assert forecast.forecast(4).xy.shape[1] == 4
+    torch.testing.assert_close(forecast.forecast(4).xy[:, :1], forecast.env.forecast.xy)
+    multi = open_world(TAG, "idle", "constant-velocity", horizon_steps=7)
     assert isinstance(multi, MultiagentWorld)
     multi.reset(0)
-    assert multi.env.forecast.xy.shape == (1, 2, multi.spec.max_agents, 7, 2)
-
-
-def test_a_policy_gets_the_most_likely_of_several_forecasts(tmp_path: Path, highway_checkpoint: str):
-    policy = str(save_forecast_policy(tmp_path, ROAD, highway_checkpoint))
-    world = open_world(ROAD, policy, highway_checkpoint, num_samples=3)
-    assert isinstance(world, EgoWorld)
-    world.reset(0)
-    seen: dict[str, Any] = world._seen()
-    assert world.observation["forecast"].shape[1] == 3
-    np.testing.assert_array_equal(seen["forecast"], world.observation["forecast"][:, 0])
-    np.testing.assert_array_equal(seen["agents"], world.observation["agents"])
+    assert multi.forecast(2).xy.shape == (1, 2, multi.spec.max_agents, 7, 2)
 
 
 @pytest.mark.parametrize(
