@@ -127,7 +127,7 @@ def test_other_options_are_named(field: str, other: int | None):
 def test_a_policy_drives_with_its_own_forecaster_only(tmp_path: Path, highway_checkpoint: str, retrained: str):
     policy = str(save_forecast_policy(tmp_path, ENV_ID, highway_checkpoint))
     assert env_for_driver(make_env(ENV_ID), policy)
-    open_world(ENV_ID, policy, highway_checkpoint, num_samples=2).close()
+    open_world(ENV_ID, policy, highway_checkpoint).close()
     with pytest.raises(UserError, match="was trained on forecaster .* but gets '.*retrained"):
         open_world(ENV_ID, policy, retrained)
 
