@@ -61,7 +61,7 @@ class TrainConfig:
     """Weight of the likelihood of the roll-out; 0 trains teacher-forced only, as the NRI family does."""
     energy_weight: float = 2.0
     """Weight of the energy score of each agent's modes; only models with modes have it."""
-    joint_energy_weight: float = 0.3
+    joint_energy_weight: float = 2.0
     """Weight of the energy score of whole scenes, whose modes are those of all agents together."""
     kl_weight: float = 1.0
     """Weight of KL(posterior ‖ prior)."""
