@@ -166,7 +166,12 @@ RENAMED: dict[str, dict[str, str]] = {
     "predictor.data.crowd": {"--agents": "--num-agents", "--steps": "--episode-steps"},
     "predictor.data.nba": {"--window-steps": "--episode-steps"},
     "envs.collect": {"--ego": "--driver"},
-    "envs.evaluate": {"--ego": "--driver", "--samples": "--num-samples", "--history-steps": "--memory-steps"},
+    "envs.evaluate": {
+        "--ego": "--driver",
+        "--samples": "--num-samples",
+        "--history-steps": "--memory-steps",
+        "--neighbours": "--data",
+    },
     "envs.export_levelx": {"--ego": "--driver"},
     "agents.evaluate": {"--workers": "--num-envs"},
     "train_policy": {"--env": "--env-id", "--envs": "--num-envs", "--partner": "--driver", "--run-dir": "--out"},

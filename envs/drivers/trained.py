@@ -7,7 +7,6 @@ Learners, the driver of the others and the forecaster are read from the note ins
 import functools
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +32,7 @@ def trained_driver(path: str, env: Any, rng: np.random.Generator) -> Driver:
 
     Args:
         path: path of an SB3 ``.zip``. It holds pickled data: load only files whose source you trust.
-        env: a `ForecastParallelEnv`, whose observations the driver gets; of several samples, it gets the first.
+        env: a `ForecastParallelEnv`, whose observations the driver gets.
         rng: source of randomness of the note's driver.
 
     Raises:
@@ -70,22 +69,14 @@ def _line(space: gym.Space) -> str:
 
 
 def _seen_space(space: gym.Space, sees_forecasts: bool) -> gym.Space:
-    """Returns an agent's observation space with one forecast, or without any."""
+    """Returns an agent's observation space with forecasts, or without any."""
     assert isinstance(space, gym.spaces.Dict)
-    if not sees_forecasts:
-        return space["observation"]
-    forecast = space["forecast"]
-    shape = forecast.shape or ()
-    one = gym.spaces.Box(-np.inf, np.inf, (shape[0], *shape[-2:]), np.float32)
-    return gym.spaces.Dict({**space.spaces, "forecast": one})
+    return space if sees_forecasts else space["observation"]
 
 
 def _seen(observation: Mapping[str, Any], sees_forecasts: bool) -> Any:
     """Returns the observation in the space of `_seen_space`."""
-    if not sees_forecasts:
-        return observation["observation"]
-    forecast = observation["forecast"]
-    return {**observation, "forecast": forecast[:, 0] if forecast.ndim == 4 else forecast}
+    return observation if sees_forecasts else observation["observation"]
 
 
 def env_for_driver(env: gym.Env, name: str) -> gym.Env:
@@ -158,7 +149,7 @@ def require_forecaster(path: str, checkpoint: str, space: gym.spaces.Dict, spec:
     Args:
         path: path of the policy's zip.
         checkpoint: checkpoint whose forecasts it gets.
-        space: observation space with that forecaster's forecasts; of several samples the policy gets the first.
+        space: observation space with that forecaster's forecasts.
         spec: layout of the scenes.
     """
     from envs.sb3.policy_file import pin_forecaster
@@ -166,4 +157,4 @@ def require_forecaster(path: str, checkpoint: str, space: gym.spaces.Dict, spec:
     note = note_of(path)
     if note is not None and note.forecaster is not None:
         found = pin_forecaster(checkpoint, space, spec)
-        note.forecaster.check(replace(found, num_samples=note.forecaster.num_samples), f"policy {path}")
+        note.forecaster.check(found, f"policy {path}")

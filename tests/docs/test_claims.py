@@ -95,10 +95,13 @@ def test_what_the_shipped_checkpoints_use_of_the_newer_parts_is_what_their_confi
     }
     sees_changes = {name for name, config in configs.items() if config.get("change_scales")}
     fitted = {name for name, config in configs.items() if config.get("input_scales")}
-    words = {3: "three", 6: "six"}
+    words = {3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine", 10: "ten"}
     assert f"Of {len(configs)}, {words[len(sees_changes)]} see changes" in README
     assert f"{words[len(fitted)]} of these have fitted input scales" in README and fitted <= sees_changes
     assert all(f"`{name}`" in README.split("fitted input scales")[1].split("\n* ")[0] for name in fitted)
+    plural = {name for name, config in configs.items() if config.get("num_modes")}
+    named = README.split("Plural are ")[1].split(". ")[0]
+    assert {name for name in configs if f"`{name}`" in named} == plural
     for config in configs.values():
         assert not config.get("innovation_rounds") and not config.get("gated_messages")
         assert config["residual"] == "constant_velocity"

@@ -45,14 +45,13 @@ def played(env: ForecastParallelEnv, path: str) -> tuple[dict[str, float], list[
     return returns, actions
 
 
-@pytest.mark.parametrize("num_samples", [1, 2])
 @pytest.mark.parametrize("observe", ["none", "constant-velocity"])
 @pytest.mark.parametrize("learners", [(), ("agent_0", "agent_2")], ids=["all", "two"])
-def test_it_acts_as_where_it_was_measured(learners: tuple[str, ...], observe: Any, num_samples: int, tmp_path: Path):
+def test_it_acts_as_where_it_was_measured(learners: tuple[str, ...], observe: Any, tmp_path: Path):
     task = Task(SPREAD, observe, learners=learners, driver="varied")
     path, model = save_run(tmp_path, task)
     (expected,) = MultiagentArena(task).play(model, [SEED])
-    returns, actions = played(forecast_env(num_samples=num_samples), path)
+    returns, actions = played(forecast_env(), path)
     assert len(actions) == expected.length
     assert len({acted["agent_0"] for acted in actions}) > 1
     mean = np.mean([value for agent, value in returns.items() if not learners or agent in learners])
@@ -100,7 +99,9 @@ def test_a_damaged_note_is_one_clear_line(tmp_path: Path):
 
 def test_a_policy_refuses_forecasts_of_other_options(tmp_path: Path):
     path, _ = save_run(tmp_path, Task(SPREAD, "constant-velocity"))
-    assert open_world(SPREAD, path, "constant-velocity", num_samples=2)
+    assert open_world(SPREAD, path, "constant-velocity")
+    with pytest.raises(UserError, match="was trained on"):
+        MultiagentWorld(forecast_env(num_samples=2), path)
     with pytest.raises(UserError, match="was trained on"):
         open_world(SPREAD, path, "constant-velocity", horizon_steps=7)
 

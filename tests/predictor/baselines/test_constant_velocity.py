@@ -129,5 +129,5 @@ def test_a_scene_with_its_own_generator_draws_the_same_in_any_batch_and_with_any
 
 def test_generators_must_be_as_many_as_scenes():
     noisy, states = NoisyConstantVelocity(spec(), 0.3, 1.0), random_states(0, 2, 3, 4)
-    with pytest.raises(UserError, match="noise needs one generator per scene, got 1 for 2"):
+    with pytest.raises(UserError, match="samples need one generator per scene, got 1 generators for 2 scenes"):
         noisy.rollout(observe(noisy, states), 3, 5, [np.random.default_rng(7)])

@@ -99,7 +99,7 @@ def test_streaming_forecasts_what_the_window_does(
     for index, t in enumerate(last_observed):
         streamed = forecaster.rollout(beliefs[t], forecaster.horizon_steps).states
         torch.testing.assert_close(
-            streamed[index, 0], window.rollout[index], rtol=1e-5, atol=1e-4
+            streamed[index, 0], window.rollout[index], rtol=1e-4, atol=1e-4
         )  # positions: tens of m
 
 

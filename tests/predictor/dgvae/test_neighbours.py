@@ -22,7 +22,7 @@ from predictor.dgvae import model as dgvae
 from predictor.dgvae.networks import Decoder, DGVAEConfig
 from predictor.dgvae.packing import Packed
 from predictor.forecaster import Belief, Memory, WindowOutput
-from predictor.graph import NO_AGENT, others, pair_mask
+from predictor.graph import NO_AGENT, among_nearest, off_diagonal, others, pair_mask
 from predictor.online import OnlineForecaster
 from predictor.scene import PADDING_ID, Forecast, Scene
 from predictor.support.errors import UserError
@@ -135,7 +135,7 @@ def test_with_room_for_all_agents_training_is_that_of_the_dense_model(name: str,
         precise(name, k).window(states, valid, torch.tensor([2, 3]), HORIZON, torch.Generator().manual_seed(0))
         for k in (near, 0)
     )
-    for one, other in zip(ours, expected, strict=True):
+    for one, other in zip(ours[:-1], expected[:-1], strict=True):  # the last are modes, of which there are none
         assert torch.equal(one, other)
 
 
@@ -214,7 +214,7 @@ def test_a_pair_that_stays_keeps_its_memory_in_another_slot(context: Any):
     states, all_agents = torch.stack([first, second], dim=1), torch.ones(1, 2, 4).bool()
     dense = forecaster.encoder(
         forecaster.codec.inputs(states, all_agents),
-        forecaster._graph_of_window(states, all_agents).present,
+        off_diagonal(pair_mask(all_agents) & among_nearest(states[..., :2], all_agents, 2)),
         *(torch.zeros(1, 4, 3, 5, dtype=torch.float64),) * 2,
         others(4),
     )
