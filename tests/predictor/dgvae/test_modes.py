@@ -271,9 +271,7 @@ def test_the_window_rolls_out_the_modes_that_streaming_does(
         assert output.modes is not None and torch.equal(output.modes.states[:, 0], output.rollout)
         for index, t in enumerate(last_observed):
             streamed = model.rollout(beliefs[t], HORIZON, count)
-            window, found = (
-                Futures(*(part[[index]] for part in futures)) for futures in (output.modes, streamed)  # type: ignore[index]
-            )
+            window, found = (Futures(*(part[[index]] for part in futures)) for futures in (output.modes, streamed))
             assert_close(window, found, valid[[index], t])
 
 
@@ -295,7 +293,7 @@ def test_every_weight_of_the_self_edges_gets_a_finite_gradient():
     model = DGVAE(spec(), PLURAL, HORIZON)
     output = model.window(*scenes(), torch.tensor([1, 3]), HORIZON, torch.Generator().manual_seed(0), 4)
     assert output.modes is not None and model.self_edges is not None
-    sum((t.square() * torch.linspace(1, 2, t.numel()).view(t.shape)).sum() for t in output.modes).backward()  # type: ignore[union-attr]
+    sum((t.square() * torch.linspace(1, 2, t.numel()).view(t.shape)).sum() for t in output.modes).backward()
     for name, parameter in model.self_edges.named_parameters():
         assert parameter.grad is not None and torch.isfinite(parameter.grad).all(), name
         assert parameter.grad.abs().amax(tuple(range(1, parameter.ndim))).min() > 0, name  # of every type

@@ -117,7 +117,7 @@ def test_unit_brings_distances_to_the_laplace_likelihood():
 
 
 def leaves(modes: Futures) -> Futures:
-    return Futures(*(t.clone().requires_grad_() for t in modes))  # type: ignore[union-attr]
+    return Futures(*(t.clone().requires_grad_() for t in modes))
 
 
 def gradients(loss: Tensor, modes: Futures) -> list[Tensor]:
