@@ -45,7 +45,8 @@ def covariance(control: GaussianResidual) -> Tensor:
     return noise
 
 
-EXPECTED = torch.kron(torch.minimum(*torch.meshgrid(*[torch.arange(1.0, 1 + HORIZON)] * 2, indexing="ij")), torch.eye(2))
+TIME = torch.arange(1.0, 1 + HORIZON)
+EXPECTED = torch.kron(torch.minimum(TIME[:, None], TIME), torch.eye(2))
 """Covariance of a random walk with steps of 1 m: min(s, t) between steps s and t, none between axes."""
 
 
