@@ -74,6 +74,9 @@ def by_loop(extractor: ForecastAttention, observations: dict[str, torch.Tensor])
             parts = [torch.tanh(now / config.near_m), now / config.far_m, motion / config.speed_mps]
             for places in (forecast, forecast - now):
                 parts.append(torch.cat([torch.tanh(places / config.near_m), places / config.far_m], -1).flatten())
+            if "xy_scale" in observations:
+                parts.append(torch.tanh(observations["xy_scale"][b, a] / config.near_m).flatten())
+                parts.append(observations["mode_probs"][b, a].flatten())
             parts += [observations["edge_probs"][b, a], observations["edge_features"][b, a]]
             hidden = extractor.token_in(torch.cat(parts)) + extractor.token_ego(ego)
             tokens.append(extractor.token_out(hidden))
@@ -88,9 +91,12 @@ def by_loop(extractor: ForecastAttention, observations: dict[str, torch.Tensor])
 
 
 @pytest.mark.parametrize("absent", [0, 1, AGENTS], ids=lambda n: f"{n} absent")
-@pytest.mark.parametrize("samples", [(), (3,)], ids=lambda s: f"{len(s)} sample axes")
-def test_features_and_gradients_equal_a_plain_loop(absent: int, samples: tuple[int, ...]):
-    shapes = SHAPES | {"forecast": (AGENTS, *samples, HORIZON, 2)}
+@pytest.mark.parametrize(
+    "shapes",
+    [SHAPES, SHAPES | {"forecast": (AGENTS, 3, HORIZON, 2)}, UNCERTAIN],
+    ids=["0 sample axes", "1 sample axes", "uncertain"],
+)
+def test_features_and_gradients_equal_a_plain_loop(absent: int, shapes: dict[str, tuple[int, ...]]):
     extractor, observations = make_extractor(shapes), make_observations(shapes)
     observations["valid"][1, 1 : 1 + absent] = 0
     observations["valid"][2, :absent] = 0
@@ -191,6 +197,16 @@ def test_several_samples_are_read():
     before = extractor(observations)
     observations["forecast"][:, :, 2] += 5.0
     assert (extractor(observations) - before).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("key", ["mode_probs", "xy_scale"])
+def test_how_likely_and_how_uncertain_a_future_is_are_read(key: str):
+    extractor, observations = make_extractor(UNCERTAIN), make_observations(UNCERTAIN)
+    observations["mode_probs"] = torch.softmax(observations["mode_probs"] / 20, dim=-1)
+    observations["xy_scale"] = observations["xy_scale"].abs()
+    before = extractor(observations)
+    observations[key] = observations[key].roll(1, dims=2)  # the same numbers, of other futures
+    assert (extractor(observations) - before).abs().amax(1).min() > 1e-3
 
 
 def test_missing_observation_is_named():

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -23,9 +24,9 @@ def tag_spec() -> SceneSpec:
     return multiagent_reader_for(make_multiagent_env(TAG)).spec
 
 
-def save_tag(path: Path, has_ego: bool = False) -> str:
+def save_tag(path: Path, has_ego: bool = False, **changes: Any) -> str:
     """A small dG-VAE with random weights for simple_tag_v3, as it is or as trained around an ego."""
-    spec, sizes = replace(tag_spec(), has_ego=has_ego), replace(SIZES, delta_scales=TAG_CHANGES)
+    spec, sizes = replace(tag_spec(), has_ego=has_ego), replace(SIZES, delta_scales=TAG_CHANGES, **changes)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         model = DGVAE(spec, sizes, HORIZON)

@@ -46,9 +46,13 @@ SIZES = DGVAEConfig(
 )
 
 
-def tiny_model(spec: SceneSpec, num_edge_types: int = 2) -> DGVAE:
+PLURAL = {"num_modes": 4, "rollout_graph": "frozen"}
+"""Changes of `SIZES` that give agents several enumerated futures with probabilities."""
+
+
+def tiny_model(spec: SceneSpec, num_edge_types: int = 2, **changes: Any) -> DGVAE:
     """Random weights, larger than at initialisation so that the history has a clear say in the forecast."""
-    config = replace(SIZES, num_edge_types=num_edge_types)
+    config = replace(SIZES, num_edge_types=num_edge_types, **changes)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         model = DGVAE(spec, config, HORIZON)
@@ -58,8 +62,9 @@ def tiny_model(spec: SceneSpec, num_edge_types: int = 2) -> DGVAE:
     return model.eval()
 
 
-def save_tiny(path: Path, spec: SceneSpec) -> str:
-    save_checkpoint(path, tiny_model(spec), CheckpointInfo(spec, SIZES, HORIZON))
+def save_tiny(path: Path, spec: SceneSpec, **changes: Any) -> str:
+    model = tiny_model(spec, **changes)
+    save_checkpoint(path, model, CheckpointInfo(spec, model.config, HORIZON))
     return str(path)
 
 

@@ -11,7 +11,7 @@ from envs.observation import ForecastStream
 from envs.scene_stream import ForecastConfig
 from predictor.scene import Forecast, SceneBatch
 from predictor.support.errors import UserError
-from tests.envs.helpers import HIGHWAY_SPEC, assert_same, random_scenes, tiny_model
+from tests.envs.helpers import HIGHWAY_SPEC, PLURAL, assert_same, random_scenes, tiny_model
 
 ENVS, SAMPLES = 3, 4
 
@@ -131,6 +131,54 @@ def test_a_copy_is_not_touched_by_a_reset_of_the_original():
     made.reset()
     made.seed(9)
     assert_same(copy.observe(scenes(1)), kept.observe(scenes(1)), tolerance=0.0)
+
+
+# --- Again, with other samples ----------------------------------------------------------------------------------------
+
+
+def plural(envs: int = ENVS, samples: int = 1) -> ForecastStream:
+    model = tiny_model(HIGHWAY_SPEC, **PLURAL)
+    return ForecastStream(model, HIGHWAY_SPEC, envs, ForecastConfig(num_samples=samples))
+
+
+@pytest.mark.parametrize("make", [plural, stream], ids=["modes", "draws"])
+@pytest.mark.parametrize("samples", [1, 3, 4, 9])
+def test_forecasting_again_changes_no_observation(make: Any, samples: int):
+    made, untouched = make(samples=1), make(samples=1)
+    for t in range(3):
+        assert_same(made.observe(scenes(t)), untouched.observe(scenes(t)), tolerance=0.0)
+        shown, taken = made.forecast, made.scenes
+        kept = deepcopy(made.forecast)
+        again = made.again(samples)
+        assert made.forecast is shown and made.scenes is taken
+        for field in fields(Forecast):
+            before, after = getattr(kept, field.name), getattr(shown, field.name)
+            assert (before is None and after is None) or bool((before == after).all()), field.name
+        assert again.xy.shape[:2] == (ENVS, samples)
+        assert_same(again.xy[:, :1].numpy(), shown.xy.numpy())
+        assert (again.mode_probs is not None) == (make is plural and samples <= PLURAL["num_modes"])
+        assert (again.xy_scale is not None) == (make is plural)
+
+
+def test_forecasting_again_gives_what_a_stream_with_as_many_samples_shows():
+    one, many = plural(samples=1), plural(samples=3)
+    for t in range(2):
+        one.observe(scenes(t)), many.observe(scenes(t))
+    again, shown = one.again(3), many.forecast
+    assert shown is not None
+    for field in fields(Forecast):
+        if (expected := getattr(shown, field.name)) is not None:
+            assert_same(getattr(again, field.name).numpy(), expected.numpy())
+
+
+def test_forecasting_again_draws_from_the_noise_of_each_environment():
+    made, alone = stream(samples=1), stream(envs=1, seed=2, samples=1)
+    made.observe(scenes(0))
+    alone.observe(scenes(0)[np.array([2])])
+    assert_same(made.again(SAMPLES).xy[2:].numpy(), alone.again(SAMPLES).xy.numpy())
+    first, second = made.again(SAMPLES).xy, made.again(SAMPLES).xy
+    assert (first[:, 1:] - second[:, 1:]).abs().max() > 1e-2
+    assert_same(first[:, :1].numpy(), second[:, :1].numpy())
 
 
 def test_a_negative_seed_is_named():

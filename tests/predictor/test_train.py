@@ -27,8 +27,8 @@ from predictor.support.errors import UserError, run_entry_point
 from predictor.train import train
 from predictor.training.config import TrainConfig
 from predictor.training.objective import window_loss
-from predictor.training.trainer import Trainer, load_data, typical_change
-from tests.predictor.helpers import FAST_LIKE, circling_episode, following_episode, model, spec, write_circles
+from predictor.training.trainer import VALIDATION_DRAWS, Trainer, load_data, typical_change
+from tests.predictor.helpers import FAST_LIKE, PLURAL, circling_episode, following_episode, model, spec, write_circles
 
 ROOT = Path(__file__).parents[2]
 State = dict[str, Any]
@@ -290,6 +290,30 @@ def test_best_checkpoint_is_kept_and_a_stale_run_stops(
     best = load_checkpoint(out)[0]
     assert all(torch.equal(a, b) for a, b in zip(best.parameters(), kept[1], strict=True))
     assert load_checkpoint(out)[1].provenance["result"]["val_energy_m"] == 1.0
+
+
+@pytest.mark.parametrize("preset", ["fast", "plural"])
+def test_the_checkpoint_of_the_lowest_energy_is_kept_whatever_the_errors_say(
+    tiny: None, circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: Any
+):
+    """The best of K and the single forecast get worse while the score of the whole distribution gets better."""
+    monkeypatch.setitem(PRESETS, "plural", PLURAL)
+    validate, scores, kept = Trainer.validate, iter([(2.0, 1.0), (1.0, 5.0), (1.5, 0.5)]), []
+
+    def scripted(trainer: Trainer) -> Any:
+        kept.append(weights(trainer))
+        accuracy, std_m = validate(trainer)
+        energy_m, error_m = next(scores)
+        return replace(accuracy, energy_m=energy_m, ade_m=error_m, min_ade_m=error_m, min_joint_ade_m=error_m), std_m
+
+    monkeypatch.setattr(Trainer, "validate", scripted)
+    out = train(config(circles, tmp_path / "run", preset=preset, steps=3, eval_every=1))
+    best, info = load_checkpoint(out)
+    assert all(torch.equal(a, b) for a, b in zip(best.parameters(), kept[1], strict=True))
+    result = info.provenance["result"]
+    assert (result["step"], result["val_energy_m"], result["val_ade_m"]) == (2, 1.0, 5.0)
+    assert result["val_samples"] == (PLURAL.num_modes if preset == "plural" else VALIDATION_DRAWS)
+    assert (state(tmp_path / "run")["best"], state(tmp_path / "run")["stale"]) == (1.0, 1)
 
 
 def test_resumed_run_remembers_its_best(tiny: None, circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

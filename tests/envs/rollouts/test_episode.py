@@ -39,7 +39,7 @@ from predictor.forecaster import Belief, Futures
 from predictor.online import OnlineForecaster
 from predictor.scene import PADDING_ID, Scene, SceneBatch, SceneSpec
 from tests.envs.evaluation import TAG, forget, save_tag, tag_spec
-from tests.envs.helpers import HIGHWAY_SPEC, HORIZON, cruising_env
+from tests.envs.helpers import HIGHWAY_SPEC, HORIZON, PLURAL, cruising_env
 from tests.envs.helpers import play as drive
 
 OFFSET_M = torch.tensor([3.0, 4.0])
@@ -293,6 +293,45 @@ def test_neighbours_that_lived_through_this_very_episode_are_exact(tmp_path: Pat
     assert {outcomes[key].forecast.shape[1] for key in (MODEL, NEIGHBOURS, NOISY, RESIDUAL)} == {made.samples}
     assert near.ade_m == pytest.approx(0.0, abs=1e-3)
     assert straight.min_ade_m > 0.1
+
+
+# --- Controls at equal K ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("who", ["tag", "tag-around-an-ego"])
+@pytest.mark.parametrize("samples", [3, PLURAL["num_modes"] + 2])
+def test_controls_have_as_many_samples_as_the_model_and_start_from_its_guess(who: str, samples: int, tmp_path: Path):
+    made = task(TAG, checkpoint=save_tag(tmp_path / "tag", who != "tag", **PLURAL), driver="heuristic", samples=samples)
+    store = tmp_path / "store"
+    recorded = collect(CollectConfig(TAG, tmp_path, 2, ("heuristic",), 50, 12, False, 1))
+    write_store(store, StoreInfo(tag_spec(), TAG), recorded)
+    made = replace(made, stores=(str(store),), histories=(2,))
+    outcomes = play(made).outcomes
+    several = (MODEL, RESIDUAL, NEIGHBOURS, NOISY)
+    assert {key: outcome.forecast.shape[1] for key, outcome in outcomes.items()} == {
+        **dict.fromkeys(several, samples), STRAIGHT: 1, memory_key(2): 1,
+    }  # fmt: skip
+    model, known = outcomes[MODEL], outcomes[MODEL].valid.any(-1)
+    assert model.scale is not None and model.scale.shape == model.forecast.shape
+    assert (model.mode_probs is None) == (samples > PLURAL["num_modes"])
+    if model.mode_probs is not None:
+        assert model.mode_probs.shape == model.forecast.shape[:3]
+        torch.testing.assert_close(model.mode_probs.sum(1), torch.ones(known.shape))
+    for key in (RESIDUAL, NEIGHBOURS, NOISY):
+        assert outcomes[key].mode_probs is None and outcomes[key].scale is None
+        assert torch.equal(outcomes[key].valid, model.valid) and torch.equal(outcomes[key].future, model.future)
+        drawn = outcomes[key].forecast.transpose(1, 2)[known]
+        assert (drawn[:, 1:] - drawn[:, :1]).abs().amax((1, 2, 3)).min() > 1e-5
+
+    def first(key: str) -> torch.Tensor:
+        return outcomes[key].forecast[:, 0][known]
+
+    torch.testing.assert_close(first(RESIDUAL), first(MODEL), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(first(NOISY), first(STRAIGHT), rtol=1e-4, atol=1e-4)
+    again, other = play(made).outcomes, play(replace(made, seed=made.seed + 1)).outcomes
+    for key in several:
+        assert torch.equal(again[key].forecast, outcomes[key].forecast)
+        assert not torch.equal(other[key].forecast, outcomes[key].forecast)
 
 
 # --- Edges and time ---------------------------------------------------------------------------------------------------

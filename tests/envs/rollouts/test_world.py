@@ -1,3 +1,7 @@
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +11,8 @@ from envs.rollouts.world import EgoWorld, MultiagentWorld, World, default_driver
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.scene import Scene
 from predictor.support.errors import UserError
-from tests.envs.evaluation import TAG
+from tests.envs.evaluation import TAG, save_tag
+from tests.envs.helpers import HIGHWAY_SPEC, PLURAL, save_tiny
 
 ROAD = "two-way-v0"
 
@@ -83,6 +88,41 @@ def test_one_ego_or_many_learners_with_forecasts_or_without(highway_checkpoint: 
     assert isinstance(multi, MultiagentWorld)
     multi.reset(0)
     assert multi.forecast(2).xy.shape == (1, 2, multi.spec.max_agents, 7, 2)
+
+
+@pytest.mark.parametrize("env_id", [ROAD, TAG])
+def test_more_samples_begin_with_the_one_that_is_observed_and_leave_it_alone(env_id: str, tmp_path: Path):
+    """A driver that is a policy sees one future, whatever is measured beside it."""
+    if env_id == ROAD:
+        checkpoint = save_tiny(tmp_path / "plural", HIGHWAY_SPEC, **PLURAL)
+    else:
+        checkpoint = save_tag(tmp_path / "plural", **PLURAL)
+    world, untouched = (open_world(env_id, "idle", checkpoint) for _ in range(2))
+    assert isinstance(world, EgoWorld | MultiagentWorld)
+    for one in (world, untouched):
+        one.reset(0)
+    for _ in range(3):
+        before = deepcopy(world.env.forecast)
+        for samples in (1, 3, PLURAL["num_modes"], 9):
+            found = world.forecast(samples)
+            assert found.xy.shape[1] == samples
+            torch.testing.assert_close(found.xy[:, :1], before.xy, rtol=1e-4, atol=1e-4)
+            assert found.xy_scale is not None and found.xy_scale.shape == found.xy.shape
+            if found.mode_probs is not None:
+                torch.testing.assert_close(found.mode_probs.sum(1), torch.ones_like(found.mode_probs[:, 0]))
+        assert torch.equal(world.env.forecast.xy, before.xy)
+        shown, expected = (w.observation if isinstance(w, EgoWorld) else w._observations for w in (world, untouched))
+        assert_same_nested(shown, expected)
+        assert world.step() == untouched.step()
+
+
+def assert_same_nested(found: Any, expected: Any) -> None:
+    if isinstance(expected, dict):
+        assert set(found) == set(expected)
+        for key in expected:
+            assert_same_nested(found[key], expected[key])
+    else:
+        np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize(

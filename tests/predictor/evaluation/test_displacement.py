@@ -1,5 +1,6 @@
 import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from predictor.evaluation.displacement import (
+    LEAST_STD_M,
     coverage,
     displacement,
     gaussian_mixture_nll,
@@ -17,6 +19,8 @@ from predictor.evaluation.displacement import (
     min_joint_ade,
     min_joint_fde,
     miss_rate,
+    mixture_nll,
+    overlap,
     squared_error,
 )
 from predictor.evaluation.graph_accuracy import edge_entropy
@@ -115,6 +119,24 @@ def test_squared_error_is_that_of_the_mean_of_the_samples():
     assert squared_error(forecast, STANDING, ALL)[0].tolist() == [[[0.0, 4.0, 16.0]]]
 
 
+@pytest.mark.parametrize(
+    ("probs", "expected"),
+    [((0.5, 0.5), [0.0, 4.0, 16.0]), ((0.25, 0.75), [0.25, 9.0, 16.0]), ((1.0, 0.0), [1.0, 0.0, 16.0])],
+)
+def test_squared_error_is_that_of_the_weighted_mean_of_the_modes(probs: tuple[float, ...], expected: list[float]):
+    forecast = one_agent(along_x(-1, 0, 4), along_x(1, 4, 4))
+    value, counts = squared_error(forecast, STANDING, ALL, torch.tensor(probs)[None, :, None])
+    assert value[0, 0].tolist() == pytest.approx(expected)
+    assert torch.equal(counts, ALL)
+
+
+def test_each_agent_weighs_modes_by_its_own_probabilities():
+    forecast = one_agent(along_x(-1), along_x(5)).expand(-1, -1, 2, -1, -1)
+    probs = torch.tensor([[0.5, 1.0], [0.5, 0.0]])[None]
+    value, _ = squared_error(forecast, torch.zeros(1, 2, 1, 2), torch.ones(1, 2, 1).bool(), probs)
+    assert value[0, :, 0].tolist() == [4.0, 1.0]
+
+
 def test_displacement_keeps_samples_apart():
     forecast = one_agent(along_x(1, 2, 3), along_x(4, 5, 6))
     assert displacement(forecast, STANDING)[0, :, 0].tolist() == [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
@@ -146,6 +168,47 @@ def test_nll_closed_form(forecast: Tensor, expected: list[float]):
 def test_nll_of_a_far_miss_is_large_but_finite():
     value, _ = gaussian_mixture_nll(one_agent(along_x(1e4, 1e4, 1e4)), STANDING, ALL, torch.full((3,), 0.1))
     assert value[0, 0, 0].item() == pytest.approx(1e8 / 0.02, rel=1e-3)
+
+
+def test_mixture_nll_is_that_of_a_mixture_of_normal_distributions():
+    generator = torch.Generator().manual_seed(0)
+    forecast, scale = 2 * torch.randn(2, 5, 3, 4, 2, generator=generator), torch.rand(2, 5, 3, 4, 2) + 0.2
+    future, probs = torch.randn(2, 3, 4, 2), torch.softmax(torch.randn(2, 5, 3, generator=generator), dim=1)
+    mean, std_m = (t.permute(0, 2, 3, 1, 4) for t in (forecast, scale))
+    mixture = torch.distributions.MixtureSameFamily(
+        torch.distributions.Categorical(probs.transpose(1, 2)[:, :, None].expand(-1, -1, 4, -1)),
+        torch.distributions.Independent(torch.distributions.Normal(mean, std_m), 1),
+    )
+    value, counts = mixture_nll(forecast, future, torch.ones(2, 3, 4).bool(), probs, scale)
+    torch.testing.assert_close(value, -mixture.log_prob(future))
+    assert counts.all()
+
+
+def test_mixture_nll_of_equal_modes_is_that_of_equal_samples():
+    generator = torch.Generator().manual_seed(0)
+    forecast, std_m = torch.randn(2, 4, 3, 3, 2, generator=generator), torch.tensor([0.5, 1.0, 2.0])
+    future, valid = torch.zeros(2, 3, 3, 2), torch.ones(2, 3, 3).bool()
+    scale = std_m[:, None].expand(forecast.shape)
+    value, _ = mixture_nll(forecast, future, valid, torch.full((2, 4, 3), 0.25), scale)
+    torch.testing.assert_close(value, gaussian_mixture_nll(forecast, future, valid, std_m)[0])
+
+
+def test_mixture_nll_has_a_least_scale_and_takes_modes_without_probability():
+    forecast, probs = one_agent(along_x(0, 0, 0), along_x(50, 50, 50)), torch.tensor([1.0, 0.0])[None, :, None]
+    narrow, least = (torch.full((1, 2, 1, 3, 2), std_m) for std_m in (0.0, LEAST_STD_M))
+    value, _ = mixture_nll(forecast, STANDING, ALL, probs, narrow)
+    assert torch.equal(value, mixture_nll(forecast, STANDING, ALL, probs, least)[0])
+    assert value[0, 0].tolist() == pytest.approx([math.log(2 * math.pi * LEAST_STD_M**2)] * 3, rel=1e-5)
+
+
+def test_mixture_nll_does_not_see_truth_that_does_not_count():
+    future, valid = STANDING.clone(), torch.tensor([[[True, False, True]]])
+    future[0, 0, 1] = math.nan
+    forecast = one_agent(along_x(1, 2, 3)).requires_grad_()
+    value, counts = mixture_nll(forecast, future, valid, torch.ones(1, 1, 1), torch.ones(1, 1, 1, 3, 2))
+    value[counts].sum().backward()
+    assert value[counts].tolist() == pytest.approx([0.5 + math.log(2 * math.pi), 4.5 + math.log(2 * math.pi)])
+    assert forecast.grad is not None and torch.isfinite(forecast.grad).all()
 
 
 @pytest.mark.parametrize(
@@ -291,6 +354,110 @@ def test_samples_spread_like_the_truth_cover_it_as_often_as_they_should(samples:
     assert coverage(3 + 2 * (forecast - 3), truth, valid, 0.5)[0].mean().item() > 0.8
 
 
+@pytest.mark.parametrize(
+    ("truth", "share", "covered"),
+    [
+        # weighted mean 0.6, distances 4.6 (0.2), 0.4 (0.5), 2.4 (0.3): nearer than the truth is 0, 0.5, 0.8 or all
+        (0.9, 0.4, 1.0),
+        (0.1, 0.4, 0.0),
+        (0.1, 0.6, 1.0),
+        (2.9, 0.6, 1.0),
+        (-1.9, 0.6, 0.0),
+        (-1.9, 0.9, 1.0),
+        (5.1, 0.9, 1.0),
+        (5.3, 0.9, 0.0),
+    ],
+    ids=["in_40", "out_40", "in_60", "edge_60", "out_60", "in_90", "edge_90", "out_90"],
+)
+def test_coverage_by_probability_closed_form(truth: float, share: float, covered: float):
+    probs, modes = torch.tensor([0.2, 0.5, 0.3])[None, :, None], one_agent(along_x(-4), along_x(1), along_x(3))
+    value, counts = coverage(modes, along_x(truth)[None, None], ALL[..., :1], share, probs)
+    assert (value.item(), counts.item()) == (covered, True)
+
+
+def test_one_mode_has_no_spread_to_judge():
+    assert not coverage(torch.zeros(1, 1, 1, 3, 2), STANDING, ALL, 0.5, torch.ones(1, 1, 1))[1].any()
+
+
+def test_few_modes_are_a_distribution_although_as_many_draws_would_not_do():
+    modes, equal = one_agent(along_x(-1), along_x(2)), torch.full((1, 2, 1), 0.5)
+    assert coverage(modes, along_x(0)[None, None], ALL[..., :1], 0.9, equal)[1].all()
+    assert not coverage(modes, along_x(0)[None, None], ALL[..., :1], 0.9)[1].any()
+
+
+def test_a_mixture_covers_its_own_draws_as_often_as_it_should():
+    """Modes far from the middle are rare here: an unweighted quantile would be far too wide."""
+    generator = torch.Generator().manual_seed(0)
+    scenes, modes = 3000, 300
+    forecast = 3 + 6 * (torch.rand(scenes, modes, 1, 1, 2, generator=generator) - 0.5)
+    probs = torch.softmax(-(forecast[..., 0, :] - 3).square().sum(-1), dim=1)
+    drawn = torch.multinomial(probs[..., 0], 1, generator=generator)
+    truth = forecast[torch.arange(scenes), drawn[:, 0]]
+    valid = torch.ones(scenes, 1, 1).bool()
+
+    def covered(positions: Tensor, share: float) -> float:
+        return coverage(positions, truth, valid, share, probs)[0].mean().item()
+
+    for share in (0.5, 0.9):  # the mode at the boundary is inside: a little more than the share
+        assert covered(forecast, share) == pytest.approx(share + 0.01, abs=0.02)
+    centre = (probs[..., None, None] * forecast).sum(1, keepdim=True)
+    assert covered(centre + 0.6 * (forecast - centre), 0.9) < 0.75
+    assert covered(centre + 1.5 * (forecast - centre), 0.5) > 0.7
+    assert coverage(forecast, truth, valid, 0.5)[0].mean().item() > 0.8
+
+
+# --- Overlap ----------------------------------------------------------------------------------------------------------
+
+
+def in_a_row(*samples: tuple[float, ...]) -> Tensor:
+    """Agents at these places on the x axis, in each sample, at one step: (1, samples, agents, 1, 2)."""
+    return torch.stack([along_x(*xs) for xs in samples])[None, :, :, None]
+
+
+@pytest.mark.parametrize(
+    ("positions", "probs", "expected"),
+    [
+        (in_a_row((0, 1, 9)), None, [1.0, 1.0, 0.0]),
+        (in_a_row((0, 2, 9)), None, [0.0, 0.0, 0.0]),  # at the distance is not nearer than it
+        (in_a_row((0, 1.99, 3.9)), None, [1.0, 1.0, 1.0]),
+        (in_a_row((0, 1, 9), (0, 5, 9)), None, [0.5, 0.5, 0.0]),
+        # agents meet in the same sample or not at all
+        (in_a_row((0, 5, 9), (5, 0, 9)), None, [0.0, 0.0, 0.0]),
+        (in_a_row((0, 1, 9), (0, 5, 6)), [[0.8, 0.6, 0.5], [0.2, 0.4, 0.5]], [0.8, 1.0, 0.5]),
+    ],
+    ids=["near", "at_the_distance", "chain", "one_of_two", "not_across_samples", "weighted"],
+)
+def test_overlap_closed_form(positions: Tensor, probs: Any, expected: list[float]):
+    mode_probs = None if probs is None else torch.tensor(probs)[None]
+    value, counts = overlap(positions, torch.ones(1, 3, 1).bool(), 2.0, mode_probs)
+    assert value[0].tolist() == pytest.approx(expected)
+    assert counts.all()
+
+
+@pytest.mark.parametrize("where", [0.0, math.nan, math.inf])
+def test_nobody_overlaps_with_an_absent_agent(where: float):
+    positions = in_a_row((0, where, 9))
+    value, counts = overlap(positions, torch.tensor([[[True], [False], [True]]]), 2.0)
+    assert value[0, [0, 2]].tolist() == [0.0, 0.0]
+    assert counts[0].tolist() == [True, False, True]
+
+
+def test_overlap_is_the_share_of_the_steps_at_which_an_agent_is_there():
+    """Both are near at the first and the third step; the second agent is not there at the last two of four."""
+    positions = torch.cat([in_a_row((0, 1)), in_a_row((0, 5)), in_a_row((0, 1)), in_a_row((0, 1))], dim=3)
+    value, _ = overlap(positions, torch.tensor([[[True] * 4, [True, True, False, False]]]), 2.0)
+    assert value[0].tolist() == [0.25, 0.5]
+    value, _ = overlap(positions, torch.ones(1, 2, 4).bool(), 2.0)
+    assert value[0].tolist() == [0.75, 0.75]
+
+
+@pytest.mark.parametrize("agents", [1, 2])
+def test_who_is_alone_overlaps_with_nobody(agents: int):
+    valid = torch.zeros(1, agents, 1).bool()
+    valid[0, 0] = True
+    assert overlap(torch.zeros(1, 3, agents, 1, 2), valid, 2.0)[0][0, 0].item() == 0.0
+
+
 # --- Three axes -------------------------------------------------------------------------------------------------------
 
 
@@ -322,6 +489,8 @@ PER_AGENT: dict[str, Metric] = {
     "squared_error": squared_error,
     "coverage": lambda f, t, v: coverage(f, t, v, share=0.5),
     "nll": lambda f, t, v: gaussian_mixture_nll(f, t, v, torch.full(t.shape[2:3], 1.5)),
+    "mixture_nll": lambda f, t, v: mixture_nll(f, t, v, torch.full(f.shape[:3], 1 / f.shape[1]), 1 + f.abs()),
+    "overlap": lambda f, t, v: overlap(f, v, 2.0),
 }
 METRICS = PER_AGENT | PER_SCENE
 

@@ -70,6 +70,17 @@ def test_plans_are_functions_of_seed_and_step():
     assert (other.dropout_seed, other.noise_seed) != (plans[0].dropout_seed, plans[0].noise_seed)
 
 
+@pytest.mark.parametrize(
+    ("modes", "few"), [(1, 1), (2, 2), (3, 2), (6, 2), (8, 2), (9, 3), (20, 6)], ids=lambda n: str(n)
+)
+def test_every_other_step_rolls_out_a_third_of_the_modes(modes: int, few: int):
+    """Never less than two, where there are two: a single one would have no score but its own likelihood."""
+    assert [plan(CONFIG, [10, 20], step, modes).num_modes for step in range(4)] == [few, modes] * 2
+    plain, others = plan(CONFIG, [10, 20], 0), plan(CONFIG, [10, 20], 0, modes)
+    assert plain.num_modes == 1
+    assert replace(plain, windows=(), num_modes=0) == replace(others, windows=(), num_modes=0)
+
+
 def test_every_store_gives_its_share():
     drawn = [plan(CONFIG, [10, 1000], step).windows for step in range(50)]
     assert all(len(a) + len(b) == 6 for a, b in drawn)

@@ -31,6 +31,7 @@ MODELS: dict[str, dict[str, Any]] = {
         "input_changes": True,
         "set": ("static_dim=2", "innovation_rounds=1", "substeps=2", "gated_messages=true", "residual=trapezoid"),
     },
+    "dgvae-plural": {"set": ("num_modes=3", "rollout_graph=frozen")},
     "dnri": {"set": ("hidden_dim=5", "rnn_dim=4", "decoder_dim=6", "message_dim=7")},
     "imma": {"set": ("hidden_dim=5", "rnn_dim=4", "decoder_dim=6", "message_dim=7", "num_layers=3")},
     "lstm": {"set": ("embed_dim=5", "rnn_dim=4")},
@@ -87,6 +88,35 @@ def test_every_model_moves_all_of_its_weights(tmp_path: Path, kind: str):
     assert ("kl" in terms) == (kind.startswith(("dgvae", "dnri")))
     still = {name for name, p in trainer.model.named_parameters() if torch.equal(p, before[name])}
     assert not still
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"), [("dgvae-plural", [2, 3, 2, 3]), ("dgvae", [None] * 4)], ids=["modes", "no-modes"]
+)
+def test_steps_take_turns_with_few_and_all_modes(circles: Path, tmp_path: Path, kind: str, expected: list[Any]):
+    """A model without modes is not asked for any."""
+    trainer, asked = made(config(circles, tmp_path, **MODELS[kind])), []
+    window = trainer.model.window
+
+    def watching(*arguments: Any, **named: Any) -> Any:
+        asked.append(named.get("num_modes"))
+        output = window(*arguments, **named)
+        assert (0 if output.modes is None else output.modes.states.shape[1]) == (asked[-1] or 0)
+        return output
+
+    trainer.model.window = watching
+    for _ in range(4):
+        terms = trainer.train_step()
+        assert ({"energy", "joint_energy", "nll_spread"} <= set(terms)) == (kind == "dgvae-plural")
+    assert asked == expected
+
+
+@pytest.mark.parametrize(("kind", "samples"), [("dgvae-plural", 3), ("dgvae", trainer_module.VALIDATION_DRAWS)])
+def test_modes_are_validated_as_enumerated_and_others_by_draws(circles: Path, tmp_path: Path, kind: str, samples: int):
+    trainer = made(config(circles, tmp_path, **MODELS[kind]))
+    (first, _), (second, _) = trainer.validate(), trainer.validate()
+    assert first.num_samples == samples and first.energy_m == second.energy_m
+    assert bool(first.mixture_nll) == (kind == "dgvae-plural")
 
 
 @pytest.mark.parametrize("model", ["dnri", "mlp"])
