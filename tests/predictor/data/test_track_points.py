@@ -3,7 +3,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from predictor.data.tracks import TrackPoints, cut_episodes, with_velocities
+from predictor.data.track_points import TrackPoints, cut_episodes, with_velocities
 
 
 def points(*entries: tuple[int, int, float]) -> TrackPoints:
