@@ -87,6 +87,15 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--source absent --out new", "no source at absent"),
         ("--source absent --out new --episode-steps 1", "episode_steps must be at least 2, got 1"),
     ],
+    "predictor.data.tracks": [
+        ("--source absent --out new", "no source at absent"),
+        ("--source file --out file", "file exists; choose another path or pass --overwrite"),
+        (
+            "--source file --out new",
+            "file, line 1: expected at least 4 columns (frame, id, x, y are (1, 2, 3, 4)), got 1",
+        ),
+        ("--source absent --out new --frame-step -1", "frame_step must not be negative, got -1"),
+    ],
     "envs.collect": [
         ("--env-id nope-v0 --out new", "cannot make env 'nope-v0'"),
         ("--env-id merge-v1 --out new --episodes 0", "episodes must be at least 1, got 0"),
@@ -201,7 +210,10 @@ REQUIRED: dict[str, list[str]] = {
     "predictor.card": ["--checkpoint", "highway", "--data", "store", "--accuracy", "accuracy.json"],
     "predictor.data.springs": ["--out", "new"],
     "predictor.data.crowd": ["--source", "store", "--out", "new"],
-    **{f"predictor.data.{name}": ["--source", "files", "--out", "new"] for name in ("nba", "levelx", "mocap", "sdd")},
+    **{
+        f"predictor.data.{name}": ["--source", "files", "--out", "new"]
+        for name in ("nba", "levelx", "mocap", "sdd", "tracks")
+    },
     "envs.collect": ["--env-id", "merge-v1", "--out", "new"],
     "envs.export_levelx": ["--env-id", "merge-v1", "--out", "new"],
     "agents.evaluate": ["--run-dir", "run"],

@@ -52,8 +52,7 @@ def save_dataset(
     Raises:
         UserError: no episodes, or the output exists and may not be replaced.
     """
-    if not episodes:
-        raise UserError(f"{config.source} gives no episode for split '{config.split}'; {_counted(notes) or 'no data'}")
+    check_not_empty(config, episodes, notes)
     read = list(files)
     facts = provenance(("numpy", "zarr")) | {
         "source_sha256": checksum(config.source, read),
@@ -68,6 +67,16 @@ def save_dataset(
     with new_file(config.card_path) as partial:
         partial.write_text(card_text(config.split, info, episodes, notes), encoding="utf-8")
         write_store(config.out, info, episodes, config.overwrite)
+
+
+def check_not_empty(config: LoaderConfig, episodes: Sequence[Episode], notes: DatasetNotes) -> None:
+    """Checks that there is an episode; the error says what was counted.
+
+    Raises:
+        UserError: there is none.
+    """
+    if not episodes:
+        raise UserError(f"{config.source} gives no episode for split '{config.split}'; {_counted(notes) or 'no data'}")
 
 
 def summary(config: LoaderConfig, episodes: Sequence[Episode]) -> str:

@@ -22,7 +22,7 @@ from predictor.data.dataset_card import DatasetNotes, most_present, save_dataset
 from predictor.data.levelx_files import CLASS_FEATURES, Features, Layout, layout_of, open_recording, read_tracks
 from predictor.data.loading import NO_LIMIT_M, LoaderConfig, find_files, frames_per_step, in_split, progressed
 from predictor.data.store import Episode
-from predictor.data.tracks import cut_episodes
+from predictor.data.track_points import cut_episodes
 from predictor.scene import KINEMATIC_FEATURES, SceneSpec
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_positive

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from predictor.data.loading import bad_line, finite, read_lines, whole
-from predictor.data.tracks import TrackPoints
+from predictor.data.track_points import TrackPoints
 from predictor.support.errors import UserError
 
 Layout = Literal["centre", "corner"]

@@ -32,7 +32,7 @@ from predictor.data.loading import (
     whole,
 )
 from predictor.data.store import Episode
-from predictor.data.tracks import TrackPoints, cut_episodes, with_velocities
+from predictor.data.track_points import TrackPoints, cut_episodes, with_velocities
 from predictor.scene import KINEMATIC_FEATURES, SceneSpec
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least

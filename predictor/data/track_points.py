@@ -1,0 +1,79 @@
+"""Cuts points (step, track, state) of a recording into episodes; agents may appear and disappear."""
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from predictor.data.store import Episode
+
+
+@dataclass(frozen=True)
+class TrackPoints:
+    """Points of a recording, one per track and step, in any order; no pair of step and track occurs twice."""
+
+    steps: Int[np.ndarray, " points"]
+    """Number of the step, counted from any origin."""
+    tracks: Int[np.ndarray, " points"]
+    """Identity of the agent within the recording."""
+    states: Float[np.ndarray, "points state"]
+    """State of the agent, SI units."""
+
+    def __len__(self) -> int:
+        """Returns the number of points."""
+        return len(self.steps)
+
+    def where(self, keep: Bool[np.ndarray, " points"]) -> "TrackPoints":
+        """Returns the points to keep."""
+        return TrackPoints(self.steps[keep], self.tracks[keep], self.states[keep])
+
+
+def with_velocities(
+    positions: TrackPoints, dt_s: float
+) -> tuple[TrackPoints, Float[np.ndarray, "moving 2"], Int[np.ndarray, " moving"]]:
+    """Returns the points whose track was present one step before, with the backward difference as their velocity.
+
+    The first point of a track and the first after a gap have no velocity and are left out.
+
+    Args:
+        positions: states are positions [m].
+        dt_s: time between steps [s].
+
+    Returns:
+        The points that are kept, sorted by track and step; their velocities [m/s]; their places among the given points.
+    """
+    order = np.lexsort((positions.steps, positions.tracks))
+    steps, tracks, states = positions.steps[order], positions.tracks[order], positions.states[order]
+    follows = np.flatnonzero((np.diff(tracks) == 0) & (np.diff(steps) == 1)) + 1
+    velocities_mps = (states[follows] - states[follows - 1]) / dt_s
+    return TrackPoints(steps[follows], tracks[follows], states[follows]), velocities_mps, order[follows]
+
+
+def cut_episodes(points: TrackPoints, episode_steps: int, label: str, counts: Counter[str]) -> list[Episode]:
+    """Cuts a recording into episodes that do not overlap, from its first step with an agent to its last.
+
+    Within an episode each track has a column; steps without any agent are kept, all invalid. The last episode may be
+    shorter. Episodes without any agent and those of one step are left out and counted.
+    """
+    episodes = []
+    first, last = (int(points.steps.min()), int(points.steps.max())) if len(points) else (0, -1)
+    for begin in range(first, last + 1, episode_steps):
+        length = min(episode_steps, last + 1 - begin)
+        inside = points.where((points.steps >= begin) & (points.steps < begin + length))
+        if not len(inside):
+            counts["episodes left out: no agent"] += 1
+        elif length < 2:
+            counts["episodes left out: one step"] += 1
+        else:
+            episodes.append(_episode(inside, begin, length, label))
+    return episodes
+
+
+def _episode(points: TrackPoints, begin: int, length: int, label: str) -> Episode:
+    ids, columns = np.unique(points.tracks, return_inverse=True)
+    states = np.zeros((length, len(ids), points.states.shape[1]), dtype=np.float32)
+    valid = np.zeros((length, len(ids)), dtype=np.bool_)
+    states[points.steps - begin, columns] = points.states
+    valid[points.steps - begin, columns] = True
+    return Episode(states, valid, ids.astype(np.int64), label)
