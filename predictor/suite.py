@@ -22,7 +22,9 @@ from rich.progress import Progress
 from predictor.data.store import read_info_of
 from predictor.evaluation.disentanglement import sklearn
 from predictor.evaluation.measure_line import FEATURED, measure_line
-from predictor.evaluation.paper_tables import BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, TABLES, Budget, Line, Sizes
+from predictor.evaluation.nri_tables import NRI_TABLES
+from predictor.evaluation.paper_tables import NUM_SAMPLES, Budget, Line, Sizes
+from predictor.evaluation.paper_tables import TABLES as PAPER_TABLES
 from predictor.reports.plots import plot_results_by_step
 from predictor.reports.tables import latex_table, markdown_report
 from predictor.support.command_line import Renamed, parse
@@ -34,15 +36,17 @@ from predictor.support.runtime import resolve_device, tune
 from predictor.train import train
 from predictor.training.config import TrainConfig, TrainPrecision, check_precision
 
-TableName = Literal["springs", "recipe", "mocap", "nba", "sdd", "ind"]
+TableName = Literal["springs", "recipe", "mocap", "nba", "sdd", "ind", "nri-springs", "nri-charged"]
+
+TABLES = PAPER_TABLES | NRI_TABLES
 
 
 @dataclass(frozen=True)
 class SuiteConfig:
-    """Trains and measures all lines of one of the paper's tables."""
+    """Trains and measures all lines of one of the paper's tables, or of a table beside NRI's."""
 
     table: TableName
-    """Table of the paper to rerun."""
+    """Table to run: one of the paper's, or graph accuracy on NRI's simulators (nri-springs, nri-charged)."""
     data: Path = Path("data")
     """Folder of the episode stores; a missing one is named with the command that makes it."""
     out: Path = Path("runs/suite")
@@ -123,10 +127,10 @@ def line_config(config: SuiteConfig, line: Line, out: Path) -> TrainConfig:
         max_episodes=sizes.max_episodes,
         steps=sizes.steps,
         batch_size=sizes.batch_size,
-        history_steps=BURN_IN_STEPS,
+        history_steps=table.protocol.train_history_steps,
         min_history_steps=8,
-        val_history_steps=BURN_IN_STEPS,
-        horizon_steps=HORIZON_STEPS,
+        val_history_steps=table.protocol.train_history_steps,
+        horizon_steps=table.protocol.train_horizon_steps,
         val_windows=sizes.val_windows,
         eval_every=sizes.eval_every,
         patience=1000,
@@ -142,9 +146,10 @@ def line_config(config: SuiteConfig, line: Line, out: Path) -> TrainConfig:
 def line_folder(config: SuiteConfig, line: Line) -> Path:
     """Returns the folder of a line's run and result; another config or other data give another folder."""
     table, sizes = TABLES[config.table], config.sizes
+    steps = [table.protocol.burn_in_steps, table.protocol.horizon_steps]
     content: dict[str, Any] = {
         "row": {"model": line.model},
-        "protocol": [BURN_IN_STEPS, HORIZON_STEPS, NUM_SAMPLES, table.test_stride, sizes.test_windows, config.seed],
+        "protocol": [*steps, NUM_SAMPLES, table.test_stride, sizes.test_windows, config.seed],
         "stores": [_fingerprint(config.data / s) for s in (table.train, table.val, *table.tests.values()) if s],
     }
     if line.is_trained:
@@ -207,6 +212,8 @@ def run_suite(config: SuiteConfig) -> dict[str, Any]:
         "train_seconds": sum(r["train_seconds"] for r in results.values()),
         "rows": [results[r.key] for r in chosen if r.key in results],
         "paper": {r.key: r.paper for r in chosen if r.paper},
+        "published": table.published,
+        "protocol": asdict(table.protocol),
         "failed": failed,
         "provenance": provenance(("torch", "numpy", "zarr")),
     }

@@ -66,6 +66,13 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--out new --physics.num-agents 0", "num_agents must be positive, got 0"),
         ("--out new --physics.kind spring", "invalid choice 'spring' for argument '--physics.kind'"),
     ],
+    "predictor.data.nri": [
+        ("--out file", "file is a file; choose another --out"),
+        ("--out new --test -1", "test must not be negative, got -1"),
+        ("--out new --num-agents 1", "num_agents must be at least 2, got 1"),
+        ("--out new --law spring", "invalid choice 'spring' for argument '--law'"),
+        ("--out new --train 0 --val 0 --test 0", "nothing to simulate: train, val and test are all 0"),
+    ],
     "predictor.data.crowd": [
         ("--source absent --out new", "no episode store at absent"),
         ("--source absent --out new --num-agents 3 0", "num_agents must be at least 1, got (3, 0)"),
@@ -209,6 +216,7 @@ REQUIRED: dict[str, list[str]] = {
     "predictor.interpret": ["--checkpoint", "highway", "--data", "store", "--out", "new"],
     "predictor.card": ["--checkpoint", "highway", "--data", "store", "--accuracy", "accuracy.json"],
     "predictor.data.springs": ["--out", "new"],
+    "predictor.data.nri": ["--out", "new"],
     "predictor.data.crowd": ["--source", "store", "--out", "new"],
     **{
         f"predictor.data.{name}": ["--source", "files", "--out", "new"]

@@ -19,8 +19,8 @@ from predictor.noise import Noise
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
-LEAST_CONSTANT = 0.25
-"""Smallest estimate of a spring constant [N/m]: half of the paper's smallest (0.5); pairs below have no spring."""
+SMALLEST_CONSTANT = 0.5
+"""Smallest spring constant of the paper's data [N/m]."""
 RIDGE = 1e-9
 
 
@@ -35,12 +35,19 @@ class SpringLeastSquares:
         spec: layout of the springs' store.
         horizon_steps: default number of steps to forecast.
         physics: physics of the box, springs only; None takes the published one.
+        smallest_constant: smallest spring constant of the data [N/m]; pairs below half of it have no spring.
     """
 
     num_edge_types = 2
     edge_feature_dim = 1
 
-    def __init__(self, spec: SceneSpec, horizon_steps: int = 10, physics: Physics | None = None) -> None:
+    def __init__(
+        self,
+        spec: SceneSpec,
+        horizon_steps: int = 10,
+        physics: Physics | None = None,
+        smallest_constant: float = SMALLEST_CONSTANT,
+    ) -> None:
         """Stores the arguments; nothing is learned."""
         physics = physics or Physics()
         if physics.kind != "springs" or spec.position_dim != 2 or spec.has_ego:
@@ -48,6 +55,7 @@ class SpringLeastSquares:
         self.spec = spec
         self.horizon_steps = horizon_steps
         self.physics = physics
+        self.smallest_constant = smallest_constant
 
     def empty_memory(self, batch: int, agents: int) -> Memory:
         """Returns zeros for the latest state with a mark, and each receiver's normal matrix and right-hand side."""
@@ -71,7 +79,7 @@ class SpringLeastSquares:
         right = torch.einsum("bija,bia->bij", regressors, kick)
         equations = equations + torch.cat([normal, right[..., None]], dim=-1) * usable
         constants = self._solve(equations, pair_mask(valid))
-        has_edge = constants > LEAST_CONSTANT
+        has_edge = constants > self.smallest_constant / 2
         probs = torch.stack([~has_edge, has_edge], dim=-1).to(states.dtype)
         belief = Belief(states, valid, probs, constants[..., None].to(states.dtype), _Internal(constants * has_edge))
         return Memory((now,), (equations,)), belief

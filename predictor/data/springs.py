@@ -7,7 +7,8 @@ once: symplectic, so energy does not drift.
 """
 
 import time
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -28,6 +29,8 @@ from predictor.support.provenance import provenance
 DT_S = 1 / 6
 FRAMES = 50
 CHUNK = 2000
+CHARGE_SUBSTEPS = 4
+"""Number of leapfrog steps of charges for each one of springs."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,9 @@ class Physics:
     substeps: int = 50
     """Number of leapfrog steps per frame (charges: four times as many)."""
     softening_m: float = 0.1
-    """Least distance of two charges in the force law, in place of NRI's cap on the force."""
+    """Least distance of two charges in the force law; with 0 the law is 1/r², and needs `largest_force`."""
+    largest_force: float = 0.0
+    """Largest force of charges on a particle along an axis [N at unit mass] (NRI: 100); 0 is no limit."""
 
     def __post_init__(self) -> None:
         """Checks choices and ranges.
@@ -61,8 +66,11 @@ class Physics:
             UserError: a value out of range.
         """
         check_choices(self)
-        check_positive(self, "num_agents", "box_m", "position_std_m", "speed_mps", "dt_s", "substeps", "softening_m")
+        check_positive(self, "num_agents", "box_m", "position_std_m", "speed_mps", "dt_s", "substeps")
+        check_at_least(self, 0, "softening_m", "largest_force")
         check_at_least(self, 2, "frames")
+        if self.softening_m == self.largest_force == 0:
+            raise UserError("softening_m and largest_force are both 0; charges that meet would have an infinite force")
 
 
 @dataclass(frozen=True)
@@ -149,7 +157,7 @@ def simulate(
         velocities: initial velocities [m/s], float64.
     """
     couplings = couplings.double()
-    substeps = physics.substeps * (1 if physics.kind == "springs" else 4)
+    substeps = physics.substeps * (1 if physics.kind == "springs" else CHARGE_SUBSTEPS)
     step_s = physics.dt_s / substeps
     # For springs the force is linear: −L r with the graph's weighted Laplacian, one product for both axes.
     kick = (couplings - torch.diag_embed(couplings.sum(-1))) * step_s
@@ -158,7 +166,7 @@ def simulate(
     def kicked(velocities: Tensor, share: float) -> Tensor:
         if physics.kind == "springs":
             return torch.baddbmm(velocities, kick, positions, alpha=share)
-        return velocities + share * step_s * _charge_force(couplings, positions, physics.softening_m)
+        return velocities + share * step_s * charge_force(physics, couplings, positions)
 
     for _ in range(physics.frames - 1):
         velocities = kicked(velocities, 0.5)
@@ -171,6 +179,20 @@ def simulate(
     return torch.stack(frames, dim=1)
 
 
+def simulate_chunks(physics: Physics, *start: Tensor) -> Float[np.ndarray, "count frames agents 4"]:
+    """Simulates any number of rollouts, a part at a time, and returns float32."""
+    parts = [
+        simulate(physics, *(t[i : i + CHUNK] for t in start)).float().numpy() for i in range(0, len(start[0]), CHUNK)
+    ]
+    return np.concatenate(parts)
+
+
+def stream_of(split: str, seed: int) -> torch.Generator:
+    """Returns the generator of a split's draws."""
+    stream = ("train", "val", "test", "ood").index(split)
+    return torch.Generator().manual_seed(int(np.random.default_rng([seed, stream]).integers(2**62)))
+
+
 def energy(
     couplings: Float[Tensor, "count agents agents"], states: Float[Tensor, "count frames agents 4"]
 ) -> Float[Tensor, "count frames"]:
@@ -181,10 +203,16 @@ def energy(
     return kinetic + elastic
 
 
-def _charge_force(couplings: Tensor, positions: Tensor, softening_m: float) -> Tensor:
+def charge_force(
+    physics: Physics, couplings: Float[Tensor, "count agents agents"], positions: Float[Tensor, "count agents 2"]
+) -> Float[Tensor, "count agents 2"]:
+    """Computes the force of all charges on each [N at unit mass]; a positive product repels."""
     apart = positions[:, :, None] - positions[:, None]
-    squared = apart.square().sum(-1) + softening_m**2
-    return ((couplings / (squared * squared.sqrt()))[..., None] * apart).sum(2)
+    # the distance to itself is 0, and its product too
+    itself = torch.eye(physics.num_agents, dtype=positions.dtype)
+    squared = apart.square().sum(-1) + physics.softening_m**2 + itself
+    force = ((couplings / (squared * squared.sqrt()))[..., None] * apart).sum(2)
+    return force.clamp(-physics.largest_force, physics.largest_force) if physics.largest_force else force
 
 
 def _reflect(positions: Tensor, velocities: Tensor, box_m: float) -> tuple[Tensor, Tensor]:
@@ -198,8 +226,7 @@ def _reflect(positions: Tensor, velocities: Tensor, box_m: float) -> tuple[Tenso
 def make_episodes(config: SpringsConfig, split: str, count: int) -> list[Episode]:
     """Simulates one split."""
     physics = config.physics
-    stream = ("train", "val", "test", "ood").index(split)
-    generator = torch.Generator().manual_seed(int(np.random.default_rng([config.seed, stream]).integers(2**62)))
+    generator = stream_of(split, config.seed)
     shifted = split == "ood"
     if physics.kind == "springs":
         constants = (1.0, 2.0, 3.0) if shifted else ()
@@ -208,11 +235,7 @@ def make_episodes(config: SpringsConfig, split: str, count: int) -> list[Episode
     else:
         couplings = draw_charges(count, physics.num_agents, 2.0 if shifted else 1.0, generator)
     positions, velocities = draw_start(count, physics, generator)
-    parts = [
-        simulate(physics, *(t[i : i + CHUNK] for t in (couplings, positions, velocities))).float().numpy()
-        for i in range(0, count, CHUNK)
-    ]
-    states = np.concatenate(parts)
+    states = simulate_chunks(physics, couplings, positions, velocities)
     # Springs: 0 none, 1 spring. Charges: 0 none (never), 1 attraction, 2 repulsion.
     signs = couplings.sign().numpy()
     types = (signs if physics.kind == "springs" else np.where(signs > 0, 2, -signs)).astype(np.int8)
@@ -239,24 +262,50 @@ def make(config: SpringsConfig) -> dict[str, float]:
     Raises:
         UserError: `out` is a file, a split exists, or no split has rollouts.
     """
-    check_out(config.out)
-    took: dict[str, float] = {}
     attribute = "spring_constant" if config.physics.kind == "springs" else "charge_product"
-    made = provenance(("torch", "numpy", "zarr"))
+    source = f"{config.physics.num_agents}-{config.physics.kind}"
+    info = StoreInfo(spring_spec(config.physics), source, edge_attribute_names=(attribute,))
     splits = {name: getattr(config, name) for name in ("train", "val", "test", "ood")}
+    return write_splits(
+        config.out, splits, info, lambda split, count: make_episodes(config, split, count), config.overwrite
+    )
+
+
+def write_splits(
+    out: Path,
+    splits: Mapping[str, int],
+    info: StoreInfo,
+    episodes: Callable[[str, int], list[Episode]],
+    overwrite: bool,
+) -> dict[str, float]:
+    """Writes a store for each split that has rollouts; returns the time of each [s].
+
+    Args:
+        out: folder of the stores.
+        splits: number of rollouts by name of the split.
+        info: content of the stores; provenance is added.
+        episodes: function that simulates a number of rollouts of a split.
+        overwrite: whether to replace existing stores.
+
+    Raises:
+        UserError: `out` is a file, a split exists, or no split has rollouts.
+    """
+    check_out(out)
+    took: dict[str, float] = {}
+    made = provenance(("torch", "numpy", "zarr"))
+    names = list(splits)
     splits = {name: count for name, count in splits.items() if count}
     if not splits:
-        raise UserError("nothing to simulate: train, val, test and ood are all 0")
+        raise UserError("nothing to simulate: " + ", ".join(names[:-1]) + f" and {names[-1]} are all 0")
     for name in splits:
-        if (config.out / name).exists() and not config.overwrite:
-            raise UserError(f"{config.out / name} exists; choose another --out or pass --overwrite")
+        if (out / name).exists() and not overwrite:
+            raise UserError(f"{out / name} exists; choose another --out or pass --overwrite")
     with Progress() as progress:
         task = progress.add_task("simulate", total=sum(splits.values()))
         for name, count in splits.items():
             began = time.perf_counter()
-            source = f"{config.physics.num_agents}-{config.physics.kind}"
-            info = StoreInfo(spring_spec(config.physics), source, made | {"split": name}, (attribute,))
-            write_store(config.out / name, info, make_episodes(config, name, count), config.overwrite)
+            here = replace(info, provenance=made | {"split": name})
+            write_store(out / name, here, episodes(name, count), overwrite)
             took[name] = time.perf_counter() - began
             progress.advance(task, count)
     return took

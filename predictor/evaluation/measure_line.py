@@ -11,6 +11,7 @@ import torch
 
 from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
 from predictor.baselines.least_squares import SpringLeastSquares
+from predictor.baselines.majority import MajorityGraph
 from predictor.checkpoint import load_checkpoint
 from predictor.data.store import EpisodeStore, read_store
 from predictor.data.windows import Windows
@@ -18,10 +19,12 @@ from predictor.evaluation.accuracy import Tally, fitted_std_m
 from predictor.evaluation.disentanglement import direct_r2, linear_r2
 from predictor.evaluation.graph_accuracy import GraphTally, edge_entropy
 from predictor.evaluation.outcomes import Outcome, run_windows
-from predictor.evaluation.paper_tables import BURN_IN_STEPS, HORIZON_STEPS, Line, Sizes, Table
+from predictor.evaluation.paper_tables import BURN_IN_STEPS, Line, Protocol, Sizes, Table
 from predictor.graph import pair_mask
 from predictor.support.errors import UserError
 
+GRAPHS = ("dgvae", "dnri", "least-squares", "majority")
+"""Models whose graph is scored."""
 FEATURED = ("dgvae", "least-squares")
 """Models whose edge features are scored; those of the others are placeholders."""
 PAIR_BUDGET = 60_000
@@ -37,12 +40,17 @@ def measure_line(
     forecaster: Any
     std_m: tuple[float, ...] = ()
     parameters = 0
+    horizon_steps = table.protocol.horizon_steps
     if line.model == "constant-velocity":
-        forecaster = ConstantVelocity(spec, HORIZON_STEPS)
+        forecaster = ConstantVelocity(spec, horizon_steps)
     elif line.model == "constant-velocity-noise":
-        forecaster = _fitted_noise(read_store(data / table.train), sizes)
+        forecaster = _fitted_noise(read_store(data / table.train), sizes, table.protocol)
+    elif line.model == "majority":
+        forecaster = MajorityGraph.fit(spec, horizon_steps, read_store(data / table.train).episodes)
     elif line.model == "least-squares":
-        forecaster, device = SpringLeastSquares(spec, HORIZON_STEPS), "cpu"  # it works there only
+        smallest = table.smallest_constant
+        # it works on the CPU only
+        forecaster, device = SpringLeastSquares(spec, horizon_steps, smallest_constant=smallest), "cpu"
     else:
         assert checkpoint is not None
         forecaster, info = load_checkpoint(checkpoint, device)
@@ -56,18 +64,21 @@ def measure_line(
     return {"parameters": parameters, "tests": results}
 
 
-def _fitted_noise(store: EpisodeStore, sizes: Sizes) -> NoisyConstantVelocity:
+def _fitted_noise(store: EpisodeStore, sizes: Sizes, protocol: Protocol) -> NoisyConstantVelocity:
     """Returns constant velocity with noise fitted to its errors on the training windows of the protocol."""
     spec, episodes = store.info.spec, store.episodes[: sizes.max_episodes or None]
-    windows = Windows(episodes, spec, 1, HORIZON_STEPS, HORIZON_STEPS, BURN_IN_STEPS)
-    straight = ConstantVelocity(spec, HORIZON_STEPS)
-    outcomes = run_windows(straight, windows, np.arange(len(windows)), HORIZON_STEPS)
+    steps = protocol.train_horizon_steps
+    windows = Windows(episodes, spec, 1, steps, steps, protocol.train_history_steps)
+    straight = ConstantVelocity(spec, steps)
+    outcomes = run_windows(straight, windows, np.arange(len(windows)), steps)
     return NoisyConstantVelocity.fit(spec, fitted_std_m(outcomes))
 
 
-def protocol_indices(windows: Windows, stride: int, limit: int, seed: int) -> np.ndarray:
+def protocol_indices(
+    windows: Windows, stride: int, limit: int, seed: int, burn_in_steps: int = BURN_IN_STEPS
+) -> np.ndarray:
     """Returns the windows whose burn-in ends at every `stride`-th step of an episode; at most `limit`, drawn evenly."""
-    chosen = np.flatnonzero((windows.index[:, 1] - (BURN_IN_STEPS - 1)) % stride == 0)
+    chosen = np.flatnonzero((windows.index[:, 1] - (burn_in_steps - 1)) % stride == 0)
     if limit and len(chosen) > limit:
         chosen = np.sort(np.random.default_rng(seed).permutation(chosen)[:limit])
     return chosen
@@ -83,28 +94,32 @@ def _measure_store(
     seed: int,
     device: str,
 ) -> dict[str, Any]:
+    burn_in, horizon = table.protocol.burn_in_steps, table.protocol.horizon_steps
     try:
-        windows = Windows(store.episodes, store.info.spec, BURN_IN_STEPS, HORIZON_STEPS, HORIZON_STEPS, BURN_IN_STEPS)
+        windows = Windows(store.episodes, store.info.spec, burn_in, horizon, horizon, burn_in)
     except UserError as error:
         raise UserError(f"test store of '{store.info.source}' fits no window of the protocol: {error}") from error
-    chosen = protocol_indices(windows, table.test_stride, sizes.test_windows, seed)
+    chosen = protocol_indices(windows, table.test_stride, sizes.test_windows, seed, burn_in)
     samples = line.num_samples
     horizon_only, whole = Tally(std_m), Tally(partial_agents=True)
-    graph, features, entropies = GraphTally(forecaster.num_edge_types), _Features(), []
+    types = max(forecaster.num_edge_types, table.num_label_types)
+    matched = bool(table.num_label_types) and not line.train.get("type_label_weight")
+    graph, features, entropies = GraphTally(types), _Features(), []
     agents = [int(store.episodes[e].valid[t].sum()) for e, t in windows.index[chosen].tolist()]
     batch = max(1, min(256, PAIR_BUDGET // (max(agents, default=1) ** 2 * samples)))
     began = time.perf_counter()
     if device.startswith("cuda"):
         torch.cuda.reset_peak_memory_stats()
     for outcome in run_windows(
-        forecaster, windows, chosen, HORIZON_STEPS, samples, seed, batch, device,
+        forecaster, windows, chosen, horizon, samples, seed, batch, device,
         whole_sequence=True, keep_beliefs=True,
     ):  # fmt: skip
         whole.add(outcome)
-        horizon_only.add(outcome.tail(HORIZON_STEPS))
+        horizon_only.add(outcome.tail(horizon))
         assert outcome.edge_probs is not None and outcome.present is not None
         pairs = pair_mask(outcome.present)
-        graph.add(outcome.edge_probs, _known_types(outcome, forecaster.num_edge_types), pairs)
+        unused = outcome.edge_probs.new_zeros(*outcome.edge_probs.shape[:-1], types - outcome.edge_probs.shape[-1])
+        graph.add(torch.cat([outcome.edge_probs, unused], dim=-1), _known_types(outcome, types), pairs)
         entropies.append(edge_entropy(outcome.edge_probs, pairs)[0][pairs].cpu())
         if line.model in FEATURED:
             features.add(outcome)
@@ -113,7 +128,7 @@ def _measure_store(
         "agents": {"min": min(agents), "median": float(np.median(agents)), "max": max(agents)},
         "horizon_only": asdict(horizon_only.accuracy(line.name)),
         "whole_sequence": asdict(whole.accuracy(line.name)),
-        "graph": asdict(graph.results()) if line.model in ("dgvae", "dnri", "least-squares") else None,
+        "graph": asdict(graph.results(matched)) if line.model in GRAPHS else None,
         "prior_entropy": float(torch.cat(entropies).mean()) if line.model in ("dgvae", "dnri") else None,
         "features": features.scores(),
         "seconds": time.perf_counter() - began,

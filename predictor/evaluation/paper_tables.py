@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 from predictor.models import ModelName
 
 Budget = Literal["smoke", "cpu", "paper"]
-Untrained = Literal["constant-velocity", "constant-velocity-noise", "least-squares"]
+Untrained = Literal["constant-velocity", "constant-velocity-noise", "least-squares", "majority"]
 """Forecasters without a training run."""
 BURN_IN_STEPS = 40
 HORIZON_STEPS = 10
@@ -67,6 +67,20 @@ class Sizes:
 
 
 @dataclass(frozen=True)
+class Protocol:
+    """Lengths of the windows of a table; the defaults are those of docs/protocol.md."""
+
+    burn_in_steps: int = BURN_IN_STEPS
+    """Number of steps observed before the free run that is measured."""
+    horizon_steps: int = HORIZON_STEPS
+    """Number of steps of this free run."""
+    train_history_steps: int = BURN_IN_STEPS
+    """Largest number of observed steps of a window in training."""
+    train_horizon_steps: int = HORIZON_STEPS
+    """Number of steps forecast in training."""
+
+
+@dataclass(frozen=True)
 class Table:
     """One table of the paper."""
 
@@ -86,6 +100,15 @@ class Table:
     """Number of steps between two test windows of one episode."""
     commands: tuple[str, ...] = ()
     """Commands that make the stores."""
+    protocol: Protocol = Protocol()
+    """Lengths of the windows."""
+    num_label_types: int = 0
+    """Number of types in the stores' graphs, "no edge" included, where the inferred types are renamed by the
+    permutation that is best on the whole test set, except of lines that were trained with labels; 0 renames nothing."""
+    smallest_constant: float = 0.5
+    """Smallest spring constant of the data [N/m], for least squares; pairs below half of it have no spring."""
+    published: dict[str, float] = field(default_factory=dict)
+    """Graph accuracies that another paper reports for this data, by its names."""
 
 
 _SMALL = {

@@ -34,7 +34,7 @@ MAX_STEPS_SHOWN = 6
 
 VIEWS = {"horizon_only": "Horizon-only", "whole_sequence": "Whole sequence"}
 EXPLAINED = {
-    "horizon_only": "Errors on the 10 future steps after a burn-in of 40, best of K samples",
+    "horizon_only": "Errors on the {horizon_steps} future steps after a burn-in of {burn_in_steps}, best of K samples",
     "whole_sequence": "Errors over all predicted steps of the sequence, one-step errors of the burn-in included",
 }
 METRICS = {"overall_rmse_m": ("RMSE", "rmse"), "min_ade_m": ("minADE", "ade"), "min_fde_m": ("minFDE", "fde")}
@@ -51,7 +51,7 @@ def markdown_report(content: dict[str, Any]) -> str:
         "Mean ± standard error over 20 random subsets of the test windows. Metres. One seed per line.",
     ]
     for view, heading in VIEWS.items():
-        parts += [f"## {heading}", EXPLAINED[view] + ".", _accuracy_table(content, view)]
+        parts += [f"## {heading}", EXPLAINED[view].format(**content["protocol"]) + ".", _accuracy_table(content, view)]
     graph = _graph_table(content)
     if graph:
         parts += ["## Graph and edge features", graph]
@@ -133,6 +133,8 @@ def _graph_table(content: dict[str, Any]) -> str:
             cells += [plain(x) for x in numbers]
         if any(c != "–" for c in cells):
             lines.append([result["name"], _samples_of(result), *cells])
+    for name, accuracy in content["published"].items():
+        lines.append([f"{name} (published)", "–", plain(accuracy), *["–"] * (7 * len(kinds) - 1)])
     if not lines:
         return ""
     names = [

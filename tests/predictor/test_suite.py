@@ -11,16 +11,18 @@ import numpy as np
 import pytest
 
 from predictor import suite
+from predictor.data import nri
+from predictor.data.nri import NRIConfig, make_nri
 from predictor.data.springs import SpringsConfig, make
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.data.windows import Windows
 from predictor.evaluation import measure_line as measuring
 from predictor.evaluation import paper_tables as tables
 from predictor.evaluation.measure_line import protocol_indices
-from predictor.evaluation.paper_tables import NUM_SAMPLES, TABLES, Line
+from predictor.evaluation.paper_tables import NUM_SAMPLES, Line
 from predictor.models import configure
 from predictor.reports.tables import latex_table, markdown_report
-from predictor.suite import SuiteConfig, line_config, line_folder, run_line, run_suite
+from predictor.suite import TABLES, SuiteConfig, line_config, line_folder, run_line, run_suite
 from predictor.support.errors import UserError
 from tests.predictor.helpers import spec
 
@@ -100,6 +102,71 @@ def test_all_lines_of_a_table_share_data_steps_and_protocol(data: Path, tmp_path
     shared = ("data", "val_data", "steps", "batch_size", "max_episodes", "history_steps", "horizon_steps", "lr", "seed")
     for name in shared:
         assert len({getattr(c, name) for c in configs}) == 1, name
+
+
+# --- Tables beside NRI's ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def nri_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("nri")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(nri, "SUBSTEPS", 8)  # of 100: in seconds
+        make_nri(NRIConfig(folder / "nri-springs", train=24, val=6, test=8, test_frames=70))
+        make_nri(NRIConfig(folder / "nri-charged", "charged", train=12, val=6, test=4, test_frames=69))
+    return folder
+
+
+def nri_line(table: str, key: str) -> Line:
+    return next(r for r in TABLES[table].lines if r.key == key)
+
+
+def test_graphs_of_nris_rollouts_are_read_once_after_49_frames(nri_data: Path, tmp_path: Path):
+    """Rollouts of 70 frames have two windows of 49 + 20 frames; NRI's encoder sees the first 49."""
+    settings = SuiteConfig("nri-springs", nri_data, tmp_path, "smoke")
+    measured = run_line(settings, nri_line("nri-springs", "least-squares"))["tests"]["test"]
+    assert measured["windows"] == 8 and measured["graph"]["pairs"] == 8 * 20
+    assert len(measured["horizon_only"]["by_step_m"]) == 20
+    assert measured["graph"]["accuracy"] == 1.0
+    assert measured["horizon_only"]["min_ade_m"] < 1e-4
+
+
+@pytest.mark.parametrize("table", ["nri-springs", "nri-charged"])
+def test_the_majority_class_is_right_for_its_share(nri_data: Path, tmp_path: Path, table: Any):
+    settings = SuiteConfig(table, nri_data, tmp_path, "smoke")
+    graph = run_line(settings, nri_line(table, "majority"))["tests"]["test"]["graph"]
+    shares = np.array(graph["confusion"]).sum(1) / graph["pairs"]
+    assert graph["accuracy"] == pytest.approx(shares.max())  # with the best permutation
+    assert shares[0] == 0 if table == "nri-charged" else 0.3 < shares[0] < 0.7
+
+
+def test_types_without_labels_are_renamed_and_types_with_labels_are_not(
+    nri_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """A majority forecaster of type 0, which charges never have, is right by another name only."""
+    table, settings = TABLES["nri-charged"], SuiteConfig("nri-charged", nri_data, tmp_path, "smoke")
+    empty = measuring.MajorityGraph(spec(has_ego=False), 20, 0, 2)  # one type fewer than the labels
+    monkeypatch.setattr(measuring.MajorityGraph, "fit", lambda *_: empty)
+    free = nri_line("nri-charged", "majority")
+    labelled = replace(free, train={"type_label_weight": 1.0})
+    found = [suite.measure_line(table, r, nri_data, settings.sizes, None, 0, "cpu") for r in (free, labelled)]
+    renamed, kept = (r["tests"]["test"]["graph"] for r in found)
+    assert renamed["accuracy"] >= 0.4 and renamed["permutation"][0] != 0
+    assert kept["accuracy"] == 0 and list(kept["permutation"]) == [0, 1, 2]
+
+
+def test_a_model_is_trained_within_49_frames_and_measured_beside_nris_figures(nri_data: Path, tmp_path: Path):
+    settings = SuiteConfig("nri-springs", nri_data, tmp_path, "smoke", ("dvae", "majority"), steps=2, workers=1)
+    made = line_config(settings, nri_line("nri-springs", "dvae"), tmp_path)
+    assert made.history_steps + made.horizon_steps == 49 and made.val_history_steps == 39
+    content = run_suite(settings)
+    assert not content["failed"]
+    text = markdown_report(content)
+    assert "Errors on the 20 future steps after a burn-in of 49" in text
+    (published,) = [line for line in text.splitlines() if line.startswith("| NRI (learned) (published) |")]
+    assert published.split("|")[2:4] == [" – ", " 0.999 "]
+    ours = [line for line in text.splitlines() if line.startswith("| dG-VAE, enhanced, types alone |")]
+    assert len(ours) == 3 and float(ours[2].split("|")[3]) >= 0.4  # two views, then the graph
 
 
 # --- Caching ------------------------------------------------------------------------------------------------------
