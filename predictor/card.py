@@ -11,11 +11,20 @@ from pathlib import Path
 from predictor.checkpoint import WEIGHTS, CheckpointInfo, load_checkpoint, name_of_folder, resolve
 from predictor.data.store import EpisodeStore, read_store
 from predictor.evaluation.in_env_record import measurements_of, update_record
+from predictor.forecaster import has_scale
 from predictor.reports.in_env_tables import card_section
 from predictor.reports.tables import MODEL_NAMES
 from predictor.support.command_line import parse
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_text
+
+
+SPREAD = {
+    True: "Where a driver's route is free, the single forecast lies between the routes, and the modes follow them.",
+    False: "The spread of its samples is not calibrated; where a driver's route is free, the forecast lies between the "
+    "routes.",
+}
+"""What is said of the spread of a model with modes, and of one without."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +62,9 @@ def write_card(config: CardConfig) -> Path:
     measured = [m for m in update_record(folder, found) if m.samples == found[0].samples]
     ego = "the ego included" if info.spec.has_ego else "no ego"
     left_out = "the ego itself is not counted" if info.spec.has_ego else "what never moves is not counted"
+    plural = has_scale(model)
     kind, parameters = MODEL_NAMES.get(info.model, info.model), sum(p.numel() for p in model.parameters())
+    kind = f"Plural {kind}" if plural else kind
     size_kb = (folder / WEIGHTS).stat().st_size / 1000
     text = "\n\n".join(
         [
@@ -71,8 +82,7 @@ def write_card(config: CardConfig) -> Path:
             training,
             "## Limits",
             "It knows the traffic of the simulator named above and nothing else: fixed maps are memorised, drivers are "
-            "those of the simulator. The spread of its samples is not calibrated; where a driver's route is free, the "
-            "forecast lies between the routes. It was trained without a view of the ego's plan.",
+            f"those of the simulator. {SPREAD[plural]} It was trained without a view of the ego's plan.",
         ]
     )
     path = folder / "README.md"
@@ -92,10 +102,13 @@ def _training(name: str, info: CheckpointInfo) -> str:
             f"checkpoint '{name}' does not say how it was trained; write cards of checkpoints of predictor.train"
         )
     result = made["result"]
+    reached = f"minADE {result['val_min_ade_m']:.3f} m"
+    if "val_energy_m" in result:
+        reached = f"energy score {result['val_energy_m']:.3f} m, ADE {result['val_ade_m']:.3f} m"
     versions = ", ".join(f"{k} {v}" for k, v in made["versions"].items())
     return (
         f"`{made['command']}`\n\nSeed {made['train_config']['seed']}, commit {made['commit']}, {versions}. Best "
-        f"validation at step {result['step']}: minADE {result['val_min_ade_m']:.3f} m against "
+        f"validation at step {result['step']}: {reached} against "
         f"{result['val_constant_velocity_ade_m']:.3f} m of constant velocity. Equal seeds give equal weights on "
         "the same CPU and torch."
     )

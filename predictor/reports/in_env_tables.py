@@ -115,7 +115,9 @@ def samples_table(measurements: Sequence[Measurement]) -> str:
 def card_section(measurements: Sequence[Measurement]) -> str:
     """Returns the table of a checkpoint's card, and the command and commit of each line."""
     commands = "\n".join(f"* {m.env_id}: `{m.command}`, {_commit(m)}" for m in measurements)
-    return f"{measurement_table(measurements)}\n\n{commands}"
+    sampled = [m for m in measurements if m.energy_m is not None]
+    several = f"\n\n{samples_table(sampled)}" if sampled else ""
+    return f"{measurement_table(measurements)}{several}\n\n{commands}"
 
 
 def _commit(measurement: Measurement) -> str:
