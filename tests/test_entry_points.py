@@ -59,6 +59,13 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint highway --data absent --out new --burn-in-steps 0", "burn_in_steps must be at least 1, got 0"),
         ("--checkpoint highway --data absent --out new --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
     ],
+    "predictor.nba_score": [
+        ("--data absent", "no episode store at absent"),
+        ("--data absent --checkpoint absent", "no checkpoint 'absent'"),
+        ("--data absent --out file", "file is a file; choose another --out"),
+        ("--data absent --num-samples 0", "num_samples must be at least 1, got 0"),
+        ("--data absent --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
+    ],
     "predictor.card": [("--checkpoint absent --data absent --accuracy absent", "no checkpoint 'absent'")],
     "predictor.data.springs": [
         ("--out file", "file is a file; choose another --out"),
@@ -79,7 +86,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     ],
     "predictor.data.nba": [
         ("--source absent --out new", "no source at absent"),
-        ("--source absent --out new --episode-steps 1", "episode_steps must be at least 2, got 1"),
+        ("--source absent --out new --episode-steps 1", "episode_steps must be 0 or at least 2, got 1"),
         ("--source absent --out new --split tset", "invalid choice 'tset' for argument '--split'"),
     ],
     "predictor.data.levelx": [
@@ -214,6 +221,7 @@ REQUIRED: dict[str, list[str]] = {
     "predictor.evaluate": ["--checkpoint", "highway", "--data", "store"],
     "predictor.suite": ["--table", "springs"],
     "predictor.interpret": ["--checkpoint", "highway", "--data", "store", "--out", "new"],
+    "predictor.nba_score": ["--data", "store"],
     "predictor.card": ["--checkpoint", "highway", "--data", "store", "--accuracy", "accuracy.json"],
     "predictor.data.springs": ["--out", "new"],
     "predictor.data.nri": ["--out", "new"],
@@ -376,6 +384,7 @@ def test_commands_that_run_a_model_take_a_device():
         "predictor.evaluate",
         "predictor.suite",
         "predictor.interpret",
+        "predictor.nba_score",
         "agents.evaluate",
         "train_policy",
         "benchmarks.gpu_springs",

@@ -7,9 +7,9 @@ Position and velocity [m, m/s] from the middle of the court, x along it, and a c
 * `sportvu`: raw JSON of one game per file, in feet, 25 Hz; every third moment is kept, so a step is 0.12 s as well.
 
 Velocity is the backward difference over one step, so the first frame of a passage is dropped. Passages are cut into
-non-overlapping episodes of `--episode-steps` steps. Splits are by game: the position of SHA-256("3:<game>") in [0, 1)
-decides, below 0.1 test, below 0.2 validation, else training; the text files' own folders `train` and `test` share
-games.
+non-overlapping episodes of `--episode-steps` steps, or kept whole (0), as `python -m predictor.nba_score` needs.
+Splits are by game: the position of SHA-256("3:<game>") in [0, 1) decides, below 0.1 test, below 0.2 validation, else
+training; the text files' own folders `train` and `test` share games.
 """
 
 import json
@@ -266,7 +266,7 @@ class NbaConfig(LoaderConfig):
     format: Literal["score", "sportvu"] = "score"
     """Format of the files: score (text files of possessions) or sportvu (raw JSON of games)."""
     episode_steps: Annotated[int, Renamed("window_steps")] = 50
-    """Length of an episode [steps of 0.12 s]; shorter rests of a passage are dropped."""
+    """Length of an episode [steps of 0.12 s]; shorter rests of a passage are dropped. 0 keeps passages whole."""
     skip_broken: bool = False
     """Leave broken files out and count them, instead of stopping at the first."""
 
@@ -277,7 +277,9 @@ class NbaConfig(LoaderConfig):
             UserError: a value out of range.
         """
         super().__post_init__()
-        check_at_least(self, 2, "episode_steps")
+        check_at_least(self, 0, "episode_steps")
+        if self.episode_steps == 1:
+            raise UserError("episode_steps must be 0 or at least 2, got 1")
 
 
 def scene_spec() -> SceneSpec:
@@ -299,15 +301,21 @@ def game_of(path: Path, format: str) -> str:
 
 
 def episodes_of(passage: Passage, episode_steps: int) -> list[Episode]:
-    """Cuts episodes that do not overlap; the first frame of the passage is used for the first velocity only."""
+    """Cuts episodes that do not overlap; the first frame of the passage is used for the first velocity only.
+
+    Args:
+        passage: positions, of at least one frame.
+        episode_steps: length of each episode; 0 gives one episode of all steps, if there are two or more.
+    """
     velocities_mps = np.diff(passage.positions_m, axis=0) / DT_S
     is_ball = np.zeros((*velocities_mps.shape[:2], 1))
     is_ball[:, 0] = 1.0
     states = np.concatenate([passage.positions_m[1:], velocities_mps, is_ball], axis=-1).astype(np.float32)
-    valid = np.ones((episode_steps, ENTITIES), dtype=np.bool_)
+    length = episode_steps or max(2, len(states))
+    valid = np.ones((length, ENTITIES), dtype=np.bool_)
     return [
-        Episode(states[begin : begin + episode_steps], valid, passage.ids, passage.label)
-        for begin in range(0, len(states) - episode_steps + 1, episode_steps)
+        Episode(states[begin : begin + length], valid, passage.ids, passage.label)
+        for begin in range(0, len(states) - length + 1, length)
     ]
 
 
@@ -328,8 +336,9 @@ def load(config: NbaConfig) -> tuple[list[Episode], DatasetNotes, list[Path]]:
     for path in progressed(chosen, "nba"):
         for passage in _passages(path, config, counts):
             found = episodes_of(passage, config.episode_steps)
-            counts[f"passages skipped, shorter than {config.episode_steps} steps"] += not found
-            counts["steps dropped at the end of passages"] += (len(passage.positions_m) - 1) % config.episode_steps
+            counts[f"passages skipped, shorter than {config.episode_steps or 2} steps"] += not found
+            kept = sum(len(episode.states) for episode in found)
+            counts["steps dropped at the end of passages"] += len(passage.positions_m) - 1 - kept
             episodes += found
     numbered = [replace(episode, seed=i) for i, episode in enumerate(episodes)]
     return numbered, _notes(config, counts), files
@@ -360,7 +369,9 @@ def _notes(config: NbaConfig, counts: Counter[str]) -> DatasetNotes:
             "The ball's height is not kept.",
             f"A step is {DT_S} s (25/3 Hz).",
             "Velocity is the backward difference over one step; the first frame of each passage is dropped.",
-            f"Passages are cut into episodes of {config.episode_steps} steps that do not overlap; rests are dropped.",
+            f"Passages are cut into episodes of {config.episode_steps} steps that do not overlap; rests are dropped."
+            if config.episode_steps
+            else "Each passage is one episode, of all its steps.",
             f"Splits by game, hash with seed {SPLIT_SEED}; 'all' takes every file of the source.",
         ),
         dict(counts),

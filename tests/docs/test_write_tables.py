@@ -43,7 +43,7 @@ def test_every_page_has_its_tables():
     named = {
         path.name: [name for _, name, _ in MARKED.findall((ROOT / path).read_text())] for path in write_tables.PAGES
     }
-    assert named == {"README.md": ["forecasts"], "in_env.md": ["forecasts-long", "lent", "transfer"]}
+    assert named == {"README.md": ["forecasts"], "in_env.md": ["forecasts-long", "samples", "lent", "transfer"]}
     cards = list((ROOT / write_tables.PRETRAINED).glob("*/README.md"))
     assert len(cards) == len(RECORDS) == len(set(write_tables.SERVED_BY.values()))
     assert all([name for _, name, _ in MARKED.findall(card.read_text())] == ["accuracy"] for card in cards)

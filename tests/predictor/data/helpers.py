@@ -1,7 +1,7 @@
 """What the tests of the dataset loaders share."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -63,3 +63,19 @@ def change_line(path: Path, number: int, text: str | None) -> None:
     lines = path.read_text().splitlines()
     lines[number - 1 : number] = [] if text is None else [text]
     path.write_text("\n".join(lines) + "\n")
+
+
+def possession(frames: int, players: Sequence[int], feet: Callable[[int, int], tuple[float, float]]) -> str:
+    """A file of the NBA's text layout.
+
+    Args:
+        frames: number of frames.
+        players: ids of the ten players; -1 is the ball, which need not come first.
+        feet: function of id and frame that returns x and y.
+    """
+    lines = []
+    for t in range(frames):
+        for entity in (*players[:3], -1, *players[3:]):
+            x, y = feet(entity, t)
+            lines.append(f"{12 * t} {entity} {x:.6f} {y:.6f} {'BALL' if entity == -1 else 'PLAYER'}")
+    return "\n".join(lines)  # no end of line after the last, as published

@@ -7,7 +7,7 @@ import pytest
 
 from predictor.data import nba
 from predictor.data.loading import split_of
-from tests.predictor.data.helpers import Loader, change_line
+from tests.predictor.data.helpers import Loader, change_line, possession
 
 PLAYERS = [11, 12, 13, 14, 15, 3, 1004, 1005, 1006, 1007]
 """Two teams; the second's ids are both below and above the first's."""
@@ -24,12 +24,7 @@ def feet(entity: int, t: float) -> tuple[float, float]:
 
 def score(frames: int) -> str:
     """A possession in the text layout."""
-    lines = []
-    for t in range(frames):
-        for entity in (*PLAYERS[:3], -1, *PLAYERS[3:]):  # the ball need not come first
-            x, y = feet(entity, t)
-            lines.append(f"{12 * t} {entity} {x:.6f} {y:.6f} {'BALL' if entity == -1 else 'PLAYER'}")
-    return "\n".join(lines)  # no end of line after the last, as published
+    return possession(frames, PLAYERS, feet)
 
 
 @pytest.fixture
@@ -82,6 +77,19 @@ def test_rests_and_short_possessions_are_counted(possessions: Path, loader: Load
     assert "| games | 1 |" in loader.card
     assert "| passages skipped, shorter than 5 steps | 1 |" in loader.card
     assert "| steps dropped at the end of passages | 7 |" in loader.card  # 3 of 8, 4 of 4
+
+
+def test_possessions_can_be_kept_whole(possessions: Path, loader: Loader):
+    for quarter, frames in ((2, 5), (3, 3), (4, 2), (5, 1)):
+        (possessions / f"ATL_BKN_1_{quarter}_60.0_50.0.txt").write_text(score(frames))
+    store = loader.load(possessions, "--episode-steps", 0)
+    assert [len(e.states) for e in store.episodes] == [8, 4, 2]  # one less than frames; a single step is no episode
+    for episode in store.episodes:
+        assert episode.valid.all() and episode.ids.tolist() == [0, *PLAYERS]
+        assert_rolls(episode.states, 1)
+    assert "| passages skipped, shorter than 2 steps | 2 |" in loader.card
+    assert "| steps dropped at the end of passages | 1 |" in loader.card
+    assert "* Each passage is one episode, of all its steps." in loader.card
 
 
 def test_only_short_possessions_are_an_error(possessions: Path, loader: Loader):
@@ -147,7 +155,8 @@ def test_broken_files_can_be_left_out(possessions: Path, loader: Loader):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--episode-steps", 1), "episode_steps must be at least 2, got 1"),
+        (("--episode-steps", 1), "episode_steps must be 0 or at least 2, got 1"),
+        (("--episode-steps", -1), "episode_steps must not be negative, got -1"),
         (("--format", "sportvu"), "{source} holds no files of format 'sportvu' (*.json)"),
     ],
 )
