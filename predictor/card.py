@@ -18,7 +18,6 @@ from predictor.support.command_line import parse
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_text
 
-
 SPREAD = {
     True: "Where a driver's route is free, the single forecast lies between the routes, and the modes follow them.",
     False: "The spread of its samples is not calibrated; where a driver's route is free, the forecast lies between the "

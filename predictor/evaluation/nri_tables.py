@@ -12,7 +12,7 @@ _PROTOCOL = Protocol(burn_in_steps=49, horizon_steps=20, train_history_steps=39,
 _ONE_WINDOW = 99
 """Stride beyond a test rollout: its first 49 frames are observed, and no others."""
 
-_SMALL = {
+_SMALL: dict[str, tuple[str, ...]] = {
     "dgvae": ("hidden_dim=32", "rnn_dim=32", "head_dim=48", "message_dim=48", "decoder_dim=48"),
     "dnri": ("hidden_dim=64", "rnn_dim=32", "head_dim=64", "message_dim=64", "decoder_dim=64"),
 }
