@@ -89,7 +89,7 @@ class TrainConfig:
     eval_every: int = 250
     """Number of optimiser steps between validations, at which the training state is saved too."""
     patience: int = 8
-    """Number of validations without a better minADE after which training stops."""
+    """Number of validations without a better energy score after which training stops."""
     seed: int = 0
     """Random seed for initial weights, split, order and noise."""
     device: str = "cpu"
