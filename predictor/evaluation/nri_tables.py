@@ -6,7 +6,7 @@ up to 39 of history and 10 of forecast. Figures of NRI: Table 1 of Kipf et al., 
 
 from typing import Any
 
-from predictor.evaluation.paper_tables import Budget, Line, Protocol, Sizes, Table
+from predictor.evaluation.paper_tables import Line, Protocol, Sizes, Table
 
 _PROTOCOL = Protocol(burn_in_steps=49, horizon_steps=20, train_history_steps=39, train_horizon_steps=10)
 _ONE_WINDOW = 99
@@ -16,8 +16,10 @@ _SMALL = {
     "dgvae": ("hidden_dim=32", "rnn_dim=32", "head_dim=48", "message_dim=48", "decoder_dim=48"),
     "dnri": ("hidden_dim=64", "rnn_dim=32", "head_dim=64", "message_dim=64", "decoder_dim=64"),
 }
-_TINY = {name: tuple(f"{text.split('=')[0]}=12" for text in widths) for name, widths in _SMALL.items()}
-_BUDGETS: dict[Budget, Sizes] = {
+_TINY: dict[str, tuple[str, ...]] = {
+    name: tuple(f"{text.split('=')[0]}=12" for text in widths) for name, widths in _SMALL.items()
+}
+_BUDGETS: dict[str, Sizes] = {
     "smoke": Sizes(20, 8, 200, 40, 100, 10, _TINY),
     "cpu": Sizes(2500, 32, 0, 200, 2000, 250, _SMALL),
     "paper": Sizes(100_000, 128, 0, 2000, 0, 1000),

@@ -52,6 +52,7 @@ SIZES = {"fast": FAST_LIKE, "paper": PAPER_LIKE, "rich": RICH}
 EVERY_MODEL: dict[str, tuple[str, Any]] = {
     "dgvae": ("dgvae", FAST_LIKE),
     "dgvae-rich": ("dgvae", RICH),
+    "dgvae-symmetric": ("dgvae", replace(FAST_LIKE, symmetric_types=True, num_edge_types=3)),
     "dgvae-window": ("dgvae", replace(RICH, pair_matching="window", hard_samples=True, num_edge_types=3)),
     "dnri": ("dnri", DNRIConfig(hidden_dim=9, rnn_dim=5, head_dim=8, decoder_dim=13, message_dim=11)),
     "imma": ("imma", IMMAConfig(hidden_dim=9, rnn_dim=5, decoder_dim=13, message_dim=11)),
