@@ -109,7 +109,8 @@ class DGVAE(nn.Module):
     def variant(self, **changes: Any) -> "DGVAE":
         """Returns a model with these weights and a changed config.
 
-        The weights fit any value of `num_neighbours`, `rollout_graph`, `temperature` and `hard_samples`.
+        The weights fit any value of `num_neighbours`, `rollout_graph`, `symmetric_types`, `temperature` and
+        `hard_samples`.
 
         Raises:
             UserError: an unknown field, or the weights do not fit the changed config.
@@ -301,7 +302,7 @@ class DGVAE(nn.Module):
     def _layers(self) -> Layers:
         """Returns the layers for single steps: with gradients the modules themselves, else folded weights."""
         dropout = self.encoder.dropout.training and self.config.dropout > 0
-        if differentiable() or dropout or self.config.innovation_rounds:
+        if differentiable() or dropout or self.config.needs_reverse_pairs:
             return self._plain()
         if self._stepper is None or not self._stepper.is_current(self.encoder, self.decoder, self.self_edges):
             self._stepper = Stepper(self.encoder, self.decoder, self.self_edges)

@@ -42,6 +42,9 @@ class DGVAEConfig:
     """Number of edge types; the first one is "no edge" and sends no message."""
     edge_feature_dim: int = 32
     """Number of an edge's continuous features (paper: 16 to 64, by dataset); 0 is the ablation without them (dVAE)."""
+    symmetric_types: bool = False
+    """Whether both directions of a pair have one distribution over types, from the mean of their logits: where forces
+    are mutual, each direction is evidence for the other. Drawn types and features still differ by direction."""
     temperature: float = 0.5
     """Temperature of the concrete distribution."""
     dropout: float = 0.0
@@ -96,8 +99,9 @@ class DGVAEConfig:
             raise UserError("num_modes needs rollout_graph=frozen: what is drawn is held for the whole roll-out")
         check_at_least(self, 1, "hidden_dim", "rnn_dim", "head_dim", "message_dim", "decoder_dim", "innovation_dim")
         check_at_least(self, 0, "edge_feature_dim", "innovation_rounds", "static_dim", "substeps", "num_neighbours")
-        if self.num_neighbours and self.innovation_rounds:
-            raise UserError("innovation_rounds needs every pair and its reverse; set num_neighbours to 0")
+        if self.num_neighbours and self.needs_reverse_pairs:
+            needy = "innovation_rounds" if self.innovation_rounds else "symmetric_types"
+            raise UserError(f"{needy} needs every pair and its reverse; set num_neighbours to 0")
         if self.static_dim > self.edge_feature_dim:
             raise UserError(
                 f"static_dim must be at most edge_feature_dim ({self.edge_feature_dim}), got {self.static_dim}"
@@ -106,6 +110,11 @@ class DGVAEConfig:
             raise UserError(f"num_edge_types must be at least 2 (the first is 'no edge'), got {self.num_edge_types}")
         if not 0 < self.temperature < float("inf") or not 0 <= self.dropout < 1:
             raise UserError(f"need 0 < temperature < inf and 0 <= dropout < 1, got {self.temperature}, {self.dropout}")
+
+    @property
+    def needs_reverse_pairs(self) -> bool:
+        """Whether the encoder computes a pair from its reverse, so that slot j must be agent j."""
+        return bool(self.innovation_rounds) or self.symmetric_types
 
 
 _FAST = DGVAEConfig(
@@ -242,7 +251,7 @@ class Encoder(nn.Module):
             features = _time_first(self.feature_head, past) * present
         else:
             features = past.new_zeros(*pairs.shape, 0)
-        logits = no_edge_where_absent(_time_first(self.prior_head, past), present)
+        logits = no_edge_where_absent(self._types(self.prior_head, past), present)
         return Edges(hiddens, cells, logits, features, hidden_layer)
 
     def _between(self, pairs: Tensor, senders: Tensor | None) -> Tensor:
@@ -274,7 +283,12 @@ class Encoder(nn.Module):
         backward, _ = masked_lstm(gates, self.backward_hidden, pairs, zeros, zeros, reverse=True)
         both = self.dropout(functional.elu(torch.cat([edges.hidden, backward], dim=-1)))
         between = self._between(pairs, senders)[..., None]
-        return no_edge_where_absent(_time_first(self.posterior_head, both), between)
+        return no_edge_where_absent(self._types(self.posterior_head, both), between)
+
+    def _types(self, head: nn.Module, memory: Tensor) -> Tensor:
+        """Computes the logits of a head."""
+        logits = _time_first(head, memory)
+        return (logits + logits.transpose(-2, -3)) / 2 if self.config.symmetric_types else logits
 
 
 def _time_first(layer: Callable[..., Tensor], *tensors: Tensor) -> Tensor:

@@ -126,8 +126,8 @@ class TrainingPass:
         return Futures(future.unflatten(0, shape), probs, self.motion.spread(growth).unflatten(0, shape))
 
     def _dense(self, agents: int) -> bool:
-        """Returns whether slot j is agent j, which self-edges and corrections of pairs need."""
-        return self.layers.self_edges is not None or bool(self.reading.config.innovation_rounds) or agents == 1
+        """Returns whether slot j is agent j, which self-edges and what is computed from reverse pairs need."""
+        return self.layers.self_edges is not None or self.reading.config.needs_reverse_pairs or agents == 1
 
     def _graph(self, states: Tensor, valid: Tensor) -> Padded:
         """Returns the pairs of each step: each agent with all others, or with the nearest."""

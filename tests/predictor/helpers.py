@@ -54,6 +54,7 @@ SIZES = {"fast": FAST_LIKE, "paper": PAPER_LIKE, "rich": RICH}
 EVERY_MODEL: dict[str, tuple[str, Any]] = {
     "dgvae": ("dgvae", FAST_LIKE),
     "dgvae-rich": ("dgvae", RICH),
+    "dgvae-symmetric": ("dgvae", replace(FAST_LIKE, symmetric_types=True, num_edge_types=3)),
     "dgvae-window": ("dgvae", replace(RICH, pair_matching="window", hard_samples=True, num_edge_types=3)),
     "dgvae-plural": ("dgvae", PLURAL),
     "dgvae-plural-rich": ("dgvae", replace(RICH, num_modes=3, rollout_graph="frozen")),
