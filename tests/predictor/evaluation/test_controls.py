@@ -87,9 +87,10 @@ def test_windows_have_a_whole_future_and_come_from_all_stores(walks: Path, tmp_p
 
 
 def test_agents_that_leave_within_the_horizon_are_left_out(tmp_path: Path):
-    """Their last positions would count as errors of zeros, or not at all in later steps."""
+    """Where they are not, states are zeros: 50 m from where they were."""
     episodes = [walk(i) for i in range(120)]
     for episode in episodes:
+        episode.states[:, 1, :2] += 50.0
         episode.valid[8:, 1] = False
         episode.states[8:, 1] = 0.0
     windows = training_windows([store(tmp_path / "leaving", episodes)], LAYOUT, HORIZON)

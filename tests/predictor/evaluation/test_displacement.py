@@ -193,12 +193,18 @@ def test_mixture_nll_of_equal_modes_is_that_of_equal_samples():
     torch.testing.assert_close(value, gaussian_mixture_nll(forecast, future, valid, std_m)[0])
 
 
-def test_mixture_nll_has_a_least_scale_and_takes_modes_without_probability():
-    forecast, probs = one_agent(along_x(0, 0, 0), along_x(50, 50, 50)), torch.tensor([1.0, 0.0])[None, :, None]
-    narrow, least = (torch.full((1, 2, 1, 3, 2), std_m) for std_m in (0.0, LEAST_STD_M))
-    value, _ = mixture_nll(forecast, STANDING, ALL, probs, narrow)
-    assert torch.equal(value, mixture_nll(forecast, STANDING, ALL, probs, least)[0])
+def test_mixture_nll_of_a_mode_without_scale_has_the_least_one():
+    narrow, least = (torch.full((1, 1, 1, 3, 2), std_m) for std_m in (0.0, LEAST_STD_M))
+    value, _ = mixture_nll(STANDING[:, None], STANDING, ALL, torch.ones(1, 1, 1), narrow)
+    assert torch.equal(value, mixture_nll(STANDING[:, None], STANDING, ALL, torch.ones(1, 1, 1), least)[0])
     assert value[0, 0].tolist() == pytest.approx([math.log(2 * math.pi * LEAST_STD_M**2)] * 3, rel=1e-5)
+
+
+def test_mixture_nll_of_a_mode_without_probability_is_that_of_the_others():
+    """Even if it alone is where the truth is."""
+    forecast, probs = one_agent(along_x(3, 3, 3), along_x(0, 0, 0)), torch.tensor([1.0, 0.0])[None, :, None]
+    value, _ = mixture_nll(forecast, STANDING, ALL, probs, torch.ones_like(forecast))
+    assert value[0, 0].tolist() == pytest.approx([4.5 + math.log(2 * math.pi)] * 3)
 
 
 def test_mixture_nll_does_not_see_truth_that_does_not_count():

@@ -81,6 +81,9 @@ def test_energy_of_scenes_closed_form():
     there = torch.tensor([[[True], [True], [False]]])
     absent = torch.cat([truth, torch.full((1, 1, 1, 2), 50.0)], dim=1)
     assert terms(wider, absent, there)[1] == pytest.approx(expected, abs=1e-4)
+    longer = standing([[0.0, 0.0], [3.0, 4.0]], [[0.8, 0.4], [0.2, 0.6]], steps=3)
+    ended = torch.tensor([True, False, True]).expand(1, 2, 3)  # a step at which nobody is there does not count
+    assert terms(longer, truth.expand(-1, -1, 3, -1), ended)[1] == pytest.approx(expected, abs=1e-4)
 
 
 def test_modes_that_belong_together_are_told_from_modes_that_do_not():
