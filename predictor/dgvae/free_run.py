@@ -29,7 +29,8 @@ def free_run(
 ) -> Float[Tensor, "batch agents horizon state"]:
     """Rolls out from an observation before its decoder step, along edge types that `sampler` draws from logits."""
     drawn = graph.per_pair(sampler, logits)
-    node, states = motion.step(layers, states, valid, Context(graph, drawn, features), node)
+    context = Context(graph, drawn, layers.feature_share(features))
+    node, states = motion.step(layers, states, valid, context, node)
     return proceed(reading, motion, layers, states, valid, graph, past, node, (drawn, features), horizon_steps, sampler)
 
 
@@ -51,10 +52,12 @@ def proceed(
     The observed pairs stay; `edges` are weights and features, kept if frozen.
     """
     future, (weights, features) = [states], edges
+    context = Context(graph, weights, layers.feature_share(features))
     for _ in range(horizon_steps - 1):
         if reading.config.rollout_graph == "evolving":
             past, logits, features = reading.step(layers, states, valid, graph, past)
             weights = edge_probabilities(logits) if sampler is None else graph.per_pair(sampler, logits)
-        node, states = motion.step(layers, states, valid, Context(graph, weights, features), node)
+            context = Context(graph, weights, layers.feature_share(features))
+        node, states = motion.step(layers, states, valid, context, node)
         future.append(states)
     return torch.stack(future, dim=2)[:, :, :horizon_steps]

@@ -157,7 +157,7 @@ class DGVAE(nn.Module):
         probs = edge_probabilities(logits)
         own = None if self.self_edges is None else functional.elu(graph.own(past.hidden))
         held = None if self.self_edges is None or own is None else self.self_edges.hold(own)
-        context = Context(graph, probs, features, held)
+        context = Context(graph, probs, layers.feature_share(features), held)
         node_after, next_states = self._motion.step(layers, states, valid, context, node_before)
         known = Internal(layers, graph, past, logits, probs, features, node_before, node_after, next_states, own)
         remembered = tuple(graph.unpack_pairs(t) for t in (past.hidden, past.cell, past.static))
@@ -210,8 +210,9 @@ class DGVAE(nn.Module):
         """Rolls out scenes that hold their types: enumerated ones, or draws if there are fewer types than samples."""
         assert self.self_edges is not None and known.own is not None
         layers, graph, valid, motion = known.layers, known.graph, belief.valid, self._motion
+        share = layers.feature_share(known.features)
         if num_samples == 1:
-            context = Context(graph, known.probs, known.features, self.self_edges.hold(known.own))
+            context = Context(graph, known.probs, share, self.self_edges.hold(known.own))
             first = graph.unpack_nodes(self.self_edges.growth(known.node_after))
             states, growth = motion.held_run(
                 layers, known.next_states, valid, context, known.node_after, horizon_steps - 1
@@ -230,17 +231,13 @@ class DGVAE(nn.Module):
             types = (uniform[..., None] >= probs.cumsum(-1)[:, None, :, :-1]).sum(-1)
             types[:, 0] = 0
             mode_probs = None
-        more = graph.repeat(num_samples)
-        own = graph.repeat_nodes(known.own, num_samples)
-        held = self.self_edges.hold(own, more.pack_nodes(types.flatten(0, 1)[..., None])[..., 0])
-        weights, features = (graph.repeat_pairs(t, num_samples) for t in (known.probs, known.features))
-        context = Context(more, weights, features, held)
-        states, valid = (t.repeat_interleave(num_samples, dim=0) for t in (belief.states, valid))
-        node = graph.repeat_nodes(known.node_before, num_samples)
-        states, growth = motion.held_run(layers, states, valid, context, node, horizon_steps)
-        futures = (t.unflatten(0, (len(belief.states), num_samples)) for t in (states, motion.spread(growth)))
-        future, spread = futures
-        return Futures(future, mode_probs, spread)
+        shared = (belief.states, valid, known.probs, share, known.own, known.node_before)
+        first, there, weights, share, own, node = (t[:, None] for t in shared)
+        held = self.self_edges.hold(own, graph.pack_nodes(types[..., None])[..., 0])
+        context = Context(graph.for_modes(), weights, share, held)
+        run = motion.held_run(layers, first, there, context, node, horizon_steps)
+        states, growth = (t.expand(-1, num_samples, *t.shape[2:]) for t in run)  # a horizon of 0 has no modes yet
+        return Futures(states, mode_probs, motion.spread(growth))
 
     # --- Training -----------------------------------------------------------------------------------------------
 

@@ -20,15 +20,19 @@ class Context(NamedTuple):
     graph: Padded | Packed
     weights: Tensor
     """Weight of each edge type, for each pair."""
-    features: Tensor
-    """Edge features, for each pair."""
+    share: Tensor
+    """Share of the edge features in messages, for each pair (`Layers.feature_share`)."""
     held: HeldType | None = None
     """Types of the self-edges; None for a model without any."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Moves agents along weighted edges."""
+    """Moves agents along weighted edges.
+
+    Roll-outs of modes have an axis for them, as in `predictor.dgvae.packing`; the first step may come with length 1
+    there, and is then computed once as far as the modes agree.
+    """
 
     codec: StateCodec
     decoder: Decoder
@@ -37,12 +41,12 @@ class Motion:
 
     def step(
         self, layers: Layers, states: Tensor, valid: Tensor, context: Context, node: Tensor
-    ) -> tuple[Tensor, Float[Tensor, "batch agents state"]]:
+    ) -> tuple[Tensor, Float[Tensor, "batch *modes agents state"]]:
         """Computes one decoder step: GRU states after it, and the next states."""
         graph = context.graph
         inputs = graph.pack_nodes(self.codec.inputs(states, valid))
         own = self.own_layer(inputs, context)
-        node, messages = layers.decode(inputs, graph, context.weights, context.features, node, own)
+        node, messages = layers.decode(inputs, graph, context.weights, context.share, node, own)
         node = graph.forget_absent(node, valid)
         change = graph.unpack_nodes(self.decoder.change(node))
         return node, self.integrate(layers, states, valid, context, change, messages)
@@ -71,7 +75,7 @@ class Motion:
             if substep:
                 inputs = graph.pack_nodes(self.codec.inputs(states, valid))
                 own = self.own_layer(inputs, context)
-                messages = layers.messages(inputs, graph, context.weights, context.features, own)
+                messages = layers.messages(inputs, graph, context.weights, context.share, own)
             pushed = graph.unpack_nodes(self.decoder.direct(messages))
             states = self.codec.advance(states, change + pushed, 1 / self.substeps)
         return states
@@ -84,7 +88,7 @@ class Motion:
         context: Context,
         node: Tensor,
         horizon_steps: int,
-    ) -> tuple[Float[Tensor, "batch agents horizon state"], Float[Tensor, "batch agents horizon axes"]]:
+    ) -> tuple[Float[Tensor, "batch *modes agents horizon state"], Float[Tensor, "batch *modes agents horizon axes"]]:
         """Rolls out along held types while the context stays as it is; returns states and growth of their spread."""
         assert self.self_edges is not None
         future, growth = [], []
@@ -93,9 +97,9 @@ class Motion:
             future.append(states)
             growth.append(context.graph.unpack_nodes(self.self_edges.growth(node)))
         if not future:
-            nothing = states[:, :, None][:, :, :0]
+            nothing = states[..., None, :][..., :0, :]
             return nothing, nothing[..., : self.codec.spec.position_dim]
-        return torch.stack(future, dim=2), torch.stack(growth, dim=2)
+        return torch.stack(future, dim=-2), torch.stack(growth, dim=-2)
 
     def spread(self, growth: Float[Tensor, "*batch horizon axes"]) -> Float[Tensor, "*batch horizon axes"]:
         """Computes the standard deviation of the position at each step [m] from its growth in each."""

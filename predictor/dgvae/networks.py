@@ -345,28 +345,40 @@ class Decoder(nn.Module):
         senders: Int[Tensor, "*some agents slots"] | None = None,
     ) -> Float[Tensor, "*batch agents message"]:
         """Computes Σ_j z_ij · h(x_i ‖ x_j ‖ e_ij) plus the agent's own term, for all steps at once."""
-        return self.combine(inputs, self.pair_layer(inputs, features, senders), pairs, weights)
+        return self.combine(inputs, self.pair_layer(inputs, self.feature_share(features), senders), pairs, weights)
+
+    def feature_share(
+        self, features: Float[Tensor, "*batch agents slots feature"]
+    ) -> Float[Tensor, "*batch agents slots hidden"]:
+        """Computes the share of edge features in `pair_layer`; computed once where features are held."""
+        share: Tensor = self.message_feature(features) if self.has_features else features
+        return share
 
     def pair_layer(
         self,
         inputs: Float[Tensor, "*batch agents inputs"],
-        features: Float[Tensor, "*batch agents slots feature"],
+        share: Float[Tensor, "*#batch agents slots _"],
         senders: Int[Tensor, "*some agents slots"] | None = None,
     ) -> Float[Tensor, "*batch agents slots hidden"]:
-        """Computes the hidden layer of h, one block for each type that sends messages; independent of edge weights."""
+        """Computes the hidden layer of h, one block for each type that sends messages; independent of edge weights.
+
+        Args:
+            inputs: inputs of each agent.
+            share: result of `feature_share`.
+            senders: index of the agent in each slot; None is dense.
+        """
         if not self.has_features:
             return self.message_pair.elu(inputs, senders)
-        feature = self.message_feature(features)
         if self.gated:
-            return self.message_pair.elu(inputs, senders) * (1 + feature)
-        return self.message_pair.elu(inputs, senders, extra=feature)
+            return self.message_pair.elu(inputs, senders) * (1 + share)
+        return self.message_pair.elu(inputs, senders, extra=share)
 
     def combine(
         self,
         inputs: Float[Tensor, "*batch agents inputs"],
         layer: Float[Tensor, "*batch agents slots hidden"],
-        pairs: Bool[Tensor, "*batch agents slots"],
-        weights: Float[Tensor, "*batch agents slots types"],
+        pairs: Bool[Tensor, "*#batch agents slots"],
+        weights: Float[Tensor, "*#batch agents slots types"],
     ) -> Float[Tensor, "*batch agents message"]:
         """Computes messages from the result of `pair_layer`, weighted by the edges' types."""
         total: Tensor = self.own(inputs)
@@ -385,13 +397,13 @@ class Decoder(nn.Module):
 
     def step(
         self,
-        messages: Float[Tensor, "batch agents message"],
-        hidden: Float[Tensor, "batch agents decoder"],
-    ) -> Float[Tensor, "batch agents decoder"]:
+        messages: Float[Tensor, "*batch agents message"],
+        hidden: Float[Tensor, "*#batch agents decoder"],
+    ) -> Float[Tensor, "*batch agents decoder"]:
         """Computes one GRU step for every agent."""
-        batch, agents, width = hidden.shape
-        after: Tensor = self.gru(messages.reshape(batch * agents, -1), hidden.reshape(batch * agents, width))
-        return after.view(batch, agents, width)
+        width, axes = hidden.shape[-1], messages.shape[:-1]
+        after: Tensor = self.gru(messages.flatten(0, -2), hidden.expand(*axes, width).flatten(0, -2))
+        return after.unflatten(0, axes)
 
     def change(self, hidden: Float[Tensor, "*batch decoder"]) -> Float[Tensor, "*batch state"]:
         """Computes the change of state, in units of `delta_scales`."""

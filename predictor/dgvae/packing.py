@@ -6,6 +6,9 @@ leaves everything in place.
 
 The lengths of the lists are rounded up by a few per cent, with unused entries: oneDNN compiles its products for each
 length, which takes longer than the product, so there should be few lengths.
+
+Roll-outs of modes have one more axis, before that of padded agents and after that of lists. What all modes share has
+length 1 there.
 """
 
 from collections.abc import Callable
@@ -28,6 +31,10 @@ class Padded(NamedTuple):
     """Which pairs may interact."""
     senders: Int[Tensor, "*some agents slots"] | None
     """Index of the sender in each slot; None if slot j is agent j's."""
+
+    def for_modes(self) -> "Padded":
+        """Returns the pairs with an axis of modes."""
+        return Padded(self.present[:, None], None if self.senders is None else self.senders[:, None])
 
     @property
     def pairs_there(self) -> Bool[Tensor, "*batch agents slots"]:
@@ -139,14 +146,18 @@ class Packed:
             selves=(receivers == senders).nonzero()[:, 0] if self_edges else None,
         )
 
+    def for_modes(self) -> "Packed":
+        """Returns the lists unchanged: all modes share them."""
+        return self
+
     @property
     def pairs_there(self) -> Bool[Tensor, "batch agents slots"]:
         """Mask of the slots of the padded array that hold a pair."""
         return self.padded.present
 
-    def pack_nodes(self, nodes: Shaped[Tensor, "batch agents node"]) -> Shaped[Tensor, "listed node"]:
+    def pack_nodes(self, nodes: Shaped[Tensor, "batch *modes agents node"]) -> Shaped[Tensor, "listed *modes node"]:
         """Returns the entries of the listed agents."""
-        return nodes.flatten(0, 1).index_select(0, _lengthened(self.agents))
+        return nodes.movedim(-2, 1).flatten(0, 1).index_select(0, _lengthened(self.agents))
 
     def pack_pairs(self, pairs: Float[Tensor, "batch agents slots pair"]) -> Float[Tensor, "pairs pair"]:
         """Returns the entries of the listed pairs."""
@@ -162,8 +173,8 @@ class Packed:
         return torch.ones(len(pairs), dtype=torch.bool, device=pairs.device)
 
     def forget_absent(
-        self, nodes: Float[Tensor, "listed node"], valid: Bool[Tensor, "batch agents"]
-    ) -> Float[Tensor, "listed node"]:
+        self, nodes: Float[Tensor, "listed *modes node"], valid: Bool[Tensor, "batch ... agents"]
+    ) -> Float[Tensor, "listed *modes node"]:
         """Returns `nodes` unchanged: absent agents are not listed."""
         return nodes
 
@@ -174,10 +185,11 @@ class Packed:
         changed = change(pairs[: len(self.slots)])
         return functional.pad(changed, (0, 0, 0, len(pairs) - len(changed)))
 
-    def unpack_nodes(self, nodes: Float[Tensor, "listed node"]) -> Float[Tensor, "batch agents node"]:
+    def unpack_nodes(self, nodes: Float[Tensor, "listed *modes node"]) -> Float[Tensor, "batch *modes agents node"]:
         """Returns the padded array of agents, with zeros for absent ones."""
-        padded = nodes.new_zeros(self.valid.numel(), nodes.shape[-1])
-        return padded.index_copy_(0, self.agents, nodes[: len(self.agents)]).unflatten(0, self.valid.shape)
+        padded = nodes.new_zeros(self.valid.numel(), *nodes.shape[1:])
+        padded.index_copy_(0, self.agents, nodes[: len(self.agents)])
+        return padded.unflatten(0, self.valid.shape).movedim(1, -2)
 
     def unpack_pairs(
         self, pairs: Float[Tensor, "pairs pair"], no_edge: bool = False
@@ -204,20 +216,22 @@ class Packed:
         valid = self.valid.repeat_interleave(times, dim=0)
         return Packed.of(self.padded.repeat(times), valid, self.selves is not None)
 
-    def spread(self, shares: Float[Tensor, "listed two_out"]) -> Float[Tensor, "pairs out"]:
+    def spread(self, shares: Float[Tensor, "listed *modes two_out"]) -> Float[Tensor, "pairs *modes out"]:
         """Computes receiver's plus sender's share of each pair; an agent's two shares are side by side."""
-        of_roles = shares.view(-1, shares.shape[1] // 2)
-        return functional.embedding_bag(self.roles, of_roles, mode="sum")
+        of_roles = shares.unflatten(-1, (2, -1)).movedim(-2, 1).flatten(0, 1)
+        summed = functional.embedding_bag(self.roles, of_roles.flatten(1), mode="sum")
+        return summed.unflatten(1, of_roles.shape[1:])
 
     def gather(
-        self, pairs: Float[Tensor, "pairs out"], weight: Float[Tensor, " pairs"] | None = None
-    ) -> Float[Tensor, "listed out"]:
+        self, pairs: Float[Tensor, "pairs *modes out"], weight: Float[Tensor, " pairs"] | None = None
+    ) -> Float[Tensor, "listed *modes out"]:
         """Computes the weighted sum over senders."""
         if weight is not None:
             weight = weight[: len(self.slots)]
-        return functional.embedding_bag(
-            self.each, pairs, self.offsets, mode="sum", per_sample_weights=weight, include_last_offset=True
+        summed = functional.embedding_bag(
+            self.each, pairs.flatten(1), self.offsets, mode="sum", per_sample_weights=weight, include_last_offset=True
         )
+        return summed.unflatten(1, pairs.shape[1:])
 
     def total(self, weight: Float[Tensor, " pairs"]) -> Float[Tensor, "listed 1"]:
         """Computes the total weight of each agent's senders."""

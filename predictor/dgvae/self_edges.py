@@ -22,9 +22,9 @@ class HeldType(NamedTuple):
 
     past: Float[Tensor, "*agents message"]
     """Share of the agent's past."""
-    shift: Float[Tensor, "*agents message"]
+    shift: Float[Tensor, "*types message"]
     """Addend of the held type."""
-    gain: Float[Tensor, "*agents message"]
+    gain: Float[Tensor, "*types message"]
     """Factor of the held type."""
 
 
@@ -52,12 +52,15 @@ class SelfEdges(nn.Module):
         self.out = nn.Linear(message, message)
         self.spread = nn.Linear(decoder, axes)
 
-    def hold(self, past: Float[Tensor, "*agents memory"], types: Int[Tensor, "*agents"] | None = None) -> HeldType:
-        """Returns what the given types (None: type 0 for all) add, from the activated memory of each self-edge."""
+    def hold(self, past: Float[Tensor, "*agents memory"], types: Int[Tensor, "*types"] | None = None) -> HeldType:
+        """Returns what the given types (None: type 0 for all) add, from the activated memory of each self-edge.
+
+        Types and agents are broadcast together.
+        """
         chosen: Tensor | int = 0 if types is None else types
         return HeldType(self.past(past), self.shift[chosen], self.gain[chosen])
 
-    def layer(self, inputs: Float[Tensor, "*agents inputs"], held: HeldType) -> Float[Tensor, "*agents message"]:
+    def layer(self, inputs: Float[Tensor, "*agents inputs"], held: HeldType) -> Float[Tensor, "*held message"]:
         """Computes the hidden layer of each agent's message to itself; `out` makes it the message."""
         return functional.elu((self.input(inputs) + held.past) * held.gain + held.shift)
 

@@ -46,12 +46,15 @@ class Layers(Protocol):
     def encode(self, inputs: Tensor, graph: Any, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Computes the memory of each pair after a step (hidden, cell), prior logits and features."""
 
+    def feature_share(self, features: Tensor) -> Tensor:
+        """Computes the share of each pair's features in its message."""
+
     def decode(
-        self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, node: Tensor, own: Tensor | None
+        self, inputs: Tensor, graph: Any, weights: Tensor, share: Tensor, node: Tensor, own: Tensor | None
     ) -> tuple[Tensor, Tensor | None]:
         """Computes GRU states after a step along weighted edges; and the messages, unless only the GRU needs them."""
 
-    def messages(self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, own: Tensor | None) -> Tensor:
+    def messages(self, inputs: Tensor, graph: Any, weights: Tensor, share: Tensor, own: Tensor | None) -> Tensor:
         """Computes the sum of messages to each agent; `own` is the hidden layer of its message to itself."""
 
 
@@ -83,16 +86,21 @@ class Modules:
         edges: Edges = self.encoder(inputs[:, None], graph.present[:, None], hidden, cell, graph.senders)
         return edges.hidden[:, 0], edges.cell[:, 0], edges.prior_logits[:, 0], edges.features[:, 0]
 
+    def feature_share(self, features: Tensor) -> Tensor:
+        """Computes the share of each pair's features in its message."""
+        return self.decoder.feature_share(features)
+
     def decode(
-        self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, node: Tensor, own: Tensor | None
+        self, inputs: Tensor, graph: Any, weights: Tensor, share: Tensor, node: Tensor, own: Tensor | None
     ) -> tuple[Tensor, Tensor | None]:
         """Computes GRU states after a step along weighted edges, and the messages."""
-        messages = self.messages(inputs, graph, weights, features, own)
+        messages = self.messages(inputs, graph, weights, share, own)
         return self.decoder.step(messages, node), messages
 
-    def messages(self, inputs: Tensor, graph: Any, weights: Tensor, features: Tensor, own: Tensor | None) -> Tensor:
+    def messages(self, inputs: Tensor, graph: Any, weights: Tensor, share: Tensor, own: Tensor | None) -> Tensor:
         """Computes the sum of messages to each agent along weighted edges, with its message to itself."""
-        summed = self.decoder.messages(inputs, graph.present, weights, features, graph.senders)
+        layer = self.decoder.pair_layer(inputs, share, graph.senders)
+        summed = self.decoder.combine(inputs, layer, graph.present, weights)
         if self.self_edges is None or own is None:
             return summed
         total: Tensor = summed + self.self_edges.out(own)
@@ -185,41 +193,45 @@ class Stepper:
             features.index_fill_(0, graph.selves, 0.0)
         return hidden, cell, logits, features
 
+    def feature_share(self, features: Float[Tensor, "pairs feature"]) -> Float[Tensor, "pairs _"]:
+        """Computes the share of each pair's features in its message."""
+        return features if self._feature is None else _product(features, self._feature)
+
     def decode(
         self,
-        inputs: Float[Tensor, "listed inputs"],
+        inputs: Float[Tensor, "listed *modes inputs"],
         graph: Packed,
-        weights: Float[Tensor, "pairs types"],
-        features: Float[Tensor, "pairs feature"],
-        node: Float[Tensor, "listed decoder"],
-        own: Float[Tensor, "listed message"] | None,
-    ) -> tuple[Float[Tensor, "listed decoder"], Float[Tensor, "listed message"] | None]:
+        weights: Float[Tensor, "pairs ... types"],
+        share: Float[Tensor, "pairs ... _"],
+        node: Float[Tensor, "listed ... decoder"],
+        own: Float[Tensor, "listed *more_modes message"] | None,
+    ) -> tuple[Float[Tensor, "listed *more_modes decoder"], Float[Tensor, "listed *more_modes message"] | None]:
         """Computes GRU states after a step along weighted edges; and the messages, if substeps need them."""
         if self._to_gates is None:
-            messages = self.messages(inputs, graph, weights, features, own)
+            messages = self.messages(inputs, graph, weights, share, own)
             gates = _product(messages, self._gru)
         else:
             messages = None
-            gates = self._along(inputs, graph, weights, features, own, *self._to_gates)
+            gates = self._along(inputs, graph, weights, share, own, *self._to_gates)
         return gru_step_(gates, _product(node, self._remembered), node), messages
 
     def messages(
         self,
-        inputs: Float[Tensor, "listed inputs"],
+        inputs: Float[Tensor, "listed *modes inputs"],
         graph: Packed,
-        weights: Float[Tensor, "pairs types"],
-        features: Float[Tensor, "pairs feature"],
-        own: Float[Tensor, "listed message"] | None,
-    ) -> Float[Tensor, "listed message"]:
+        weights: Float[Tensor, "pairs ... types"],
+        share: Float[Tensor, "pairs ... _"],
+        own: Float[Tensor, "listed *more_modes message"] | None,
+    ) -> Float[Tensor, "listed *more_modes message"]:
         """Computes the sum of messages to each agent along weighted edges, its own terms included."""
-        return self._along(inputs, graph, weights, features, own, self._own, self._out, self._self_out)
+        return self._along(inputs, graph, weights, share, own, self._own, self._out, self._self_out)
 
     def _along(
         self,
         inputs: Tensor,
         graph: Packed,
         weights: Tensor,
-        features: Tensor,
+        share: Tensor,
         own: Tensor | None,
         own_term: Layer,
         out: list[Layer],
@@ -229,16 +241,15 @@ class Stepper:
         if self._feature is None:
             elu_(layer)
         elif self._gated:
-            elu_(layer).mul_(_product(features, self._feature).add_(1))
+            elu_(layer).mul_(share + 1)
         else:
-            elu_(layer.addmm_(features, self._feature[0].t()))
-        total = _product(inputs, own_term)
-        if own is not None and self_out is not None:
-            total = _product(own, self_out, total)
+            elu_(layer.add_(share))
+        total = None if own is None or self_out is None else _product(own, self_out)
+        total = _product(inputs, own_term, total)
         for k, (block, (matrix, bias)) in enumerate(zip(layer.chunk(len(out), -1), out, strict=True)):
-            weight = weights[:, k + 1].contiguous()
+            weight = weights[..., k + 1].flatten()  # the modes share it
             total = _product(graph.gather(block.contiguous(), weight), (matrix, None), total)
-            total.addcmul_(graph.total(weight), bias)
+            total.addcmul_(graph.total(weight).view(-1, *[1] * (total.ndim - 1)), bias)
         return total
 
     def _take_encoder(self, encoder: Encoder) -> None:
@@ -278,16 +289,17 @@ def _versions(*modules: nn.Module | None) -> list[tuple[int, int]]:
 
 
 def _product(inputs: Tensor, layer: tuple[Tensor, Tensor | None], plus: Tensor | None = None) -> Tensor:
-    """Computes a linear layer, plus `plus` (which may be overwritten)."""
+    """Computes a linear layer, plus `plus` (which may be overwritten, and may have more modes)."""
     weight, bias = layer
     if _ONEDNN and inputs.device.type == "cpu" and inputs.dtype is torch.float32:
-        if len(inputs) * weight.numel() >= _LARGE:
+        if inputs.shape[:-1].numel() * weight.numel() >= _LARGE:
             linear = torch.ops.mkldnn._linear_pointwise
             if plus is None:
                 return linear(inputs, weight, bias, "none", [], "")
-            return linear.binary(inputs, plus, weight, bias, "add")
+            if plus.shape[:-1] == inputs.shape[:-1]:
+                return linear.binary(inputs, plus, weight, bias, "add")
     product = functional.linear(inputs, weight, bias)
-    return product if plus is None else product.add_(plus)
+    return product if plus is None else plus.add_(product)
 
 
 def _spread(nodes: Tensor, layer: Layer, graph: Packed) -> Tensor:

@@ -57,12 +57,13 @@ class TrainingPass:
         shown = self.reading.match_window(edges.features, features, graph.present)
         own = None if self_edges is None else functional.elu(graph.own(past.hidden))
         held = None if self_edges is None or own is None else self_edges.hold(own)
-        layer = decoder.pair_layer(inputs, shown, graph.senders)
+        share = decoder.feature_share(shown)
+        layer = decoder.pair_layer(inputs, share, graph.senders)
         to_itself = self._to_itself(inputs, held)
         messages = decoder.combine(inputs, layer, graph.present, sampled) + to_itself
         change = decoder.change(masked_gru(messages, decoder.gru, valid, node))
         one_step = self.motion.integrate(
-            self.layers, states, valid, Context(graph, sampled, shown, held), change, messages
+            self.layers, states, valid, Context(graph, sampled, share, held), change, messages
         )
         prior_posterior_features = _dense_outputs(graph, edges.prior_logits, posterior, shown)
         if not rollout_steps:
@@ -73,7 +74,7 @@ class TrainingPass:
         steps = states.shape[1] if last_observed.is_cuda else int(last_observed.max())
         expected = edge_probabilities(edges.prior_logits[:, :steps])
         if shown is not features:
-            layer = decoder.pair_layer(inputs, features, graph.senders)
+            layer = decoder.pair_layer(inputs, decoder.feature_share(features), graph.senders)
         messages = decoder.combine(inputs[:, :steps], layer[:, :steps], graph.present[:, :steps], expected)
         to_itself = to_itself if held is None else to_itself[:, :steps]
         remembered = masked_gru(messages + to_itself, decoder.gru, valid[:, :steps], node)
@@ -115,15 +116,13 @@ class TrainingPass:
         """Rolls out the first `num_modes` types of all agents along one draw of the edges."""
         self_edges = self.layers.self_edges
         assert self_edges is not None
-        windows, agents = valid.shape
-        types = torch.arange(num_modes, device=states.device).repeat(windows)[:, None].expand(-1, agents)
-        repeated = (states, valid, self.sampler(logits), features, own, node)
-        first, there, weights, features, past, memory = (t.repeat_interleave(num_modes, dim=0) for t in repeated)
-        context = Context(graph.repeat(num_modes), weights, features, self_edges.hold(past, types))
+        shared = (states, valid, self.sampler(logits), self.layers.feature_share(features), own, node)
+        first, there, weights, share, past, memory = (t[:, None] for t in shared)
+        types = torch.arange(num_modes, device=states.device)[:, None]
+        context = Context(graph.for_modes(), weights, share, self_edges.hold(past, types))
         future, growth = self.motion.held_run(self.layers, first, there, context, memory, horizon_steps)
         probs = torch.softmax(self_edges.prior_head(own)[..., :num_modes], dim=-1).transpose(1, 2)
-        shape = (windows, num_modes)
-        return Futures(future.unflatten(0, shape), probs, self.motion.spread(growth).unflatten(0, shape))
+        return Futures(future, probs, self.motion.spread(growth))
 
     def _dense(self, agents: int) -> bool:
         """Returns whether slot j is agent j, which self-edges and what is computed from reverse pairs need."""

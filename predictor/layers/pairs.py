@@ -47,7 +47,7 @@ class PairLinear(nn.Module):
         nodes: Float[Tensor, "*batch agents node"],
         senders: Int[Tensor, "*some agents slots"] | None = None,
         after: nn.Linear | None = None,
-        extra: Float[Tensor, "*batch agents slots out"] | None = None,
+        extra: Float[Tensor, "*#batch agents slots out"] | None = None,
     ) -> Float[Tensor, "*batch agents slots out"]:
         """Computes the ELU of `forward` plus `extra`; only the result is kept for the gradient."""
         pairs = self(nodes, senders, after)
@@ -67,10 +67,13 @@ class PairLinear(nn.Module):
 def to_pairs(
     nodes: Float[Tensor, "*batch agents node"], senders: Int[Tensor, "*some agents slots"]
 ) -> Float[Tensor, "*batch agents slots node"]:
-    """Returns the node of each pair's sender; `senders` is one list for all, or one for each of the last batch axis."""
+    """Returns the node of each pair's sender; `senders` is one list for all, or one for each of the last batch axes."""
     agents, slots = senders.shape[-2:]
     if senders.ndim == 2:
         return nodes.index_select(-2, senders.flatten()).unflatten(-2, (agents, slots))
+    if senders.ndim > 3:
+        places = senders.flatten(-2)[..., None].expand(*nodes.shape[:-2], -1, nodes.shape[-1])
+        return nodes.gather(-2, places).unflatten(-2, (agents, slots))
     places = senders + agents * torch.arange(len(senders), device=senders.device)[:, None, None]
     return nodes.flatten(-3, -2).index_select(-2, places.flatten()).unflatten(-2, tuple(senders.shape))
 
@@ -82,7 +85,7 @@ def folded(outer: nn.Linear, inner: nn.Linear) -> tuple[Float[Tensor, "out in"],
 
 
 def sum_over_senders(
-    pairs: Float[Tensor, "*batch agents slots hidden"], weight: Float[Tensor, "*batch agents slots"]
+    pairs: Float[Tensor, "*batch agents slots hidden"], weight: Float[Tensor, "*#batch agents slots"]
 ) -> Float[Tensor, "*batch agents hidden"]:
     """Computes Σ_j weight_ij · pair_ij."""
     return torch.matmul(weight[..., None, :], pairs)[..., 0, :]

@@ -95,13 +95,15 @@ def lstm_step_(
 
 
 def gru_step_(
-    gates: Float[Tensor, "agents gates"], share: Float[Tensor, "agents gates"], hidden: Float[Tensor, "agents hidden"]
-) -> Float[Tensor, "agents hidden"]:
+    gates: Float[Tensor, "*agents gates"],
+    share: Float[Tensor, "*#agents gates"],
+    hidden: Float[Tensor, "*#agents hidden"],
+) -> Float[Tensor, "*agents hidden"]:
     """Computes a GRU's state after one step; `gates` (the input's share) is overwritten, `share` is the state's."""
     width = hidden.shape[-1]
-    gates[:, : 2 * width].add_(share[:, : 2 * width]).sigmoid_()
+    gates[..., : 2 * width].add_(share[..., : 2 * width]).sigmoid_()
     r, z, u = gates.chunk(3, dim=-1)
-    n = u.addcmul_(r, share[:, 2 * width :]).mul_(2).sigmoid_().mul_(2).sub_(1)
+    n = u.addcmul_(r, share[..., 2 * width :]).mul_(2).sigmoid_().mul_(2).sub_(1)
     return torch.lerp(n, hidden, z)
 
 

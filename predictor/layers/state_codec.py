@@ -19,10 +19,10 @@ Residual = Literal["state", "constant_velocity", "trapezoid"]
 def drift(
     spec: SceneSpec,
     residual: Residual,
-    states: Float[Tensor, "*batch state"],
+    states: Float[Tensor, "*#batch state"],
     after: Float[Tensor, "*batch state"],
     fraction: float = 1.0,
-) -> Float[Tensor, "*batch axes"]:
+) -> Float[Tensor, "*#batch axes"]:
     """Computes the change of position in one step that follows from velocities alone [m].
 
     Args:
@@ -97,7 +97,7 @@ class StateCodec(nn.Module):
         return self.spec.num_features + int(self.spec.has_ego)
 
     def inputs(
-        self, states: Float[Tensor, "*batch agents state"], valid: Bool[Tensor, "*batch agents"]
+        self, states: Float[Tensor, "*batch agents state"], valid: Bool[Tensor, "*#batch agents"]
     ) -> Float[Tensor, "*batch agents inputs"]:
         """Computes scaled features, re-centred at this step, plus the ego's mark; zeros where absent."""
         axes = self.spec.position_dim
@@ -114,7 +114,7 @@ class StateCodec(nn.Module):
         return inputs * present
 
     def advance(
-        self, states: Float[Tensor, "*batch state"], change: Float[Tensor, "*batch state"], fraction: float = 1.0
+        self, states: Float[Tensor, "*#batch state"], change: Float[Tensor, "*batch state"], fraction: float = 1.0
     ) -> Float[Tensor, "*batch state"]:
         """Computes the states [SI] a step, or a fraction of one, later.
 

@@ -165,9 +165,9 @@ def test_an_agent_keeps_its_type_and_the_others_follow_theirs(variant: str):
         hold = type(model.self_edges).hold
 
         def first_agent_stays(self_edges: Any, past: Tensor, types: Tensor | None = None) -> Any:
-            if types is not None and types.ndim == 2:
+            if types is not None and types.ndim == 3:
                 types = types.clone()
-                types[:, 0] = 0
+                types[..., 0] = 0
             return hold(self_edges, past, types)
 
         with torch.enable_grad():  # padded arrays: places are those of the agents

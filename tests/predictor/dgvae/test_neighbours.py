@@ -19,8 +19,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from predictor.dgvae import DGVAE
 from predictor.dgvae import model as dgvae
-from predictor.dgvae.networks import Decoder, DGVAEConfig
+from predictor.dgvae.networks import DGVAEConfig
 from predictor.dgvae.packing import Packed
+from predictor.dgvae.single_step import Modules
 from predictor.forecaster import Belief, Memory, WindowOutput
 from predictor.graph import NO_AGENT, among_nearest, off_diagonal, others, pair_mask
 from predictor.online import OnlineForecaster
@@ -506,23 +507,24 @@ def test_frozen_graphs_are_drawn_once(frozen: bool, monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize("samples", [1, 3])
 def test_frozen_steps_have_the_same_graph_and_features(samples: int, monkeypatch: pytest.MonkeyPatch):
     shown: list[tuple[Tensor, Tensor]] = []
-    messages = Decoder.messages
+    messages = Modules.messages
 
-    def watched(self: Decoder, inputs: Tensor, pairs: Tensor, graph: Tensor, features: Tensor, *rest: Any) -> Tensor:
-        shown.append((graph, features))
-        return messages(self, inputs, pairs, graph, features, *rest)
+    def watched(self: Modules, inputs: Tensor, graph: Any, weights: Tensor, share: Tensor, own: Any) -> Tensor:
+        shown.append((weights, share))
+        return messages(self, inputs, graph, weights, share, own)
 
     forecaster = precise("fast", 2, frozen=True)
     belief = last(forecaster)
-    monkeypatch.setattr(Decoder, "messages", watched)
+    share = forecaster.decoder.feature_share(belief.edge_features)
+    monkeypatch.setattr(Modules, "messages", watched)
     forecaster.rollout(belief, HORIZON, samples, torch.Generator().manual_seed(0))
     expected, drawn = shown[: HORIZON - 1], shown[HORIZON - 1 :]  # the expected run's first step was taken before
-    for graph, features in expected:
-        assert torch.equal(graph, belief.edge_probs) and torch.equal(features, belief.edge_features)
+    for graph, shared in expected:
+        assert torch.equal(graph, belief.edge_probs) and torch.equal(shared, share)
     assert len(drawn) == (HORIZON if samples > 1 else 0)
-    for graph, features in drawn:
+    for graph, shared in drawn:
         assert torch.equal(graph, drawn[0][0])
-        assert torch.equal(features, belief.edge_features.repeat_interleave(samples - 1, dim=0))
+        assert torch.equal(shared, share.repeat_interleave(samples - 1, dim=0))
 
 
 @pytest.mark.usefixtures("gradients")
