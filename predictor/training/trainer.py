@@ -202,7 +202,7 @@ class Trainer:
         self.baseline_m = self._baseline()
         self.noise = torch.Generator(device=self.device)
         source = open_batches(config, data.train, self.device)
-        self.batches, self.notes = source.batches, source.notes
+        self.batches, self.notes, self._widths = source.batches, source.notes, source.widths
         self.read_every = LOG_EVERY if on_cuda else 1
         self._checks_each_loss = not on_cuda
         self._recorder: Recorder | None = CudaRecorder(self.device, self.noise) if source.capture else None
@@ -241,13 +241,13 @@ class Trainer:
         if self._recorder is not None:
             terms = self._replayed(self._recorder, batch, now.rollout_steps, now.num_modes)
         else:
-            terms = self._optimise(batch, now.rollout_steps, now.num_modes)
+            terms = self._optimise(batch, now.rollout_steps, now.num_modes, now.weight)
         self.step += 1
         return terms
 
     def plan(self, step: int) -> Plan:
         """Returns batch, seeds and schedules of a step."""
-        return plan(self.config, [len(w) for w in self.data.train], step, self.num_modes)
+        return plan(self.config, [len(w) for w in self.data.train], step, self.num_modes, self._widths)
 
     @property
     def num_modes(self) -> int:
@@ -268,7 +268,9 @@ class Trainer:
             )
         return dict(zip(terms, values, strict=True))
 
-    def _optimise(self, batch: WindowBatch, rollout_steps: int, num_modes: int) -> Mapping[str, Tensor]:
+    def _optimise(
+        self, batch: WindowBatch, rollout_steps: int, num_modes: int, weight: float = 1.0
+    ) -> Mapping[str, Tensor]:
         """Computes forward, loss, backward, clipping and update; on a CUDA device the host reads no result."""
         kind = self.config.precision
         with _tensor_cores(kind == "tf32"):
@@ -282,7 +284,7 @@ class Trainer:
             if self._checks_each_loss and not torch.isfinite(loss):
                 raise UserError(f"the loss is {float(loss.detach())} at step {self.step}; lower --lr or check the data")
             self.optimizer.zero_grad(set_to_none=True)
-            loss.backward()
+            (weight * loss).backward()
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.clip_norm)
         self.optimizer.step()
         self._finite.logical_and_(torch.isfinite(loss.detach()))
