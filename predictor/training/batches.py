@@ -57,7 +57,7 @@ def plan(
     sizes: Sequence[int],
     step: int,
     num_modes: int = 1,
-    widths: Sequence[Int[np.ndarray, " windows"]] | None = None,
+    widths: Sequence[Int[np.ndarray, " _"]] | None = None,
 ) -> Plan:
     """Draws the random quantities of a step and computes the scheduled ones.
 
@@ -257,7 +257,7 @@ class Source:
     """Whether steps are captured as CUDA graphs: on a CUDA device, with fixed shapes."""
     notes: tuple[str, ...] = ()
     """Messages for the user, one line each."""
-    widths: tuple[Int[np.ndarray, " windows"], ...] | None = None
+    widths: tuple[Int[np.ndarray, " _"], ...] | None = None
     """Number of agents of each window, by which batches are put together; None if shapes are fixed or all are equal."""
 
 
