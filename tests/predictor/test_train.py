@@ -19,7 +19,7 @@ from predictor import train as training
 from predictor.checkpoint import load_checkpoint
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.data.windows import WindowBatch
-from predictor.dgvae.networks import PRESETS
+from predictor.dgvae.config import PRESETS
 from predictor.evaluation.accuracy import summarise
 from predictor.evaluation.outcomes import run_windows
 from predictor.forecaster import WindowOutput
