@@ -14,9 +14,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
+from predictor.dgvae.geometry import Geometry
 from predictor.dgvae.innovation import Innovation
 from predictor.graph import self_pairs
-from predictor.layers.pairs import PairLinear, folded, sum_over_senders
+from predictor.layers.pairs import PairLinear, ends, folded, sum_over_senders
 from predictor.layers.rnn import Correction, masked_lstm
 from predictor.layers.state_codec import Residual
 from predictor.noise import PairNoise
@@ -59,6 +60,9 @@ class DGVAEConfig:
     scales. A road of 500 m by 12 m needs it: at 100 m for both axes its lanes lie 0.04 apart."""
     change_scales: tuple[float, ...] = ()
     """Typical one-step change of each input [SI]; if given, the change since the last step is an encoder input too."""
+    geometry_scales: tuple[float, ...] = ()
+    """Typical distance [m] and relative speed [m/s] of neighbours; if given, the geometry of each pair at these scales
+    is an input of its edge and of its messages (`predictor.dgvae.geometry`)."""
     forget_bias: float = 0.0
     """Addend of the initial bias of the LSTMs' forget gates; 2 starts them with a memory of about eight steps."""
     innovation_rounds: int = 0
@@ -108,6 +112,9 @@ class DGVAEConfig:
             )
         if self.num_edge_types < 2:
             raise UserError(f"num_edge_types must be at least 2 (the first is 'no edge'), got {self.num_edge_types}")
+        scales = self.geometry_scales
+        if scales and (len(scales) != 2 or not all(0 < scale < float("inf") for scale in scales)):
+            raise UserError(f"geometry_scales needs a distance [m] and a speed [m/s], both positive, got {scales}")
         if not 0 < self.temperature < float("inf") or not 0 <= self.dropout < 1:
             raise UserError(f"need 0 < temperature < inf and 0 <= dropout < 1, got {self.temperature}, {self.dropout}")
 
@@ -187,16 +194,20 @@ def _head(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 class Encoder(nn.Module):
     """Computes edge logits and features from states, step by step or for many steps at once."""
 
-    def __init__(self, config: DGVAEConfig, inputs: int) -> None:
+    def __init__(self, config: DGVAEConfig, inputs: int, geometry: Geometry | None = None) -> None:
         """Creates the layers, in the order in which data passes them."""
         super().__init__()
         self.config = config
+        self.geometry = geometry
         width, rnn = config.hidden_dim, config.rnn_dim
         self.embed = nn.Linear(inputs, width)
         self.conv_pair = PairLinear(width, width, relative=True)
         self.conv_out = nn.Linear(width, width)
         self.edge_pair = PairLinear(width, width)
         self.edge_out = nn.Linear(width, width)
+        if geometry is not None:
+            self.conv_geometry = nn.Linear(geometry.num_features, width, bias=False)
+            self.edge_geometry = nn.Linear(geometry.num_features, width, bias=False)
         self.forward_input = nn.Linear(width, 4 * rnn)
         self.forward_hidden = nn.Linear(rnn, 4 * rnn, bias=False)
         self.backward_input = nn.Linear(width, 4 * rnn)
@@ -220,11 +231,15 @@ class Encoder(nn.Module):
     ) -> Float[Tensor, "*batch agents slots hidden"]:
         """Computes the graph block up to the hidden layer of the edge MLP, for all steps at once."""
         weight = pairs.to(inputs.dtype)
-        summed = sum_over_senders(self.conv_pair.elu(inputs, senders, self.embed), weight)
+        to_conv = to_edge = None
+        if self.geometry is not None:
+            geometry = self.geometry(*ends(inputs, senders))
+            to_conv, to_edge = self.conv_geometry(geometry), self.edge_geometry(geometry)
+        summed = sum_over_senders(self.conv_pair.elu(inputs, senders, self.embed, to_conv), weight)
         # Σ_j (W h_ij + b) = W Σ_j h_ij + n b: the second layer of EdgeConv costs agents, not pairs.
         count = weight.sum(-1, keepdim=True)
         nodes = functional.elu(functional.linear(summed, self.conv_out.weight) + count * self.conv_out.bias)
-        return self.edge_pair.elu(nodes, senders)
+        return self.edge_pair.elu(nodes, senders, extra=to_edge)
 
     def _gates(self, layer: nn.Linear, hidden: Tensor) -> Tensor:
         """Computes the input share of an LSTM's gates."""
@@ -316,13 +331,16 @@ def no_edge_where_absent(
 class Decoder(nn.Module):
     """Computes changes of state from messages along edges."""
 
-    def __init__(self, config: DGVAEConfig, inputs: int, outputs: int) -> None:
+    def __init__(self, config: DGVAEConfig, inputs: int, outputs: int, geometry: Geometry | None = None) -> None:
         """Creates the layers, in the order in which data passes them."""
         super().__init__()
+        self.geometry = geometry
         self.types = config.num_edge_types - 1  # type 0 sends no message
         self.gated = config.gated_messages
         width = config.message_dim
         self.message_pair = PairLinear(inputs, self.types * width)
+        if geometry is not None:
+            self.message_geometry = nn.Linear(geometry.num_features, self.types * width, bias=False)
         if config.edge_feature_dim:
             self.message_feature = nn.Linear(config.edge_feature_dim, self.types * width, bias=False)
         self.message_out = nn.Linear(width, self.types * width)  # one block for each type that sends messages
@@ -367,11 +385,13 @@ class Decoder(nn.Module):
             share: result of `feature_share`.
             senders: index of the agent in each slot; None is dense.
         """
-        if not self.has_features:
-            return self.message_pair.elu(inputs, senders)
-        if self.gated:
-            return self.message_pair.elu(inputs, senders) * (1 + share)
-        return self.message_pair.elu(inputs, senders, extra=share)
+        extra = None
+        if self.geometry is not None:
+            extra = self.message_geometry(self.geometry(*ends(inputs, senders)))
+        if self.has_features and not self.gated:
+            extra = share if extra is None else extra + share
+        layer = self.message_pair.elu(inputs, senders, extra=extra)
+        return layer * (1 + share) if self.has_features and self.gated else layer
 
     def combine(
         self,

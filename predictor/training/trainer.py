@@ -140,6 +140,24 @@ def typical_spread(episodes: Sequence[Episode], spec: SceneSpec) -> tuple[float,
     return tuple(float(s) for s in np.maximum(spread, least))
 
 
+def typical_neighbour(episodes: Sequence[Episode], spec: SceneSpec) -> tuple[float, ...]:
+    """Computes the median distance of an agent to the nearest other [m], and their median relative speed [m/s]."""
+    axes, distances, speeds = spec.position_dim, [], []
+    for episode in episodes:
+        states, valid = torch.from_numpy(episode.states), torch.from_numpy(episode.valid)
+        place = states[..., :axes]
+        apart = torch.cdist(place, place, compute_mode="donot_use_mm_for_euclid_dist")
+        found = apart.masked_fill(~pair_mask(valid), torch.inf).min(-1)
+        velocity = states[..., axes : 2 * axes]
+        other = velocity.gather(1, found.indices[..., None].expand_as(velocity))
+        near = found.values < torch.inf
+        distances.append(found.values[near])
+        speeds.append(torch.linalg.vector_norm(other - velocity, dim=-1)[near])
+    if not sum(len(d) for d in distances):
+        raise UserError("--edge-geometry needs steps with two agents, and the training data has none; leave it out")
+    return tuple(max(float(torch.cat(found).median()), 1e-2) for found in (distances, speeds))
+
+
 def _in_frame(episode: Episode, spec: SceneSpec) -> np.ndarray:
     codec = StateCodec(spec)
     inputs = codec.inputs(torch.from_numpy(episode.states), torch.from_numpy(episode.valid))[..., : spec.num_features]
@@ -151,19 +169,21 @@ def model_config(config: TrainConfig, data: TrainingData) -> Any:
     """Builds the network's config, with scales fitted to the training data.
 
     Raises:
-        UserError: --set names a field that the model does not have, or --input-changes or --fit-inputs is set for
-            another model than the dG-VAE.
+        UserError: --set names a field that the model does not have, or --input-changes, --fit-inputs or
+            --edge-geometry is set for another model than the dG-VAE.
     """
     plain = configure(config.model, config.preset, config.set)
     fitted = {"delta_scales": typical_change(data.train_episodes, data.spec, plain.residual)}
+    for option in ("input_changes", "fit_inputs", "edge_geometry"):
+        if getattr(config, option) and config.model != "dgvae":
+            flag = "--" + option.replace("_", "-")
+            raise UserError(f"{flag} belongs to the dG-VAE; leave it out for --model {config.model}")
     if config.input_changes:
-        if config.model != "dgvae":
-            raise UserError(f"--input-changes belongs to the dG-VAE; leave it out for --model {config.model}")
         fitted["change_scales"] = typical_change(data.train_episodes, data.spec, "state")
     if config.fit_inputs:
-        if config.model != "dgvae":
-            raise UserError(f"--fit-inputs belongs to the dG-VAE; leave it out for --model {config.model}")
         fitted["input_scales"] = typical_spread(data.train_episodes, data.spec)
+    if config.edge_geometry:
+        fitted["geometry_scales"] = typical_neighbour(data.train_episodes, data.spec)
     return configure(config.model, config.preset, config.set, **fitted)
 
 
