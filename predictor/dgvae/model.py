@@ -23,17 +23,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
+from predictor.dgvae.config import PRESETS, DGVAEConfig
 from predictor.dgvae.free_run import free_run, proceed
 from predictor.dgvae.geometry import Geometry
 from predictor.dgvae.motion import Context, Motion
-from predictor.dgvae.networks import (
-    PRESETS,
-    Decoder,
-    DGVAEConfig,
-    Encoder,
-    concrete_sample,
-    edge_probabilities,
-)
+from predictor.dgvae.networks import Decoder, Encoder, concrete_sample, edge_probabilities
 from predictor.dgvae.packing import Packed, Padded
 from predictor.dgvae.reading import Reading
 from predictor.dgvae.self_edges import SelfEdges

@@ -17,7 +17,7 @@ from predictor.baselines.lstm import LSTMConfig
 from predictor.baselines.mlp import MLPConfig
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.dgvae import DGVAE
-from predictor.dgvae.networks import DGVAEConfig
+from predictor.dgvae.config import DGVAEConfig
 from predictor.models import build
 from predictor.scene import PADDING_ID, AxisFrame, Scene, SceneBatch, SceneSpec
 

@@ -17,7 +17,8 @@ from torch import Tensor
 from predictor.checkpoint import CheckpointInfo, load_checkpoint, save_checkpoint
 from predictor.dgvae import DGVAE
 from predictor.dgvae import model as dgvae
-from predictor.dgvae.networks import DGVAEConfig, edge_probabilities
+from predictor.dgvae.config import DGVAEConfig
+from predictor.dgvae.networks import edge_probabilities
 from predictor.forecaster import Belief, Futures, has_scale
 from predictor.support.errors import UserError
 from tests.predictor.helpers import FAST_LIKE, PLURAL, RICH, random_presence, random_states, spec

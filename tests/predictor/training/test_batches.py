@@ -14,7 +14,7 @@ import torch
 
 from predictor.data.device_windows import ResidentWindows
 from predictor.data.windows import WindowBatch, Windows
-from predictor.dgvae.networks import PRESETS
+from predictor.dgvae.config import PRESETS
 from predictor.support.errors import UserError
 from predictor.training import batches as batches_module
 from predictor.training.batches import (
