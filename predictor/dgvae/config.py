@@ -43,6 +43,9 @@ class DGVAEConfig:
     scales. A road of 500 m by 12 m needs it: at 100 m for both axes its lanes lie 0.04 apart."""
     change_scales: tuple[float, ...] = ()
     """Typical one-step change of each input [SI]; if given, the change since the last step is an encoder input too."""
+    geometry_scales: tuple[float, ...] = ()
+    """Typical distance [m] and relative speed [m/s] of neighbours; if given, the geometry of each pair at these scales
+    is an input of its edge and of its messages (`predictor.dgvae.geometry`)."""
     forget_bias: float = 0.0
     """Addend of the initial bias of the LSTMs' forget gates; 2 starts them with a memory of about eight steps."""
     innovation_rounds: int = 0
@@ -92,6 +95,9 @@ class DGVAEConfig:
             )
         if self.num_edge_types < 2:
             raise UserError(f"num_edge_types must be at least 2 (the first is 'no edge'), got {self.num_edge_types}")
+        scales = self.geometry_scales
+        if scales and (len(scales) != 2 or not all(0 < scale < float("inf") for scale in scales)):
+            raise UserError(f"geometry_scales needs a distance [m] and a speed [m/s], both positive, got {scales}")
         if not 0 < self.temperature < float("inf") or not 0 <= self.dropout < 1:
             raise UserError(f"need 0 < temperature < inf and 0 <= dropout < 1, got {self.temperature}, {self.dropout}")
 

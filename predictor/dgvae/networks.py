@@ -14,9 +14,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from predictor.dgvae.config import DGVAEConfig
+from predictor.dgvae.geometry import Geometry
 from predictor.dgvae.innovation import Innovation
 from predictor.graph import self_pairs
-from predictor.layers.pairs import PairLinear, folded, sum_over_senders
+from predictor.layers.pairs import PairLinear, ends, folded, sum_over_senders
 from predictor.layers.rnn import Correction, masked_lstm
 from predictor.noise import PairNoise
 
@@ -71,16 +72,20 @@ def _head(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 class Encoder(nn.Module):
     """Computes edge logits and features from states, step by step or for many steps at once."""
 
-    def __init__(self, config: DGVAEConfig, inputs: int) -> None:
+    def __init__(self, config: DGVAEConfig, inputs: int, geometry: Geometry | None = None) -> None:
         """Creates the layers, in the order in which data passes them."""
         super().__init__()
         self.config = config
+        self.geometry = geometry
         width, rnn = config.hidden_dim, config.rnn_dim
         self.embed = nn.Linear(inputs, width)
         self.conv_pair = PairLinear(width, width, relative=True)
         self.conv_out = nn.Linear(width, width)
         self.edge_pair = PairLinear(width, width)
         self.edge_out = nn.Linear(width, width)
+        if geometry is not None:
+            self.conv_geometry = nn.Linear(geometry.num_features, width, bias=False)
+            self.edge_geometry = nn.Linear(geometry.num_features, width, bias=False)
         self.forward_input = nn.Linear(width, 4 * rnn)
         self.forward_hidden = nn.Linear(rnn, 4 * rnn, bias=False)
         self.backward_input = nn.Linear(width, 4 * rnn)
@@ -104,11 +109,15 @@ class Encoder(nn.Module):
     ) -> Float[Tensor, "*batch agents slots hidden"]:
         """Computes the graph block up to the hidden layer of the edge MLP, for all steps at once."""
         weight = pairs.to(inputs.dtype)
-        summed = sum_over_senders(self.conv_pair.elu(inputs, senders, self.embed), weight)
+        to_conv = to_edge = None
+        if self.geometry is not None:
+            geometry = self.geometry(*ends(inputs, senders))
+            to_conv, to_edge = self.conv_geometry(geometry), self.edge_geometry(geometry)
+        summed = sum_over_senders(self.conv_pair.elu(inputs, senders, self.embed, to_conv), weight)
         # Σ_j (W h_ij + b) = W Σ_j h_ij + n b: the second layer of EdgeConv costs agents, not pairs.
         count = weight.sum(-1, keepdim=True)
         nodes = functional.elu(functional.linear(summed, self.conv_out.weight) + count * self.conv_out.bias)
-        return self.edge_pair.elu(nodes, senders)
+        return self.edge_pair.elu(nodes, senders, extra=to_edge)
 
     def _gates(self, layer: nn.Linear, hidden: Tensor) -> Tensor:
         """Computes the input share of an LSTM's gates."""
@@ -200,13 +209,16 @@ def no_edge_where_absent(
 class Decoder(nn.Module):
     """Computes changes of state from messages along edges."""
 
-    def __init__(self, config: DGVAEConfig, inputs: int, outputs: int) -> None:
+    def __init__(self, config: DGVAEConfig, inputs: int, outputs: int, geometry: Geometry | None = None) -> None:
         """Creates the layers, in the order in which data passes them."""
         super().__init__()
+        self.geometry = geometry
         self.types = config.num_edge_types - 1  # type 0 sends no message
         self.gated = config.gated_messages
         width = config.message_dim
         self.message_pair = PairLinear(inputs, self.types * width)
+        if geometry is not None:
+            self.message_geometry = nn.Linear(geometry.num_features, self.types * width, bias=False)
         if config.edge_feature_dim:
             self.message_feature = nn.Linear(config.edge_feature_dim, self.types * width, bias=False)
         self.message_out = nn.Linear(width, self.types * width)  # one block for each type that sends messages
@@ -251,11 +263,13 @@ class Decoder(nn.Module):
             share: result of `feature_share`.
             senders: index of the agent in each slot; None is dense.
         """
-        if not self.has_features:
-            return self.message_pair.elu(inputs, senders)
-        if self.gated:
-            return self.message_pair.elu(inputs, senders) * (1 + share)
-        return self.message_pair.elu(inputs, senders, extra=share)
+        extra = None
+        if self.geometry is not None:
+            extra = self.message_geometry(self.geometry(*ends(inputs, senders)))
+        if self.has_features and not self.gated:
+            extra = share if extra is None else extra + share
+        layer = self.message_pair.elu(inputs, senders, extra=extra)
+        return layer * (1 + share) if self.has_features and self.gated else layer
 
     def combine(
         self,

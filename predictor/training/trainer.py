@@ -22,7 +22,6 @@ from predictor.data.store import Episode, EpisodeStore, read_store
 from predictor.data.windows import WindowBatch, Windows, split_episodes
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import run_windows
-from predictor.layers.state_codec import Residual, StateCodec, drift
 from predictor.models import build, configure
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
@@ -38,6 +37,7 @@ from predictor.training.cuda_graph import (
     default_generator,
     signature,
 )
+from predictor.training.fitted_scales import typical_change, typical_neighbour, typical_spread
 from predictor.training.objective import window_loss
 
 VALIDATION_DRAWS = 5
@@ -118,52 +118,25 @@ def _windows(config: TrainConfig, episodes: Sequence[Episode], spec: SceneSpec, 
     )
 
 
-def typical_change(episodes: Sequence[Episode], spec: SceneSpec, residual: Residual) -> tuple[float, ...]:
-    """Computes the root mean square of the change that the decoder predicts in one step, per feature [SI]."""
-    total, count = np.zeros(spec.num_features), 0
-    for episode in episodes:
-        both = episode.valid[1:] & episode.valid[:-1]
-        before, after = (torch.from_numpy(s) for s in (episode.states[:-1], episode.states[1:]))
-        change = (after - before).numpy()
-        change[..., : spec.position_dim] -= drift(spec, residual, before, after).numpy()
-        total += np.square(change[both].astype(np.float64)).sum(axis=0)
-        count += int(both.sum())
-    scale = np.sqrt(total / max(count, 1))
-    return tuple(float(s) for s in np.maximum(scale, 1e-3))
-
-
-def typical_spread(episodes: Sequence[Episode], spec: SceneSpec) -> tuple[float, ...]:
-    """Computes the standard deviation of each input feature over the data [SI], with positions in the spec's frame."""
-    states = [_in_frame(episode, spec)[episode.valid] for episode in episodes]
-    spread = np.concatenate(states).astype(np.float64).std(axis=0)
-    least = 1e-2 * np.array(spec.feature_scales)
-    return tuple(float(s) for s in np.maximum(spread, least))
-
-
-def _in_frame(episode: Episode, spec: SceneSpec) -> np.ndarray:
-    codec = StateCodec(spec)
-    inputs = codec.inputs(torch.from_numpy(episode.states), torch.from_numpy(episode.valid))[..., : spec.num_features]
-    framed: np.ndarray = (inputs * codec.scales).numpy()
-    return framed
-
-
 def model_config(config: TrainConfig, data: TrainingData) -> Any:
     """Builds the network's config, with scales fitted to the training data.
 
     Raises:
-        UserError: --set names a field that the model does not have, or --input-changes or --fit-inputs is set for
-            another model than the dG-VAE.
+        UserError: --set names a field that the model does not have, or --input-changes, --fit-inputs or
+            --edge-geometry is set for another model than the dG-VAE.
     """
     plain = configure(config.model, config.preset, config.set)
     fitted = {"delta_scales": typical_change(data.train_episodes, data.spec, plain.residual)}
+    for option in ("input_changes", "fit_inputs", "edge_geometry"):
+        if getattr(config, option) and config.model != "dgvae":
+            flag = "--" + option.replace("_", "-")
+            raise UserError(f"{flag} belongs to the dG-VAE; leave it out for --model {config.model}")
     if config.input_changes:
-        if config.model != "dgvae":
-            raise UserError(f"--input-changes belongs to the dG-VAE; leave it out for --model {config.model}")
         fitted["change_scales"] = typical_change(data.train_episodes, data.spec, "state")
     if config.fit_inputs:
-        if config.model != "dgvae":
-            raise UserError(f"--fit-inputs belongs to the dG-VAE; leave it out for --model {config.model}")
         fitted["input_scales"] = typical_spread(data.train_episodes, data.spec)
+    if config.edge_geometry:
+        fitted["geometry_scales"] = typical_neighbour(data.train_episodes, data.spec)
     return configure(config.model, config.preset, config.set, **fitted)
 
 

@@ -26,8 +26,9 @@ from predictor.forecaster import WindowOutput
 from predictor.support.errors import UserError, run_entry_point
 from predictor.train import train
 from predictor.training.config import TrainConfig
+from predictor.training.fitted_scales import typical_change
 from predictor.training.objective import window_loss
-from predictor.training.trainer import VALIDATION_DRAWS, Trainer, load_data, typical_change
+from predictor.training.trainer import VALIDATION_DRAWS, Trainer, load_data
 from tests.predictor.helpers import FAST_LIKE, PLURAL, circling_episode, following_episode, model, spec, write_circles
 
 ROOT = Path(__file__).parents[2]
