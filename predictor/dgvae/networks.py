@@ -19,7 +19,7 @@ from predictor.graph import self_pairs
 from predictor.layers.pairs import PairLinear, folded, sum_over_senders
 from predictor.layers.rnn import Correction, masked_lstm
 from predictor.layers.state_codec import Residual
-from predictor.noise import PairNoise
+from predictor.noise import NoiseOfPairs, uniform_like
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError
 
@@ -154,7 +154,7 @@ class Edges(NamedTuple):
 def concrete_sample(
     logits: Float[Tensor, "*batch types"],
     temperature: float,
-    generator: torch.Generator | PairNoise | None = None,
+    generator: NoiseOfPairs | None = None,
     hard: bool = False,
 ) -> Float[Tensor, "*batch types"]:
     """Draws a reparameterised sample of the concrete distribution (paper Sec. IV, Sampling).
@@ -167,10 +167,7 @@ def concrete_sample(
     """
     if logits.dtype in (torch.bfloat16, torch.float16):
         logits = logits.float()  # rare types are drawn by the tails of the noise
-    if isinstance(generator, PairNoise):
-        uniform = generator.like(logits)
-    else:
-        uniform = torch.rand(logits.shape, generator=generator, device=logits.device, dtype=logits.dtype)
+    uniform = uniform_like(logits, generator)
     tiny = torch.finfo(logits.dtype).tiny
     gumbel = -torch.log(-torch.log(uniform.clamp(tiny, 1 - torch.finfo(logits.dtype).eps)))
     soft = edge_probabilities((logits + gumbel) / temperature)
