@@ -10,7 +10,7 @@ from agents.features import TOKEN_KEYS, VALID_KEY, AttentionConfig, ForecastAtte
 from agents.task import Task
 from agents.training import TrainingPlan, make_model
 from agents.vec_envs import make_venv
-from envs.observation import FORECAST_KEYS, UNCERTAINTY_KEYS
+from envs.observation import FORECAST_KEYS, UNCERTAINTY_KEYS, WHAT_IF_KEYS
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
@@ -27,6 +27,9 @@ UNCERTAIN = SHAPES | {
     "forecast": (AGENTS, 3, HORIZON, 2),
     "mode_probs": (AGENTS, 3),
     "xy_scale": (AGENTS, 3, HORIZON, 2),
+    "what_if_gap": (AGENTS, 2),
+    "what_if_contact": (AGENTS, 2),
+    "what_if_risk": (AGENTS, 2),
 }
 
 
@@ -153,7 +156,7 @@ def test_empty_scene_is_finite_with_finite_gradients():
 
 def test_every_entry_of_the_wrappers_is_read():
     """One that is added to the wrappers alone would change no policy, without a word."""
-    assert {*TOKEN_KEYS, VALID_KEY} == {*FORECAST_KEYS, *UNCERTAINTY_KEYS}
+    assert {*TOKEN_KEYS, VALID_KEY} == {*FORECAST_KEYS, *UNCERTAINTY_KEYS, *WHAT_IF_KEYS}
 
 
 def test_a_new_token_key_is_read(monkeypatch: pytest.MonkeyPatch):
