@@ -225,7 +225,7 @@ def test_the_example_plans_what_the_robot_then_does():
     for plan, name in enumerate(model.names):
         env = gym.make("Crossing-v0")
         env.reset(seed=1)
-        env.unwrapped.robot[2:] = [0.0, 0.5]  # type: ignore[attr-defined]
+        env.unwrapped.robot[1:] = [-4.0, 0.0, 0.5]  # type: ignore[attr-defined]  # away from the wall
         plans = checked_plans(model, env, horizon, 4)
         assert plans.rewards is not None
         for step in range(horizon):
