@@ -11,7 +11,7 @@ substeps or input changes.
 
 from dataclasses import dataclass
 
-from predictor.dgvae.networks import DGVAEConfig
+from predictor.dgvae.config import DGVAEConfig
 
 STATE = 4
 """Number of features of a kinematic state."""

@@ -5,6 +5,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from benchmarks.flops import Work
 from benchmarks.models import SIZES, forecaster, inference, observed, road, scenes, sized
@@ -38,12 +39,39 @@ CASES: dict[str, tuple[Case, ...]] = {
     ),
 }
 EVOLVING = "evolving graph, float32"
+ONE, SIX = "one forecast, plural", "six futures, plural"
+"""Names of the lines of a model with modes, each a step of streaming: observe and roll out."""
+WITHOUT_MODES = "one forecast without modes"
 
 
 def run(settings: Settings) -> list[Line]:
-    """Measures both presets at every shape."""
-    meter = Meter.of(settings)
-    return [line for preset in SIZES for case in CASES[settings.mode] for line in _case(preset, case, meter)]
+    """Measures both presets at every shape, and what modes cost."""
+    meter, cases = Meter.of(settings), CASES[settings.mode]
+    lines = [line for preset in SIZES for case in cases for line in _case(preset, case, meter)]
+    shapes = dict.fromkeys(case._replace(samples=1) for case in cases)
+    return lines + [line for case in shapes for line in _modes(case, meter)]
+
+
+def _modes(case: Case, meter: Meter) -> list[Line]:
+    """Measures a step of streaming with one forecast and with six, beside the step of a model without modes."""
+    states, valid = scenes(case.batch, case.agents)
+    steps = {
+        name: inference(
+            partial(_step, forecaster(sized(preset), road(case.agents), case.horizon), states, valid, samples)
+        )
+        for name, preset, samples in ((WITHOUT_MODES, "fast", 1), (ONE, "plural", 1), (SIX, "plural", 6))
+    }
+    timings = meter.measure(steps)
+    return [
+        timed_line("forecast", name, case._asdict() | {"samples": samples}, timings[name], base=timings[base],
+                   ratio_to=base)
+        for name, base, samples in ((ONE, WITHOUT_MODES, 1), (SIX, ONE, 6))
+    ]  # fmt: skip
+
+
+def _step(model: DGVAE, states: Tensor, valid: Tensor, samples: int) -> Any:
+    _, belief = model.observe(model.empty_memory(*valid.shape), states, valid)
+    return model.rollout(belief, model.horizon_steps, samples).states
 
 
 def _case(preset: str, case: Case, meter: Meter) -> list[Line]:

@@ -20,7 +20,7 @@ from predictor.checkpoint import load_checkpoint
 from predictor.data.store import read_store
 from predictor.data.windows import Windows
 from predictor.dgvae import DGVAE
-from predictor.dgvae.networks import DGVAEConfig
+from predictor.dgvae.config import DGVAEConfig
 from predictor.evaluation.accuracy import Tally
 from predictor.evaluation.measure_line import protocol_indices
 from predictor.evaluation.outcomes import run_windows

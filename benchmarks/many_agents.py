@@ -19,7 +19,7 @@ from benchmarks.settings import Settings
 from benchmarks.timing import Meter, timed_line
 from benchmarks.worker_process import WorkerProcess, exact_memory
 from predictor.dgvae import DGVAE
-from predictor.dgvae.networks import DGVAEConfig
+from predictor.dgvae.config import DGVAEConfig
 
 NEIGHBOURS = 8
 HORIZON = 20

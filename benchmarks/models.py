@@ -11,7 +11,7 @@ from torch import Tensor
 
 from predictor.data.windows import WindowBatch
 from predictor.dgvae import DGVAE
-from predictor.dgvae.networks import PRESETS, DGVAEConfig
+from predictor.dgvae.config import PRESETS, DGVAEConfig
 from predictor.forecaster import Belief, Memory
 from predictor.scene import AxisFrame, SceneSpec
 from predictor.support.runtime import Precision, precision

@@ -20,7 +20,7 @@ from benchmarks.models import TrainingStep, box, forecaster, inference
 from benchmarks.results import Line
 from benchmarks.settings import Settings
 from benchmarks.timing import Meter, Timing, ratio_line, timed_line
-from predictor.dgvae.networks import DGVAEConfig
+from predictor.dgvae.config import DGVAEConfig
 from predictor.support.errors import UserError
 
 EQUAL = DGVAEConfig(

@@ -25,7 +25,7 @@ from envs.registry import make_env
 from envs.sb3.forecast import VecForecast
 from envs.wrappers import SceneObservation
 from predictor.dgvae import DGVAE
-from predictor.dgvae.networks import PRESETS
+from predictor.dgvae.config import PRESETS
 from predictor.forecaster import Forecaster
 from predictor.scene import SceneSpec
 from predictor.support.command_line import Renamed, parse

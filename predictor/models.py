@@ -16,7 +16,7 @@ from predictor.baselines.imma import IMMA, IMMAConfig
 from predictor.baselines.lstm import LSTM, LSTMConfig
 from predictor.baselines.mlp import MLP, MLPConfig
 from predictor.dgvae import DGVAE
-from predictor.dgvae.networks import PRESETS, DGVAEConfig
+from predictor.dgvae.config import PRESETS, DGVAEConfig
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 

@@ -23,16 +23,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
+from predictor.dgvae.config import PRESETS, DGVAEConfig
 from predictor.dgvae.free_run import free_run, proceed
+from predictor.dgvae.geometry import Geometry
 from predictor.dgvae.motion import Context, Motion
-from predictor.dgvae.networks import (
-    PRESETS,
-    Decoder,
-    DGVAEConfig,
-    Encoder,
-    concrete_sample,
-    edge_probabilities,
-)
+from predictor.dgvae.networks import Decoder, Encoder, concrete_sample, edge_probabilities
 from predictor.dgvae.packing import Packed, Padded
 from predictor.dgvae.planned_run import PlannedRun
 from predictor.dgvae.reading import Reading
@@ -75,8 +70,11 @@ class DGVAE(nn.Module):
         if self.sees_changes:
             check_scales("change_scales", config.change_scales, spec)
         inputs = self.codec.num_inputs
-        self.encoder = Encoder(config, inputs + spec.num_features * self.sees_changes)
-        self.decoder = Decoder(config, inputs, spec.num_features)
+        geometry = None
+        if config.geometry_scales:
+            geometry = Geometry(self.codec.scales[: 2 * spec.position_dim], *config.geometry_scales)
+        self.encoder = Encoder(config, inputs + spec.num_features * self.sees_changes, geometry)
+        self.decoder = Decoder(config, inputs, spec.num_features, geometry)
         self.self_edges: SelfEdges | None = None
         if config.num_modes:
             sizes = (config.rnn_dim, config.head_dim, config.message_dim, config.decoder_dim)

@@ -1,4 +1,4 @@
-"""The dG-VAE's two networks (paper Sec. IV): the encoder of edges and the decoder of motion, and their sizes.
+"""The dG-VAE's two networks (paper Sec. IV): the encoder of edges and the decoder of motion.
 
 Both take one step or many at once; `predictor.dgvae.model` combines them. Linear layers on a concatenation of two
 agents are computed per agent and added on the pair, and the last layer of an edge MLP is moved behind the sum over
@@ -6,135 +6,20 @@ senders; both are identities.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
+from predictor.dgvae.config import DGVAEConfig
+from predictor.dgvae.geometry import Geometry
 from predictor.dgvae.innovation import Innovation
 from predictor.graph import self_pairs
-from predictor.layers.pairs import PairLinear, folded, sum_over_senders
+from predictor.layers.pairs import PairLinear, ends, folded, sum_over_senders
 from predictor.layers.rnn import Correction, masked_lstm
-from predictor.layers.state_codec import Residual
 from predictor.noise import NoiseOfPairs, uniform_like
-from predictor.support.config_checks import check_at_least, check_choices
-from predictor.support.errors import UserError
-
-
-@dataclass(frozen=True)
-class DGVAEConfig:
-    """Sizes and variants of the network; the defaults are the paper's (Sec. V, Implementation)."""
-
-    hidden_dim: int = 128
-    """Width of the encoder's graph layers."""
-    rnn_dim: int = 64
-    """Width of the LSTM of each pair."""
-    head_dim: int = 256
-    """Hidden width of the prior, posterior and feature heads."""
-    message_dim: int = 128
-    """Width of the decoder's messages."""
-    decoder_dim: int = 256
-    """Width of the GRU of each agent."""
-    num_edge_types: int = 2
-    """Number of edge types; the first one is "no edge" and sends no message."""
-    edge_feature_dim: int = 32
-    """Number of an edge's continuous features (paper: 16 to 64, by dataset); 0 is the ablation without them (dVAE)."""
-    symmetric_types: bool = False
-    """Whether both directions of a pair have one distribution over types, from the mean of their logits: where forces
-    are mutual, each direction is evidence for the other. Drawn types and features still differ by direction."""
-    temperature: float = 0.5
-    """Temperature of the concrete distribution."""
-    dropout: float = 0.0
-    """Dropout probability after the LSTM."""
-    residual: Residual = "state"
-    """Position to which the predicted change is added: the current one (paper), or the current one moved on at the
-    current velocity, or at the mean of current and predicted velocity (velocity-consistent)."""
-    delta_scales: tuple[float, ...] = ()
-    """Typical one-step change of each feature [SI] beyond the residual; empty takes the spec's feature scales."""
-    input_scales: tuple[float, ...] = ()
-    """Spread of each feature over the map [SI], which divides the network's inputs; empty takes the spec's feature
-    scales. A road of 500 m by 12 m needs it: at 100 m for both axes its lanes lie 0.04 apart."""
-    change_scales: tuple[float, ...] = ()
-    """Typical one-step change of each input [SI]; if given, the change since the last step is an encoder input too."""
-    forget_bias: float = 0.0
-    """Addend of the initial bias of the LSTMs' forget gates; 2 starts them with a memory of about eight steps."""
-    innovation_rounds: int = 0
-    """Number of corrections of pair memories at each encoder step (`predictor.dgvae.innovation`); paper: 0."""
-    innovation_dim: int = 32
-    """Width of these corrections."""
-    static_dim: int = 0
-    """Number of first feature dimensions that pair matching averages over time (paper: 16); 0 is off."""
-    pair_matching: Literal["window", "causal"] = "causal"
-    """Span of this average in training: the whole window (paper), or the past of each step, as when deployed."""
-    substeps: int = 0
-    """Number of evaluations of the messages within a step, each followed by a motion of the agents; 0 is the paper's
-    decoder, in which messages act through the GRU alone."""
-    gated_messages: bool = False
-    """Whether edge features scale the messages instead of being one more input of theirs."""
-    zero_start: bool = False
-    """Whether fresh weights predict no change beyond the residual: with many senders, sums are large, and a roll-out
-    through random weights diverges."""
-    hard_samples: bool = False
-    """Whether sampled edge types are one-hot, with the gradient of the soft ones (straight-through)."""
-    num_neighbours: int = 0
-    """Largest number of senders of an agent, the nearest ones; 0 takes all. With a limit, the cost grows with the
-    number of agents, not with its square. A roll-out keeps the neighbours that it starts with."""
-    rollout_graph: Literal["evolving", "frozen"] = "evolving"
-    """Whether a roll-out encodes its predictions ("evolving"), or keeps the edges and features that it starts with
-    ("frozen"): faster, and less accurate unless trained so."""
-
-    num_modes: int = 0
-    """Number of types of an agent's edge to itself, each of which is a possible future (`predictor.dgvae.self_edges`);
-    0 is the paper's model, which has none. Needs rollout_graph="frozen": what is drawn is held for the roll-out."""
-
-    def __post_init__(self) -> None:
-        """Checks choices and ranges."""
-        check_choices(self)
-        if self.num_modes < 0 or self.num_modes == 1:
-            raise UserError(f"num_modes must be 0 or at least 2, got {self.num_modes}")
-        if self.num_modes and self.rollout_graph != "frozen":
-            raise UserError("num_modes needs rollout_graph=frozen: what is drawn is held for the whole roll-out")
-        check_at_least(self, 1, "hidden_dim", "rnn_dim", "head_dim", "message_dim", "decoder_dim", "innovation_dim")
-        check_at_least(self, 0, "edge_feature_dim", "innovation_rounds", "static_dim", "substeps", "num_neighbours")
-        if self.num_neighbours and self.needs_reverse_pairs:
-            needy = "innovation_rounds" if self.innovation_rounds else "symmetric_types"
-            raise UserError(f"{needy} needs every pair and its reverse; set num_neighbours to 0")
-        if self.static_dim > self.edge_feature_dim:
-            raise UserError(
-                f"static_dim must be at most edge_feature_dim ({self.edge_feature_dim}), got {self.static_dim}"
-            )
-        if self.num_edge_types < 2:
-            raise UserError(f"num_edge_types must be at least 2 (the first is 'no edge'), got {self.num_edge_types}")
-        if not 0 < self.temperature < float("inf") or not 0 <= self.dropout < 1:
-            raise UserError(f"need 0 < temperature < inf and 0 <= dropout < 1, got {self.temperature}, {self.dropout}")
-
-    @property
-    def needs_reverse_pairs(self) -> bool:
-        """Whether the encoder computes a pair from its reverse, so that slot j must be agent j."""
-        return bool(self.innovation_rounds) or self.symmetric_types
-
-
-_FAST = DGVAEConfig(
-    hidden_dim=48,
-    rnn_dim=24,
-    head_dim=48,
-    message_dim=64,
-    decoder_dim=96,
-    edge_feature_dim=8,
-    residual="constant_velocity",
-)
-
-PRESETS: dict[str, DGVAEConfig] = {
-    "paper": DGVAEConfig(),
-    "fast": _FAST,
-    "plural": replace(_FAST, num_modes=20, rollout_graph="frozen"),
-}
-"""Named sizes: "paper" is the paper's model, "fast" a small one for policies on a CPU, "plural" the small one with
-modes: its samples are enumerated futures with probabilities."""
-
 
 NO_EDGE_LOGIT = -1e4
 """Logit of every type but "no edge" where there is no edge."""
@@ -184,16 +69,20 @@ def _head(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 class Encoder(nn.Module):
     """Computes edge logits and features from states, step by step or for many steps at once."""
 
-    def __init__(self, config: DGVAEConfig, inputs: int) -> None:
+    def __init__(self, config: DGVAEConfig, inputs: int, geometry: Geometry | None = None) -> None:
         """Creates the layers, in the order in which data passes them."""
         super().__init__()
         self.config = config
+        self.geometry = geometry
         width, rnn = config.hidden_dim, config.rnn_dim
         self.embed = nn.Linear(inputs, width)
         self.conv_pair = PairLinear(width, width, relative=True)
         self.conv_out = nn.Linear(width, width)
         self.edge_pair = PairLinear(width, width)
         self.edge_out = nn.Linear(width, width)
+        if geometry is not None:
+            self.conv_geometry = nn.Linear(geometry.num_features, width, bias=False)
+            self.edge_geometry = nn.Linear(geometry.num_features, width, bias=False)
         self.forward_input = nn.Linear(width, 4 * rnn)
         self.forward_hidden = nn.Linear(rnn, 4 * rnn, bias=False)
         self.backward_input = nn.Linear(width, 4 * rnn)
@@ -217,11 +106,15 @@ class Encoder(nn.Module):
     ) -> Float[Tensor, "*batch agents slots hidden"]:
         """Computes the graph block up to the hidden layer of the edge MLP, for all steps at once."""
         weight = pairs.to(inputs.dtype)
-        summed = sum_over_senders(self.conv_pair.elu(inputs, senders, self.embed), weight)
+        to_conv = to_edge = None
+        if self.geometry is not None:
+            geometry = self.geometry(*ends(inputs, senders))
+            to_conv, to_edge = self.conv_geometry(geometry), self.edge_geometry(geometry)
+        summed = sum_over_senders(self.conv_pair.elu(inputs, senders, self.embed, to_conv), weight)
         # Σ_j (W h_ij + b) = W Σ_j h_ij + n b: the second layer of EdgeConv costs agents, not pairs.
         count = weight.sum(-1, keepdim=True)
         nodes = functional.elu(functional.linear(summed, self.conv_out.weight) + count * self.conv_out.bias)
-        return self.edge_pair.elu(nodes, senders)
+        return self.edge_pair.elu(nodes, senders, extra=to_edge)
 
     def _gates(self, layer: nn.Linear, hidden: Tensor) -> Tensor:
         """Computes the input share of an LSTM's gates."""
@@ -313,13 +206,16 @@ def no_edge_where_absent(
 class Decoder(nn.Module):
     """Computes changes of state from messages along edges."""
 
-    def __init__(self, config: DGVAEConfig, inputs: int, outputs: int) -> None:
+    def __init__(self, config: DGVAEConfig, inputs: int, outputs: int, geometry: Geometry | None = None) -> None:
         """Creates the layers, in the order in which data passes them."""
         super().__init__()
+        self.geometry = geometry
         self.types = config.num_edge_types - 1  # type 0 sends no message
         self.gated = config.gated_messages
         width = config.message_dim
         self.message_pair = PairLinear(inputs, self.types * width)
+        if geometry is not None:
+            self.message_geometry = nn.Linear(geometry.num_features, self.types * width, bias=False)
         if config.edge_feature_dim:
             self.message_feature = nn.Linear(config.edge_feature_dim, self.types * width, bias=False)
         self.message_out = nn.Linear(width, self.types * width)  # one block for each type that sends messages
@@ -364,11 +260,13 @@ class Decoder(nn.Module):
             share: result of `feature_share`.
             senders: index of the agent in each slot; None is dense.
         """
-        if not self.has_features:
-            return self.message_pair.elu(inputs, senders)
-        if self.gated:
-            return self.message_pair.elu(inputs, senders) * (1 + share)
-        return self.message_pair.elu(inputs, senders, extra=share)
+        extra = None
+        if self.geometry is not None:
+            extra = self.message_geometry(self.geometry(*ends(inputs, senders)))
+        if self.has_features and not self.gated:
+            extra = share if extra is None else extra + share
+        layer = self.message_pair.elu(inputs, senders, extra=extra)
+        return layer * (1 + share) if self.has_features and self.gated else layer
 
     def combine(
         self,

@@ -20,6 +20,8 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 from torch.nn import functional
 
+from predictor.layers.pairs import ends
+
 _LEAST_STEP = 8
 """Smallest unit of which lengths are multiples."""
 
@@ -44,6 +46,10 @@ class Padded(NamedTuple):
     def pack_nodes(self, nodes: Tensor) -> Tensor:
         """Returns `nodes` unchanged."""
         return nodes
+
+    def ends(self, nodes: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns the entries of each pair's receiver and sender, left to broadcasting."""
+        return ends(nodes, self.senders)
 
     def own(self, pairs: Tensor) -> Tensor:
         """Returns the entry of each agent's pair with itself, which is the last slot where senders are listed."""
@@ -162,6 +168,13 @@ class Packed:
     def pack_pairs(self, pairs: Float[Tensor, "batch agents slots pair"]) -> Float[Tensor, "pairs pair"]:
         """Returns the entries of the listed pairs."""
         return pairs.flatten(0, 2).index_select(0, _lengthened(self.slots))
+
+    def ends(
+        self, nodes: Float[Tensor, "listed *modes node"]
+    ) -> tuple[Float[Tensor, "pairs *modes node"], Float[Tensor, "pairs *modes node"]]:
+        """Returns the entries of each pair's receiver and sender."""
+        receivers, senders = (self.roles // 2).unbind(1)
+        return nodes.index_select(0, receivers), nodes.index_select(0, senders)
 
     def own(self, pairs: Float[Tensor, "pairs pair"]) -> Float[Tensor, "listed pair"]:
         """Returns the entry of each listed agent's pair with itself."""

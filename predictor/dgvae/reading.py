@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from predictor.dgvae.networks import DGVAEConfig, Encoder
+from predictor.dgvae.config import DGVAEConfig
+from predictor.dgvae.networks import Encoder
 from predictor.dgvae.packing import Packed, Padded
 from predictor.dgvae.pair_matching import running_mean, running_mean_step, window_mean
 from predictor.dgvae.single_step import Encoding, Layers, Past

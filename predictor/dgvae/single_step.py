@@ -175,10 +175,11 @@ class Stepper:
         Float[Tensor, "pairs feature"],
     ]:
         """Computes the memory of each pair after a step (hidden, cell), prior logits and features."""
-        summed = graph.gather(elu_(_spread(inputs, self._conv, graph)))
+        geometry = None if self._geometry is None else self._geometry(*graph.ends(inputs))
+        summed = graph.gather(elu_(_spread(inputs, self._conv, graph, geometry, self._conv_geometry)))
         nodes = _product(summed, (self._conv_out[0], None))
         nodes = elu_(nodes.addcmul_(graph.counts, self._conv_out[1]))
-        edges = elu_(_spread(nodes, self._edge, graph))
+        edges = elu_(_spread(nodes, self._edge, graph, geometry, self._edge_geometry))
         gates = _product(edges, self._gates, _product(hidden, self._recurrent))
         hidden, cell = lstm_step_(gates, cell)
         heads = elu_(_product(elu(hidden), self._heads))
@@ -237,7 +238,8 @@ class Stepper:
         out: list[Layer],
         self_out: Layer | None,
     ) -> Tensor:
-        layer = _spread(inputs, self._message, graph)
+        geometry = None if self._geometry is None else self._geometry(*graph.ends(inputs))
+        layer = _spread(inputs, self._message, graph, geometry, self._message_geometry)
         if self._feature is None:
             elu_(layer)
         elif self._gated:
@@ -256,6 +258,11 @@ class Stepper:
         self._conv = _roles(encoder.conv_pair, encoder.embed)
         self._conv_out = _layer(encoder.conv_out)
         self._edge = _roles(encoder.edge_pair)
+        self._geometry = encoder.geometry
+        self._conv_geometry: Layer | None = None
+        self._edge_geometry: Layer | None = None
+        if encoder.geometry is not None:
+            self._conv_geometry, self._edge_geometry = _layer(encoder.conv_geometry), _layer(encoder.edge_geometry)
         self._gates = folded(encoder.forward_input, encoder.edge_out)
         self._recurrent = (encoder.forward_hidden.weight.detach(), None)
         heads = [encoder.prior_head, encoder.feature_head] if encoder.config.edge_feature_dim else [encoder.prior_head]
@@ -267,6 +274,7 @@ class Stepper:
     def _take_decoder(self, decoder: Decoder, self_out: Layer | None) -> None:
         gru, types = decoder.gru, decoder.types
         self._message, self._gated = _roles(decoder.message_pair), decoder.gated
+        self._message_geometry = None if decoder.geometry is None else _layer(decoder.message_geometry)
         self._feature = (decoder.message_feature.weight.detach(), None) if decoder.has_features else None
         self._own = _layer(decoder.own)
         parts = (t.detach().chunk(types) for t in (decoder.message_out.weight, decoder.message_out.bias))
@@ -302,9 +310,12 @@ def _product(inputs: Tensor, layer: tuple[Tensor, Tensor | None], plus: Tensor |
     return product if plus is None else plus.add_(product)
 
 
-def _spread(nodes: Tensor, layer: Layer, graph: Packed) -> Tensor:
-    """Computes a `PairLinear` with one product instead of two."""
-    return graph.spread(_product(nodes, layer))
+def _spread(
+    nodes: Tensor, layer: Layer, graph: Packed, geometry: Tensor | None = None, geometry_layer: Layer | None = None
+) -> Tensor:
+    """Computes a `PairLinear` with one product instead of two, plus a layer on the pairs' geometry."""
+    pairs = graph.spread(_product(nodes, layer))
+    return pairs if geometry is None or geometry_layer is None else _product(geometry, geometry_layer, pairs)
 
 
 def _roles(pair: PairLinear, after: nn.Linear | None = None) -> Layer:

@@ -113,14 +113,24 @@ class TrainingPass:
         horizon_steps: int,
         num_modes: int,
     ) -> Futures:
-        """Rolls out the first `num_modes` types of all agents along one draw of the edges."""
+        """Rolls out the first `num_modes` types of all agents along one draw of the edges.
+
+        Columns after the last agent that is present get zeros: batches have the agents that left at the end.
+        """
         self_edges = self.layers.self_edges
-        assert self_edges is not None
-        shared = (states, valid, self.sampler(logits), self.layers.feature_share(features), own, node)
-        first, there, weights, share, past, memory = (t[:, None] for t in shared)
+        assert self_edges is not None and graph.senders is None
+        agents = valid.shape[1]
+        # reading it from a GPU would wait for the device
+        used = agents if valid.is_cuda else _last(valid.any(0)) + 1
+        weights, drawn = self.sampler(logits), slice(used)
+        share = self.layers.feature_share(features[:, drawn, drawn])
+        pairs = (graph.present[:, drawn, drawn], weights[:, drawn, drawn], share)
+        nodes = (states[:, drawn], valid[:, drawn], own[:, drawn], node[:, drawn])
+        present, weights, share, first, there, past, memory = (t[:, None] for t in (*pairs, *nodes))
         types = torch.arange(num_modes, device=states.device)[:, None]
-        context = Context(graph.for_modes(), weights, share, self_edges.hold(past, types))
-        future, growth = self.motion.held_run(self.layers, first, there, context, memory, horizon_steps)
+        context = Context(Padded(present, None), weights, share, self_edges.hold(past, types))
+        run = self.motion.held_run(self.layers, first, there, context, memory, horizon_steps)
+        future, growth = (functional.pad(t, (0, 0, 0, 0, 0, agents - used)) for t in run)
         probs = torch.softmax(self_edges.prior_head(own)[..., :num_modes], dim=-1).transpose(1, 2)
         return Futures(future, probs, self.motion.spread(growth))
 
@@ -139,6 +149,12 @@ class TrainingPass:
         if self._dense(valid.shape[-1]):
             return Padded(present, None)
         return Padded(off_diagonal(present), others(valid.shape[-1], valid.device))
+
+
+def _last(present: Tensor) -> int:
+    """Returns the index of the last agent that is present; 0 if there is none."""
+    places = present.nonzero()
+    return int(places[-1]) if len(places) else 0
 
 
 def _dense_outputs(graph: Padded, prior: Tensor, posterior: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -78,6 +78,13 @@ def to_pairs(
     return nodes.flatten(-3, -2).index_select(-2, places.flatten()).unflatten(-2, tuple(senders.shape))
 
 
+def ends(
+    nodes: Float[Tensor, "*batch agents node"], senders: Int[Tensor, "*some agents slots"] | None = None
+) -> tuple[Float[Tensor, "*batch agents 1 node"], Float[Tensor, "*batch _ slots node"]]:
+    """Returns the nodes of each pair's receiver and sender, for broadcasting over pairs; no `senders` is dense."""
+    return nodes[..., :, None, :], nodes[..., None, :, :] if senders is None else to_pairs(nodes, senders)
+
+
 def folded(outer: nn.Linear, inner: nn.Linear) -> tuple[Float[Tensor, "out in"], Float[Tensor, " out"]]:
     """Returns weight and bias of two consecutive linear layers: W (W' x + b') + b."""
     bias = outer.weight @ inner.bias

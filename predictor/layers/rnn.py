@@ -15,6 +15,8 @@ from torch import Tensor, nn
 
 _MANY = 2**15
 """Number of elements from which six fast operations take less time than a slow one."""
+_BLOCK = 2**17
+"""Number of elements that stay in a core's own cache between them."""
 
 Correction = Callable[[int, Tensor], Tensor]
 """Function that computes an addend of the gates from the step's index and the hidden state before it."""
@@ -108,18 +110,18 @@ def gru_step_(
 
 
 def elu_(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Computes ELU in place; for many numbers on a CPU as x⁺ + 1/σ(−x⁻) − 2 (σ: logistic), which is a third faster."""
-    if x.device.type != "cpu" or x.numel() < _MANY:
+    """Computes ELU in place; for many numbers on a CPU as x⁺ + 1/σ(−x⁻) − 2 (σ: logistic), which is a fifth faster."""
+    if x.device.type != "cpu" or x.numel() < _MANY or not x.is_contiguous():
         return torch.nn.functional.elu_(x)
-    below = x.clamp(max=0).neg_().sigmoid_().reciprocal_()
-    return x.clamp_(min=0).add_(below).sub_(2)
+    for part in x.view(-1).split(_BLOCK):
+        below = part.clamp(max=0).neg_().sigmoid_().reciprocal_()
+        part.clamp_(min=0).add_(below).sub_(2)
+    return x
 
 
 def elu(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Computes ELU like `elu_`, not in place."""
-    if x.device.type != "cpu" or x.numel() < _MANY:
-        return torch.nn.functional.elu(x)
-    return x.clamp(min=0).add_(x.clamp(max=0).neg_().sigmoid_().reciprocal_()).sub_(2)
+    return elu_(x.clone())
 
 
 def _tanh(x: Tensor) -> Tensor:

@@ -22,6 +22,8 @@ from predictor.training.config import TrainConfig
 MOST_PADDING = 3.0
 """Largest factor by which padding to a fixed size may increase the pairs of a batch; more costs more than it saves."""
 _HISTORY_BUCKET = 8
+_POOL = 8
+"""Number of steps whose windows are sorted by their number of agents, so that a batch has little padding."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +48,17 @@ class Plan:
     """Learning rate."""
     windows: tuple[np.ndarray, ...]
     """Indices of the drawn windows of each store."""
+    weight: float = 1.0
+    """Factor of the loss: number of agents per window, relative to that of all windows."""
 
 
-def plan(config: TrainConfig, sizes: Sequence[int], step: int, num_modes: int = 1) -> Plan:
+def plan(
+    config: TrainConfig,
+    sizes: Sequence[int],
+    step: int,
+    num_modes: int = 1,
+    widths: Sequence[Int[np.ndarray, " _"]] | None = None,
+) -> Plan:
     """Draws the random quantities of a step and computes the scheduled ones.
 
     Args:
@@ -57,7 +67,23 @@ def plan(config: TrainConfig, sizes: Sequence[int], step: int, num_modes: int = 
         step: index of the step.
         num_modes: number of modes of the model. Every other step rolls out the first third of them, so that a few
             modes are a forecast as well.
+        widths: number of agents of each window. If given, the windows of several steps are sorted by it, so that each
+            of these steps gets scenes of similar size; the loss is weighted so that agents count the same in all.
     """
+    dropout, noise, history, drawn = _draw(config, sizes, step)
+    weight = 1.0
+    if widths is not None:
+        drawn = _of_similar_width(config, sizes, step, widths)
+        mean = np.average([w.mean() for w in widths], weights=sizes)
+        weight = float(np.concatenate([w[d] for w, d in zip(widths, drawn, strict=True)]).mean() / mean)
+    warm = min(1.0, (step + 1) / config.kl_warmup_steps) if config.kl_warmup_steps else 1.0
+    lr = config.lr * _schedule(step, config.steps)
+    modes = num_modes if step % 2 else max(min(2, num_modes), num_modes // 3)
+    return Plan(step, dropout, noise, history, _rollout_steps(config, step), modes, warm, lr, tuple(drawn), weight)
+
+
+def _draw(config: TrainConfig, sizes: Sequence[int], step: int) -> tuple[int, int, int, list[np.ndarray]]:
+    """Draws both seeds, the longest history and the windows of each store."""
     rng = np.random.default_rng([config.seed, 1, step])
     dropout, noise = int(rng.integers(2**62)), int(rng.integers(2**62))
     history = config.history_steps
@@ -66,10 +92,22 @@ def plan(config: TrainConfig, sizes: Sequence[int], step: int, num_modes: int = 
     shares = np.array(sizes)
     counts = rng.multinomial(config.batch_size, shares / shares.sum())
     drawn = [rng.integers(n, size=c) if c else np.zeros(0, dtype=np.int64) for n, c in zip(sizes, counts, strict=True)]
-    warm = min(1.0, (step + 1) / config.kl_warmup_steps) if config.kl_warmup_steps else 1.0
-    lr = config.lr * _schedule(step, config.steps)
-    modes = num_modes if step % 2 else max(min(2, num_modes), num_modes // 3)
-    return Plan(step, dropout, noise, history, _rollout_steps(config, step), modes, warm, lr, tuple(drawn))
+    return dropout, noise, history, drawn
+
+
+def _of_similar_width(
+    config: TrainConfig, sizes: Sequence[int], step: int, widths: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Returns a step's part of the windows of `_POOL` steps, sorted by width; which part is drawn."""
+    first = step - step % _POOL
+    draws = [_draw(config, sizes, s)[3] for s in range(first, first + _POOL)]
+    pool = [np.concatenate(of_store) for of_store in zip(*draws, strict=True)]
+    store = np.repeat(np.arange(len(pool)), [len(p) for p in pool])
+    window = np.concatenate(pool)
+    order = np.argsort(np.concatenate([w[p] for w, p in zip(widths, pool, strict=True)]), kind="stable")
+    part = int(np.random.default_rng([config.seed, 4, first]).permutation(_POOL)[step - first])
+    chosen = order[part * config.batch_size : (part + 1) * config.batch_size]
+    return [window[chosen[store[chosen] == k]] for k in range(len(pool))]
 
 
 def _rollout_steps(config: TrainConfig, step: int) -> int:
@@ -219,6 +257,8 @@ class Source:
     """Whether steps are captured as CUDA graphs: on a CUDA device, with fixed shapes."""
     notes: tuple[str, ...] = ()
     """Messages for the user, one line each."""
+    widths: tuple[Int[np.ndarray, " _"], ...] | None = None
+    """Number of agents of each window, by which batches are put together; None if shapes are fixed or all are equal."""
 
 
 def open_batches(config: TrainConfig, windows: Sequence[Windows], device: torch.device) -> Source:
@@ -229,9 +269,11 @@ def open_batches(config: TrainConfig, windows: Sequence[Windows], device: torch.
     """
     if device.type != "cuda":
         resident = config.data_device == "device"
-        return Source(
+        batches: Batches = (
             DeviceBatches(ResidentWindows(windows, device), device) if resident else HostBatches(windows, device)
         )
+        widths = tuple(window_sizes(w) for w in windows)
+        return Source(batches, widths=widths if len(np.unique(np.concatenate(widths))) > 1 else None)
     agents = np.concatenate([window_sizes(w) for w in windows])
     shapes: Shapes | None = Shapes(int(agents.max()), config.history_steps, config.horizon_steps)
     waste = padding_factor(agents, config.batch_size)
@@ -248,7 +290,7 @@ def open_batches(config: TrainConfig, windows: Sequence[Windows], device: torch.
     budget = torch.cuda.mem_get_info()[0] // 2
     needed = bytes_needed(windows)
     if config.data_device == "device" or (config.data_device == "auto" and shapes and needed <= budget):
-        batches: Batches = DeviceBatches(ResidentWindows(windows, device, int(agents.max()), budget), device, shapes)
+        batches = DeviceBatches(ResidentWindows(windows, device, int(agents.max()), budget), device, shapes)
         notes.append(f"windows are kept on the device ({needed / 2**20:,.0f} MiB)")
     else:
         plans = partial(plan, config, [len(w) for w in windows])

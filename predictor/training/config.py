@@ -38,6 +38,9 @@ class TrainConfig:
     """Whether changes since the last step are inputs of the dG-VAE's encoder (`change_scales`, fitted to the data)."""
     fit_inputs: bool = False
     """Whether the dG-VAE's inputs are divided by their spread in the data (`input_scales`), not the spec's scales."""
+    edge_geometry: bool = False
+    """Whether relative position, relative speed and time to contact are inputs of the dG-VAE's edges
+    (`geometry_scales`, fitted to the data)."""
     steps: int = 4000
     """Number of optimiser steps."""
     batch_size: int = 64

@@ -22,7 +22,6 @@ from predictor.data.store import Episode, EpisodeStore, read_store
 from predictor.data.windows import WindowBatch, Windows, split_episodes
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import run_windows
-from predictor.layers.state_codec import Residual, StateCodec, drift
 from predictor.models import build, configure
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
@@ -38,6 +37,7 @@ from predictor.training.cuda_graph import (
     default_generator,
     signature,
 )
+from predictor.training.fitted_scales import typical_change, typical_neighbour, typical_spread
 from predictor.training.objective import window_loss
 
 VALIDATION_DRAWS = 5
@@ -118,52 +118,25 @@ def _windows(config: TrainConfig, episodes: Sequence[Episode], spec: SceneSpec, 
     )
 
 
-def typical_change(episodes: Sequence[Episode], spec: SceneSpec, residual: Residual) -> tuple[float, ...]:
-    """Computes the root mean square of the change that the decoder predicts in one step, per feature [SI]."""
-    total, count = np.zeros(spec.num_features), 0
-    for episode in episodes:
-        both = episode.valid[1:] & episode.valid[:-1]
-        before, after = (torch.from_numpy(s) for s in (episode.states[:-1], episode.states[1:]))
-        change = (after - before).numpy()
-        change[..., : spec.position_dim] -= drift(spec, residual, before, after).numpy()
-        total += np.square(change[both].astype(np.float64)).sum(axis=0)
-        count += int(both.sum())
-    scale = np.sqrt(total / max(count, 1))
-    return tuple(float(s) for s in np.maximum(scale, 1e-3))
-
-
-def typical_spread(episodes: Sequence[Episode], spec: SceneSpec) -> tuple[float, ...]:
-    """Computes the standard deviation of each input feature over the data [SI], with positions in the spec's frame."""
-    states = [_in_frame(episode, spec)[episode.valid] for episode in episodes]
-    spread = np.concatenate(states).astype(np.float64).std(axis=0)
-    least = 1e-2 * np.array(spec.feature_scales)
-    return tuple(float(s) for s in np.maximum(spread, least))
-
-
-def _in_frame(episode: Episode, spec: SceneSpec) -> np.ndarray:
-    codec = StateCodec(spec)
-    inputs = codec.inputs(torch.from_numpy(episode.states), torch.from_numpy(episode.valid))[..., : spec.num_features]
-    framed: np.ndarray = (inputs * codec.scales).numpy()
-    return framed
-
-
 def model_config(config: TrainConfig, data: TrainingData) -> Any:
     """Builds the network's config, with scales fitted to the training data.
 
     Raises:
-        UserError: --set names a field that the model does not have, or --input-changes or --fit-inputs is set for
-            another model than the dG-VAE.
+        UserError: --set names a field that the model does not have, or --input-changes, --fit-inputs or
+            --edge-geometry is set for another model than the dG-VAE.
     """
     plain = configure(config.model, config.preset, config.set)
     fitted = {"delta_scales": typical_change(data.train_episodes, data.spec, plain.residual)}
+    for option in ("input_changes", "fit_inputs", "edge_geometry"):
+        if getattr(config, option) and config.model != "dgvae":
+            flag = "--" + option.replace("_", "-")
+            raise UserError(f"{flag} belongs to the dG-VAE; leave it out for --model {config.model}")
     if config.input_changes:
-        if config.model != "dgvae":
-            raise UserError(f"--input-changes belongs to the dG-VAE; leave it out for --model {config.model}")
         fitted["change_scales"] = typical_change(data.train_episodes, data.spec, "state")
     if config.fit_inputs:
-        if config.model != "dgvae":
-            raise UserError(f"--fit-inputs belongs to the dG-VAE; leave it out for --model {config.model}")
         fitted["input_scales"] = typical_spread(data.train_episodes, data.spec)
+    if config.edge_geometry:
+        fitted["geometry_scales"] = typical_neighbour(data.train_episodes, data.spec)
     return configure(config.model, config.preset, config.set, **fitted)
 
 
@@ -202,7 +175,7 @@ class Trainer:
         self.baseline_m = self._baseline()
         self.noise = torch.Generator(device=self.device)
         source = open_batches(config, data.train, self.device)
-        self.batches, self.notes = source.batches, source.notes
+        self.batches, self.notes, self._widths = source.batches, source.notes, source.widths
         self.read_every = LOG_EVERY if on_cuda else 1
         self._checks_each_loss = not on_cuda
         self._recorder: Recorder | None = CudaRecorder(self.device, self.noise) if source.capture else None
@@ -241,13 +214,13 @@ class Trainer:
         if self._recorder is not None:
             terms = self._replayed(self._recorder, batch, now.rollout_steps, now.num_modes)
         else:
-            terms = self._optimise(batch, now.rollout_steps, now.num_modes)
+            terms = self._optimise(batch, now.rollout_steps, now.num_modes, now.weight)
         self.step += 1
         return terms
 
     def plan(self, step: int) -> Plan:
         """Returns batch, seeds and schedules of a step."""
-        return plan(self.config, [len(w) for w in self.data.train], step, self.num_modes)
+        return plan(self.config, [len(w) for w in self.data.train], step, self.num_modes, self._widths)
 
     @property
     def num_modes(self) -> int:
@@ -268,7 +241,9 @@ class Trainer:
             )
         return dict(zip(terms, values, strict=True))
 
-    def _optimise(self, batch: WindowBatch, rollout_steps: int, num_modes: int) -> Mapping[str, Tensor]:
+    def _optimise(
+        self, batch: WindowBatch, rollout_steps: int, num_modes: int, weight: float = 1.0
+    ) -> Mapping[str, Tensor]:
         """Computes forward, loss, backward, clipping and update; on a CUDA device the host reads no result."""
         kind = self.config.precision
         with _tensor_cores(kind == "tf32"):
@@ -282,7 +257,7 @@ class Trainer:
             if self._checks_each_loss and not torch.isfinite(loss):
                 raise UserError(f"the loss is {float(loss.detach())} at step {self.step}; lower --lr or check the data")
             self.optimizer.zero_grad(set_to_none=True)
-            loss.backward()
+            (weight * loss).backward()
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.clip_norm)
         self.optimizer.step()
         self._finite.logical_and_(torch.isfinite(loss.detach()))

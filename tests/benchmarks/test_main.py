@@ -55,13 +55,13 @@ def test_a_section_from_the_command_line_to_the_table_and_the_file(
     assert processor() in shown.out and "1 torch threads" in shown.out and "quick run" in shown.out
     lines = shown.out.splitlines()
     assert lines[2].startswith("section")
-    assert sum(line.startswith("forecast") for line in lines) == 10
+    assert sum(line.startswith("forecast") for line in lines) == 12
     assert "forecast …" in shown.err
     result = json.loads(out.read_text())
     assert result["machine"] == processor() and result["threads"] == 1 and result["mode"] == "quick"
     assert result["keeps_freed_memory"] is False
     assert {"commit", "versions"} <= set(result["provenance"])
-    assert len(result["lines"]) == 10
+    assert len(result["lines"]) == 12
     assert result["lines"][0]["key"] == "forecast | observe | preset fast, batch 1, agents 3, horizon 2, samples 1"
     assert result["lines"][0]["flop"] > 0
     assert [path.name for path in out.parent.iterdir()] == ["benchmarks.json"]  # no half-written file

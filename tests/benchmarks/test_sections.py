@@ -28,7 +28,7 @@ def test_the_machines_rate_is_of_all_products_together():
 
 def test_forecasts_have_rates_and_ratios_to_the_evolving_graph(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(forecast, "CASES", {"quick": (forecast.Case(2, 3, 4, 2),)})
-    lines = {r.name: r for r in forecast.run(QUICK) if r.what["preset"] == "fast"}
+    lines = {r.name: r for r in forecast.run(QUICK) if r.what.get("preset") == "fast"}
     assert len(lines) == 5
     assert all((r.flop or 0) > 0 or "half" in r.name for r in lines.values())
     assert all(r.compared is not None for r in lines.values())
@@ -36,6 +36,23 @@ def test_forecasts_have_rates_and_ratios_to_the_evolving_graph(monkeypatch: pyte
     frozen, evolving = lines["roll-out, frozen graph"], lines["roll-out"]
     assert (frozen.flop or 0) < (evolving.flop or 0)
     assert lines["observe + roll-out"].unit == "agent-forecasts/s"
+
+
+def test_modes_are_measured_beside_one_forecast_and_a_model_without(monkeypatch: pytest.MonkeyPatch):
+    case = forecast.Case(2, 3, 4, 1)
+    monkeypatch.setattr(forecast, "CASES", {"quick": (case, case._replace(samples=6))})
+    shown: list[tuple[int, int]] = []
+    rollout = forecast.DGVAE.rollout
+
+    def watched(self: forecast.DGVAE, belief: Any, steps: int, samples: int = 1, *rest: Any) -> Any:
+        shown.append((self.config.num_modes, samples))
+        return rollout(self, belief, steps, samples, *rest)
+
+    monkeypatch.setattr(forecast.DGVAE, "rollout", watched)
+    one, six = (r for r in forecast.run(QUICK) if "plural" in r.name)
+    assert (one.ratio_to, six.ratio_to) == (forecast.WITHOUT_MODES, forecast.ONE) and one.what["samples"] == 1
+    assert (one.ratio or 0) > 0 and (six.ratio or 0) > 0 and six.what == case._asdict() | {"samples": 6}
+    assert {(0, 1), (20, 1), (20, 6)} <= set(shown)
 
 
 def test_streaming_keeps_each_history_near_its_mark(monkeypatch: pytest.MonkeyPatch):

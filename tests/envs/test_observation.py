@@ -30,7 +30,7 @@ from envs.registry import CHECKPOINTS, make_env
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.checkpoint import CheckpointInfo, load_forecaster, resolve, save_checkpoint, shipped
 from predictor.dgvae import DGVAE
-from predictor.dgvae.networks import DGVAEConfig
+from predictor.dgvae.config import DGVAEConfig
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 from predictor.support.errors import UserError
 from tests.envs.helpers import (

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from predictor.dgvae.networks import PRESETS
+from predictor.dgvae.config import PRESETS
 from tests.predictor.helpers import FAST_LIKE, write_circles
 
 

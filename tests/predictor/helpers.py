@@ -17,7 +17,7 @@ from predictor.baselines.lstm import LSTMConfig
 from predictor.baselines.mlp import MLPConfig
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.dgvae import DGVAE
-from predictor.dgvae.networks import DGVAEConfig
+from predictor.dgvae.config import DGVAEConfig
 from predictor.models import build
 from predictor.scene import PADDING_ID, AxisFrame, Scene, SceneBatch, SceneSpec
 
@@ -46,9 +46,17 @@ RICH = replace(
     static_dim=3,
     substeps=2,
     gated_messages=True,
+    geometry_scales=(2.0, 1.5),
 )
 # An edge of each agent to itself, with types that are its futures; every other option that fits, too.
-PLURAL = replace(FAST_LIKE, num_modes=4, rollout_graph="frozen", change_scales=(3.0, 3.0, 2.0, 2.0), static_dim=2)
+PLURAL = replace(
+    FAST_LIKE,
+    num_modes=4,
+    rollout_graph="frozen",
+    change_scales=(3.0, 3.0, 2.0, 2.0),
+    static_dim=2,
+    geometry_scales=(2.0, 1.5),
+)
 SIZES = {"fast": FAST_LIKE, "paper": PAPER_LIKE, "rich": RICH}
 # Every kind of trainable forecaster: its name in `predictor.models`, and a small config.
 EVERY_MODEL: dict[str, tuple[str, Any]] = {

@@ -9,7 +9,7 @@ import torch
 
 from predictor.baselines.lstm import LSTMConfig
 from predictor.baselines.mlp import MLPConfig
-from predictor.dgvae.networks import PRESETS, DGVAEConfig
+from predictor.dgvae.config import PRESETS, DGVAEConfig
 from predictor.forecaster import TrainableForecaster
 from predictor.models import KINDS, ModelName, build, config_from_json, configure, name_of
 from predictor.support.errors import UserError

@@ -19,15 +19,16 @@ from predictor import train as training
 from predictor.checkpoint import load_checkpoint
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.data.windows import WindowBatch
-from predictor.dgvae.networks import PRESETS
+from predictor.dgvae.config import PRESETS
 from predictor.evaluation.accuracy import summarise
 from predictor.evaluation.outcomes import run_windows
 from predictor.forecaster import WindowOutput
 from predictor.support.errors import UserError, run_entry_point
 from predictor.train import train
 from predictor.training.config import TrainConfig
+from predictor.training.fitted_scales import typical_change
 from predictor.training.objective import window_loss
-from predictor.training.trainer import VALIDATION_DRAWS, Trainer, load_data, typical_change
+from predictor.training.trainer import VALIDATION_DRAWS, Trainer, load_data
 from tests.predictor.helpers import FAST_LIKE, PLURAL, circling_episode, following_episode, model, spec, write_circles
 
 ROOT = Path(__file__).parents[2]

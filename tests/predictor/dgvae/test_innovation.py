@@ -12,8 +12,9 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn import functional
 
+from predictor.dgvae.config import DGVAEConfig
 from predictor.dgvae.innovation import Innovation
-from predictor.dgvae.networks import Decoder, DGVAEConfig, Encoder
+from predictor.dgvae.networks import Decoder, Encoder
 from predictor.graph import pair_mask
 from predictor.layers.pairs import PairLinear
 from tests.predictor.helpers import precise, random_presence

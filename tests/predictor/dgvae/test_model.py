@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from predictor.dgvae import DGVAE
 from predictor.dgvae import model as dgvae
-from predictor.dgvae.networks import DGVAEConfig
+from predictor.dgvae.config import DGVAEConfig
 from predictor.forecaster import Belief, Memory, WindowOutput
 from predictor.graph import pair_mask
 from predictor.support.errors import UserError

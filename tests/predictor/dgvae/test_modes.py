@@ -17,7 +17,8 @@ from torch import Tensor
 from predictor.checkpoint import CheckpointInfo, load_checkpoint, save_checkpoint
 from predictor.dgvae import DGVAE
 from predictor.dgvae import model as dgvae
-from predictor.dgvae.networks import DGVAEConfig, edge_probabilities
+from predictor.dgvae.config import DGVAEConfig
+from predictor.dgvae.networks import edge_probabilities
 from predictor.forecaster import Belief, Futures, has_scale
 from predictor.support.errors import UserError
 from tests.predictor.helpers import FAST_LIKE, PLURAL, RICH, random_presence, random_states, spec
@@ -273,6 +274,28 @@ def test_the_window_rolls_out_the_modes_that_streaming_does(
             streamed = model.rollout(beliefs[t], HORIZON, count)
             window, found = (Futures(*(part[[index]] for part in futures)) for futures in (output.modes, streamed))
             assert_close(window, found, valid[[index], t])
+
+
+@every_variant
+def test_agents_that_are_gone_cost_a_window_nothing(variant: str):
+    """Their columns come last; they are not rolled out, and change no other agent's modes."""
+    model, (states, valid) = made(variant), scenes()
+    last_observed, count = torch.tensor([1, 3]), VARIANTS[variant].num_modes
+    valid[:, 2:, -1] = False
+    valid[0, 1, -1] = False  # the last observed step of the first window
+    steps: list[int] = []
+    advance = type(model.codec).advance
+
+    def counted(codec: Any, before: Tensor, *rest: Any) -> Tensor:
+        steps.append(before.shape[-2])
+        return advance(codec, before, *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(model.codec), "advance", counted)
+        drawn = torch.Generator().manual_seed(0)
+        modes = model.window(states, valid, last_observed, HORIZON, drawn, num_modes=count).modes
+    assert modes is not None and modes.states.shape[2] == AGENTS and not modes.states[:, :, -1].any()
+    assert set(steps[-HORIZON:]) == {AGENTS - 1}
 
 
 def test_modes_of_a_window_share_one_draw_of_the_edges():

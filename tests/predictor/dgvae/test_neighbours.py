@@ -19,7 +19,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from predictor.dgvae import DGVAE
 from predictor.dgvae import model as dgvae
-from predictor.dgvae.networks import DGVAEConfig
+from predictor.dgvae.config import DGVAEConfig
 from predictor.dgvae.packing import Packed
 from predictor.dgvae.single_step import Modules
 from predictor.forecaster import Belief, Memory, WindowOutput

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 from torch.nn import functional
 
-from predictor.dgvae.networks import PRESETS, Decoder, DGVAEConfig, Encoder, concrete_sample
+from predictor.dgvae.config import PRESETS, DGVAEConfig
+from predictor.dgvae.networks import Decoder, Encoder, concrete_sample
 from predictor.graph import pair_mask
 from predictor.support.errors import UserError
 from tests.predictor.helpers import FAST_LIKE, model, random_presence, random_states

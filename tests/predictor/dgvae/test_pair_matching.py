@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from predictor.dgvae import DGVAE
-from predictor.dgvae.networks import DGVAEConfig
+from predictor.dgvae.config import DGVAEConfig
 from predictor.dgvae.pair_matching import running_mean, window_mean
 from predictor.forecaster import Belief
 from predictor.graph import pair_mask

@@ -17,7 +17,7 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from predictor.dgvae import DGVAE
 from predictor.dgvae import model as dgvae
 from predictor.dgvae import single_step as stepper
-from predictor.dgvae.networks import DGVAEConfig
+from predictor.dgvae.config import DGVAEConfig
 from predictor.dgvae.packing import Packed
 from predictor.dgvae.single_step import Stepper
 from predictor.forecaster import Belief, Memory

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from predictor.dgvae import DGVAE
-from predictor.dgvae.networks import DGVAEConfig
+from predictor.dgvae.config import DGVAEConfig
 from predictor.graph import pair_mask
 from predictor.support.errors import UserError
 from tests.predictor.helpers import precise, random_presence, random_states

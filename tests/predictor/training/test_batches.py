@@ -14,7 +14,7 @@ import torch
 
 from predictor.data.device_windows import ResidentWindows
 from predictor.data.windows import WindowBatch, Windows
-from predictor.dgvae.networks import PRESETS
+from predictor.dgvae.config import PRESETS
 from predictor.support.errors import UserError
 from predictor.training import batches as batches_module
 from predictor.training.batches import (
@@ -86,6 +86,45 @@ def test_every_store_gives_its_share():
     assert all(len(a) + len(b) == 6 for a, b in drawn)
     assert sum(len(a) for a, _ in drawn) < 20
     assert all((a < 10).all() and (b < 1000).all() for a, b in drawn)
+
+
+def test_sorted_batches_hold_the_windows_of_their_steps_in_order_of_size():
+    sizes, rng = [10, 300], np.random.default_rng(0)
+    widths = [rng.integers(1, 13, n) for n in sizes]
+    for first in (0, batches_module._POOL):
+        steps = range(first, first + batches_module._POOL)
+        plain, ordered = ([plan(CONFIG, sizes, s, widths=w) for s in steps] for w in (None, widths))
+        for k in range(len(sizes)):
+            pools = (np.sort(np.concatenate([p.windows[k] for p in plans])) for plans in (plain, ordered))
+            np.testing.assert_array_equal(*pools)
+        found = sorted(
+            (np.concatenate([w[i] for w, i in zip(widths, p.windows, strict=True)]) for p in ordered),
+            key=lambda w: (w.min(), w.max()),
+        )
+        assert all(len(w) == CONFIG.batch_size for w in found)
+        assert all(a.max() <= b.min() for a, b in zip(found, found[1:], strict=False))
+        mean = np.average([w.mean() for w in widths], weights=sizes)
+        assert sorted(p.weight for p in ordered) == pytest.approx([w.mean() / mean for w in found])
+        assert {p.weight for p in plain} == {1.0}
+
+
+def test_sizes_come_in_no_fixed_order():
+    """Every other step rolls out a third of the modes: large scenes must not always meet the same ones."""
+    widths = [np.arange(100)]
+    weights = np.array([plan(CONFIG, [100], s, widths=widths).weight for s in range(30 * batches_module._POOL)])
+    of_step = weights.reshape(30, batches_module._POOL)
+    largest, even = of_step.argmax(1), weights[::2].mean()
+    assert len(set(largest.tolist())) > batches_module._POOL // 2 and even == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize(("agents", "sorts"), [((3, 3), False), ((2, 3), True)])
+def test_batches_are_sorted_where_scenes_differ_in_size(agents: tuple[int, ...], sorts: bool):
+    widths = open_batches(CONFIG, windows(agents=agents), CPU).widths
+    assert (widths is not None) == sorts
+    if widths is not None:
+        assert [w.tolist() for w in widths] == [
+            [n] * len(s) for n, s in zip(agents, windows(agents=agents), strict=True)
+        ]
 
 
 def test_rate_warms_up_and_falls_to_2_percent():

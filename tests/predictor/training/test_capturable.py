@@ -22,7 +22,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from predictor.data.device_windows import ResidentWindows
 from predictor.data.store import Episode
 from predictor.data.windows import WindowBatch, Windows
-from predictor.dgvae.networks import DGVAEConfig
+from predictor.dgvae.config import DGVAEConfig
 from predictor.models import build
 from predictor.training.config import TrainConfig
 from predictor.training.objective import window_loss

@@ -19,8 +19,9 @@ from predictor.support.errors import UserError
 from predictor.train import train
 from predictor.training import trainer as trainer_module
 from predictor.training.config import TrainConfig
+from predictor.training.fitted_scales import typical_change, typical_neighbour, typical_spread
 from predictor.training.objective import window_loss
-from predictor.training.trainer import Trainer, load_data, model_config, typical_change, typical_spread
+from predictor.training.trainer import Trainer, load_data, model_config
 from tests.predictor.helpers import FAST_LIKE, circling_episode, random_states, spec, write_circles
 
 SMALL = {"steps": 2, "batch_size": 4, "history_steps": 3, "horizon_steps": 2, "val_fraction": 0.34, "eval_every": 2}
@@ -132,15 +133,18 @@ def test_teacher_forced_training_takes_no_free_run(circles: Path, tmp_path: Path
 
 
 def test_scales_are_fitted_to_the_training_episodes(circles: Path, tmp_path: Path):
-    settings = config(circles, tmp_path, input_changes=True, set=("residual=trapezoid",))
+    settings = config(circles, tmp_path, input_changes=True, edge_geometry=True, set=("residual=trapezoid",))
     data = load_data(settings)
     fitted = model_config(settings, data)
     assert fitted.delta_scales == typical_change(data.train_episodes, spec(), "trapezoid")
     assert fitted.change_scales == typical_change(data.train_episodes, spec(), "state")
+    assert fitted.geometry_scales == typical_neighbour(data.train_episodes, spec())
     assert fitted.delta_scales[:2] != fitted.change_scales[:2]
     assert fitted.delta_scales[2:] == fitted.change_scales[2:]
-    assert replace(fitted, delta_scales=(), change_scales=()) == replace(FAST_LIKE, residual="trapezoid")
-    assert model_config(replace(settings, input_changes=False), data).change_scales == ()
+    plain = replace(fitted, delta_scales=(), change_scales=(), geometry_scales=())
+    assert plain == replace(FAST_LIKE, residual="trapezoid")
+    unset = model_config(replace(settings, input_changes=False, edge_geometry=False), data)
+    assert unset.change_scales == unset.geometry_scales == ()
 
 
 def test_given_scales_win_over_fitted_ones(circles: Path, tmp_path: Path):
@@ -148,10 +152,11 @@ def test_given_scales_win_over_fitted_ones(circles: Path, tmp_path: Path):
     assert model_config(settings, load_data(settings)).delta_scales == (1.0, 2.0, 3.0, 4.0)
 
 
+@pytest.mark.parametrize("option", ["input_changes", "fit_inputs", "edge_geometry"])
 @pytest.mark.parametrize("model", ["dnri", "imma", "lstm", "mlp"])
-def test_changes_are_an_input_of_the_dgvae_only(circles: Path, tmp_path: Path, model: Any):
-    settings = config(circles, tmp_path, model=model, input_changes=True)
-    message = f"--input-changes belongs to the dG-VAE; leave it out for --model {model}"
+def test_changes_and_scales_are_of_the_dgvae_only(circles: Path, tmp_path: Path, model: Any, option: str):
+    settings = config(circles, tmp_path, model=model, **{option: True})
+    message = f"--{option.replace('_', '-')} belongs to the dG-VAE; leave it out for --model {model}"
     with pytest.raises(UserError) as error:
         model_config(settings, load_data(settings))
     assert str(error.value) == message
@@ -349,3 +354,20 @@ def test_inputs_are_divided_by_their_spread_in_the_frame_of_the_spec():
     assert world == pytest.approx([*states.reshape(-1, 4).std(axis=0)[:3], 0.3], rel=1e-3)  # a spread of 0 has a floor
     relative = typical_spread([episode], SceneSpec(dt_s=1.0, frame=("ego", "world")))
     assert relative[0] == pytest.approx((states[..., 0] - states[:, :1, 0]).std(), rel=1e-3)
+
+
+def test_typical_neighbours_are_the_nearest_ones():
+    states = np.zeros((2, 3, 4), dtype=np.float32)
+    states[:, :, 0] = [0.0, 3.0, 10.0]
+    states[:, :, 2] = [5.0, 7.0, 4.0]
+    valid = np.ones((2, 3), dtype=np.bool_)
+    valid[1, 1] = False  # then the others are 10 m apart
+    episode = Episode(states, valid, np.arange(3))
+    # distances 3, 3, 7, 10, 10; relative speeds 2, 2, 3, 1, 1
+    assert typical_neighbour([episode], spec()) == pytest.approx((7.0, 2.0))
+
+
+def test_edge_geometry_needs_two_agents():
+    alone = Episode(np.zeros((3, 1, 4), dtype=np.float32), np.ones((3, 1), dtype=np.bool_), np.arange(1))
+    with pytest.raises(UserError, match="--edge-geometry needs steps with two agents"):
+        typical_neighbour([alone], spec())

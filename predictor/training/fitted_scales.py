@@ -1,0 +1,59 @@
+"""Fits the scales of a network's inputs and outputs to the training data."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from predictor.data.store import Episode
+from predictor.graph import pair_mask
+from predictor.layers.state_codec import Residual, StateCodec, drift
+from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
+
+
+def typical_change(episodes: Sequence[Episode], spec: SceneSpec, residual: Residual) -> tuple[float, ...]:
+    """Computes the root mean square of the change that the decoder predicts in one step, per feature [SI]."""
+    total, count = np.zeros(spec.num_features), 0
+    for episode in episodes:
+        both = episode.valid[1:] & episode.valid[:-1]
+        before, after = (torch.from_numpy(s) for s in (episode.states[:-1], episode.states[1:]))
+        change = (after - before).numpy()
+        change[..., : spec.position_dim] -= drift(spec, residual, before, after).numpy()
+        total += np.square(change[both].astype(np.float64)).sum(axis=0)
+        count += int(both.sum())
+    scale = np.sqrt(total / max(count, 1))
+    return tuple(float(s) for s in np.maximum(scale, 1e-3))
+
+
+def typical_spread(episodes: Sequence[Episode], spec: SceneSpec) -> tuple[float, ...]:
+    """Computes the standard deviation of each input feature over the data [SI], with positions in the spec's frame."""
+    states = [_in_frame(episode, spec)[episode.valid] for episode in episodes]
+    spread = np.concatenate(states).astype(np.float64).std(axis=0)
+    least = 1e-2 * np.array(spec.feature_scales)
+    return tuple(float(s) for s in np.maximum(spread, least))
+
+
+def typical_neighbour(episodes: Sequence[Episode], spec: SceneSpec) -> tuple[float, ...]:
+    """Computes the median distance of an agent to the nearest other [m], and their median relative speed [m/s]."""
+    axes, distances, speeds = spec.position_dim, [], []
+    for episode in episodes:
+        states, valid = torch.from_numpy(episode.states), torch.from_numpy(episode.valid)
+        place = states[..., :axes]
+        apart = torch.cdist(place, place, compute_mode="donot_use_mm_for_euclid_dist")
+        found = apart.masked_fill(~pair_mask(valid), torch.inf).min(-1)
+        velocity = states[..., axes : 2 * axes]
+        other = velocity.gather(1, found.indices[..., None].expand_as(velocity))
+        near = found.values < torch.inf
+        distances.append(found.values[near])
+        speeds.append(torch.linalg.vector_norm(other - velocity, dim=-1)[near])
+    if not sum(len(d) for d in distances):
+        raise UserError("--edge-geometry needs steps with two agents, and the training data has none; leave it out")
+    return tuple(max(float(torch.cat(found).median()), 1e-2) for found in (distances, speeds))
+
+
+def _in_frame(episode: Episode, spec: SceneSpec) -> np.ndarray:
+    codec = StateCodec(spec)
+    inputs = codec.inputs(torch.from_numpy(episode.states), torch.from_numpy(episode.valid))[..., : spec.num_features]
+    framed: np.ndarray = (inputs * codec.scales).numpy()
+    return framed
