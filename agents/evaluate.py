@@ -274,7 +274,8 @@ class EvaluateConfig:
     env_id: str | None = None
     """Environment of --policy; a training run has its own."""
     drivers: tuple[str, ...] = ()
-    """Further drivers of the ego, each a line of the table: planner, planner:CHECKPOINT, keep-lane, …"""
+    """Further drivers of the ego, each a line of the table: planner, planner:CHECKPOINT, or another of
+    envs.drivers.ego."""
     episodes: int = 50
     """Number of episodes per policy."""
     seed: int = EVALUATION_SEED

@@ -80,7 +80,12 @@ def by_loop(extractor: ForecastAttention, observations: dict[str, torch.Tensor])
             if "xy_scale" in observations:
                 parts.append(torch.tanh(observations["xy_scale"][b, a] / config.near_m).flatten())
                 parts.append(observations["mode_probs"][b, a].flatten())
+            if "what_if_gap" in observations:
+                gap = observations["what_if_gap"][b, a]
+                parts += [torch.tanh(gap / config.near_m), gap / config.far_m]
             parts += [observations["edge_probs"][b, a], observations["edge_features"][b, a]]
+            if "what_if_gap" in observations:
+                parts += [observations["what_if_contact"][b, a], observations["what_if_risk"][b, a]]
             hidden = extractor.token_in(torch.cat(parts)) + extractor.token_ego(ego)
             tokens.append(extractor.token_out(hidden))
         tokens = torch.stack(tokens)
