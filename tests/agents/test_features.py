@@ -79,10 +79,11 @@ def by_loop(extractor: ForecastAttention, observations: dict[str, torch.Tensor])
                 parts.append(torch.cat([torch.tanh(places / config.near_m), places / config.far_m], -1).flatten())
             if "xy_scale" in observations:
                 parts.append(torch.tanh(observations["xy_scale"][b, a] / config.near_m).flatten())
-                parts.append(observations["mode_probs"][b, a].flatten())
             if "what_if_gap" in observations:
                 gap = observations["what_if_gap"][b, a]
                 parts += [torch.tanh(gap / config.near_m), gap / config.far_m]
+            if "xy_scale" in observations:
+                parts.append(observations["mode_probs"][b, a].flatten())
             parts += [observations["edge_probs"][b, a], observations["edge_features"][b, a]]
             if "what_if_gap" in observations:
                 parts += [observations["what_if_contact"][b, a], observations["what_if_risk"][b, a]]
