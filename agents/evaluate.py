@@ -1,7 +1,8 @@
 """Evaluates a policy in closed loop on held-out seeds: `python -m agents.evaluate --run-dir runs/highway`.
 
-Every policy drives the same seeds; the table compares the trained policy with random and idle drivers. Evaluation seeds
-are disjoint from those of training and of model selection (`agents.task`).
+Every policy drives the same seeds; the table compares the trained policy with random and idle drivers, and with others
+that `--drivers` names. `--policy planner --env-id highway-fast-v0 --out results` evaluates a driver without a training
+run. Evaluation seeds are disjoint from those of training and of model selection (`agents.task`).
 """
 
 import math
@@ -23,6 +24,8 @@ from agents.arena import open_arena
 from agents.runs import POLICY_FILE, load_model, read_config
 from agents.task import EVALUATION_SEED, Task
 from agents.vec_envs import EpisodeResult
+from envs.drivers.ego import make_ego_driver
+from envs.registry import make_env
 from envs.sb3.policy_file import read_policy_note
 from predictor.support import markdown
 from predictor.support.command_line import Renamed, parse
@@ -187,30 +190,33 @@ def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
 
 def evaluate_policy_on_seeds(
     task: Task,
-    model: BaseAlgorithm,
+    model: BaseAlgorithm | str,
     name: str,
     num_episodes: int,
     num_envs: int = 1,
     first_seed: int = EVALUATION_SEED,
     on_episode: Callable[[], None] = lambda: None,
+    drivers: Sequence[str] = (),
 ) -> Evaluation:
     """Evaluates the trained policy (most likely actions) and the arena's baselines on the same seeds.
 
     Args:
         task: task that the model was trained on.
-        model: the trained policy.
+        model: the trained policy, or the name of a driver.
         name: name of the policy in the table.
         num_episodes: number of episodes per policy.
         num_envs: number of parallel environments; the results do not depend on it.
         first_seed: seed of the first episode; episode i is reset with first_seed + i.
         on_episode: called after each episode.
+        drivers: names of drivers that are compared beside the arena's baselines ("planner").
     """
     seeds = range(first_seed, first_seed + num_episodes)
     arena = open_arena(task, min(num_envs, num_episodes))
     try:
         results = {name: arena.play(model, seeds, on_episode)}
-        for baseline in arena.baselines:
-            results[baseline] = arena.play(baseline, seeds, on_episode)
+        for baseline in dict.fromkeys((*drivers, *arena.baselines)):
+            if baseline not in results:
+                results[baseline] = arena.play(baseline, seeds, on_episode)
     finally:
         arena.close()
     return Evaluation(task.env_id, first_seed, results, has_ego=not task.is_multiagent)
@@ -218,18 +224,19 @@ def evaluate_policy_on_seeds(
 
 def evaluate_with_progress(
     task: Task,
-    model: BaseAlgorithm,
+    model: BaseAlgorithm | str,
     name: str,
     num_episodes: int,
     num_envs: int,
     first_seed: int = EVALUATION_SEED,
+    drivers: Sequence[str] = (),
 ) -> Evaluation:
     """Runs `evaluate_policy_on_seeds` with a progress bar."""
     columns = (TextColumn(f"evaluate {task.env_id}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns) as progress:
-        bar = progress.add_task("", total=num_episodes * NUM_POLICIES)
+        bar = progress.add_task("", total=num_episodes * (NUM_POLICIES + len(drivers)))
         return evaluate_policy_on_seeds(
-            task, model, name, num_episodes, num_envs, first_seed, lambda: progress.advance(bar)
+            task, model, name, num_episodes, num_envs, first_seed, lambda: progress.advance(bar), drivers
         )
 
 
@@ -259,8 +266,16 @@ def _plus_minus(error: float, digits: int) -> str:
 class EvaluateConfig:
     """Evaluates the policy of a training run on held-out seeds, beside random and idle drivers."""
 
-    run_dir: Path
-    """Folder of the training run, as train_policy.py wrote it."""
+    run_dir: Path | None = None
+    """Folder of the training run, as train_policy.py wrote it; leave it out with --policy."""
+    policy: str | None = None
+    """Driver of the ego instead of a trained policy: planner (docs/what_if.md), planner:CHECKPOINT, or another name of
+    envs.drivers.ego; needs --env-id and --out."""
+    env_id: str | None = None
+    """Environment of --policy; a training run has its own."""
+    drivers: tuple[str, ...] = ()
+    """Further drivers of the ego, each a line of the table: planner, planner:CHECKPOINT, or another of
+    envs.drivers.ego."""
     episodes: int = 50
     """Number of episodes per policy."""
     seed: int = EVALUATION_SEED
@@ -279,6 +294,12 @@ class EvaluateConfig:
             UserError: a value is out of range, or the device is not available.
         """
         check_at_least(self, 1, "episodes", "num_envs")
+        if (self.run_dir is None) == (self.policy is None):
+            raise UserError("give either --run-dir (a training run) or --policy (a driver such as planner)")
+        if (self.policy is None) != (self.env_id is None):
+            raise UserError("--policy and --env-id go together; a training run has its own environment")
+        if self.policy is not None and self.out is None:
+            raise UserError("--policy has no run folder; say with --out where the results go")
         check_at_least(self, 0, "seed")
         object.__setattr__(self, "device", resolve_device(self.device))
 
@@ -288,10 +309,41 @@ def main() -> None:
     keep_freed_memory()
     torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
     config = parse(EvaluateConfig, __doc__)
-    out = config.out or config.run_dir / "evaluation"
+    out = config.out or (config.run_dir or Path()) / "evaluation"
     if out.is_file():
         raise UserError(f"{out} is a file; choose another --out")
-    run = read_config(config.run_dir)
+    evaluation, noted = _of_driver(config) if config.run_dir is None else _of_run(config, config.run_dir)
+    out.mkdir(parents=True, exist_ok=True)
+    evaluation.write(out, **noted)
+    Console().print(evaluation.table())
+    Console().print(f"written to {out / 'summary.json'} and {out / 'summary.md'}")
+
+
+def _of_driver(config: EvaluateConfig) -> tuple[Evaluation, dict[str, str]]:
+    """Evaluates a driver; returns what is noted beside the results, too."""
+    assert config.policy is not None and config.env_id is not None
+    task = Task(config.env_id, "none", device=config.device)
+    task.check()
+    check_drivers(task, (config.policy, *config.drivers))
+    evaluation = evaluate_with_progress(
+        task, config.policy, config.policy, config.episodes, config.num_envs, config.seed, config.drivers
+    )
+    return evaluation, {"driver": config.policy}
+
+
+def check_drivers(task: Task, names: Sequence[str]) -> None:
+    """Raises a `UserError` unless each of these drivers can drive the ego of a task."""
+    if names and task.is_multiagent:
+        raise UserError(f"drivers of an ego need an environment with one ego, {task.env_id} has several agents")
+    for name in names:
+        env = make_env(task.env_id, disable_env_checker=True)
+        make_ego_driver(name, env, np.random.default_rng(0))
+        env.close()
+
+
+def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str, str]]:
+    """Evaluates the policy of a training run; returns what is noted beside the results, too."""
+    run = read_config(run_dir)
     task = Task(
         run["env_id"],
         run["observe"],
@@ -301,7 +353,8 @@ def main() -> None:
         driver=run.get("partner", "heuristic"),
     )
     task.check()
-    policy = config.run_dir / POLICY_FILE
+    check_drivers(task, config.drivers)
+    policy = run_dir / POLICY_FILE
     model = load_model(policy, run["algorithm"])
     note, now = read_policy_note(policy), task.note
     if note is None:
@@ -310,11 +363,10 @@ def main() -> None:
     elif note.forecaster is not None and now.forecaster is not None:
         note.forecaster.check(now.forecaster, f"policy {policy}")
     name = f"{run['algorithm']} ({run['observe']})"
-    out.mkdir(parents=True, exist_ok=True)
-    evaluation = evaluate_with_progress(task, model, name, config.episodes, config.num_envs, config.seed)
-    evaluation.write(out, algorithm=run["algorithm"], observe=run["observe"])
-    Console().print(evaluation.table())
-    Console().print(f"written to {out / 'summary.json'} and {out / 'summary.md'}")
+    evaluation = evaluate_with_progress(
+        task, model, name, config.episodes, config.num_envs, config.seed, config.drivers
+    )
+    return evaluation, {"algorithm": run["algorithm"], "observe": run["observe"]}
 
 
 if __name__ == "__main__":

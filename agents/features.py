@@ -1,8 +1,8 @@
 """Features extractor of the policy's network: the ego attends over the agents around it.
 
 Reads the Dict observation of `ForecastObservation` / `VecForecast`: the env's own observation becomes the ego's
-embedding (the query); each agent's state, futures with their probabilities and standard deviations, edge probabilities
-and edge features become a token (key, value).
+embedding (the query); each agent's state, futures with their probabilities and standard deviations, edge probabilities,
+edge features and what happens in each candidate plan of the ego become a token (key, value).
 The result does not depend on the order of agents, and padded agents (`valid` = 0) change nothing. A learned null token
 is always present, so an empty scene works. It is not recurrent: only the forecaster keeps a history.
 """
@@ -23,7 +23,11 @@ from predictor.support.errors import UserError
 
 EGO_KEY = "observation"
 VALID_KEY = "valid"
-TOKEN_KEYS = ("agents", "forecast", "mode_probs", "xy_scale", "edge_probs", "edge_features")
+WHAT_IF_GAP = "what_if_gap"
+TOKEN_KEYS = (
+    *("agents", "forecast", "mode_probs", "xy_scale", "edge_probs", "edge_features"),
+    *(WHAT_IF_GAP, "what_if_contact", "what_if_risk"),
+)
 """Entries of an observation that become tokens; others are not read. Those without a scale here are of order one."""
 
 NEAR, FAR, SPEED = 0.1, 0.5, 1.0
@@ -77,7 +81,7 @@ class ForecastAttention(BaseFeaturesExtractor):
 
     Args:
         observation_space: Dict space with the keys `observation` and some of `agents`, `forecast`, `mode_probs`,
-            `xy_scale`, `edge_probs`, `edge_features`, `valid`.
+            `xy_scale`, `edge_probs`, `edge_features`, `what_if_gap`, `what_if_contact`, `what_if_risk`, `valid`.
         config: sizes and scales.
     """
 
@@ -156,7 +160,11 @@ class ForecastAttention(BaseFeaturesExtractor):
                 parts.append(self._squash(forecast - now).flatten(1))
         if "xy_scale" in self._keys:
             parts.append(torch.tanh(present["xy_scale"] / self.config.near_m).flatten(1))
-        parts += [present[k].flatten(1) for k in self._keys if k not in ("agents", "forecast", "xy_scale")]
+        if WHAT_IF_GAP in self._keys:
+            gap = present[WHAT_IF_GAP]
+            parts += [torch.tanh(gap / self.config.near_m), gap / self.config.far_m]
+        scaled = ("agents", "forecast", "xy_scale", WHAT_IF_GAP)
+        parts += [present[k].flatten(1) for k in self._keys if k not in scaled]
         return torch.cat(parts, dim=-1)
 
     def _squash(self, metres: Float[Tensor, "*axes 2"]) -> Float[Tensor, "*axes 4"]:

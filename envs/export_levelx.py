@@ -18,6 +18,7 @@ from jaxtyping import Float
 from rich.progress import track
 
 from envs.drivers.ego import EGO_DRIVER_NAMES, make_ego_driver
+from envs.drivers.planner import PLANNER
 from envs.readers.highway import HighwayReader, is_highway_env, vehicles_of
 from envs.registry import make_env
 from envs.seeding import driver_rng
@@ -68,7 +69,8 @@ class ExportConfig:
         """
         check_at_least(self, 1, "episodes", "max_steps")
         check_at_least(self, 0, "seed")
-        check_choice("driver", self.driver, EGO_DRIVER_NAMES)  # a policy's wrapper would not see every frame
+        # a policy's wrapper would not see every frame, and the planner not every step
+        check_choice("driver", self.driver, tuple(name for name in EGO_DRIVER_NAMES if name != PLANNER))
 
     def check_out(self) -> None:
         """Checks that `out` is free, or an export that may be replaced.

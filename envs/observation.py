@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from envs.plans.contact import FAR_M, contacts
 from envs.registry import checkpoint_for
 from envs.scene_stream import ForecastConfig, SceneStream
 from predictor.checkpoint import load_forecaster
@@ -25,6 +26,8 @@ FORECAST_KEYS = ("agents", "forecast", "edge_probs", "edge_features", "valid")
 """Entries of every observation with forecasts."""
 UNCERTAINTY_KEYS = ("mode_probs", "xy_scale")
 """Entries with several samples, or on request (`ForecastConfig.uncertainty`); the second, if the forecaster has it."""
+WHAT_IF_KEYS = ("what_if_gap", "what_if_contact", "what_if_risk")
+"""Entries for candidate plans of the ego (`ForecastConfig.num_plans`)."""
 
 
 def scene_spaces(spec: SceneSpec) -> dict[str, gym.Space]:
@@ -164,6 +167,12 @@ def entry_spaces(forecaster: Forecaster, view: SceneSpec, config: ForecastConfig
         uncertain["mode_probs"] = gym.spaces.Box(0, 1, (others, *samples), np.float32)
         if has_scale(forecaster):
             uncertain["xy_scale"] = gym.spaces.Box(0, np.inf, (others, *samples, horizon, 2), np.float32)
+    supposed: dict[str, gym.Space] = {}
+    if config.num_plans:
+        of_plans = (others, config.num_plans)
+        supposed["what_if_gap"] = gym.spaces.Box(-FAR_M, FAR_M, of_plans, np.float32)
+        supposed["what_if_contact"] = gym.spaces.Box(0, 1, of_plans, np.float32)
+        supposed["what_if_risk"] = gym.spaces.Box(0, 1, of_plans, np.float32)
     return {
         "agents": unbounded(others, view.num_features),
         "forecast": unbounded(others, *samples, horizon, 2),
@@ -171,6 +180,7 @@ def entry_spaces(forecaster: Forecaster, view: SceneSpec, config: ForecastConfig
         "edge_probs": gym.spaces.Box(0, 1, (others, 2 * (forecaster.num_edge_types - 1)), np.float32),
         "edge_features": unbounded(others, 2 * forecaster.edge_feature_dim),
         "valid": gym.spaces.Box(0, 1, (others,), np.float32),
+        **supposed,
     }
 
 
@@ -230,6 +240,29 @@ def ego_entries(scenes: SceneBatch, forecast: Forecast, uncertainty: bool = Fals
         "edge_features": padded(of_edges(features)),
         "valid": valid.astype(np.float32),
     }
+
+
+def what_if_entries(
+    scenes: SceneBatch, forecast: Forecast, size_m: tuple[float, float] = (5.0, 2.0)
+) -> dict[str, NDArray[np.float32]]:
+    """Returns what a forecast with plans says of the ego and each other agent of this size, agents as in `ego_entries`.
+
+    Returns:
+        what_if_gap: (B, A−1, P) smallest gap between both vehicles in the single forecast of each plan [m], negative
+            where they overlap (`envs.plans.contact`).
+        what_if_contact: (B, A−1, P) time of their first contact there, as a share of the horizon; 1 without any.
+        what_if_risk: (B, A−1, P) probability of a contact over the forecast's samples.
+    """
+    found = contacts(forecast, scenes, size_m)
+    order = others_by_distance(scenes)
+    envs = np.arange(len(order))[:, None]
+    valid = scenes.valid[envs, 1 + order][..., None]
+
+    def sorted_entries(values: Float[np.ndarray, "batch plans others"]) -> NDArray[np.float32]:
+        return (values.transpose(0, 2, 1)[envs, order] * valid).astype(np.float32)
+
+    risk = found.risk().clip(0.0, 1.0)
+    return dict(zip(WHAT_IF_KEYS, map(sorted_entries, (found.gap_m[:, :, 0], found.share[:, :, 0], risk)), strict=True))
 
 
 def _turned(

@@ -1,12 +1,13 @@
 """Forecasts the scenes of parallel environments with one forecaster; each environment has its own history and noise."""
 
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from predictor.forecaster import Forecaster
@@ -37,6 +38,9 @@ class ForecastConfig:
     """Whether probabilities of the samples and their standard deviations are in the observation; None: with several
     samples."""
 
+    num_plans: int = 0
+    """Number of candidate plans of the ego whose what-if forecasts are in the observation."""
+
     @property
     def shows_uncertainty(self) -> bool:
         """Whether probabilities and standard deviations are in the observation."""
@@ -45,7 +49,7 @@ class ForecastConfig:
     def __post_init__(self) -> None:
         """Checks ranges, and replaces `device="auto"` by the device that it stands for."""
         check_at_least(self, 1, "num_samples", "horizon_steps")
-        check_at_least(self, 0, "seed")
+        check_at_least(self, 0, "seed", "num_plans")
         object.__setattr__(self, "device", resolve_device(self.device))
 
 
@@ -97,6 +101,14 @@ class SceneStream:
         What observations hold does not change; draws, if the forecaster draws, come from the same noise.
         """
         return self._shown(self._online.forecast(self.horizon_steps, num_samples, self._noise))
+
+    def what_if(self, plans: Float[np.ndarray, "envs plans horizon state"]) -> Forecast:
+        """Forecasts the latest scene of each environment for each plan of its ego, in the world frame.
+
+        What observations hold does not change, and no noise is used up.
+        """
+        noise = deepcopy(self._noise)
+        return self._online.forecast(self.horizon_steps, self.config.num_samples, noise, plans)
 
     def continue_noise(self, streams: "Sequence[SceneStream]") -> None:
         """Takes over the noise generators of one stream per environment, in their current state."""

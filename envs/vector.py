@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
+from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader, refuse_what_if
 from envs.observation import (
     ForecastStream,
     Observations,
@@ -55,6 +55,7 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         forecaster: forecaster on `device`, instead of a checkpoint.
         seed: random seed of the samples' noise: environment i gets seed + i, until `reset(seed=…)` gives others.
         reader: refused, because the environments report their scenes; give it to `SceneObservation`.
+        what_if: refused, because plans are made from the running environment; see `ForecastObservation`.
 
     Raises:
         UserError: the environments report no scenes, differ from each other, or do not fit the forecaster.
@@ -72,10 +73,12 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         forecaster: Forecaster | None = None,
         seed: int = 0,
         reader: MakeReader | None = None,
+        what_if: bool = False,
     ) -> None:
         """Loads the forecaster and extends the observation space."""
         gym.vector.VectorWrapper.__init__(self, env)
         refuse_reader(reader, "VectorForecast")
+        refuse_what_if(what_if, "VectorForecast")
         space = require_scenes(env.single_observation_space, "VectorForecast")
         spec: SceneSpec = common_value(_attribute_of_each(env, "scene_spec"), "scene spec")
         source: str = common_value(_attribute_of_each(env, "scene_source"), "env id")

@@ -14,13 +14,21 @@ import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
-from envs.observation import ForecastStream, carries_scenes, open_forecaster, scene_entries, scene_spaces
+from envs.observation import (
+    ForecastStream,
+    carries_scenes,
+    open_forecaster,
+    scene_entries,
+    scene_spaces,
+    what_if_entries,
+)
+from envs.plans import PlanModel, Plans, checked_plans, plan_model_for
 from envs.readers import MakeReader, reader_for
 from envs.readers.base import build_reader, require_scene, show
 from envs.scene_stream import ForecastConfig
 from envs.simulators.copies import RunningCopy
 from predictor.forecaster import Forecaster
-from predictor.scene import Scene, SceneBatch, SceneSpec
+from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 from predictor.support.errors import ProtocolError, UserError
 
 
@@ -134,10 +142,17 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         seed: random seed of the samples' noise, until `reset(seed=…)` gives another.
         reader: function or class that makes a reader for the env; None picks one by env family. Refused over a
             `SceneObservation`, which has its own.
+        what_if: whether the observation also holds what the others are forecast to do for each candidate plan of the
+            ego: `what_if_gap`, `what_if_contact`, `what_if_risk` (`envs.observation.what_if_entries`). True takes the
+            environment's plan model; or a `PlanModel` (docs/what_if.md).
+
+    Attributes:
+        plans: candidate plans of the latest step; None without `what_if`.
+        what_if: forecast for these plans, world axes, with an axis of plans; None without `what_if`.
 
     Raises:
         UserError: no reader, or one although the env is a `SceneObservation`; no checkpoint, or a forecaster of
-            another spec (features, dt).
+            another spec (features, dt); no plan model for `what_if=True`.
     """
 
     def __init__(
@@ -154,14 +169,17 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         forecaster: Forecaster | None = None,
         seed: int = 0,
         reader: MakeReader | None = None,
+        what_if: bool | PlanModel = False,
     ) -> None:
         """Loads the forecaster and extends the observation space."""
         RecordConstructorArgs.__init__(
             self, checkpoint=checkpoint, horizon_steps=horizon_steps, num_samples=num_samples, flatten=flatten,
             perception_m=perception_m, max_agents=max_agents, device=device, forecaster=forecaster, seed=seed,
-            _disable_deepcopy=True,
+            what_if=what_if, _disable_deepcopy=True,
         )  # the reader is recorded by the SceneObservation below  # fmt: skip
-        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten)
+        plan_model = (plan_model_for(env) if what_if else None) if isinstance(what_if, bool) else what_if
+        num_plans = 0 if plan_model is None else len(plan_model.names)
+        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, num_plans=num_plans)
         ready = carries_scenes(env.observation_space)
         source = scene_source(env)
         if ready:
@@ -181,6 +199,9 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
             spec = env.scene_spec
         gym.Wrapper.__init__(self, env)
         self.stream: ForecastStream = ForecastStream(forecaster, spec, envs=1, config=config)
+        self.plan_model = plan_model
+        self.plans: Plans | None = None
+        self.what_if: Forecast | None = None
         own = env.observation_space["observation"]  # type: ignore[index]
         self._layout = ObservationLayout(own, self.stream.spaces(), flatten)
         self.observation_space = self._layout.space
@@ -205,5 +226,11 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         return self._observe(obs), reward, terminated, truncated, info
 
     def _observe(self, obs: dict[str, Any]) -> Any:
-        entries = self.stream.observe(SceneBatch.stack([self.scene]))
+        scenes = SceneBatch.stack([self.scene])
+        entries = self.stream.observe(scenes)
+        if self.plan_model is not None:
+            horizon, features = self.stream.horizon_steps, self.stream.scene_spec.num_features
+            self.plans = checked_plans(self.plan_model, self.env, horizon, features)
+            self.what_if = self.stream.what_if(self.plans.states[None])
+            entries |= what_if_entries(scenes, self.what_if, self.plans.size_m)
         return self._layout.one(obs["observation"], {key: value[0] for key, value in entries.items()})

@@ -155,11 +155,12 @@ def edgeless_belief(
 class Futures(NamedTuple):
     """Possible futures of each scene of a batch; each sample is a whole scene."""
 
-    states: Float[Tensor, "batch samples agents horizon state"]
-    """Future states [SI]; sample 0 is the single forecast, for use where only one is wanted."""
-    mode_probs: Float[Tensor, "batch samples agents"] | None = None
+    states: Float[Tensor, "batch *plans samples agents horizon state"]
+    """Future states [SI]; sample 0 is the single forecast, for use where only one is wanted. With plans of the ego
+    (`predictor.what_if`) there is an axis for them."""
+    mode_probs: Float[Tensor, "batch *plans samples agents"] | None = None
     """Probability of each sample for each agent, which sum to 1 over the samples; None if the samples are draws."""
-    scale: Float[Tensor, "batch samples agents horizon axes"] | None = None
+    scale: Float[Tensor, "batch *plans samples agents horizon axes"] | None = None
     """Standard deviation of the position around each sample [m]; None if the forecaster has no such estimate."""
 
 

@@ -63,6 +63,45 @@ class PairNoise:
         return placed
 
 
+class RepeatedNoise:
+    """Uniform numbers that every plan of a scene shares: those that the scene would get without plans.
+
+    Args:
+        noise: source of the numbers.
+        unrepeated: function from the logits of all plans to as many as without plans, of which only the shape is read.
+        repeat: function that repeats numbers for each plan, in the order of the logits.
+    """
+
+    def __init__(
+        self,
+        noise: "torch.Generator | PairNoise | None",
+        unrepeated: Callable[[Tensor], Tensor],
+        repeat: Callable[[Tensor], Tensor],
+    ) -> None:
+        """Stores source and functions; draws nothing."""
+        self._noise, self._unrepeated, self._repeat = noise, unrepeated, repeat
+
+    def like(self, logits: Float[Tensor, "*batch types"]) -> Float[Tensor, "*batch types"]:
+        """Returns the next step's numbers."""
+        return self._repeat(uniform_like(self._unrepeated(logits), self._noise))
+
+
+NoiseOfPairs = torch.Generator | PairNoise | RepeatedNoise
+"""Source of the noise of one roll-out."""
+
+
+def uniform_like(logits: Float[Tensor, "*batch types"], noise: NoiseOfPairs | None) -> Float[Tensor, "*batch types"]:
+    """Draws uniform numbers in [0, 1), one for each logit."""
+    if isinstance(noise, PairNoise | RepeatedNoise):
+        return noise.like(logits)
+    return torch.rand(logits.shape, generator=noise, device=logits.device, dtype=logits.dtype)
+
+
+def repeat_scenes(times: int) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
+    """Returns functions that undo and do the repetition of each scene of a batch, for `RepeatedNoise`."""
+    return lambda pairs: pairs[::times], lambda pairs: pairs.repeat_interleave(times, dim=0)
+
+
 def noise_of_pairs(
     noise: Noise | None, present: Bool[Tensor, "scenes agents slots"], draws: int, steps: int, types: int
 ) -> torch.Generator | PairNoise | None:

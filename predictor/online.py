@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 from torch.nn import functional
 
 from predictor.forecaster import Belief, Forecaster, Memory
@@ -20,6 +21,7 @@ from predictor.noise import Noise
 from predictor.scene import PADDING_ID, Forecast, SceneBatch
 from predictor.support.errors import ProtocolError
 from predictor.support.runtime import resolve_device
+from predictor.what_if import check_plans, rollout_plans
 
 _process = os.getpid()
 
@@ -59,6 +61,7 @@ class OnlineForecaster:
         self._ids: Int[np.ndarray, "envs agents"] = np.full((envs, agents), PADDING_ID, dtype=np.int64)
         self._ego_axes = np.array([f == "ego" for f in forecaster.spec.frame], dtype=np.float64)
         self._belief: Belief | None = None
+        self._origins: Float[np.ndarray, "scenes axes"] = np.zeros((0, len(self._ego_axes)))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "OnlineForecaster":
         """Returns an independent copy; memory and belief are replaced at each step, never written to."""
@@ -119,6 +122,7 @@ class OnlineForecaster:
         horizon_steps: int | None = None,
         num_samples: int = 1,
         generator: Noise | None = None,
+        ego_plan: Float[np.ndarray, "..."] | None = None,
     ) -> Forecast:
         """Forecasts from the latest observation; sample 0 is the single forecast.
 
@@ -126,20 +130,30 @@ class OnlineForecaster:
             horizon_steps: number of steps; None takes the forecaster's.
             num_samples: number of futures per agent.
             generator: source of the samples' noise; one for all scenes of the latest observation, or one for each.
+            ego_plan: plans of the ego, (scenes, plans, steps, features): its state at each step, in the world frame and
+                the spec's units. The ego follows them, the others react; the forecast has an axis for the plans.
 
         Raises:
             ProtocolError: nothing was observed yet.
+            UserError: the spec has no ego, the ego is absent, or the plans are of another shape or not finite.
         """
         use_one_thread_after_fork()
         if self._belief is None:
             raise ProtocolError("forecast() needs an observation; call observe() first")
         belief = self._belief
         steps = horizon_steps or self.forecaster.horizon_steps
-        futures = self.forecaster.rollout(belief, steps, num_samples, generator)
+        if ego_plan is None:
+            futures = self.forecaster.rollout(belief, steps, num_samples, generator)
+        else:
+            plans = self._local_plans(ego_plan, belief, steps)
+            futures = rollout_plans(self.forecaster, belief, plans, num_samples, generator)
         # float32 relative to the ego: the origin that observe() removed is the ego's own position on "ego" axes
         axes = self.forecaster.spec.position_dim
         ego_now = belief.states[:, None, :1, None, :axes] * float(self.forecaster.spec.has_ego)
-        xy = (futures.states[..., :axes] - ego_now).masked_fill(~belief.valid[:, None, :, None, None], 0.0)
+        absent = ~belief.valid[:, None, :, None, None]
+        if ego_plan is not None:  # the axis of plans
+            ego_now, absent = ego_now[:, None], absent[:, None]
+        xy = (futures.states[..., :axes] - ego_now).masked_fill(absent, 0.0)
         missing = self._ids.shape[1] - belief.valid.shape[1]
         senders = belief.senders
         pairs = (0, 0, 0, missing if senders is None else 0, 0, missing)
@@ -158,6 +172,16 @@ class OnlineForecaster:
             None if futures.scale is None else functional.pad(futures.scale, (0, 0, 0, 0, 0, missing)),
         )
 
+    def _local_plans(
+        self, ego_plan: Float[np.ndarray, "..."], belief: Belief, horizon_steps: int
+    ) -> Float[Tensor, "batch plans horizon state"]:
+        """Returns plans in the axes of the belief's states; raises a `UserError` if they do not fit the scenes."""
+        plans = np.array(ego_plan, dtype=np.float64)
+        finite = bool(np.isfinite(plans).all())
+        check_plans(self.forecaster.spec, belief.valid[:, 0], plans.shape, finite, horizon_steps)
+        plans[..., : self._origins.shape[-1]] -= self._origins[:, None, None]
+        return torch.from_numpy(plans.astype(np.float32)).to(self.device)
+
     def _take(
         self, scenes: SceneBatch, old_ids: Int[np.ndarray, "envs agents"], memory: Memory
     ) -> tuple[Memory, Int[np.ndarray, "envs agents"]]:
@@ -172,7 +196,8 @@ class OnlineForecaster:
         # values in padding, not-a-number for example, must not reach any agent
         local = np.where(valid[..., None], scenes.states[:, :agents], 0.0)
         axes = len(self._ego_axes)
-        local[..., :axes] -= local[:, :1, :axes] * self._ego_axes
+        self._origins = local[:, 0, :axes] * self._ego_axes
+        local[..., :axes] -= self._origins[:, None]
         states = torch.from_numpy(np.where(valid[..., None], local, 0.0).astype(np.float32)).to(self.device)
         memory, self._belief = self.forecaster.observe(memory, states, torch.from_numpy(valid).to(self.device))
         return memory.padded(ids.shape[1]), ids

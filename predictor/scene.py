@@ -264,9 +264,10 @@ def perceived_agents(
 class Forecast:
     """Forecast of the steps that follow one instant."""
 
-    xy: Float[Tensor, "batch samples agents horizon axes"]
+    xy: Float[Tensor, "batch *plans samples agents horizon axes"]
     """Predicted positions [m], world axes; relative to the ego's position now, or to the world's origin where there is
-    no ego (a spec without one, or an absent agent 0). Zeros where `valid` is not."""
+    no ego (a spec without one, or an absent agent 0). Zeros where `valid` is not. With plans of the ego there is an
+    axis for them, also in `mode_probs` and `xy_scale`; `of_plan` takes one."""
     edge_probs: Float[Tensor, "batch agents slots types"]
     """Prior probabilities of edge types now, receiver first; type 0 is "no edge"."""
     edge_features: Float[Tensor, "batch agents slots feature"]
@@ -275,10 +276,30 @@ class Forecast:
     """Which agents are forecast."""
     senders: Int[Tensor, "batch agents slots"] | None = None
     """Index of the sender in each slot (`predictor.graph.NO_AGENT` where empty); None if slot j is agent j's."""
-    mode_probs: Float[Tensor, "batch samples agents"] | None = None
+    mode_probs: Float[Tensor, "batch *plans samples agents"] | None = None
     """Probability of each sample for each agent, which sum to 1 over the samples; None if the samples are draws."""
-    xy_scale: Float[Tensor, "batch samples agents horizon axes"] | None = None
+    xy_scale: Float[Tensor, "batch *plans samples agents horizon axes"] | None = None
     """Standard deviation of the position around each sample [m], world axes; None without an estimate."""
+
+    @property
+    def num_plans(self) -> int:
+        """Number of plans of the ego that the forecast has an axis for; 0 for a forecast without plans."""
+        return self.xy.shape[1] if self.xy.ndim == 6 else 0
+
+    def of_plan(self, plan: int) -> "Forecast":
+        """Returns the forecast for one plan of the ego, without the axis of plans.
+
+        Raises:
+            UserError: there is no such plan.
+        """
+        if not 0 <= plan < self.num_plans:
+            raise UserError(f"plan must be from 0 to {self.num_plans - 1}, the plans of this forecast, got {plan}")
+        return replace(
+            self,
+            xy=self.xy[:, plan],
+            mode_probs=None if self.mode_probs is None else self.mode_probs[:, plan],
+            xy_scale=None if self.xy_scale is None else self.xy_scale[:, plan],
+        )
 
     def dense(self) -> "Forecast":
         """Returns the forecast with slot j for agent j; of use where scenes are small."""
@@ -293,19 +314,19 @@ class Forecast:
             return self.dense()
         dense = self.dense()
         return Forecast(
-            dense.xy[:, :, agents:],
+            dense.xy[..., agents:, :, :],
             dense.edge_probs[:, agents:, agents:],
             dense.edge_features[:, agents:, agents:],
             dense.valid[:, agents:],
-            mode_probs=None if dense.mode_probs is None else dense.mode_probs[:, :, agents:],
-            xy_scale=None if dense.xy_scale is None else dense.xy_scale[:, :, agents:],
+            mode_probs=None if dense.mode_probs is None else dense.mode_probs[..., agents:],
+            xy_scale=None if dense.xy_scale is None else dense.xy_scale[..., agents:, :, :],
         )
 
-    def sample_probs(self) -> Float[Tensor, "batch samples agents"]:
+    def sample_probs(self) -> Float[Tensor, "batch *plans samples agents"]:
         """Returns the probability of each sample, which is the same for all draws."""
         if self.mode_probs is not None:
             return self.mode_probs
-        return self.xy.new_full(self.xy.shape[:3], 1 / self.xy.shape[1])
+        return self.xy.new_full(self.xy.shape[:-2], 1 / self.xy.shape[-4])
 
     def ego_edges(self) -> tuple[Float[Tensor, "batch agents 2 types"], Float[Tensor, "batch agents 2 feature"]]:
         """Returns probabilities and features of the edges from each agent to agent 0, and of those back."""

@@ -136,6 +136,12 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--run-dir absent", "absent holds no training run"),
         ("--run-dir absent --num-envs 0", "num_envs must be at least 1, got 0"),
         ("--run-dir absent --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
+        ("", "give either --run-dir (a training run) or --policy"),
+        ("--run-dir absent --policy planner", "give either --run-dir (a training run) or --policy"),
+        ("--policy planner --out new", "--policy and --env-id go together"),
+        ("--policy planner --env-id merge-v1", "--policy has no run folder; say with --out where the results go"),
+        ("--policy nobody --env-id merge-v1 --out new", "driver must be one of random, idle, varied, keep-lane"),
+        ("--policy planner --env-id simple_tag_v3 --out new", "drivers of an ego need an environment with one ego"),
     ],
     "train_policy": [
         ("--env-id nope-v0 --observe none", "cannot make env 'nope-v0'"),

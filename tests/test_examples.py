@@ -1,5 +1,6 @@
 """The guide and its examples run: every Python block, every command, the environment and its reader."""
 
+import importlib
 import re
 import shlex
 import sys
@@ -15,10 +16,13 @@ from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
 import envs.readers
 from envs.collect import CollectConfig, collect
+from envs.drivers.planner import Planner
 from envs.evaluate import EvaluateConfig
+from envs.plans import checked_plans
 from envs.readers import reader_for
 from envs.readers.entities import EntityRowsReader
 from envs.wrappers import ForecastObservation, SceneObservation
+from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.data.store import StoreInfo, write_store
 from predictor.scene import SceneSpec
 from predictor.support.command_line import parse
@@ -45,7 +49,7 @@ def examples_on_the_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(envs.readers, "_REGISTERED", {})
     yield
     gym.registry.pop("Crossing-v0", None)
-    for name in ("crossing_env", "crossing_reader"):
+    for name in ("crossing_env", "crossing_plans", "crossing_reader"):
         sys.modules.pop(name, None)
 
 
@@ -200,3 +204,46 @@ def test_collect_train_wrap(tmp_path: Path):
         assert obs in env.observation_space
         assert obs["forecast"].shape == (11, 3, 2)
         obs, *_ = env.step(env.action_space.sample())
+
+
+# --- Plans of one's own -----------------------------------------------------------------------------------------------
+
+
+def test_the_plan_model_of_the_example_is_short_and_the_one_of_the_page():
+    text, page = (EXAMPLES / "crossing_plans.py").read_text(), (ROOT / "docs" / "what_if.md").read_text()
+    code = re.sub(r'^\s*""".*?"""\n', "", text, flags=re.MULTILINE | re.DOTALL)
+    shown = next(block for block in blocks(page, "python") if "class CrossingPlans" in block)
+    assert [line for line in code.splitlines() if line] == [line for line in shown.splitlines() if line]
+    assert len([line for line in code.splitlines() if line]) <= 20
+
+
+def test_the_example_plans_what_the_robot_then_does():
+    from crossing_plans import CrossingPlans
+
+    importlib.import_module("crossing_reader")
+    model, horizon = CrossingPlans(), 4
+    for plan, name in enumerate(model.names):
+        env = gym.make("Crossing-v0")
+        env.reset(seed=1)
+        env.unwrapped.robot[1:] = [-4.0, 0.0, 0.5]  # type: ignore[attr-defined]  # away from the wall
+        plans = checked_plans(model, env, horizon, 4)
+        assert plans.rewards is not None
+        for step in range(horizon):
+            _, reward, *_ = env.step(plans.actions[plan])
+            np.testing.assert_allclose(env.unwrapped.robot, plans.states[plan, step], atol=1e-9, err_msg=name)  # type: ignore[attr-defined]
+            assert reward == pytest.approx(plans.rewards[plan, step])
+
+
+def test_the_planner_drives_the_example():
+    from crossing_plans import CrossingPlans
+
+    importlib.import_module("crossing_reader")
+    env = gym.make("Crossing-v0")
+    env.reset(seed=0)
+    spec = reader_for(env).spec
+    planner = Planner(env, ConstantVelocity(spec, horizon_steps=8), CrossingPlans())
+    for _ in range(60):
+        *_, terminated, truncated, _ = env.step(planner())
+        if terminated or truncated:
+            break
+    assert env.unwrapped.robot[1] >= 5.0  # type: ignore[attr-defined]  # the other wall

@@ -6,12 +6,13 @@ import gymnasium as gym
 import numpy as np
 from highway_env.vehicle.controller import ControlledVehicle
 
+from envs.drivers.planner import PLANNER, is_planner, planner_driver
 from envs.drivers.sampled_actions import uniform_action, varied_actions
 from envs.drivers.trained import EgoDriver, kept_policy
 from predictor.support.errors import UserError
 
 WHO = "random egos"
-EGO_DRIVER_NAMES = ("random", "idle", "varied", "keep-lane")
+EGO_DRIVER_NAMES = ("random", "idle", "varied", "keep-lane", PLANNER)
 
 
 def make_ego_driver(name: str, env: gym.Env, rng: np.random.Generator) -> EgoDriver:
@@ -19,8 +20,9 @@ def make_ego_driver(name: str, env: gym.Env, rng: np.random.Generator) -> EgoDri
 
     Args:
         name: "random" (uniform actions), "idle" (no action), "varied" (each episode draws its own preferences and how
-            long a choice is kept), "keep-lane" (steers along its lane; continuous steering only), or the path of a
-            Stable-Baselines3 ``.zip``.
+            long a choice is kept), "keep-lane" (steers along its lane; continuous steering only), "planner" (the best
+            of its plans by what-if forecasts, `envs.drivers.planner`; "planner:CHECKPOINT" names the forecaster), or
+            the path of a Stable-Baselines3 ``.zip``.
         env: the environment that will be driven.
         rng: source of all randomness of this episode.
 
@@ -36,6 +38,8 @@ def make_ego_driver(name: str, env: gym.Env, rng: np.random.Generator) -> EgoDri
         return varied_actions(env.action_space, rng, WHO)
     if name == "keep-lane":
         return _keep_lane(env, rng)
+    if is_planner(name):
+        return planner_driver(name, env, rng)
     if name.endswith(".zip"):
         return _trained(name)
     raise UserError(f"driver must be one of {', '.join(EGO_DRIVER_NAMES)} or the path of a policy .zip, got '{name}'")

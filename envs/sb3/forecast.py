@@ -13,7 +13,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
+from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader, refuse_what_if
 from envs.observation import (
     ForecastStream,
     common_value,
@@ -50,6 +50,7 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         forecaster: forecaster on `device`, instead of a checkpoint.
         seed: random seed of the samples' noise: environment i gets seed + i, until `seed(…)` gives others.
         reader: refused, because the environments report their scenes; give it to `SceneObservation`.
+        what_if: refused, because plans are made from the running environment; see `ForecastObservation`.
 
     Raises:
         UserError: the environments report no scenes, differ from each other, or do not fit the forecaster.
@@ -67,9 +68,11 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         forecaster: Forecaster | None = None,
         seed: int = 0,
         reader: MakeReader | None = None,
+        what_if: bool = False,
     ) -> None:
         """Loads the forecaster and extends the observation space."""
         refuse_reader(reader, "VecForecast")
+        refuse_what_if(what_if, "VecForecast")
         space = require_scenes(venv.observation_space, "VecForecast")
         spec = common_value(venv.get_attr("scene_spec"), "scene spec")
         source = common_value(venv.get_attr("scene_source"), "env id")

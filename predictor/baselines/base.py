@@ -19,6 +19,7 @@ from predictor.layers.state_codec import Residual, StateCodec
 from predictor.noise import Noise
 from predictor.scene import SceneSpec
 from predictor.support.config_checks import check_at_least, check_choices
+from predictor.what_if import with_ego
 
 Tensors = tuple[Tensor, ...]
 WeightRule = Callable[[Tensor], Tensor]
@@ -159,6 +160,21 @@ class UnrolledForecaster(nn.Module, ABC):
         )
         return Futures(future[:, None].expand(-1, num_samples, -1, -1, -1))
 
+    def rollout_plans(
+        self,
+        belief: Belief,
+        plans: Float[Tensor, "batch plans horizon state"],
+        num_samples: int = 1,
+        generator: Noise | None = None,
+    ) -> Futures:
+        """Rolls out from the belief while agent 0 follows each plan; all samples are equal."""
+        now: Internal = belief.internal
+        future = self.continue_from(
+            now.next_states, belief.valid, now.pairs, now.scores, now.nodes, plans.shape[2], self.expected, plans
+        )
+        each = future.unflatten(0, plans.shape[:2])[:, :, None]
+        return Futures(each.expand(-1, -1, num_samples, -1, -1, -1))
+
     # --- Training -----------------------------------------------------------------------------------------------
 
     def window(
@@ -214,14 +230,24 @@ class UnrolledForecaster(nn.Module, ABC):
         nodes: Tensors,
         horizon_steps: int,
         rule: WeightRule,
-    ) -> Float[Tensor, "batch agents horizon state"]:
-        """Rolls out from the states predicted for the first step; all present agents stay."""
+        plans: Float[Tensor, "batch plans horizon state"] | None = None,
+    ) -> Float[Tensor, "batch_and_plans agents horizon state"]:
+        """Rolls out from the states predicted for the first step; all present agents stay.
+
+        With plans, agent 0 follows them, and each scene is rolled out once for each of its plans.
+        """
+        if plans is not None:
+            count, plan = plans.shape[1], plans.flatten(0, 1)
+            states, valid, scores = (t.repeat_interleave(count, dim=0) for t in (states, valid, scores))
+            pairs, nodes = (tuple(t.repeat_interleave(count, dim=0) for t in ts) for ts in (pairs, nodes))
+            states = with_ego(states, plan[:, 0])
         future = [states]
-        for _ in range(horizon_steps - 1):
+        for step in range(1, horizon_steps):
             inputs = self.codec.inputs(states, valid)
             pairs, scores = self.evolve(inputs, valid, pairs, scores)
             nodes = self.recur(inputs, valid, rule(scores), nodes)
             states = self.codec.advance(states, self.change(inputs, valid, nodes))
+            states = states if plans is None else with_ego(states, plan[:, step])
             future.append(states)
         return torch.stack(future, dim=2)[:, :, :horizon_steps]
 

@@ -32,7 +32,7 @@ from predictor.dgvae.networks import concrete_sample, no_edge_where_absent
 from predictor.forecaster import Belief, Futures, WindowOutput
 from predictor.graph import pair_mask
 from predictor.layers.state_codec import Residual
-from predictor.noise import Noise, PairNoise, noise_of_pairs
+from predictor.noise import Noise, NoiseOfPairs, RepeatedNoise, noise_of_pairs, repeat_scenes
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
@@ -153,7 +153,7 @@ class DNRI(UnrolledForecaster):
         """Computes the prior's probabilities."""
         return torch.softmax(scores, dim=-1)
 
-    def drawn(self, generator: torch.Generator | PairNoise | None) -> WeightRule:
+    def drawn(self, generator: NoiseOfPairs | None) -> WeightRule:
         """Returns a rule that draws edge weights."""
 
         def draw(logits: Tensor) -> Tensor:
@@ -207,6 +207,31 @@ class DNRI(UnrolledForecaster):
         drawn = futures.unflatten(0, (len(belief.states), draws))
         return Futures(torch.cat([expected.states, drawn], dim=1))
 
+    def rollout_plans(
+        self,
+        belief: Belief,
+        plans: Float[Tensor, "batch plans horizon state"],
+        num_samples: int = 1,
+        generator: Noise | None = None,
+    ) -> Futures:
+        """Rolls out while agent 0 follows each plan; samples as those of `rollout`, the same draws for each plan."""
+        expected = super().rollout_plans(belief, plans)
+        if num_samples == 1:
+            return expected
+        now: Internal = belief.internal
+        draws, (count, horizon_steps) = num_samples - 1, plans.shape[1:3]
+        noise = noise_of_pairs(generator, pair_mask(belief.valid), draws, horizon_steps, self.num_edge_types)
+        rules = (self.drawn(noise), self.drawn(RepeatedNoise(noise, *repeat_scenes(count))))
+
+        def repeat(*tensors: Tensor) -> Tensors:
+            return tuple(t.repeat_interleave(draws, dim=0) for t in tensors)
+
+        states, valid, scores, plans = repeat(belief.states, belief.valid, now.scores, plans)
+        memory, before = repeat(*now.pairs), repeat(*now.before)
+        futures = self._branch(states, valid, memory, scores, before, horizon_steps, *rules, plans)
+        drawn = futures.unflatten(0, (len(belief.states), draws, count)).transpose(1, 2)
+        return Futures(torch.cat([expected.states, drawn], dim=2))
+
     # --- Training -----------------------------------------------------------------------------------------------
 
     def window(
@@ -247,9 +272,14 @@ class DNRI(UnrolledForecaster):
         before: Tensors,
         horizon_steps: int,
         rule: WeightRule,
-    ) -> Float[Tensor, "batch agents horizon state"]:
-        """Rolls out from an observation before its decoder step, with edge weights of a given rule."""
+        later_rule: WeightRule | None = None,
+        plans: Float[Tensor, "batch plans horizon state"] | None = None,
+    ) -> Float[Tensor, "batch_and_plans agents horizon state"]:
+        """Rolls out from an observation before its decoder step, with edge weights of a given rule.
+
+        With plans, the weights of all steps but the first, which does not depend on plans, follow the later rule.
+        """
         inputs = self.codec.inputs(states, valid)
         nodes = self.recur(inputs, valid, rule(scores), before)
         states = self.codec.advance(states, self.change(inputs, valid, nodes))
-        return self.continue_from(states, valid, pairs, scores, nodes, horizon_steps, rule)
+        return self.continue_from(states, valid, pairs, scores, nodes, horizon_steps, later_rule or rule, plans)

@@ -12,6 +12,7 @@ from predictor.forecaster import Belief, Forecaster, Futures, Memory
 from predictor.noise import Noise, normal_of_agents
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
+from predictor.what_if import rollout_plans
 
 LEAST_STD_M = 1e-6
 """Standard deviation that is added to every coordinate, so that the covariance has a root [m]."""
@@ -85,14 +86,39 @@ class GaussianResidual:
         Raises:
             UserError: `horizon_steps` is larger than the fitted one.
         """
+        self._check(horizon_steps)
+        single = self.forecaster.rollout(belief, horizon_steps, 1).states
+        return self._around(single, belief, num_samples, generator)
+
+    def rollout_plans(
+        self,
+        belief: Belief,
+        plans: Float[Tensor, "batch plans horizon state"],
+        num_samples: int = 1,
+        generator: Noise | None = None,
+    ) -> Futures:
+        """Returns, for each plan of agent 0, the single forecast as sample 0, and draws around it; all share the noise.
+
+        Raises:
+            UserError: the plans have more steps than the fitted ones, or do not fit the scenes.
+        """
+        self._check(plans.shape[2])
+        single = rollout_plans(self.forecaster, belief, plans).states
+        return self._around(single, belief, num_samples, generator)
+
+    def _check(self, horizon_steps: int) -> None:
         if horizon_steps > self.horizon_steps:
             raise UserError(f"the noise was fitted to {self.horizon_steps} steps, got horizon_steps={horizon_steps}")
-        single = self.forecaster.rollout(belief, horizon_steps, 1).states
-        axes = self.spec.position_dim
-        future = single.repeat(1, num_samples, 1, 1, 1)
+
+    def _around(self, single: Tensor, belief: Belief, num_samples: int, generator: Noise | None) -> Futures:
+        """Draws around single forecasts, [batch *plans 1 agents horizon state]."""
+        axes, horizon_steps = self.spec.position_dim, single.shape[-2]
+        future = single.repeat_interleave(num_samples, dim=-4)
         drawn = normal_of_agents(generator, belief.valid, num_samples - 1, len(self._root)).to(future)
         noise = (drawn @ self._root.to(future).T).unflatten(-1, (self.horizon_steps, axes))[..., :horizon_steps, :]
-        future[:, 1:, ..., :axes] += noise
+        if future.ndim == 6:  # with plans
+            noise = noise[:, None]
+        future[..., 1:, :, :, :axes] += noise
         change = noise.diff(dim=-2, prepend=torch.zeros_like(noise[..., :1, :]))
-        future[:, 1:, ..., axes : 2 * axes] += change / self.spec.dt_s
+        future[..., 1:, :, :, axes : 2 * axes] += change / self.spec.dt_s
         return Futures(future)

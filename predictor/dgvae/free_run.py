@@ -11,6 +11,7 @@ from predictor.dgvae.networks import edge_probabilities
 from predictor.dgvae.packing import Packed, Padded
 from predictor.dgvae.reading import Reading
 from predictor.dgvae.single_step import Layers, Past
+from predictor.what_if import with_ego
 
 
 def free_run(
@@ -46,18 +47,21 @@ def proceed(
     edges: tuple[Tensor, Tensor],
     horizon_steps: int,
     sampler: Callable[[Tensor], Tensor] | None,
+    plan: Float[Tensor, "batch horizon state"] | None = None,
 ) -> Float[Tensor, "batch agents horizon state"]:
     """Rolls out from predicted states; without a sampler along edge probabilities.
 
-    The observed pairs stay; `edges` are weights and features, kept if frozen.
+    The observed pairs stay; `edges` are weights and features, kept if frozen. With a plan, agent 0 follows it.
     """
+    states = states if plan is None else with_ego(states, plan[:, 0])
     future, (weights, features) = [states], edges
     context = Context(graph, weights, layers.feature_share(features))
-    for _ in range(horizon_steps - 1):
+    for step in range(1, horizon_steps):
         if reading.config.rollout_graph == "evolving":
             past, logits, features = reading.step(layers, states, valid, graph, past)
             weights = edge_probabilities(logits) if sampler is None else graph.per_pair(sampler, logits)
             context = Context(graph, weights, layers.feature_share(features))
         node, states = motion.step(layers, states, valid, context, node)
+        states = states if plan is None else with_ego(states, plan[:, step])
         future.append(states)
     return torch.stack(future, dim=2)[:, :, :horizon_steps]

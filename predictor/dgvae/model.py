@@ -29,6 +29,7 @@ from predictor.dgvae.geometry import Geometry
 from predictor.dgvae.motion import Context, Motion
 from predictor.dgvae.networks import Decoder, Encoder, concrete_sample, edge_probabilities
 from predictor.dgvae.packing import Packed, Padded
+from predictor.dgvae.planned_run import PlannedRun
 from predictor.dgvae.reading import Reading
 from predictor.dgvae.self_edges import SelfEdges
 from predictor.dgvae.single_step import Internal, Layers, Modules, Past, Stepper, differentiable, unpacked
@@ -36,7 +37,7 @@ from predictor.dgvae.training_pass import TrainingPass
 from predictor.forecaster import Belief, Futures, Memory, WindowOutput
 from predictor.graph import NO_AGENT, nearest, pair_mask
 from predictor.layers.state_codec import StateCodec, check_scales
-from predictor.noise import Noise, PairNoise, noise_of_pairs, uniform_of_agents
+from predictor.noise import Noise, NoiseOfPairs, noise_of_pairs, uniform_of_agents
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
@@ -218,17 +219,7 @@ class DGVAE(nn.Module):
             states = torch.cat([known.next_states[:, :, None], states], dim=2)
             growth = torch.cat([first[:, :, None], growth], dim=2)
             return Futures(states[:, None], torch.ones_like(states[:, None, :, 0, 0]), motion.spread(growth)[:, None])
-        logits = graph.unpack_nodes(self.self_edges.prior_head(known.own))
-        probs = torch.softmax(logits.masked_fill(~valid[..., None], 0.0), dim=-1)
-        types = torch.arange(num_samples, device=valid.device)[None, :, None].expand(len(valid), -1, valid.shape[1])
-        mode_probs: Tensor | None
-        if num_samples <= self.config.num_modes:
-            mode_probs = (probs[..., :num_samples] / probs[..., :num_samples].sum(-1, keepdim=True)).transpose(1, 2)
-        else:
-            uniform = uniform_of_agents(generator, valid, num_samples).to(probs)
-            types = (uniform[..., None] >= probs.cumsum(-1)[:, None, :, :-1]).sum(-1)
-            types[:, 0] = 0
-            mode_probs = None
+        types, mode_probs = self._types(known, valid, num_samples, generator)
         shared = (belief.states, valid, known.probs, share, known.own, known.node_before)
         first, there, weights, share, own, node = (t[:, None] for t in shared)
         held = self.self_edges.hold(own, graph.pack_nodes(types[..., None])[..., 0])
@@ -236,6 +227,44 @@ class DGVAE(nn.Module):
         run = motion.held_run(layers, first, there, context, node, horizon_steps)
         states, growth = (t.expand(-1, num_samples, *t.shape[2:]) for t in run)  # a horizon of 0 has no modes yet
         return Futures(states, mode_probs, motion.spread(growth))
+
+    def _types(
+        self, known: Internal, valid: Tensor, num_samples: int, generator: Noise | None
+    ) -> tuple[Int[Tensor, "batch samples agents"], Float[Tensor, "batch samples agents"] | None]:
+        """Returns the type of each agent in each sample, and their probabilities unless they are drawn."""
+        assert self.self_edges is not None and known.own is not None
+        logits = known.graph.unpack_nodes(self.self_edges.prior_head(known.own))
+        probs = torch.softmax(logits.masked_fill(~valid[..., None], 0.0), dim=-1)
+        types = torch.arange(num_samples, device=valid.device)[None, :, None].expand(len(valid), -1, valid.shape[1])
+        if num_samples <= self.config.num_modes:
+            first = probs[..., :num_samples]
+            return types, (first / first.sum(-1, keepdim=True)).transpose(1, 2)
+        uniform = uniform_of_agents(generator, valid, num_samples).to(probs)
+        types = (uniform[..., None] >= probs.cumsum(-1)[:, None, :, :-1]).sum(-1)
+        types[:, 0] = 0
+        return types, None
+
+    def rollout_plans(
+        self,
+        belief: Belief,
+        plans: Float[Tensor, "batch plans horizon state"],
+        num_samples: int = 1,
+        generator: Noise | None = None,
+    ) -> Futures:
+        """Rolls out from a belief while agent 0 follows each plan; samples as those of `rollout`."""
+        known: Internal = belief.internal
+        if differentiable():
+            known = unpacked(known, self._plain())
+        run = PlannedRun(self._reading, self._motion, known, belief.states, belief.valid, plans)
+        if self.self_edges is not None:
+            types, probs = self._types(known, belief.valid, num_samples, generator)
+            return run.held(types, probs)
+        noise = None
+        if num_samples > 1:
+            steps = plans.shape[2] if self.config.rollout_graph == "evolving" else 1
+            draws = num_samples - 1
+            noise = noise_of_pairs(generator, known.graph.pairs_there, draws, steps, self.num_edge_types)
+        return run.free(num_samples, noise, self._sampler)
 
     # --- Training -----------------------------------------------------------------------------------------------
 
@@ -280,7 +309,7 @@ class DGVAE(nn.Module):
         seen = zeros(batch, agents, self.codec.num_inputs + 1 if self.sees_changes else 0)
         return (zeros(batch, agents, config.decoder_dim), seen), (pair, pair.clone(), static)
 
-    def _sampler(self, noise: torch.Generator | PairNoise | None) -> Callable[[Tensor], Tensor]:
+    def _sampler(self, noise: NoiseOfPairs | None) -> Callable[[Tensor], Tensor]:
         return lambda logits: concrete_sample(logits, self.config.temperature, noise, self.config.hard_samples)
 
     def _plain(self) -> Modules:

@@ -12,6 +12,7 @@ from predictor.dgvae.packing import Packed, Padded
 from predictor.dgvae.self_edges import HeldType, SelfEdges
 from predictor.dgvae.single_step import Layers
 from predictor.layers.state_codec import StateCodec
+from predictor.what_if import with_ego
 
 
 class Context(NamedTuple):
@@ -88,12 +89,17 @@ class Motion:
         context: Context,
         node: Tensor,
         horizon_steps: int,
+        plan: Float[Tensor, "batch modes horizon state"] | None = None,
     ) -> tuple[Float[Tensor, "batch *modes agents horizon state"], Float[Tensor, "batch *modes agents horizon axes"]]:
-        """Rolls out along held types while the context stays as it is; returns states and growth of their spread."""
+        """Rolls out along held types while the context stays as it is; returns states and growth of their spread.
+
+        With plans, one for each mode, agent 0 follows them.
+        """
         assert self.self_edges is not None
         future, growth = [], []
-        for _ in range(horizon_steps):
+        for step in range(horizon_steps):
             node, states = self.step(layers, states, valid, context, node)
+            states = states if plan is None else with_ego(states, plan[..., step, :])
             future.append(states)
             growth.append(context.graph.unpack_nodes(self.self_edges.growth(node)))
         if not future:

@@ -19,7 +19,7 @@ from predictor.dgvae.innovation import Innovation
 from predictor.graph import self_pairs
 from predictor.layers.pairs import PairLinear, ends, folded, sum_over_senders
 from predictor.layers.rnn import Correction, masked_lstm
-from predictor.noise import PairNoise
+from predictor.noise import NoiseOfPairs, uniform_like
 
 NO_EDGE_LOGIT = -1e4
 """Logit of every type but "no edge" where there is no edge."""
@@ -39,7 +39,7 @@ class Edges(NamedTuple):
 def concrete_sample(
     logits: Float[Tensor, "*batch types"],
     temperature: float,
-    generator: torch.Generator | PairNoise | None = None,
+    generator: NoiseOfPairs | None = None,
     hard: bool = False,
 ) -> Float[Tensor, "*batch types"]:
     """Draws a reparameterised sample of the concrete distribution (paper Sec. IV, Sampling).
@@ -52,10 +52,7 @@ def concrete_sample(
     """
     if logits.dtype in (torch.bfloat16, torch.float16):
         logits = logits.float()  # rare types are drawn by the tails of the noise
-    if isinstance(generator, PairNoise):
-        uniform = generator.like(logits)
-    else:
-        uniform = torch.rand(logits.shape, generator=generator, device=logits.device, dtype=logits.dtype)
+    uniform = uniform_like(logits, generator)
     tiny = torch.finfo(logits.dtype).tiny
     gumbel = -torch.log(-torch.log(uniform.clamp(tiny, 1 - torch.finfo(logits.dtype).eps)))
     soft = edge_probabilities((logits + gumbel) / temperature)

@@ -8,6 +8,7 @@ from agents.arena import MultiagentArena
 from agents.evaluate import (
     NUM_POLICIES,
     Evaluation,
+    check_drivers,
     evaluate_policy_on_seeds,
     mean_and_standard_error,
     summarize,
@@ -140,3 +141,23 @@ def test_all_policies_play_the_same_held_out_seeds():
     for name, found in evaluation.results.items():
         expected = MultiagentArena(task).play(model if name == "ppo" else name, seeds)
         assert [(e.seed, e.episode_return) for e in found] == [(e.seed, e.episode_return) for e in expected]
+
+
+def test_the_planner_is_a_policy_and_a_line_of_the_table():
+    """A driver in the place of a trained policy, and another one beside the baselines; each name once."""
+    task = Task("highway-fast-v0", "none")
+    evaluation = evaluate_policy_on_seeds(
+        task, "planner:constant-velocity", "planner", num_episodes=1, first_seed=7, drivers=("idle",)
+    )
+    assert list(evaluation.results) == ["planner", "idle", "random"]
+    planned, idle = (evaluation.results[name][0] for name in ("planner", "idle"))
+    assert (planned.seed, planned.length) == (7, 30) and planned.crashed is False
+    assert planned.episode_return > idle.episode_return
+
+
+def test_drivers_that_cannot_drive_are_refused_before_anything_runs():
+    with pytest.raises(UserError, match="drivers of an ego need an environment with one ego, simple_tag_v3 has"):
+        check_drivers(Task("simple_tag_v3", "none"), ("planner",))
+    with pytest.raises(UserError, match="no scene reader knows|no plan model knows"):
+        check_drivers(Task("CartPole-v1", "none"), ("planner",))
+    check_drivers(Task("simple_tag_v3", "none"), ())

@@ -10,7 +10,7 @@ from agents.features import TOKEN_KEYS, VALID_KEY, AttentionConfig, ForecastAtte
 from agents.task import Task
 from agents.training import TrainingPlan, make_model
 from agents.vec_envs import make_venv
-from envs.observation import FORECAST_KEYS, UNCERTAINTY_KEYS
+from envs.observation import FORECAST_KEYS, UNCERTAINTY_KEYS, WHAT_IF_KEYS
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
@@ -27,6 +27,9 @@ UNCERTAIN = SHAPES | {
     "forecast": (AGENTS, 3, HORIZON, 2),
     "mode_probs": (AGENTS, 3),
     "xy_scale": (AGENTS, 3, HORIZON, 2),
+    "what_if_gap": (AGENTS, 2),
+    "what_if_contact": (AGENTS, 2),
+    "what_if_risk": (AGENTS, 2),
 }
 
 
@@ -76,8 +79,14 @@ def by_loop(extractor: ForecastAttention, observations: dict[str, torch.Tensor])
                 parts.append(torch.cat([torch.tanh(places / config.near_m), places / config.far_m], -1).flatten())
             if "xy_scale" in observations:
                 parts.append(torch.tanh(observations["xy_scale"][b, a] / config.near_m).flatten())
+            if "what_if_gap" in observations:
+                gap = observations["what_if_gap"][b, a]
+                parts += [torch.tanh(gap / config.near_m), gap / config.far_m]
+            if "xy_scale" in observations:
                 parts.append(observations["mode_probs"][b, a].flatten())
             parts += [observations["edge_probs"][b, a], observations["edge_features"][b, a]]
+            if "what_if_gap" in observations:
+                parts += [observations["what_if_contact"][b, a], observations["what_if_risk"][b, a]]
             hidden = extractor.token_in(torch.cat(parts)) + extractor.token_ego(ego)
             tokens.append(extractor.token_out(hidden))
         tokens = torch.stack(tokens)
@@ -153,7 +162,7 @@ def test_empty_scene_is_finite_with_finite_gradients():
 
 def test_every_entry_of_the_wrappers_is_read():
     """One that is added to the wrappers alone would change no policy, without a word."""
-    assert {*TOKEN_KEYS, VALID_KEY} == {*FORECAST_KEYS, *UNCERTAINTY_KEYS}
+    assert {*TOKEN_KEYS, VALID_KEY} == {*FORECAST_KEYS, *UNCERTAINTY_KEYS, *WHAT_IF_KEYS}
 
 
 def test_a_new_token_key_is_read(monkeypatch: pytest.MonkeyPatch):

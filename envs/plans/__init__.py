@@ -1,0 +1,48 @@
+"""Candidate plans of an ego: what it could do next, as states for what-if forecasts, with what each would earn.
+
+A plan model proposes them. highway-env has one; for another environment pass `what_if=` a `PlanModel`, or register one
+for its class (docs/what_if.md has an example of 20 lines).
+"""
+
+from collections.abc import Callable
+
+import gymnasium as gym
+
+from envs.plans.base import PlanModel, Plans, checked_plans
+from envs.plans.highway import HighwayPlans
+from envs.readers.highway import is_highway_env
+from predictor.support.errors import UserError
+
+__all__ = ["HighwayPlans", "PlanModel", "Plans", "checked_plans", "plan_model_for", "register_plan_model"]
+
+MakePlanModel = Callable[[gym.Env], PlanModel]
+"""Takes an environment (not reset yet, wrapped or not) and returns its plan model."""
+
+_REGISTERED: dict[type, MakePlanModel] = {}
+
+
+def register_plan_model(env_class: type, make_plan_model: MakePlanModel) -> None:
+    """Registers a plan model for an environment class and what derives from it, for wrappers and the planner.
+
+    Args:
+        env_class: class of the unwrapped environment.
+        make_plan_model: takes an environment (not reset yet, wrapped or not) and returns its plan model.
+    """
+    _REGISTERED[env_class] = make_plan_model
+
+
+def plan_model_for(env: gym.Env) -> PlanModel:
+    """Returns the plan model of an environment: the one registered for its class, or highway-env's.
+
+    Raises:
+        UserError: there is none for the environment or its actions.
+    """
+    for kind in type(env.unwrapped).__mro__:
+        if kind in _REGISTERED:
+            return _REGISTERED[kind](env)
+    if is_highway_env(env):
+        return HighwayPlans(env)
+    raise UserError(
+        f"no plan model knows {type(env.unwrapped).__name__}: pass what_if= an object with names and plans(env, "
+        "horizon_steps), or call register_plan_model for its class; see docs/what_if.md"
+    )

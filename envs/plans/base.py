@@ -1,0 +1,73 @@
+"""Interface of plan models, and what they return."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import gymnasium as gym
+import numpy as np
+from jaxtyping import Bool, Float
+
+from predictor.support.errors import UserError
+
+
+@dataclass(frozen=True)
+class Plans:
+    """Candidate plans of an ego, as if it were alone; rewards are needed by the planner only."""
+
+    states: Float[np.ndarray, "plans horizon state"]
+    """State of the ego at each of the next policy steps, in the world frame and the units of its scenes."""
+    actions: tuple[Any, ...]
+    """Action with which each plan begins."""
+    rewards: Float[np.ndarray, "plans horizon"] | None = None
+    """Reward of each step without a collision."""
+    crash_rewards: Float[np.ndarray, "plans horizon"] | None = None
+    """Reward of each step if the ego collides in it; the episode then ends. None takes 0."""
+    crashed: Bool[np.ndarray, "plans horizon"] | None = None
+    """Whether the ego has collided with a fixed obstacle by each step; None takes False."""
+    size_m: tuple[float, float] = (5.0, 2.0)
+    """Length and width of every agent [m], with which collisions are found; default: highway-env's vehicles."""
+
+
+@runtime_checkable
+class PlanModel(Protocol):
+    """Proposes plans for the ego of a running environment, always as many; the mildest first, since it wins ties."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of each plan."""
+
+    def plans(self, env: gym.Env, horizon_steps: int) -> Plans:
+        """Returns the plans from the environment's present state, which it must not change."""
+
+
+def checked_plans(model: PlanModel, env: gym.Env, horizon_steps: int, num_features: int) -> Plans:
+    """Returns the plans of a model, after checking them.
+
+    Args:
+        model: plan model.
+        env: environment that was reset.
+        horizon_steps: number of steps of a plan.
+        num_features: number of features of a state.
+
+    Raises:
+        UserError: plans of another shape, not finite numbers, or not one action for each plan.
+    """
+    plans, count = model.plans(env, horizon_steps), len(model.names)
+    source = f"plan model {type(model).__name__}"
+    wanted = {
+        "states": (count, horizon_steps, num_features),
+        "rewards": (count, horizon_steps),
+        "crash_rewards": (count, horizon_steps),
+        "crashed": (count, horizon_steps),
+    }
+    for name, shape in wanted.items():
+        values = getattr(plans, name)
+        if values is None and name != "states":
+            continue
+        if np.shape(values) != shape:
+            raise UserError(f"{source}: {name} need the shape {shape}, got {np.shape(values)}")
+        if not np.isfinite(values).all():
+            raise UserError(f"{source}: {name} must be finite, got NaN or infinity")
+    if count < 1 or len(plans.actions) != count:
+        raise UserError(f"{source}: each of its {count} plans needs one action, got {len(plans.actions)}")
+    return plans

@@ -1,0 +1,114 @@
+"""Contacts between an ego that follows plans and the forecast of other agents: gaps, times and probabilities.
+
+Every agent is a rectangle along its direction of motion, all of one size. Between two steps agents move straight,
+and are compared at several instants. The gap of two rectangles is the largest separation along an axis of one of them:
+at most their distance, and negative exactly where they overlap.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from predictor.scene import Forecast, SceneBatch
+
+INSTANTS = 5
+"""Number of instants at which agents are compared in each step."""
+LEAST_MOVE_M = 0.1
+"""Shortest move between two steps that has a direction [m]; shorter ones keep the heading."""
+FAR_M = 1000.0
+"""Largest gap [m], so that a far agent does not become infinite."""
+
+
+class Contacts(NamedTuple):
+    """Contacts of the ego with every other agent, for each plan and sample."""
+
+    gap_m: Float[np.ndarray, "batch plans samples others"]
+    """Smallest gap over the horizon [m]; `FAR_M` for absent agents."""
+    share: Float[np.ndarray, "batch plans samples others"]
+    """Time of the first contact as a share of the horizon; 1 without a contact."""
+    by_step: Bool[np.ndarray, "batch plans samples others horizon"]
+    """Whether there was a contact by each step."""
+    probs: Float[np.ndarray, "batch samples others"]
+    """Probability of each sample for each agent."""
+    enumerated: bool
+    """Whether samples are modes of each agent; else each is a draw of the whole scene."""
+
+    def risk(self) -> Float[np.ndarray, "batch plans others"]:
+        """Returns the probability of a contact with each agent within the horizon."""
+        return np.einsum("bka,bpka->bpa", self.probs, self.by_step[..., -1].astype(np.float64))
+
+    def survival(self) -> Float[np.ndarray, "batch plans horizon"]:
+        """Returns the probability of no contact by each step.
+
+        Draws are counted as whole scenes. Modes of different agents are combined as independent.
+        """
+        if not self.enumerated:
+            return 1.0 - self.by_step.any(axis=3).mean(axis=2)
+        by_agent = np.einsum("bka,bpkah->bpah", self.probs, self.by_step.astype(np.float64))
+        survival: Float[np.ndarray, "batch plans horizon"] = (1.0 - by_agent).clip(0.0, 1.0).prod(axis=2)
+        return survival
+
+
+def contacts(forecast: Forecast, scenes: SceneBatch, size_m: tuple[float, float] = (5.0, 2.0)) -> Contacts:
+    """Computes the contacts of the ego with the other agents of each scene.
+
+    Args:
+        forecast: forecast with an axis of plans, agents as in `scenes`.
+        scenes: observed scenes, which give where and how agents move now.
+        size_m: length and width of every agent [m].
+    """
+    xy = forecast.xy.cpu().numpy().astype(np.float64)
+    batch, plans, samples, agents, horizon = xy.shape[:5]
+    now_m = (scenes.states[..., :2] - scenes.states[:, :1, :2])[:, None, None, :, None]
+    path = np.concatenate([np.broadcast_to(now_m, (*xy.shape[:4], 1, 2)), xy], axis=-2)
+    heading_rad = np.arctan2(scenes.states[..., 3], scenes.states[..., 2])
+    slow = np.hypot(scenes.states[..., 2], scenes.states[..., 3]) < LEAST_MOVE_M
+    heading_rad[:, 0] = np.where(slow[:, 0], scenes.heading_rad, heading_rad[:, 0])
+    headings = _headings(path, np.broadcast_to(heading_rad[:, None, None], xy.shape[:4]))
+    gap = _gaps(path[:, :, :, :1], path[:, :, :, 1:], headings[:, :, :, :1], headings[:, :, :, 1:], size_m)
+    gap = np.where(scenes.valid[:, None, None, 1:, None, None], gap, FAR_M).clip(max=FAR_M)
+    touched = (gap <= 0).reshape(batch, plans, samples, agents - 1, -1)
+    ever = touched.any(-1)
+    share = np.where(ever, (1 + touched.argmax(-1)) / (horizon * INSTANTS), 1.0)
+    by_step = np.logical_or.accumulate((gap <= 0).any(-1), axis=-1)
+    # the probabilities of agents do not depend on the plan
+    probs = forecast.sample_probs().cpu().numpy()[:, 0, :, 1:].astype(np.float64)
+    return Contacts(gap.min((-2, -1)), share, by_step, probs, forecast.mode_probs is not None)
+
+
+def _headings(
+    path: Float[np.ndarray, "*batch points 2"], now_rad: Float[np.ndarray, "*batch"]
+) -> Float[np.ndarray, "*batch steps"]:
+    """Returns the direction of each move along a path [rad]; the one before where an agent hardly moves."""
+    moves = np.diff(path, axis=-2)
+    directions = np.arctan2(moves[..., 1], moves[..., 0])
+    moving = np.hypot(moves[..., 0], moves[..., 1]) >= LEAST_MOVE_M
+    found, before = [], now_rad
+    for step in range(moves.shape[-2]):
+        before = np.where(moving[..., step], directions[..., step], before)
+        found.append(before)
+    return np.stack(found, axis=-1)
+
+
+def _gaps(
+    ego: Float[np.ndarray, "*#batch points 2"],
+    others: Float[np.ndarray, "*batch points 2"],
+    ego_rad: Float[np.ndarray, "*#batch steps"],
+    others_rad: Float[np.ndarray, "*batch steps"],
+    size_m: tuple[float, float],
+) -> Float[np.ndarray, "*batch steps instants"]:
+    """Computes the gap of two rectangles at the instants of each step [m]."""
+    between, (length_m, width_m) = others - ego, size_m
+    when = np.arange(1, INSTANTS + 1)[:, None] / INSTANTS
+    offset = between[..., :-1, None, :] + when * np.diff(between, axis=-2)[..., None, :]
+    cos, sin = np.abs(np.cos(others_rad - ego_rad)), np.abs(np.sin(others_rad - ego_rad))
+    reach_along = (length_m + length_m * cos + width_m * sin) / 2
+    reach_across = (width_m + length_m * sin + width_m * cos) / 2
+    gap = np.full(offset.shape[:-1], -np.inf)
+    for heading in (ego_rad, others_rad):
+        along, across = np.cos(heading)[..., None], np.sin(heading)[..., None]
+        x, y = offset[..., 0], offset[..., 1]
+        gap = np.maximum(gap, np.abs(x * along + y * across) - reach_along[..., None])
+        gap = np.maximum(gap, np.abs(y * along - x * across) - reach_across[..., None])
+    return gap

@@ -1,0 +1,150 @@
+"""The planner takes the best plan within its risk, ties and "all too risky" by rule, and drives highway-env."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from envs.drivers.ego import make_ego_driver
+from envs.drivers.planner import Planner, PlannerConfig, choose, expected_rewards, is_planner
+from envs.plans import Plans
+from envs.registry import make_env
+from envs.wrappers import ForecastObservation, SceneObservation
+from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
+
+ROAD = SceneSpec(dt_s=1.0, frame=("ego", "world"))
+
+
+def plans_worth(*rewards: float, crash: float = -1.0) -> Plans:
+    """Plans of two steps with these rewards in each."""
+    table = np.repeat(np.array(rewards)[:, None], 2, axis=1)
+    states = np.zeros((len(rewards), 2, 4))
+    return Plans(states, tuple(range(len(rewards))), table, np.full_like(table, crash))
+
+
+def surviving(*risks: float) -> np.ndarray:
+    """No collision in the first step, one in the second with these probabilities."""
+    return np.stack([np.ones(len(risks)), 1 - np.array(risks)], axis=1)
+
+
+def test_the_value_counts_rewards_until_a_collision_and_its_reward_then():
+    values = expected_rewards(plans_worth(1.0, 1.0), np.array([[1.0, 0.75], [0.5, 0.5]]))
+    np.testing.assert_allclose(values, [1.0 + 0.75 - 0.25, 0.5 - 0.5 + 0.5])
+
+
+@pytest.mark.parametrize(
+    ("rewards", "risks", "max_risk", "chosen"),
+    [
+        ((0.5, 0.9, 0.7), (0.0, 0.0, 0.0), 0.05, 1),  # the best of the safe
+        ((0.5, 9.0, 0.7), (0.0, 0.06, 0.0), 0.05, 2),  # better, but too risky
+        ((0.5, 9.0, 0.7), (0.0, 0.05, 0.0), 0.05, 1),  # as risky as it may be
+        ((0.7, 0.7, 0.7), (0.0, 0.0, 0.0), 0.05, 0),  # equal: the first of the model
+        ((9.0, 0.1, 0.2), (0.9, 0.3, 0.4), 0.05, 1),  # all too risky: the least risk
+        ((0.1, 0.3, 0.3), (0.3, 0.3, 0.3), 0.05, 1),  # of equal risks the highest value, then the first
+        ((0.2, 0.3), (1.0, 1.0), 1.0, 1),  # any risk may be taken
+    ],
+)
+def test_the_rules(rewards: tuple[float, ...], risks: tuple[float, ...], max_risk: float, chosen: int):
+    assert choose(plans_worth(*rewards), surviving(*risks), max_risk) == chosen
+
+
+def test_of_equal_values_the_least_risk_is_taken():
+    plans = plans_worth(1.0, 1.0, crash=1.0)  # a collision costs nothing
+    assert choose(plans, surviving(0.04, 0.0), 0.05) == 1
+
+
+def traffic(gap_m: float, speed_mps: float) -> gym.Env:
+    """highway-fast-v0 with one slow vehicle ahead of the ego, whose lane has no others beside it."""
+    from highway_env.vehicle.kinematics import Vehicle
+
+    env = make_env("highway-fast-v0")
+    env.reset(seed=0)
+    base: Any = env.unwrapped
+    ahead = Vehicle(base.road, base.vehicle.position + [gap_m, 0.0], 0.0, speed_mps)
+    base.road.vehicles = [base.vehicle, ahead]
+    return env
+
+
+def drive(planner: Planner, env: gym.Env, steps: int) -> bool:
+    for _ in range(steps):
+        *_, terminated, truncated, info = env.step(planner())
+        if terminated or truncated:
+            break
+    return bool(info["crashed"])
+
+
+def test_a_slow_vehicle_ahead_is_avoided_where_idle_collides():
+    env = traffic(45.0, 10.0)
+    planner = Planner(env, ConstantVelocity(ROAD))
+    action = planner()
+    names = planner.plan_model.names
+    assert 1 - planner.survival[names.index("IDLE"), -1] == 1.0  # 25 m/s against 10 m/s over 40 m in 5 s
+    assert (
+        names[planner.chosen] in ("SLOWER", "LANE_LEFT", "LANE_RIGHT")
+        and action == planner.plans.actions[planner.chosen]
+    )  # type: ignore[union-attr]
+    assert not drive(Planner(env, ConstantVelocity(ROAD)), env, 6)
+    idle = traffic(45.0, 10.0)
+    assert any(idle.step(1)[4]["crashed"] for _ in range(6))
+
+
+def test_an_empty_road_is_driven_fast():
+    env = traffic(400.0, 40.0)
+    planner = Planner(env, ConstantVelocity(ROAD))
+    for _ in range(5):
+        env.step(planner())
+    assert env.unwrapped.vehicle.speed > 28  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(planner.survival, 1.0)
+
+
+@pytest.mark.parametrize("wrap", [None, SceneObservation, ForecastObservation])
+def test_the_driver_is_the_same_over_any_wrapper(wrap: Any):
+    """It keeps its own history, so that it may drive a plain environment."""
+    env = make_env("highway-fast-v0")
+    plain = make_env("highway-fast-v0")
+    wrapped = env if wrap is None else wrap(env)
+    wrapped.reset(seed=3)
+    plain.reset(seed=3)
+    name = "planner" if wrap is ForecastObservation else "planner:highway"
+    ego, expected = (
+        make_ego_driver(n, e, np.random.default_rng(0)) for n, e in ((name, wrapped), ("planner:highway", plain))
+    )
+    for _ in range(3):
+        action = ego(None)
+        assert action == expected(None) and action in env.action_space
+        wrapped.step(action)
+        plain.step(action)
+
+
+def test_names_of_the_planner():
+    assert is_planner("planner") and is_planner("planner:highway") and not is_planner("planners")
+
+
+class Blank(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (1,))
+    action_space = gym.spaces.Discrete(2)
+
+
+class WithoutRewards:
+    names = ("only",)
+
+    def plans(self, env: gym.Env, horizon_steps: int) -> Plans:
+        return Plans(np.zeros((1, horizon_steps, 4)), (1,))
+
+
+def test_environments_and_models_that_do_not_fit_are_refused():
+    with pytest.raises(UserError, match="no plan model knows Blank"):
+        make_ego_driver("planner", Blank(), np.random.default_rng(0))
+    env = make_env("highway-fast-v0")
+    with pytest.raises(UserError, match="no checkpoint 'absent'"):
+        make_ego_driver("planner:absent", env, np.random.default_rng(0))
+    with pytest.raises(UserError, match="the planner's forecaster was trained at dt_s=0.2"):
+        Planner(env, ConstantVelocity(SceneSpec(dt_s=0.2, frame=("ego", "world"))))
+    env.reset(seed=0)
+    with pytest.raises(UserError, match="the planner needs rewards, but plan model WithoutRewards gives none"):
+        Planner(env, ConstantVelocity(ROAD), WithoutRewards())()
+    with pytest.raises(UserError, match="max_risk must be from 0 to 1, got 1.5"):
+        PlannerConfig(max_risk=1.5)

@@ -1,0 +1,182 @@
+"""Plans of highway-env are what the ego does when it is alone, and making them changes nothing."""
+
+from copy import deepcopy
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from envs.plans import HighwayPlans, Plans, checked_plans, plan_model_for, register_plan_model
+from envs.plans import base as plans_base
+from envs.readers.highway import HighwayReader
+from envs.registry import make_env
+from predictor.support.errors import UserError
+
+HORIZON = 4
+
+
+def alone(env_id: str, seed: int = 1, **config: Any) -> gym.Env:
+    """An environment whose other vehicles are gone."""
+    env = make_env(env_id, **({"config": config} if config else {}))
+    env.reset(seed=seed)
+    base: Any = env.unwrapped
+    base.road.vehicles = [base.vehicle]
+    return env
+
+
+def driven(env: gym.Env, actions: list[Any]) -> tuple[np.ndarray, list[float]]:
+    """True states of the ego and rewards after each of these actions."""
+    reader, states, rewards = HighwayReader(env), [], []
+    for action in actions:
+        rewards.append(float(env.step(action)[1]))
+        states.append(reader.read_all(env).states[0])
+    return np.array(states), rewards
+
+
+@pytest.mark.parametrize("env_id", ["highway-fast-v0", "merge-v1", "roundabout-v1", "intersection-v2"])
+def test_a_plan_is_what_the_ego_then_does_and_earns_alone(env_id: str):
+    env = alone(env_id)
+    if env_id == "intersection-v2":
+        env.unwrapped.config["initial_vehicle_count"] = 0  # type: ignore[attr-defined]
+        env.unwrapped.config["spawn_probability"] = 0  # type: ignore[attr-defined]
+    model = plan_model_for(env)
+    plans = checked_plans(model, env, HORIZON, 4)
+    assert isinstance(model, HighwayPlans) and set(model.names) >= {"IDLE", "SLOWER", "FASTER"}
+    idle = plans.actions[model.names.index("IDLE")]
+    assert plans.rewards is not None
+    for plan, action in enumerate(plans.actions):
+        states, rewards = driven(deepcopy(env), [action] + [idle] * (HORIZON - 1))
+        np.testing.assert_allclose(plans.states[plan], states, atol=1e-6, err_msg=model.names[plan])
+        np.testing.assert_allclose(plans.rewards[plan], rewards, atol=1e-9, err_msg=model.names[plan])
+
+
+def test_continuous_plans_are_repeated_by_their_first_action():
+    env = alone("racetrack-v1")
+    model = plan_model_for(env)
+    assert model.names == ("keep", "keep left", "keep right")
+    plans = model.plans(env, HORIZON)
+    for plan, action in enumerate(plans.actions):
+        assert action in env.action_space
+        states, _ = driven(deepcopy(env), [action])
+        np.testing.assert_allclose(plans.states[plan, 0], states[0], atol=1e-5)
+    lateral_m = [env.unwrapped.vehicle.lane.local_coordinates(state[:2])[1] for state in plans.states[:, -1]]  # type: ignore[attr-defined]
+    assert abs(lateral_m[0]) < 1.5
+
+
+def test_throttles_stay_between_standing_and_the_largest_speed():
+    env = alone("highway-fast-v0", action={"type": "ContinuousAction"})
+    model = plan_model_for(env)
+    assert len(model.names) == 9 and model.names[:3] == ("keep", "brake", "accelerate")
+    speed_mps = np.hypot(*model.plans(env, 10).states[:3, :, 2:].transpose(2, 0, 1))
+    np.testing.assert_allclose(speed_mps[0], speed_mps[0, 0], atol=1e-6)
+    assert speed_mps[1, -1] < 1e-3 and speed_mps[2, -1] == pytest.approx(40.0, abs=0.5)
+    assert (np.diff(speed_mps[1]) <= 1e-6).all() and (np.diff(speed_mps[2]) >= -1e-6).all()
+
+
+@pytest.mark.parametrize("env_id", ["highway-fast-v0", "intersection-v2", "racetrack-v1"])
+def test_planning_changes_nothing_in_the_environment(env_id: str):
+    """With and without it, the same episode."""
+    episodes = []
+    for asks in (False, True):
+        env = make_env(env_id)
+        env.reset(seed=5)
+        model, found = plan_model_for(env), []
+        for _ in range(4):
+            if asks:
+                model.plans(env, HORIZON)
+            _, reward, *_ = env.step(env.action_space.sample() if asks is None else _constant(env))
+            found.append((HighwayReader(env).read_all(env).states, reward))
+        episodes.append(found)
+    for (states, reward), (other, again) in zip(*episodes, strict=True):
+        np.testing.assert_array_equal(states, other)
+        assert reward == again
+
+
+def _constant(env: gym.Env) -> Any:
+    return 1 if isinstance(env.action_space, gym.spaces.Discrete) else np.zeros(env.action_space.shape, np.float32)
+
+
+def test_the_other_vehicles_change_no_plan():
+    env = make_env("highway-fast-v0")
+    env.reset(seed=2)
+    before = plan_model_for(env).plans(env, HORIZON)
+    base: Any = env.unwrapped
+    base.road.vehicles = [base.vehicle]
+    after = plan_model_for(env).plans(env, HORIZON)
+    np.testing.assert_array_equal(before.states, after.states)
+
+
+def test_a_collision_is_worth_what_the_environment_says():
+    env = alone("highway-fast-v0")
+    plans = plan_model_for(env).plans(env, HORIZON)
+    assert plans.rewards is not None and plans.crash_rewards is not None and plans.crashed is not None
+    config = env.unwrapped.config  # type: ignore[attr-defined]
+    span = config["high_speed_reward"] + config["right_lane_reward"] - config["collision_reward"]
+    np.testing.assert_allclose(plans.rewards - plans.crash_rewards, -config["collision_reward"] / span)
+    assert not plans.crashed.any() and not env.unwrapped.vehicle.crashed  # type: ignore[attr-defined]
+
+
+def test_a_fixed_obstacle_is_a_collision_of_the_plan_alone():
+    env = alone("highway-fast-v0")
+    base: Any = env.unwrapped
+    from highway_env.vehicle.objects import Obstacle
+
+    obstacle = Obstacle(base.road, base.vehicle.position + [35.0, 0.0])
+    base.road.objects.append(obstacle)
+    plans = plan_model_for(env).plans(env, HORIZON)
+    assert plans.crashed is not None and plans.crashed[0].any() and plans.crashed[0, -1]
+    assert not obstacle.hit and not base.vehicle.crashed
+
+
+class Blank(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (1,))
+    action_space = gym.spaces.Discrete(2)
+
+
+class TwoPlans:
+    names = ("stay", "go")
+
+    def __init__(self, found: Any) -> None:
+        self.found = found
+
+    def plans(self, env: gym.Env, horizon_steps: int) -> Any:
+        return self.found
+
+
+def given(states: np.ndarray, actions: tuple[int, ...], rewards: np.ndarray | None = None) -> Any:
+    """What a careless model may return; `Plans` itself refuses such shapes while shapes are checked."""
+    return SimpleNamespace(states=states, actions=actions, rewards=rewards, crash_rewards=None, crashed=None)
+
+
+def test_a_registered_model_serves_its_class_and_others_are_refused(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("envs.plans._REGISTERED", {})
+    with pytest.raises(UserError, match="no plan model knows Blank: pass what_if= an object with names and plans"):
+        plan_model_for(Blank())
+    model = TwoPlans(Plans(np.zeros((2, 3, 4)), (0, 1)))
+    assert isinstance(model, plans_base.PlanModel)
+    register_plan_model(Blank, lambda env: model)
+    assert plan_model_for(Blank()) is model
+
+
+@pytest.mark.parametrize(
+    ("found", "message"),
+    [
+        (given(np.zeros((2, 2, 4)), (0, 1)), r"states need the shape \(2, 3, 4\), got \(2, 2, 4\)"),
+        (given(np.full((2, 3, 4), np.nan), (0, 1)), "states must be finite, got NaN or infinity"),
+        (given(np.zeros((2, 3, 4)), (0,)), "each of its 2 plans needs one action, got 1"),
+        (given(np.zeros((2, 3, 4)), (0, 1), np.zeros((2, 2))), r"rewards need the shape \(2, 3\), got \(2, 2\)"),
+    ],
+)
+def test_plans_that_do_not_fit_are_refused(found: Any, message: str):
+    with pytest.raises(UserError, match=f"plan model TwoPlans: {message}"):
+        checked_plans(TwoPlans(found), Blank(), 3, 4)
+
+
+def test_actions_without_plans_are_refused():
+    env = make_env("highway-fast-v0", config={"action": {"type": "DiscreteAction"}})
+    with pytest.raises(UserError, match="plans are known for DiscreteMetaAction and ContinuousAction .*DiscreteAction"):
+        plan_model_for(env)
+    with pytest.raises(UserError, match="HighwayPlans needs a highway-env environment, got Blank"):
+        HighwayPlans(Blank())
