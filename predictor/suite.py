@@ -193,7 +193,7 @@ def run_line(config: SuiteConfig, line: Line) -> dict[str, Any]:
     began = time.perf_counter()
     checkpoint = None
     if line.is_trained:
-        source = line_of(config.table, line.residual_of or line.key)
+        source = line_of(config.table, line.residual_of) if line.residual_of else line
         checkpoint = train(line_config(config, source, line_folder(config, source) / "run"))
     trained = time.perf_counter()
     result = {
