@@ -72,6 +72,7 @@ def _recipe_lines(common: dict[str, Any], ramp_steps: int) -> tuple[Line, ...]:
         changes = {"edge_cost": 5.0, "input_changes": True} | common | train
         return Line(key, name, "dgvae", ("edge_feature_dim=16", *sets), changes)
 
+    enhanced = line("priced", "+ price of edges (5 nats): dG-VAE+", _WHOLE)
     return (
         *CONTROLS,
         line("paper", "dG-VAE (paper): teacher-forced, Gaussian", (), **_PLAIN, **TEACHER_FORCED),
@@ -80,7 +81,8 @@ def _recipe_lines(common: dict[str, Any], ramp_steps: int) -> tuple[Line, ...]:
         line("infers", "+ innovation", _INFERS, edge_cost=0.0),
         line("moves", "+ velocity-consistent decoding, 2 substeps", _MOVES, edge_cost=0.0),
         line("gated", "+ gated messages", _WHOLE, edge_cost=0.0),
-        line("priced", "+ price of edges (5 nats): dG-VAE+", _WHOLE),
+        enhanced,
+        enhanced.with_gaussian(),
         line("hard", "… hard samples", (*_WHOLE, "hard_samples=true")),
         line("warm-up", f"… KL warm-up over {ramp_steps} steps", _WHOLE, kl_warmup_steps=ramp_steps),
         line("curriculum", f"… free run grows over {ramp_steps} steps", _WHOLE, curriculum_steps=ramp_steps),
