@@ -363,6 +363,7 @@ def test_windows_end_their_burn_in_at_every_stride():
             "table 'springs' has no line 'dgvea'; there are constant-velocity, constant-velocity-noise",
         ),
         ({"steps": -1}, "steps must not be negative, got -1"),
+        ({"seeds": 0}, "seeds must be at least 1, got 0"),
         ({"device": "cuda:7"}, "device 'cuda:7' was asked for but torch finds no CUDA device"),
     ],
 )
