@@ -1,7 +1,7 @@
 """Reruns the paper's tables: `python -m predictor.suite --table springs --budget cpu --data data --out runs/suite`.
 
-Trains each line (in its own process, resumable, cached by a hash of its config and data), measures it in both views
-of docs/protocol.md, and prints the table as Markdown, with JSON and LaTeX beside it.
+Trains each line under each seed (in its own process, resumable, cached by a hash of its config and data), measures it
+in both views of docs/protocol.md, and prints the table as Markdown, with JSON and LaTeX beside it.
 """
 
 import hashlib
@@ -13,20 +13,22 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import matplotlib
 from matplotlib import pyplot as plt
 from rich.progress import Progress
 
 from predictor.data.store import read_info_of
+from predictor.evaluation.ablations import ABLATIONS
 from predictor.evaluation.disentanglement import sklearn
 from predictor.evaluation.measure_line import FEATURED, measure_line
 from predictor.evaluation.nri_tables import NRI_TABLES
 from predictor.evaluation.paper_tables import NUM_SAMPLES, Budget, Line, Sizes
 from predictor.evaluation.paper_tables import TABLES as PAPER_TABLES
+from predictor.evaluation.training_seeds import joined
 from predictor.reports.plots import plot_results_by_step
-from predictor.reports.tables import latex_table, markdown_report
+from predictor.reports.suite_tables import latex_table, markdown_report
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, run_entry_point
@@ -36,17 +38,23 @@ from predictor.support.runtime import resolve_device, tune
 from predictor.train import train
 from predictor.training.config import TrainConfig, TrainPrecision, check_precision
 
-TableName = Literal["springs", "recipe", "mocap", "nba", "sdd", "ind", "nri-springs", "nri-charged"]
+TableName = Literal[
+    "springs", "mocap", "nba", "sdd", "ind", "recipe", "recipe-driving", "modes", "modes-driving", "nri-springs",
+    "nri-charged",
+]  # fmt: skip
 
-TABLES = PAPER_TABLES | NRI_TABLES
+TABLES = PAPER_TABLES | ABLATIONS | NRI_TABLES
+MEASURING = 2
+"""Number of the way of measuring: results of another one are not taken for finished."""
 
 
 @dataclass(frozen=True)
 class SuiteConfig:
-    """Trains and measures all lines of one of the paper's tables, or of a table beside NRI's."""
+    """Trains and measures all lines of one of the paper's tables, of an ablation, or of a table beside NRI's."""
 
     table: TableName
-    """Table to run: one of the paper's, or graph accuracy on NRI's simulators (nri-springs, nri-charged)."""
+    """Table to run: one of the paper's; what each part of the dG-VAE+ (recipe) or of its modes is worth, on springs or
+    in driving; or graph accuracy on NRI's simulators."""
     data: Path = Path("data")
     """Folder of the episode stores; a missing one is named with the command that makes it."""
     out: Path = Path("runs/suite")
@@ -61,11 +69,13 @@ class SuiteConfig:
     workers: Annotated[int, Renamed("jobs")] = 0
     """Number of parallel processes, a line in each; 0 is one per core (one in all on a GPU)."""
     seed: int = 0
-    """Random seed for training and forecasts."""
+    """Random seed for training and forecasts; the first one, if there are several."""
     device: str = "cpu"
     """Device that trains and measures: cpu, cuda or auto (cuda where there is one)."""
     precision: TrainPrecision = "float32"
     """Precision of matrix products in training (see `python -m predictor.train --help`); measuring is in float32."""
+    seeds: int = 1
+    """Number of training seeds of each line, from `seed` on; cells then show mean and range."""
     only_line: Annotated[str, Renamed("only_row")] = ""
     """Key of a line to run in this process; the suite starts its processes with it."""
 
@@ -77,6 +87,7 @@ class SuiteConfig:
         """
         check_choices(self)
         check_at_least(self, 0, "steps", "workers", "seed")
+        check_at_least(self, 1, "seeds")
         keys = [line.key for line in TABLES[self.table].lines]
         for key in (*self.lines, *filter(None, [self.only_line])):
             if key not in keys:
@@ -148,7 +159,8 @@ def line_folder(config: SuiteConfig, line: Line) -> Path:
     table, sizes = TABLES[config.table], config.sizes
     steps = [table.protocol.burn_in_steps, table.protocol.horizon_steps]
     content: dict[str, Any] = {
-        "row": {"model": line.model},
+        "row": {"model": line.model, "residual_of": line.residual_of, "overlap_m": table.overlap_m},
+        "measuring": MEASURING,
         "protocol": [*steps, NUM_SAMPLES, table.test_stride, sizes.test_windows, config.seed],
         "stores": [_fingerprint(config.data / s) for s in (table.train, table.val, *table.tests.values()) if s],
     }
@@ -163,20 +175,31 @@ def line_folder(config: SuiteConfig, line: Line) -> Path:
     return config.folder / "rows" / f"{line.key}-{digest}"
 
 
+def line_of(table: TableName, key: str) -> Line:
+    """Returns the line with this key."""
+    return next(line for line in TABLES[table].lines if line.key == key)
+
+
 def run_line(config: SuiteConfig, line: Line) -> dict[str, Any]:
-    """Trains (or resumes) and measures one line; writes and returns its result."""
-    if line.model in FEATURED and read_info_of(config.data / TABLES[config.table].train).edge_attribute_names:
+    """Trains (or resumes) and measures one line under the first seed; writes and returns its result."""
+    if (
+        line.model in FEATURED
+        and not line.residual_of
+        and read_info_of(config.data / TABLES[config.table].train).edge_attribute_names
+    ):
         sklearn("linear_model")  # raises before training, not after it
     folder = line_folder(config, line)
     folder.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()
     checkpoint = None
     if line.is_trained:
-        checkpoint = train(line_config(config, line, folder / "run"))
+        source = line_of(config.table, line.residual_of) if line.residual_of else line
+        checkpoint = train(line_config(config, source, line_folder(config, source) / "run"))
     trained = time.perf_counter()
     result = {
         "key": line.key,
         "name": line.name,
+        "seed": config.seed,
         "train_seconds": trained - began,
         **measure_line(TABLES[config.table], line, config.data, config.sizes, checkpoint, config.seed, config.device),
         "measure_seconds": time.perf_counter() - trained,
@@ -186,6 +209,44 @@ def run_line(config: SuiteConfig, line: Line) -> dict[str, Any]:
     return result
 
 
+class Job(NamedTuple):
+    """A line under one seed."""
+
+    config: SuiteConfig
+    """Config of the suite with this seed alone."""
+    line: Line
+    """Line to train and measure."""
+
+    @property
+    def name(self) -> str:
+        """Name in messages."""
+        return f"{self.line.key}, seed {self.config.seed}"
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the result."""
+        return line_folder(self.config, self.line)
+
+    @property
+    def result(self) -> Path:
+        """File of the result."""
+        return self.folder / "result.json"
+
+    def waits_for(self, other: "Job") -> bool:
+        """Returns whether the other job trains the model that this one measures."""
+        return self.line.residual_of == other.line.key and self.config.seed == other.config.seed
+
+
+def jobs_of(config: SuiteConfig) -> list[Job]:
+    """Returns the chosen lines under each of their seeds; a line without training has the first one alone."""
+    chosen = [line for line in TABLES[config.table].lines if not config.lines or line.key in config.lines]
+    return [
+        Job(replace(config, seed=config.seed + i, seeds=1), line)
+        for line in chosen
+        for i in range(config.seeds if line.is_trained else 1)
+    ]
+
+
 def run_suite(config: SuiteConfig) -> dict[str, Any]:
     """Runs all lines without a result, then writes the table; returns its content.
 
@@ -193,25 +254,26 @@ def run_suite(config: SuiteConfig) -> dict[str, Any]:
         UserError: a store is missing.
     """
     config.check_stores()
-    table = TABLES[config.table]
-    chosen = [r for r in table.lines if not config.lines or r.key in config.lines]
-    pending = [r for r in chosen if not (line_folder(config, r) / "result.json").exists()]
+    table, jobs = TABLES[config.table], jobs_of(config)
     began = time.perf_counter()
-    failed = _run_in_processes(config, pending)
-    results = {
-        r.key: json.loads((line_folder(config, r) / "result.json").read_text())
-        for r in chosen
-        if (line_folder(config, r) / "result.json").exists()
-    }
+    failed = _run_in_processes(config, [job for job in jobs if not job.result.exists()])
+    results: dict[str, list[dict[str, Any]]] = {}
+    for job in jobs:
+        if job.result.exists():
+            results.setdefault(job.line.key, []).append(json.loads(job.result.read_text()))
+    lines = [joined(found) for found in results.values()]
     content = {
         "table": config.table,
         "title": table.title,
         "budget": config.budget,
         "sizes": asdict(config.sizes),
+        "num_samples": NUM_SAMPLES,
+        "seeds": config.seeds,
+        "overlap_m": table.overlap_m,
         "wall_seconds_this_call": time.perf_counter() - began,
-        "train_seconds": sum(r["train_seconds"] for r in results.values()),
-        "rows": [results[r.key] for r in chosen if r.key in results],
-        "paper": {r.key: r.paper for r in chosen if r.paper},
+        "train_seconds": sum(line["train_seconds"] for line in lines),
+        "rows": lines,
+        "paper": {line.key: line.paper for line in table.lines if line.paper and line.key in results},
         "published": table.published,
         "protocol": asdict(table.protocol),
         "failed": failed,
@@ -221,8 +283,8 @@ def run_suite(config: SuiteConfig) -> dict[str, Any]:
     write_json(config.folder / "table.json", content)
     for name, text in (("table.md", markdown_report(content)), ("table.tex", latex_table(content))):
         write_text(config.folder / name, text)
-    if content["rows"]:
-        _plot(config, content["rows"], content["title"])
+    if lines:
+        _plot(config, lines, content["title"])
     return content
 
 
@@ -239,47 +301,51 @@ def _plot(config: SuiteConfig, results: Sequence[dict[str, Any]], title: str) ->
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2 * len(kinds), fontsize=7.5, frameon=False)
     figure.suptitle(
-        f"{title}, budget {config.budget}, one seed per line; bars: standard error over 20 subsets", fontsize=9
+        f"{title}, budget {config.budget}, mean over seeds: {config.seeds}; bars: standard error over 20 subsets",
+        fontsize=9,
     )
     figure.savefig(config.folder / "by_step.png", dpi=110)
     plt.close(figure)
 
 
-def _run_in_processes(config: SuiteConfig, pending: Sequence[Line]) -> dict[str, str]:
-    """Runs lines in parallel; returns the last line of output of those that failed, by key."""
+def _run_in_processes(config: SuiteConfig, pending: Sequence[Job]) -> dict[str, str]:
+    """Runs jobs in parallel; returns the last line of output of those that failed, by name."""
     waiting, failed = list(pending), {}
-    running: dict[str, tuple[subprocess.Popen[bytes], Path]] = {}
+    running: list[tuple[Job, subprocess.Popen[bytes], Path]] = []
     with Progress() as progress:
         task = progress.add_task(f"{config.table}: {len(pending)} lines to run", total=len(pending))
         try:
             while waiting or running:
-                while waiting and len(running) < config.num_processes:
-                    line = waiting.pop(0)
-                    running[line.key] = _start(config, line)
+                busy = [*waiting, *(job for job, *_ in running)]
+                ready = [job for job in waiting if not any(job.waits_for(other) for other in busy)]
+                for job in ready[: config.num_processes - len(running)]:
+                    waiting.remove(job)
+                    running.append((job, *_start(job)))
                 time.sleep(0.5)
-                for key, (process, log) in list(running.items()):
-                    if process.poll() is None:
-                        continue
-                    del running[key]
+                ended = [one for one in running if one[1].poll() is not None]
+                for job, process, log in ended:
                     if process.returncode:
-                        failed[key] = (log.read_text(errors="replace").strip().splitlines() or ["no output"])[-1]
+                        failed[job.name] = (log.read_text(errors="replace").strip().splitlines() or ["no output"])[-1]
                     progress.advance(task)
-                    progress.update(task, description=f"{config.table}: {', '.join(running) or 'done'}")
+                running = [one for one in running if one not in ended]
+                if ended or ready:
+                    named = ", ".join(job.name for job, *_ in running) or "done"
+                    progress.update(task, description=f"{config.table}: {named}")
         finally:
-            for process, _ in running.values():
+            for _, process, _ in running:
                 process.terminate()
     return failed
 
 
-def _start(config: SuiteConfig, line: Line) -> "tuple[subprocess.Popen[bytes], Path]":
-    folder = line_folder(config, line)
-    folder.mkdir(parents=True, exist_ok=True)
-    log = folder / "log.txt"
+def _start(job: Job) -> "tuple[subprocess.Popen[bytes], Path]":
+    config = job.config
+    job.folder.mkdir(parents=True, exist_ok=True)
+    log = job.folder / "log.txt"
     command = [
         sys.executable, "-m", "predictor.suite", "--table", config.table, "--data", str(config.data),
         "--out", str(config.out), "--budget", config.budget, "--steps", str(config.steps), "--workers",
         str(config.num_processes), "--seed", str(config.seed), "--device", config.device,
-        "--precision", config.precision, "--only-line", line.key,
+        "--precision", config.precision, "--only-line", job.line.key,
     ]  # fmt: skip
     with log.open("wb") as stream:
         return subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT), log
@@ -299,7 +365,7 @@ def main() -> None:
     tune(config.device)
     if config.only_line:
         config.check_stores()
-        run_line(config, next(r for r in TABLES[config.table].lines if r.key == config.only_line))
+        run_line(config, line_of(config.table, config.only_line))
         return
     content = run_suite(config)
     print((config.folder / "table.md").read_text())

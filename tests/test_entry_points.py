@@ -50,6 +50,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--table springs --data absent --only-line mlp", "no store at absent/springs/train"),
         ("--table spring", "invalid choice 'spring' for argument '--table'"),
         ("--table springs --workers -1", "workers must not be negative, got -1"),
+        ("--table springs --seeds 0", "seeds must be at least 1, got 0"),
         ("--table springs --precision tf32", "precision 'tf32' needs a CUDA device"),
         ("--table springs --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
     ],

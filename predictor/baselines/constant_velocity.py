@@ -87,6 +87,11 @@ class NoisyConstantVelocity(ConstantVelocity):
         growth, offset = np.polyfit(np.log(time_s[used]), np.log(found[used]), 1)
         return cls(spec, float(np.exp(offset)), float(growth), len(std_m))
 
+    def std_m(self, horizon_steps: int) -> Float[Tensor, "horizon axes"]:
+        """Returns the standard deviation of the noise at each step [m]."""
+        time_s = self.spec.dt_s * torch.arange(1, horizon_steps + 1, dtype=torch.float32)
+        return (self.noise_m * time_s**self.growth)[:, None].expand(-1, self.spec.position_dim)
+
     def rollout(
         self,
         belief: Belief,

@@ -34,6 +34,7 @@ class GaussianResidual:
         self.forecaster = forecaster
         axes = forecaster.spec.position_dim
         self.horizon_steps = len(covariance) // axes
+        self.covariance = covariance
         root = np.linalg.cholesky(covariance + LEAST_STD_M**2 * np.eye(len(covariance)))
         self._root = torch.from_numpy(root).float()
 
@@ -67,6 +68,11 @@ class GaussianResidual:
     def edge_feature_dim(self) -> int:
         """Number of features of an edge."""
         return self.forecaster.edge_feature_dim
+
+    def std_m(self, horizon_steps: int) -> Float[Tensor, "horizon axes"]:
+        """Returns the standard deviation of the noise at each step [m]."""
+        std_m = torch.from_numpy(np.sqrt(np.diag(self.covariance))).float()
+        return std_m.unflatten(0, (self.horizon_steps, self.spec.position_dim))[:horizon_steps]
 
     def empty_memory(self, batch: int, agents: int) -> Memory:
         """Returns the forecaster's memory before any observation."""

@@ -19,7 +19,7 @@ from predictor.evaluation.standard_errors import NUM_SUBSETS, Statistic, batch_i
 
 OPTIONAL = ("coverage", "mixture_nll")
 """Names of quantities that are left out, not NaN, if they could not be measured."""
-SCALAR_NAMES = {"rmse_m": "overall_rmse_m", "coverage": "coverage"}
+SCALAR_NAMES = {"rmse_m": "overall_rmse_m", "coverage": "coverage", "mixture_nll": "mixture_nll"}
 """Names of the numbers over all steps, by name of the quantity at each step."""
 
 
@@ -75,8 +75,8 @@ class Accuracy:
     axes: int = 2
     """Number of axes of a position."""
     statistics: dict[str, Statistic] = field(default_factory=dict)
-    """Mean ± standard error over subsets of the windows, by name of the scalar fields above, and "coverage" over all
-    steps; without those that could not be measured."""
+    """Mean ± standard error over subsets of the windows, by name of the scalar fields above, and "coverage" and
+    "mixture_nll" over all steps; without those that could not be measured."""
     step_errors: dict[str, list[float | None]] = field(default_factory=dict)
     """Standard error over these subsets at each step, by name of the list fields above."""
     intervals: dict[str, tuple[float, float]] = field(default_factory=dict)

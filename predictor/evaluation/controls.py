@@ -26,23 +26,41 @@ def training_windows(stores: Sequence[Path], spec: SceneSpec, horizon_steps: int
     return Windows(episodes, spec, HISTORY_STEPS, horizon_steps, min_future_steps=horizon_steps)
 
 
-def fit_noise(windows: Windows, horizon_steps: int, seed: int = 0) -> NoisyConstantVelocity:
-    """Fits the two parameters of constant velocity with noise."""
+def fit_noise(
+    windows: Windows, horizon_steps: int, seed: int = 0, most_windows: int | None = None
+) -> NoisyConstantVelocity:
+    """Fits the two parameters of constant velocity with noise; see `fit_residual`."""
     straight = ConstantVelocity(windows.spec, horizon_steps)
-    outcomes = run_windows(straight, windows, _drawn(windows, seed), horizon_steps)
+    outcomes = run_windows(straight, windows, _drawn(windows, seed, most_windows), horizon_steps)
     return NoisyConstantVelocity.fit(windows.spec, fitted_std_m(outcomes))
 
 
 def fit_residual(
-    forecaster: Forecaster, windows: Windows, horizon_steps: int, seed: int = 0, device: str = "cpu"
+    forecaster: Forecaster,
+    windows: Windows,
+    horizon_steps: int,
+    seed: int = 0,
+    device: str = "cpu",
+    most_windows: int | None = None,
+    batch_size: int = 256,
 ) -> GaussianResidual:
-    """Fits the covariance of a forecaster's errors."""
-    errors = []
-    for outcome in run_windows(forecaster, windows, _drawn(windows, seed), horizon_steps, device=device):
+    """Fits the covariance of a forecaster's errors.
+
+    Args:
+        forecaster: model whose single forecast errs.
+        windows: windows of training data.
+        horizon_steps: number of steps of the forecast.
+        seed: random seed of the windows that are drawn.
+        device: device that runs the model.
+        most_windows: largest number of windows; None takes `MOST_WINDOWS`.
+        batch_size: number of windows in one forward; limits the memory.
+    """
+    errors, drawn = [], _drawn(windows, seed, most_windows)
+    for outcome in run_windows(forecaster, windows, drawn, horizon_steps, batch_size=batch_size, device=device):
         whole = outcome.valid.all(-1)
         errors.append((outcome.future - outcome.forecast[:, 0])[whole].cpu().numpy())
     return GaussianResidual.fit(forecaster, np.concatenate(errors))
 
 
-def _drawn(windows: Windows, seed: int) -> np.ndarray:
-    return np.random.default_rng([seed, 3]).permutation(len(windows))[:MOST_WINDOWS]
+def _drawn(windows: Windows, seed: int, most_windows: int | None = None) -> np.ndarray:
+    return np.random.default_rng([seed, 3]).permutation(len(windows))[: most_windows or MOST_WINDOWS]

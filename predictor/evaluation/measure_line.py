@@ -2,24 +2,24 @@
 
 import resource
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
-from predictor.baselines.least_squares import SpringLeastSquares
-from predictor.baselines.majority import MajorityGraph
-from predictor.checkpoint import load_checkpoint
+from predictor.baselines.constant_velocity import NoisyConstantVelocity
+from predictor.baselines.gaussian_residual import GaussianResidual
 from predictor.data.store import EpisodeStore, read_store
 from predictor.data.windows import Windows
-from predictor.evaluation.accuracy import Tally, fitted_std_m
+from predictor.evaluation.accuracy import Tally
 from predictor.evaluation.disentanglement import direct_r2, linear_r2
+from predictor.evaluation.displacement import MISS_THRESHOLD_M
 from predictor.evaluation.graph_accuracy import GraphTally, edge_entropy
+from predictor.evaluation.line_forecasters import LineForecaster, batch_size, line_forecaster
 from predictor.evaluation.outcomes import Outcome, run_windows
-from predictor.evaluation.paper_tables import BURN_IN_STEPS, Line, Protocol, Sizes, Table
+from predictor.evaluation.paper_tables import BURN_IN_STEPS, NUM_SAMPLES, Line, Sizes, Table
 from predictor.graph import pair_mask
 from predictor.support.errors import UserError
 
@@ -27,51 +27,23 @@ GRAPHS = ("dgvae", "dnri", "least-squares", "majority")
 """Models whose graph is scored."""
 FEATURED = ("dgvae", "least-squares")
 """Models whose edge features are scored; those of the others are placeholders."""
-PAIR_BUDGET = 60_000
-"""Largest number of pairs × samples per batch; it limits memory for scenes of any size."""
+WINDOWS_SEED = 0
+"""Random seed of the test windows, the same for all training seeds."""
 
 
 def measure_line(
     table: Table, line: Line, data: Path, sizes: Sizes, checkpoint: Path | None, seed: int, device: str
 ) -> dict[str, Any]:
-    """Returns the results of a line: parameters, and for each test store both views, graph and feature scores."""
+    """Returns the results of a line: parameters, what was fitted, and for each test store both views and scores."""
     stores = {kind: read_store(data / name) for kind, name in table.tests.items()}
     spec = next(iter(stores.values())).info.spec
-    forecaster: Any
-    std_m: tuple[float, ...] = ()
-    parameters = 0
-    horizon_steps = table.protocol.horizon_steps
-    if line.model == "constant-velocity":
-        forecaster = ConstantVelocity(spec, horizon_steps)
-    elif line.model == "constant-velocity-noise":
-        forecaster = _fitted_noise(read_store(data / table.train), sizes, table.protocol)
-    elif line.model == "majority":
-        forecaster = MajorityGraph.fit(spec, horizon_steps, read_store(data / table.train).episodes)
-    elif line.model == "least-squares":
-        smallest = table.smallest_constant
-        # it works on the CPU only
-        forecaster, device = SpringLeastSquares(spec, horizon_steps, smallest_constant=smallest), "cpu"
-    else:
-        assert checkpoint is not None
-        forecaster, info = load_checkpoint(checkpoint, device)
-        std_m, parameters = info.std_m, sum(p.numel() for p in forecaster.parameters())
-        for kind, store in stores.items():
-            info.spec.check_compatible(store.info.spec, f"line '{line.key}'", f"store {data / table.tests[kind]}")
-    results = {
-        kind: _measure_store(forecaster, store, table, line, sizes, std_m, seed, device)
-        for kind, store in stores.items()
-    }
-    return {"parameters": parameters, "tests": results}
-
-
-def _fitted_noise(store: EpisodeStore, sizes: Sizes, protocol: Protocol) -> NoisyConstantVelocity:
-    """Returns constant velocity with noise fitted to its errors on the training windows of the protocol."""
-    spec, episodes = store.info.spec, store.episodes[: sizes.max_episodes or None]
-    steps = protocol.train_horizon_steps
-    windows = Windows(episodes, spec, 1, steps, steps, protocol.train_history_steps)
-    straight = ConstantVelocity(spec, steps)
-    outcomes = run_windows(straight, windows, np.arange(len(windows)), steps)
-    return NoisyConstantVelocity.fit(spec, fitted_std_m(outcomes))
+    made = line_forecaster(table, line, data, sizes, checkpoint, spec, device)
+    for kind, store in stores.items():
+        made.forecaster.spec.check_compatible(
+            store.info.spec, f"line '{line.key}'", f"store {data / table.tests[kind]}"
+        )
+    results = {kind: _measure_store(made, store, table, line, sizes, seed) for kind, store in stores.items()}
+    return {"parameters": made.parameters, "fitted": made.fitted, "tests": results}
 
 
 def protocol_indices(
@@ -85,56 +57,83 @@ def protocol_indices(
 
 
 def _measure_store(
-    forecaster: Any,
-    store: EpisodeStore,
-    table: Table,
-    line: Line,
-    sizes: Sizes,
-    std_m: tuple[float, ...],
-    seed: int,
-    device: str,
+    made: LineForecaster, store: EpisodeStore, table: Table, line: Line, sizes: Sizes, seed: int
 ) -> dict[str, Any]:
     burn_in, horizon = table.protocol.burn_in_steps, table.protocol.horizon_steps
     try:
         windows = Windows(store.episodes, store.info.spec, burn_in, horizon, horizon, burn_in)
     except UserError as error:
         raise UserError(f"test store of '{store.info.source}' fits no window of the protocol: {error}") from error
-    chosen = protocol_indices(windows, table.test_stride, sizes.test_windows, seed, burn_in)
-    samples = line.num_samples
-    horizon_only, whole = Tally(std_m), Tally(partial_agents=True)
-    types = max(forecaster.num_edge_types, table.num_label_types)
-    matched = bool(table.num_label_types) and not line.train.get("type_label_weight")
-    graph, features, entropies = GraphTally(types), _Features(), []
+    chosen = protocol_indices(windows, table.test_stride, sizes.test_windows, WINDOWS_SEED, burn_in)
     agents = [int(store.episodes[e].valid[t].sum()) for e, t in windows.index[chosen].tolist()]
-    batch = max(1, min(256, PAIR_BUDGET // (max(agents, default=1) ** 2 * samples)))
-    began = time.perf_counter()
-    if device.startswith("cuda"):
+    tallies, began = _Tallies(made, table, line), time.perf_counter()
+    if made.device.startswith("cuda"):
         torch.cuda.reset_peak_memory_stats()
     for outcome in run_windows(
-        forecaster, windows, chosen, horizon, samples, seed, batch, device,
-        whole_sequence=True, keep_beliefs=True,
+        made.forecaster, windows, chosen, horizon, NUM_SAMPLES, seed,
+        batch_size(max(agents, default=1), NUM_SAMPLES), made.device, whole_sequence=True, keep_beliefs=True,
     ):  # fmt: skip
-        whole.add(outcome)
-        horizon_only.add(outcome.tail(horizon))
-        assert outcome.edge_probs is not None and outcome.present is not None
-        pairs = pair_mask(outcome.present)
-        unused = outcome.edge_probs.new_zeros(*outcome.edge_probs.shape[:-1], types - outcome.edge_probs.shape[-1])
-        graph.add(torch.cat([outcome.edge_probs, unused], dim=-1), _known_types(outcome, types), pairs)
-        entropies.append(edge_entropy(outcome.edge_probs, pairs)[0][pairs].cpu())
-        if line.model in FEATURED:
-            features.add(outcome)
-    result: dict[str, Any] = {
+        tallies.add(outcome)
+    return {
         "windows": len(chosen),
         "agents": {"min": min(agents), "median": float(np.median(agents)), "max": max(agents)},
-        "horizon_only": asdict(horizon_only.accuracy(line.name)),
-        "whole_sequence": asdict(whole.accuracy(line.name)),
-        "graph": asdict(graph.results(matched)) if line.model in GRAPHS else None,
-        "prior_entropy": float(torch.cat(entropies).mean()) if line.model in ("dgvae", "dnri") else None,
-        "features": features.scores(),
+        **tallies.results(),
         "seconds": time.perf_counter() - began,
-        "peak_memory_mb": _peak_memory_mb(device),
+        "peak_memory_mb": _peak_memory_mb(made.device),
     }
-    return result
+
+
+class _Tallies:
+    """Collects everything that is measured on one store."""
+
+    def __init__(self, made: LineForecaster, table: Table, line: Line) -> None:
+        self._made, self._line, self._horizon = made, line, table.protocol.horizon_steps
+        threshold_m = table.overlap_m or MISS_THRESHOLD_M
+        self._horizon_only = Tally(made.std_m, threshold_m)
+        self._whole = Tally(miss_threshold_m=threshold_m, partial_agents=True)
+        self._density = Tally()
+        self._has_density = isinstance(made.forecaster, GaussianResidual | NoisyConstantVelocity)
+        self._types = max(made.forecaster.num_edge_types, table.num_label_types)
+        self._matched = bool(table.num_label_types) and not line.train.get("type_label_weight")
+        self._graph, self._features = GraphTally(self._types), _Features()
+        self._entropies: list[torch.Tensor] = []
+        own = not line.residual_of  # the graph of another line is scored there
+        self._scores_graph, self._scores_features = own and line.model in GRAPHS, own and line.model in FEATURED
+        self._has_prior = own and line.model in ("dgvae", "dnri")
+
+    def add(self, outcome: Outcome) -> None:
+        free = outcome.tail(self._horizon)
+        self._whole.add(outcome)
+        self._horizon_only.add(free)
+        if self._has_density:  # of draws around the single forecast, which is Gaussian
+            scale = self._made.forecaster.std_m(self._horizon).to(free.forecast)
+            single = free.single()
+            self._density.add(replace(single, scale=scale.expand_as(single.forecast)))
+        assert outcome.edge_probs is not None and outcome.present is not None
+        pairs = pair_mask(outcome.present)
+        unused = outcome.edge_probs.new_zeros(
+            *outcome.edge_probs.shape[:-1], self._types - outcome.edge_probs.shape[-1]
+        )
+        self._graph.add(torch.cat([outcome.edge_probs, unused], dim=-1), _known_types(outcome, self._types), pairs)
+        self._entropies.append(edge_entropy(outcome.edge_probs, pairs)[0][pairs].cpu())
+        if self._scores_features:
+            self._features.add(outcome)
+
+    def results(self) -> dict[str, Any]:
+        """Returns the measurements."""
+        horizon_only = asdict(self._horizon_only.accuracy(self._line.name))
+        if self._has_density:
+            density = asdict(self._density.accuracy(self._line.name))
+            horizon_only["mixture_nll"] = density["mixture_nll"]
+            for part in ("statistics", "step_errors"):
+                horizon_only[part]["mixture_nll"] = density[part]["mixture_nll"]
+        return {
+            "horizon_only": horizon_only,
+            "whole_sequence": asdict(self._whole.accuracy(self._line.name)),
+            "graph": asdict(self._graph.results(self._matched)) if self._scores_graph else None,
+            "prior_entropy": float(torch.cat(self._entropies).mean()) if self._has_prior else None,
+            "features": self._features.scores(),
+        }
 
 
 def _peak_memory_mb(device: str) -> float:
@@ -150,7 +149,7 @@ def _known_types(outcome: Outcome, num_types: int) -> torch.Tensor | None:
 
 
 class _Features:
-    """Collects edge features and true attributes over all windows of one size."""
+    """Collects edge features and true attributes over all windows, padded to the largest scene."""
 
     def __init__(self) -> None:
         self._features: list[np.ndarray] = []
@@ -172,8 +171,18 @@ class _Features:
         """Computes R² of the first attribute on true edges, by the first dimension and by a linear regression."""
         if not self._features:
             return None
-        features, truth, valid = (np.concatenate(x) for x in (self._features, self._truth, self._valid))
+        widest = max(valid.shape[-1] for valid in self._valid)
+        features, truth, valid = (
+            np.concatenate([_padded(part, widest) for part in parts])
+            for parts in (self._features, self._truth, self._valid)
+        )
         return {
             "direct_r2": direct_r2(features[..., 0], truth, valid),
             "linear_r2": linear_r2(features, truth, valid),
         }
+
+
+def _padded(pairs: np.ndarray, agents: int) -> np.ndarray:
+    """Returns an array [windows, agents, agents, …] with room for `agents` agents."""
+    missing = agents - pairs.shape[1]
+    return np.pad(pairs, ((0, 0), (0, missing), (0, missing), *((0, 0),) * (pairs.ndim - 3)))

@@ -6,27 +6,18 @@ up to 39 of history and 10 of forecast. Figures of NRI: Table 1 of Kipf et al., 
 
 from typing import Any
 
-from predictor.evaluation.paper_tables import Line, Protocol, Sizes, Table
+from predictor.evaluation.paper_tables import CONTROLS, SMALL, TEACHER_FORCED, TINY, Line, Protocol, Sizes, Table
 
 _PROTOCOL = Protocol(burn_in_steps=49, horizon_steps=20, train_history_steps=39, train_horizon_steps=10)
 _ONE_WINDOW = 99
 """Stride beyond a test rollout: its first 49 frames are observed, and no others."""
 
-_SMALL: dict[str, tuple[str, ...]] = {
-    "dgvae": ("hidden_dim=32", "rnn_dim=32", "head_dim=48", "message_dim=48", "decoder_dim=48"),
-    "dnri": ("hidden_dim=64", "rnn_dim=32", "head_dim=64", "message_dim=64", "decoder_dim=64"),
-}
-_TINY: dict[str, tuple[str, ...]] = {
-    name: tuple(f"{text.split('=')[0]}=12" for text in widths) for name, widths in _SMALL.items()
-}
 _BUDGETS: dict[str, Sizes] = {
-    "smoke": Sizes(20, 8, 200, 40, 100, 10, _TINY),
-    "cpu": Sizes(2500, 32, 0, 200, 2000, 250, _SMALL),
+    "smoke": Sizes(20, 8, 200, 40, 100, 10, TINY),
+    "cpu": Sizes(2500, 32, 0, 200, 2000, 250, SMALL),
     "paper": Sizes(100_000, 128, 0, 2000, 0, 1000),
 }
 
-_TEACHER_FORCED = {"rollout_weight": 0.0, "one_step_weight": 1.0, "likelihood": "gaussian"}
-"""Training options of the NRI family: one-step likelihood under the posterior, no free run."""
 _INFERS = (
     "forget_bias=2",
     "innovation_rounds=1",
@@ -43,16 +34,18 @@ def _lines(types: int) -> tuple[Line, ...]:
     def enhanced(key: str, name: str, *more: str, **train: Any) -> Line:
         return Line(key, name, "dgvae", (*several, *_INFERS, *more), {"input_changes": True} | train)
 
+    types_alone = enhanced("dvae", "dVAE+ (types alone)", "edge_feature_dim=0")
     return (
-        Line("majority", "majority class, constant velocity", "majority"),
-        Line("constant-velocity-noise", "constant velocity + noise", "constant-velocity-noise"),
-        Line("dnri", "dNRI", "dnri", several, _TEACHER_FORCED),
+        Line("majority", "majority class, constant velocity + Gaussian", "majority"),
+        *CONTROLS,
+        Line("dnri", "dNRI", "dnri", several, TEACHER_FORCED),
         Line("dnri-free", "dNRI, trained in free run", "dnri", (*several, "residual=trapezoid"), {"edge_cost": 1.0}),
-        Line("dgvae-paper", "dG-VAE (paper)", "dgvae", (*several, "edge_feature_dim=16"), _TEACHER_FORCED),
-        enhanced("dgvae", "dG-VAE, enhanced", "edge_feature_dim=16", "gated_messages=true", edge_cost=5.0),
-        enhanced("dvae", "dG-VAE, enhanced, types alone", "edge_feature_dim=0"),
-        enhanced("plural", "dG-VAE, enhanced, types alone, 20 modes", "edge_feature_dim=0", "num_modes=20"),
-        enhanced("supervised", "dG-VAE, enhanced, types alone, trained with labels", "edge_feature_dim=0",
+        Line("dgvae-paper", "dG-VAE (paper)", "dgvae", (*several, "edge_feature_dim=16"), TEACHER_FORCED),
+        enhanced("dgvae", "dG-VAE+", "edge_feature_dim=16", "gated_messages=true", edge_cost=5.0),
+        types_alone,
+        types_alone.with_gaussian(),
+        enhanced("plural", "plural dVAE+ (types alone)", "edge_feature_dim=0", "num_modes=20"),
+        enhanced("supervised", "dVAE+ (types alone), trained with labels", "edge_feature_dim=0",
                  type_label_weight=40.0),
     )  # fmt: skip
 
@@ -63,7 +56,7 @@ NRI_TABLES: dict[str, Table] = {
         train="nri-springs/train",
         val="nri-springs/val",
         tests={"test": "nri-springs/test"},
-        lines=(*_lines(2), Line("least-squares", "least squares (limit)", "least-squares")),
+        lines=(*_lines(2), Line("least-squares", "least squares (limit) + Gaussian", "least-squares")),
         budgets=_BUDGETS,
         test_stride=_ONE_WINDOW,
         commands=("python -m predictor.data.nri --law springs --out {data}/nri-springs",),

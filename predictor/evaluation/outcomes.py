@@ -114,10 +114,13 @@ def run_sequence_batch(
     """
     axes = forecaster.spec.position_dim
     window = torch.arange(len(batch.states), device=batch.states.device)
-    predicted, truth, valid = [], [], []
+    predicted, truth, valid, scales = [], [], [], []
     belief: Belief | None = None
     for step, belief in _observed(forecaster, batch):
-        predicted.append(forecaster.rollout(belief, 1, 1).states[:, 0, :, 0, :axes])
+        one = forecaster.rollout(belief, 1, 1)
+        predicted.append(one.states[:, 0, :, 0, :axes])
+        if one.scale is not None:
+            scales.append(one.scale[:, 0, :, 0])
         ahead = (step + 1).clamp(min=0)
         truth.append(batch.states[window, ahead][..., :axes])
         valid.append(_without_ego(forecaster, batch.valid[window, ahead] & belief.valid))
@@ -127,12 +130,16 @@ def run_sequence_batch(
         return free
     # The last entry is the free run's own first step.
     one_step = torch.stack(predicted[:-1], dim=2)[:, None].expand(-1, num_samples, -1, -1, -1)
+    scale = free.scale
+    if scale is not None:
+        spread = torch.stack(scales[:-1], dim=2)[:, None].expand(-1, num_samples, -1, -1, -1)
+        scale = torch.cat([spread, scale], dim=3)
     return replace(
         free,
         forecast=torch.cat([one_step, free.forecast], dim=3),
         future=torch.cat([torch.stack(truth[:-1], dim=2), free.future], dim=2),
         valid=torch.cat([torch.stack(valid[:-1], dim=2), free.valid], dim=2),
-        scale=None,  # one-step predictions have none
+        scale=scale,
     )
 
 

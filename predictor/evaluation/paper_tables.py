@@ -4,18 +4,22 @@ A line is a model and the training options in which it differs from its table; a
 horizon, selection) are equal for all lines of a table. `predictor.suite` runs them.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 from predictor.models import ModelName
 
 Budget = Literal["smoke", "cpu", "paper"]
-Untrained = Literal["constant-velocity", "constant-velocity-noise", "least-squares", "majority"]
+Untrained = Literal["constant-velocity", "constant-velocity-noise", "nearest-neighbours", "least-squares", "majority"]
 """Forecasters without a training run."""
+STOCHASTIC = ("dgvae", "dnri", "constant-velocity-noise", "nearest-neighbours")
+"""Models with samples of their own; the others draw theirs around their single forecast, from a fitted Gaussian."""
 BURN_IN_STEPS = 40
 HORIZON_STEPS = 10
 NUM_SAMPLES = 20
-"""Number of samples K of a stochastic model; the others have one forecast."""
+"""Number of samples K, the same for every line of every table."""
+MOST_FIT_WINDOWS = 2000
+"""Largest number of training windows to which noise is fitted."""
 
 
 @dataclass(frozen=True)
@@ -34,16 +38,23 @@ class Line:
     """Fields of the training config that differ from those of the table."""
     paper: dict[str, float] = field(default_factory=dict)
     """The paper's figures, by column: "rmse", "ade", "fde", "ood_ade", "ood_fde" [m], and "graph", an accuracy."""
+    residual_of: str = ""
+    """Key of the line whose trained model this line measures by its single forecast with fitted Gaussian noise."""
 
     @property
     def is_trained(self) -> bool:
-        """Whether the line needs a training run."""
+        """Whether the line needs a training run, its own or that of `residual_of`."""
         return self.model not in get_args(Untrained)
 
     @property
-    def num_samples(self) -> int:
-        """Number of forecasts per window, K."""
-        return NUM_SAMPLES if self.model in ("dgvae", "dnri", "constant-velocity-noise") else 1
+    def draws_residuals(self) -> bool:
+        """Whether samples are the single forecast with fitted Gaussian noise."""
+        return bool(self.residual_of) or self.model not in STOCHASTIC
+
+    def with_gaussian(self) -> "Line":
+        """Returns the control of a stochastic line: its single forecast, with fitted Gaussian noise."""
+        name = f"{self.name}, single forecast + Gaussian"
+        return replace(self, key=f"{self.key}-gaussian", name=name, paper={}, residual_of=self.key)
 
 
 @dataclass(frozen=True)
@@ -64,6 +75,11 @@ class Sizes:
     """Number of steps between validations."""
     widths: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Fields of the config (name=value) by model; empty takes the sizes of the papers."""
+
+    @property
+    def fit_windows(self) -> int:
+        """Number of training windows to which noise is fitted."""
+        return min(self.test_windows or MOST_FIT_WINDOWS, MOST_FIT_WINDOWS)
 
 
 @dataclass(frozen=True)
@@ -107,32 +123,50 @@ class Table:
     permutation that is best on the whole test set, except of lines that were trained with labels; 0 renames nothing."""
     smallest_constant: float = 0.5
     """Smallest spring constant of the data [N/m], for least squares; pairs below half of it have no spring."""
+    overlap_m: float = 0.0
+    """Distance of two centres below which agents overlap [m]; 0 leaves the column out: points pass through another."""
     published: dict[str, float] = field(default_factory=dict)
     """Graph accuracies that another paper reports for this data, by its names."""
 
 
-_SMALL = {
+SMALL = {
     "dgvae": ("hidden_dim=32", "rnn_dim=32", "head_dim=48", "message_dim=48", "decoder_dim=48"),
     "dnri": ("hidden_dim=64", "rnn_dim=32", "head_dim=64", "message_dim=64", "decoder_dim=64"),
     "imma": ("hidden_dim=64", "rnn_dim=32", "message_dim=64", "decoder_dim=64"),
 }
 """Widths of a quarter to a half of the published ones, so that both graph models take about equal time on a CPU."""
 
-_TINY = {
+TINY = {
     "dgvae": ("hidden_dim=12", "rnn_dim=8", "head_dim=12", "message_dim=12", "decoder_dim=12"),
     "dnri": ("hidden_dim=12", "rnn_dim=8", "head_dim=12", "message_dim=12", "decoder_dim=12"),
     "imma": ("hidden_dim=12", "rnn_dim=8", "message_dim=12", "decoder_dim=12"),
 }
 
-_OURS = ("innovation_rounds=1", "forget_bias=2", "residual=trapezoid", "substeps=2", "gated_messages=true")
-"""Options of the recipe in docs/training.md, in addition to the paper's network."""
-_TEACHER_FORCED = {"rollout_weight": 0.0, "one_step_weight": 1.0, "likelihood": "gaussian"}
+OURS = ("innovation_rounds=1", "forget_bias=2", "residual=trapezoid", "substeps=2", "gated_messages=true")
+"""Options of the dG-VAE+ (docs/training.md), in addition to the paper's network."""
+MODES = ("num_modes=20", "rollout_graph=frozen")
+"""Options of the plural dG-VAE+, in addition to those of the dG-VAE+."""
+TEACHER_FORCED = {"rollout_weight": 0.0, "one_step_weight": 1.0, "likelihood": "gaussian"}
 """Training options of the NRI family: one-step likelihood under the posterior, no free run."""
 
 
+CONTROLS = (
+    Line("constant-velocity", "constant velocity + Gaussian", "constant-velocity"),
+    Line("constant-velocity-noise", "constant velocity + noise", "constant-velocity-noise"),
+    Line("nearest-neighbours", "nearest neighbours", "nearest-neighbours"),
+)
+"""Lines that learn nothing but the spread of errors, or nothing."""
+
+
 def _dgvae(key: str, name: str, features: int, *more: str, paper: dict[str, float] | None = None, **train: Any) -> Line:
+    """Returns a line of the dG-VAE+, the enhanced model."""
     changes = {"input_changes": True} | train
-    return Line(key, name, "dgvae", (*_OURS, f"edge_feature_dim={features}", *more), changes, paper or {})
+    return Line(key, name, "dgvae", (*OURS, f"edge_feature_dim={features}", *more), changes, paper or {})
+
+
+def _papers(features: int, paper: dict[str, float]) -> Line:
+    """Returns the line of the paper's own model, trained as the paper does."""
+    return Line("dgvae-paper", "dG-VAE (paper)", "dgvae", (f"edge_feature_dim={features}",), TEACHER_FORCED, paper)
 
 
 def _figures(rmse: float, ade: float, fde: float, ood_ade: float = 0.0, ood_fde: float = 0.0) -> dict[str, float]:
@@ -141,6 +175,8 @@ def _figures(rmse: float, ade: float, fde: float, ood_ade: float = 0.0, ood_fde:
 
 
 _LSTM_JOINT = ("joint=true",)
+_LABELLED = {"label_weight": 200.0, "type_label_weight": 40.0}
+_SPRINGS_PLUS = _dgvae("dgvae", "dG-VAE+", 16, edge_cost=5.0)
 
 SPRINGS = Table(
     title="5-Spring",
@@ -149,61 +185,69 @@ SPRINGS = Table(
     tests={"test": "springs/test", "ood": "springs/ood"},
     commands=("python -m predictor.data.springs --out {data}/springs",),
     lines=(
-        Line("constant-velocity", "constant velocity", "constant-velocity"),
-        Line("constant-velocity-noise", "constant velocity + noise", "constant-velocity-noise"),
-        Line("mlp", "Linear (MLP)", "mlp", paper=_figures(0.196, 0.202, 0.446, 2.158, 3.541)),
-        Line("lstm-joint", "LSTM (all agents)", "lstm", _LSTM_JOINT, paper=_figures(0.037, 0.024, 0.159, 0.406, 1.485)),
-        Line("lstm", "LSTM (per agent)", "lstm"),
-        Line("imma", "IMMA", "imma", paper=_figures(0.162, 0.176, 0.350, 1.389, 1.934)),
+        *CONTROLS,
+        Line("mlp", "Linear (MLP) + Gaussian", "mlp", paper=_figures(0.196, 0.202, 0.446, 2.158, 3.541)),
         Line(
-            "dnri", "dNRI", "dnri", train=_TEACHER_FORCED,
+            "lstm-joint", "LSTM (all agents) + Gaussian", "lstm", _LSTM_JOINT,
+            paper=_figures(0.037, 0.024, 0.159, 0.406, 1.485),
+        ),
+        Line("lstm", "LSTM (per agent) + Gaussian", "lstm"),
+        Line("imma", "IMMA + Gaussian", "imma", paper=_figures(0.162, 0.176, 0.350, 1.389, 1.934)),
+        Line(
+            "dnri", "dNRI", "dnri", train=TEACHER_FORCED,
             paper=_figures(0.114, 0.058, 0.469, 0.379, 1.372) | {"graph": 0.877},
         ),
         Line("dnri-free", "dNRI, trained in free run", "dnri", ("residual=trapezoid",), {"edge_cost": 1.0}),
-        _dgvae("dvae", "dVAE (no edge features)", 0, edge_cost=5.0),
-        _dgvae("dgvae", "dG-VAE", 16, edge_cost=5.0, paper=_figures(0.019, 0.011, 0.048, 0.302, 1.063)),
-        _dgvae("dgvae-pm", "dG-VAE + pair matching", 24, "static_dim=16", edge_cost=5.0),
+        _papers(16, _figures(0.019, 0.011, 0.048, 0.302, 1.063)),
+        _dgvae("dvae", "dVAE+ (no edge features)", 0, edge_cost=5.0),
+        _SPRINGS_PLUS,
+        _SPRINGS_PLUS.with_gaussian(),
+        _dgvae("dgvae-pm", "dG-VAE+ with pair matching", 24, "static_dim=16", edge_cost=5.0),
         _dgvae(
-            "dgvae-pm-window", "dG-VAE + pair matching, whole window in training", 24,
+            "dgvae-pm-window", "dG-VAE+ with pair matching, whole window in training", 24,
             "static_dim=16", "pair_matching=window", edge_cost=5.0,
         ),
         _dgvae(
-            "dgvae-rl", "dG-VAE + restricted labelling", 16, label_weight=200.0, type_label_weight=40.0,
+            "dgvae-rl", "dG-VAE+ with restricted labelling", 16, **_LABELLED,
             paper=_figures(0.016, 0.010, 0.063, 0.309, 1.032) | {"graph": 0.984},
         ),
-        Line("least-squares", "least squares (limit)", "least-squares"),
+        _dgvae("plural", "plural dG-VAE+", 16, *MODES, edge_cost=5.0),
+        _dgvae("plural-rl", "plural dG-VAE+ with restricted labelling", 16, *MODES, **_LABELLED),
+        Line("least-squares", "least squares (limit) + Gaussian", "least-squares"),
     ),
     budgets={
-        "smoke": Sizes(60, 16, 500, 100, 200, 30, _TINY),
-        "cpu": Sizes(1500, 32, 10_000, 500, 2000, 250, _SMALL),
+        "smoke": Sizes(60, 16, 500, 100, 200, 30, TINY),
+        "cpu": Sizes(1500, 32, 10_000, 500, 2000, 250, SMALL),
         "paper": Sizes(150 * 50_000 // 128, 128, 0, 2000, 0, 1000),
     },
 )  # fmt: skip
 
 _REAL_BUDGETS = {
-    "smoke": Sizes(40, 4, 40, 20, 40, 20, _TINY),
-    "cpu": Sizes(800, 8, 0, 200, 400, 200, _SMALL),
+    "smoke": Sizes(40, 4, 40, 20, 40, 20, TINY),
+    "cpu": Sizes(800, 8, 0, 200, 400, 200, SMALL),
 }
 
 
 def _real_lines(
     features: int, static: int, paper: dict[str, dict[str, float]], more: tuple[str, ...] = ()
 ) -> tuple[Line, ...]:
-    free = ("residual=trapezoid",)
+    plus = _dgvae("dgvae", "dG-VAE+", features, "substeps=1", *more)
     return (
-        Line("constant-velocity", "constant velocity", "constant-velocity"),
-        Line("constant-velocity-noise", "constant velocity + noise", "constant-velocity-noise"),
-        Line("mlp", "Linear (MLP)", "mlp", paper=paper.get("mlp", {})),
-        Line("lstm-joint", "LSTM (all agents)", "lstm", _LSTM_JOINT, paper=paper.get("lstm", {})),
-        Line("lstm", "LSTM (per agent)", "lstm"),
-        Line("imma", "IMMA", "imma", paper=paper.get("imma", {})),
-        Line("dnri", "dNRI", "dnri", train=_TEACHER_FORCED, paper=paper.get("dnri", {})),
-        Line("dnri-free", "dNRI, trained in free run", "dnri", free),
-        _dgvae("dgvae", "dG-VAE", features, "substeps=1", *more, paper=paper.get("dgvae", {})),
+        *CONTROLS,
+        Line("mlp", "Linear (MLP) + Gaussian", "mlp", paper=paper.get("mlp", {})),
+        Line("lstm-joint", "LSTM (all agents) + Gaussian", "lstm", _LSTM_JOINT, paper=paper.get("lstm", {})),
+        Line("lstm", "LSTM (per agent) + Gaussian", "lstm"),
+        Line("imma", "IMMA + Gaussian", "imma", paper=paper.get("imma", {})),
+        Line("dnri", "dNRI", "dnri", train=TEACHER_FORCED, paper=paper.get("dnri", {})),
+        Line("dnri-free", "dNRI, trained in free run", "dnri", ("residual=trapezoid",)),
+        _papers(features, paper.get("dgvae", {})),
+        plus,
+        plus.with_gaussian(),
         _dgvae(
-            "dgvae-pm", "dG-VAE + pair matching", features, "substeps=1", *more, f"static_dim={static}",
+            "dgvae-pm", "dG-VAE+ with pair matching", features, "substeps=1", *more, f"static_dim={static}",
             paper=paper.get("dgvae-pm", {}),
         ),
+        _dgvae("plural", "plural dG-VAE+", features, "substeps=1", *more, *MODES),
     )  # fmt: skip
 
 
@@ -232,13 +276,14 @@ MOCAP = Table(
         ("zero_start=true",),
     ),
     budgets=_REAL_BUDGETS | {
-        "cpu": Sizes(400, 2, 0, 40, 40, 100, _SMALL),
+        "cpu": Sizes(400, 2, 0, 40, 40, 100, SMALL),
         "paper": Sizes(150 * 64, 64, 0, 200, 0, 500),
     },
 )  # fmt: skip
 
 NBA = Table(
     title="NBA",
+    overlap_m=0.5,
     train="nba_train",
     tests={"test": "nba_test"},
     commands=(
@@ -262,21 +307,17 @@ NBA = Table(
 
 def _crowd_lines(paper: dict[str, dict[str, float]]) -> tuple[Line, ...]:
     """Returns the lines for variable N(t): without those that need a fixed set of agents."""
-    return tuple(
-        line
-        for line in _real_lines(64, 16, paper)
-        if line.key
-        in ("constant-velocity", "constant-velocity-noise", "lstm", "dnri", "dnri-free", "dgvae", "dgvae-pm")
-    )
+    return tuple(line for line in _real_lines(64, 16, paper) if line.key not in ("mlp", "lstm-joint", "imma"))
 
 
 _CROWD_BUDGETS = _REAL_BUDGETS | {
-    "cpu": Sizes(600, 4, 0, 60, 200, 150, _SMALL),
+    "cpu": Sizes(600, 4, 0, 60, 200, 150, SMALL),
     "paper": Sizes(40_000, 1, 0, 300, 0, 1000),
 }
 
 SDD = Table(
     title="Stanford Drone Dataset",
+    overlap_m=0.5,
     train="sdd_train",
     val="sdd_val",
     tests={"test": "sdd_test", "crowd": "sdd_crowd"},
@@ -294,6 +335,7 @@ SDD = Table(
 
 IND = Table(
     title="inD, out of distribution rounD",
+    overlap_m=2.0,
     train="ind_train",
     val="ind_val",
     tests={"test": "ind_test", "ood": "round"},
@@ -311,51 +353,11 @@ IND = Table(
             "dgvae-pm": _figures(1.104, 0.558, 4.441, 4.384, 34.848),
         }
     ),
-    budgets=_CROWD_BUDGETS | {"cpu": Sizes(600, 1, 0, 60, 200, 100, _SMALL)},
-)
-
-_PLAIN = {"edge_cost": 0.0, "input_changes": False}
-_SEES = ("forget_bias=2",)
-_INFERS = (*_SEES, "innovation_rounds=1")
-_MOVES = (*_INFERS, "residual=trapezoid", "substeps=2")
-_WHOLE = (*_MOVES, "gated_messages=true")
-
-
-def _recipe(key: str, name: str, sets: tuple[str, ...], **train: Any) -> Line:
-    return Line(key, name, "dgvae", ("edge_feature_dim=16", *sets), {"edge_cost": 5.0, "input_changes": True} | train)
-
-
-RECIPE = Table(
-    title="5-Spring: what each part of the recipe is worth",
-    train="springs/train",
-    val="springs/val",
-    tests={"test": "springs/test", "ood": "springs/ood"},
-    commands=SPRINGS.commands,
-    lines=(
-        _recipe("paper", "paper's network, teacher-forced, Gaussian", (), **_PLAIN, **_TEACHER_FORCED),
-        _recipe("free", "paper's network, free run", (), **_PLAIN),
-        _recipe("sees", "+ input changes, forget bias", _SEES, edge_cost=0.0),
-        _recipe("infers", "+ innovation", _INFERS, edge_cost=0.0),
-        _recipe("moves", "+ velocity-consistent decoding, 2 substeps", _MOVES, edge_cost=0.0),
-        _recipe("gated", "+ gated messages", _WHOLE, edge_cost=0.0),
-        _recipe("priced", "+ price of edges (5 nats)", _WHOLE),
-        _recipe("hard", "… hard samples", (*_WHOLE, "hard_samples=true")),
-        _recipe("warm-up", "… KL warm-up over half of the steps", _WHOLE, kl_warmup_steps=150),
-        _recipe("curriculum", "… free run grows over half of the steps", _WHOLE, curriculum_steps=150),
-        _recipe("sigma", "… σ = 5e-3 instead of 5e-5", _WHOLE, variance=5e-3),
-        _recipe("gaussian", "… Gaussian instead of Laplace", _WHOLE, likelihood="gaussian"),
-        _recipe("labels", "… restricted labelling", _WHOLE, label_weight=200.0, type_label_weight=40.0),
-    ),
-    budgets={
-        "smoke": Sizes(20, 8, 200, 50, 50, 20, _TINY),
-        "cpu": Sizes(300, 32, 10_000, 500, 500, 100, _SMALL),
-        "paper": Sizes(20_000, 128, 0, 2000, 0, 1000),
-    },
+    budgets=_CROWD_BUDGETS | {"cpu": Sizes(600, 1, 0, 60, 200, 100, SMALL)},
 )
 
 TABLES: dict[str, Table] = {
     "springs": SPRINGS,
-    "recipe": RECIPE,
     "mocap": MOCAP,
     "nba": NBA,
     "sdd": SDD,

@@ -40,7 +40,7 @@ def plot_results_by_step(ax: Axes, results: Sequence[dict[str, Any]], kind: str,
         view = result["tests"][kind]["horizon_only"]
         if result["key"] == "least-squares":  # the limit, orders of magnitude below
             continue
-        ours = result["key"].startswith(("dgvae", "dvae"))
+        ours = result["key"].startswith(("dgvae", "dvae", "plural")) and not result["key"].endswith("-gaussian")
         baseline = result["key"].startswith("constant-velocity")
         time_s = dt_s * np.arange(1, len(view["by_step_m"]) + 1)
         errors = [error or 0.0 for error in view["step_errors"]["by_step_m"]]

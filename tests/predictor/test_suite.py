@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from predictor import suite
+from predictor.baselines.majority import MajorityGraph
 from predictor.data import nri
 from predictor.data.nri import NRIConfig, make_nri
 from predictor.data.springs import SpringsConfig, make
@@ -21,8 +22,8 @@ from predictor.evaluation import paper_tables as tables
 from predictor.evaluation.measure_line import protocol_indices
 from predictor.evaluation.paper_tables import NUM_SAMPLES, Line
 from predictor.models import configure
-from predictor.reports.tables import latex_table, markdown_report
-from predictor.suite import TABLES, SuiteConfig, line_config, line_folder, run_line, run_suite
+from predictor.reports.suite_tables import latex_table, markdown_report
+from predictor.suite import TABLES, SuiteConfig, jobs_of, line_config, line_folder, run_line, run_suite
 from predictor.support.errors import UserError
 from tests.predictor.helpers import spec
 
@@ -72,8 +73,8 @@ def test_every_kind_of_line_is_trained_and_measured(data: Path, tmp_path: Path, 
 
 def test_least_squares_runs_on_the_cpu_whatever_the_device(data: Path, monkeypatch: pytest.MonkeyPatch):
     devices = []
-    monkeypatch.setattr(measuring, "_measure_store", lambda *arguments: devices.append(arguments[-1]))
-    for key in ("least-squares", "constant-velocity"):
+    monkeypatch.setattr(measuring, "_measure_store", lambda made, *_: devices.append(made.device))
+    for key in ("least-squares", "constant-velocity-noise"):
         suite.measure_line(TABLES["springs"], line(key), data, TABLES["springs"].budgets["smoke"], None, 0, "cuda")
     assert devices == ["cpu", "cpu", "cuda", "cuda"]
 
@@ -145,8 +146,8 @@ def test_types_without_labels_are_renamed_and_types_with_labels_are_not(
 ):
     """A majority forecaster of type 0, which charges never have, is right by another name only."""
     table, settings = TABLES["nri-charged"], SuiteConfig("nri-charged", nri_data, tmp_path, "smoke")
-    empty = measuring.MajorityGraph(spec(has_ego=False), 20, 0, 2)  # one type fewer than the labels
-    monkeypatch.setattr(measuring.MajorityGraph, "fit", lambda *_: empty)
+    empty = MajorityGraph(spec(has_ego=False), 20, 0, 2)  # one type fewer than the labels
+    monkeypatch.setattr(MajorityGraph, "fit", lambda *_: empty)
     free = nri_line("nri-charged", "majority")
     labelled = replace(free, train={"type_label_weight": 1.0})
     found = [suite.measure_line(table, r, nri_data, settings.sizes, None, 0, "cpu") for r in (free, labelled)]
@@ -165,7 +166,7 @@ def test_a_model_is_trained_within_49_frames_and_measured_beside_nris_figures(nr
     assert "Errors on the 20 future steps after a burn-in of 49" in text
     (published,) = [line for line in text.splitlines() if line.startswith("| NRI (learned) (published) |")]
     assert published.split("|")[2:4] == [" – ", " 0.999 "]
-    ours = [line for line in text.splitlines() if line.startswith("| dG-VAE, enhanced, types alone |")]
+    ours = [line for line in text.splitlines() if line.startswith("| dVAE+ (types alone) |")]
     assert len(ours) == 3 and float(ours[2].split("|")[3]) >= 0.4  # two views, then the graph
 
 
@@ -204,8 +205,77 @@ def test_a_line_that_fails_says_why_and_leaves_the_others(data: Path, tmp_path: 
     (folder / "unknown.txt").write_text("not a run")
     content = run_suite(broken)
     assert [r["key"] for r in content["rows"]] == ["constant-velocity"]
-    assert "not empty and not a training run" in content["failed"]["mlp"]
-    assert "Failed lines: mlp" in (broken.folder / "table.md").read_text()
+    assert "not empty and not a training run" in content["failed"]["mlp, seed 0"]
+    assert "Failed lines: mlp, seed 0" in (broken.folder / "table.md").read_text()
+
+
+def test_seeds_are_jobs_of_their_own_and_trained_lines_alone_have_several(data: Path, tmp_path: Path):
+    several = config(data, tmp_path, lines=("constant-velocity", "mlp", "dgvae-gaussian"), seed=5, seeds=3)
+    jobs = jobs_of(several)
+    assert [(j.line.key, j.config.seed) for j in jobs] == [
+        ("constant-velocity", 5), *(("mlp", s) for s in (5, 6, 7)), *(("dgvae-gaussian", s) for s in (5, 6, 7))
+    ]  # fmt: skip
+    assert len({j.folder for j in jobs}) == 7
+    alone = jobs_of(config(data, tmp_path, lines=("mlp",), seed=6))
+    assert [j.folder for j in alone] == [jobs[2].folder]  # the same result, however it is asked for
+
+
+def test_several_seeds_are_shown_by_mean_and_range_and_resumed(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    in_this_process(monkeypatch)
+    settings = config(data, tmp_path, lines=("constant-velocity", "mlp"), seeds=2)
+    for job in jobs_of(settings)[:2]:
+        run_line(job.config, job.line)
+    started = in_this_process(monkeypatch)
+    content = run_suite(settings)
+    assert started == ["mlp, seed 1"]
+    straight, mlp = content["rows"]
+    assert (straight["seeds"], mlp["seeds"]) == ([0], [0, 1])
+    errors = [r["tests"]["test"]["horizon_only"]["ade_m"] for r in mlp["runs"]]
+    assert errors[0] != errors[1]
+    assert mlp["tests"]["test"]["horizon_only"]["ade_m"] == pytest.approx(np.mean(errors))
+    shown = next(line for line in markdown_report(content).splitlines() if line.startswith("| Linear (MLP)"))
+    assert f"{np.mean(errors):.3f} ({min(errors):.3f} to {max(errors):.3f})" in shown
+    windows = {tuple(r["tests"]["test"][key] for key in ("windows",)) for r in mlp["runs"]}
+    assert windows == {(24,)}
+
+
+def test_a_single_forecast_with_noise_is_measured_after_its_model_and_of_the_same_weights(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    started = in_this_process(monkeypatch)
+    content = run_suite(config(data, tmp_path, lines=("dgvae-gaussian", "dgvae"), workers=2))
+    assert started == ["dgvae, seed 0", "dgvae-gaussian, seed 0"] and not content["failed"]
+    model, control = content["rows"]
+    for view in ("horizon_only", "whole_sequence"):
+        ours, noisy = (r["tests"]["test"][view] for r in (model, control))
+        assert ours["ade_m"] == pytest.approx(noisy["ade_m"], rel=1e-5)
+        assert ours["min_ade_m"] != noisy["min_ade_m"]
+    assert control["parameters"] == model["parameters"]
+    assert control["tests"]["test"]["graph"] is None and model["tests"]["test"]["graph"] is not None
+    runs = list((tmp_path / "springs-smoke" / "rows").glob("*/run"))
+    assert len(runs) == 1  # one training
+
+
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Lets the suite run its jobs here instead of in processes of their own; returns their names in order."""
+    started: list[str] = []
+
+    class Done:
+        returncode = 0
+
+        def poll(self) -> int:
+            return 0
+
+    def start(job: Any) -> tuple[Any, Path]:
+        started.append(job.name)
+        job.folder.mkdir(parents=True, exist_ok=True)
+        run_line(job.config, job.line)
+        return Done(), job.folder / "log.txt"
+
+    monkeypatch.setattr(suite, "_start", start)
+    return started
 
 
 # --- Tables -------------------------------------------------------------------------------------------------------
@@ -216,28 +286,49 @@ def test_reports_have_a_line_for_each_model_and_the_papers_figures(data: Path, t
     content = run_suite(settings)
     content["paper"] = {"least-squares": {"rmse": 0.125, "ade": 0.25, "fde": 0.5}}
     text, latex = markdown_report(content), latex_table(content)
-    assert text.count("| least squares (limit) |") == 3  # two views and the graph
-    assert "0.125 / 0.250 / 0.500" in text
-    assert latex.count(r"\\") == 3 and latex.count("&") == 3 * 13
+    assert text.count("| least squares (limit) + Gaussian |") == 4  # test, ood, whole sequence, graph
+    assert "0.250 / 0.500 / 0.125" in text
+    assert latex.count(r"\begin{tabular}") == 4 and latex.count(r"\\") == 4 + 3 * 2 + 1
 
 
-def test_the_stochastic_control_has_as_many_samples_as_the_models_and_says_so(data: Path, tmp_path: Path):
+def test_every_line_has_k_samples_and_says_so(data: Path, tmp_path: Path):
+    """Constant velocity gets them from a Gaussian: its single forecast is the same, its best of 20 is better."""
     content = run_suite(config(data, tmp_path, lines=("constant-velocity", "constant-velocity-noise"), workers=2))
-    straight, noisy = (r["tests"]["test"]["horizon_only"] for r in content["rows"])
-    assert (straight["num_samples"], noisy["num_samples"]) == (1, 20)
-    assert noisy["min_ade_m"] < 0.8 * straight["min_ade_m"]
+    drawn, noisy = (r["tests"]["test"]["horizon_only"] for r in content["rows"])
+    assert drawn["num_samples"] == noisy["num_samples"] == NUM_SAMPLES
+    assert drawn["ade_m"] == pytest.approx(noisy["ade_m"]) and drawn["fde_m"] == pytest.approx(noisy["fde_m"])
+    for accuracy in (drawn, noisy):
+        assert accuracy["min_ade_m"] < 0.8 * accuracy["ade_m"]
+        assert 0.7 < accuracy["statistics"]["coverage"]["mean"] <= 1
+        assert accuracy["statistics"]["mixture_nll"]["mean"] == pytest.approx(np.mean(accuracy["mixture_nll"]), abs=0.1)
     lines = markdown_report(content).splitlines()
-    for name, samples in (("constant velocity", "1"), ("constant velocity + noise", "20")):
+    for name in ("constant velocity + Gaussian", "constant velocity + noise"):
         found = [line.split("|")[2].strip() for line in lines if line.startswith(f"| {name} |")]
-        assert len(found) >= 2 and set(found) == {samples}  # in every table that names it
-    assert 0.7 < noisy["statistics"]["coverage"]["mean"] <= 1
+        assert len(found) == 3 and set(found) == {"20"}
+    assert "σ = " in markdown_report(content) and len(content["rows"][0]["fitted"]["covariance_m2"]) == 20
 
 
-@pytest.mark.parametrize("name", ["springs", "mocap", "nba", "sdd", "ind"])
-def test_every_table_of_the_paper_has_the_stochastic_control(name: str):
-    lines = {r.key: r for r in TABLES[name].lines}
-    assert lines["constant-velocity-noise"].num_samples == lines["dgvae"].num_samples == NUM_SAMPLES
-    assert not lines["constant-velocity-noise"].is_trained
+@pytest.mark.parametrize("name", list(TABLES))
+def test_every_table_has_the_controls_the_papers_model_and_modes(name: str):
+    table = TABLES[name]
+    lines = {r.key: r for r in table.lines}
+    assert {"constant-velocity", "constant-velocity-noise", "nearest-neighbours"} <= set(lines)
+    assert not any(lines[key].is_trained for key in ("constant-velocity-noise", "nearest-neighbours"))
+    assert any(each.residual_of for each in table.lines)
+    for each in table.lines:
+        if each.residual_of:
+            source = lines[each.residual_of]
+            assert (each.set, each.train, each.model) == (source.set, source.train, source.model)
+            assert not source.residual_of and each.name == f"{source.name}, single forecast + Gaussian"
+        elif each.draws_residuals:
+            assert each.name.endswith(" + Gaussian")
+        else:
+            assert "Gaussian" not in each.name.replace("teacher-forced, Gaussian", "").replace("… Gaussian", "")
+    if not name.startswith(("recipe", "modes")):
+        papers = lines["dgvae-paper"]
+        assert papers.name == "dG-VAE (paper)" and papers.train == tables.TEACHER_FORCED
+        assert [s.split("=")[0] for s in papers.set if not s.startswith("num_edge_types")] == ["edge_feature_dim"]
+        assert {"num_modes=20", "rollout_graph=frozen"} <= set(lines["plural"].set)
 
 
 @pytest.mark.parametrize("name", list(TABLES))
@@ -272,6 +363,7 @@ def test_windows_end_their_burn_in_at_every_stride():
             "table 'springs' has no line 'dgvea'; there are constant-velocity, constant-velocity-noise",
         ),
         ({"steps": -1}, "steps must not be negative, got -1"),
+        ({"seeds": 0}, "seeds must be at least 1, got 0"),
         ({"device": "cuda:7"}, "device 'cuda:7' was asked for but torch finds no CUDA device"),
     ],
 )

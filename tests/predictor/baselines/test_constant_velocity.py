@@ -96,6 +96,7 @@ def test_samples_scatter_around_constant_velocity_as_fitted():
     offsets = (samples - exact)[:, 1:]
     spread_m = 0.3 * torch.tensor([0.5, 1.0, 1.5, 2.0]) ** 1.5
     torch.testing.assert_close(offsets[..., :2].std((0, 1, 2)), spread_m[:, None].expand(4, 2), rtol=0.02, atol=0)
+    torch.testing.assert_close(noisy.std_m(4), spread_m[:, None].expand(4, 2))
     assert float(offsets[..., :2].mean().abs()) < 0.01
     correlation = torch.corrcoef(
         torch.stack([offsets[..., 0].flatten(0, 2)[:, 3], offsets[..., 1].flatten(0, 2)[:, 3]])

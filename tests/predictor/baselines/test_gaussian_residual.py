@@ -172,3 +172,10 @@ def test_a_forecast_beyond_the_fitted_steps_is_refused():
         with pytest.raises(UserError) as error:
             control.rollout(now, HORIZON + 1, samples)
         assert str(error.value) == "the noise was fitted to 3 steps, got horizon_steps=4"
+
+
+def test_the_standard_deviation_is_that_of_the_samples():
+    control = fitted()
+    drawn = noise_of(control, belief(control))[:, 0, :, :AXES].std(0)
+    torch.testing.assert_close(control.std_m(HORIZON), drawn, rtol=0.03, atol=0)
+    assert torch.equal(control.std_m(1), control.std_m(HORIZON)[:1])

@@ -13,7 +13,7 @@ from predictor.forecaster import Belief, Futures, Memory
 from predictor.graph import pair_mask
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from predictor.support.errors import UserError
-from tests.predictor.helpers import ROAD, model, random_presence, random_states, spec
+from tests.predictor.helpers import ROAD, any_model, model, random_presence, random_states, spec
 
 SOLID = SceneSpec(
     0.5, ("world",) * 3, feature_names=KINEMATIC_FEATURES_3D, feature_scales=(1.0,) * 6, has_ego=False, max_agents=9
@@ -121,6 +121,22 @@ def test_tail_of_the_sequence_is_the_window():
     assert torch.equal(tail.future, free.future) and torch.equal(tail.valid, free.valid)
     assert not whole.valid[:, 0].any()
     assert whole.valid[:, 1:, :3].any()
+
+
+def test_the_spread_of_a_model_with_modes_is_that_of_each_step_of_the_sequence():
+    forecaster, cut = any_model("dgvae-plural"), windows()
+    indices = np.arange(len(cut))
+    (whole,) = run_windows(forecaster, cut, indices, 3, num_samples=4, whole_sequence=True)
+    (free,) = run_windows(forecaster, cut, indices, 3, num_samples=4)
+    assert whole.scale is not None and free.scale is not None and whole.scale.shape == whole.forecast.shape
+    assert torch.equal(whole.tail(3).scale, free.scale)
+    batch = cut.batch(np.array([5]))
+    one = run_sequence_batch(forecaster, batch, 3, num_samples=4)
+    memory = forecaster.empty_memory(1, batch.states.shape[2])
+    _, belief = forecaster.observe(memory, batch.states[:, 0], batch.valid[:, 0])
+    expected = forecaster.rollout(belief, 1).scale[0, 0, :, 0]
+    for sample in range(4):
+        torch.testing.assert_close(one.scale[0, sample, :, 0], expected)
 
 
 def test_one_step_part_of_a_model_against_a_loop():
