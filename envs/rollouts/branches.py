@@ -25,9 +25,9 @@ import numpy as np
 from highway_env.envs.common.abstract import AbstractEnv
 from jaxtyping import Bool, Float, Int
 
-from envs.rollouts.interventions import intervene
+from envs.rollouts.interventions import hold_others, intervene, kinds_of
 from envs.rollouts.world import World
-from envs.simulators.interventions import Intervention, simulator_of
+from envs.simulators.interventions import Intervention, log_motion, simulator_of
 from predictor.scene import Scene
 from predictor.support.errors import UserError
 
@@ -78,27 +78,60 @@ def branch(world: World, intervention: Intervention, horizon_steps: int) -> Bran
     Raises:
         UserError: the environment cannot be copied or perturbed, or the agent does not allow the intervention.
     """
-    (found,) = branches(world, [intervention], horizon_steps)
-    return found
+    return BranchPoint(world, horizon_steps).perturbed(intervention)
 
 
-def branches(world: World, interventions: Sequence[Intervention], horizon_steps: int) -> list[Branches]:
-    """Plays several interventions, each in a copy of its own; the branch without is played once.
+class BranchPoint:
+    """One moment of a running world, from which any number of interventions are played; the plain branch once.
+
+    Args:
+        world: a running world; it is not changed, and must not step before the last branch has been played.
+        horizon_steps: number of steps to play.
 
     Raises:
-        UserError: as `branch`.
+        UserError: the environment cannot be copied or perturbed.
     """
-    if horizon_steps < 1:
-        raise UserError(f"horizon_steps must be at least 1, got {horizon_steps}")
-    ids = world.full_scene().ids.copy()
-    plain, streams = _play(copied(world), ids, horizon_steps)
-    found = []
-    for intervention in interventions:
+
+    def __init__(self, world: World, horizon_steps: int) -> None:
+        """Plays the plain branch."""
+        if horizon_steps < 1:
+            raise UserError(f"horizon_steps must be at least 1, got {horizon_steps}")
+        kinds_of(world)
+        self._world, self._horizon = world, horizon_steps
+        self.ids = world.full_scene().ids.copy()
         other = copied(world)
+        self._log = log_motion(other.env)
+        self.plain, self._streams = _play(other, self.ids, horizon_steps)
+
+    def perturbed(self, intervention: Intervention) -> Branches:
+        """Plays an intervention; all agents may react.
+
+        Raises:
+            UserError: the agent does not allow it.
+        """
+        return self._branches(copied(self._world), intervention)
+
+    def direct(self, intervention: Intervention, receiver: int) -> Branches:
+        """Plays an intervention to which one agent alone may react: all others move as without it.
+
+        So its shift is what reaches it directly, not through a third agent. The others' shifts are 0, but for the
+        agent of the intervention.
+
+        Args:
+            intervention: what is done.
+            receiver: id of the agent that may react.
+
+        Raises:
+            UserError: the agent does not allow it.
+        """
+        other = copied(self._world)
+        hold_others(other, self._log, (intervention.agent, receiver))
+        return self._branches(other, intervention)
+
+    def _branches(self, other: World, intervention: Intervention) -> Branches:
         intervene(other, intervention)
-        perturbed, _ = _play(other, ids, horizon_steps, streams)
-        found.append(Branches(intervention, ids, plain, perturbed, world.spec.position_dim))
-    return found
+        perturbed, _ = _play(other, self.ids, self._horizon, self._streams)
+        return Branches(intervention, self.ids, self.plain, perturbed, self._world.spec.position_dim)
 
 
 def copied(world: World) -> World:

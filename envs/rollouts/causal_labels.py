@@ -1,12 +1,13 @@
-"""Causal labels: whose future changes when an agent brakes or is taken out, by how much.
+"""Causal labels: whose future changes when an agent brakes or is taken out, by how much, and not through a third one.
 
 At a step the world is branched (`envs.rollouts.branches`): for each sender, once it brakes over the whole horizon, once
-it is taken out, where that is possible. The label of a receiver is the farthest that either moves it within the
-horizon [m]. Where a sender was not tried, the label is unknown.
+it is taken out, where that is possible. Receivers that either moves by more than the threshold may have been reached
+through others: a sender's follower brakes, and so its follower brakes. So each of them is played again, with all others
+held to what they do without the intervention. The label is the farthest direct shift within the horizon [m]; of
+receivers below the threshold already, the whole shift. Where a sender was not tried, the label is unknown.
 
-The label is the total effect within the horizon: it counts also what reaches the receiver through a third agent, which
-takes time. A short horizon keeps such chains out: a driver reacts to its leader in the same simulated frame, but the
-next one behind only to the speed that the first one has lost by then.
+Edges are thus what one agent does to another at once. Chains follow from them, as in a model whose messages pass edge
+by edge; labels that contained the chains would grow with the horizon and with the density of traffic.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +17,7 @@ from itertools import islice
 import numpy as np
 from jaxtyping import Float
 
-from envs.rollouts.branches import Branches, branches, copied
+from envs.rollouts.branches import Branches, BranchPoint, copied
 from envs.rollouts.interventions import intervene, interventions_of, kinds_of
 from envs.rollouts.world import World
 from envs.simulators.interventions import Intervention, Kind
@@ -63,7 +64,7 @@ class CausalLabels:
     ids: Sequence[int]
     """Agents, in the order of `World.full_scene`."""
     shift_m: Float[np.ndarray, "agents agents"]
-    """float32, receiver first: farthest shift by an intervention on the sender [m]; NaN where unknown."""
+    """float32, receiver first: farthest direct shift by an intervention on the sender [m]; NaN where unknown."""
 
 
 def causal_labels(world: World, settings: CausalSettings) -> CausalLabels:
@@ -77,13 +78,25 @@ def causal_labels(world: World, settings: CausalSettings) -> CausalLabels:
     shift_m = np.full((len(ids), len(ids)), np.nan, dtype=np.float32)
     steps = max(1, round(settings.horizon_s / world.spec.dt_s))
     tried = [one for sender in senders_of(world, settings) for one in possible(world, sender, steps)]
-    for found in branches(world, tried, steps) if tried else ():
-        column = ids.index(found.intervention.agent)
-        shift_m[:, column] = np.fmax(shift_m[:, column], farthest(found, settings.threshold_m))
+    point = BranchPoint(world, steps) if tried else None
+    for intervention in tried:
+        assert point is not None
+        column = ids.index(intervention.agent)
+        shift_m[:, column] = np.fmax(shift_m[:, column], _direct(point, intervention, settings.threshold_m))
     if world.spec.has_ego:
         shift_m[0] = np.nan  # its future is the policy's choice
     np.fill_diagonal(shift_m, np.nan)
     return CausalLabels(ids, shift_m)
+
+
+def _direct(point: BranchPoint, intervention: Intervention, threshold_m: float) -> Float[np.ndarray, " agents"]:
+    """Returns each agent's farthest shift [m]; the direct one where the whole one exceeds the threshold."""
+    whole_m = farthest(point.perturbed(intervention), threshold_m)
+    for receiver in np.flatnonzero(whole_m > threshold_m):
+        if point.ids[receiver] != intervention.agent:
+            alone = point.direct(intervention, int(point.ids[receiver]))
+            whole_m[receiver] = farthest(alone, threshold_m)[receiver]
+    return whole_m
 
 
 def farthest(found: Branches, threshold_m: float) -> Float[np.ndarray, " agents"]:

@@ -12,10 +12,12 @@
 True
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 from envs.rollouts.world import World
-from envs.simulators.interventions import Intervention, Kind, in_force, kinds_for, start
+from envs.simulators.held_agents import MotionLog
+from envs.simulators.interventions import Intervention, Kind, hold, in_force, kinds_for, start
 from predictor.support.errors import UserError
 
 
@@ -52,6 +54,17 @@ def kinds_of(world: World) -> tuple[Kind, ...]:
 def interventions_of(world: World) -> dict[int, Intervention]:
     """Returns the interventions that act on the next step, by agent."""
     return in_force(world.env)
+
+
+def hold_others(world: World, log: MotionLog, free: Sequence[int]) -> None:
+    """Holds all agents but some to the motion of another branch of the same moment.
+
+    Args:
+        world: a copy of the moment at which the log began.
+        log: motion of the other branch (`envs.simulators.interventions.log_motion`).
+        free: ids of the agents that move freely.
+    """
+    hold(world.env, log, [_body(world, agent) for agent in free])
 
 
 def _body(world: World, agent: int) -> Any:

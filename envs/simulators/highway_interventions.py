@@ -6,6 +6,7 @@ lane keeps its own speed control. One that is taken out drives on unseen: nobody
 its time is over and its place is free.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,12 @@ from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.vehicle.controller import ControlledVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
+from envs.simulators.held_agents import HeldAgents, MotionLog
 from envs.simulators.intervention import Intervention
 from predictor.support.errors import UserError
 
+MOTION = ("position", "heading", "speed", "lane", "lane_index", "target_lane_index", "action", "crashed")
+"""Attributes of a vehicle that make up its motion in a frame."""
 CHANGE_MPS = {"brake": 8.0, "accelerate": 5.0}
 """Changes of speed where an intervention names none; 8 m/s is the larger one of docs/datasets/env.md's measurements."""
 RATE_MPS2 = {"brake": 6.0, "accelerate": 3.0}
@@ -49,10 +53,27 @@ def intervene_on_road(env: AbstractEnv, vehicle: Vehicle, intervention: Interven
         begun = _SpeedChange(vehicle, intervention, env)
     if intervention.steps:
         begun.begin()
-        standing = env.road.__dict__.get("act")
-        if standing is None:
-            standing = env.road.act = RoadInterventions(env.road)
-        standing.running.append(begun)
+        _standing(env.road).running.append(begun)
+
+
+def log_road(env: AbstractEnv) -> MotionLog:
+    """Begins to log the motion of all vehicles on the road, and returns the log."""
+    standing = _standing(env.road)
+    standing.log = MotionLog(env.road.vehicles, MOTION)
+    return standing.log
+
+
+def hold_on_road(env: AbstractEnv, log: MotionLog, free: Sequence[Vehicle]) -> None:
+    """Holds all vehicles but some to a log; called before any intervention."""
+    _standing(env.road).held = HeldAgents(env.road.vehicles, log, free)
+
+
+def _standing(road: Any) -> "RoadInterventions":
+    """Returns what stands in the road's `act`; puts it there if nothing does."""
+    if "act" not in road.__dict__:
+        road.act = RoadInterventions(road)
+    found: RoadInterventions = road.act
+    return found
 
 
 def road_interventions(env: AbstractEnv) -> dict[int, Intervention]:
@@ -73,17 +94,27 @@ class RoadInterventions:
         """Starts without interventions."""
         self.road = road
         self.running: list[_Override] = []
+        self.log: MotionLog | None = None
+        self.held: HeldAgents | None = None
 
     def __call__(self) -> None:
         """Lets all drivers decide, then overrides; ends what is over, and leaves the road when all is."""
         self.running = [one for one in self.running if one.frames > 0 or not one.end()]
         for one in self.running:
             one.before()
-        type(self.road).act(self.road)
+        if self.held is None:
+            type(self.road).act(self.road)
+        else:
+            self.held.place()
+            for vehicle in self.road.vehicles:
+                if vehicle not in self.held:
+                    vehicle.act()
         for one in self.running:
             one.after()
             one.frames -= 1
-        if not self.running:
+        if self.log is not None:
+            self.log.note(self.road.vehicles)
+        if not self.running and self.log is None and self.held is None:
             del self.road.act
 
 

@@ -5,14 +5,22 @@ lives inside the simulator: `copy.deepcopy` and `pickle` of an environment carry
 agent's driver takes over again. `envs.rollouts.interventions` finds the agent by the id that readers report.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from highway_env.envs.common.abstract import AbstractEnv
 
-from envs.simulators.highway_interventions import intervene_on_road, road_interventions
+from envs.simulators.held_agents import MotionLog
+from envs.simulators.highway_interventions import hold_on_road, intervene_on_road, log_road, road_interventions
 from envs.simulators.intervention import KINDS, Intervention, Kind
-from envs.simulators.mpe_interventions import drop_from_particles, intervene_on_particles, particle_interventions
+from envs.simulators.mpe_interventions import (
+    drop_from_particles,
+    hold_particles,
+    intervene_on_particles,
+    log_particles,
+    particle_interventions,
+)
 from predictor.support.errors import UserError
 
 __all__ = [
@@ -21,8 +29,10 @@ __all__ = [
     "Kind",
     "drop_all",
     "generator_of",
+    "hold",
     "in_force",
     "kinds_for",
+    "log_motion",
     "simulator_of",
     "start",
 ]
@@ -70,6 +80,32 @@ def in_force(env: Any) -> dict[int, Intervention]:
     if isinstance(simulator, AbstractEnv):
         return {} if simulator.road is None else road_interventions(simulator)
     return particle_interventions(simulator.world) if _has_particles(simulator) else {}
+
+
+def log_motion(env: Any) -> MotionLog:
+    """Begins to log the motion of all agents that are present, frame by frame, and returns the log.
+
+    Raises:
+        UserError: the simulator cannot be perturbed.
+    """
+    kinds_for(env)
+    simulator = simulator_of(env)
+    return log_road(simulator) if isinstance(simulator, AbstractEnv) else log_particles(simulator.world)
+
+
+def hold(env: Any, log: MotionLog, free: Sequence[Any]) -> None:
+    """Holds all agents but some to the motion of another branch; called at once after the copy.
+
+    Args:
+        env: a copy of the environment from the moment at which the log began.
+        log: motion of the other branch.
+        free: agents that move freely, the simulator's own objects.
+    """
+    simulator = simulator_of(env)
+    if isinstance(simulator, AbstractEnv):
+        hold_on_road(simulator, log, free)
+    else:
+        hold_particles(simulator.world, log, free)
 
 
 def drop_all(env: Any) -> None:

@@ -6,14 +6,18 @@ away and marked as not alive, so that readers leave it out; the drivers and obse
 far away. It comes back where it was, with the velocity that it had, when its time is over and its place is free.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from envs.simulators.held_agents import HeldAgents, MotionLog
 from envs.simulators.intervention import Intervention
 from predictor.support.errors import UserError
 
+MOTION = ("p_pos", "p_vel", "u")
+"""Attributes of an agent's state and action that make up its motion in a step."""
 CHANGE_MPS = {"brake": np.inf, "accelerate": 1.0}
 """Changes of speed where an intervention names none: brake to rest."""
 AWAY_M = 100.0
@@ -38,10 +42,31 @@ def intervene_on_particles(world: Any, body: Any, intervention: Intervention) ->
         raise UserError(f"{name} ({body.name}) does not move by actions and cannot be perturbed; choose another agent")
     begun = (_Absence if intervention.kind == "remove" else _Push)(world, body, intervention)
     if intervention.steps:
-        standing = world.__dict__.get("step")
-        if standing is None:
-            standing = world.step = ParticleInterventions(world)
-        standing.running.append(begun)
+        _standing(world).running.append(begun)
+
+
+def log_particles(world: Any) -> MotionLog:
+    """Begins to log the motion of all agents, and returns the log."""
+    standing = _standing(world)
+    standing.log = MotionLog(_parts(world.agents), MOTION)
+    return standing.log
+
+
+def hold_particles(world: Any, log: MotionLog, free: Sequence[Any]) -> None:
+    """Holds all agents but some to a log; called before any intervention."""
+    _standing(world).held = HeldAgents(_parts(world.agents), log, _parts(free))
+
+
+def _parts(agents: Sequence[Any]) -> list[Any]:
+    return [part for agent in agents for part in (agent.state, agent.action)]
+
+
+def _standing(world: Any) -> "ParticleInterventions":
+    """Returns what stands in the world's `step`; puts it there if nothing does."""
+    if "step" not in world.__dict__:
+        world.step = ParticleInterventions(world)
+    found: ParticleInterventions = world.step
+    return found
 
 
 def particle_interventions(world: Any) -> dict[int, Intervention]:
@@ -68,17 +93,23 @@ class ParticleInterventions:
         """Starts without interventions."""
         self.world = world
         self.running: list[_Push | _Absence] = []
+        self.log: MotionLog | None = None
+        self.held: HeldAgents | None = None
 
     def __call__(self) -> None:
         """Overrides actions, steps the world, and ends what is over."""
+        if self.held is not None:
+            self.held.place()
         for one in self.running:
             one.before()
+        if self.log is not None:
+            self.log.note(_parts(self.world.agents))
         type(self.world).step(self.world)
         for one in self.running:
             one.after()
             one.steps -= 1
         self.running = [one for one in self.running if one.steps > 0 or not one.end()]
-        if not self.running:
+        if not self.running and self.log is None and self.held is None:
             del self.world.step
 
 

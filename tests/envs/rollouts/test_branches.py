@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from envs.rollouts.branches import branch, branches, copied
+from envs.rollouts.branches import BranchPoint, branch, copied
 from envs.rollouts.interventions import intervene
 from envs.rollouts.world import open_world
-from envs.simulators.interventions import Intervention
+from envs.simulators.interventions import Intervention, Kind
 from predictor.support.errors import UserError
 from tests.envs.interventions import assert_same_scenes, played, road_world, state_of
 
@@ -38,6 +38,33 @@ def test_a_measurement_at_once_starts_from_the_slower_scene():
     assert state_of(found.perturbed.perceived[0], 2)[2] == 12.0
     shift, _ = found.shift()
     assert shift[5, 1, 0] < -2.0 and abs(shift[5, 3, 0]) < 1e-9
+
+
+@pytest.mark.parametrize("kind", ["brake", "remove"])
+def test_what_reaches_an_agent_through_another_is_not_direct(kind: Kind):
+    """Three in a row: what the first does reaches the last through the middle one."""
+    point = BranchPoint(road_world((0.0, 4.0), (25.0, 4.0), (50.0, 4.0)), 5)
+    first = Intervention(3, kind, 5)
+    whole, _ = point.perturbed(first).shift()
+    assert abs(whole[5, 1, 0]) > 0.3 and abs(whole[5, 2, 0]) > 1.0
+    last, _ = point.direct(first, 1).shift()
+    assert np.abs(last[:, [0, 1, 2]]).max() < 1e-9
+    middle, _ = point.direct(first, 2).shift()
+    assert np.abs(middle[:, [0, 1]]).max() < 1e-9
+    assert middle[5, 2, 0] == pytest.approx(whole[5, 2, 0])
+
+
+def test_in_an_arena_others_are_held_too():
+    world = open_world("simple_tag_v3", "heuristic")
+    world.reset(2)
+    played(world, 4)
+    point = BranchPoint(world, 8)
+    gone = Intervention(3, "remove", 9)
+    alone, valid = point.direct(gone, 0).shift()
+    whole, _ = point.perturbed(gone).shift()
+    assert valid[:, :3].all() and not valid[:, 3].any()
+    assert np.abs(alone[:, 1:]).max() < 1e-9 < 0.05 < np.abs(alone[:, 0]).max()
+    assert np.abs(whole[:, 1]).max() > 0.05
 
 
 def test_an_agent_that_is_taken_out_has_no_shift():
@@ -77,9 +104,10 @@ def test_both_branches_draw_the_same_noise():
     """A lane change of the ego is drawn in both alike, although the intervention changes what the road draws."""
     world = open_world("intersection-v2", "random")
     world.reset(4)
-    found = branches(world, [Intervention(1, kind, 6) for kind in ("brake", "remove")], 6)
+    point = BranchPoint(world, 6)
+    found = [point.perturbed(Intervention(1, kind, 6)) for kind in ("brake", "remove")]
     assert [one.intervention.kind for one in found] == ["brake", "remove"]
-    np.testing.assert_array_equal(found[0].plain.states, found[1].plain.states)
+    assert found[0].plain is found[1].plain
     ego = [one.perturbed.states[:, 0] for one in found]
     np.testing.assert_array_equal(ego[0], found[0].plain.states[:, 0])
     np.testing.assert_array_equal(ego[1], found[0].plain.states[:, 0])
@@ -120,7 +148,7 @@ def test_a_running_envpool_environment_cannot_branch():
     pytest.importorskip("envpool")
     world = open_world("envpool/HighwayFast-v0", "idle")
     world.reset(0)
-    with pytest.raises(UserError, match="a running EnvPool environment cannot be copied"):
+    with pytest.raises(UserError, match="EnvPoolEnv cannot be perturbed"):
         branch(world, Intervention(1, "brake", 1), 2)
     with pytest.raises(UserError, match="EnvPoolEnv cannot be perturbed"):
         intervene(world, Intervention(1, "brake", 1))
