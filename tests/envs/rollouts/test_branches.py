@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
 
+from envs.rollouts import branches as rollout_branches
 from envs.rollouts.branches import BranchPoint, branch, copied
 from envs.rollouts.interventions import intervene
-from envs.rollouts.world import open_world
+from envs.rollouts.world import World, open_world
 from envs.simulators.interventions import Intervention, Kind
 from predictor.support.errors import UserError
 from tests.envs.interventions import assert_same_scenes, played, road_world, state_of
@@ -100,17 +101,23 @@ def test_the_plain_branch_is_what_then_happens(env_id: str, driver: str):
                 np.testing.assert_array_equal(first.plain.states[step, first.ids.tolist().index(agent)], state)
 
 
-def test_both_branches_draw_the_same_noise():
-    """A lane change of the ego is drawn in both alike, although the intervention changes what the road draws."""
-    world = open_world("intersection-v2", "random")
+def test_both_branches_draw_the_same_noise(monkeypatch: pytest.MonkeyPatch):
+    """Also where the intervention makes the simulator or a driver draw more often."""
+
+    def intervene_and_draw(world: World, intervention: Intervention) -> None:
+        intervene(world, intervention)
+        for generator in world.generators():
+            generator.random(7)
+
+    monkeypatch.setattr(rollout_branches, "intervene", intervene_and_draw)
+    world = open_world("highway-fast-v0", "random")
     world.reset(4)
-    point = BranchPoint(world, 6)
-    found = [point.perturbed(Intervention(1, kind, 6)) for kind in ("brake", "remove")]
-    assert [one.intervention.kind for one in found] == ["brake", "remove"]
-    assert found[0].plain is found[1].plain
-    ego = [one.perturbed.states[:, 0] for one in found]
-    np.testing.assert_array_equal(ego[0], found[0].plain.states[:, 0])
-    np.testing.assert_array_equal(ego[1], found[0].plain.states[:, 0])
+    assert len(world.generators()) == 2
+    farthest = int(world.full_scene().states[:, 0].argmax())
+    found = branch(world, Intervention(farthest, "brake", 4), 4)
+    shift, _ = found.shift()
+    assert np.abs(shift[4, farthest]).max() > 1.0
+    np.testing.assert_array_equal(found.perturbed.states[:, 0], found.plain.states[:, 0])
 
 
 def test_a_world_under_an_intervention_can_branch():
