@@ -1,23 +1,29 @@
 """Records the agents of an environment: `python -m envs.collect --env-id roundabout-v1 --out data/roundabout`.
 
-Each episode is a function of its seed alone, so the store is the same for any number of workers.
+Each episode is a function of its seed and the options alone, so the store is the same for any number of workers. A
+recording that is stopped goes on where it stopped when its command is repeated.
 """
 
 import multiprocessing
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from envs.readers.highway_labels import ATTRIBUTE_NAMES, SceneLabels, with_labels
+from envs.readers.highway_labels import ATTRIBUTE_NAMES
+from envs.rollouts.causal_labels import TRIED, CausalSettings, settings_for
+from envs.rollouts.interventions import kinds_of
+from envs.rollouts.perturbations import check_kinds, mix_for
+from envs.rollouts.recording import Recording, record
 from envs.rollouts.world import World, default_drivers, open_world
-from predictor.data.store import Episode, StoreInfo, write_store
-from predictor.scene import Scene
+from envs.simulators.interventions import Kind
+from predictor.data.partial_store import PartialStore
+from predictor.data.store import Episode, StoreInfo
 from predictor.support.command_line import Renamed, parse
-from predictor.support.config_checks import check_at_least
+from predictor.support.config_checks import check_at_least, check_positive
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.provenance import provenance
 
@@ -47,6 +53,20 @@ class CollectConfig:
     """Whether to record leaders and followers with their gaps at each step: for training on known edges and for scores,
     never part of an observation. Recorded states do not depend on it; docs/datasets/env.md has its cost in time and
     bytes."""
+    perturb: float = 0.0
+    """Share of the steps during which one agent is perturbed: at random moments, a random perceived agent brakes,
+    accelerates, changes lane or is taken out, for a while (docs/datasets/env.md). 0 records undisturbed episodes."""
+    perturb_kinds: tuple[Kind, ...] = ()
+    """Kinds of interventions to draw from; none given: all that the environment allows."""
+    causal_labels: int = 0
+    """Number of steps from one with causal labels to the next; 0 records none. At such a step copies of the simulator
+    show whose future changes when an agent brakes or is taken out; docs/datasets/env.md has the cost."""
+    causal_horizon_s: float | None = None
+    """Time that copies are played for causal labels [s]; None takes 3 s on roads, 1 s in mpe2."""
+    causal_threshold_m: float | None = None
+    """Shift above which an edge counts as causal [m]; None takes 1 m on roads, 0.05 m in mpe2."""
+    causal_senders: int = 8
+    """Largest number of agents that are perturbed for the causal labels of one step."""
     workers: int = os.cpu_count() or 1
     """Number of parallel processes; the store does not depend on it."""
     overwrite: bool = False
@@ -58,8 +78,15 @@ class CollectConfig:
         Raises:
             UserError: a value out of range.
         """
-        check_at_least(self, 1, "episodes", "max_steps", "workers")
-        check_at_least(self, 0, "seed")
+        check_at_least(self, 1, "episodes", "max_steps", "causal_senders", "workers")
+        check_at_least(self, 0, "seed", "causal_labels")
+        check_positive(self, "causal_horizon_s", "causal_threshold_m")
+        if not 0 <= self.perturb <= 1:
+            raise UserError(f"perturb must lie between 0 and 1, got {self.perturb:g}")
+        if self.perturb_kinds and not self.perturb:
+            raise UserError("perturb_kinds needs perturb above 0, got 0; pass --perturb, for example 0.2")
+        if not self.causal_labels and (self.causal_horizon_s is not None or self.causal_threshold_m is not None):
+            raise UserError("causal_horizon_s and causal_threshold_m need causal_labels above 0, got 0")
 
     @property
     def drivers(self) -> tuple[str, ...]:
@@ -67,26 +94,54 @@ class CollectConfig:
         return self.driver or default_drivers(self.env_id)
 
 
-def collect(config: CollectConfig) -> Iterator[Episode]:
-    """Records the episodes of a config, in the order of their seeds."""
-    drivers = config.drivers
+def collect(config: CollectConfig, first: int = 0) -> Iterator[Episode]:
+    """Records the episodes of a config, in the order of their seeds, from the one with number `first` on.
+
+    Raises:
+        UserError: the environment cannot be perturbed or copied, where that is asked for.
+    """
+    drivers, settings = config.drivers, recording_of(config)
     tasks = [
-        _Task(config.env_id, drivers[i % len(drivers)], config.seed + i, config.max_steps, config.labels)
-        for i in range(config.episodes)
+        _Task(config.env_id, drivers[i % len(drivers)], config.seed + i, settings)
+        for i in range(first, config.episodes)
     ]
     if config.workers == 1:
         yield from map(_record, tasks)
         return
     with multiprocessing.get_context("spawn").Pool(config.workers, initializer=_limit_threads) as pool:
-        yield from pool.imap(_record, tasks, chunksize=4)
+        yield from pool.imap(_record, tasks, chunksize=1 if config.causal_labels else 4)
+
+
+def recording_of(config: CollectConfig) -> Recording:
+    """Returns what is recorded of each episode.
+
+    Raises:
+        UserError: the environment cannot be perturbed or copied, where that is asked for.
+    """
+    plain = Recording(config.max_steps, config.labels)
+    if not config.perturb and not config.causal_labels:
+        return plain
+    world = _world(config.env_id, config.drivers[0])
+    check_kinds(world, config.perturb_kinds)
+    causal: CausalSettings | None = None
+    if config.causal_labels:
+        given = {"horizon_s": config.causal_horizon_s, "threshold_m": config.causal_threshold_m}
+        changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        causal = replace(settings_for(world), senders=config.causal_senders, **changes)
+    return replace(
+        plain,
+        perturb=config.perturb,
+        perturb_kinds=config.perturb_kinds,
+        causal_every=config.causal_labels,
+        causal=causal,
+    )
 
 
 class _Task(NamedTuple):
     env_id: str
     driver: str
     seed: int
-    max_steps: int
-    labels: bool
+    recording: Recording
 
 
 _worlds: dict[tuple[str, str], World] = {}
@@ -98,27 +153,47 @@ def _limit_threads() -> None:
     torch.set_num_threads(1)  # workers already fill the cores
 
 
+def _world(env_id: str, driver: str) -> World:
+    if (env_id, driver) not in _worlds:
+        _worlds[env_id, driver] = open_world(env_id, driver)
+    return _worlds[env_id, driver]
+
+
 def _record(task: _Task) -> Episode:
-    if (task.env_id, task.driver) not in _worlds:
-        _worlds[task.env_id, task.driver] = open_world(task.env_id, task.driver)
-    world = _worlds[task.env_id, task.driver]
-    world.reset(task.seed)
-    scenes: list[Scene] = []
-    labels: list[SceneLabels] = []
+    return record(_world(task.env_id, task.driver), task.seed, task.driver, task.recording)
 
-    def note() -> None:
-        scenes.append(world.full_scene())
-        if task.labels and (found := world.labels()) is not None:
-            labels.append(found)
 
-    note()
-    for _ in range(task.max_steps):
-        ended = world.step()
-        note()
-        if ended:
-            break
-    episode = Episode.from_scenes(scenes, label=task.driver, seed=task.seed)
-    return with_labels(episode, scenes, labels) if labels else episode
+def _info(config: CollectConfig) -> StoreInfo:
+    """Returns content and provenance of the store; makes each driver once, so that a wrong one ends here.
+
+    Raises:
+        UserError: a driver, an environment or settings that do not go together.
+    """
+    worlds = [open_world(config.env_id, name) for name in config.drivers]
+    worlds[0].reset(config.seed)
+    labelled = config.labels and worlds[0].labels() is not None
+    recording = recording_of(config)
+    made = provenance(PACKAGES) | {"seed": config.seed}
+    if config.perturb:
+        kinds = check_kinds(worlds[0], config.perturb_kinds)
+        made["perturbations"] = {"share": config.perturb, "kinds": kinds, "mix": asdict(mix_for(kinds_of(worlds[0])))}
+    if recording.causal is not None:
+        made["causal_labels"] = {"every": config.causal_labels, "tried": TRIED} | asdict(recording.causal)
+    for world in worlds:
+        world.close()
+    return StoreInfo(
+        worlds[0].spec,
+        config.env_id,
+        made,
+        ATTRIBUTE_NAMES if labelled else (),
+        causal_threshold_m=None if recording.causal is None else recording.causal.threshold_m,
+    )
+
+
+def _settings(config: CollectConfig, info: StoreInfo) -> dict[str, Any]:
+    """Returns all that an episode depends on, for recordings that are taken up again."""
+    given = {name: value for name, value in asdict(config).items() if name not in ("out", "workers", "overwrite")}
+    return given | {name: info.provenance[name] for name in ("commit", "versions")} | {"drivers": config.drivers}
 
 
 def main() -> None:
@@ -126,28 +201,21 @@ def main() -> None:
     config = parse(CollectConfig, __doc__)
     if config.out.exists() and not config.overwrite:
         raise UserError(f"{config.out} exists; choose another path or pass --overwrite")
-    worlds = [open_world(config.env_id, name) for name in config.drivers]
-    worlds[0].reset(config.seed)
-    labelled = config.labels and worlds[0].labels() is not None
-    info = StoreInfo(
-        worlds[0].spec,
-        config.env_id,
-        provenance(PACKAGES) | {"seed": config.seed},
-        ATTRIBUTE_NAMES if labelled else (),
-    )
-    for world in worlds:
-        world.close()
-    episodes = []
+    info = _info(config)
     columns = (TextColumn(f"collect {config.env_id}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns) as progress:
-        task = progress.add_task("", total=config.episodes)
-        for episode in collect(config):
-            episodes.append(episode)
-            progress.advance(task)
-    write_store(config.out, info, episodes, config.overwrite)
+    with PartialStore(config.out, _settings(config, info), discard=config.overwrite) as partial:
+        done = partial.num_done
+        with Progress(*columns) as progress:
+            task = progress.add_task("", total=config.episodes, completed=done)
+            for episode in collect(config, done):
+                partial.add(info, episode)
+                progress.advance(task)
+        episodes = partial.finish(info, config.overwrite)
     steps = sum(len(e.states) for e in episodes)
+    taken = f" ({done} of them from an unfinished recording)" if done else ""
     print(
-        f"{config.out}: {len(episodes)} episodes, {steps} scenes, seeds {config.seed}–{config.seed + len(episodes) - 1}"
+        f"{config.out}: {len(episodes)} episodes{taken}, {steps} scenes, "
+        f"seeds {config.seed}–{config.seed + len(episodes) - 1}"
     )
 
 

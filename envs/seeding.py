@@ -2,10 +2,24 @@
 
 Environments draw from `numpy.random.default_rng(seed)`: Gymnasium, PettingZoo and mpe2 make their generators so. A
 driver whose generator had the same seed would draw the numbers that set the environment's start, and its hidden habits
-could be inferred from the first scene. Each driver therefore draws from a child of the seed's `SeedSequence`.
+could be inferred from the first scene. Each driver therefore draws from a child of the seed's `SeedSequence`. So do
+random interventions and the choice of the steps that get causal labels, whatever the number of drivers.
 """
 
 import numpy as np
+
+_PERTURBATIONS, _LABELS = 2**16, 2**16 + 1
+"""Numbers of the children for what is not a driver; drivers have the first ones."""
+
+
+def perturbation_rng(seed: int) -> np.random.Generator:
+    """Returns the generator of an episode's random interventions."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_PERTURBATIONS,)))
+
+
+def label_rng(seed: int) -> np.random.Generator:
+    """Returns the generator that chooses an episode's steps with causal labels."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_LABELS,)))
 
 
 def driver_rng(seed: int | None, group: int = 0) -> np.random.Generator:

@@ -2,11 +2,13 @@
 
 Every agent draws its own habits anew in each episode, from a random stream of its own that is independent of the
 environment's (`envs.seeding`): the start of an episode carries no information on the habits, only an agent's history
-does. Heuristics use the simulator's state; recordings hold only what a scene reader reads.
+does. Heuristics use the simulator's state; recordings hold only what a scene reader reads. Drivers are partials
+and bound methods, not closures: `copy.deepcopy` of a running world copies their state too.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -56,34 +58,51 @@ def make_driver(name: str, env: Any, rng: np.random.Generator) -> Driver:
     """
     for agent in getattr(env, "possible_agents", ()):
         uniform_action(env.action_space(agent), np.random.default_rng(0), WHO)
-    draw = _agent_drivers(name, env, rng)
-    drivers: dict[str, AgentDriver] = {}
+    return partial(_drive, env, rng, _agent_drivers(name, env, rng), {})
 
-    def drive(observations: Mapping[str, Any]) -> dict[str, Any]:
-        living = set(env.agents)
-        for agent in observations:
-            if agent in living and agent not in drivers:
-                drivers[agent] = draw(agent, rng.spawn(1)[0])
-        return {agent: drivers[agent](seen) for agent, seen in observations.items() if agent in living}
 
-    return drive
+def _drive(
+    env: Any,
+    rng: np.random.Generator,
+    draw: DrawAgentDriver,
+    drivers: dict[str, AgentDriver],
+    observations: Mapping[str, Any],
+) -> dict[str, Any]:
+    living = set(env.agents)
+    for agent in observations:
+        if agent in living and agent not in drivers:
+            drivers[agent] = draw(agent, rng.spawn(1)[0])
+    return {agent: drivers[agent](seen) for agent, seen in observations.items() if agent in living}
 
 
 def _agent_drivers(name: str, env: Any, rng: np.random.Generator) -> DrawAgentDriver:
     """Returns the function that makes the driver of an agent; `rng` is for the agents' common decisions."""
-    if name == "random":
-        return lambda agent, own: lambda seen: uniform_action(env.action_space(agent), own, WHO)
-    if name == "idle":
-        return lambda agent, own: lambda seen: idle_action(env, agent)
-    if name == "varied":
-        return lambda agent, own: varied_actions(env.action_space(agent), own, WHO)
+    if name in ("random", "idle", "varied"):
+        return partial(_draw, name, env)
     if name == "heuristic":
         return _heuristic(env, rng)
     if name == "mixed":
         kinds = ("random", "varied", "heuristic") if has_heuristic(env) else ("random", "varied")
-        draws = [_agent_drivers(kind, env, rng) for kind in kinds]
-        return lambda agent, own: draws[own.integers(len(draws))](agent, own)
+        return partial(_draw_any, [_agent_drivers(kind, env, rng) for kind in kinds])
     raise UserError(f"driver must be one of {', '.join(DRIVER_NAMES)}, got '{name}'")
+
+
+def _draw(name: str, env: Any, agent: str, own: np.random.Generator) -> AgentDriver:
+    if name == "varied":
+        return varied_actions(env.action_space(agent), own, WHO)
+    return partial(_idle, env, agent) if name == "idle" else partial(_random, env.action_space(agent), own)
+
+
+def _random(space: gym.Space, own: np.random.Generator, seen: Any) -> Any:
+    return uniform_action(space, own, WHO)
+
+
+def _idle(env: Any, agent: str, seen: Any) -> Any:
+    return idle_action(env, agent)
+
+
+def _draw_any(draws: list[DrawAgentDriver], agent: str, own: np.random.Generator) -> AgentDriver:
+    return draws[own.integers(len(draws))](agent, own)
 
 
 def idle_action(env: Any, agent: str) -> Any:
@@ -137,20 +156,25 @@ def _heuristic(env: Any, rng: np.random.Generator) -> DrawAgentDriver:
         )
     family = _PursuitIntentions(env) if is_pursuit_env(env) else _MpeIntentions(env, rng)
 
-    def draw(agent: str, own: np.random.Generator) -> AgentDriver:
-        habits = Habits.draw(own)
-        intend = family.of(agent, habits, own)
-        space = env.action_space(agent)
-        last: list[Any] = []
+    return partial(_draw_heuristic, env, family)
 
-        def choose(seen: Any) -> Any:
-            if not last or own.random() < habits.attention:
-                last[:] = [uniform_action(space, own, WHO) if own.random() < habits.slip else intend()]
-            return last[0]
 
-        return choose
+def _draw_heuristic(env: Any, family: Any, agent: str, own: np.random.Generator) -> AgentDriver:
+    habits = Habits.draw(own)
+    return partial(_choose, env.action_space(agent), own, habits, family.of(agent, habits, own), [])
 
-    return draw
+
+def _choose(
+    space: gym.Space,
+    own: np.random.Generator,
+    habits: Habits,
+    intend: Callable[[], Any],
+    last: list[Any],
+    seen: Any,
+) -> Any:
+    if not last or own.random() < habits.attention:
+        last[:] = [uniform_action(space, own, WHO) if own.random() < habits.slip else intend()]
+    return last[0]
 
 
 class _PursuitIntentions:
@@ -163,19 +187,18 @@ class _PursuitIntentions:
         index = self._env.agent_name_mapping[agent]
         side = _PURSUIT_STEPS[rng.integers(4)]
         axes = rng.permutation([1.0, 1.01])  # breaks ties between the two axes
+        return partial(self._intend, index, side, axes)
 
-        def intend() -> int:
-            grid = self._env.env
-            if not grid.evader_layer.allies:
-                return _PURSUIT_STAY
-            here = np.array(grid.pursuer_layer.get_position(index))
-            evaders = np.array([evader.current_position() for evader in grid.evader_layer.allies])
-            target = evaders[np.abs(evaders - here).sum(axis=1).argmin()] + side
-            distance = (np.abs(here + _PURSUIT_STEPS - target) * axes).sum(axis=1)
-            free = [self._free(grid, cell) for cell in here + _PURSUIT_STEPS]
-            return int(np.where(free, distance, np.inf).argmin())
-
-        return intend
+    def _intend(self, index: int, side: np.ndarray, axes: np.ndarray) -> int:
+        grid = self._env.env
+        if not grid.evader_layer.allies:
+            return _PURSUIT_STAY
+        here = np.array(grid.pursuer_layer.get_position(index))
+        evaders = np.array([evader.current_position() for evader in grid.evader_layer.allies])
+        target = evaders[np.abs(evaders - here).sum(axis=1).argmin()] + side
+        distance = (np.abs(here + _PURSUIT_STEPS - target) * axes).sum(axis=1)
+        free = [self._free(grid, cell) for cell in here + _PURSUIT_STEPS]
+        return int(np.where(free, distance, np.inf).argmin())
 
     @staticmethod
     def _free(grid: Any, cell: np.ndarray) -> bool:
@@ -197,13 +220,12 @@ class _MpeIntentions:
     def of(self, agent: str, habits: Habits, rng: np.random.Generator) -> Callable[[], Any]:
         body = next(body for body in self.world.agents if body.name == agent)
         word = 0 if body.silent else int(rng.integers(self.world.dim_c))
+        return partial(self._intend, body, habits, word)
+
+    def _intend(self, body: Any, habits: Habits, word: int) -> Any:
+        velocity = self._aim(self, body, habits) if body.movable else np.zeros(2)
         act = self._continuous if self.env.continuous_actions else self._discrete
-
-        def intend() -> Any:
-            velocity = self._aim(self, body, habits) if body.movable else np.zeros(2)
-            return act(body, velocity, word)
-
-        return intend
+        return act(body, velocity, word)
 
     def _discrete(self, body: Any, velocity: Float[np.ndarray, " axes"], word: int) -> int:
         if not body.movable:
@@ -308,7 +330,7 @@ def _stand(places: Callable[[Any], np.ndarray]) -> "Aim":
             return intentions.towards(body, _likely_goal(good, world.landmarks).state.p_pos, habits)
         return intentions.towards(body, intentions.place(body, good, places(world)), habits)
 
-    return aim
+    return aim  # a closure over a function without state, so that copies may share it
 
 
 def _likely_goal(bodies: list[Any], landmarks: list[Any]) -> Any:

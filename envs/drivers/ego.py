@@ -1,5 +1,9 @@
-"""Drivers of the ego in data collection and evaluation."""
+"""Drivers of the ego in data collection and evaluation.
 
+A driver is a partial or a bound method, not a closure: `copy.deepcopy` of a running world copies its state too.
+"""
+
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -30,10 +34,9 @@ def make_ego_driver(name: str, env: gym.Env, rng: np.random.Generator) -> EgoDri
         UserError: unknown name, or a driver that does not support this action space.
     """
     if name == "random":
-        return lambda obs: uniform_action(env.action_space, rng, WHO)
+        return partial(_random, env.action_space, rng)
     if name == "idle":
-        action = idle_action(env)
-        return lambda obs: np.copy(action) if isinstance(action, np.ndarray) else action
+        return partial(_constant, idle_action(env))
     if name == "varied":
         return varied_actions(env.action_space, rng, WHO)
     if name == "keep-lane":
@@ -41,7 +44,8 @@ def make_ego_driver(name: str, env: gym.Env, rng: np.random.Generator) -> EgoDri
     if is_planner(name):
         return planner_driver(name, env, rng)
     if name.endswith(".zip"):
-        return _trained(name)
+        kept_policy(name)
+        return partial(_trained, name)
     raise UserError(f"driver must be one of {', '.join(EGO_DRIVER_NAMES)} or the path of a policy .zip, got '{name}'")
 
 
@@ -61,19 +65,25 @@ def _keep_lane(env: gym.Env, rng: np.random.Generator) -> EgoDriver:
     action_type: Any = getattr(env.unwrapped, "action_type", None)
     if not isinstance(env.action_space, gym.spaces.Box) or not hasattr(action_type, "steering_range"):
         raise UserError(f"keep-lane needs continuous steering, got {env.action_space}; use random, idle or varied")
-    noise = rng.uniform(0.0, 0.1)
-
-    def act(obs: Any) -> Any:
-        vehicle: Any = env.unwrapped.vehicle  # type: ignore[attr-defined]
-        driver = ControlledVehicle(vehicle.road, vehicle.position, vehicle.heading, vehicle.speed)
-        steering = driver.steering_control(vehicle.lane_index) / action_type.steering_range[1]
-        action = idle_action(env)
-        action[-1] = np.clip(steering + noise * rng.standard_normal(), -1, 1)
-        return action
-
-    return act
+    return partial(_steer, env, action_type.steering_range[1], rng.uniform(0.0, 0.1), rng)
 
 
-def _trained(path: str) -> EgoDriver:
-    policy = kept_policy(path)
-    return lambda obs: policy.predict(obs, deterministic=True)[0]
+def _steer(env: gym.Env, range_rad: float, noise: float, rng: np.random.Generator, obs: Any) -> Any:
+    vehicle: Any = env.unwrapped.vehicle  # type: ignore[attr-defined]
+    driver = ControlledVehicle(vehicle.road, vehicle.position, vehicle.heading, vehicle.speed)
+    steering = driver.steering_control(vehicle.lane_index) / range_rad
+    action = idle_action(env)
+    action[-1] = np.clip(steering + noise * rng.standard_normal(), -1, 1)
+    return action
+
+
+def _random(space: gym.Space, rng: np.random.Generator, obs: Any) -> Any:
+    return uniform_action(space, rng, WHO)
+
+
+def _constant(action: Any, obs: Any) -> Any:
+    return np.copy(action) if isinstance(action, np.ndarray) else action
+
+
+def _trained(path: str, obs: Any) -> Any:
+    return kept_policy(path).predict(obs, deterministic=True)[0]

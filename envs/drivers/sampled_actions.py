@@ -1,6 +1,7 @@
 """Actions sampled from an action space alone, for drivers of an ego and drivers of all agents."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -37,15 +38,22 @@ def varied_actions(space: gym.Space, rng: np.random.Generator, who: str) -> Call
     """
     persistence = rng.uniform(0.0, 0.9)
     taste = rng.dirichlet(np.full(int(space.n), 0.7)) if isinstance(space, gym.spaces.Discrete) else None
-    last: list[Any] = []
+    return partial(_varied, space, rng, who, persistence, taste, [])
 
-    def act(seen: Any) -> Any:
-        if last and rng.random() <= persistence:
-            return last[0]
-        if isinstance(space, gym.spaces.Discrete):
-            last[:] = [int(space.start + rng.choice(int(space.n), p=taste))]
-        else:
-            last[:] = [uniform_action(space, rng, who)]
+
+def _varied(
+    space: gym.Space,
+    rng: np.random.Generator,
+    who: str,
+    persistence: float,
+    taste: np.ndarray | None,
+    last: list[Any],
+    seen: Any,
+) -> Any:
+    if last and rng.random() <= persistence:
         return last[0]
-
-    return act
+    if isinstance(space, gym.spaces.Discrete):
+        last[:] = [int(space.start + rng.choice(int(space.n), p=taste))]
+    else:
+        last[:] = [uniform_action(space, rng, who)]
+    return last[0]

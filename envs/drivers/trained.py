@@ -7,6 +7,7 @@ Learners, the driver of the others and the forecaster are read from the note ins
 import functools
 import warnings
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,17 +52,24 @@ def trained_driver(path: str, env: Any, rng: np.random.Generator) -> Driver:
     others = (
         make_driver(note.driver, env, rng) if note is not None and set(learners) < set(env.possible_agents) else None
     )
+    return partial(_drive, path, env, padded, actions, others)
 
-    def drive(observations: Mapping[str, Any]) -> dict[str, Any]:
-        chosen = {} if others is None else others({a: s for a, s in observations.items() if a not in learners})
-        for agent in (a for a in observations if a in learners and a in env.agents):
-            action, _ = policy.predict(
-                padded.one(agent, _seen(observations[agent], sees_forecasts)), deterministic=True
-            )
-            chosen[agent] = own_action(action, actions[agent])
-        return chosen
 
-    return drive
+def _drive(
+    path: str,
+    env: Any,
+    padded: PaddedObservation,
+    actions: Mapping[str, gym.Space],
+    others: Driver | None,
+    observations: Mapping[str, Any],
+) -> dict[str, Any]:
+    policy = kept_policy(path)
+    whole = isinstance(policy.observation_space, gym.spaces.Dict)
+    chosen = {} if others is None else others({a: s for a, s in observations.items() if a not in actions})
+    for agent in (a for a in observations if a in actions and a in env.agents):
+        action, _ = policy.predict(padded.one(agent, _seen(observations[agent], whole)), deterministic=True)
+        chosen[agent] = own_action(action, actions[agent])
+    return chosen
 
 
 def _line(space: gym.Space) -> str:

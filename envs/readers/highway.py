@@ -107,6 +107,11 @@ class HighwayReader(Reader):
         heading_rad = float(vehicles[0].heading) if len(vehicles) else 0.0
         return Scene(states, ids, np.ones(len(vehicles), dtype=np.bool_), heading_rad)
 
+    def body_of(self, env: gym.Env, agent: int) -> Vehicle | None:
+        """Returns the vehicle on the road with this id; None if there is none."""
+        present = env.unwrapped.road.vehicles  # type: ignore[attr-defined]
+        return next((vehicle for vehicle in present if self._ids.get(vehicle) == agent), None)
+
     def _identify(self, vehicle: Vehicle) -> int:
         number = self._ids.get(vehicle)
         if number is None:

@@ -57,6 +57,10 @@ class HighwayMultiagentReader:
         full = self._reader.read_vehicles(inner.highway, vehicles)
         return pad_multiagent_scene(full, indices, headings, self._spec, type(self).__name__)
 
+    def body_of(self, env: ParallelEnv, agent: int) -> Any:
+        """Returns the vehicle on the road with this id; None if there is none."""
+        return self._reader.body_of(env.unwrapped.highway, agent)
+
 
 def most_vehicles(config: Mapping[str, Any]) -> int:
     """Returns the most vehicles that a config can bring to the intersection: those at the start, one more per step."""

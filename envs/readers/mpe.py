@@ -140,6 +140,11 @@ class MpeReader:
         scene = Scene(states, ids, np.ones(len(entities), dtype=np.bool_))
         return pad_multiagent_scene(scene, indices, np.zeros(len(entities)), self._spec, type(self).__name__)
 
+    def body_of(self, env: Any, agent: int) -> Any:
+        """Returns the entity with this id, if it is present; None otherwise."""
+        present = (entity for entity in self._listed(env.unwrapped.world) if getattr(entity, "alive", True))
+        return next((e for e in present if (known := self._known.get(e)) is not None and known.number == agent), None)
+
     def _listed(self, world: Any) -> list[Any]:
         return list(world.entities if self.landmarks else world.agents)
 

@@ -33,6 +33,7 @@ from envs.registry import (
     make_multiagent_env,
 )
 from envs.seeding import driver_rng
+from envs.simulators.interventions import drop_all, generator_of
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.scene import Forecast, Scene, SceneSpec
@@ -42,9 +43,15 @@ from predictor.scene import Forecast, Scene, SceneSpec
 class World(Protocol):
     """Environment with its drivers."""
 
+    env: Any
+    """Environment in its wrapper."""
+
     @property
     def spec(self) -> SceneSpec:
         """Layout of the scenes."""
+
+    def generators(self) -> list[np.random.Generator]:
+        """Random streams of simulator and drivers."""
 
     def reset(self, seed: int) -> None:
         """Begins the episode of a seed: environment and drivers are a function of it."""
@@ -54,6 +61,9 @@ class World(Protocol):
 
     def perceived(self) -> Scene:
         """Returns the scene that forecasters get, padded."""
+
+    def reread(self) -> tuple[Scene, Scene]:
+        """Reads anew what forecasters get and all agents, without a step: after an intervention at once."""
 
     def full_scene(self) -> Scene:
         """Returns all agents, unpadded: the truth."""
@@ -92,12 +102,22 @@ class EgoWorld:
     def reset(self, seed: int) -> None:
         """Begins the episode of a seed."""
         self.observation, _ = self.env.reset(seed=seed)
-        self._ego = make_ego_driver(self._name, self.env, driver_rng(seed))
+        self._rng = driver_rng(seed)
+        self._ego = make_ego_driver(self._name, self.env, self._rng)
 
     def step(self) -> bool:
         """Lets the ego act."""
         self.observation, _, terminated, truncated, _ = self.env.step(self._ego(self._seen()))
         return bool(terminated or truncated)
+
+    def generators(self) -> list[np.random.Generator]:
+        """Random streams of simulator and driver."""
+        own = generator_of(self.env)
+        return [self._rng] if own is None else [self._rng, own]
+
+    def reread(self) -> tuple[Scene, Scene]:
+        """Reads anew what the ego perceives and all agents."""
+        return self._reader.read(self.env), self._reader.read_all(self.env)
 
     def perceived(self) -> Scene:
         """Returns the ego's perceived scene."""
@@ -148,8 +168,10 @@ class MultiagentWorld:
 
     def reset(self, seed: int) -> None:
         """Begins the episode of a seed."""
+        drop_all(self.env)
         self._observations, _ = self.env.reset(seed=seed)
-        self._driver = self._make_driver(driver_rng(seed))
+        self._rng = driver_rng(seed)
+        self._driver = self._make_driver(self._rng)
 
     def step(self) -> bool:
         """Lets all agents act."""
@@ -159,14 +181,23 @@ class MultiagentWorld:
         self._observations, *_ = self.env.step(self._driver(seen))
         return not self.env.agents
 
+    def generators(self) -> list[np.random.Generator]:
+        """Random streams of simulator and drivers; agents have streams of their own beside them."""
+        own = generator_of(self.env)
+        return [self._rng] if own is None else [self._rng, own]
+
+    def reread(self) -> tuple[Scene, Scene]:
+        """Reads all agents anew, padded and unpadded."""
+        scene = self.env.reader.read(self.env).scene
+        return scene, _unpadded(scene)
+
     def perceived(self) -> Scene:
         """Returns all agents, padded; none is the ego."""
         return self.env.scene.scene
 
     def full_scene(self) -> Scene:
         """Returns all agents."""
-        scene = self.env.scene.scene
-        return Scene(scene.states[scene.valid], scene.ids[scene.valid], scene.valid[scene.valid])
+        return _unpadded(self.env.scene.scene)
 
     def forecast(self, num_samples: int) -> Forecast:
         """Returns the forecast of all agents, from the wrapper's own stream."""
@@ -228,6 +259,10 @@ def open_world(
         world = EgoWorld(ForecastObservation(env, checkpoint, horizon_steps=horizon_steps), driver)
     make_ego_driver(driver, world.env, np.random.default_rng(0))
     return world
+
+
+def _unpadded(scene: Scene) -> Scene:
+    return Scene(scene.states[scene.valid], scene.ids[scene.valid], scene.valid[scene.valid])
 
 
 def _forecaster_for(env_id: str, driver: str) -> str:

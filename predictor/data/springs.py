@@ -14,11 +14,11 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from rich.progress import Progress
 from torch import Tensor
 
-from predictor.data.store import Episode, StoreInfo, write_store
+from predictor.data.store import PERTURBATIONS, Episode, StoreInfo, write_store
 from predictor.scene import SceneSpec
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices, check_positive
@@ -89,6 +89,11 @@ class SpringsConfig:
     """Number of rollouts out of distribution: p = 0.5, k ∈ {1, 2, 3} (charges: twice the strength)."""
     edge_probability: float = 0.7
     """Probability of a spring between two particles (paper: 0.7)."""
+    kicks: float = 0.0
+    """Share of rollouts in which one particle is kicked: at a random frame its velocity changes by `kick_mps` in a
+    random direction. The store marks the kicked particle from the frame before (`perturbed`). 0 simulates none."""
+    kick_mps: float = 1.0
+    """Change of velocity by a kick [m/s]; particles move at about 0.5 m/s."""
     seed: int = 0
     """Random seed for the rollouts; each split draws from its own stream."""
     overwrite: bool = False
@@ -105,6 +110,9 @@ class SpringsConfig:
         check_at_least(self, 0, "train", "val", "test", "ood", "seed")
         if not 0 <= self.edge_probability <= 1:
             raise UserError(f"edge_probability must lie between 0 and 1, got {self.edge_probability}")
+        if not 0 <= self.kicks <= 1:
+            raise UserError(f"kicks must lie between 0 and 1, got {self.kicks}")
+        check_positive(self, "kick_mps")
 
 
 def draw_springs(
@@ -142,11 +150,29 @@ def draw_start(
     return positions.double(), velocities.double()
 
 
+def draw_kicks(
+    count: int, physics: Physics, share: float, kick_mps: float, generator: torch.Generator
+) -> tuple[Int[Tensor, " count"], Float[Tensor, "count agents 2"]]:
+    """Draws one kick per rollout: the frame after which it comes, and the change of each particle's velocity [m/s].
+
+    Rollouts without a kick have frame -1 and no change; one particle is kicked in the others.
+    """
+    frame = torch.randint(physics.frames - 1, (count,), generator=generator)
+    particle = torch.randint(physics.num_agents, (count,), generator=generator)
+    angle = 2 * torch.pi * torch.rand(count, generator=generator, dtype=torch.float64)
+    kicked = torch.rand(count, generator=generator) < share
+    change = kick_mps * torch.stack([angle.cos(), angle.sin()], dim=-1)
+    hit = kicked[:, None] & (torch.arange(physics.num_agents) == particle[:, None])
+    return torch.where(kicked, frame, -1), hit[..., None] * change[:, None]
+
+
 def simulate(
     physics: Physics,
     couplings: Float[Tensor, "count agents agents"],
     positions: Float[Tensor, "count agents 2"],
     velocities: Float[Tensor, "count agents 2"],
+    kick_frames: Int[Tensor, " count"] | None = None,
+    kicks_mps: Float[Tensor, "count agents 2"] | None = None,
 ) -> Float[Tensor, "count frames agents 4"]:
     """Computes positions [m] and velocities [m/s] at every frame, the given ones first.
 
@@ -155,6 +181,8 @@ def simulate(
         couplings: spring constants [N/m at unit mass], or charge products.
         positions: initial positions [m], float64.
         velocities: initial velocities [m/s], float64.
+        kick_frames: frame right after which the velocities change; -1 for none. None kicks no rollout.
+        kicks_mps: change of the velocities [m/s].
     """
     couplings = couplings.double()
     substeps = physics.substeps * (1 if physics.kind == "springs" else CHARGE_SUBSTEPS)
@@ -168,7 +196,9 @@ def simulate(
             return torch.baddbmm(velocities, kick, positions, alpha=share)
         return velocities + share * step_s * charge_force(physics, couplings, positions)
 
-    for _ in range(physics.frames - 1):
+    for frame in range(physics.frames - 1):
+        if kick_frames is not None and kicks_mps is not None:
+            velocities = velocities + (kick_frames == frame)[:, None, None] * kicks_mps
         velocities = kicked(velocities, 0.5)
         for substep in range(substeps):
             positions = positions + velocities * step_s
@@ -235,14 +265,26 @@ def make_episodes(config: SpringsConfig, split: str, count: int) -> list[Episode
     else:
         couplings = draw_charges(count, physics.num_agents, 2.0 if shifted else 1.0, generator)
     positions, velocities = draw_start(count, physics, generator)
-    states = simulate_chunks(physics, couplings, positions, velocities)
+    kicks: tuple[Tensor, ...] = ()
+    if config.kicks:
+        kicks = draw_kicks(count, physics, config.kicks, config.kick_mps, generator)
+    states = simulate_chunks(physics, couplings, positions, velocities, *kicks)
     # Springs: 0 none, 1 spring. Charges: 0 none (never), 1 attraction, 2 repulsion.
     signs = couplings.sign().numpy()
     types = (signs if physics.kind == "springs" else np.where(signs > 0, 2, -signs)).astype(np.int8)
     attributes = couplings.abs().float().numpy()[..., None]
     present = np.ones(states.shape[1:3], dtype=np.bool_)
     ids = np.arange(physics.num_agents)
-    return [Episode(states[i], present, ids, split, i, types[i][None], attributes[i][None]) for i in range(count)]
+    episodes = [Episode(states[i], present, ids, split, i, types[i][None], attributes[i][None]) for i in range(count)]
+    return [_marked(episode, *(k[i] for k in kicks)) for i, episode in enumerate(episodes)] if kicks else episodes
+
+
+def _marked(episode: Episode, frame: Tensor, kick_mps: Tensor) -> Episode:
+    """Returns the episode with a mark at the kicked particle, at the last frame before the kick."""
+    perturbed = np.zeros(episode.valid.shape, dtype=np.int8)
+    if frame >= 0:
+        perturbed[int(frame), kick_mps.abs().sum(-1).numpy() > 0] = PERTURBATIONS.index("kick")
+    return replace(episode, perturbed=perturbed)
 
 
 def spring_spec(physics: Physics) -> SceneSpec:

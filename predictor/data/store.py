@@ -7,7 +7,7 @@ Within an episode an agent keeps its column from its first step to its last, so 
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,10 @@ from predictor.support.files import new_folder
 FORMAT = "dgvae-rl episodes"
 VERSION = 1
 EDGE_LABELS = ("edge_types", "edge_attributes")
+_FILL = {"edge_types": -1.0, "edge_attributes": 0.0, "causal_shift_m": np.nan}
+"""All labels of pairs in a store, with the value for what is not known or not there."""
+PERTURBATIONS = ("none", "brake", "accelerate", "left", "right", "remove", "kick")
+"""What was done to an agent; `Episode.perturbed` holds the index in this tuple."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,11 @@ class Episode:
     """True type of each edge, receiver first; -1 where unknown. One step if it never changes."""
     edge_attributes: Float[np.ndarray, "label_time agents agents attributes"] | None = None
     """Known properties of each edge (a spring's constant), named in `StoreInfo`; one step if they never change."""
+    causal_shift_m: Float[np.ndarray, "label_time agents agents"] | None = None
+    """Farthest that an intervention on the sender moves the receiver within the labels' horizon [m], receiver first;
+    NaN where unknown: at all steps and for all senders that were not tried. `causal_types` makes edge types of it."""
+    perturbed: Int[np.ndarray, "time agents"] | None = None
+    """What is done to each agent from this step to the next, an index in `PERTURBATIONS`; None if nothing ever is."""
 
     @staticmethod
     def from_scenes(scenes: Sequence[Scene], label: str = "", seed: int = 0) -> "Episode":
@@ -73,6 +82,8 @@ class StoreInfo:
     """Names of the columns of the episodes' `edge_attributes`."""
     num_steps: int = 0
     """Number of scenes over all episodes; set when a store is read."""
+    causal_threshold_m: float | None = None
+    """Shift above which an edge counts as causal [m]; None without causal labels."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +115,9 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
     episodes = list(episodes)
     if not episodes:
         raise UserError("a store needs at least one episode, got none")
+    marked = [e.perturbed is not None for e in episodes]
+    if any(marked) and not all(marked):
+        raise UserError(f"{path}: either all episodes have perturbed or none, got both")
     for episode in episodes:
         _check_finite(episode, str(path))
     columns = max(e.states.shape[1] for e in episodes)
@@ -111,11 +125,14 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
     starts = np.concatenate([[0], np.cumsum(lengths)])
     states = np.zeros((starts[-1], columns, info.spec.num_features), dtype=np.float32)
     valid = np.zeros((starts[-1], columns), dtype=np.bool_)
+    perturbed = np.zeros(valid.shape, dtype=np.int8)
     ids = np.full((len(episodes), columns), PADDING_ID, dtype=np.int64)
     for i, episode in enumerate(episodes):
         steps = slice(starts[i], starts[i + 1])
         states[steps, : episode.states.shape[1]] = episode.states
         valid[steps, : episode.states.shape[1]] = episode.valid
+        if episode.perturbed is not None:
+            perturbed[steps, : episode.states.shape[1]] = episode.perturbed
         ids[i, : len(episode.ids)] = episode.ids
     with new_folder(path) as partial:
         group = zarr.open_group(partial, mode="w")
@@ -123,6 +140,8 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
         every_chunk: Any = {"write_empty_chunks": True}  # so that a missing chunk is damage, not zeros
         group.create_array("states", data=states, chunks=(chunk, columns, states.shape[-1]), config=every_chunk)
         group.create_array("valid", data=valid, chunks=(chunk, columns), config=every_chunk)
+        if any(marked):
+            group.create_array("perturbed", data=perturbed, chunks=(chunk, columns), config=every_chunk)
         group.create_array("ids", data=ids)
         group.create_array("starts", data=starts)
         group.create_array("seeds", data=np.array([e.seed for e in episodes], dtype=np.int64))
@@ -137,6 +156,7 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
                 "provenance": json.loads(json.dumps(info.provenance, default=str)),
                 "labels": [e.label for e in episodes],
                 "edge_attribute_names": list(info.edge_attribute_names),
+                "causal_threshold_m": info.causal_threshold_m,
             }
         )
 
@@ -160,13 +180,15 @@ def read_store(path: Path) -> EpisodeStore:
                 f"{path} has store version {attrs['version']}, this release reads {VERSION}; collect it anew"
             )
         arrays = {name: np.asarray(group[name]) for name in ("states", "valid", "ids", "starts", "seeds")}
-        labelled = [name for name in EDGE_LABELS if name in group]
-        for name in ("states", "valid", *labelled):
+        labelled = [name for name in _FILL if name in group]
+        marks = ["perturbed"] if "perturbed" in group else []
+        for name in ("states", "valid", *labelled, *marks):
             stored: Any = group[name]
             if stored.nchunks_initialized != stored.nchunks:  # Zarr reads what is missing as zeros
                 raise UserError(f"{path}: chunks of '{name}' are missing; copy or collect it anew")
         info = _info(attrs, len(arrays["states"]))
         labels = list(attrs["labels"])
+        perturbed = np.asarray(group["perturbed"]) if marks else None
         edge_labels = {name: np.asarray(group[name]) for name in labelled}
         label_starts = np.asarray(group["label_starts"]) if edge_labels else None
     except (KeyError, TypeError, OSError, RuntimeError, json.JSONDecodeError, zarr.errors.BaseZarrError) as error:
@@ -180,6 +202,7 @@ def read_store(path: Path) -> EpisodeStore:
             arrays["ids"][i][present],
             str(labels[i]),
             int(arrays["seeds"][i]),
+            perturbed=None if perturbed is None else perturbed[start:stop][:, present],
             **_labels_of(edge_labels, label_starts, i, present),
         )
         _check_finite(episode, str(path))
@@ -204,12 +227,13 @@ def read_info_of(path: Path) -> StoreInfo:
 def _info(attrs: dict[str, Any], num_steps: int) -> StoreInfo:
     names = tuple(str(name) for name in attrs.get("edge_attribute_names", ()))
     spec = _spec_from_json(attrs["spec"])
-    return StoreInfo(spec, str(attrs["source"]), dict(attrs["provenance"]), names, num_steps)
+    threshold_m = attrs.get("causal_threshold_m")
+    return StoreInfo(spec, str(attrs["source"]), dict(attrs["provenance"]), names, num_steps, threshold_m)
 
 
 def _padded_labels(episodes: Sequence[Episode], columns: int, where: str) -> dict[str, np.ndarray]:
     """Returns the edge labels of all episodes end to end, and where each episode begins; empty without labels."""
-    given = {name: [getattr(e, name) for e in episodes] for name in EDGE_LABELS}
+    given = {name: [getattr(e, name) for e in episodes] for name in _FILL}
     given = {name: labels for name, labels in given.items() if any(x is not None for x in labels)}
     if not given:
         return {}
@@ -223,9 +247,8 @@ def _padded_labels(episodes: Sequence[Episode], columns: int, where: str) -> dic
             raise UserError(f"{where}: {name} of episode {bad[0]} need one step or every step, got {lengths[bad[0]]}")
         starts = np.concatenate([[0], np.cumsum(lengths)])
         if not np.array_equal(padded.setdefault("label_starts", starts), starts):
-            raise UserError(f"{where}: edge_types and edge_attributes need equal numbers of steps in each episode")
-        fill = -1 if name == "edge_types" else 0
-        joined = np.full((starts[-1], columns, columns, *labels[0].shape[3:]), fill, dtype=labels[0].dtype)
+            raise UserError(f"{where}: labels of edges need equal numbers of steps in each episode")
+        joined = np.full((starts[-1], columns, columns, *labels[0].shape[3:]), _FILL[name], labels[0].dtype)
         for label, begin in zip(labels, starts[:-1], strict=True):
             joined[begin : begin + len(label), : label.shape[1], : label.shape[2]] = label
         padded[name] = joined
@@ -239,6 +262,36 @@ def _labels_of(
         return {}
     steps = slice(starts[episode], starts[episode + 1])
     return {name: labels[steps][:, present][:, :, present] for name, labels in edge_labels.items()}
+
+
+def causal_types(shift_m: Float[np.ndarray, "*pairs"], threshold_m: float) -> Int[np.ndarray, "*pairs"]:
+    """Returns edge types of causal labels: 1 where the shift exceeds the threshold, else 0, -1 where it is unknown."""
+    return np.where(np.isnan(shift_m), -1, shift_m > threshold_m).astype(np.int8)
+
+
+def with_causal_edges(store: EpisodeStore, threshold_m: float | None = None) -> EpisodeStore:
+    """Returns the store with causal edges in place of its edge labels, for training and scores on them.
+
+    `edge_types` are those of `causal_types`; the one attribute of an edge is `causal_shift_m`, 0 where unknown.
+
+    Args:
+        store: a store with causal labels.
+        threshold_m: shift above which an edge counts [m]; None takes the store's.
+
+    Raises:
+        UserError: the store has no causal labels.
+    """
+    given = store.info.causal_threshold_m if threshold_m is None else threshold_m
+    if given is None or any(e.causal_shift_m is None for e in store.episodes):
+        raise UserError(f"a store of {store.info.source} has no causal labels; collect it with --causal-labels")
+    episodes = []
+    for episode in store.episodes:
+        assert episode.causal_shift_m is not None
+        shift_m = episode.causal_shift_m
+        attributes = np.nan_to_num(shift_m)[..., None]
+        episodes.append(replace(episode, edge_types=causal_types(shift_m, given), edge_attributes=attributes))
+    info = replace(store.info, edge_attribute_names=("causal_shift_m",), causal_threshold_m=given)
+    return EpisodeStore(info, episodes)
 
 
 def _check_finite(episode: Episode, where: str) -> None:

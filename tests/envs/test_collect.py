@@ -30,7 +30,7 @@ def assert_same_episodes(first: list[Episode], second: list[Episode]) -> None:
     assert len(first) == len(second) > 0
     for actual, expected in zip(first, second, strict=True):
         assert (actual.label, actual.seed) == (expected.label, expected.seed)
-        for name in ("states", "valid", "ids", "edge_types", "edge_attributes"):
+        for name in ("states", "valid", "ids", "edge_types", "edge_attributes", "causal_shift_m", "perturbed"):
             np.testing.assert_array_equal(getattr(actual, name), getattr(expected, name))
 
 
@@ -85,6 +85,41 @@ def test_the_store_is_the_same_for_any_number_of_workers(
     assert alone.info.spec == HighwayReader(make_env(ENV_ID)).spec
     assert alone.info.provenance["seed"] == 30
     assert sorted(p.name for p in tmp_path.iterdir()) == ["1", "2"]
+
+
+PERTURBED = ["--perturb", "0.7", "--causal-labels", "2", "--causal-horizon-s", "1", "--causal-senders", "3"]
+
+
+def test_a_perturbed_store_is_the_same_for_any_number_of_workers_and_after_a_stop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    base = ["--env-id", TAG, "--episodes", "4", "--seed", "30", "--max-steps", "6", *PERTURBED]
+    for workers in ("1", "2"):
+        arguments = [*base, "--out", str(tmp_path / workers), "--workers", workers]
+        assert run_command(collect.main, arguments, monkeypatch, capsys)[:2] == (0, [])
+    recorded = collect._record
+
+    def stop_at_third(task: Any) -> Episode:
+        if task.seed == 32:
+            raise KeyboardInterrupt
+        return recorded(task)
+
+    again = [*base, "--out", str(tmp_path / "stopped"), "--workers", "1"]
+    with monkeypatch.context() as stopping:
+        stopping.setattr(collect, "_record", stop_at_third)
+        assert run_command(collect.main, again, stopping, capsys)[0] == 130
+    assert not (tmp_path / "stopped").exists()
+    code, errors, output = run_command(collect.main, again, monkeypatch, capsys)
+    assert (code, errors) == (0, [])
+    assert "4 episodes (2 of them from an unfinished recording)" in output
+    alone, together, stopped = (read_store(tmp_path / name) for name in ("1", "2", "stopped"))
+    assert_same_episodes(together.episodes, alone.episodes)
+    assert_same_episodes(stopped.episodes, alone.episodes)
+    assert alone.info.causal_threshold_m == stopped.info.causal_threshold_m == 0.05
+    assert alone.info.provenance["perturbations"]["share"] == 0.7
+    assert alone.info.provenance["causal_labels"]["horizon_s"] == 1.0
+    assert all(e.perturbed is not None and e.causal_shift_m is not None for e in alone.episodes)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["1", "2", "stopped"]
 
 
 def test_every_ego_drives(tmp_path: Path):
@@ -179,6 +214,16 @@ ERRORS = {
     "negative-steps": (["--max-steps", "-1"], "max_steps must be at least 1, got -1"),
     "zero-workers": (["--workers", "0"], "workers must be at least 1, got 0"),
     "negative-seed": (["--seed", "-1"], "seed must not be negative, got -1"),
+    "share-above-one": (["--perturb", "1.5"], "perturb must lie between 0 and 1, got 1.5"),
+    "kinds-of-nothing": (["--perturb-kinds", "brake"], "perturb_kinds needs perturb above 0, got 0"),
+    "negative-labels": (["--causal-labels", "-1"], "causal_labels must not be negative, got -1"),
+    "horizon-of-nothing": (["--causal-horizon-s", "2"], "causal_horizon_s and causal_threshold_m need causal_labels"),
+    "no-senders": (["--causal-labels", "2", "--causal-senders", "0"], "causal_senders must be at least 1, got 0"),
+    "no-lanes": (
+        ["--env-id", TAG, "--perturb", "0.2", "--perturb-kinds", "left"],
+        "perturb_kinds must be among brake, accelerate, remove in this environment, got left",
+    ),
+    "grid-world": (["--env-id", "pursuit_v5", "--perturb", "0.2"], "raw_env cannot be perturbed; use an environment"),
     "unknown-ego": (["--driver", "random", "reckless"], "driver must be one of random, idle,"),
     "unfit-ego": (["--driver", "keep-lane"], "keep-lane needs continuous steering"),
     "missing-policy": (["--driver", "absent.zip"], "no policy at absent.zip"),

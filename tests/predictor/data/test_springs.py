@@ -24,7 +24,7 @@ from predictor.data.springs import (
     simulate,
     spring_spec,
 )
-from predictor.data.store import read_store
+from predictor.data.store import PERTURBATIONS, read_store
 from predictor.support.errors import UserError, run_entry_point
 from predictor.training.config import TrainConfig
 from predictor.training.trainer import Trainer, load_data
@@ -425,3 +425,37 @@ def test_charges_train_a_model_of_three_edge_types(tmp_path: Path):
     for _ in range(30):
         last = trainer.train_step()
     assert last["type_label"] < first["type_label"]
+
+
+# --- Kicks ------------------------------------------------------------------------------------------------------------
+
+
+def test_without_kicks_nothing_changes_and_with_kicks_everything_before_them_is_the_same():
+    plain, kicked = (SpringsConfig(Path("unused"), kicks=share, physics=Physics(frames=12)) for share in (0.0, 1.0))
+    calm, hit = (springs.make_episodes(one, "train", 6) for one in (plain, kicked))
+    frames = set()
+    for before, after in zip(calm, hit, strict=True):
+        assert before.perturbed is None and after.perturbed is not None
+        ((frame, particle),) = np.argwhere(after.perturbed)
+        assert PERTURBATIONS[after.perturbed[frame, particle]] == "kick"
+        np.testing.assert_array_equal(after.states[: frame + 1], before.states[: frame + 1])
+        change = after.states[frame + 1] - before.states[frame + 1]
+        assert np.linalg.norm(change[:, 2:], axis=-1).argmax() == particle
+        assert 0.5 < np.linalg.norm(change[particle, 2:]) < 1.5
+        frames.add(int(frame))
+    assert len(frames) > 1
+
+
+def test_a_share_of_the_rollouts_is_kicked_and_the_store_says_which(tmp_path: Path):
+    config = SpringsConfig(tmp_path, train=40, val=0, test=0, ood=0, kicks=0.5, physics=Physics(frames=4))
+    springs.make(config)
+    episodes = read_store(tmp_path / "train").episodes
+    shares = [e.perturbed is not None and bool(e.perturbed.any()) for e in episodes]
+    assert 10 < sum(shares) < 30
+
+
+def test_kicks_out_of_range_are_named(tmp_path: Path):
+    with pytest.raises(UserError, match="kicks must lie between 0 and 1, got 1.5"):
+        SpringsConfig(tmp_path, kicks=1.5)
+    with pytest.raises(UserError, match="kick_mps must be positive, got 0"):
+        SpringsConfig(tmp_path, kicks=0.5, kick_mps=0.0)

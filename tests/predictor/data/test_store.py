@@ -10,10 +10,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from predictor.data.store import EDGE_LABELS, Episode, StoreInfo, read_info_of, read_store, write_store
+from predictor.data.store import (
+    EDGE_LABELS,
+    PERTURBATIONS,
+    Episode,
+    StoreInfo,
+    read_info_of,
+    read_store,
+    with_causal_edges,
+    write_store,
+)
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
-from tests.predictor.helpers import ROAD, random_presence, random_states, scene, spec
+from tests.predictor.helpers import ROAD, circling_episode, random_presence, random_states, scene, spec
 
 INFO = StoreInfo(spec(ROAD), "toy-v0", {"command": "python -m envs.collect", "seeds": [3, 4]})
 
@@ -320,3 +329,58 @@ def test_crash_while_writing_leaves_what_was_there(
     assert [p.name for p in tmp_path.iterdir()] == ["store"] * existing
     if existing:
         assert_equal(read_store(path).episodes[0], episode(1))
+
+
+# --- Interventions ----------------------------------------------------------------------------------------------------
+
+
+def shifted_episode(seed: int, agents: int) -> Episode:
+    """One step of four has causal labels, for one sender."""
+    plain = circling_episode(seed, steps=4, agents=agents)
+    shift = np.full((4, agents, agents), np.nan, dtype=np.float32)
+    shift[1, :, 0] = np.arange(agents) / 2
+    shift[1, 0, 0] = np.nan
+    done = np.zeros(plain.valid.shape, dtype=np.int8)
+    done[2, 1] = PERTURBATIONS.index("brake")
+    return replace(plain, causal_shift_m=shift, perturbed=done)
+
+
+def test_causal_labels_and_marks_come_back_as_they_were(tmp_path: Path):
+    written = [shifted_episode(0, 3), shifted_episode(1, 5)]
+    write_store(tmp_path / "s", StoreInfo(spec(), "circle", causal_threshold_m=0.75), written)
+    store = read_store(tmp_path / "s")
+    assert store.info.causal_threshold_m == 0.75
+    for found, expected in zip(store.episodes, written, strict=True):
+        np.testing.assert_array_equal(found.causal_shift_m, expected.causal_shift_m)
+        np.testing.assert_array_equal(found.perturbed, expected.perturbed)
+    group = zarr.open_group(tmp_path / "s", mode="r")
+    assert np.isnan(np.asarray(group["causal_shift_m"])[:4, 3:]).all()  # padding is unknown, too
+
+
+def test_causal_edges_are_unknown_wherever_nothing_was_tried(tmp_path: Path):
+    write_store(tmp_path / "s", StoreInfo(spec(), "circle", causal_threshold_m=0.75), [shifted_episode(0, 4)])
+    store = read_store(tmp_path / "s")
+    (episode,) = with_causal_edges(store).episodes
+    assert episode.edge_types is not None and episode.edge_attributes is not None
+    assert episode.edge_types[1, :, 0].tolist() == [-1, 0, 1, 1]
+    assert (episode.edge_types[[0, 2, 3]] == -1).all() and (episode.edge_types[1, :, 1:] == -1).all()
+    assert episode.edge_attributes[1, :, 0, 0].tolist() == [0.0, 0.5, 1.0, 1.5]
+    assert np.isfinite(episode.edge_attributes).all()
+    (strict,) = with_causal_edges(store, threshold_m=1.2).episodes
+    assert strict.edge_types is not None and strict.edge_types[1, :, 0].tolist() == [-1, 0, 0, 1]
+    assert with_causal_edges(store).info.edge_attribute_names == ("causal_shift_m",)
+
+
+def test_a_store_without_causal_labels_says_so(tmp_path: Path):
+    write_store(tmp_path / "s", StoreInfo(spec(), "circle"), [circling_episode(0, steps=4)])
+    store = read_store(tmp_path / "s")
+    assert (store.episodes[0].causal_shift_m, store.episodes[0].perturbed) == (None, None)
+    with pytest.raises(UserError, match="a store of circle has no causal labels; collect it with --causal-labels"):
+        with_causal_edges(store)
+
+
+def test_marks_are_for_all_episodes_or_for_none(tmp_path: Path):
+    with pytest.raises(UserError, match="either all episodes have perturbed or none, got both"):
+        marked = replace(shifted_episode(0, 3), causal_shift_m=None)
+        write_store(tmp_path / "s", StoreInfo(spec(), "circle"), [marked, circling_episode(0, steps=4)])
+    assert not (tmp_path / "s").exists()

@@ -1,0 +1,185 @@
+"""Branches of a running world: what happens with an intervention, beside what happens without.
+
+The world is copied, so that it continues as if this had not been asked. Both branches have the same driver and random
+streams: at each step, the branch with the intervention gets the state that the streams had in the branch without. So
+what differs follows from the intervention. Streams that agents of a PettingZoo environment have of their own are
+copied, and drawn from at each step alike.
+
+>>> from envs.rollouts.branches import branch
+>>> from envs.rollouts.world import open_world
+>>> from envs.simulators.interventions import Intervention
+>>> world = open_world("highway-fast-v0", "idle")
+>>> world.reset(seed=0)
+>>> found = branch(world, Intervention(agent=1, kind="brake", steps=3, change_mps=8.0), horizon_steps=3)
+>>> shift_m, valid = found.shift()
+>>> shift_m.shape == (4, len(found.ids), 2) and bool(shift_m[3, 1, 0] < -5.0)
+True
+"""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from highway_env.envs.common.abstract import AbstractEnv
+from jaxtyping import Bool, Float, Int
+
+from envs.rollouts.interventions import hold_others, intervene, kinds_of
+from envs.rollouts.world import World
+from envs.simulators.interventions import Intervention, log_motion, simulator_of
+from predictor.scene import Scene
+from predictor.support.errors import UserError
+
+
+@dataclass(frozen=True)
+class Branch:
+    """What happened in one branch; agents as in `Branches.ids`."""
+
+    states: Float[np.ndarray, "time agents state"]
+    """True states, world frame, SI units; step 0 is now (after a change of speed at once), zeros where not valid."""
+    valid: Bool[np.ndarray, "time agents"]
+    """Whether the agent is present; False after an episode's end where the environment cannot go on."""
+    perceived: tuple[Scene, ...]
+    """What forecasters get at each step; fewer scenes where the environment cannot go on."""
+
+
+@dataclass(frozen=True)
+class Branches:
+    """The same seconds twice."""
+
+    intervention: Intervention
+    """What was done in the perturbed branch."""
+    ids: Int[np.ndarray, " agents"]
+    """Agents that are present now, without the intervention, in the order of `World.full_scene`; those that appear
+    later are left out, for their ids need not mean the same agent in both branches."""
+    plain: Branch
+    """Branch without the intervention."""
+    perturbed: Branch
+    """Branch with it."""
+    axes: int = 2
+    """Number of coordinates of a position."""
+
+    def shift(self) -> tuple[Float[np.ndarray, "time agents axes"], Bool[np.ndarray, "time agents"]]:
+        """Returns how far the intervention moved each agent [m], world frame, and where both branches have it."""
+        valid = self.plain.valid & self.perturbed.valid
+        moved = self.perturbed.states[..., : self.axes] - self.plain.states[..., : self.axes]
+        return np.where(valid[..., None], moved, 0.0), valid
+
+
+def branch(world: World, intervention: Intervention, horizon_steps: int) -> Branches:
+    """Plays the next steps with and without an intervention, in copies of the world.
+
+    Args:
+        world: a running world; it is not changed.
+        intervention: what is done now.
+        horizon_steps: number of steps to play.
+
+    Raises:
+        UserError: the environment cannot be copied or perturbed, or the agent does not allow the intervention.
+    """
+    return BranchPoint(world, horizon_steps).perturbed(intervention)
+
+
+class BranchPoint:
+    """One moment of a running world, from which any number of interventions are played; the plain branch once.
+
+    Args:
+        world: a running world; it is not changed, and must not step before the last branch has been played.
+        horizon_steps: number of steps to play.
+
+    Raises:
+        UserError: the environment cannot be copied or perturbed.
+    """
+
+    def __init__(self, world: World, horizon_steps: int) -> None:
+        """Plays the plain branch."""
+        if horizon_steps < 1:
+            raise UserError(f"horizon_steps must be at least 1, got {horizon_steps}")
+        kinds_of(world)
+        self._world, self._horizon = world, horizon_steps
+        self.ids = world.full_scene().ids.copy()
+        other = copied(world)
+        self._log = log_motion(other.env)
+        self.plain, self._streams = _play(other, self.ids, horizon_steps)
+
+    def perturbed(self, intervention: Intervention) -> Branches:
+        """Plays an intervention; all agents may react.
+
+        Raises:
+            UserError: the agent does not allow it.
+        """
+        return self._branches(copied(self._world), intervention)
+
+    def direct(self, intervention: Intervention, receiver: int) -> Branches:
+        """Plays an intervention to which one agent alone may react: all others move as without it.
+
+        So its shift is what reaches it directly, not through a third agent. The others' shifts are 0, but for the
+        agent of the intervention.
+
+        Args:
+            intervention: what is done.
+            receiver: id of the agent that may react.
+
+        Raises:
+            UserError: the agent does not allow it.
+        """
+        other = copied(self._world)
+        hold_others(other, self._log, (intervention.agent, receiver))
+        return self._branches(other, intervention)
+
+    def _branches(self, other: World, intervention: Intervention) -> Branches:
+        intervene(other, intervention)
+        perturbed, _ = _play(other, self.ids, self._horizon, self._streams)
+        return Branches(intervention, self.ids, self.plain, perturbed, self._world.spec.position_dim)
+
+
+def copied(world: World) -> World:
+    """Returns a copy that continues exactly; it shares the road network, which no step changes.
+
+    Raises:
+        UserError: the environment cannot be copied (EnvPool).
+    """
+    simulator = simulator_of(world.env)
+    memo: dict[int, Any] = {}
+    if isinstance(simulator, AbstractEnv) and simulator.road is not None:
+        memo[id(simulator.road.network)] = simulator.road.network
+    return copy.deepcopy(world, memo)
+
+
+def _play(
+    world: World, ids: Int[np.ndarray, " agents"], horizon_steps: int, streams: Sequence[list[Any]] = ()
+) -> tuple[Branch, list[list[Any]]]:
+    """Plays a copy; returns also the state of its random streams before each step.
+
+    Args:
+        world: the copy.
+        ids: agents to report.
+        horizon_steps: number of steps.
+        streams: states that the streams get before each step, if given.
+    """
+    states = np.zeros((horizon_steps + 1, len(ids), world.spec.num_features))
+    valid = np.zeros(states.shape[:2], dtype=np.bool_)
+    index = {int(agent): i for i, agent in enumerate(ids)}
+    seen: list[Scene] = []
+    drawn: list[list[Any]] = []
+
+    def note(step: int, perceived: Scene, full: Scene) -> None:
+        seen.append(perceived)
+        for agent, state in zip(full.ids, full.states, strict=True):
+            if (column := index.get(int(agent))) is not None:
+                states[step, column], valid[step, column] = state, True
+
+    note(0, *world.reread())
+    # highway-env simulates on after the end of an episode of its ego
+    goes_on = isinstance(simulator_of(world.env), AbstractEnv) and world.spec.has_ego
+    for step in range(horizon_steps):
+        if step < len(streams):
+            for generator, state in zip(world.generators(), streams[step], strict=True):
+                generator.bit_generator.state = state
+        drawn.append([generator.bit_generator.state for generator in world.generators()])
+        ended = world.step()
+        note(step + 1, world.perceived(), world.full_scene())
+        if ended and not goes_on:
+            break
+    return Branch(states, valid, tuple(seen)), drawn

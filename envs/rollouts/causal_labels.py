@@ -1,0 +1,145 @@
+"""Causal labels: whose future changes when an agent brakes or is taken out, by how much, and not through a third one.
+
+At a step the world is branched (`envs.rollouts.branches`): for each sender, once it brakes over the whole horizon, once
+it is taken out, where that is possible. Receivers that either moves by more than the threshold may have been reached
+through others: a sender's follower brakes, and so its follower brakes. So each of them is played again, with all others
+held to what they do without the intervention. The label is the farthest direct shift within the horizon [m]; of
+receivers below the threshold already, the whole shift. Where a sender was not tried, the label is unknown.
+
+Edges are thus what one agent does to another at once. Chains follow from them, as in a model whose messages pass edge
+by edge; labels that contained the chains would grow with the horizon and with the density of traffic.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import numpy as np
+from jaxtyping import Float
+
+from envs.rollouts.branches import Branches, BranchPoint, copied
+from envs.rollouts.interventions import intervene, interventions_of, kinds_of
+from envs.rollouts.world import World
+from envs.simulators.interventions import Intervention, Kind
+from predictor.data.store import Episode
+from predictor.support.errors import UserError
+
+TRIED: tuple[Kind, ...] = ("brake", "remove")
+"""What is done to a sender; a vehicle at rest can hold others up without braking, and a policy's cannot be removed."""
+
+
+@dataclass(frozen=True)
+class CausalSettings:
+    """How causal labels are measured."""
+
+    horizon_s: float
+    """Time that branches are played [s]."""
+    threshold_m: float
+    """Shift above which an edge counts as causal [m]."""
+    near_m: float
+    """A sender has another agent within this distance [m]; others are not tried."""
+    senders: int = 8
+    """Largest number of senders at a step, nearest to the ego first; without an ego, nearest to another agent."""
+
+
+ON_ROADS = CausalSettings(horizon_s=3.0, threshold_m=1.0, near_m=60.0)
+"""Settings for highway-env."""
+IN_ARENAS = CausalSettings(horizon_s=1.0, threshold_m=0.05, near_m=1.5)
+"""Settings for mpe2, whose arena is 2 m wide."""
+
+
+def settings_for(world: World) -> CausalSettings:
+    """Returns the settings of the world's family.
+
+    Raises:
+        UserError: the world cannot be perturbed.
+    """
+    return ON_ROADS if "left" in kinds_of(world) else IN_ARENAS
+
+
+@dataclass(frozen=True)
+class CausalLabels:
+    """Causal labels at one instant."""
+
+    ids: Sequence[int]
+    """Agents, in the order of `World.full_scene`."""
+    shift_m: Float[np.ndarray, "agents agents"]
+    """float32, receiver first: farthest direct shift by an intervention on the sender [m]; NaN where unknown."""
+
+
+def causal_labels(world: World, settings: CausalSettings) -> CausalLabels:
+    """Measures the labels of a running world, which is not changed.
+
+    Raises:
+        UserError: the world cannot be copied or perturbed.
+    """
+    scene = world.full_scene()
+    ids = [int(agent) for agent in scene.ids]
+    shift_m = np.full((len(ids), len(ids)), np.nan, dtype=np.float32)
+    steps = max(1, round(settings.horizon_s / world.spec.dt_s))
+    tried = [one for sender in senders_of(world, settings) for one in possible(world, sender, steps)]
+    point = BranchPoint(world, steps) if tried else None
+    for intervention in tried:
+        assert point is not None
+        column = ids.index(intervention.agent)
+        shift_m[:, column] = np.fmax(shift_m[:, column], _direct(point, intervention, settings.threshold_m))
+    if world.spec.has_ego:
+        shift_m[0] = np.nan  # its future is the policy's choice
+    np.fill_diagonal(shift_m, np.nan)
+    return CausalLabels(ids, shift_m)
+
+
+def _direct(point: BranchPoint, intervention: Intervention, threshold_m: float) -> Float[np.ndarray, " agents"]:
+    """Returns each agent's farthest shift [m]; the direct one where the whole one exceeds the threshold."""
+    whole_m = farthest(point.perturbed(intervention), threshold_m)
+    for receiver in np.flatnonzero(whole_m > threshold_m):
+        if point.ids[receiver] != intervention.agent:
+            alone = point.direct(intervention, int(point.ids[receiver]))
+            whole_m[receiver] = farthest(alone, threshold_m)[receiver]
+    return whole_m
+
+
+def farthest(found: Branches, threshold_m: float) -> Float[np.ndarray, " agents"]:
+    """Returns each agent's farthest shift over the horizon [m].
+
+    NaN for an agent that one branch does not have at each step, unless it has moved beyond the threshold before.
+    """
+    shift, valid = found.shift()
+    farthest_m = np.linalg.norm(shift, axis=-1).max(axis=0)
+    return np.where(valid.all(axis=0) | (farthest_m > threshold_m), farthest_m, np.nan)
+
+
+def senders_of(world: World, settings: CausalSettings) -> list[int]:
+    """Returns the agents to try: perceived, with another one near, and under no intervention."""
+    scene = world.perceived()
+    ids, positions = scene.ids[scene.valid], scene.states[scene.valid, : world.spec.position_dim]
+    apart = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
+    np.fill_diagonal(apart, np.inf)
+    nearest = apart.min(axis=1) if len(ids) > 1 else np.full(len(ids), np.inf)
+    order = range(len(ids)) if world.spec.has_ego else np.argsort(nearest, kind="stable")
+    busy = interventions_of(world)
+    near = (int(ids[i]) for i in order if nearest[i] <= settings.near_m and int(ids[i]) not in busy)
+    return list(islice((agent for agent in near if possible(world, agent, 1)), settings.senders))
+
+
+def possible(world: World, agent: int, steps: int) -> list[Intervention]:
+    """Returns what can be tried on an agent; empty for one that does not move by itself."""
+    found = []
+    for kind in TRIED:
+        intervention = Intervention(agent, kind, steps)
+        try:
+            intervene(copied(world), intervention)
+        except UserError:
+            continue
+        found.append(intervention)
+    return found
+
+
+def with_causal_labels(episode: Episode, labels: Mapping[int, CausalLabels]) -> Episode:
+    """Returns the episode with labels of some of its steps; all other steps are unknown (NaN)."""
+    column = {int(agent): i for i, agent in enumerate(episode.ids)}
+    shift_m = np.full((*episode.valid.shape, len(column)), np.nan, dtype=np.float32)
+    for step, label in labels.items():
+        columns = np.array([column[agent] for agent in label.ids])
+        shift_m[step, columns[:, None], columns] = label.shift_m
+    return replace(episode, causal_shift_m=shift_m)

@@ -1,0 +1,106 @@
+"""Keeps the finished episodes of a long recording on disk, so that one that was stopped goes on where it stopped.
+
+Beside the store that is being made, under a hidden name, are the parts that are finished, each an episode store of its
+own, and the settings that they were made with. When all episodes are there, they become one store and the parts are
+deleted. A recording that is shorter than `PART_S` writes no parts.
+"""
+
+import json
+import shutil
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from predictor.data.store import Episode, StoreInfo, read_store, write_store
+from predictor.support.errors import UserError
+from predictor.support.files import delete_leftovers, write_json
+
+PART_S = 30.0
+"""Time after which the episodes that have been recorded since the last part are written [s]."""
+SETTINGS = "settings.json"
+
+
+class PartialStore:
+    """Episodes of a store that is being recorded, in their order; a context manager, which writes what it has at exit.
+
+    Args:
+        path: path of the store.
+        settings: everything that the episodes depend on, as JSON; parts with the same settings are taken over.
+        discard: whether parts with other settings are deleted.
+        part_s: time between two parts [s].
+
+    Raises:
+        UserError: there are parts with other settings, and `discard` is not set.
+    """
+
+    def __init__(self, path: Path, settings: Mapping[str, Any], discard: bool = False, part_s: float = PART_S) -> None:
+        """Finds the parts of an earlier attempt."""
+        self._path, self._part_s = Path(path), part_s
+        self._folder = self._path.with_name(f".{self._path.name}.unfinished")
+        self._settings = json.loads(json.dumps(settings, default=str))
+        self._info: StoreInfo | None = None
+        self._new: list[Episode] = []
+        self._written_at = time.monotonic()
+        if self._folder.exists():
+            self._take_over(discard)
+        self.num_done = sum(int(part.name.partition("+")[2]) for part in self._parts())
+
+    def __enter__(self) -> "PartialStore":
+        """Returns itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Writes the episodes that are not on disk yet, if the recording was stopped."""
+        self._write_part()
+
+    def add(self, info: StoreInfo, episode: Episode) -> None:
+        """Takes the next episode of the store."""
+        self._info = info
+        self._new.append(episode)
+        if time.monotonic() - self._written_at >= self._part_s:
+            self._write_part()
+
+    def finish(self, info: StoreInfo, overwrite: bool = False) -> list[Episode]:
+        """Writes the store, deletes the parts, and returns all episodes.
+
+        Raises:
+            UserError: as `predictor.data.store.write_store`.
+        """
+        episodes = [episode for part in self._parts() for episode in read_store(part).episodes] + self._new
+        write_store(self._path, info, episodes, overwrite)
+        self._new = []
+        shutil.rmtree(self._folder, ignore_errors=True)
+        return episodes
+
+    def _parts(self) -> list[Path]:
+        return sorted(part for part in self._folder.glob("*+*") if part.is_dir())
+
+    def _take_over(self, discard: bool) -> None:
+        delete_leftovers(self._folder)
+        try:
+            found = json.loads((self._folder / SETTINGS).read_text(encoding="utf-8"))
+        except (OSError, json.JSONDecodeError):
+            found = {}
+        if found == self._settings:
+            return
+        if not discard:
+            other = [name for name in self._settings if found.get(name) != self._settings[name]]
+            raise UserError(
+                f"{self._folder} has episodes of an unfinished recording with another {', '.join(other) or 'setting'}; "
+                "repeat its command to go on, or pass --overwrite to begin anew"
+            )
+        shutil.rmtree(self._folder)
+
+    def _write_part(self) -> None:
+        self._written_at = time.monotonic()
+        if not self._new or self._info is None:
+            return
+        self._folder.mkdir(parents=True, exist_ok=True)
+        write_json(self._folder / SETTINGS, self._settings)
+        write_store(self._folder / f"{self.num_done:08d}+{len(self._new)}", self._info, self._new)
+        self.num_done += len(self._new)
+        self._new = []

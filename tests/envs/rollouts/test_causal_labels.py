@@ -1,0 +1,74 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from envs.rollouts.causal_labels import ON_ROADS, CausalLabels, causal_labels, senders_of, with_causal_labels
+from envs.rollouts.interventions import intervene
+from envs.rollouts.world import open_world
+from envs.simulators.interventions import Intervention
+from predictor.data.store import Episode, causal_types
+from tests.envs.interventions import assert_same_scenes, played, road_world
+
+SETTINGS = replace(ON_ROADS, horizon_s=5.0, threshold_m=0.5)
+
+
+def test_the_rear_one_depends_on_the_middle_one_and_the_front_one_does_not():
+    """Three in one lane, ids 1 to 3 from the rear, and the ego (0) two lanes aside."""
+    world = road_world((0.0, 4.0), (25.0, 4.0), (50.0, 4.0), ego_m=(25.0, 12.0))
+    world.step()
+    untouched = world.full_scene()
+    labels = causal_labels(world, SETTINGS)
+    assert_same_scenes([world.full_scene()], [untouched])
+    types = causal_types(labels.shift_m, SETTINGS.threshold_m)
+    assert list(labels.ids) == [0, 1, 2, 3]
+    assert types.tolist() == [
+        [-1, -1, -1, -1],  # the ego's future is its policy's choice
+        [0, -1, 1, 0],  # the leader's leader reaches it through the leader alone
+        [0, 0, -1, 1],
+        [0, 0, 0, -1],
+    ]
+    assert labels.shift_m[1, 2] > 2.0
+    assert labels.shift_m.dtype == np.float32
+
+
+def test_senders_that_are_not_tried_are_unknown():
+    world = road_world((0.0, 4.0), (25.0, 4.0), (50.0, 4.0), (0.0, 0.0), ego_m=(0.0, 12.0))
+    world.step()
+    assert senders_of(world, replace(ON_ROADS, senders=2))[0] == 0
+    labels = causal_labels(world, replace(ON_ROADS, horizon_s=1.0, senders=2))
+    known = ~np.isnan(labels.shift_m)
+    assert known.any(axis=0).sum() == 2
+    intervene(world, Intervention(0, "brake", 5))
+    assert 0 not in senders_of(world, ON_ROADS)
+    assert senders_of(world, replace(ON_ROADS, near_m=1.0)) == []
+    assert np.isnan(causal_labels(world, replace(ON_ROADS, near_m=1.0)).shift_m).all()
+
+
+def test_steps_that_were_not_sampled_are_unknown():
+    valid = np.ones((3, 2), dtype=np.bool_)
+    episode = Episode(np.zeros((3, 2, 4), dtype=np.float32), valid, np.array([7, 4]))
+    shift = np.array([[np.nan, 2.0], [0.0, np.nan]], dtype=np.float32)
+    found = with_causal_labels(episode, {1: CausalLabels([4, 7], shift)}).causal_shift_m
+    assert found is not None
+    assert np.isnan(found[[0, 2]]).all()
+    np.testing.assert_array_equal(found[1], [[np.nan, 0.0], [2.0, np.nan]])  # columns are [7, 4]
+
+
+def test_agents_of_an_arena_have_labels_and_landmarks_send_nothing():
+    world = open_world("simple_tag_v3", "heuristic")
+    world.reset(2)
+    played(world, 4)
+    assert set(senders_of(world, replace(ON_ROADS, near_m=10.0))) == {0, 1, 2, 3}
+    labels = causal_labels(world, replace(ON_ROADS, near_m=10.0, horizon_s=0.5, threshold_m=0.02))
+    types = causal_types(labels.shift_m, 0.02)
+    assert (types[:, 4:] == -1).all()  # landmarks are no senders
+    assert (types[4:, :4] == 0).all()  # and do not move
+    assert types[0, 3] == 1  # a hunter depends on its prey
+
+
+@pytest.mark.parametrize("horizon_s", [1.0, 4.0])
+def test_what_leaves_is_unknown_unless_it_moved(horizon_s: float):
+    world = road_world((0.0, 4.0), (25.0, 4.0), ego_m=(0.0, 12.0))
+    labels = causal_labels(world, replace(SETTINGS, horizon_s=horizon_s))
+    assert not np.isnan(labels.shift_m[1, 2])

@@ -1,0 +1,69 @@
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from envs.rollouts.interventions import interventions_of
+from envs.rollouts.perturbations import ON_ROADS, Perturber, check_kinds
+from envs.rollouts.world import open_world
+from envs.seeding import driver_rng, label_rng, perturbation_rng
+from predictor.support.errors import UserError
+from tests.envs.interventions import assert_same_scenes, played
+
+
+def test_a_share_of_the_steps_is_perturbed_and_every_kind_comes():
+    world = open_world("simple_spread_v3", "idle")
+    busy, kinds = [], Counter[str]()
+    for seed in range(40):
+        world.reset(seed)
+        perturber = Perturber(world, 0.5, (), perturbation_rng(seed))
+        for _ in range(25):
+            perturber()
+            now = interventions_of(world)
+            assert len(now) <= 1
+            busy.append(len(now))
+            kinds.update(one.kind for one in now.values())
+            world.step()
+    assert 0.4 < np.mean(busy) < 0.6
+    assert set(kinds) == {"brake", "accelerate", "remove"}
+
+
+def test_always_and_only_one_kind():
+    world = open_world("highway-fast-v0", "idle")
+    world.reset(0)
+    perturber = Perturber(world, 1.0, ("brake",), perturbation_rng(0))
+    for _ in range(4):
+        perturber()
+        (one,) = interventions_of(world).values()
+        assert one.kind == "brake" and one.change_mps is not None
+        assert ON_ROADS.brake_mps[0] <= one.change_mps <= ON_ROADS.brake_mps[1]
+        assert one.agent in world.perceived().ids
+        world.step()
+
+
+def test_interventions_follow_from_the_seed_alone():
+    found = []
+    for _ in range(2):
+        world = open_world("simple_tag_v3", "heuristic")
+        world.reset(3)
+        perturber = Perturber(world, 0.7, (), perturbation_rng(3))
+        scenes = []
+        for _ in range(10):
+            perturber()
+            scenes += played(world, 1)
+        found.append(scenes)
+    assert_same_scenes(found[0], found[1])
+
+
+def test_streams_are_independent():
+    draws = [rng.random(4).tolist() for rng in (perturbation_rng(5), label_rng(5), driver_rng(5), driver_rng(5, 1))]
+    draws.append(np.random.default_rng(5).random(4).tolist())
+    assert len({tuple(draw) for draw in draws}) == 5
+    assert perturbation_rng(5).random() == draws[0][0] != perturbation_rng(6).random()
+
+
+def test_kinds_that_are_not_possible_are_named():
+    world = open_world("simple_tag_v3", "idle")
+    assert check_kinds(world, ("brake",)) == ("brake",)
+    with pytest.raises(UserError, match="perturb_kinds must be among brake, accelerate, remove in this environment"):
+        check_kinds(world, ("left",))
