@@ -53,6 +53,10 @@ class CollectConfig:
     """Whether to record leaders and followers with their gaps at each step: for training on known edges and for scores,
     never part of an observation. Recorded states do not depend on it; docs/datasets/env.md has its cost in time and
     bytes."""
+    workers: int = os.cpu_count() or 1
+    """Number of parallel processes; the store does not depend on it."""
+    overwrite: bool = False
+    """Whether to replace an existing store."""
     perturb: float = 0.0
     """Share of the steps during which one agent is perturbed: at random moments, a random perceived agent brakes,
     accelerates, changes lane or is taken out, for a while (docs/datasets/env.md). 0 records undisturbed episodes."""
@@ -67,10 +71,6 @@ class CollectConfig:
     """Shift above which an edge counts as causal [m]; None takes 1 m on roads, 0.05 m in mpe2."""
     causal_senders: int = 8
     """Largest number of agents that are perturbed for the causal labels of one step."""
-    workers: int = os.cpu_count() or 1
-    """Number of parallel processes; the store does not depend on it."""
-    overwrite: bool = False
-    """Whether to replace an existing store."""
 
     def __post_init__(self) -> None:
         """Checks ranges.

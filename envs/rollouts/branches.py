@@ -46,7 +46,7 @@ class Branch:
 
 @dataclass(frozen=True)
 class Branches:
-    """The same seconds twice."""
+    """States of the steps that follow one moment, with and without an intervention."""
 
     intervention: Intervention
     """What was done in the perturbed branch."""

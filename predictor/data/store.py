@@ -247,7 +247,7 @@ def _padded_labels(episodes: Sequence[Episode], columns: int, where: str) -> dic
             raise UserError(f"{where}: {name} of episode {bad[0]} need one step or every step, got {lengths[bad[0]]}")
         starts = np.concatenate([[0], np.cumsum(lengths)])
         if not np.array_equal(padded.setdefault("label_starts", starts), starts):
-            raise UserError(f"{where}: labels of edges need equal numbers of steps in each episode")
+            raise UserError(f"{where}: edge_types and edge_attributes need equal numbers of steps in each episode")
         joined = np.full((starts[-1], columns, columns, *labels[0].shape[3:]), _FILL[name], labels[0].dtype)
         for label, begin in zip(labels, starts[:-1], strict=True):
             joined[begin : begin + len(label), : label.shape[1], : label.shape[2]] = label
