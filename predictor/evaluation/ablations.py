@@ -115,7 +115,7 @@ def _mode_lines(more: tuple[str, ...], common: dict[str, Any]) -> tuple[Line, ..
         return Line(key, name, "dgvae", (*base, f"edge_feature_dim={features}", *sets), changes)
 
     frozen = line("frozen", "no modes, graph held in a roll-out", "rollout_graph=frozen")
-    plural = line("plural", "plural dG-VAE+: 20 modes, both energy scores", *MODES)
+    plural = line("plural", "plural dG-VAE+ (20 modes, both energy scores)", *MODES)
     return (
         *CONTROLS,
         line("evolving", "dG-VAE+: no modes, types per pair alone"),

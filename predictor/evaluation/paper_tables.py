@@ -175,7 +175,7 @@ def _figures(rmse: float, ade: float, fde: float, ood_ade: float = 0.0, ood_fde:
 
 
 _LSTM_JOINT = ("joint=true",)
-_LABELLED = {"label_weight": 200.0, "type_label_weight": 40.0}
+_LABELLED: dict[str, Any] = {"label_weight": 200.0, "type_label_weight": 40.0}
 _SPRINGS_PLUS = _dgvae("dgvae", "dG-VAE+", 16, edge_cost=5.0)
 
 SPRINGS = Table(
