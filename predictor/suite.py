@@ -44,6 +44,8 @@ TableName = Literal[
 ]  # fmt: skip
 
 TABLES = PAPER_TABLES | ABLATIONS | NRI_TABLES
+MIN_HISTORY_STEPS = 8
+"""Smallest number of observed steps of a training window, where the table's burn-in is not shorter."""
 MEASURING = 2
 """Number of the way of measuring: results of another one are not taken for finished."""
 
@@ -128,6 +130,7 @@ def line_config(config: SuiteConfig, line: Line, out: Path) -> TrainConfig:
     """Returns the training config of a line."""
     table, sizes = TABLES[config.table], config.sizes
     sets = (*sizes.widths.get(line.model, ()), *line.set)
+    val_history_steps = min(table.protocol.burn_in_steps, table.protocol.train_history_steps)
     base = TrainConfig(
         data=(config.data / table.train,),
         val_data=(config.data / table.val,) if table.val else (),
@@ -139,8 +142,8 @@ def line_config(config: SuiteConfig, line: Line, out: Path) -> TrainConfig:
         steps=sizes.steps,
         batch_size=sizes.batch_size,
         history_steps=table.protocol.train_history_steps,
-        min_history_steps=8,
-        val_history_steps=table.protocol.train_history_steps,
+        min_history_steps=min(MIN_HISTORY_STEPS, val_history_steps),
+        val_history_steps=val_history_steps,
         horizon_steps=table.protocol.train_horizon_steps,
         val_windows=sizes.val_windows,
         eval_every=sizes.eval_every,

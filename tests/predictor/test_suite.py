@@ -146,7 +146,7 @@ def test_types_without_labels_are_renamed_and_types_with_labels_are_not(
 ):
     """A majority forecaster of type 0, which charges never have, is right by another name only."""
     table, settings = TABLES["nri-charged"], SuiteConfig("nri-charged", nri_data, tmp_path, "smoke")
-    empty = MajorityGraph(spec(has_ego=False), 20, 0, 2)  # one type fewer than the labels
+    empty = MajorityGraph(spec(has_ego=False, dt_s=0.1), 20, 0, 2)  # one type fewer than the labels
     monkeypatch.setattr(MajorityGraph, "fit", lambda *_: empty)
     free = nri_line("nri-charged", "majority")
     labelled = replace(free, train={"type_label_weight": 1.0})
@@ -380,6 +380,8 @@ def test_a_missing_store_is_named_with_the_command_that_makes_it(tmp_path: Path)
 def test_test_stores_too_short_for_the_protocol_are_refused(data: Path, tmp_path: Path):
     short = Episode(np.zeros((12, 2, 4), np.float32), np.ones((12, 2), np.bool_), np.arange(2))
     write_store(tmp_path / "short", StoreInfo(spec(has_ego=False), "short"), [short])
-    table = replace(tables.SPRINGS, tests={"test": "short"})
+    long = Episode(np.zeros((70, 2, 4), np.float32), np.ones((70, 2), np.bool_), np.arange(2))
+    write_store(tmp_path / "long", StoreInfo(spec(has_ego=False), "long"), [long])
+    table = replace(tables.SPRINGS, train="long", tests={"test": "short"})
     with pytest.raises(UserError, match="test store of 'short' fits no window of the protocol"):
         suite.measure_line(table, line("constant-velocity"), tmp_path, table.budgets["smoke"], None, 0, "cpu")

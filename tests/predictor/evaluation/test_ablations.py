@@ -1,5 +1,6 @@
 """Ablations change one part each: what a line's name says, and nothing else."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from predictor.evaluation.ablations import ABLATIONS
 from predictor.evaluation.paper_tables import SPRINGS, Line
 from predictor.models import configure
+from predictor.suite import SuiteConfig, line_config
 
 BOTH = pytest.mark.parametrize("name", ["modes", "modes-driving"])
 
@@ -72,3 +74,11 @@ def test_the_table_of_driving_has_episodes_of_its_own_for_the_test():
     assert table.tests == {"test": "test/highway-fast-v0"} != {"test": table.train} and table.overlap_m == 2.0
     seeds = [command.split("--seed ")[1].split()[0] if "--seed" in command else "0" for command in table.commands]
     assert len(set(seeds)) == len(seeds) == 2
+
+
+@pytest.mark.parametrize("name", ["recipe-driving", "modes-driving"])
+def test_models_of_driving_are_selected_on_the_history_that_is_measured(name: Any):
+    settings = SuiteConfig(name, Path(), Path(), "cpu")
+    made = line_config(settings, lines(name)["priced" if name.startswith("recipe") else "plural"], Path())
+    assert (made.history_steps, made.val_history_steps, made.min_history_steps) == (10, 5, 5)
+    assert ABLATIONS[name].protocol.burn_in_steps == 5
