@@ -173,8 +173,7 @@ class _SpeedChange(_Override):
     def before(self) -> None:
         """Gives the driver its own last action back: a policy's is kept over several frames."""
         super().before()
-        if self._given is not None and self.vehicle.action is self._put:
-            self.vehicle.action = self._given
+        self._give_back()
 
     def after(self) -> None:
         """Replaces the acceleration: braking bounds the driver's speed, accelerating overrides it while there is room.
@@ -193,8 +192,12 @@ class _SpeedChange(_Override):
         self._put = self.vehicle.action = {**self._given, "acceleration": chosen}
 
     def end(self) -> bool:
-        self.before()
+        self._give_back()
         return super().end()
+
+    def _give_back(self) -> None:
+        if self._given is not None and self.vehicle.action is self._put:
+            self.vehicle.action = self._given
 
     def _has_room(self) -> bool:
         front, _ = self.road.neighbour_vehicles(self.vehicle)

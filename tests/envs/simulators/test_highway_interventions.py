@@ -111,6 +111,29 @@ def test_the_ego_brakes_whatever_its_policy_asks_and_is_free_again(driver: str):
     assert simulator.vehicle.speed > before - 6.0 + 1.0
 
 
+def test_a_policy_cannot_change_lane_while_its_vehicle_brakes():
+    world = road_world((100.0, 4.0), ego_m=(0.0, 4.0))
+    simulator: Any = world.env.unwrapped
+    asked = simulator.action_type.actions_indexes["LANE_RIGHT"]
+    intervene(world, Intervention(0, "brake", 2, change_mps=6.0))
+    lanes = []
+    for _ in range(3):
+        world.env.step(asked)
+        lanes.append(simulator.vehicle.target_lane_index[2])
+    assert lanes == [1, 1, 2]
+
+
+@pytest.mark.parametrize("kind", ["brake", "accelerate", "left"])
+def test_a_driver_begins_no_lane_change_meanwhile_and_may_again_afterwards(kind: Kind):
+    world = road_world((0.0, 4.0))
+    (_, driver) = world.env.unwrapped.road.vehicles
+    driver.enable_lane_change = True
+    intervene(world, Intervention(1, kind, 2))
+    assert not driver.enable_lane_change
+    played(world, 3)
+    assert driver.enable_lane_change
+
+
 def test_an_ego_that_steers_itself_keeps_its_own_acceleration_for_later():
     """A continuous action is given once per step and kept over its frames."""
     world = open_world("racetrack-v1", "keep-lane")
