@@ -14,10 +14,11 @@ from typing import Annotated, Any, NamedTuple
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from envs.readers.highway_labels import ATTRIBUTE_NAMES
-from envs.rollouts.causal_labels import TRIED, CausalSettings, settings_for
+from envs.rollouts.branch_recording import branch_mix_for
+from envs.rollouts.causal_labels import TRIED, settings_for
 from envs.rollouts.interventions import kinds_of
 from envs.rollouts.perturbations import check_kinds, mix_for
-from envs.rollouts.recording import Recording, record
+from envs.rollouts.recording import Recording, record_all
 from envs.rollouts.world import World, default_drivers, open_world
 from envs.simulators.interventions import Kind
 from predictor.data.partial_store import PartialStore
@@ -71,6 +72,12 @@ class CollectConfig:
     """Shift above which an edge counts as causal [m]; None takes 1 m on roads, 0.05 m in mpe2."""
     causal_senders: int = 8
     """Largest number of agents that are perturbed for the causal labels of one step."""
+    branches: int = 0
+    """Number of branches recorded of each episode, in place of the episode: at random moments the simulator is copied,
+    and in the copy one agent is slower, faster or gone at once. Each is an episode of its own, with causal labels: the
+    steps before, and what follows. 0 records whole episodes."""
+    branch_history_steps: int = 10
+    """Largest number of steps before the moment of a branch."""
 
     def __post_init__(self) -> None:
         """Checks ranges.
@@ -78,15 +85,18 @@ class CollectConfig:
         Raises:
             UserError: a value out of range.
         """
-        check_at_least(self, 1, "episodes", "max_steps", "causal_senders", "workers")
-        check_at_least(self, 0, "seed", "causal_labels")
+        check_at_least(self, 1, "episodes", "max_steps", "causal_senders", "workers", "branch_history_steps")
+        check_at_least(self, 0, "seed", "causal_labels", "branches")
         check_positive(self, "causal_horizon_s", "causal_threshold_m")
         if not 0 <= self.perturb <= 1:
             raise UserError(f"perturb must lie between 0 and 1, got {self.perturb:g}")
         if self.perturb_kinds and not self.perturb:
             raise UserError("perturb_kinds needs perturb above 0, got 0; pass --perturb, for example 0.2")
-        if not self.causal_labels and (self.causal_horizon_s is not None or self.causal_threshold_m is not None):
-            raise UserError("causal_horizon_s and causal_threshold_m need causal_labels above 0, got 0")
+        if self.branches and (self.perturb or self.causal_labels):
+            raise UserError("branches are of undisturbed episodes and have causal labels; leave out the other options")
+        labelled = self.causal_labels or self.branches
+        if not labelled and (self.causal_horizon_s is not None or self.causal_threshold_m is not None):
+            raise UserError("causal_horizon_s and causal_threshold_m need causal_labels or branches above 0, got 0")
 
     @property
     def drivers(self) -> tuple[str, ...]:
@@ -94,8 +104,17 @@ class CollectConfig:
         return self.driver or default_drivers(self.env_id)
 
 
-def collect(config: CollectConfig, first: int = 0) -> Iterator[Episode]:
-    """Records the episodes of a config, in the order of their seeds, from the one with number `first` on.
+def collect(config: CollectConfig) -> Iterator[Episode]:
+    """Records the episodes of a config, in the order of their seeds.
+
+    Raises:
+        UserError: the environment cannot be perturbed or copied, where that is asked for.
+    """
+    return (episode for episodes in recorded(config) for episode in episodes)
+
+
+def recorded(config: CollectConfig, first: int = 0) -> Iterator[list[Episode]]:
+    """Records the episodes of each seed, from that with number `first` on: one, or all its branches.
 
     Raises:
         UserError: the environment cannot be perturbed or copied, where that is asked for.
@@ -109,7 +128,7 @@ def collect(config: CollectConfig, first: int = 0) -> Iterator[Episode]:
         yield from map(_record, tasks)
         return
     with multiprocessing.get_context("spawn").Pool(config.workers, initializer=_limit_threads) as pool:
-        yield from pool.imap(_record, tasks, chunksize=1 if config.causal_labels else 4)
+        yield from pool.imap(_record, tasks, chunksize=1 if config.causal_labels or config.branches else 4)
 
 
 def recording_of(config: CollectConfig) -> Recording:
@@ -119,21 +138,21 @@ def recording_of(config: CollectConfig) -> Recording:
         UserError: the environment cannot be perturbed or copied, where that is asked for.
     """
     plain = Recording(config.max_steps, config.labels)
-    if not config.perturb and not config.causal_labels:
+    if not (config.perturb or config.causal_labels or config.branches):
         return plain
     world = _world(config.env_id, config.drivers[0])
     check_kinds(world, config.perturb_kinds)
-    causal: CausalSettings | None = None
-    if config.causal_labels:
-        given = {"horizon_s": config.causal_horizon_s, "threshold_m": config.causal_threshold_m}
-        changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-        causal = replace(settings_for(world), senders=config.causal_senders, **changes)
+    given = {"horizon_s": config.causal_horizon_s, "threshold_m": config.causal_threshold_m}
+    changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    causal = replace(settings_for(world), senders=config.causal_senders, **changes)
     return replace(
         plain,
         perturb=config.perturb,
         perturb_kinds=config.perturb_kinds,
         causal_every=config.causal_labels,
-        causal=causal,
+        causal=causal if config.causal_labels or config.branches else None,
+        branches=config.branches,
+        branch_history_steps=config.branch_history_steps,
     )
 
 
@@ -159,8 +178,8 @@ def _world(env_id: str, driver: str) -> World:
     return _worlds[env_id, driver]
 
 
-def _record(task: _Task) -> Episode:
-    return record(_world(task.env_id, task.driver), task.seed, task.driver, task.recording)
+def _record(task: _Task) -> list[Episode]:
+    return record_all(_world(task.env_id, task.driver), task.seed, task.driver, task.recording)
 
 
 def _info(config: CollectConfig) -> StoreInfo:
@@ -171,7 +190,7 @@ def _info(config: CollectConfig) -> StoreInfo:
     """
     worlds = [open_world(config.env_id, name) for name in config.drivers]
     worlds[0].reset(config.seed)
-    labelled = config.labels and worlds[0].labels() is not None
+    labelled = config.labels and not config.branches and worlds[0].labels() is not None
     recording = recording_of(config)
     made = provenance(PACKAGES) | {"seed": config.seed}
     if config.perturb:
@@ -179,6 +198,8 @@ def _info(config: CollectConfig) -> StoreInfo:
         made["perturbations"] = {"share": config.perturb, "kinds": kinds, "mix": asdict(mix_for(kinds_of(worlds[0])))}
     if recording.causal is not None:
         made["causal_labels"] = {"every": config.causal_labels, "tried": TRIED} | asdict(recording.causal)
+    if config.branches:
+        made["branches"] = {"of_each": config.branches} | asdict(branch_mix_for(worlds[0]))
     for world in worlds:
         world.close()
     return StoreInfo(
@@ -207,15 +228,15 @@ def main() -> None:
         done = partial.num_done
         with Progress(*columns) as progress:
             task = progress.add_task("", total=config.episodes, completed=done)
-            for episode in collect(config, done):
-                partial.add(info, episode)
+            for found in recorded(config, done):
+                partial.add(info, *found)
                 progress.advance(task)
         episodes = partial.finish(info, config.overwrite)
     steps = sum(len(e.states) for e in episodes)
     taken = f" ({done} of them from an unfinished recording)" if done else ""
     print(
         f"{config.out}: {len(episodes)} episodes{taken}, {steps} scenes, "
-        f"seeds {config.seed}–{config.seed + len(episodes) - 1}"
+        f"seeds {config.seed}–{config.seed + config.episodes - 1}"
     )
 
 

@@ -82,29 +82,40 @@ def causal_labels(world: World, settings: CausalSettings) -> CausalLabels:
     for intervention in tried:
         assert point is not None
         column = ids.index(intervention.agent)
-        shift_m[:, column] = np.fmax(shift_m[:, column], _direct(point, intervention, settings.threshold_m))
+        found = direct_shift_m(point, point.perturbed(intervention), settings.threshold_m)
+        shift_m[:, column] = np.fmax(shift_m[:, column], found)
     if world.spec.has_ego:
         shift_m[0] = np.nan  # its future is the policy's choice
     np.fill_diagonal(shift_m, np.nan)
     return CausalLabels(ids, shift_m)
 
 
-def _direct(point: BranchPoint, intervention: Intervention, threshold_m: float) -> Float[np.ndarray, " agents"]:
-    """Returns each agent's farthest shift [m]; the direct one where the whole one exceeds the threshold."""
-    whole_m = farthest(point.perturbed(intervention), threshold_m)
+def direct_shift_m(
+    point: BranchPoint, found: Branches, threshold_m: float, steps: int | None = None
+) -> Float[np.ndarray, " agents"]:
+    """Computes how far an intervention moves each agent at most [m]; beyond the threshold, the direct shift alone.
+
+    Args:
+        point: the moment of the branches.
+        found: what followed the intervention.
+        threshold_m: shift above which an agent is played again, with all others held [m].
+        steps: number of steps that count; None takes all that were played.
+    """
+    whole_m = farthest(found, threshold_m, steps)
+    sender = found.intervention.agent
     for receiver in np.flatnonzero(whole_m > threshold_m):
-        if point.ids[receiver] != intervention.agent:
-            alone = point.direct(intervention, int(point.ids[receiver]))
-            whole_m[receiver] = farthest(alone, threshold_m)[receiver]
+        if point.ids[receiver] != sender:
+            alone = point.direct(found.intervention, int(point.ids[receiver]))
+            whole_m[receiver] = farthest(alone, threshold_m, steps)[receiver]
     return whole_m
 
 
-def farthest(found: Branches, threshold_m: float) -> Float[np.ndarray, " agents"]:
-    """Returns each agent's farthest shift over the horizon [m].
+def farthest(found: Branches, threshold_m: float, steps: int | None = None) -> Float[np.ndarray, " agents"]:
+    """Returns each agent's farthest shift over the first steps [m]; None takes all.
 
     NaN for an agent that one branch does not have at each step, unless it has moved beyond the threshold before.
     """
-    shift, valid = found.shift()
+    shift, valid = (found_all[: None if steps is None else steps + 1] for found_all in found.shift())
     farthest_m = np.linalg.norm(shift, axis=-1).max(axis=0)
     return np.where(valid.all(axis=0) | (farthest_m > threshold_m), farthest_m, np.nan)
 

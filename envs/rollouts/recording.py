@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from envs.readers.highway_labels import SceneLabels, with_labels
+from envs.rollouts.branch_recording import BranchRecording, branch_mix_for, record_branches
 from envs.rollouts.causal_labels import CausalLabels, CausalSettings, causal_labels, with_causal_labels
 from envs.rollouts.interventions import interventions_of
 from envs.rollouts.perturbations import Perturber
@@ -36,6 +37,29 @@ class Recording:
     """Number of steps from one with causal labels to the next; 0 records none."""
     causal: CausalSettings | None = None
     """How causal labels are measured; needed if they are."""
+    branches: int = 0
+    """Number of branches recorded in place of the episode."""
+    branch_history_steps: int = 10
+    """Largest number of steps before the moment of a branch."""
+
+
+def record_all(world: World, seed: int, label: str, settings: Recording) -> list[Episode]:
+    """Plays the episode of a seed and returns it, or its branches.
+
+    Args:
+        world: world to play; it is reset.
+        seed: seed of the episode.
+        label: tag of the episode.
+        settings: what is recorded.
+
+    Raises:
+        UserError: the world cannot be perturbed or copied, where that is asked for.
+    """
+    if not settings.branches:
+        return [record(world, seed, label, settings)]
+    assert settings.causal is not None
+    branches = BranchRecording(settings.branches, settings.branch_history_steps, branch_mix_for(world), settings.causal)
+    return record_branches(world, seed, label, settings.max_steps, branches)
 
 
 def record(world: World, seed: int, label: str, settings: Recording) -> Episode:

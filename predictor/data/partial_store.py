@@ -42,6 +42,7 @@ class PartialStore:
         self._settings = json.loads(json.dumps(settings, default=str))
         self._info: StoreInfo | None = None
         self._new: list[Episode] = []
+        self._added = 0
         self._written_at = time.monotonic()
         if self._folder.exists():
             self._take_over(discard)
@@ -57,10 +58,11 @@ class PartialStore:
         """Writes the episodes that are not on disk yet, if the recording was stopped."""
         self._write_part()
 
-    def add(self, info: StoreInfo, episode: Episode) -> None:
-        """Takes the next episode of the store."""
+    def add(self, info: StoreInfo, *episodes: Episode) -> None:
+        """Takes what the next step of the recording brought: one episode, several, or none; `num_done` counts steps."""
         self._info = info
-        self._new.append(episode)
+        self._new.extend(episodes)
+        self._added += 1
         if time.monotonic() - self._written_at >= self._part_s:
             self._write_part()
 
@@ -101,6 +103,6 @@ class PartialStore:
             return
         self._folder.mkdir(parents=True, exist_ok=True)
         write_json(self._folder / SETTINGS, self._settings)
-        write_store(self._folder / f"{self.num_done:08d}+{len(self._new)}", self._info, self._new)
-        self.num_done += len(self._new)
-        self._new = []
+        write_store(self._folder / f"{self.num_done:08d}+{self._added}", self._info, self._new)
+        self.num_done += self._added
+        self._new, self._added = [], 0

@@ -272,26 +272,29 @@ def causal_types(shift_m: Float[np.ndarray, "*pairs"], threshold_m: float) -> In
 def with_causal_edges(store: EpisodeStore, threshold_m: float | None = None) -> EpisodeStore:
     """Returns the store with causal edges in place of its edge labels, for training and scores on them.
 
-    `edge_types` are those of `causal_types`; the one attribute of an edge is `causal_shift_m`, 0 where unknown.
+    `edge_types` are those of `causal_types`; the one attribute of an edge is its strength, `causal_strength`. In a
+    store without causal labels all edges are unknown.
 
     Args:
-        store: a store with causal labels.
+        store: a store.
         threshold_m: shift above which an edge counts [m]; None takes the store's.
-
-    Raises:
-        UserError: the store has no causal labels.
     """
     given = store.info.causal_threshold_m if threshold_m is None else threshold_m
-    if given is None or any(e.causal_shift_m is None for e in store.episodes):
-        raise UserError(f"a store of {store.info.source} has no causal labels; collect it with --causal-labels")
     episodes = []
     for episode in store.episodes:
-        assert episode.causal_shift_m is not None
         shift_m = episode.causal_shift_m
-        attributes = np.nan_to_num(shift_m)[..., None]
-        episodes.append(replace(episode, edge_types=causal_types(shift_m, given), edge_attributes=attributes))
-    info = replace(store.info, edge_attribute_names=("causal_shift_m",), causal_threshold_m=given)
+        if shift_m is None or given is None:
+            shift_m = np.full((1, len(episode.ids), len(episode.ids)), np.nan, dtype=np.float32)
+        types = causal_types(shift_m, given or np.inf)
+        strength = causal_strength(shift_m, given or np.inf)[..., None]
+        episodes.append(replace(episode, edge_types=types, edge_attributes=strength))
+    info = replace(store.info, edge_attribute_names=("causal_strength",), causal_threshold_m=given)
     return EpisodeStore(info, episodes)
+
+
+def causal_strength(shift_m: Float[np.ndarray, "*pairs"], threshold_m: float) -> Float[np.ndarray, "*pairs"]:
+    """Returns the strength of causal edges, log(1 + shift / threshold); 0 where unknown."""
+    return np.log1p(np.nan_to_num(shift_m) / threshold_m).astype(np.float32)
 
 
 def _check_finite(episode: Episode, where: str) -> None:

@@ -1,7 +1,8 @@
 """Cuts training windows from episodes: what the ego perceived up to a step, and what happened after it.
 
 History is masked to perception (range and nearest N at each step). After the last observed step, the agents visible
-then are followed while they exist, visible or not: that is the truth a forecast is compared with.
+then are followed while they exist, visible or not: that is the truth a forecast is compared with. No window has an
+intervention that begins after its last observed step: nobody could foresee it.
 """
 
 from collections.abc import Callable, Sequence
@@ -84,7 +85,8 @@ class Windows:
         self.history_steps = history_steps
         self.horizon_steps = horizon_steps
         lengths = np.array([len(e.states) for e in episodes], dtype=np.int64)
-        self.index = _index(lengths, min_history_steps - 1, min_future_steps)
+        index = _index(lengths, min_history_steps - 1, min_future_steps)
+        self.index = index[_foreseeable(index, episodes, horizon_steps)]
         if not len(self.index):
             raise UserError(
                 f"no window fits: episodes have at most {lengths.max(initial=0)} steps, "
@@ -147,6 +149,32 @@ def _index(lengths: Int[np.ndarray, " episodes"], first: int, future_steps: int)
     episode = np.repeat(np.arange(len(lengths)), counts)
     begins = np.repeat(np.cumsum(counts) - counts, counts)
     return np.stack([episode, np.arange(len(episode)) - begins + first], axis=1)
+
+
+def _foreseeable(
+    index: Int[np.ndarray, "windows 2"], episodes: Sequence[Episode], horizon_steps: int
+) -> Bool[np.ndarray, " windows"]:
+    """Returns in which windows no intervention begins between the last observed step and the last one forecast."""
+    kept = np.ones(len(index), dtype=np.bool_)
+    for number, episode in enumerate(episodes):
+        if episode.perturbed is None:
+            continue
+        before = np.pad(episode.perturbed, ((1, 0), (0, 0)))[:-1]
+        begins = ((episode.perturbed != 0) & (episode.perturbed != before)).any(axis=1)
+        until = np.concatenate([[0], np.cumsum(begins)])
+        mine = slice(*np.searchsorted(index[:, 0], [number, number + 1]))
+        now = index[mine, 1]
+        kept[mine] = until[np.minimum(now + horizon_steps, len(begins))] == until[now]
+    return kept
+
+
+def siblings(episodes: Sequence[Episode]) -> Int[np.ndarray, " episodes"]:
+    """Returns a number for each episode that branches of one episode share, for they have steps in common."""
+    first = [
+        i == 0 or e.perturbed is None or (e.seed, e.label) != (episodes[i - 1].seed, episodes[i - 1].label)
+        for i, e in enumerate(episodes)
+    ]
+    return np.cumsum(first) - 1
 
 
 def split_episodes(count: int, fraction: float, seed: int) -> tuple[list[int], list[int]]:

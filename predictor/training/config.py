@@ -41,6 +41,9 @@ class TrainConfig:
     edge_geometry: bool = False
     """Whether relative position, relative speed and time to contact are inputs of the dG-VAE's edges
     (`geometry_scales`, fitted to the data)."""
+    causal_edges: bool = False
+    """Whether the causal labels of the stores are the known edges (`--label-weight`, `--type-label-weight`), in place
+    of leaders and followers; where a store has none, edges are unknown."""
     steps: int = 4000
     """Number of optimiser steps."""
     batch_size: int = 64

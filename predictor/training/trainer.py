@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.data.store import Episode, EpisodeStore, read_store
-from predictor.data.windows import WindowBatch, Windows, split_episodes
+from predictor.data.store import Episode, EpisodeStore, read_store, with_causal_edges
+from predictor.data.windows import WindowBatch, Windows, siblings, split_episodes
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import run_windows
 from predictor.models import build, configure
@@ -69,6 +69,10 @@ def load_data(config: TrainConfig) -> TrainingData:
         UserError: stores differ in features or dt, or have too few episodes.
     """
     stores: list[EpisodeStore] = [read_store(path) for path in (*config.data, *config.val_data)]
+    if config.causal_edges:
+        if all(store.info.causal_threshold_m is None for store in stores[: len(config.data)]):
+            raise UserError("causal_edges needs a store with causal labels, got none; collect one with --branches 4")
+        stores = [with_causal_edges(store) for store in stores]
     spec = stores[0].info.spec
     for path, store in zip((*config.data, *config.val_data), stores, strict=True):
         spec.check_compatible(store.info.spec, f"store {config.data[0]}", f"store {path}")
@@ -82,7 +86,9 @@ def load_data(config: TrainConfig) -> TrainingData:
         return TrainingData(spec, sources, train, val, [e for part in chosen[:cut] for e in part])
     train, val, episodes = [], [], []
     for path, store in zip(config.data, stores, strict=True):
-        kept, held_out = split_episodes(len(store.episodes), config.val_fraction, config.seed)
+        group = siblings(store.episodes)
+        parts = split_episodes(int(group[-1]) + 1, config.val_fraction, config.seed)
+        kept, held_out = (np.flatnonzero(np.isin(group, part)).tolist() for part in parts)
         kept = kept[: config.max_episodes or None]
         if not kept or not held_out:
             raise UserError(

@@ -68,3 +68,15 @@ def test_an_unfinished_part_does_not_count(tmp_path: Path):
     (folder / ".00000002+3.abc.partial").mkdir()
     assert PartialStore(tmp_path / "store", SETTINGS_A).num_done == 2
     assert sorted(p.name for p in folder.iterdir()) == ["00000000+1", "00000001+1", SETTINGS]
+
+
+def test_a_step_of_the_recording_may_bring_several_episodes_or_none(tmp_path: Path):
+    first, second, third, *_ = episodes()
+    with pytest.raises(KeyboardInterrupt), PartialStore(tmp_path / "store", SETTINGS_A, part_s=1e6) as partial:
+        partial.add(INFO, first, second)
+        partial.add(INFO)
+        raise KeyboardInterrupt
+    with PartialStore(tmp_path / "store", SETTINGS_A) as partial:
+        assert partial.num_done == 2
+        partial.add(INFO, third)
+        assert [len(e.states) for e in partial.finish(INFO)] == [6, 7, 8]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from predictor.data.store import Episode
-from predictor.data.windows import WindowBatch, Windows, concatenate, split_episodes, visible
+from predictor.data.windows import WindowBatch, Windows, concatenate, siblings, split_episodes, visible
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 from tests.predictor.helpers import random_presence, random_states, spec
@@ -333,3 +333,22 @@ def test_split_is_a_partition_of_whole_episodes(count: int, fraction: float):
 def test_split_depends_on_the_seed_alone():
     assert split_episodes(30, 0.3, seed=1) == split_episodes(30, 0.3, seed=1)
     assert split_episodes(30, 0.3, seed=1) != split_episodes(30, 0.3, seed=2)
+
+
+def test_an_intervention_may_begin_before_the_forecast_and_not_within():
+    """One begins at step 3 and is in force for two steps, another follows it at once."""
+    episode = along_x([0.0] * 9, [1.0] * 9)
+    perturbed = np.zeros((9, 2), dtype=np.int8)
+    perturbed[3:5, 1], perturbed[5, 0] = 1, 1
+    disturbed = replace(episode, perturbed=perturbed)
+    found = Windows([episode, disturbed], spec(), 1, 2).index.tolist()
+    assert [now for number, now in found if number == 0] == list(range(8))
+    assert [now for number, now in found if number == 1] == [0, 1, 6, 7]
+
+
+def test_branches_of_one_episode_are_siblings():
+    marks = np.zeros((3, 1), dtype=np.int8)
+    branch = replace(along_x([0.0] * 3), perturbed=marks, seed=4)
+    found = [branch, branch, replace(branch, seed=5), replace(branch, seed=5, label="idle"), along_x([0.0] * 3)]
+    assert siblings(found).tolist() == [0, 0, 1, 2, 3]
+    assert siblings([along_x([0.0] * 3)] * 3).tolist() == [0, 1, 2]

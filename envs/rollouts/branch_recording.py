@@ -1,0 +1,183 @@
+"""Records what follows an intervention: at random moments of an episode the world is copied, and perturbed in the copy.
+
+Each branch is an episode of its own: undisturbed steps, then the moment at which one agent is slower, faster or gone at
+once, then what all agents make of it. So nothing that happens after the moment is unforeseeable, which cannot be said
+of an episode that is perturbed again and again. The same moment without the intervention gives the causal labels of the
+perturbed agent. All draws are a function of the episode's seed alone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from envs.rollouts.branches import Branches, BranchPoint, copied
+from envs.rollouts.causal_labels import CausalSettings, direct_shift_m, farthest, senders_of
+from envs.rollouts.interventions import kinds_of
+from envs.rollouts.world import World
+from envs.seeding import branch_rng
+from envs.simulators.interventions import Intervention, Kind
+from predictor.data.store import PERTURBATIONS, Episode
+from predictor.scene import Scene
+from predictor.support.errors import UserError
+
+SHARES: dict[Kind, float] = {"brake": 0.55, "accelerate": 0.2, "remove": 0.25}
+"""Probability of each kind; a kind that an agent does not allow is drawn anew."""
+FREE = 0.6
+"""Probability that a driver is free after its speed has changed; otherwise it holds the speed for a while."""
+TRIES = 3
+"""Largest number of interventions that are tried until one moves another agent; the last one is kept in any case."""
+
+
+@dataclass(frozen=True)
+class BranchMix:
+    """Distribution of the interventions of recorded branches."""
+
+    brake_mps: tuple[float, float]
+    """Range of the loss of speed, to rest at most [m/s]."""
+    accelerate_mps: tuple[float, float]
+    """Range of the gain of speed [m/s]."""
+    horizon_s: float
+    """Time that is played after the moment [s]."""
+
+
+ON_ROADS = BranchMix((2.0, 10.0), (2.0, 6.0), 5.0)
+"""Mix for highway-env."""
+IN_ARENAS = BranchMix((0.2, 1.2), (0.2, 0.8), 1.5)
+"""Mix for mpe2, whose agents move at about 1 m/s."""
+
+
+@dataclass(frozen=True)
+class BranchRecording:
+    """What is recorded of an episode in branches; can be pickled."""
+
+    branches: int
+    """Number of branches of an episode."""
+    history_steps: int
+    """Largest number of undisturbed steps before the moment."""
+    mix: BranchMix
+    """Distribution of interventions."""
+    causal: CausalSettings
+    """Which agents are perturbed, and how their causal labels are measured."""
+
+
+def branch_mix_for(world: World) -> BranchMix:
+    """Returns the mix of the world's family.
+
+    Raises:
+        UserError: the world cannot be perturbed.
+    """
+    return ON_ROADS if "left" in kinds_of(world) else IN_ARENAS
+
+
+def record_branches(world: World, seed: int, label: str, max_steps: int, settings: BranchRecording) -> list[Episode]:
+    """Plays the episode of a seed and returns its branches; fewer than asked for if no agent can be perturbed.
+
+    Args:
+        world: world to play; it is reset.
+        seed: seed of the episode.
+        label: tag of the episodes.
+        max_steps: largest length of the episode [policy steps].
+        settings: what is recorded.
+
+    Raises:
+        UserError: the world cannot be copied or perturbed.
+    """
+    rng = branch_rng(seed)
+    scenes, moments = _play(world, seed, max_steps, settings.branches, rng)
+    found = []
+    for step, moment in moments:
+        before = scenes[max(0, step - settings.history_steps) : step]
+        episode = _branch(moment, before, settings, rng)
+        if episode is not None:
+            found.append(replace(episode, label=label, seed=seed))
+    return found
+
+
+def _play(
+    world: World, seed: int, max_steps: int, branches: int, rng: np.random.Generator
+) -> tuple[list[Scene], list[tuple[int, World]]]:
+    """Plays the episode; returns all its scenes, and copies of the world at moments drawn evenly, with their steps."""
+    world.reset(seed)
+    scenes = [world.full_scene()]
+    moments: list[tuple[int, World]] = []
+    for step in range(1, max_steps):
+        if world.step():
+            break
+        scenes.append(world.full_scene())
+        # the k-th moment replaces each kept one with probability 1 / k, so that all are equally likely in the end
+        replaced = np.flatnonzero(rng.random(branches) < 1 / step)
+        if len(replaced):
+            moment = (step, copied(world))
+            moments = [moment if i in replaced else kept for i, kept in enumerate(moments or [moment] * branches)]
+    return scenes, moments
+
+
+def _branch(
+    moment: World, before: Sequence[Scene], settings: BranchRecording, rng: np.random.Generator
+) -> Episode | None:
+    """Returns a branch of a moment; None if no agent can be perturbed."""
+    horizon = max(1, round(settings.mix.horizon_s / moment.spec.dt_s))
+    point = BranchPoint(moment, horizon)
+    labelled = min(horizon, max(1, round(settings.causal.horizon_s / moment.spec.dt_s)))
+    senders = senders_of(moment, settings.causal)
+    if not senders:
+        return None
+    for attempt in range(TRIES):
+        sender = int(rng.choice(senders))
+        found = _perturbed(point, sender, horizon, settings.mix, rng)
+        if found is None:
+            continue
+        moved_m = farthest(found, settings.causal.threshold_m, labelled)
+        moved_m[point.ids == sender] = 0
+        if np.nanmax(moved_m, initial=0.0) > settings.causal.threshold_m or attempt == TRIES - 1:
+            return _episode(point, found, before, settings.causal.threshold_m, labelled, moment.spec.has_ego)
+    return None
+
+
+def _perturbed(
+    point: BranchPoint, sender: int, horizon: int, mix: BranchMix, rng: np.random.Generator
+) -> Branches | None:
+    """Plays a random intervention on an agent; None if it allows none."""
+    kinds = list(SHARES)
+    shares = np.array([SHARES[kind] for kind in kinds])
+    for kind in rng.choice(kinds, len(kinds), replace=False, p=shares / shares.sum()):
+        try:
+            return point.perturbed(_drawn(sender, kind, horizon, mix, rng))
+        except UserError:
+            continue  # an ego that cannot be taken out, a vehicle at rest
+    return None
+
+
+def _drawn(sender: int, kind: Kind, horizon: int, mix: BranchMix, rng: np.random.Generator) -> Intervention:
+    if kind == "remove":
+        return Intervention(sender, kind, horizon)
+    change_mps = rng.uniform(*(mix.brake_mps if kind == "brake" else mix.accelerate_mps))
+    steps = 0 if rng.random() < FREE else int(rng.integers(1, horizon + 1))
+    return Intervention(sender, kind, steps, change_mps, at_once=True)
+
+
+def _episode(
+    point: BranchPoint, found: Branches, before: Sequence[Scene], threshold_m: float, labelled: int, has_ego: bool
+) -> Episode:
+    """Returns the episode of a branch, with the mark and the causal labels of the perturbed agent."""
+    after = [
+        Scene(states, found.ids, valid)
+        for states, valid in zip(found.perturbed.states, found.perturbed.valid, strict=True)
+    ]
+    while not after[-1].valid.any():  # the environment could not go on
+        after.pop()
+    episode = Episode.from_scenes([*before, *after])
+    sender = found.intervention.agent
+    column = {int(agent): i for i, agent in enumerate(episode.ids)}
+    now = len(before)
+    perturbed = np.zeros(episode.valid.shape, dtype=np.int8)
+    perturbed[now - 1, column[sender]] = PERTURBATIONS.index(found.intervention.kind)
+    shift_m = np.full((*episode.valid.shape, len(column)), np.nan, dtype=np.float32)
+    direct_m = direct_shift_m(point, found, threshold_m, labelled)
+    for agent, moved_m in zip(point.ids, direct_m, strict=True):
+        if int(agent) in column and agent != sender:
+            shift_m[now - 1 : now + 1, column[int(agent)], column[sender]] = moved_m
+    if has_ego:
+        shift_m[:, 0] = np.nan  # its future is the policy's choice
+    return replace(episode, perturbed=perturbed, causal_shift_m=shift_m)

@@ -1,0 +1,106 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from envs.collect import CollectConfig, collect
+from envs.rollouts.branch_recording import IN_ARENAS as ARENA_MIX
+from envs.rollouts.branch_recording import ON_ROADS as ROAD_MIX
+from envs.rollouts.branch_recording import BranchRecording, record_branches
+from envs.rollouts.causal_labels import IN_ARENAS, ON_ROADS
+from envs.rollouts.recording import Recording, record
+from envs.rollouts.world import open_world
+from predictor.data.store import PERTURBATIONS, Episode
+from predictor.data.windows import Windows
+from predictor.support.errors import UserError
+
+ROAD, TAG = "highway-fast-v0", "simple_tag_v3"
+ON_ROAD = BranchRecording(3, 4, replace(ROAD_MIX, horizon_s=3.0), replace(ON_ROADS, senders=4))
+IN_ARENA = BranchRecording(3, 4, replace(ARENA_MIX, horizon_s=0.5), replace(IN_ARENAS, horizon_s=0.5))
+
+
+def moment_of(episode: Episode) -> tuple[int, int]:
+    """Returns the step before the intervention, and the column of its agent."""
+    assert episode.perturbed is not None
+    ((step, column),) = np.argwhere(episode.perturbed)
+    return int(step), int(column)
+
+
+@pytest.fixture(scope="module")
+def branches() -> list[Episode]:
+    return record_branches(open_world(ROAD, "idle"), 5, "idle", 9, ON_ROAD)
+
+
+def test_a_branch_is_the_episode_up_to_its_moment(branches: list[Episode]):
+    whole = record(open_world(ROAD, "idle"), 5, "idle", Recording(9, labels=False))
+    assert len(branches) == 3 and {e.label for e in branches} == {"idle"} and {e.seed for e in branches} == {5}
+    for branch in branches:
+        step, agent = moment_of(branch)
+        assert len(branch.states) == step + 1 + 4 and step < 4
+        begin = next(i for i in range(len(whole.states)) if (whole.states[i, 0] == branch.states[0, 0]).all())
+        columns = [whole.ids.tolist().index(i) for i in branch.ids]
+        before = whole.states[begin : begin + step + 1][:, columns]
+        np.testing.assert_array_equal(branch.states[: step + 1], np.where(branch.valid[: step + 1, :, None], before, 0))
+        now = whole.states[begin + step + 1, columns]
+        others = np.arange(len(columns)) != agent
+        np.testing.assert_array_equal(branch.states[step + 1, others], now[others])
+
+
+def test_at_the_moment_one_agent_is_slower_faster_or_gone(branches: list[Episode]):
+    for branch in branches:
+        step, agent = moment_of(branch)
+        kind = PERTURBATIONS[branch.perturbed[step, agent]]  # type: ignore[index]
+        if kind == "remove":
+            assert branch.valid[step, agent] and not branch.valid[step + 1 :, agent].any()
+            continue
+        before, now = (np.linalg.norm(branch.states[t, agent, 2:]) for t in (step, step + 1))
+        assert (now - before) * {"brake": -1, "accelerate": 1}[kind] > 1.0
+
+
+def test_labels_are_of_the_perturbed_agent_alone(branches: list[Episode]):
+    for branch in branches:
+        step, agent = moment_of(branch)
+        shift_m = branch.causal_shift_m
+        assert shift_m is not None
+        known = ~np.isnan(shift_m)
+        assert known[step : step + 2, :, agent].any() and known.sum() == known[step : step + 2, :, agent].sum()
+        assert not known[:, 0].any() and not known[:, agent, agent].any()
+
+
+def test_the_moments_are_spread_over_the_episode():
+    world = open_world(TAG, "random")
+    counts = np.zeros(26)
+    for seed in range(20):
+        for branch in record_branches(world, seed, "random", 25, replace(IN_ARENA, history_steps=30)):
+            counts[moment_of(branch)[0] + 1] += 1
+    assert counts[1:9].sum() > 8 and counts[9:17].sum() > 8 and counts[17:].sum() > 8
+    assert counts.sum() == 60
+
+
+def test_no_window_has_an_intervention_that_nobody_could_foresee():
+    world = open_world(TAG, "idle")
+    found = record_branches(world, 0, "idle", 25, IN_ARENA)
+    windows = Windows(found, world.spec, 3, 2)
+    for episode, now in windows.index:
+        step, _ = moment_of(found[episode])
+        assert now > step or now + 2 <= step
+    assert any(now == moment_of(found[episode])[0] + 1 for episode, now in windows.index)
+    undisturbed = [replace(e, perturbed=None) for e in found]
+    assert len(Windows(undisturbed, world.spec, 3, 2)) > len(windows)
+
+
+def test_branches_are_a_function_of_the_seed(branches: list[Episode]):
+    again = record_branches(open_world(ROAD, "idle"), 5, "idle", 9, ON_ROAD)
+    for one, other in zip(branches, again, strict=True):
+        np.testing.assert_array_equal(one.states, other.states)
+        np.testing.assert_array_equal(one.causal_shift_m, other.causal_shift_m)
+
+
+def test_collected_branches_come_in_the_order_of_their_seeds(tmp_path):
+    config = CollectConfig(TAG, tmp_path / "s", 2, ("idle",), seed=3, max_steps=6, workers=1, branches=2)
+    assert [e.seed for e in collect(config)] == [3, 3, 4, 4]
+
+
+def test_branches_go_with_no_other_disturbance(tmp_path):
+    with pytest.raises(UserError, match="branches are of undisturbed episodes"):
+        CollectConfig(ROAD, tmp_path / "s", branches=2, perturb=0.2)
