@@ -79,6 +79,9 @@ class TrainConfig:
     """Weight of restricted labelling: regression of the first feature dimensions on known edge attributes."""
     type_label_weight: float = 0.0
     """Weight of restricted labelling of edge types: the prior's and posterior's cross-entropy with known types."""
+    reaction_weight: float = 0.0
+    """Additional weight of agents that are about to react to an intervention: the roll-out's errors of an agent count
+    1 + this times the strength of its causal edge; needs `causal_edges`."""
     variance: float = 5e-5
     """Fixed variance of the likelihood, in scaled units (σ in the paper)."""
     likelihood: Likelihood = "laplace"
@@ -127,10 +130,12 @@ class TrainConfig:
         check_at_least(
             self, 0, "one_step_weight", "rollout_weight", "kl_weight", "seed", "threads", "curriculum_steps",
             "kl_warmup_steps", "energy_weight", "joint_energy_weight", "edge_cost", "label_weight", "type_label_weight",
-            "min_history_steps", "max_episodes",
+            "min_history_steps", "max_episodes", "reaction_weight",
         )  # fmt: skip
         if self.one_step_weight == self.rollout_weight == 0:
             raise UserError("one_step_weight and rollout_weight are both 0; nothing would be learned")
+        if self.reaction_weight and not self.causal_edges:
+            raise UserError("reaction_weight needs the causal labels of branches; pass --causal-edges, or set it to 0")
         if self.min_history_steps > self.history_steps:
             raise UserError(f"min_history_steps must be at most {self.history_steps}, got {self.min_history_steps}")
         if not 1 <= self.val_history_steps <= self.history_steps:

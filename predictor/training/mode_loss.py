@@ -27,6 +27,7 @@ def energy_terms(
     valid: Bool[Tensor, "batch agents horizon"],
     scales: Float[Tensor, " state"],
     axes: int,
+    weights: Float[Tensor, "batch agents"] | float = 1.0,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """Computes the energy score of agents (mean over agents) and of scenes (mean over scenes and steps).
 
@@ -41,6 +42,7 @@ def energy_terms(
         valid: which entries count.
         scales: divisors that make features comparable.
         axes: number of axes of a position.
+        weights: factors of the agents' scores.
     """
     assert modes.mode_probs is not None
     samples = torch.cat([modes.states[:, :1].detach(), modes.states[:, 1:]], dim=1) / scales
@@ -54,7 +56,7 @@ def energy_terms(
         moved = position + REST_SHARE * rest
         return torch.where(valid[:, None], moved, 0.0).sum(-1) / steps[:, None]
 
-    agents = masked_mean(weighted_score(samples, target, modes.mode_probs, apart), there)
+    agents = masked_mean(weighted_score(samples, target, modes.mode_probs, apart) * weights, there)
 
     present = there[:, None].to(samples.dtype)
     count = present.sum(-1).clamp(min=1)

@@ -26,6 +26,7 @@ def nll(
     scales: Float[Tensor, " state"],
     variance: float,
     likelihood: Likelihood = "gaussian",
+    weights: Float[Tensor, "*#batch"] | float = 1.0,
 ) -> Float[Tensor, ""]:
     """Computes the negative log-likelihood at fixed variance, up to a constant: sum of features, mean of valid entries.
 
@@ -36,6 +37,7 @@ def nll(
         scales: divisors that make features comparable; the variance is in these units.
         variance: variance of the likelihood; σ in the paper (which uses it as a variance), 5e-5 there.
         likelihood: "gaussian" (paper) or "laplace" with the same variance, whose gradient does not grow with the error.
+        weights: factors of the entries.
 
     Raises:
         UserError: the likelihood has another name.
@@ -47,7 +49,7 @@ def nll(
         per_entry = error.square().sum(-1) / (2 * variance)
     else:
         per_entry = error.abs().sum(-1) / math.sqrt(variance / 2)
-    return masked_mean(per_entry, valid)
+    return masked_mean(per_entry * weights, valid)
 
 
 def kl_categorical(
@@ -95,11 +97,12 @@ def window_loss(
         steps = batch.last_observed[:, None] + torch.arange(1, horizon + 1, device=windows.device)
         truth = batch.states[windows, steps].transpose(1, 2)
         valid = batch.valid[windows, steps].transpose(1, 2)
-        rollout = nll(output.rollout, truth, valid, scales, config.variance, config.likelihood)
+        weights = reaction_weights(batch, config.reaction_weight)
+        rollout = nll(output.rollout, truth, valid, scales, config.variance, config.likelihood, weights[..., None])
         total = total + config.rollout_weight * rollout
         terms["nll_rollout"] = rollout
         if output.modes is not None:
-            extra, mode_terms = _mode_loss(model.spec.position_dim, output.modes, truth, valid, scales, config)
+            extra, mode_terms = _mode_loss(model.spec.position_dim, output.modes, truth, valid, scales, weights, config)
             total = total + extra
             terms |= mode_terms
     if output.prior_logits is not None:
@@ -109,11 +112,31 @@ def window_loss(
     return total, {k: v.detach() for k, v in terms.items()}
 
 
+def reaction_weights(batch: WindowBatch, weight: float) -> Float[Tensor, "batch agents"]:
+    """Computes a factor for each agent: 1 plus `weight` times the strength of the causal edges to it, over its mean.
+
+    Known are the edges from an agent whose intervention is the last thing that was observed: its receivers react.
+
+    Args:
+        batch: windows; the first edge attribute is the strength, where there is one.
+        weight: weight of a strength of 1; 0 gives 1 for all.
+    """
+    rows = torch.arange(len(batch.valid), device=batch.valid.device)
+    visible = batch.valid[rows, batch.last_observed]
+    factors = torch.ones_like(visible, dtype=batch.states.dtype)
+    if not weight or batch.edge_attributes is None or batch.edge_types is None:
+        return factors
+    is_edge = batch.edge_types[rows, batch.last_observed] > 0
+    strength = torch.where(is_edge, batch.edge_attributes[rows, batch.last_observed][..., 0], 0.0).amax(-1)
+    factors = factors + weight * strength
+    return factors / masked_mean(factors, visible)
+
+
 def _mode_loss(
-    axes: int, modes: Futures, truth: Tensor, valid: Tensor, scales: Tensor, config: TrainConfig
+    axes: int, modes: Futures, truth: Tensor, valid: Tensor, scales: Tensor, weights: Tensor, config: TrainConfig
 ) -> tuple[Tensor, Terms]:
     scale = unit(config.variance)
-    agents, scenes = (scale * term for term in energy_terms(modes, truth, valid, scales, axes))
+    agents, scenes = (scale * term for term in energy_terms(modes, truth, valid, scales, axes, weights))
     spread = spread_nll(modes, truth, valid, axes)
     total = config.energy_weight * agents + config.joint_energy_weight * scenes + spread
     return total, {"energy": agents, "joint_energy": scenes, "nll_spread": spread}

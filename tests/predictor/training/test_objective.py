@@ -212,6 +212,29 @@ def test_labels_of_a_model_without_features_have_no_term():
     assert "label" not in terms(replace(SILENT, label_weight=1.0), batch(TYPES, attributes), output(features=None))
 
 
+def test_agents_that_react_weigh_more():
+    """Agent 1 has a causal edge of strength 2 from agent 0 at step 1; the other way is known to have none."""
+    types = torch.full((1, 3, 2, 2), -1, dtype=torch.int8)
+    types[0, 1, 1, 0], types[0, 1, 0, 1] = 1, 0
+    strength = torch.zeros(1, 3, 2, 2, 1)
+    strength[0, 1, 1, 0], strength[0, 1, 0, 1] = 2.0, 0.5
+    rollout = torch.zeros(1, 2, 1, 4)
+    rollout[0, 0, 0, 0] = 10.0  # agent 0 is 1 wrong in scaled units, agent 1 is 2 wrong
+    rollout[0, 1, 0, 0] = 20.0
+    for now, weights in ((1, (1 / 4, 7 / 4)), (0, (1.0, 1.0))):  # 1 and 1 + 3 · 2, over their mean; not yet labelled
+        windows = replace(batch(types.tolist(), strength, now), valid=torch.ones(1, 3, 2).bool())
+        out = output()._replace(rollout=rollout)
+        config = replace(SILENT, likelihood="laplace", causal_edges=True, reaction_weight=3.0)
+        assert terms(config, windows, out)["nll_rollout"] == pytest.approx((weights[0] * 2 + weights[1] * 4) / 2)
+        plain = terms(replace(config, reaction_weight=0.0), windows, out)
+        assert plain["nll_rollout"] == pytest.approx((2 + 4) / 2)
+
+
+def test_the_weight_of_reactions_needs_causal_labels():
+    with pytest.raises(UserError, match="reaction_weight needs the causal labels of branches; pass --causal-edges"):
+        replace(SILENT, reaction_weight=1.0)
+
+
 # --- Models without a graph -------------------------------------------------------------------------------------------
 
 
