@@ -60,6 +60,8 @@ def _run(trainer: Trainer, state_file: Path, made: dict[str, Any]) -> None:
         Progress(*columns, TextColumn("{task.fields[note]}")) as progress,
     ):
         task = progress.add_task("", total=config.steps, completed=trainer.step, note="")
+        if config.init and not trainer.step:
+            note = _validate_and_save(trainer, writer, made)  # so that the result is no worse than where it began
         began, since = time.perf_counter(), trainer.step
         while not trainer.finished:
             terms = trainer.train_step()
@@ -100,7 +102,7 @@ def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, 
             "val_constant_velocity_ade_m": trainer.baseline_m,
         }
         info = CheckpointInfo(
-            spec=trainer.data.spec,
+            spec=trainer.model.spec,
             config=trainer.model.config,
             model=trainer.config.model,
             horizon_steps=trainer.config.horizon_steps,

@@ -15,6 +15,8 @@ Likelihood = Literal["gaussian", "laplace"]
 TrainPrecision = Literal["float32", "tf32", "bfloat16"]
 DataDevice = Literal["auto", "cpu", "device"]
 Capture = Literal["auto", "off"]
+OF_THE_NETWORK = ("preset", "set", "input_changes", "fit_inputs", "edge_geometry")
+"""Options that make the network; a checkpoint to start from has them already."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,9 @@ class TrainConfig:
     sizes without modes; "paper" is the paper's network. Of other models, "paper" has their published sizes."""
     set: tuple[str, ...] = ()
     """Fields of the network's config to change, as field=value: --set hidden_dim=64 static_dim=16."""
+    init: str = ""
+    """Checkpoint to start from: a shipped name, a folder or a run folder. Network and scales are the checkpoint's, so
+    leave out the options of the network. Empty starts from random weights."""
     input_changes: bool = False
     """Whether changes since the last step are inputs of the dG-VAE's encoder (`change_scales`, fitted to the data)."""
     fit_inputs: bool = False
@@ -134,6 +139,9 @@ class TrainConfig:
         )  # fmt: skip
         if self.one_step_weight == self.rollout_weight == 0:
             raise UserError("one_step_weight and rollout_weight are both 0; nothing would be learned")
+        given = [name for name in OF_THE_NETWORK if getattr(self, name) != getattr(type(self), name)]
+        if self.init and given:
+            raise UserError(f"init takes the network of '{self.init}'; leave out {', '.join(given)}")
         if self.reaction_weight and not self.causal_edges:
             raise UserError("reaction_weight needs the causal labels of branches; pass --causal-edges, or set it to 0")
         if self.min_history_steps > self.history_steps:

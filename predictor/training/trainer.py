@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.checkpoint import load_checkpoint
 from predictor.data.store import Episode, EpisodeStore, read_store, with_causal_edges
 from predictor.data.windows import WindowBatch, Windows, siblings, split_episodes
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
@@ -146,6 +147,23 @@ def model_config(config: TrainConfig, data: TrainingData) -> Any:
     return configure(config.model, config.preset, config.set, **fitted)
 
 
+def initial_model(config: TrainConfig, data: TrainingData) -> Any:
+    """Builds the model with random weights, or with those of the checkpoint to start from.
+
+    Raises:
+        UserError: as `model_config`; or the checkpoint cannot be read, is of another model, or has other features.
+    """
+    if not config.init:
+        return build(config.model, data.spec, model_config(config, data), config.horizon_steps)
+    source, info = load_checkpoint(config.init)
+    if info.model != config.model:
+        raise UserError(f"checkpoint '{config.init}' is of model {info.model}; pass --model {info.model}")
+    info.spec.check_compatible(data.spec, f"checkpoint '{config.init}'", f"store {config.data[0]}")
+    model = build(info.model, info.spec, info.config, config.horizon_steps)
+    model.load_state_dict(source.state_dict())
+    return model
+
+
 @contextmanager
 def _tensor_cores(allowed: bool) -> Iterator[None]:
     """Lets products of float32 on CUDA round their inputs to TF32 inside the block; else keeps torch's setting."""
@@ -173,8 +191,7 @@ class Trainer:
         if on_cuda and self.device.index is not None:
             torch.cuda.set_device(self.device)
         torch.manual_seed(config.seed)
-        self.model: Any = build(config.model, data.spec, model_config(config, data), config.horizon_steps)
-        self.model.to(self.device)
+        self.model: Any = initial_model(config, data).to(self.device)
         self.step = 0
         self.best = math.inf
         self.stale = 0

@@ -371,3 +371,37 @@ def test_edge_geometry_needs_two_agents():
     alone = Episode(np.zeros((3, 1, 4), dtype=np.float32), np.ones((3, 1), dtype=np.bool_), np.arange(1))
     with pytest.raises(UserError, match="--edge-geometry needs steps with two agents"):
         typical_neighbour([alone], spec())
+
+
+# --- From a checkpoint ------------------------------------------------------------------------------------------------
+
+
+def test_training_may_start_from_a_checkpoint(circles: Path, tmp_path: Path):
+    first = train(config(circles, tmp_path / "first", set=("num_modes=3", "rollout_graph=frozen"), fit_inputs=True))
+    began = made(config(circles, tmp_path / "second", init=str(tmp_path / "first"), horizon_steps=1))
+    source, info = load_checkpoint(first)
+    assert began.model.config == info.config and began.model.horizon_steps == 1
+    for name, value in source.state_dict().items():
+        assert torch.equal(began.model.state_dict()[name], value), name
+
+
+def test_what_began_well_is_kept_if_training_makes_it_worse(circles: Path, tmp_path: Path):
+    first = train(config(circles, tmp_path / "first", steps=30, lr=1e-2))
+    harmed = train(config(circles, tmp_path / "second", init=str(first), lr=200.0))
+    before, after = (load_checkpoint(path)[0].state_dict() for path in (first, harmed))
+    assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fit_inputs": True}, "init takes the network of 'RUN'; leave out fit_inputs"),
+        ({"preset": "paper", "set": ("rnn_dim=3",)}, "leave out preset, set"),
+        ({"model": "lstm"}, "is of model dgvae; pass --model dgvae"),
+        ({"init": "nowhere"}, "nowhere"),
+    ],
+)
+def test_a_start_that_does_not_fit_is_named(circles: Path, tmp_path: Path, changes: dict[str, Any], message: str):
+    first = str(train(config(circles, tmp_path / "first")))
+    with pytest.raises(UserError, match=message.replace("RUN", first)):
+        made(config(circles, tmp_path / "second", **({"init": first} | changes)))
