@@ -120,8 +120,9 @@ def _branch(
     horizon = max(1, round(settings.mix.horizon_s / moment.spec.dt_s))
     point = BranchPoint(moment, horizon)
     labelled = min(horizon, max(1, round(settings.causal.horizon_s / moment.spec.dt_s)))
-    senders = senders_of(moment, settings.causal)
-    if not senders:
+    seen = set(before[-1].ids[before[-1].valid].tolist())
+    senders = [agent for agent in senders_of(moment, settings.causal) if agent in seen]
+    if not senders:  # nobody who is there for more than this moment
         return None
     for attempt in range(TRIES):
         sender = int(rng.choice(senders))

@@ -89,6 +89,14 @@ def test_no_window_has_an_intervention_that_nobody_could_foresee():
     assert len(Windows(undisturbed, world.spec, 3, 2)) > len(windows)
 
 
+def test_who_has_just_appeared_is_not_perturbed():
+    """On the intersection vehicles appear all the time: one that was never seen could not be missed."""
+    settings = BranchRecording(3, 10, ROAD_MIX, ON_ROADS)
+    for branch in record_branches(open_world("intersection-v2", "random"), 120_040, "random", 200, settings):
+        step, agent = moment_of(branch)
+        assert branch.valid[step, agent]
+
+
 def test_branches_are_a_function_of_the_seed(branches: list[Episode]):
     again = record_branches(open_world(ROAD, "idle"), 5, "idle", 9, ON_ROAD)
     for one, other in zip(branches, again, strict=True):
