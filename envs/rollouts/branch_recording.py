@@ -25,6 +25,8 @@ SHARES: dict[Kind, float] = {"brake": 0.55, "accelerate": 0.2, "remove": 0.25}
 """Probability of each kind; a kind that an agent does not allow is drawn anew."""
 FREE = 0.6
 """Probability that a driver is free after its speed has changed; otherwise it holds the speed for a while."""
+EGO_SHARE = 0.3
+"""Probability that the ego is the one that is perturbed, if others are possible too: policies ask what they cause."""
 TRIES = 3
 """Largest number of interventions that are tried until one moves another agent; the last one is kept in any case."""
 
@@ -125,7 +127,7 @@ def _branch(
     if not senders:  # nobody who is there for more than this moment
         return None
     for attempt in range(TRIES):
-        sender = int(rng.choice(senders))
+        sender = _sender(senders, int(point.ids[0]) if moment.spec.has_ego else None, rng)
         found = _perturbed(point, sender, horizon, settings.mix, rng)
         if found is None:
             continue
@@ -134,6 +136,14 @@ def _branch(
         if np.nanmax(moved_m, initial=0.0) > settings.causal.threshold_m or attempt == TRIES - 1:
             return _episode(point, found, before, settings.causal.threshold_m, labelled, moment.spec.has_ego)
     return None
+
+
+def _sender(senders: Sequence[int], ego: int | None, rng: np.random.Generator) -> int:
+    """Draws the agent of an intervention."""
+    others = [agent for agent in senders if agent != ego]
+    if ego is not None and ego in senders and (not others or rng.random() < EGO_SHARE):
+        return ego
+    return int(rng.choice(others))
 
 
 def _perturbed(

@@ -6,7 +6,7 @@ import pytest
 from envs.collect import CollectConfig, collect
 from envs.rollouts.branch_recording import IN_ARENAS as ARENA_MIX
 from envs.rollouts.branch_recording import ON_ROADS as ROAD_MIX
-from envs.rollouts.branch_recording import BranchRecording, record_branches
+from envs.rollouts.branch_recording import BranchRecording, _sender, record_branches
 from envs.rollouts.causal_labels import IN_ARENAS, ON_ROADS
 from envs.rollouts.recording import Recording, record
 from envs.rollouts.world import open_world
@@ -112,3 +112,12 @@ def test_collected_branches_come_in_the_order_of_their_seeds(tmp_path):
 def test_branches_go_with_no_other_disturbance(tmp_path):
     with pytest.raises(UserError, match="branches are of undisturbed episodes"):
         CollectConfig(ROAD, tmp_path / "s", branches=2, perturb=0.2)
+
+
+def test_the_ego_is_drawn_more_often_than_others():
+    rng = np.random.default_rng(0)
+    drawn = [_sender([4, 0, 5, 6, 7, 8], 0, rng) for _ in range(1000)]
+    assert 250 < drawn.count(0) < 350 and min(drawn.count(agent) for agent in (4, 5, 6, 7, 8)) > 100
+    assert {_sender([0], 0, rng) for _ in range(5)} == {0}
+    assert {_sender([3], None, rng) for _ in range(5)} == {3}
+    assert 0 not in {_sender([3, 4], 0, rng) for _ in range(50)}  # it is under an intervention already
