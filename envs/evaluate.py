@@ -4,6 +4,8 @@ Drives the environment through the deployed wrapper and compares each step's for
 its agents, perceived again or not (`envs.rollouts.episode`). Constant velocity forecasts the same scenes, and, given
 recorded data, so does a memoryless nearest-neighbour forecaster. Counted are all agents but an ego, whose future is
 the policy's choice, and landmarks. Several checkpoints make a transfer matrix: trained on A, measured on B.
+
+`--reactions` measures instead how forecasts react when an agent brakes or is taken out (docs/reactions.md).
 """
 
 import multiprocessing
@@ -20,7 +22,7 @@ from rich.console import Console
 from rich.progress import track
 
 from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, checkpoint_for
-from envs.rollouts import report
+from envs.rollouts import reaction_report, report
 from envs.rollouts.episode import (
     MODEL,
     NEIGHBOURS,
@@ -33,6 +35,7 @@ from envs.rollouts.episode import (
     memory_key,
     play,
 )
+from envs.rollouts.reaction_run import EnvReactions, ReactionRun, check_can_branch, measure_reactions
 from envs.rollouts.report import EnvAccuracy
 from envs.rollouts.world import default_drivers, open_world
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, name_of_folder, read_info, resolve
@@ -94,6 +97,14 @@ class EvaluateConfig:
     """Number of parallel processes; the results do not depend on it."""
     out: Path | None = None
     """Folder for accuracy.json, accuracy.md, and per environment a figure by horizon and a gallery of worst cases."""
+    reactions: bool = False
+    """Whether to measure, instead of accuracy, how forecasts react when a leader, the ego or a bystander brakes at
+    once, or an agent is taken out, beside what then happens in a copy of the simulator: reactions.json, reactions.md
+    and a figure per environment under --out."""
+    perturbations: int = 100
+    """Number of perturbations of each kind for --reactions."""
+    most_episodes: int = 400
+    """Largest number of episodes that --reactions plays in each environment to find so many."""
 
     def __post_init__(self) -> None:
         """Checks ranges.
@@ -102,6 +113,7 @@ class EvaluateConfig:
             UserError: a value out of range, or two checkpoints of one name.
         """
         check_at_least(self, 1, "episodes", "num_samples", "max_steps", "workers", "horizon_steps", "memory_steps")
+        check_at_least(self, 1, "perturbations", "most_episodes")
         check_at_least(self, 0, "seed")
         check_positive(self, "miss_m")
         names = [name_of_folder(checkpoint) for checkpoint in self.checkpoint]
@@ -267,6 +279,34 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
     return results, misfits
 
 
+def evaluate_reactions(config: EvaluateConfig, console: Console) -> list[EnvReactions]:
+    """Measures the reactions of all checkpoints in all environments; writes them under `config.out`.
+
+    Raises:
+        UserError: an environment cannot be perturbed or copied, or no checkpoint fits it.
+    """
+    drivers = {env_id: config.driver or default_drivers(env_id)[0] for env_id in config.env_ids}
+    for env_id in config.env_ids:  # raises before hours of work
+        check_can_branch(env_id, "idle" if drivers[env_id].endswith(".zip") else drivers[env_id])
+    results = []
+    for env_id, driver in drivers.items():
+        run = ReactionRun(
+            env_id, driver, config.checkpoint or (checkpoint_for(env_id),), config.perturbations, config.most_episodes,
+            config.seed, config.max_steps, config.workers, config.horizon_steps, _stores_of(config.data, env_id),
+        )  # fmt: skip
+        results.append(measure_reactions(run))
+        console.print(reaction_report.shown(results[-1]))
+        for remark in reaction_report.remarks(results[-1]):
+            console.print(remark)
+        if config.out is not None:
+            reaction_report.write_picture(config.out, results[-1])
+    if config.out is not None:
+        content = {"config": asdict(config), "results": [reaction_report.as_json(r) for r in results]}
+        write_json(config.out / "reactions.json", finite(content | {"provenance": provenance(PACKAGES)}))
+        write_text(config.out / "reactions.md", reaction_report.markdown(results))
+    return results
+
+
 def main() -> None:
     """Entry point."""
     keep_freed_memory()
@@ -280,6 +320,9 @@ def main() -> None:
     for checkpoint in config.checkpoint:
         if checkpoint != CONSTANT_VELOCITY:
             resolve(checkpoint)
+    if config.reactions:
+        evaluate_reactions(config, console)
+        return
     results, misfits = evaluate(config, console)
     if not results:
         raise UserError("no checkpoint fits any environment: " + "; ".join(misfits.values()))

@@ -122,6 +122,8 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--memory-steps 3 0", "memory_steps must be at least 1, got (3, 0)"),
         ("--env-ids merge-v1 --out file", "file is a file; choose another --out"),
         ("--checkpoint runs/a/checkpoint runs/a", "each checkpoint needs a name of its own, got a, a"),
+        ("--reactions --perturbations 0", "perturbations must be at least 1, got 0"),
+        ("--reactions --env-ids pursuit_v5", "raw_env cannot be perturbed; use an environment of highway-env"),
     ],
     "envs.export_levelx": [
         ("--env-id nope-v0 --out new", "cannot make env 'nope-v0'"),

@@ -20,17 +20,16 @@ from jaxtyping import Bool, Float, Int
 from envs.multiagent_observation import MultiagentStream
 from envs.observation import ForecastStream
 from envs.readers.highway_labels import SceneLabels
+from envs.rollouts.side_forecasts import SideForecaster, kept_forecaster
 from envs.rollouts.world import EgoWorld, MultiagentWorld, World, open_world
 from envs.scene_stream import ForecastConfig
 from envs.wrappers import ForecastObservation
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.baselines.nearest_neighbour import fit_from_stores
-from predictor.checkpoint import load_forecaster
 from predictor.evaluation.controls import fit_noise, fit_residual, training_windows
 from predictor.evaluation.displacement import displacement
 from predictor.evaluation.outcomes import Outcome
 from predictor.forecaster import Forecaster
-from predictor.online import OnlineForecaster
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 
 MODEL, STRAIGHT, NEIGHBOURS = "model", "constant velocity", "nearest neighbours"
@@ -109,37 +108,6 @@ class Episode:
     """Worst forecast of the model among those with a whole future."""
 
 
-class _Baseline:
-    """Forecaster of the same scenes as the measured one, with all history or the last `history_steps` only."""
-
-    def __init__(
-        self,
-        forecaster: Forecaster,
-        spec: SceneSpec,
-        horizon_steps: int,
-        history_steps: int = 0,
-        samples: int = 1,
-        seed: int = 0,
-    ) -> None:
-        self._front = int(forecaster.spec.has_ego and not spec.has_ego)
-        self._online = OnlineForecaster(forecaster, 1, spec.max_agents + self._front)
-        self._horizon, self._limit, self._samples = horizon_steps, history_steps, samples
-        self._noise = [np.random.default_rng([seed, samples])]
-        self._recent: list[SceneBatch] = []
-
-    def __call__(self, scene: Scene) -> Forecast:
-        batch = SceneBatch.stack([scene.behind_absent(self._front)])
-        if self._limit:
-            self._recent = [*self._recent, batch][-self._limit :]
-            self._online.reset()
-            for past in self._recent:
-                self._online.observe(past)
-        else:
-            self._online.observe(batch)
-        forecast = self._online.forecast(self._horizon, self._samples, self._noise)
-        return forecast.without_first(self._front)
-
-
 def play(task: EpisodeTask) -> Episode:
     """Plays one episode."""
     world = _world(task)
@@ -179,18 +147,13 @@ def _world(task: EpisodeTask) -> World:
     return _kept_world(task.env_id, task.driver, task.checkpoint, task.horizon_steps)
 
 
-@functools.lru_cache(maxsize=4)
-def _kept_forecaster(checkpoint: str, spec: SceneSpec, source: str) -> Forecaster:
-    return load_forecaster(checkpoint, spec, source)
-
-
 @functools.lru_cache(maxsize=2)
 def _kept_controls(
     stores: tuple[str, ...], checkpoint: str, spec: SceneSpec, source: str, horizon_steps: int
 ) -> dict[str, Forecaster]:
     """Returns the controls that are fitted to recorded data, by key."""
     paths = [Path(store) for store in stores]
-    model = _kept_forecaster(checkpoint, spec, source)
+    model = kept_forecaster(checkpoint, spec, source)
     windows = training_windows(paths, spec, horizon_steps)
     return {
         RESIDUAL: fit_residual(model, training_windows(paths, model.spec, horizon_steps), horizon_steps),
@@ -199,16 +162,16 @@ def _kept_controls(
     }
 
 
-def _baselines(task: EpisodeTask, spec: SceneSpec) -> dict[str, _Baseline]:
+def _baselines(task: EpisodeTask, spec: SceneSpec) -> dict[str, SideForecaster]:
     """Returns new controls and ablations for an episode, by key."""
-    found = {STRAIGHT: _Baseline(ConstantVelocity(spec), spec, task.horizon_steps)}
+    found = {STRAIGHT: SideForecaster(ConstantVelocity(spec), spec, task.horizon_steps)}
     if task.stores:
         fitted = _kept_controls(task.stores, task.checkpoint, spec, task.env_id, task.horizon_steps)
         for key, control in fitted.items():
-            found[key] = _Baseline(control, spec, task.horizon_steps, samples=task.samples, seed=task.seed)
+            found[key] = SideForecaster(control, spec, task.horizon_steps, samples=task.samples, seed=task.seed)
     for steps in task.histories:
-        model = _kept_forecaster(task.checkpoint, spec, task.env_id)
-        found[memory_key(steps)] = _Baseline(model, spec, task.horizon_steps, steps)
+        model = kept_forecaster(task.checkpoint, spec, task.env_id)
+        found[memory_key(steps)] = SideForecaster(model, spec, task.horizon_steps, steps)
     return found
 
 
@@ -229,7 +192,7 @@ class _Probe:
 
     def __init__(self, task: EpisodeTask, world: World) -> None:
         self._world = world
-        forecaster = _kept_forecaster(task.checkpoint, world.spec, task.env_id)
+        forecaster = kept_forecaster(task.checkpoint, world.spec, task.env_id)
         config = ForecastConfig(task.horizon_steps)
         self._stream: Any
         if isinstance(world, MultiagentWorld):

@@ -28,7 +28,7 @@ def intervene(world: World, intervention: Intervention) -> None:
         UserError: the environment or the agent does not allow it, or no such agent is present.
     """
     kinds_of(world)
-    body = _body(world, intervention.agent)
+    body = body_of(world, intervention.agent)
     if body is None:
         present = ", ".join(str(agent) for agent in sorted(world.full_scene().ids.tolist()))
         raise UserError(f"no agent {intervention.agent} is present; present are {present}")
@@ -64,10 +64,11 @@ def hold_others(world: World, log: MotionLog, free: Sequence[int]) -> None:
         log: motion of the other branch (`envs.simulators.interventions.log_motion`).
         free: ids of the agents that move freely.
     """
-    hold(world.env, log, [_body(world, agent) for agent in free])
+    hold(world.env, log, [body_of(world, agent) for agent in free])
 
 
-def _body(world: World, agent: int) -> Any:
+def body_of(world: World, agent: int) -> Any:
+    """Returns the simulator's object of an agent; None if it is not present."""
     return _reader(world).body_of(world.env, agent)
 
 

@@ -222,6 +222,7 @@ def open_world(
     checkpoint: str | None = None,
     *,
     horizon_steps: int | None = None,
+    perceived_as: SceneSpec | None = None,
 ) -> World:
     """Makes an environment with a driver, and with forecasts if a checkpoint is given.
 
@@ -232,6 +233,8 @@ def open_world(
         checkpoint: checkpoint of the forecasts; None makes no forecasts for an ego, and for many learners those that
             the driver was trained on, or constant velocity.
         horizon_steps: number of steps to forecast.
+        perceived_as: layout whose `perception_m` and `max_agents` bound what an ego perceives, where no forecasts are
+            made; None takes the reader's.
 
     Raises:
         UserError: unknown env, driver or checkpoint, or ones that do not fit together.
@@ -247,7 +250,10 @@ def open_world(
     env = make_env(env_id, disable_env_checker=True)
     if checkpoint is None:
         seen = env_for_driver(env, driver)
-        world = EgoWorld(seen if isinstance(seen, ForecastObservation) else SceneObservation(seen), driver)
+        if not isinstance(seen, ForecastObservation):
+            bounds = () if perceived_as is None else (perceived_as.perception_m, perceived_as.max_agents)
+            seen = SceneObservation(seen, *bounds)
+        world = EgoWorld(seen, driver)
     else:
         if sees_forecasts(driver):
             seen = ForecastObservation(env, checkpoint, horizon_steps=horizon_steps)

@@ -6,6 +6,7 @@ so all lines of a table are compared on equal subsets. The error measures the de
 not on the seed of training; it is too small if windows overlap in time, since they are not independent.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,6 +79,35 @@ def batch_interval(
     totals, numbers = drawn @ sums, drawn @ counts
     ratios = totals[numbers > 0] / numbers[numbers > 0]
     low, high = np.percentile(np.sqrt(ratios) if root else ratios, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def bootstrap_interval(
+    sums: Float[np.ndarray, "batches parts"],
+    value: Callable[[Float[np.ndarray, "draws parts"]], Float[np.ndarray, " draws"]],
+    seed: int = 0,
+) -> tuple[float, float] | None:
+    """Computes the 95 % percentile bootstrap of a function of sums over whole batches (episodes).
+
+    Equal seeds and numbers of batches give equal draws, those of `batch_interval`.
+
+    Args:
+        sums: sums of each batch.
+        value: the function, of the sums of each draw; NaN where it is not defined.
+        seed: random seed of the draws.
+
+    Returns:
+        Lower and upper limit over the draws where the function is defined; None with fewer than two batches, or if it
+        is defined nowhere.
+    """
+    if len(sums) < 2:
+        return None
+    drawn = np.random.default_rng(seed).multinomial(len(sums), np.full(len(sums), 1 / len(sums)), size=BOOTSTRAP_DRAWS)
+    values = value(drawn @ sums)
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return None
+    low, high = np.percentile(values, [2.5, 97.5])
     return float(low), float(high)
 
 

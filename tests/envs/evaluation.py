@@ -1,14 +1,21 @@
 """What the tests of the evaluation in live environments share: a small checkpoint for mpe2, and a clean slate."""
 
+import json
+import multiprocessing
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import pytest
 import torch
 
 from envs.readers import multiagent_reader_for
 from envs.registry import make_multiagent_env
 from envs.rollouts import episode as live
+from envs.rollouts import reactions
+from envs.rollouts.side_forecasts import kept_forecaster
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE
 from predictor.scene import SceneSpec
@@ -38,6 +45,41 @@ def save_tag(path: Path, has_ego: bool = False, **changes: Any) -> str:
 
 
 def forget() -> None:
-    """Drop what `envs.rollouts.episode` keeps from episode to episode: nothing of one test may serve in another."""
-    for kept in (live._kept_world, live._kept_forecaster, live._kept_controls):
+    """Drop what `envs.rollouts` keeps from episode to episode: nothing of one test may serve in another."""
+    for kept in (
+        live._kept_world,
+        live._kept_controls,
+        reactions._kept_world,
+        reactions._kept_neighbours,
+        kept_forecaster,
+    ):
         kept.cache_clear()
+
+
+class InProcessPool:
+    """Runs a pool's tasks here: a process of its own takes seconds to start."""
+
+    def __init__(self, processes: int, initializer: Any = None, initargs: Any = ()) -> None:
+        assert processes >= 1
+
+    def __enter__(self) -> "InProcessPool":
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        pass
+
+    def imap(self, function: Callable[[Any], Any], tasks: Iterable[Any], chunksize: int = 1) -> Iterator[Any]:
+        return map(function, tasks)
+
+
+def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(multiprocessing, "get_context", lambda method: SimpleNamespace(Pool=InProcessPool))
+
+
+def read_json(path: Path) -> Any:
+    """Strictly: a reader other than Python's knows no NaN."""
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(path.read_text(), parse_constant=refuse)

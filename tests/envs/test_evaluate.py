@@ -1,11 +1,8 @@
-import json
-import multiprocessing
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import redirect_stdout
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,31 +22,11 @@ from predictor.data.store import StoreInfo, write_store
 from predictor.evaluation.outcomes import Outcome
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
-from tests.envs.evaluation import TAG, forget, save_tag, tag_spec
+from tests.envs.evaluation import TAG, forget, no_processes, read_json, save_tag, tag_spec
 from tests.envs.helpers import HIGHWAY_SPEC, HORIZON, SIZES, run_command, save_forecast_policy, tiny_model
 
 ROAD = "two-way-v0"
 STILL = "constant-velocity"
-
-
-class InProcessPool:
-    """Runs a pool's tasks here: a process of its own takes seconds to start."""
-
-    def __init__(self, processes: int, initializer: Any = None, initargs: Any = ()) -> None:
-        assert processes >= 1
-
-    def __enter__(self) -> "InProcessPool":
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        pass
-
-    def imap(self, function: Callable[[Any], Any], tasks: Iterable[Any], chunksize: int = 1) -> Iterator[Any]:
-        return map(function, tasks)
-
-
-def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(multiprocessing, "get_context", lambda method: SimpleNamespace(Pool=InProcessPool))
 
 
 @pytest.fixture
@@ -58,15 +35,6 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     forget()
     yield
     forget()
-
-
-def read_json(path: Path) -> Any:
-    """Strictly: a reader other than Python's knows no NaN."""
-
-    def refuse(constant: str) -> None:
-        raise AssertionError(f"{constant} is not JSON")
-
-    return json.loads(path.read_text(), parse_constant=refuse)
 
 
 # --- Numbers of given episodes ----------------------------------------------------------------------------------------

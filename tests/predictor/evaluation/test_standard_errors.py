@@ -3,7 +3,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from predictor.evaluation.standard_errors import Statistic, batch_interval, ratio_statistics, subset_ratios
+from predictor.evaluation.standard_errors import (
+    Statistic,
+    batch_interval,
+    bootstrap_interval,
+    ratio_statistics,
+    subset_ratios,
+)
 
 
 def parts(found: Statistic | None) -> tuple[float, float, int]:
@@ -123,3 +129,21 @@ def test_intervals_are_those_of_scipy_up_to_the_draws(root: bool):
     ).confidence_interval
     ours = batch_interval(sums, counts, root=root)
     assert ours == pytest.approx((library.low, library.high), abs=0.05 * (library.high - library.low))
+
+
+def test_the_bootstrap_of_a_function_is_that_of_the_ratio():
+    rng = np.random.default_rng(3)
+    sums, counts = rng.random(12), rng.integers(1, 9, size=12).astype(np.float64)
+    found = bootstrap_interval(np.stack([sums, counts], axis=-1), lambda s: s[:, 0] / s[:, 1], seed=5)
+    assert found == pytest.approx(batch_interval(sums, counts, seed=5))
+
+
+def test_draws_in_which_a_function_is_not_defined_are_left_out():
+    parts = np.array([[1.0, 1.0], [0.0, 0.0]])
+
+    def ratio(sums: np.ndarray) -> np.ndarray:
+        return np.where(sums[:, 1] > 0, sums[:, 0] / np.maximum(sums[:, 1], 1e-9), np.nan)
+
+    assert bootstrap_interval(parts, ratio) == (1.0, 1.0)
+    assert bootstrap_interval(parts, lambda sums: np.full(len(sums), np.nan)) is None
+    assert bootstrap_interval(parts[:1], ratio) is None

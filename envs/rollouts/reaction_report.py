@@ -1,0 +1,143 @@
+"""Reports of `envs.evaluate --reactions`: a table for a terminal and a page, a figure by time ahead."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from rich.table import Table
+
+from envs.rollouts.reaction_cells import FALSE_BESIDE
+from envs.rollouts.reaction_run import CellReactions, EnvReactions
+from envs.rollouts.reactions import NEIGHBOURS, STRAIGHT
+from predictor.evaluation.reactions import Estimate
+from predictor.support.markdown import table
+
+HEADS = (
+    "perturbation", "n (episodes)", "forecaster", "true [m]", "predicted [m]", "slope (95 %)", "r at the end (95 %)",
+    "r of all steps", "false reaction (95 %)",
+)  # fmt: skip
+"""Columns of the table."""
+COLORS = {STRAIGHT: "grey", NEIGHBOURS: "tab:green"}
+"""Colors of the forecasters that no checkpoint holds."""
+OTHER_COLORS = ("tab:orange", "tab:blue", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive", "tab:cyan")
+"""Colors of checkpoints, in their order."""
+
+
+def title(result: EnvReactions) -> str:
+    """Returns the title of one environment's table."""
+    steps = f"{result.horizon_steps} steps of {result.dt_s:g} s"
+    return f"{result.env_id}, driven {result.driver}: shift of receivers after {steps}"
+
+
+def remarks(result: EnvReactions) -> list[str]:
+    """Returns what a reader of the table should know: cells that are short, checkpoints that do not fit."""
+    few = [f"{cell.name} {cell.pairs}" for cell in result.cells if cell.pairs < result.asked]
+    found = [f"{result.episodes} episodes; fewer than {result.asked} perturbations: {', '.join(few)}"] if few else []
+    return found + [f"left out: {name}: {why}" for name, why in result.misfits.items()]
+
+
+def shown(result: EnvReactions) -> Table:
+    """Returns the table of one environment for a terminal."""
+    lines = Table(title=title(result))
+    for i, heading in enumerate(HEADS):
+        lines.add_column(heading.replace("[", r"\["), justify="left" if i in (0, 2) else "right", no_wrap=i > 2)
+    for cells in _lines(result):
+        lines.add_row(*cells)
+    return lines
+
+
+def markdown(results: Sequence[EnvReactions]) -> str:
+    """Returns all tables as Markdown."""
+    parts = []
+    for result in results:
+        notes = "".join(f"\n* {remark}" for remark in remarks(result))
+        parts.append(f"### {title(result)}\n\n{table(HEADS, _lines(result))}\n{notes}\n")
+    return "\n".join(parts)
+
+
+def _lines(result: EnvReactions) -> list[list[str]]:
+    lines = []
+    for cell in result.cells:
+        if not cell.pairs:
+            lines.append([cell.name, "0", *["–"] * (len(HEADS) - 2)])
+        for name, found in cell.reactions.items():
+            first = [cell.name, f"{found.pairs} ({found.episodes})"]
+            predicted = found.length_m if cell.name in FALSE_BESIDE else found.along_m
+            lines.append(
+                [
+                    *first, name, _metres(found.true_m), _metres(predicted), _with_interval(found.slope),
+                    _with_interval(found.correlation),
+                    "–" if found.correlation_of_steps is None else f"{found.correlation_of_steps.value:.2f}",
+                    _with_interval(cell.false_reactions.get(name)),
+                ]
+            )  # fmt: skip
+    return lines
+
+
+def _metres(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}" if abs(value) >= 1 else f"{value:.3f}"
+
+
+def _with_interval(estimate: Estimate | None) -> str:
+    if estimate is None:
+        return "–"
+    bounds = "" if estimate.interval is None else " ({:.2f} to {:.2f})".format(*estimate.interval)
+    return f"{estimate.value:.2f}{bounds}"
+
+
+def as_json(result: EnvReactions) -> dict[str, Any]:
+    """Returns one environment's results for `reactions.json`: arrays become lists."""
+    ones = [
+        asdict(one)
+        | {"true_m": one.true_m.tolist(), "predicted_m": {name: m.tolist() for name, m in one.predicted_m.items()}}
+        for one in result.perturbations
+    ]
+    return asdict(replace(result, perturbations=[])) | {"perturbations": ones}
+
+
+def write_picture(out: Path, result: EnvReactions) -> None:
+    """Writes `ENV.reactions.png` under `out`: a panel for each cell, a line for each forecaster."""
+    matplotlib.use("Agg")
+    out.mkdir(parents=True, exist_ok=True)
+    cells = [cell for cell in result.cells if cell.pairs]
+    if not cells:
+        return
+    figure, grid = plt.subplots(1, len(cells), figsize=(3.4 * len(cells), 3.8), layout="constrained", squeeze=False)
+    panels = dict(zip([cell.name for cell in cells], grid[0], strict=True))
+    for cell in cells:
+        plot_cell(panels[cell.name], cell, result.dt_s)
+    for name, beside in FALSE_BESIDE.items():
+        if name in panels and beside in panels:  # what is false is seen beside what is true
+            panels[name].set_ylim(panels[beside].get_ylim())
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+    figure.suptitle(f"{result.env_id}: mean shift of the receiver [m]", fontsize=11)
+    figure.savefig(out / f"{result.env_id.replace('/', '-')}.reactions.png", dpi=130)
+    plt.close(figure)
+
+
+def plot_cell(ax: Axes, cell: CellReactions, dt_s: float) -> Axes:
+    """Plots the mean shift [m] against time ahead: the true one black, those of forecasters along it."""
+    still = cell.name in FALSE_BESIDE
+    for i, (name, found) in enumerate(cell.reactions.items()):
+        if not i:
+            _line(ax, found.true_by_step_m, dt_s, "true", "black", 2.0)
+        predicted = found.length_by_step_m if still else found.along_by_step_m
+        _line(ax, predicted, dt_s, name, COLORS.get(name, OTHER_COLORS[i % len(OTHER_COLORS)]), 1.3)
+    ax.axhline(0.0, color="0.8", lw=0.8, zorder=0)
+    ax.set_title(f"{cell.name}\n(n = {cell.pairs})", fontsize=9)
+    ax.set_xlabel("time ahead [s]")
+    ax.grid(alpha=0.3)
+    ax.tick_params(labelsize=8)
+    return ax
+
+
+def _line(ax: Axes, values: Sequence[float], dt_s: float, name: str, color: str, width: float) -> None:
+    time_s = dt_s * np.arange(len(values) + 1)
+    style = "-" if name == "true" else "--"
+    ax.plot(time_s, [0.0, *values], color=color, lw=width, ls=style, marker="o", ms=2.5, label=name)

@@ -1,0 +1,206 @@
+"""Measures reactions in one environment: plays episodes in parallel until each cell has enough perturbations."""
+
+import multiprocessing
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from envs.rollouts.interventions import kinds_of
+from envs.rollouts.reaction_cells import FALSE_BESIDE, cells_of
+from envs.rollouts.reactions import Perturbation, ReactionTask, play_reactions
+from envs.rollouts.world import open_world
+from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, name_of_folder
+from predictor.evaluation.reactions import Estimate, Reaction, Shifts, false_reaction, reaction
+from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
+
+
+@dataclass(frozen=True)
+class ReactionRun:
+    """Settings of the measurement in one environment."""
+
+    env_id: str
+    """Id of the environment."""
+    driver: str
+    """Name of the driver."""
+    checkpoints: tuple[str, ...]
+    """Checkpoints to measure."""
+    perturbations: int
+    """Number of perturbations of each cell."""
+    episodes: int
+    """Largest number of episodes."""
+    seed: int
+    """Seed of the first episode."""
+    max_steps: int
+    """Largest length of an episode [policy steps]."""
+    workers: int
+    """Number of parallel processes."""
+    horizon_steps: int | None = None
+    """Number of steps forecast and played; None takes the first checkpoint's."""
+    stores: tuple[str, ...] = ()
+    """Stores to fit nearest neighbours to; empty leaves them out."""
+
+
+@dataclass(frozen=True)
+class CellReactions:
+    """Reactions to one kind of perturbation."""
+
+    name: str
+    """Name of the cell."""
+    pairs: int
+    """Number of perturbations found."""
+    reactions: dict[str, Reaction]
+    """Reaction of each forecaster, by name; empty if nothing was found."""
+    false_reactions: dict[str, Estimate | None]
+    """False reaction of each forecaster in a cell of bystanders; empty in others."""
+
+
+@dataclass(frozen=True)
+class EnvReactions:
+    """Reactions in one environment."""
+
+    env_id: str
+    """Id of the environment."""
+    driver: str
+    """Name of the driver."""
+    dt_s: float
+    """Time step [s]."""
+    horizon_steps: int
+    """Number of steps forecast and played."""
+    asked: int
+    """Number of perturbations that were asked for in each cell."""
+    episodes: int
+    """Number of episodes that were enough, or all that were allowed."""
+    cells: list[CellReactions]
+    """Cells, in the order of the table."""
+    misfits: dict[str, str]
+    """Reason for each checkpoint that was left out, by its name."""
+    perturbations: list[Perturbation]
+    """All perturbations, with their shifts."""
+
+
+def check_can_branch(env_id: str, driver: str) -> None:
+    """Checks that agents of an environment can be perturbed in copies of it.
+
+    Raises:
+        UserError: they cannot, or the environment or the driver is unknown.
+    """
+    world = open_world(env_id, driver)
+    try:
+        kinds_of(world)
+    finally:
+        world.close()
+
+
+def measure_reactions(run: ReactionRun) -> EnvReactions:
+    """Plays the episodes of one environment and summarises the reactions of all forecasters.
+
+    The result does not depend on the number of workers: perturbations are taken in the order of the episodes.
+
+    Raises:
+        UserError: the environment cannot be perturbed or copied, checkpoints perceive differently, or none fits.
+    """
+    world = open_world(run.env_id, run.driver if not run.driver.endswith(".zip") else "idle")
+    spec, names = world.spec, [cell.name for cell in cells_of(world)]
+    kinds_of(world)
+    world.close()
+    fitting, misfits = _fitting(run, spec)
+    horizon = run.horizon_steps or load_forecaster(fitting[0], spec, run.env_id).horizon_steps
+    found, episodes = _play_until_enough(run, fitting, horizon, names)
+    shifts = {name: _shifts_of([one for one in found if one.cell == name]) for name in names}
+    return EnvReactions(
+        run.env_id,
+        run.driver,
+        spec.dt_s,
+        horizon,
+        run.perturbations,
+        episodes,
+        [_cell(name, shifts) for name in names],
+        misfits,
+        found,
+    )
+
+
+def _fitting(run: ReactionRun, spec: SceneSpec) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Returns the checkpoints that fit the environment, and why the others do not."""
+    fitting, misfits, seen = [], {}, {}
+    for checkpoint in run.checkpoints:
+        try:
+            found = load_forecaster(checkpoint, spec, f"env '{run.env_id}'")
+        except UserError as error:
+            if len(run.checkpoints) == 1:
+                raise
+            misfits[name_of_folder(checkpoint)] = str(error)
+            continue
+        fitting.append(checkpoint)
+        if spec.has_ego and checkpoint != CONSTANT_VELOCITY:
+            seen[found.spec.perception_m, found.spec.max_agents] = checkpoint
+    if not fitting:
+        raise UserError(f"no checkpoint fits {run.env_id}: " + "; ".join(misfits.values()))
+    if len(seen) > 1:
+        listed = ", ".join(f"'{name}' {agents} agents within {m:g} m" for (m, agents), name in seen.items())
+        raise UserError(f"checkpoints measured together must perceive alike, got {listed}; measure them one by one")
+    return tuple(fitting), misfits
+
+
+def _play_until_enough(
+    run: ReactionRun, checkpoints: tuple[str, ...], horizon_steps: int, names: Sequence[str]
+) -> tuple[list[Perturbation], int]:
+    """Returns the first perturbations of each cell, and the number of episodes that they took."""
+    found: dict[str, list[Perturbation]] = {name: [] for name in names}
+    columns = TextColumn(f"reactions {run.env_id}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    context, played, needed = multiprocessing.get_context("spawn"), 0, 0
+    with (
+        context.Pool(run.workers, initializer=torch.set_num_threads, initargs=(1,)) as pool,
+        Progress(*columns) as progress,
+    ):
+        bar = progress.add_task("", total=len(names) * run.perturbations)
+        while played < run.episodes:
+            wanted = tuple(name for name in names if len(found[name]) < run.perturbations)
+            if not wanted:
+                break
+            wave = range(played, min(played + 2 * run.workers, run.episodes))
+            tasks = [
+                ReactionTask(
+                    run.env_id, run.driver, checkpoints, run.seed + i, horizon_steps, run.max_steps, wanted, run.stores
+                )
+                for i in wave
+            ]
+            for episode, ones in zip(wave, pool.imap(play_reactions, tasks, chunksize=1), strict=True):
+                for one in ones:
+                    if len(found[one.cell]) < run.perturbations:
+                        found[one.cell].append(one)
+                        needed = episode + 1
+                        progress.advance(bar)
+            played = wave.stop
+    enough = all(len(ones) == run.perturbations for ones in found.values())
+    return [one for ones in found.values() for one in ones], needed if enough else played
+
+
+def _shifts_of(found: Sequence[Perturbation]) -> dict[str, Shifts]:
+    """Returns the shifts of one cell, by forecaster."""
+    if not found:
+        return {}
+    true_m, episode = np.stack([one.true_m for one in found]), np.array([one.seed for one in found])
+    return {
+        name: Shifts(true_m, np.stack([one.predicted_m[name] for one in found]), episode)
+        for name in found[0].predicted_m
+    }
+
+
+def _cell(name: str, shifts: dict[str, dict[str, Shifts]]) -> CellReactions:
+    """Returns the reactions of a cell; slope and correlation where receivers truly move."""
+    found = {forecaster: reaction(one) for forecaster, one in shifts[name].items()}
+    pairs = max((one.pairs for one in found.values()), default=0)
+    if name not in FALSE_BESIDE:
+        return CellReactions(name, pairs, found, {})
+    still = {
+        forecaster: replace(one, slope=None, correlation=None, correlation_of_steps=None)
+        for forecaster, one in found.items()
+    }
+    beside = shifts[FALSE_BESIDE[name]]
+    false = {key: false_reaction(one, beside[key]) if beside else None for key, one in shifts[name].items()}
+    return CellReactions(name, pairs, still, false)

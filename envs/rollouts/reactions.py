@@ -1,0 +1,228 @@
+"""Perturbs agents of running episodes and pairs the true shifts of receivers with the predicted ones.
+
+At random steps the world is branched (`envs.rollouts.branches`): one agent loses speed at once, or is taken out. The
+true shift is where a receiver is in that branch, minus where it is in the plain one. The predicted shift is the
+difference of two forecasts of one forecaster, whose history is the same up to the last step: one of the scene as it
+is, one of the scene as perturbed. Each is the single most likely forecast. The world goes on as if nothing had been
+asked. `predictor.evaluation.reactions` makes numbers of the shifts.
+"""
+
+import copy
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from envs.drivers.trained import sees_forecasts
+from envs.rollouts.branches import Branches, BranchPoint
+from envs.rollouts.reaction_cells import Cell, Pair, cells_of, is_moved_as_asked, pairs_of
+from envs.rollouts.side_forecasts import SideForecaster, kept_forecaster
+from envs.rollouts.world import World, open_world
+from envs.seeding import reaction_rng
+from envs.simulators.interventions import Intervention
+from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.baselines.nearest_neighbour import NearestNeighbour, fit_from_stores
+from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint, name_of_folder
+from predictor.forecaster import Forecaster
+from predictor.scene import Scene, SceneSpec
+from predictor.support.errors import UserError
+
+STRAIGHT, NEIGHBOURS = "constant velocity", "nearest neighbours"
+"""Names of the forecasters that no checkpoint holds."""
+SHARE = 0.15
+"""Probability that agents are perturbed at a step."""
+FIRST_STEP = 3
+"""First step at which agents are perturbed; forecasters have seen the motion by then."""
+MOST_BRANCHES = 4
+"""Largest number of interventions that are tried for one cell at one step."""
+
+
+@dataclass(frozen=True)
+class ReactionTask:
+    """Settings of one episode; can be pickled."""
+
+    env_id: str
+    """Id of the environment."""
+    driver: str
+    """Name of the driver."""
+    checkpoints: tuple[str, ...]
+    """Checkpoints that forecast; the first one's perception holds for all."""
+    seed: int
+    """Seed of the episode."""
+    horizon_steps: int
+    """Number of steps forecast and played."""
+    max_steps: int
+    """Largest length of an episode [policy steps]."""
+    cells: tuple[str, ...]
+    """Names of the cells to measure; what is found in one does not depend on the others."""
+    stores: tuple[str, ...] = ()
+    """Stores to fit nearest neighbours to; empty leaves them out."""
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """One perturbation and the shifts of one receiver."""
+
+    cell: str
+    """Name of the cell."""
+    seed: int
+    """Seed of the episode."""
+    step: int
+    """Step of the episode."""
+    sender: int
+    """Id of the agent that was perturbed."""
+    receiver: int
+    """Id of the agent whose shifts these are."""
+    true_m: Float[np.ndarray, "horizon axes"]
+    """True shift [m], world axes."""
+    predicted_m: dict[str, Float[np.ndarray, "horizon axes"]]
+    """Predicted shift [m], by forecaster."""
+
+
+def play_reactions(task: ReactionTask) -> list[Perturbation]:
+    """Plays one episode and returns its perturbations."""
+    world = _kept_world(task.env_id, task.driver, task.checkpoints)
+    world.reset(task.seed)
+    forecasters = _forecasters(task, world.spec)
+    rng = reaction_rng(task.seed)
+    found: list[Perturbation] = []
+    for step in range(task.max_steps):
+        chosen = rng.random() < SHARE and step >= FIRST_STEP
+        before = copy.deepcopy(forecasters) if chosen else {}
+        for forecaster in forecasters.values():
+            forecaster.observe(world.perceived())
+        if chosen:
+            moment = Moment(world, before, forecasters, task.horizon_steps)
+            cells = cells_of(world)
+            for cell, own in zip(cells, rng.spawn(len(cells)), strict=True):
+                if cell.name in task.cells and (one := moment.perturbed(cell, own)) is not None:
+                    pair, true_m, predicted_m = one
+                    found.append(Perturbation(cell.name, task.seed, step, pair[1], pair[0], true_m, predicted_m))
+        if world.step():
+            break
+    return found
+
+
+class Moment:
+    """One step of a running world at which perturbations are tried.
+
+    Args:
+        world: the world; it is not changed.
+        before: forecasters that have not observed the present scene yet.
+        now: the same forecasters, which have.
+        horizon_steps: number of steps to forecast and to play.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        before: Mapping[str, SideForecaster],
+        now: Mapping[str, SideForecaster],
+        horizon_steps: int,
+    ) -> None:
+        """Keeps all, and plays nothing before it is needed."""
+        self._world, self._before, self._now, self._horizon = world, before, now, horizon_steps
+        self._scene = world.perceived()
+        self._tried: dict[Intervention, Branches | None] = {}
+
+    def perturbed(
+        self, cell: Cell, rng: np.random.Generator
+    ) -> tuple[Pair, Float[np.ndarray, "horizon axes"], dict[str, Float[np.ndarray, "horizon axes"]]] | None:
+        """Returns receiver and sender of one random perturbation of a kind, with the true and the predicted shifts.
+
+        None if none was found: pairs are tried in random order, with at most `MOST_BRANCHES` interventions.
+        """
+        pairs = pairs_of(cell, self._world)
+        tried: set[Intervention] = set()
+        for index in rng.permutation(len(pairs)):
+            receiver, sender = pairs[index]
+            intervention = cell.intervention(sender, self._horizon)
+            if intervention not in tried and len(tried) == MOST_BRANCHES:
+                continue
+            tried.add(intervention)
+            branches = self._branches(intervention)
+            true_m = None if branches is None else _true_shift(branches, receiver)
+            if branches is None or true_m is None or not is_moved_as_asked(cell, self._world, true_m):
+                continue
+            predicted_m = self._predicted(branches.perturbed.perceived[0], receiver)
+            if predicted_m is not None:
+                return (receiver, sender), true_m, predicted_m
+        return None
+
+    @functools.cached_property
+    def _point(self) -> BranchPoint:
+        return BranchPoint(self._world, self._horizon)
+
+    @functools.cached_property
+    def _plain(self) -> dict[str, Float[np.ndarray, "agents horizon axes"]]:
+        """Forecasts of the plain scene, by forecaster; their noise is not used up."""
+        return {name: _positions(copy.deepcopy(forecaster)) for name, forecaster in self._now.items()}
+
+    def _branches(self, intervention: Intervention) -> Branches | None:
+        """Returns what an intervention does, played once; None if the agent does not allow it."""
+        if intervention not in self._tried:
+            try:
+                self._tried[intervention] = self._point.perturbed(intervention)
+            except UserError:  # one that does not act by itself
+                self._tried[intervention] = None
+        return self._tried[intervention]
+
+    def _predicted(self, scene: Scene, receiver: int) -> dict[str, Float[np.ndarray, "horizon axes"]] | None:
+        """Returns the predicted shifts of a receiver; None if the perturbed scene does not have it."""
+        places = _place(scene, receiver), _place(self._scene, receiver)
+        if places[0] is None or places[1] is None:
+            return None
+        shifts = {}
+        for name, forecaster in self._before.items():
+            fork = copy.deepcopy(forecaster)
+            fork.observe(scene)
+            shifts[name] = _positions(fork)[places[0]] - self._plain[name][places[1]]
+        return shifts
+
+
+def _positions(forecaster: SideForecaster) -> Float[np.ndarray, "agents horizon axes"]:
+    """Returns the single forecast of the latest scene [m]; its origin, if any, is where the ego is now."""
+    return forecaster.forecast().xy[0, 0].cpu().numpy().astype(np.float64)
+
+
+def _place(scene: Scene, agent: int) -> int | None:
+    """Returns an agent's index in a scene; None if it is not there."""
+    found = np.flatnonzero(scene.valid & (scene.ids == agent))
+    return int(found[0]) if len(found) else None
+
+
+def _true_shift(branches: Branches, receiver: int) -> Float[np.ndarray, "horizon axes"] | None:
+    """Returns the receiver's shift at each step ahead [m]; None if one of the branches does not have it to the end."""
+    shift_m, valid = branches.shift()
+    column = branches.ids.tolist().index(receiver)
+    return shift_m[1:, column] if valid[:, column].all() else None
+
+
+@functools.lru_cache(maxsize=4)
+def _kept_world(env_id: str, driver: str, checkpoints: tuple[str, ...]) -> World:
+    """Returns a world whose ego perceives what the first checkpoint was trained on."""
+    if sees_forecasts(driver):
+        return open_world(env_id, driver, checkpoints[0])
+    learned = [name for name in checkpoints if name != CONSTANT_VELOCITY]
+    return open_world(env_id, driver, perceived_as=load_checkpoint(learned[0])[1].spec if learned else None)
+
+
+@functools.lru_cache(maxsize=2)
+def _kept_neighbours(stores: tuple[str, ...], spec: SceneSpec, horizon_steps: int) -> NearestNeighbour:
+    return fit_from_stores([Path(store) for store in stores], spec, horizon_steps)
+
+
+def _forecasters(task: ReactionTask, spec: SceneSpec) -> dict[str, SideForecaster]:
+    """Returns new forecasters for an episode, by name."""
+    found: dict[str, Forecaster] = {
+        name_of_folder(name): kept_forecaster(name, spec, f"env '{task.env_id}'")
+        for name in task.checkpoints
+        if name != CONSTANT_VELOCITY
+    }
+    if task.stores:
+        found[NEIGHBOURS] = _kept_neighbours(task.stores, spec, task.horizon_steps)
+    found[STRAIGHT] = ConstantVelocity(spec)
+    return {name: SideForecaster(forecaster, spec, task.horizon_steps) for name, forecaster in found.items()}

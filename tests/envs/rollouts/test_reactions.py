@@ -1,0 +1,281 @@
+import copy
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from envs.rollouts import branches as rollout_branches
+from envs.rollouts import reactions
+from envs.rollouts.branches import Branch
+from envs.rollouts.reaction_cells import BYSTANDER_CELL, ELSEWHERE, LEADER_CELL, NEAR_CELL, ON_LANES, Cell
+from envs.rollouts.reactions import NEIGHBOURS, STRAIGHT, Moment, Perturbation, ReactionTask, play_reactions
+from envs.rollouts.side_forecasts import SideForecaster
+from envs.rollouts.world import World, open_world
+from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.checkpoint import CheckpointInfo, save_checkpoint
+from predictor.evaluation.reactions import Reaction, Shifts, reaction
+from predictor.models import build, configure
+from predictor.scene import Forecast, Scene
+from tests.envs.evaluation import TAG, forget, save_tag
+from tests.envs.helpers import HIGHWAY_SPEC
+from tests.envs.interventions import assert_same_scenes, played, road_world, state_of
+
+STEPS = 5
+QUEUE = (0.0, 4.0), (25.0, 4.0), (60.0, 4.0), (20.0, 12.0)
+"""Three in a row, ids 1 to 3 from the rear, and one beside them (4)."""
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_kept() -> Iterator[None]:
+    forget()
+    yield
+    forget()
+
+
+class Replay(SideForecaster):
+    """Forecasts what the simulator then does, or a share of it: it looks up the branch that began with its scene."""
+
+    def __init__(self, played: list[tuple[Branch, Any]], share: float = 1.0) -> None:
+        self.played, self.share = played, share
+        self.seen: list[Scene] = []
+
+    def __deepcopy__(self, memo: Any) -> "Replay":
+        twin = Replay(self.played, self.share)
+        twin.seen = list(self.seen)
+        return twin
+
+    def observe(self, scene: Scene) -> None:
+        self.seen.append(scene)
+
+    def forecast(self) -> Forecast:
+        scene = self.seen[-1]
+        here = [(b, ids) for b, ids in self.played if self._is_here(b.perceived[0], scene)]
+        plain, own = here[0], next(one for one in here if np.array_equal(one[0].perceived[0].states, scene.states))
+        places = [self._future(branch, ids, scene) for branch, ids in (plain, own)]
+        mixed = places[0] + self.share * (places[1] - places[0])
+        xy = torch.from_numpy(mixed - scene.states[0, :2])[None, None]
+        edges = torch.zeros(1, len(scene.ids), len(scene.ids), 1)
+        return Forecast(xy, edges, edges, torch.from_numpy(scene.valid)[None])
+
+    @staticmethod
+    def _is_here(first: Scene, scene: Scene) -> bool:
+        """Whether a branch began at this moment: some agents stand where they do now."""
+        both = set(first.ids[first.valid]) & set(scene.ids[scene.valid])
+        return all(np.array_equal(state_of(first, i)[:2], state_of(scene, i)[:2]) for i in both)
+
+    @staticmethod
+    def _future(branch: Branch, ids: Any, scene: Scene) -> np.ndarray:
+        columns = {int(agent): i for i, agent in enumerate(ids)}
+        still = np.zeros((STEPS, 2))
+        return np.stack([branch.states[1:, columns[i], :2] if i in columns else still for i in scene.ids.tolist()])
+
+
+@pytest.fixture
+def branches(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Branch, Any]]:
+    """All branches that are played from now on, with the agents of their columns."""
+    logged: list[tuple[Branch, Any]] = []
+    play: Callable[..., Any] = rollout_branches._play
+
+    def play_and_log(world: World, ids: Any, *arguments: Any) -> Any:
+        found = play(world, ids, *arguments)
+        logged.append((found[0], ids))
+        return found
+
+    monkeypatch.setattr(rollout_branches, "_play", play_and_log)
+    return logged
+
+
+def moment(world: World, forecasters: dict[str, Any], steps: int = STEPS) -> Moment:
+    """Lets forecasters observe the present scene of a world, and returns that moment."""
+    before = copy.deepcopy(forecasters)
+    for forecaster in forecasters.values():
+        forecaster.observe(world.perceived())
+    return Moment(world, before, forecasters, steps)
+
+
+def queue() -> Any:
+    world = road_world(*QUEUE, ego_m=(-40.0, 12.0))
+    world.step()
+    return world
+
+
+def measured(moments: int, cell: Cell, make: Callable[[World], dict[str, Any]]) -> dict[str, Reaction]:
+    """Reactions of forecasters over some moments of one world."""
+    world = queue()
+    forecasters = make(world)
+    found = []
+    for i in range(moments):
+        one = moment(world, forecasters).perturbed(cell, np.random.default_rng(i))
+        assert one is not None
+        found.append(one)
+        world.step()
+    true_m = np.stack([one[1] for one in found])
+    episode = np.arange(moments)
+    return {name: reaction(Shifts(true_m, np.stack([one[2][name] for one in found]), episode)) for name in forecasters}
+
+
+def test_an_oracle_has_slope_one_and_half_an_oracle_half(branches: list[tuple[Branch, Any]]):
+    found = measured(
+        3,
+        LEADER_CELL,
+        lambda world: {
+            "oracle": Replay(branches),
+            "half": Replay(branches, 0.5),
+            "straight": SideForecaster(ConstantVelocity(world.spec), world.spec, STEPS),
+        },
+    )
+    for name, slope in (("oracle", 1.0), ("half", 0.5), ("straight", 0.0)):
+        assert found[name].slope is not None and found[name].slope.value == pytest.approx(slope, abs=1e-6)
+        assert found[name].true_m is not None and found[name].true_m > 2.0
+    for name in ("oracle", "half"):
+        assert found[name].correlation is not None and found[name].correlation.value == pytest.approx(1.0)
+    assert found["straight"].correlation is None
+
+
+def test_both_forecasts_have_one_history_and_differ_in_the_sender_alone(branches: list[tuple[Branch, Any]]):
+    shown: list[list[Scene]] = []
+
+    class Recorder(Replay):
+        def __deepcopy__(self, memo: Any) -> "Recorder":
+            twin = Recorder(self.played)
+            twin.seen = list(self.seen)
+            return twin
+
+        def forecast(self) -> Forecast:
+            shown.append(self.seen)
+            return super().forecast()
+
+    world = queue()
+    recorder = Recorder(branches)
+    for _ in range(3):
+        recorder.observe(world.perceived())
+        world.step()
+    one = moment(world, {"recorder": recorder}).perturbed(LEADER_CELL, np.random.default_rng(0))
+    assert one is not None
+    perturbed, plain = shown
+    assert len(plain) == len(perturbed) == 4
+    assert_same_scenes(plain[:-1], perturbed[:-1])
+    (_, sender), now, instead = one[0], plain[-1], perturbed[-1]
+    np.testing.assert_array_equal(now.ids, instead.ids)
+    np.testing.assert_array_equal(now.states[:, :2], instead.states[:, :2])
+    changed = (now.states != instead.states).any(axis=1)
+    assert now.ids[changed].tolist() == [sender]
+    slower_mps = np.linalg.norm(state_of(now, sender)[2:]) - np.linalg.norm(state_of(instead, sender)[2:])
+    assert slower_mps == pytest.approx(8.0)
+
+
+def test_true_shifts_are_those_of_the_simulator(branches: list[tuple[Branch, Any]]):
+    world = queue()
+    one = moment(world, {"oracle": Replay(branches)}).perturbed(LEADER_CELL, np.random.default_rng(0))
+    assert one is not None
+    (receiver, sender), true_m, predicted_m = one
+    ids = world.full_scene().ids.tolist()
+    (plain, _), (slow, _) = branches
+    moved = slow.states[1:, ids.index(receiver), :2] - plain.states[1:, ids.index(receiver), :2]
+    np.testing.assert_array_equal(true_m, moved)
+    assert (receiver, sender) in ((1, 2), (2, 3)) and true_m[-1, 0] < -1.0
+    np.testing.assert_allclose(predicted_m["oracle"], true_m, atol=1e-9)
+
+
+def test_the_world_goes_on_as_if_nothing_was_asked():
+    world, untouched = queue(), queue()
+    forecasters = {"straight": SideForecaster(ConstantVelocity(world.spec), world.spec, STEPS)}
+    asked = moment(world, forecasters)
+    found = [asked.perturbed(cell, np.random.default_rng(3)) for cell in ON_LANES]
+    assert sum(one is not None for one in found) >= 3
+    assert_same_scenes(played(world, 6), played(untouched, 6))
+
+
+def test_a_bystander_does_not_move_and_one_taken_out_does():
+    world = queue()
+    asked = moment(world, {"straight": SideForecaster(ConstantVelocity(world.spec), world.spec, STEPS)})
+    for seed in range(4):
+        aside = asked.perturbed(BYSTANDER_CELL, np.random.default_rng(seed))
+        assert aside is not None and np.abs(aside[1]).max() < 0.1
+        assert (4 in aside[0]) and 0 not in aside[0]
+        gone = asked.perturbed(ON_LANES[-1], np.random.default_rng(seed))
+        assert gone is not None and np.linalg.norm(gone[1], axis=-1).max() > 1.0
+
+
+def test_a_moment_without_a_pair_costs_no_branch(branches: list[tuple[Branch, Any]]):
+    world = road_world((0.0, 4.0), ego_m=(0.0, 12.0))
+    world.step()
+    asked = moment(world, {})
+    assert all(asked.perturbed(cell, np.random.default_rng(0)) is None for cell in ON_LANES)
+    assert branches == []
+
+
+def test_no_more_is_tried_than_allowed(branches: list[tuple[Branch, Any]], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(reactions, "is_moved_as_asked", lambda *_: False)
+    monkeypatch.setattr(reactions, "MOST_BRANCHES", 2)
+    assert moment(queue(), {}).perturbed(ON_LANES[-1], np.random.default_rng(0)) is None
+    assert len(branches) == 1 + 2
+
+
+def task(env_id: str, checkpoints: tuple[str, ...], steps: int = 3, **changes: Any) -> ReactionTask:
+    names = tuple(cell.name for cell in ON_LANES + ELSEWHERE)
+    driver = "heuristic" if env_id == TAG else "idle"
+    settings = {"cells": names, "max_steps": 12, **changes}
+    return ReactionTask(env_id, driver, checkpoints, 900_000, steps, **settings)
+
+
+def assert_equal(found: list[Perturbation], expected: list[Perturbation]) -> None:
+    assert [(p.cell, p.step, p.sender, p.receiver) for p in found] == [
+        (p.cell, p.step, p.sender, p.receiver) for p in expected
+    ]
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one.true_m, other.true_m)
+        for name, shift_m in one.predicted_m.items():
+            np.testing.assert_array_equal(shift_m, other.predicted_m[name])
+
+
+def test_an_episode_is_a_function_of_its_seed_and_cells_are_independent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(reactions, "SHARE", 0.5)
+    checkpoint = save_tag(tmp_path / "tag")
+    found = play_reactions(task(TAG, (checkpoint,)))
+    assert {one.cell for one in found} == {cell.name for cell in ELSEWHERE}
+    assert set(found[0].predicted_m) == {"tag", STRAIGHT}
+    assert any(np.abs(one.predicted_m["tag"]).max() > 0 for one in found)
+    assert all((one.predicted_m[STRAIGHT] == 0).all() for one in found)
+    assert_equal(play_reactions(task(TAG, (checkpoint,))), found)
+    only = play_reactions(task(TAG, (checkpoint,), cells=(NEAR_CELL.name,)))
+    assert_equal(only, [one for one in found if one.cell == NEAR_CELL.name])
+    assert all(one.step >= reactions.FIRST_STEP for one in found)
+
+
+@pytest.mark.parametrize("kind", ["lstm", "dnri"])
+def test_other_models_are_measured_too(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(reactions, "SHARE", 1.0)
+    changes = {"lstm": ("embed_dim=4", "rnn_dim=4", "joint=true"), "dnri": ("hidden_dim=4", "rnn_dim=4", "head_dim=4")}
+    torch.manual_seed(0)
+    config = configure(kind, "paper", changes[kind])
+    model = build(kind, HIGHWAY_SPEC, config, 2)
+    save_checkpoint(tmp_path / kind, model, CheckpointInfo(HIGHWAY_SPEC, config, 2, model=kind))
+    found = play_reactions(task("two-way-v0", (str(tmp_path / kind),), 2, max_steps=5))
+    assert found and set(found[0].predicted_m) == {kind, STRAIGHT}
+    assert any(np.abs(one.predicted_m[kind]).max() > 1e-4 for one in found)
+
+
+def test_neighbours_forecast_where_there_is_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from envs.collect import CollectConfig, collect
+    from predictor.data.store import StoreInfo, write_store
+
+    monkeypatch.setattr(reactions, "SHARE", 1.0)
+    world = open_world(TAG, "heuristic")
+    store = tmp_path / TAG
+    write_store(store, StoreInfo(world.spec, TAG), list(collect(CollectConfig(TAG, store, 1, max_steps=6, workers=1))))
+    found = play_reactions(task(TAG, ("constant-velocity",), 2, max_steps=5, stores=(str(store),)))
+    assert found and set(found[0].predicted_m) == {NEIGHBOURS, STRAIGHT}
+
+
+def test_an_ego_perceives_what_its_checkpoint_was_trained_on(highway_checkpoint: str):
+    world = reactions._kept_world("two-way-v0", "idle", (highway_checkpoint,))
+    spec = world.spec
+    assert (spec.perception_m, spec.max_agents) == (HIGHWAY_SPEC.perception_m, HIGHWAY_SPEC.max_agents)
+    plain = reactions._kept_world("two-way-v0", "idle", ("constant-velocity",))
+    assert plain.spec.max_agents != HIGHWAY_SPEC.max_agents

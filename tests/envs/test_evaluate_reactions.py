@@ -1,0 +1,69 @@
+"""The command `python -m envs.evaluate --reactions`."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from envs import evaluate
+from envs.rollouts import reactions
+from envs.rollouts.reaction_cells import ELSEWHERE
+from envs.rollouts.reactions import STRAIGHT
+from tests.envs.evaluation import TAG, forget, no_processes, read_json, save_tag
+from tests.envs.helpers import run_command
+
+STILL = "constant-velocity"
+
+
+@pytest.fixture(autouse=True)
+def in_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    no_processes(monkeypatch)
+    forget()
+    yield
+    forget()
+
+
+def test_the_command_writes_table_figure_and_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    monkeypatch.setattr(reactions, "SHARE", 1.0)
+    out = tmp_path / "results"
+    arguments = ["--reactions", "--env-ids", TAG, "--checkpoint", save_tag(tmp_path / "tag"), "--out", str(out)]
+    arguments += ["--perturbations", "2", "--most-episodes", "2", "--max-steps", "6", "--workers", "1"]
+    code, errors, output = run_command(evaluate.main, arguments, monkeypatch, capsys)
+    assert (code, errors) == (0, [])
+    assert f"{TAG}, driven heuristic: shift of receivers after 3 steps of 0.1 s" in output
+    assert {path.name for path in out.iterdir()} == {"reactions.json", "reactions.md", f"{TAG}.reactions.png"}
+    content = read_json(out / "reactions.json")
+    assert content["config"]["perturbations"] == 2
+    assert {"command", "commit", "versions"} <= set(content["provenance"])
+    (result,) = content["results"]
+    assert [cell["name"] for cell in result["cells"]] == [cell.name for cell in ELSEWHERE]
+    straight = result["cells"][0]["reactions"][STRAIGHT]
+    assert (straight["pairs"], straight["slope"]["value"], straight["length_m"]) == (2, 0.0, 0.0)
+    learned = result["cells"][0]["reactions"]["tag"]
+    assert learned["slope"]["value"] != 0.0 and learned["true_m"] == straight["true_m"] > 0.01
+    assert len(result["perturbations"]) == sum(cell["pairs"] for cell in result["cells"])
+    assert f"| {ELSEWHERE[0].name} | 2 (" in (out / "reactions.md").read_text()
+
+
+ERRORS = {
+    "no-copies": (["--env-ids", TAG, "pursuit_v5"], "raw_env cannot be perturbed; use an environment of highway-env"),
+    "zero": (["--perturbations", "0"], "perturbations must be at least 1, got 0"),
+    "no-episodes": (["--most-episodes", "0"], "most_episodes must be at least 1, got 0"),
+    "no-store": (["--data", "nowhere"], "nowhere is not a readable episode store"),
+    "no-checkpoint": (["--checkpoint", "nowhere"], "no checkpoint 'nowhere'"),
+}
+
+
+@pytest.mark.parametrize("case", ERRORS)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    arguments, message = ERRORS[case]
+    monkeypatch.chdir(tmp_path)
+    base = ["--reactions", "--env-ids", TAG, "--checkpoint", STILL, "--workers", "1", "--out", "results"]
+    code, errors, _ = run_command(evaluate.main, [*base, *arguments], monkeypatch, capsys)
+    assert (code, len(errors)) == (2, 1)
+    assert errors[0].startswith(f"error: {message}")
+    assert list(tmp_path.iterdir()) == []
