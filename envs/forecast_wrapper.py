@@ -102,15 +102,6 @@ def _flattened(space: gym.Space, stacked: Any) -> NDArray[Any]:
     return np.stack([np.asarray(gym.spaces.flatten(space, one)) for one in stacked])
 
 
-def refuse_what_if(what_if: Any, wrapper: str) -> None:
-    """Raises a `UserError` if a wrapper whose environments may run in other processes is asked for what-if entries."""
-    if what_if is not False:
-        raise UserError(
-            f"{wrapper} takes no what_if: plans are made from the running environment, possibly in other processes; "
-            "wrap each environment in ForecastObservation(env, what_if=True) instead"
-        )
-
-
 def refuse_reader(reader: Any, wrapper: str) -> None:
     """Raises a `UserError` if a wrapper whose environments report their scenes is given a reader."""
     if reader is not None:

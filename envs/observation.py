@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from envs.plans.batch import PlanBatch
 from envs.plans.contact import FAR_M, contacts
 from envs.registry import checkpoint_for
 from envs.scene_stream import ForecastConfig, SceneStream
@@ -118,6 +119,9 @@ class ForecastStream(SceneStream):
         envs: number of parallel environments.
         config: settings of the forecast.
 
+    Attributes:
+        planned: latest forecast for plans, with an axis of plans; None before the first.
+
     Raises:
         UserError: scenes that do not lie in a plane.
     """
@@ -128,23 +132,43 @@ class ForecastStream(SceneStream):
             raise UserError(f"observations need positions in a plane, got {scene_spec.position_dim} axes")
         super().__init__(forecaster, envs, scene_spec.max_agents, config)
         self.scene_spec = scene_spec
+        self.planned: Forecast | None = None
 
     def spaces(self) -> dict[str, gym.Space]:
         """Returns the spaces of the forecast entries."""
         return entry_spaces(self.forecaster, self.scene_spec, self.config)
 
     def observe(
-        self, scenes: SceneBatch, envs: Int[np.ndarray, " some"] | None = None
+        self, scenes: SceneBatch, envs: Int[np.ndarray, " some"] | None = None, plans: PlanBatch | None = None
     ) -> dict[str, NDArray[np.float32]]:
-        """Takes in one scene for each environment (of `envs`, if given); returns the forecast entries for each."""
-        return ego_entries(scenes, self.take(scenes, envs), self.config.shows_uncertainty)
+        """Takes in one scene for each environment (of `envs`, if given); returns the forecast entries for each.
+
+        With candidate plans, one of each scene, they include those of `what_if_entries`.
+        """
+        return self._entries(scenes, self.take(scenes, envs), plans)
 
     def observe_boundary(
-        self, scenes: SceneBatch, ended: Int[np.ndarray, " ended"], successors: SceneBatch
+        self,
+        scenes: SceneBatch,
+        ended: Int[np.ndarray, " ended"],
+        successors: SceneBatch,
+        plans: PlanBatch | None = None,
     ) -> dict[str, NDArray[np.float32]]:
-        """Takes in scenes like `observe`, ended episodes with their last; appends their successors' entries."""
+        """Takes in scenes like `observe`, ended episodes with their last; appends their successors' entries.
+
+        Plans are those of the scenes, then those of the successors.
+        """
         forecast = self.take_boundary(scenes, ended, successors)
-        return ego_entries(SceneBatch.concatenate(scenes, successors), forecast, self.config.shows_uncertainty)
+        return self._entries(SceneBatch.concatenate(scenes, successors), forecast, plans)
+
+    def _entries(
+        self, scenes: SceneBatch, forecast: Forecast, plans: PlanBatch | None
+    ) -> dict[str, NDArray[np.float32]]:
+        entries = ego_entries(scenes, forecast, self.config.shows_uncertainty)
+        if plans is None:
+            return entries
+        self.planned = self.what_if(plans.states)
+        return entries | what_if_entries(scenes, self.planned, plans.size_m)
 
 
 def entry_spaces(forecaster: Forecaster, view: SceneSpec, config: ForecastConfig) -> dict[str, gym.Space]:
@@ -243,7 +267,7 @@ def ego_entries(scenes: SceneBatch, forecast: Forecast, uncertainty: bool = Fals
 
 
 def what_if_entries(
-    scenes: SceneBatch, forecast: Forecast, size_m: tuple[float, float] = (5.0, 2.0)
+    scenes: SceneBatch, forecast: Forecast, size_m: tuple[float, float] | Float[np.ndarray, "batch 2"] = (5.0, 2.0)
 ) -> dict[str, NDArray[np.float32]]:
     """Returns what a forecast with plans says of the ego and each other agent of this size, agents as in `ego_entries`.
 
@@ -313,17 +337,24 @@ def batch_entries(scenes: SceneBatch) -> dict[str, NDArray[Any]]:
 
 
 def observe_ended(
-    stream: ForecastStream, observations: Observations, ended: NDArray[np.int64], closing: list[Observations]
+    stream: ForecastStream,
+    observations: Observations,
+    ended: NDArray[np.int64],
+    closing: list[Observations],
+    plans: PlanBatch | None = None,
 ) -> tuple[Observations, list[Observations]]:
-    """Returns forecast entries of each environment, and of each closing observation with its own episode's history."""
+    """Returns forecast entries of each environment, and of each closing observation with its own episode's history.
+
+    Plans are ordered as in `ForecastStream.observe_boundary`: the closing ones in their places, then the opening ones.
+    """
     opening = scenes_from(observations)
     if not len(ended):
-        return dict(stream.observe(opening)), []
+        return dict(stream.observe(opening, plans=plans)), []
     scenes = SceneBatch(*(field.copy() for field in (opening.states, opening.ids, opening.valid, opening.heading_rad)))
     for env, last in zip(ended, closing, strict=True):
         scenes.states[env], scenes.ids[env] = last["scene_states"], last["scene_ids"]
         scenes.valid[env], scenes.heading_rad[env] = last["scene_valid"], last["scene_heading_rad"][0]
-    both = stream.observe_boundary(scenes, ended, opening[ended])
+    both = stream.observe_boundary(scenes, ended, opening[ended], plans)
     envs = len(opening)
     of_closing = {key: value[ended] for key, value in both.items()}
     for value in both.values():

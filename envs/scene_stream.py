@@ -80,6 +80,7 @@ class SceneStream:
         self.forecast: Forecast | None = None
         self._online = OnlineForecaster(forecaster, envs, agents, config.device)
         self._noise: list[np.random.Generator] = [_noise(config.seed + env) for env in range(envs)]
+        self._before: list[np.random.Generator] = self._noise
 
     @property
     def forecaster(self) -> Forecaster:
@@ -102,12 +103,13 @@ class SceneStream:
         """
         return self._shown(self._online.forecast(self.horizon_steps, num_samples, self._noise))
 
-    def what_if(self, plans: Float[np.ndarray, "envs plans horizon state"]) -> Forecast:
-        """Forecasts the latest scene of each environment for each plan of its ego, in the world frame.
+    def what_if(self, plans: Float[np.ndarray, "entries plans horizon state"]) -> Forecast:
+        """Forecasts each scene of the latest forecast again, for each plan of its ego, in the world frame.
 
-        What observations hold does not change, and no noise is used up.
+        What observations hold does not change, and no noise is used up. With `config.num_plans`, samples are drawn from
+        the same noise as those of the latest forecast.
         """
-        noise = deepcopy(self._noise)
+        noise = deepcopy(self._before)
         return self._online.forecast(self.horizon_steps, self.config.num_samples, noise, plans)
 
     def continue_noise(self, streams: "Sequence[SceneStream]") -> None:
@@ -151,6 +153,7 @@ class SceneStream:
     def _forecast_for(self, envs: Int[np.ndarray, " entries"]) -> Forecast:
         """Returns the forecasts of the latest scenes; an ended episode draws its noise before its successor does."""
         noise = [self._noise[env] for env in envs]
+        self._before = deepcopy(noise) if self.config.num_plans else noise
         return self._shown(self._online.forecast(self.horizon_steps, self.config.num_samples, noise))
 
     def _given(self, scenes: SceneBatch) -> SceneBatch:

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader, refuse_what_if
+from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
 from envs.observation import (
     ForecastStream,
     Observations,
@@ -23,6 +23,8 @@ from envs.observation import (
     require_scenes,
     scenes_from,
 )
+from envs.plans import PlanModel
+from envs.plans.batch import PLANS_INFO, PlanBatch, ask_for_plans
 from envs.readers import MakeReader
 from envs.scene_stream import ForecastConfig
 from predictor.forecaster import Forecaster
@@ -55,10 +57,16 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         forecaster: forecaster on `device`, instead of a checkpoint.
         seed: random seed of the samples' noise: environment i gets seed + i, until `reset(seed=…)` gives others.
         reader: refused, because the environments report their scenes; give it to `SceneObservation`.
-        what_if: refused, because plans are made from the running environment; see `ForecastObservation`.
+        what_if: whether observations also hold what the others are forecast to do for each candidate plan of the ego,
+            as in `ForecastObservation`. True takes the environments' plan model; or a `PlanModel`, which is copied to
+            where they run.
+
+    Attributes:
+        plan_names: names of the candidate plans; none without `what_if`.
 
     Raises:
-        UserError: the environments report no scenes, differ from each other, or do not fit the forecaster.
+        UserError: the environments report no scenes, differ from each other, or do not fit the forecaster; no plan
+            model for `what_if=True`.
     """
 
     def __init__(
@@ -73,17 +81,19 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         forecaster: Forecaster | None = None,
         seed: int = 0,
         reader: MakeReader | None = None,
-        what_if: bool = False,
+        what_if: bool | PlanModel = False,
     ) -> None:
         """Loads the forecaster and extends the observation space."""
         gym.vector.VectorWrapper.__init__(self, env)
         refuse_reader(reader, "VectorForecast")
-        refuse_what_if(what_if, "VectorForecast")
         space = require_scenes(env.single_observation_space, "VectorForecast")
         spec: SceneSpec = common_value(_attribute_of_each(env, "scene_spec"), "scene spec")
         source: str = common_value(_attribute_of_each(env, "scene_source"), "env id")
-        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten)
         forecaster = open_forecaster(checkpoint, spec, source, device, forecaster)
+        steps = horizon_steps or forecaster.horizon_steps
+        base: Any = env.unwrapped  # vector wrappers do not pass calls on
+        self.plan_names = ask_for_plans(lambda *a: base.call(*a), what_if, steps, "VectorForecast", base)
+        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, num_plans=len(self.plan_names))
         self.stream: ForecastStream = ForecastStream(forecaster, spec, env.num_envs, config)
         self._layout = ObservationLayout(space["observation"], self.stream.spaces(), flatten)
         self.single_observation_space = self._layout.space
@@ -110,7 +120,8 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
             self.stream.seed([own if env in envs else None for env, own in enumerate(seeds)])
         self._ended[envs] = False
         # A partial reset repeats the others' observations, which were taken in already and must not count twice.
-        entries = self.stream.observe(scenes_from(observations)[envs], envs)
+        plans = self._plans(infos)
+        entries = self.stream.observe(scenes_from(observations)[envs], envs, None if plans is None else plans[envs])
         for key, value in entries.items():
             self._entries.setdefault(key, np.zeros((self.num_envs, *value.shape[1:]), value.dtype))[envs] = value
         shown = {key: value.copy() for key, value in self._entries.items()}
@@ -123,17 +134,31 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         if self._mode is AutoresetMode.SAME_STEP:
             over = np.flatnonzero(ended)
             closing = [infos["final_obs"][i] for i in over]
-            entries, closing_entries = observe_ended(self.stream, observations, over, closing)
+            plans = self._plans(infos)
+            if plans is not None and len(over):
+                last_plans = self._plans(infos["final_info"])
+                assert last_plans is not None
+                plans = plans.replaced(over, last_plans[over]).followed_by(plans[over])
+            entries, closing_entries = observe_ended(self.stream, observations, over, closing, plans)
             for i, last, extra in zip(over, closing, closing_entries, strict=True):
                 infos["final_obs"][i] = self._layout.one(last["observation"], extra)
         else:
             if self._mode is AutoresetMode.NEXT_STEP:
                 self.stream.reset(np.flatnonzero(self._ended))
-            entries = self.stream.observe(scenes_from(observations))
+            entries = self.stream.observe(scenes_from(observations), plans=self._plans(infos))
         # copies: a later reset writes into the entries of the environments that it opens
         self._ended, self._entries = ended, {key: value.copy() for key, value in entries.items()}
         shown = self._layout.batch(observations["observation"], entries)
         return shown, rewards, terminations, truncations, infos
+
+    def _plans(self, infos: dict[str, Any]) -> PlanBatch | None:
+        """Returns the plans that infos carry and takes them out of there; None without `what_if`."""
+        if not self.plan_names:
+            return None
+        plans = PlanBatch.from_vector_info(infos)
+        del infos[PLANS_INFO]
+        infos.pop(f"_{PLANS_INFO}", None)
+        return plans
 
 
 def _attribute_of_each(env: gym.vector.VectorEnv, name: str) -> Any:

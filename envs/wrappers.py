@@ -20,9 +20,9 @@ from envs.observation import (
     open_forecaster,
     scene_entries,
     scene_spaces,
-    what_if_entries,
 )
 from envs.plans import PlanModel, Plans, checked_plans, plan_model_for
+from envs.plans.batch import PlanBatch, plans_info
 from envs.readers import MakeReader, reader_for
 from envs.readers.base import build_reader, require_scene, show
 from envs.scene_stream import ForecastConfig
@@ -77,6 +77,8 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
             )
         self.reader = _reader_of(env, reader, perception_m, max_agents)
         self._scene: Scene | None = None
+        self._plan_model: PlanModel | None = None
+        self._plan_steps = 0
         self.observation_space = gym.spaces.Dict({"observation": own, **scene_spaces(self.reader.spec)})
 
     @property
@@ -96,17 +98,40 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
             raise ProtocolError("there is no scene yet; call reset() first")
         return self._scene
 
+    def propose_plans(self, what_if: bool | PlanModel, horizon_steps: int) -> tuple[str, ...] | UserError:
+        """Puts candidate plans of the ego into all later infos, for vector wrappers with `what_if`.
+
+        Args:
+            what_if: True for the env's own plan model; or a `PlanModel`.
+            horizon_steps: number of steps of a plan.
+
+        Returns:
+            Names of the plans; or the error that there is no plan model, which another process could not raise.
+        """
+        try:
+            self._plan_model = plan_model_for(self) if isinstance(what_if, bool) else what_if
+        except UserError as error:
+            return error
+        self._plan_steps = horizon_steps
+        return tuple(self._plan_model.names)
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Resets the env; identities start anew."""
         obs, info = self.env.reset(seed=seed, options=options)
         self.reader.reset()
-        return self._observe(obs), info
+        return self._observe(obs), self._with_plans(info)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Steps the env and reads the scene."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         # some highway-env ids return NumPy's bool, which SB3 refuses
-        return self._observe(obs), reward, bool(terminated), bool(truncated), info
+        return self._observe(obs), reward, bool(terminated), bool(truncated), self._with_plans(info)
+
+    def _with_plans(self, info: dict[str, Any]) -> dict[str, Any]:
+        if self._plan_model is None:
+            return info
+        features = self.reader.spec.num_features
+        return {**info, **plans_info(checked_plans(self._plan_model, self, self._plan_steps, features))}
 
     def _observe(self, obs: Any) -> dict[str, Any]:
         show(self.reader, obs)
@@ -226,11 +251,11 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         return self._observe(obs), reward, terminated, truncated, info
 
     def _observe(self, obs: dict[str, Any]) -> Any:
-        scenes = SceneBatch.stack([self.scene])
-        entries = self.stream.observe(scenes)
+        plans = None
         if self.plan_model is not None:
             horizon, features = self.stream.horizon_steps, self.stream.scene_spec.num_features
             self.plans = checked_plans(self.plan_model, self.env, horizon, features)
-            self.what_if = self.stream.what_if(self.plans.states[None])
-            entries |= what_if_entries(scenes, self.what_if, self.plans.size_m)
+            plans = PlanBatch.stack([self.plans])
+        entries = self.stream.observe(SceneBatch.stack([self.scene]), plans=plans)
+        self.what_if = self.stream.planned
         return self._layout.one(obs["observation"], {key: value[0] for key, value in entries.items()})

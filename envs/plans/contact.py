@@ -50,13 +50,17 @@ class Contacts(NamedTuple):
         return survival
 
 
-def contacts(forecast: Forecast, scenes: SceneBatch, size_m: tuple[float, float] = (5.0, 2.0)) -> Contacts:
+def contacts(
+    forecast: Forecast,
+    scenes: SceneBatch,
+    size_m: tuple[float, float] | Float[np.ndarray, "batch 2"] = (5.0, 2.0),
+) -> Contacts:
     """Computes the contacts of the ego with the other agents of each scene.
 
     Args:
         forecast: forecast with an axis of plans, agents as in `scenes`.
         scenes: observed scenes, which give where and how agents move now.
-        size_m: length and width of every agent [m].
+        size_m: length and width of every agent [m], of all scenes or of each.
     """
     xy = forecast.xy.cpu().numpy().astype(np.float64)
     batch, plans, samples, agents, horizon = xy.shape[:5]
@@ -66,7 +70,8 @@ def contacts(forecast: Forecast, scenes: SceneBatch, size_m: tuple[float, float]
     slow = np.hypot(scenes.states[..., 2], scenes.states[..., 3]) < LEAST_MOVE_M
     heading_rad[:, 0] = np.where(slow[:, 0], scenes.heading_rad, heading_rad[:, 0])
     headings = _headings(path, np.broadcast_to(heading_rad[:, None, None], xy.shape[:4]))
-    gap = _gaps(path[:, :, :, :1], path[:, :, :, 1:], headings[:, :, :, :1], headings[:, :, :, 1:], size_m)
+    sizes = np.broadcast_to(np.asarray(size_m, np.float64), (batch, 2)).T.reshape(2, batch, 1, 1, 1, 1)
+    gap = _gaps(path[:, :, :, :1], path[:, :, :, 1:], headings[:, :, :, :1], headings[:, :, :, 1:], sizes)
     gap = np.where(scenes.valid[:, None, None, 1:, None, None], gap, FAR_M).clip(max=FAR_M)
     touched = (gap <= 0).reshape(batch, plans, samples, agents - 1, -1)
     ever = touched.any(-1)
@@ -96,7 +101,7 @@ def _gaps(
     others: Float[np.ndarray, "*batch points 2"],
     ego_rad: Float[np.ndarray, "*#batch steps"],
     others_rad: Float[np.ndarray, "*batch steps"],
-    size_m: tuple[float, float],
+    size_m: Float[np.ndarray, "2 ..."],
 ) -> Float[np.ndarray, "*batch steps instants"]:
     """Computes the gap of two rectangles at the instants of each step [m]."""
     between, (length_m, width_m) = others - ego, size_m

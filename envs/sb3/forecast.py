@@ -10,10 +10,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader, refuse_what_if
+from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
 from envs.observation import (
     ForecastStream,
     common_value,
@@ -22,6 +23,8 @@ from envs.observation import (
     require_scenes,
     scenes_from,
 )
+from envs.plans import PlanModel
+from envs.plans.batch import PLANS_INFO, PlanBatch, ask_for_plans
 from envs.readers import MakeReader
 from envs.scene_stream import ForecastConfig
 from predictor.forecaster import Forecaster
@@ -50,10 +53,16 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         forecaster: forecaster on `device`, instead of a checkpoint.
         seed: random seed of the samples' noise: environment i gets seed + i, until `seed(…)` gives others.
         reader: refused, because the environments report their scenes; give it to `SceneObservation`.
-        what_if: refused, because plans are made from the running environment; see `ForecastObservation`.
+        what_if: whether observations also hold what the others are forecast to do for each candidate plan of the ego,
+            as in `ForecastObservation`. True takes the environments' plan model; or a `PlanModel`, which is copied to
+            where they run.
+
+    Attributes:
+        plan_names: names of the candidate plans; none without `what_if`.
 
     Raises:
-        UserError: the environments report no scenes, differ from each other, or do not fit the forecaster.
+        UserError: the environments report no scenes, differ from each other, or do not fit the forecaster; no plan
+            model for `what_if=True`.
     """
 
     def __init__(
@@ -68,16 +77,17 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         forecaster: Forecaster | None = None,
         seed: int = 0,
         reader: MakeReader | None = None,
-        what_if: bool = False,
+        what_if: bool | PlanModel = False,
     ) -> None:
         """Loads the forecaster and extends the observation space."""
         refuse_reader(reader, "VecForecast")
-        refuse_what_if(what_if, "VecForecast")
         space = require_scenes(venv.observation_space, "VecForecast")
         spec = common_value(venv.get_attr("scene_spec"), "scene spec")
         source = common_value(venv.get_attr("scene_source"), "env id")
-        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten)
         forecaster = open_forecaster(checkpoint, spec, source, device, forecaster)
+        steps = horizon_steps or forecaster.horizon_steps
+        self.plan_names = ask_for_plans(venv.env_method, what_if, steps, "VecForecast", venv.unwrapped)
+        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, num_plans=len(self.plan_names))
         self.stream: ForecastStream = ForecastStream(forecaster, spec, venv.num_envs, config)
         self._layout = ObservationLayout(space["observation"], self.stream.spaces(), flatten)
         VecEnvWrapper.__init__(self, venv, observation_space=self._layout.space)
@@ -99,7 +109,9 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         """Resets all environments and clears all histories."""
         observations: Any = self.venv.reset()
         self.stream.reset()
-        return self._layout.batch(observations["observation"], self.stream.observe(scenes_from(observations)))
+        plans = PlanBatch.from_infos(self.venv.unwrapped.reset_infos) if self.plan_names else None
+        entries = self.stream.observe(scenes_from(observations), plans=plans)
+        return self._layout.batch(observations["observation"], entries)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Steps; one batched forward serves running episodes, terminal observations and new episodes."""
@@ -108,10 +120,20 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         infos = list(step_infos)  # a tuple, with SubprocVecEnv
         ended = np.flatnonzero(dones)
         closing = [infos[i]["terminal_observation"] for i in ended]
-        entries, closing_entries = observe_ended(self.stream, observations, ended, closing)
+        plans = self._plans(infos, ended) if self.plan_names else None
+        entries, closing_entries = observe_ended(self.stream, observations, ended, closing, plans)
         for i, last, extra in zip(ended, closing, closing_entries, strict=True):
             infos[i]["terminal_observation"] = self._layout.one(last["observation"], extra)
         return self._layout.batch(observations["observation"], entries), rewards, dones, infos
+
+    def _plans(self, infos: list[dict[str, Any]], ended: NDArray[np.int64]) -> PlanBatch:
+        """Returns the plans of a step, those of closing observations in their places; takes them out of the infos."""
+        latest, opening = PlanBatch.from_infos(infos), self.venv.unwrapped.reset_infos
+        for i, info in enumerate(infos):
+            infos[i] = {key: value for key, value in info.items() if key != PLANS_INFO}
+        if not len(ended):
+            return latest
+        return latest.followed_by(PlanBatch.from_infos([opening[i] for i in ended]))
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seeds the environments and their samples' noise; None leaves the noise as it is."""

@@ -1,7 +1,6 @@
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -32,48 +31,7 @@ from tests.envs.helpers import (
     short_env,
     short_scene_env,
 )
-
-DURATIONS = (2, 5, 3)
-"""Steps per episode of each environment, so that environments end at different times."""
-STEPS = 7
-SEED = 20
-ACTIONS = np.random.default_rng(0).integers(5, size=(STEPS, len(DURATIONS)))
-MAKERS = [partial(short_scene_env, duration) for duration in DURATIONS]
-
-
-@dataclass
-class Played:
-    """What one environment should see, played alone by `ForecastObservation`."""
-
-    opening: dict[str, Any]
-    """The first observation."""
-    steps: list[dict[str, Any]] = field(default_factory=list)
-    """The observation that each step leads to; the closing one where an episode ends."""
-    rewards: list[float] = field(default_factory=list)
-    ends: list[bool] = field(default_factory=list)
-    successors: dict[int, dict[str, Any]] = field(default_factory=dict)
-    """By step at which an episode ended: the first observation of the next."""
-
-
-def play_alone(i: int, checkpoint: str, idle_steps: bool = False) -> Played:
-    """One environment for `STEPS` steps of its vector env; with `idle_steps`, the step after an end only resets."""
-    env = ForecastObservation(short_env(DURATIONS[i]), checkpoint)
-    played = Played(env.reset(seed=SEED + i)[0])
-    fresh_at = -1
-    for t in range(STEPS):
-        if t == fresh_at:
-            played.steps.append(played.successors[t - 1])
-            played.rewards.append(0.0)
-            played.ends.append(False)
-            continue
-        obs, reward, terminated, truncated, _ = env.step(int(ACTIONS[t, i]))
-        played.steps.append(obs)
-        played.rewards.append(float(reward))
-        played.ends.append(terminated or truncated)
-        if terminated or truncated:
-            played.successors[t] = env.reset()[0]
-            fresh_at = t + 1 if idle_steps else -1
-    return played
+from tests.envs.played_alone import ACTIONS, DURATIONS, MAKERS, SEED, STEPS, Played, one_of, play_alone
 
 
 @pytest.fixture(scope="module")
@@ -84,10 +42,6 @@ def alone(highway_checkpoint: str) -> list[Played]:
 @pytest.fixture(scope="module")
 def alone_with_idle_steps(highway_checkpoint: str) -> list[Played]:
     return [play_alone(i, highway_checkpoint, idle_steps=True) for i in range(len(DURATIONS))]
-
-
-def one_of(observations: dict[str, Any], i: int) -> dict[str, Any]:
-    return {key: value[i] for key, value in observations.items()}
 
 
 def test_envs_end_at_different_steps(alone: list[Played], alone_with_idle_steps: list[Played]):

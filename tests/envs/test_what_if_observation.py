@@ -8,15 +8,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents.features import ForecastAttention
 from envs.observation import FORECAST_KEYS, WHAT_IF_KEYS, others_by_distance, what_if_entries
 from envs.plans import Plans
 from envs.plans.contact import contacts
 from envs.registry import make_env
-from envs.sb3.forecast import VecForecast
-from envs.vector import VectorForecast
 from envs.wrappers import ForecastObservation
 from predictor.scene import SceneBatch
 from predictor.support.errors import UserError
@@ -118,12 +115,7 @@ def test_a_plan_model_of_ones_own():
     np.testing.assert_allclose(env.what_if.xy[:, :, :, 0].numpy(), 0.0, atol=1e-4)  # it stays where it is
 
 
-def test_vector_wrappers_and_unknown_environments_refuse_it():
-    refused = "takes no what_if: plans are made from the running environment"
-    with pytest.raises(UserError, match=f"VectorForecast {refused}"):
-        VectorForecast(gym.vector.SyncVectorEnv([lambda: make_env("highway-fast-v0")]), "highway", what_if=True)
-    with pytest.raises(UserError, match=f"VecForecast {refused}"):
-        VecForecast(DummyVecEnv([lambda: make_env("highway-fast-v0")]), "highway", what_if=True)
+def test_environments_without_a_plan_model_are_refused():
     env = make_env("highway-fast-v0", config={"action": {"type": "DiscreteAction"}})
     with pytest.raises(UserError, match="plans are known for DiscreteMetaAction and ContinuousAction"):
         ForecastObservation(env, "highway", what_if=True)
