@@ -23,6 +23,7 @@ from rich.progress import track
 
 from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, checkpoint_for
 from envs.rollouts import reaction_report, report
+from envs.rollouts.branches import check_can_branch
 from envs.rollouts.episode import (
     MODEL,
     NEIGHBOURS,
@@ -35,7 +36,7 @@ from envs.rollouts.episode import (
     memory_key,
     play,
 )
-from envs.rollouts.reaction_run import EnvReactions, ReactionRun, check_can_branch, measure_reactions
+from envs.rollouts.reaction_run import EnvReactions, ReactionRun, measure_reactions
 from envs.rollouts.report import EnvAccuracy
 from envs.rollouts.world import default_drivers, open_world
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, name_of_folder, read_info, resolve
@@ -311,7 +312,7 @@ def main() -> None:
     """Entry point."""
     keep_freed_memory()
     config = parse(EvaluateConfig, __doc__)
-    console = Console(width=170)
+    console = Console(width=200 if config.reactions else 170)
     if config.out is not None and config.out.is_file():
         raise UserError(f"{config.out} is a file; choose another --out")
     for env_id in config.env_ids:  # unknown ids and drivers raise before hours of work

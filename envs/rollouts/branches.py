@@ -25,8 +25,8 @@ import numpy as np
 from highway_env.envs.common.abstract import AbstractEnv
 from jaxtyping import Bool, Float, Int
 
-from envs.rollouts.interventions import hold_others, intervene, kinds_of
-from envs.rollouts.world import World
+from envs.rollouts.interventions import body_of, hold_others, intervene, kinds_of
+from envs.rollouts.world import World, open_world
 from envs.simulators.interventions import Intervention, log_motion, simulator_of
 from predictor.scene import Scene
 from predictor.support.errors import UserError
@@ -42,6 +42,8 @@ class Branch:
     """Whether the agent is present; False after an episode's end where the environment cannot go on."""
     perceived: tuple[Scene, ...]
     """What forecasters get at each step; fewer scenes where the environment cannot go on."""
+    crashed: frozenset[int] = frozenset()
+    """Ids of the agents that have crashed by the end; none where the simulator knows no crash."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,19 @@ class BranchPoint:
         return Branches(intervention, self.ids, self.plain, perturbed, self._world.spec.position_dim)
 
 
+def check_can_branch(env_id: str, driver: str) -> None:
+    """Checks that agents of an environment can be perturbed in copies of it.
+
+    Raises:
+        UserError: they cannot, or the environment or the driver is unknown.
+    """
+    world = open_world(env_id, driver)
+    try:
+        kinds_of(world)
+    finally:
+        world.close()
+
+
 def copied(world: World) -> World:
     """Returns a copy that continues exactly; it shares the road network, which no step changes.
 
@@ -182,4 +197,6 @@ def _play(
         note(step + 1, world.perceived(), world.full_scene())
         if ended and not goes_on:
             break
-    return Branch(states, valid, tuple(seen)), drawn
+    bodies = ((int(agent), body_of(world, int(agent))) for agent in ids)
+    crashed = frozenset(agent for agent, body in bodies if getattr(body, "crashed", False))
+    return Branch(states, valid, tuple(seen), crashed), drawn

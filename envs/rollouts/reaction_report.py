@@ -14,12 +14,12 @@ from rich.table import Table
 from envs.rollouts.reaction_cells import FALSE_BESIDE
 from envs.rollouts.reaction_run import CellReactions, EnvReactions
 from envs.rollouts.reactions import NEIGHBOURS, STRAIGHT
-from predictor.evaluation.reactions import Estimate
+from predictor.evaluation.standard_errors import Estimate
 from predictor.support.markdown import table
 
 HEADS = (
-    "perturbation", "n (episodes)", "forecaster", "true [m]", "predicted [m]", "slope (95 %)", "r at the end (95 %)",
-    "r of all steps", "false reaction (95 %)",
+    "perturbation", "n (episodes)", "forecaster", "true [m]", "predicted [m]", "slope (95 %)", "slope on one path (n)",
+    "r at the end (95 %)", "r of all steps", "false reaction (95 %)",
 )  # fmt: skip
 """Columns of the table."""
 COLORS = {STRAIGHT: "grey", NEIGHBOURS: "tab:green"}
@@ -38,6 +38,9 @@ def remarks(result: EnvReactions) -> list[str]:
     """Returns what a reader of the table should know: cells that are short, checkpoints that do not fit."""
     few = [f"{cell.name} {cell.pairs}" for cell in result.cells if cell.pairs < result.asked]
     found = [f"{result.episodes} episodes; fewer than {result.asked} perturbations: {', '.join(few)}"] if few else []
+    crashed = [f"{cell.name} {cell.crashed}" for cell in result.cells if cell.crashed]
+    if crashed:
+        found.append(f"not counted, because the receiver crashes in one branch: {', '.join(crashed)}")
     return found + [f"left out: {name}: {why}" for name, why in result.misfits.items()]
 
 
@@ -45,7 +48,7 @@ def shown(result: EnvReactions) -> Table:
     """Returns the table of one environment for a terminal."""
     lines = Table(title=title(result))
     for i, heading in enumerate(HEADS):
-        lines.add_column(heading.replace("[", r"\["), justify="left" if i in (0, 2) else "right", no_wrap=i > 2)
+        lines.add_column(heading.replace("[", r"\["), justify="left" if i in (0, 2) else "right", no_wrap=i > 4)
     for cells in _lines(result):
         lines.add_row(*cells)
     return lines
@@ -71,12 +74,17 @@ def _lines(result: EnvReactions) -> list[list[str]]:
             lines.append(
                 [
                     *first, name, _metres(found.true_m), _metres(predicted), _with_interval(found.slope),
-                    _with_interval(found.correlation),
+                    _on_path(cell, name), _with_interval(found.correlation),
                     "–" if found.correlation_of_steps is None else f"{found.correlation_of_steps.value:.2f}",
                     _with_interval(cell.false_reactions.get(name)),
                 ]
             )  # fmt: skip
     return lines
+
+
+def _on_path(cell: CellReactions, forecaster: str) -> str:
+    found = cell.on_path.get(forecaster)
+    return "–" if found is None else f"{_with_interval(found.slope)} ({found.pairs})"
 
 
 def _metres(value: float | None) -> str:

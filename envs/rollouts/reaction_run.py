@@ -11,11 +11,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from envs.rollouts.interventions import kinds_of
 from envs.rollouts.reaction_cells import FALSE_BESIDE, cells_of
 from envs.rollouts.reactions import Perturbation, ReactionTask, play_reactions
+from envs.rollouts.side_forecasts import fitting_checkpoints
 from envs.rollouts.world import open_world
-from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, name_of_folder
-from predictor.evaluation.reactions import Estimate, Reaction, Shifts, false_reaction, reaction
-from predictor.scene import SceneSpec
-from predictor.support.errors import UserError
+from predictor.checkpoint import load_forecaster
+from predictor.evaluation.reactions import Reaction, Shifts, false_reaction, reaction
+from predictor.evaluation.standard_errors import Estimate
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,15 @@ class CellReactions:
     name: str
     """Name of the cell."""
     pairs: int
-    """Number of perturbations found."""
+    """Number of perturbations that count."""
     reactions: dict[str, Reaction]
     """Reaction of each forecaster, by name; empty if nothing was found."""
+    on_path: dict[str, Reaction]
+    """Reaction over the receivers that keep to their path in both branches; empty off the roads and of bystanders."""
     false_reactions: dict[str, Estimate | None]
     """False reaction of each forecaster in a cell of bystanders; empty in others."""
+    crashed: int = 0
+    """Number of perturbations that do not count, because the receiver crashes in one of the branches."""
 
 
 @dataclass(frozen=True)
@@ -82,19 +86,6 @@ class EnvReactions:
     """All perturbations, with their shifts."""
 
 
-def check_can_branch(env_id: str, driver: str) -> None:
-    """Checks that agents of an environment can be perturbed in copies of it.
-
-    Raises:
-        UserError: they cannot, or the environment or the driver is unknown.
-    """
-    world = open_world(env_id, driver)
-    try:
-        kinds_of(world)
-    finally:
-        world.close()
-
-
 def measure_reactions(run: ReactionRun) -> EnvReactions:
     """Plays the episodes of one environment and summarises the reactions of all forecasters.
 
@@ -107,10 +98,9 @@ def measure_reactions(run: ReactionRun) -> EnvReactions:
     spec, names = world.spec, [cell.name for cell in cells_of(world)]
     kinds_of(world)
     world.close()
-    fitting, misfits = _fitting(run, spec)
+    fitting, misfits = fitting_checkpoints(run.env_id, run.checkpoints, spec)
     horizon = run.horizon_steps or load_forecaster(fitting[0], spec, run.env_id).horizon_steps
     found, episodes = _play_until_enough(run, fitting, horizon, names)
-    shifts = {name: _shifts_of([one for one in found if one.cell == name]) for name in names}
     return EnvReactions(
         run.env_id,
         run.driver,
@@ -118,32 +108,10 @@ def measure_reactions(run: ReactionRun) -> EnvReactions:
         horizon,
         run.perturbations,
         episodes,
-        [_cell(name, shifts) for name in names],
+        [_cell(name, found) for name in names],
         misfits,
         found,
     )
-
-
-def _fitting(run: ReactionRun, spec: SceneSpec) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Returns the checkpoints that fit the environment, and why the others do not."""
-    fitting, misfits, seen = [], {}, {}
-    for checkpoint in run.checkpoints:
-        try:
-            found = load_forecaster(checkpoint, spec, f"env '{run.env_id}'")
-        except UserError as error:
-            if len(run.checkpoints) == 1:
-                raise
-            misfits[name_of_folder(checkpoint)] = str(error)
-            continue
-        fitting.append(checkpoint)
-        if spec.has_ego and checkpoint != CONSTANT_VELOCITY:
-            seen[found.spec.perception_m, found.spec.max_agents] = checkpoint
-    if not fitting:
-        raise UserError(f"no checkpoint fits {run.env_id}: " + "; ".join(misfits.values()))
-    if len(seen) > 1:
-        listed = ", ".join(f"'{name}' {agents} agents within {m:g} m" for (m, agents), name in seen.items())
-        raise UserError(f"checkpoints measured together must perceive alike, got {listed}; measure them one by one")
-    return tuple(fitting), misfits
 
 
 def _play_until_enough(
@@ -159,7 +127,7 @@ def _play_until_enough(
     ):
         bar = progress.add_task("", total=len(names) * run.perturbations)
         while played < run.episodes:
-            wanted = tuple(name for name in names if len(found[name]) < run.perturbations)
+            wanted = tuple(name for name in names if _count(found[name]) < run.perturbations)
             if not wanted:
                 break
             wave = range(played, min(played + 2 * run.workers, run.episodes))
@@ -171,13 +139,18 @@ def _play_until_enough(
             ]
             for episode, ones in zip(wave, pool.imap(play_reactions, tasks, chunksize=1), strict=True):
                 for one in ones:
-                    if len(found[one.cell]) < run.perturbations:
+                    if _count(found[one.cell]) < run.perturbations:
                         found[one.cell].append(one)
                         needed = episode + 1
-                        progress.advance(bar)
+                        progress.advance(bar, not one.crashed)
             played = wave.stop
-    enough = all(len(ones) == run.perturbations for ones in found.values())
+    enough = all(_count(ones) == run.perturbations for ones in found.values())
     return [one for ones in found.values() for one in ones], needed if enough else played
+
+
+def _count(found: Sequence[Perturbation]) -> int:
+    """Returns how many perturbations count."""
+    return sum(not one.crashed for one in found)
 
 
 def _shifts_of(found: Sequence[Perturbation]) -> dict[str, Shifts]:
@@ -191,16 +164,20 @@ def _shifts_of(found: Sequence[Perturbation]) -> dict[str, Shifts]:
     }
 
 
-def _cell(name: str, shifts: dict[str, dict[str, Shifts]]) -> CellReactions:
+def _cell(name: str, found: Sequence[Perturbation]) -> CellReactions:
     """Returns the reactions of a cell; slope and correlation where receivers truly move."""
-    found = {forecaster: reaction(one) for forecaster, one in shifts[name].items()}
-    pairs = max((one.pairs for one in found.values()), default=0)
+    own = [one for one in found if one.cell == name and not one.crashed]
+    crashed = sum(one.cell == name and one.crashed for one in found)
+    shifts = _shifts_of(own)
+    reactions = {forecaster: reaction(one) for forecaster, one in shifts.items()}
     if name not in FALSE_BESIDE:
-        return CellReactions(name, pairs, found, {})
+        on_path = _shifts_of([one for one in own if one.swerved is False])
+        kept = {forecaster: reaction(one) for forecaster, one in on_path.items()}
+        return CellReactions(name, len(own), reactions, kept, {}, crashed)
     still = {
         forecaster: replace(one, slope=None, correlation=None, correlation_of_steps=None)
-        for forecaster, one in found.items()
+        for forecaster, one in reactions.items()
     }
-    beside = shifts[FALSE_BESIDE[name]]
-    false = {key: false_reaction(one, beside[key]) if beside else None for key, one in shifts[name].items()}
-    return CellReactions(name, pairs, still, false)
+    beside = _shifts_of([one for one in found if one.cell == FALSE_BESIDE[name] and not one.crashed])
+    false = {key: false_reaction(one, beside[key]) if beside else None for key, one in shifts.items()}
+    return CellReactions(name, len(own), still, {}, false, crashed)

@@ -5,28 +5,29 @@ true shift is where a receiver is in that branch, minus where it is in the plain
 difference of two forecasts of one forecaster, whose history is the same up to the last step: one of the scene as it
 is, one of the scene as perturbed. Each is the single most likely forecast. The world goes on as if nothing had been
 asked. `predictor.evaluation.reactions` makes numbers of the shifts.
+
+Whether two cars touch turns on centimetres, and a crash is then a shift of tens of metres: perturbations of which the
+receiver crashes in one branch are marked, and so are those in which it changes lane in one branch alone.
 """
 
 import copy
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from envs.drivers.trained import sees_forecasts
 from envs.rollouts.branches import Branches, BranchPoint
-from envs.rollouts.reaction_cells import Cell, Pair, cells_of, is_moved_as_asked, pairs_of
-from envs.rollouts.side_forecasts import SideForecaster, kept_forecaster
-from envs.rollouts.world import World, open_world
+from envs.rollouts.causal_labels import ON_ROADS, settings_for
+from envs.rollouts.reaction_cells import Cell, cells_of, is_moved_as_asked, pairs_of
+from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters, kept_world
+from envs.rollouts.world import World
 from envs.seeding import reaction_rng
 from envs.simulators.interventions import Intervention
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.baselines.nearest_neighbour import NearestNeighbour, fit_from_stores
-from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint, name_of_folder
-from predictor.forecaster import Forecaster
 from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError
 
@@ -38,6 +39,9 @@ FIRST_STEP = 3
 """First step at which agents are perturbed; forecasters have seen the motion by then."""
 MOST_BRANCHES = 4
 """Largest number of interventions that are tried for one cell at one step."""
+
+SAME_PATH_M = 2.0
+"""Largest distance of two paths that count as one [m]: half a lane's width."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +84,15 @@ class Perturbation:
     """True shift [m], world axes."""
     predicted_m: dict[str, Float[np.ndarray, "horizon axes"]]
     """Predicted shift [m], by forecaster."""
+    crashed: bool = False
+    """Whether the receiver crashes in one of the branches."""
+    swerved: bool | None = None
+    """Whether it leaves the path that it takes in the other branch, as by a change of lane; None off the roads."""
 
 
 def play_reactions(task: ReactionTask) -> list[Perturbation]:
     """Plays one episode and returns its perturbations."""
-    world = _kept_world(task.env_id, task.driver, task.checkpoints)
+    world = kept_world(task.env_id, task.driver, task.checkpoints)
     world.reset(task.seed)
     forecasters = _forecasters(task, world.spec)
     rng = reaction_rng(task.seed)
@@ -99,8 +107,7 @@ def play_reactions(task: ReactionTask) -> list[Perturbation]:
             cells = cells_of(world)
             for cell, own in zip(cells, rng.spawn(len(cells)), strict=True):
                 if cell.name in task.cells and (one := moment.perturbed(cell, own)) is not None:
-                    pair, true_m, predicted_m = one
-                    found.append(Perturbation(cell.name, task.seed, step, pair[1], pair[0], true_m, predicted_m))
+                    found.append(replace(one, seed=task.seed, step=step))
         if world.step():
             break
     return found
@@ -128,10 +135,8 @@ class Moment:
         self._scene = world.perceived()
         self._tried: dict[Intervention, Branches | None] = {}
 
-    def perturbed(
-        self, cell: Cell, rng: np.random.Generator
-    ) -> tuple[Pair, Float[np.ndarray, "horizon axes"], dict[str, Float[np.ndarray, "horizon axes"]]] | None:
-        """Returns receiver and sender of one random perturbation of a kind, with the true and the predicted shifts.
+    def perturbed(self, cell: Cell, rng: np.random.Generator) -> Perturbation | None:
+        """Returns one random perturbation of a kind, with the true and the predicted shifts.
 
         None if none was found: pairs are tried in random order, with at most `MOST_BRANCHES` interventions.
         """
@@ -149,7 +154,9 @@ class Moment:
                 continue
             predicted_m = self._predicted(branches.perturbed.perceived[0], receiver)
             if predicted_m is not None:
-                return (receiver, sender), true_m, predicted_m
+                crashed = receiver in branches.plain.crashed | branches.perturbed.crashed
+                swerved = _swerved(branches, receiver) if settings_for(self._world) is ON_ROADS else None
+                return Perturbation(cell.name, 0, 0, sender, receiver, true_m, predicted_m, crashed, swerved)
         return None
 
     @functools.cached_property
@@ -201,13 +208,20 @@ def _true_shift(branches: Branches, receiver: int) -> Float[np.ndarray, "horizon
     return shift_m[1:, column] if valid[:, column].all() else None
 
 
-@functools.lru_cache(maxsize=4)
-def _kept_world(env_id: str, driver: str, checkpoints: tuple[str, ...]) -> World:
-    """Returns a world whose ego perceives what the first checkpoint was trained on."""
-    if sees_forecasts(driver):
-        return open_world(env_id, driver, checkpoints[0])
-    learned = [name for name in checkpoints if name != CONSTANT_VELOCITY]
-    return open_world(env_id, driver, perceived_as=load_checkpoint(learned[0])[1].spec if learned else None)
+def _swerved(branches: Branches, receiver: int) -> bool:
+    """Returns whether the receiver's paths in the two branches lie more than `SAME_PATH_M` apart somewhere.
+
+    Compared are the places of the branch in which it comes less far with the line through those of the other one, so
+    that who only drives slower or faster does not swerve.
+    """
+    column, axes = branches.ids.tolist().index(receiver), branches.axes
+    paths = [branch.states[:, column, :axes] for branch in (branches.plain, branches.perturbed)]
+    short, long = sorted(paths, key=lambda path: float(np.linalg.norm(np.diff(path, axis=0), axis=-1).sum()))
+    begins, along = long[:-1], np.diff(long, axis=0)
+    squares = np.maximum(np.square(along).sum(axis=-1), 1e-12)
+    share = np.clip(((short[:, None] - begins) * along).sum(axis=-1) / squares, 0.0, 1.0)
+    apart_m = np.linalg.norm(short[:, None] - begins - share[..., None] * along, axis=-1).min(axis=1)
+    return bool(apart_m.max() > SAME_PATH_M)
 
 
 @functools.lru_cache(maxsize=2)
@@ -217,11 +231,7 @@ def _kept_neighbours(stores: tuple[str, ...], spec: SceneSpec, horizon_steps: in
 
 def _forecasters(task: ReactionTask, spec: SceneSpec) -> dict[str, SideForecaster]:
     """Returns new forecasters for an episode, by name."""
-    found: dict[str, Forecaster] = {
-        name_of_folder(name): kept_forecaster(name, spec, f"env '{task.env_id}'")
-        for name in task.checkpoints
-        if name != CONSTANT_VELOCITY
-    }
+    found = checkpoint_forecasters(task.checkpoints, spec, task.env_id)
     if task.stores:
         found[NEIGHBOURS] = _kept_neighbours(task.stores, spec, task.horizon_steps)
     found[STRAIGHT] = ConstantVelocity(spec)

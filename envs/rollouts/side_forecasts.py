@@ -1,13 +1,20 @@
-"""Forecasters that follow a world beside the deployed stream: controls, ablations, several checkpoints at once."""
+"""Forecasters that follow a world beside the deployed stream: controls, ablations, several checkpoints at once.
+
+Checkpoints that are measured together see one and the same scene, so they must perceive alike.
+"""
 
 import functools
+from collections.abc import Sequence
 
 import numpy as np
 
-from predictor.checkpoint import load_forecaster
+from envs.drivers.trained import sees_forecasts
+from envs.rollouts.world import World, open_world
+from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint, load_forecaster, name_of_folder
 from predictor.forecaster import Forecaster
 from predictor.online import OnlineForecaster
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
+from predictor.support.errors import UserError
 
 
 class SideForecaster:
@@ -67,3 +74,49 @@ class SideForecaster:
 def kept_forecaster(checkpoint: str, spec: SceneSpec, source: str) -> Forecaster:
     """Returns the forecaster of a checkpoint (`predictor.checkpoint.load_forecaster`), loaded once in a process."""
     return load_forecaster(checkpoint, spec, source)
+
+
+def checkpoint_forecasters(checkpoints: Sequence[str], spec: SceneSpec, env_id: str) -> dict[str, Forecaster]:
+    """Returns the forecasters of all checkpoints but constant velocity, by the names of their folders."""
+    return {
+        name_of_folder(name): kept_forecaster(name, spec, f"env '{env_id}'")
+        for name in checkpoints
+        if name != CONSTANT_VELOCITY
+    }
+
+
+def fitting_checkpoints(
+    env_id: str, checkpoints: Sequence[str], spec: SceneSpec
+) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Returns the checkpoints that fit an environment, to be measured together, and why the others do not, by name.
+
+    Raises:
+        UserError: none fits, or those that do perceive differently.
+    """
+    fitting, misfits, seen = [], {}, {}
+    for checkpoint in checkpoints:
+        try:
+            found = load_forecaster(checkpoint, spec, f"env '{env_id}'")
+        except UserError as error:
+            if len(checkpoints) == 1:
+                raise
+            misfits[name_of_folder(checkpoint)] = str(error)
+            continue
+        fitting.append(checkpoint)
+        if spec.has_ego and checkpoint != CONSTANT_VELOCITY:
+            seen[found.spec.perception_m, found.spec.max_agents] = checkpoint
+    if not fitting:
+        raise UserError(f"no checkpoint fits {env_id}: " + "; ".join(misfits.values()))
+    if len(seen) > 1:
+        listed = ", ".join(f"'{name}' {agents} agents within {m:g} m" for (m, agents), name in seen.items())
+        raise UserError(f"checkpoints measured together must perceive alike, got {listed}; measure them one by one")
+    return tuple(fitting), misfits
+
+
+@functools.lru_cache(maxsize=4)
+def kept_world(env_id: str, driver: str, checkpoints: tuple[str, ...]) -> World:
+    """Returns a world whose ego perceives what the first learned checkpoint was trained on, kept in a process."""
+    if sees_forecasts(driver):
+        return open_world(env_id, driver, checkpoints[0])
+    learned = [name for name in checkpoints if name != CONSTANT_VELOCITY]
+    return open_world(env_id, driver, perceived_as=load_checkpoint(learned[0])[1].spec if learned else None)

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from predictor.evaluation.standard_errors import bootstrap_interval
+from predictor.evaluation.standard_errors import Estimate, bootstrap_interval
 
 NO_SHIFT_M = 1e-6
 """Length below which a true shift has no direction [m]."""
@@ -51,16 +51,6 @@ class Shifts:
         still = length_m < NO_SHIFT_M
         along_m = (self.predicted_m * self.true_m).sum(axis=-1) / np.where(still, 1.0, length_m)
         return np.where(still, np.linalg.norm(self.predicted_m, axis=-1), along_m)
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A number with its interval."""
-
-    value: float
-    """Value over all pairs."""
-    interval: tuple[float, float] | None
-    """95 % bootstrap over episodes; None with fewer than two."""
 
 
 @dataclass(frozen=True)

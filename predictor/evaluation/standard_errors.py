@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 NUM_SUBSETS = 20
 """Number of subsets, as in the paper."""
@@ -28,6 +28,16 @@ class Statistic:
     """Standard deviation of the subsets' values (n − 1) / √subsets; None with fewer than two."""
     subsets: int
     """Number of subsets with at least one valid entry; fewer than requested if there are fewer windows."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its interval."""
+
+    value: float
+    """Value over all episodes."""
+    interval: tuple[float, float] | None
+    """95 % bootstrap over episodes; None with fewer than two."""
 
 
 def ratio_statistics(
@@ -75,7 +85,7 @@ def batch_interval(
     """
     if np.count_nonzero(counts) < 2:
         return None
-    drawn = np.random.default_rng(seed).multinomial(len(sums), np.full(len(sums), 1 / len(sums)), size=BOOTSTRAP_DRAWS)
+    drawn = bootstrap_draws(len(sums), seed)
     totals, numbers = drawn @ sums, drawn @ counts
     ratios = totals[numbers > 0] / numbers[numbers > 0]
     low, high = np.percentile(np.sqrt(ratios) if root else ratios, [2.5, 97.5])
@@ -100,14 +110,20 @@ def bootstrap_interval(
         Lower and upper limit over the draws where the function is defined; None with fewer than two batches, or if it
         is defined nowhere.
     """
-    if len(sums) < 2:
+    return None if len(sums) < 2 else central_interval(value(bootstrap_draws(len(sums), seed) @ sums))
+
+
+def bootstrap_draws(batches: int, seed: int = 0, draws: int = BOOTSTRAP_DRAWS) -> Int[np.ndarray, "draws batches"]:
+    """Returns how often each batch is drawn in each of the draws of a bootstrap."""
+    return np.random.default_rng(seed).multinomial(batches, np.full(batches, 1 / batches), size=draws)
+
+
+def central_interval(values: Float[np.ndarray, " draws"]) -> tuple[float, float] | None:
+    """Returns the central 95 % of the draws that are defined; None if none is."""
+    defined = values[np.isfinite(values)]
+    if not len(defined):
         return None
-    drawn = np.random.default_rng(seed).multinomial(len(sums), np.full(len(sums), 1 / len(sums)), size=BOOTSTRAP_DRAWS)
-    values = value(drawn @ sums)
-    values = values[np.isfinite(values)]
-    if not len(values):
-        return None
-    low, high = np.percentile(values, [2.5, 97.5])
+    low, high = np.percentile(defined, [2.5, 97.5])
     return float(low), float(high)
 
 

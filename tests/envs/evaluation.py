@@ -15,7 +15,7 @@ from envs.readers import multiagent_reader_for
 from envs.registry import make_multiagent_env
 from envs.rollouts import episode as live
 from envs.rollouts import reactions
-from envs.rollouts.side_forecasts import kept_forecaster
+from envs.rollouts.side_forecasts import kept_forecaster, kept_world
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE
 from predictor.scene import SceneSpec
@@ -49,7 +49,7 @@ def forget() -> None:
     for kept in (
         live._kept_world,
         live._kept_controls,
-        reactions._kept_world,
+        kept_world,
         reactions._kept_neighbours,
         kept_forecaster,
     ):

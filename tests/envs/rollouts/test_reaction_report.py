@@ -11,7 +11,8 @@ from envs.rollouts.reaction_cells import BYSTANDER_CELL, LEADER_CELL
 from envs.rollouts.reaction_report import as_json, markdown, plot_cell, remarks, shown, write_picture
 from envs.rollouts.reaction_run import CellReactions, EnvReactions
 from envs.rollouts.reactions import STRAIGHT, Perturbation
-from predictor.evaluation.reactions import Estimate, Reaction
+from predictor.evaluation.reactions import Reaction
+from predictor.evaluation.standard_errors import Estimate
 
 REACTION = Reaction(
     20,
@@ -26,11 +27,12 @@ REACTION = Reaction(
     (4.0, 8.88),
     (4.5, 9.0),
 )
-LEADERS = CellReactions(LEADER_CELL.name, 20, {"ours": REACTION, STRAIGHT: replace(REACTION, slope=None)}, {})
-BYSTANDERS = CellReactions(
-    BYSTANDER_CELL.name, 20, {"ours": replace(REACTION, slope=None)}, {"ours": Estimate(0.08, (0.05, 0.12))}
+NO_SLOPE = replace(REACTION, slope=None)
+LEADERS = CellReactions(
+    LEADER_CELL.name, 20, {"ours": REACTION, STRAIGHT: NO_SLOPE}, {"ours": replace(REACTION, pairs=12)}, {}, 3
 )
-NOTHING = CellReactions("taken out", 0, {}, {})
+BYSTANDERS = CellReactions(BYSTANDER_CELL.name, 20, {"ours": NO_SLOPE}, {}, {"ours": Estimate(0.08, (0.05, 0.12))})
+NOTHING = CellReactions("taken out", 0, {}, {}, {})
 ONE = Perturbation("taken out", 900_000, 4, 1, 2, np.ones((2, 2)), {"ours": np.zeros((2, 2))})
 RESULT = EnvReactions(
     "merge-v1", "varied", 1.0, 2, 20, 40, [LEADERS, BYSTANDERS, NOTHING], {"far": "steps of 0.2 s"}, [ONE]
@@ -42,19 +44,30 @@ def test_lines_of_the_page():
     assert lines[0] == "### merge-v1, driven varied: shift of receivers after 2 steps of 1 s"
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[4:8]]
     assert cells[0] == [
-        LEADER_CELL.name, "20 (6)", "ours", "11.10", "-8.88", "0.80 (0.70 to 0.90)", "0.75", "0.85", "–",
+        LEADER_CELL.name, "20 (6)", "ours", "11.10", "-8.88", "0.80 (0.70 to 0.90)",
+        "0.80 (0.70 to 0.90) (12)", "0.75", "0.85", "–",
     ]  # fmt: skip
     assert cells[1][2:6] == [STRAIGHT, "11.10", "-8.88", "–"]
-    assert cells[2][2:] == ["ours", "11.10", "9.00", "–", "0.75", "0.85", "0.08 (0.05 to 0.12)"]  # a length, no sign
-    assert cells[3] == ["taken out", "0"] + ["–"] * 7
+    assert cells[2][2:] == [
+        "ours",
+        "11.10",
+        "9.00",
+        "–",
+        "–",
+        "0.75",
+        "0.85",
+        "0.08 (0.05 to 0.12)",
+    ]  # a length, no sign
+    assert cells[3] == ["taken out", "0"] + ["–"] * 8
     assert "* 40 episodes; fewer than 20 perturbations: taken out 0" in lines
+    assert f"* not counted, because the receiver crashes in one branch: {LEADER_CELL.name} 3" in lines
     assert "* left out: far: steps of 0.2 s" in lines
-    assert remarks(replace(RESULT, cells=[LEADERS], misfits={})) == []
+    assert remarks(replace(RESULT, cells=[BYSTANDERS], misfits={})) == []
 
 
 def test_the_terminal_has_the_same_cells():
     text = StringIO()
-    Console(file=text, width=170).print(shown(RESULT))
+    Console(file=text, width=200).print(shown(RESULT))
     assert all(word in text.getvalue() for word in ("0.80 (0.70 to 0.90)", "0.08 (0.05 to 0.12)", "predicted [m]"))
 
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from envs.rollouts import reaction_run, reactions
+from envs.rollouts.branches import check_can_branch
 from envs.rollouts.reaction_cells import BYSTANDER_CELL, ELSEWHERE, LEADER_CELL, NEAR_CELL, ON_LANES, STILL_CELL
-from envs.rollouts.reaction_run import EnvReactions, ReactionRun, check_can_branch, measure_reactions
+from envs.rollouts.reaction_run import EnvReactions, ReactionRun, measure_reactions
 from envs.rollouts.reactions import STRAIGHT, Perturbation, ReactionTask
 from predictor.support.errors import UserError
 from tests.envs.evaluation import TAG, forget, no_processes, save_tag
@@ -67,6 +68,25 @@ def test_the_first_perturbations_of_each_cell_count(monkeypatch: pytest.MonkeyPa
     wanted = {task.seed - 900_000: set(task.cells) for task in asked}
     assert wanted[0] == {cell.name for cell in ELSEWHERE}
     assert wanted[8] == {gone.name}
+
+
+def test_crashes_do_not_count_and_swerves_have_no_place_in_one_slope(monkeypatch: pytest.MonkeyPatch):
+    """Of each episode the first perturbation is a crash, the second a swerve, which is forecast well."""
+
+    def play(task: ReactionTask) -> list[Perturbation]:
+        true_m = np.full((HORIZON, 2), [2.0, 0.0])
+        crash = Perturbation(NEAR_CELL.name, task.seed, 4, 1, 0, 50 * true_m, {"f": true_m}, True, False)
+        swerve = Perturbation(NEAR_CELL.name, task.seed, 5, 1, 0, true_m, {"f": true_m}, False, True)
+        keep = Perturbation(NEAR_CELL.name, task.seed, 6, 1, 0, true_m, {"f": 0 * true_m}, False, False)
+        return [crash, swerve, keep]
+
+    monkeypatch.setattr(reaction_run, "play_reactions", play)
+    found = measure_reactions(run(perturbations=4, episodes=9)).cells[0]
+    assert (found.pairs, found.crashed) == (4, 2)
+    assert found.reactions["f"].true_m == pytest.approx(2.0)
+    assert found.reactions["f"].slope is not None and found.reactions["f"].slope.value == pytest.approx(0.5)
+    assert found.on_path["f"].slope is not None and found.on_path["f"].slope.value == 0.0
+    assert (found.on_path["f"].pairs, found.on_path["f"].episodes) == (2, 2)
 
 
 def test_it_ends_when_there_are_enough(monkeypatch: pytest.MonkeyPatch):

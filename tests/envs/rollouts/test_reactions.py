@@ -9,11 +9,12 @@ import torch
 
 from envs.rollouts import branches as rollout_branches
 from envs.rollouts import reactions
-from envs.rollouts.branches import Branch
+from envs.rollouts.branches import Branch, Branches
 from envs.rollouts.reaction_cells import BYSTANDER_CELL, ELSEWHERE, LEADER_CELL, NEAR_CELL, ON_LANES, Cell
 from envs.rollouts.reactions import NEIGHBOURS, STRAIGHT, Moment, Perturbation, ReactionTask, play_reactions
-from envs.rollouts.side_forecasts import SideForecaster
+from envs.rollouts.side_forecasts import SideForecaster, kept_world
 from envs.rollouts.world import World, open_world
+from envs.simulators.interventions import Intervention
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.evaluation.reactions import Reaction, Shifts, reaction
@@ -112,9 +113,11 @@ def measured(moments: int, cell: Cell, make: Callable[[World], dict[str, Any]]) 
         assert one is not None
         found.append(one)
         world.step()
-    true_m = np.stack([one[1] for one in found])
-    episode = np.arange(moments)
-    return {name: reaction(Shifts(true_m, np.stack([one[2][name] for one in found]), episode)) for name in forecasters}
+    true_m = np.stack([one.true_m for one in found])
+    return {
+        name: reaction(Shifts(true_m, np.stack([one.predicted_m[name] for one in found]), np.arange(moments)))
+        for name in forecasters
+    }
 
 
 def test_an_oracle_has_slope_one_and_half_an_oracle_half(branches: list[tuple[Branch, Any]]):
@@ -158,12 +161,12 @@ def test_both_forecasts_have_one_history_and_differ_in_the_sender_alone(branches
     perturbed, plain = shown
     assert len(plain) == len(perturbed) == 4
     assert_same_scenes(plain[:-1], perturbed[:-1])
-    (_, sender), now, instead = one[0], plain[-1], perturbed[-1]
+    now, instead = plain[-1], perturbed[-1]
     np.testing.assert_array_equal(now.ids, instead.ids)
     np.testing.assert_array_equal(now.states[:, :2], instead.states[:, :2])
     changed = (now.states != instead.states).any(axis=1)
-    assert now.ids[changed].tolist() == [sender]
-    slower_mps = np.linalg.norm(state_of(now, sender)[2:]) - np.linalg.norm(state_of(instead, sender)[2:])
+    assert now.ids[changed].tolist() == [one.sender]
+    slower_mps = np.linalg.norm(state_of(now, one.sender)[2:]) - np.linalg.norm(state_of(instead, one.sender)[2:])
     assert slower_mps == pytest.approx(8.0)
 
 
@@ -171,13 +174,13 @@ def test_true_shifts_are_those_of_the_simulator(branches: list[tuple[Branch, Any
     world = queue()
     one = moment(world, {"oracle": Replay(branches)}).perturbed(LEADER_CELL, np.random.default_rng(0))
     assert one is not None
-    (receiver, sender), true_m, predicted_m = one
     ids = world.full_scene().ids.tolist()
     (plain, _), (slow, _) = branches
-    moved = slow.states[1:, ids.index(receiver), :2] - plain.states[1:, ids.index(receiver), :2]
-    np.testing.assert_array_equal(true_m, moved)
-    assert (receiver, sender) in ((1, 2), (2, 3)) and true_m[-1, 0] < -1.0
-    np.testing.assert_allclose(predicted_m["oracle"], true_m, atol=1e-9)
+    column = ids.index(one.receiver)
+    np.testing.assert_array_equal(one.true_m, slow.states[1:, column, :2] - plain.states[1:, column, :2])
+    assert (one.receiver, one.sender) in ((1, 2), (2, 3)) and one.true_m[-1, 0] < -1.0
+    np.testing.assert_allclose(one.predicted_m["oracle"], one.true_m, atol=1e-9)
+    assert (one.cell, one.crashed, one.swerved) == (LEADER_CELL.name, False, False)
 
 
 def test_the_world_goes_on_as_if_nothing_was_asked():
@@ -194,10 +197,44 @@ def test_a_bystander_does_not_move_and_one_taken_out_does():
     asked = moment(world, {"straight": SideForecaster(ConstantVelocity(world.spec), world.spec, STEPS)})
     for seed in range(4):
         aside = asked.perturbed(BYSTANDER_CELL, np.random.default_rng(seed))
-        assert aside is not None and np.abs(aside[1]).max() < 0.1
-        assert (4 in aside[0]) and 0 not in aside[0]
+        assert aside is not None and np.abs(aside.true_m).max() < 0.1
+        assert 4 in (aside.sender, aside.receiver) and 0 not in (aside.sender, aside.receiver)
         gone = asked.perturbed(ON_LANES[-1], np.random.default_rng(seed))
-        assert gone is not None and np.linalg.norm(gone[1], axis=-1).max() > 1.0
+        assert gone is not None and np.linalg.norm(gone.true_m, axis=-1).max() > 1.0
+
+
+def test_a_receiver_that_crashes_is_marked():
+    """The one behind cannot stop any more; it crashes in the perturbed branch alone."""
+    world = road_world((0.0, 4.0), (7.0, 4.0), ego_m=(0.0, 12.0), speed_mps=25.0)
+    world.env._scene = world.reread()[0]  # type: ignore[union-attr]
+    one = moment(world, {}).perturbed(LEADER_CELL, np.random.default_rng(0))
+    assert one is not None and (one.receiver, one.sender, one.crashed) == (1, 2, True)
+
+
+def branches_of(plain: Any, perturbed: Any) -> Branches:
+    """One agent's branches, from its places."""
+    both = []
+    for places in (plain, perturbed):
+        states = np.zeros((len(places), 1, 4))
+        states[:, 0, :2] = places
+        both.append(Branch(states, np.ones((len(places), 1), dtype=np.bool_), ()))
+    return Branches(Intervention(0, "remove", 1), np.array([7]), *both)
+
+
+@pytest.mark.parametrize(
+    ("plain", "perturbed", "swerved"),
+    [
+        ([(0, 0), (20, 0), (40, 0)], [(0, 0), (11, 0), (19, 1)], False),
+        ([(0, 0), (20, 0), (40, 0)], [(0, 0), (30, 0), (60, 1)], False),  # faster, as when one is taken out
+        ([(0, 0), (20, 0), (40, 0)], [(0, 0), (20, 2), (38, 4)], True),
+        ([(0, 0), (20, 4), (40, 4)], [(0, 0), (15, 0), (28, 0)], True),
+        ([(0, 0), (10, 10), (10, 20)], [(0, 0), (4, 4), (8, 8)], False),  # a bend
+        ([(0, 0), (0, 0), (0, 0)], [(0, 0), (3, 0), (9, 0)], False),  # waits, and does not
+    ],
+)
+def test_who_only_drives_slower_or_faster_does_not_swerve(plain: Any, perturbed: Any, swerved: bool):
+    assert reactions._swerved(branches_of(plain, perturbed), 7) is swerved
+    assert reactions._swerved(branches_of(perturbed, plain), 7) is swerved
 
 
 def test_a_moment_without_a_pair_costs_no_branch(branches: list[tuple[Branch, Any]]):
@@ -245,7 +282,7 @@ def test_an_episode_is_a_function_of_its_seed_and_cells_are_independent(
     assert_equal(play_reactions(task(TAG, (checkpoint,))), found)
     only = play_reactions(task(TAG, (checkpoint,), cells=(NEAR_CELL.name,)))
     assert_equal(only, [one for one in found if one.cell == NEAR_CELL.name])
-    assert all(one.step >= reactions.FIRST_STEP for one in found)
+    assert all(one.step >= reactions.FIRST_STEP and one.seed == 900_000 and one.swerved is None for one in found)
 
 
 @pytest.mark.parametrize("kind", ["lstm", "dnri"])
@@ -274,8 +311,8 @@ def test_neighbours_forecast_where_there_is_data(tmp_path: Path, monkeypatch: py
 
 
 def test_an_ego_perceives_what_its_checkpoint_was_trained_on(highway_checkpoint: str):
-    world = reactions._kept_world("two-way-v0", "idle", (highway_checkpoint,))
+    world = kept_world("two-way-v0", "idle", (highway_checkpoint,))
     spec = world.spec
     assert (spec.perception_m, spec.max_agents) == (HIGHWAY_SPEC.perception_m, HIGHWAY_SPEC.max_agents)
-    plain = reactions._kept_world("two-way-v0", "idle", ("constant-velocity",))
+    plain = kept_world("two-way-v0", "idle", ("constant-velocity",))
     assert plain.spec.max_agents != HIGHWAY_SPEC.max_agents

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from predictor.evaluation.reactions import Estimate, Shifts, false_reaction, reaction
+from predictor.evaluation.reactions import Shifts, false_reaction, reaction
+from predictor.evaluation.standard_errors import Estimate
 
 
 def shifts(true_m: object, predicted_m: object, episode: object = None) -> Shifts:
