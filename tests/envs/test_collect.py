@@ -87,7 +87,7 @@ def test_the_store_is_the_same_for_any_number_of_workers(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["1", "2"]
 
 
-PERTURBED = ["--perturb", "0.7", "--causal-labels", "2", "--causal-horizon-s", "1", "--causal-senders", "3"]
+PERTURBED = ["--perturb", "0.7", "--causal-labels", "2", "--causal-horizon-s", "0.3", "--causal-senders", "2"]
 
 
 def test_a_perturbed_store_is_the_same_for_any_number_of_workers_and_after_a_stop(
@@ -117,7 +117,7 @@ def test_a_perturbed_store_is_the_same_for_any_number_of_workers_and_after_a_sto
     assert_same_episodes(stopped.episodes, alone.episodes)
     assert alone.info.causal_threshold_m == stopped.info.causal_threshold_m == 0.05
     assert alone.info.provenance["perturbations"]["share"] == 0.7
-    assert alone.info.provenance["causal_labels"]["horizon_s"] == 1.0
+    assert alone.info.provenance["causal_labels"]["horizon_s"] == 0.3
     assert all(e.perturbed is not None and e.causal_shift_m is not None for e in alone.episodes)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["1", "2", "stopped"]
 

@@ -14,7 +14,7 @@ from tests.envs.interventions import assert_same_scenes, played
 def test_a_share_of_the_steps_is_perturbed_and_every_kind_comes():
     world = open_world("simple_spread_v3", "idle")
     busy, kinds = [], Counter[str]()
-    for seed in range(40):
+    for seed in range(20):
         world.reset(seed)
         perturber = Perturber(world, 0.5, (), perturbation_rng(seed))
         for _ in range(25):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 
 from envs.rollouts.causal_labels import IN_ARENAS
@@ -6,6 +8,7 @@ from envs.rollouts.world import open_world
 from predictor.data.store import PERTURBATIONS
 
 TAG = "simple_tag_v3"
+QUICK = replace(IN_ARENAS, horizon_s=0.3, senders=2)
 
 
 def test_a_record_says_what_was_done_to_whom():
@@ -36,7 +39,7 @@ def test_labels_come_every_so_many_steps_from_a_random_one_on():
     world = open_world(TAG, "idle")
     firsts = set()
     for seed in range(4):
-        found = record(world, seed, "idle", Recording(12, causal_every=5, causal=IN_ARENAS)).causal_shift_m
+        found = record(world, seed, "idle", Recording(12, causal_every=5, causal=QUICK)).causal_shift_m
         assert found is not None
         steps = np.flatnonzero(~np.isnan(found).all(axis=(1, 2)))
         assert (np.diff(steps) == 5).all() and 2 <= len(steps) <= 3
@@ -47,6 +50,6 @@ def test_labels_come_every_so_many_steps_from_a_random_one_on():
 def test_labels_change_nothing_in_the_record():
     world = open_world(TAG, "heuristic")
     plain = record(world, 3, "heuristic", Recording(8, perturb=0.5))
-    labelled = record(world, 3, "heuristic", Recording(8, perturb=0.5, causal_every=3, causal=IN_ARENAS))
+    labelled = record(world, 3, "heuristic", Recording(8, perturb=0.5, causal_every=3, causal=QUICK))
     for name in ("states", "valid", "ids", "perturbed"):
         np.testing.assert_array_equal(getattr(plain, name), getattr(labelled, name))
