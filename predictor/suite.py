@@ -46,6 +46,8 @@ TableName = Literal[
 TABLES = PAPER_TABLES | ABLATIONS | NRI_TABLES
 MIN_HISTORY_STEPS = 8
 """Smallest number of observed steps of a training window, where the table's burn-in is not shorter."""
+ADDED = {"precision": "float32", "causal_edges": False, "reaction_weight": 0.0, "init": ""}
+"""Options that came after the first lines were trained, with the values that change nothing."""
 MEASURING = 2
 """Number of the way of measuring: results of another one are not taken for finished."""
 
@@ -138,6 +140,9 @@ def line_config(config: SuiteConfig, line: Line, out: Path) -> TrainConfig:
         model=line.model,  # type: ignore[arg-type]  # lines without training do not come here
         preset="paper",
         set=sets,
+        input_changes=False,  # a line that has more than the paper's inputs says so
+        fit_inputs=False,
+        edge_geometry=False,
         max_episodes=sizes.max_episodes,
         steps=sizes.steps,
         batch_size=sizes.batch_size,
@@ -171,8 +176,9 @@ def line_folder(config: SuiteConfig, line: Line) -> Path:
         values = asdict(line_config(config, line, Path()))
         for name in ("data", "val_data", "out", "threads", "device", "data_device", "capture", "resume"):
             del values[name]
-        if values["precision"] == "float32":
-            del values["precision"]  # lines trained before the option existed keep their folder
+        for name, before in ADDED.items():
+            if values[name] == before:
+                del values[name]  # lines trained before the option existed keep their folder
         content["train"] = values
     digest = hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:10]
     return config.folder / "rows" / f"{line.key}-{digest}"

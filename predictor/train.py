@@ -5,6 +5,7 @@ a spread like the truth's, whereas one-step errors reward neither.
 """
 
 import json
+import shlex
 import time
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -20,7 +21,7 @@ from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, delete_leftovers, write_json
 from predictor.support.provenance import provenance
 from predictor.support.runtime import tune
-from predictor.training.config import TrainConfig
+from predictor.training.config import BEFORE_THEY_EXISTED, TrainConfig
 from predictor.training.trainer import LOG_EVERY, Trainer, load_data
 
 
@@ -142,11 +143,22 @@ def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
         before, now = json.loads(config_file.read_text())["config"], _comparable(config)
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{config_file} cannot be read ({error}); train anew into another --out") from error
-    defaults = {f.name: f.default for f in fields(TrainConfig)}  # of fields that did not exist when the run began
-    for name, value in now.items():
-        known = before.get(name, defaults[name])
-        if name != "steps" and known != value:
-            raise UserError(f"cannot resume: {name} was {known} and is now {value}; use the same arguments")
+    # of fields that did not exist when the run began
+    defaults = {f.name: f.default for f in fields(TrainConfig)} | BEFORE_THEY_EXISTED
+    old = {name: before.get(name, defaults[name]) for name in now}
+    changed = [name for name in now if old[name] != now[name] and name not in ("steps", *config.without_effect)]
+    if changed:
+        differences = ", ".join(f"{name} was {old[name]} and is now {now[name]}" for name in changed)
+        options = " ".join(_option(name, old[name]) for name in changed)
+        raise UserError(f"cannot resume: {differences}; use the same arguments, with {options}")
+
+
+def _option(name: str, value: Any) -> str:
+    """Returns a field's value as words of a command line."""
+    flag = name.replace("_", "-")
+    if isinstance(value, bool):
+        return f"--{flag}" if value else f"--no-{flag}"
+    return shlex.join([f"--{flag}", *map(str, value if isinstance(value, list) else [value])])
 
 
 def main() -> None:

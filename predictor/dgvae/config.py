@@ -83,7 +83,9 @@ class DGVAEConfig:
         if self.num_modes < 0 or self.num_modes == 1:
             raise UserError(f"num_modes must be 0 or at least 2, got {self.num_modes}")
         if self.num_modes and self.rollout_graph != "frozen":
-            raise UserError("num_modes needs rollout_graph=frozen: what is drawn is held for the whole roll-out")
+            raise UserError(
+                "num_modes needs rollout_graph=frozen: what is drawn is held for the whole roll-out; or set num_modes=0"
+            )
         check_at_least(self, 1, "hidden_dim", "rnn_dim", "head_dim", "message_dim", "decoder_dim", "innovation_dim")
         check_at_least(self, 0, "edge_feature_dim", "innovation_rounds", "static_dim", "substeps", "num_neighbours")
         if self.num_neighbours and self.needs_reverse_pairs:

@@ -15,8 +15,12 @@ Likelihood = Literal["gaussian", "laplace"]
 TrainPrecision = Literal["float32", "tf32", "bfloat16"]
 DataDevice = Literal["auto", "cpu", "device"]
 Capture = Literal["auto", "off"]
-OF_THE_NETWORK = ("preset", "set", "input_changes", "fit_inputs", "edge_geometry")
+OF_THE_DGVAE = ("input_changes", "fit_inputs", "edge_geometry")
+"""Options of the dG-VAE's inputs, without effect on other models."""
+OF_THE_NETWORK = ("preset", "set", *OF_THE_DGVAE)
 """Options that make the network; a checkpoint to start from has them already."""
+BEFORE_THEY_EXISTED = dict.fromkeys(OF_THE_DGVAE, False)
+"""Values of options in runs that began before the option existed, where today's default is another one."""
 
 
 @dataclass(frozen=True)
@@ -31,21 +35,25 @@ class TrainConfig:
     """Episode stores for model selection; none given, episodes of `data` are held out."""
     model: ModelName = "dgvae"
     """Network to train."""
-    preset: Literal["plural", "fast", "paper"] = "fast"
-    """Network: "plural" has modes, so that its samples are enumerated futures with probabilities; "fast" has the same
-    sizes without modes; "paper" is the paper's network. Of other models, "paper" has their published sizes."""
+    preset: Literal["plural", "fast", "paper"] = "plural"
+    """Sizes and parts of the network: "plural" has modes, so that its samples are enumerated futures with
+    probabilities; "fast" has the same sizes without modes; "paper" has those of the paper, whose inputs take
+    `--no-input-changes --no-fit-inputs --no-edge-geometry` as well. Other models have their published sizes with
+    "paper", and half of them otherwise."""
     set: tuple[str, ...] = ()
     """Fields of the network's config to change, as field=value: --set hidden_dim=64 static_dim=16."""
     init: str = ""
     """Checkpoint to start from: a shipped name, a folder or a run folder. Network and scales are the checkpoint's, so
     leave out the options of the network. Empty starts from random weights."""
-    input_changes: bool = False
-    """Whether changes since the last step are inputs of the dG-VAE's encoder (`change_scales`, fitted to the data)."""
-    fit_inputs: bool = False
-    """Whether the dG-VAE's inputs are divided by their spread in the data (`input_scales`), not the spec's scales."""
-    edge_geometry: bool = False
+    input_changes: bool = True
+    """Whether changes since the last step are inputs of the dG-VAE's encoder (`change_scales`, fitted to the data). No
+    effect on other models."""
+    fit_inputs: bool = True
+    """Whether the dG-VAE's inputs are divided by their spread in the data (`input_scales`), not the spec's scales. No
+    effect on other models."""
+    edge_geometry: bool = True
     """Whether relative position, relative speed and time to contact are inputs of the dG-VAE's edges
-    (`geometry_scales`, fitted to the data)."""
+    (`geometry_scales`, fitted to the data, if any step has two agents). No effect on other models."""
     causal_edges: bool = False
     """Whether the causal labels of the stores are the known edges (`--label-weight`, `--type-label-weight`), in place
     of leaders and followers; where a store has none, edges are unknown."""
@@ -156,6 +164,13 @@ class TrainConfig:
             raise UserError("data needs at least one episode store; make one with python -m envs.collect")
         object.__setattr__(self, "device", resolve_device(self.device))
         check_precision(self.precision, self.device)
+
+    @property
+    def without_effect(self) -> tuple[str, ...]:
+        """Options that change nothing in this run."""
+        if self.init:
+            return OF_THE_NETWORK
+        return () if self.model == "dgvae" else OF_THE_DGVAE
 
 
 def check_precision(precision: TrainPrecision, device: str) -> None:

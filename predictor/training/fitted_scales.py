@@ -9,7 +9,6 @@ from predictor.data.store import Episode
 from predictor.graph import pair_mask
 from predictor.layers.state_codec import Residual, StateCodec, drift
 from predictor.scene import SceneSpec
-from predictor.support.errors import UserError
 
 
 def typical_change(episodes: Sequence[Episode], spec: SceneSpec, residual: Residual) -> tuple[float, ...]:
@@ -35,7 +34,11 @@ def typical_spread(episodes: Sequence[Episode], spec: SceneSpec) -> tuple[float,
 
 
 def typical_neighbour(episodes: Sequence[Episode], spec: SceneSpec) -> tuple[float, ...]:
-    """Computes the median distance of an agent to the nearest other [m], and their median relative speed [m/s]."""
+    """Computes the median distance of an agent to the nearest other [m], and their median relative speed [m/s].
+
+    Returns:
+        Both, or nothing if no step has two agents: then no pair has a geometry.
+    """
     axes, distances, speeds = spec.position_dim, [], []
     for episode in episodes:
         states, valid = torch.from_numpy(episode.states), torch.from_numpy(episode.valid)
@@ -48,7 +51,7 @@ def typical_neighbour(episodes: Sequence[Episode], spec: SceneSpec) -> tuple[flo
         distances.append(found.values[near])
         speeds.append(torch.linalg.vector_norm(other - velocity, dim=-1)[near])
     if not sum(len(d) for d in distances):
-        raise UserError("--edge-geometry needs steps with two agents, and the training data has none; leave it out")
+        return ()
     return tuple(max(float(torch.cat(found).median()), 1e-2) for found in (distances, speeds))
 
 

@@ -129,21 +129,17 @@ def model_config(config: TrainConfig, data: TrainingData) -> Any:
     """Builds the network's config, with scales fitted to the training data.
 
     Raises:
-        UserError: --set names a field that the model does not have, or --input-changes, --fit-inputs or
-            --edge-geometry is set for another model than the dG-VAE.
+        UserError: --set names a field that the model does not have.
     """
     plain = configure(config.model, config.preset, config.set)
     fitted = {"delta_scales": typical_change(data.train_episodes, data.spec, plain.residual)}
-    for option in ("input_changes", "fit_inputs", "edge_geometry"):
-        if getattr(config, option) and config.model != "dgvae":
-            flag = "--" + option.replace("_", "-")
-            raise UserError(f"{flag} belongs to the dG-VAE; leave it out for --model {config.model}")
-    if config.input_changes:
-        fitted["change_scales"] = typical_change(data.train_episodes, data.spec, "state")
-    if config.fit_inputs:
-        fitted["input_scales"] = typical_spread(data.train_episodes, data.spec)
-    if config.edge_geometry:
-        fitted["geometry_scales"] = typical_neighbour(data.train_episodes, data.spec)
+    if config.model == "dgvae":
+        if config.input_changes:
+            fitted["change_scales"] = typical_change(data.train_episodes, data.spec, "state")
+        if config.fit_inputs:
+            fitted["input_scales"] = typical_spread(data.train_episodes, data.spec)
+        if config.edge_geometry:
+            fitted["geometry_scales"] = typical_neighbour(data.train_episodes, data.spec)
     return configure(config.model, config.preset, config.set, **fitted)
 
 

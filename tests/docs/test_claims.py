@@ -2,19 +2,26 @@
 
 import json
 import re
+import shlex
 import tomllib
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, MULTIAGENT_IDS
 from predictor.evaluation.paper_tables import NUM_SAMPLES
+from predictor.models import configure
+from predictor.suite import TABLES, SuiteConfig, line_config
+from predictor.support.command_line import parse
+from predictor.training.config import OF_THE_DGVAE, TrainConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 README = (ROOT / "README.md").read_text()
 RESULTS = (ROOT / "docs" / "results.md").read_text()
+TRAINING = (ROOT / "docs" / "training.md").read_text()
 CONTROL = "constant velocity + noise"
 STOCHASTIC = ("dG-VAE", "dVAE", "dNRI", "plural", "nearest neighbours", CONTROL)
 TITLES = {  # the run that a picture's title names
@@ -113,6 +120,22 @@ def test_the_run_in_a_pictures_title_is_the_one_that_the_page_names(picture: str
     assert pages
     for page in pages:
         assert TITLES[picture] in page.read_text(), page.name
+
+
+@pytest.mark.parametrize(("name", "key"), [("dG-VAE (paper)", "dgvae-paper"), ("dG-VAE+", "dgvae")])
+def test_the_options_that_stand_behind_a_name_make_the_suites_row(name: str, key: str):
+    """Whatever the defaults are; sizes are the budget's, the number of features is the table's."""
+    rows = {row[0].strip(): row[2] for row in next(tables(TRAINING.split("## Names")[1]))}
+    words = shlex.split(" ".join(re.findall(r"`([^`]+)`", rows[name])))
+    named = parse(TrainConfig, args=["--data", "store", "--out", "run", *words])
+    suite = SuiteConfig("springs", budget="paper")
+    line = next(line for line in TABLES["springs"].lines if line.key == key)
+    made = line_config(suite, line, Path("run"))
+    weights = [f.name for f in fields(TrainConfig) if f.name.endswith(("_weight", "_cost"))]
+    for field in ("model", "preset", "likelihood", "variance", *OF_THE_DGVAE, *weights):
+        assert getattr(named, field) == getattr(made, field), field
+    features = [each for each in line.set if each.startswith("edge_feature_dim=")]
+    assert configure("dgvae", named.preset, (*named.set, *features)) == configure("dgvae", made.preset, made.set)
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda p: p.name)

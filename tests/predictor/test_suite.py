@@ -186,6 +186,31 @@ def test_a_line_has_a_folder_of_its_own_for_each_config_and_data(data: Path, tmp
     assert line_folder(replace(base, workers=2), line("dgvae")) in folders  # nothing that changes no number
 
 
+def test_lines_keep_their_folders_when_training_gets_options_or_other_defaults(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Names of before `--causal-edges` existed; a new option goes into `ADDED` with the value that changes nothing."""
+    monkeypatch.setattr(suite, "_fingerprint", lambda path: path.name)
+    settings = SuiteConfig("nba", tmp_path, tmp_path)
+    expected = {
+        "nearest-neighbours": "ebf5a8f5df", "dnri": "8979c3fe0d", "dgvae-paper": "59b2f8d38c", "plural": "69071be171",
+    }  # fmt: skip
+    for each in TABLES["nba"].lines:
+        if each.key in expected:
+            assert line_folder(settings, each).name == f"{each.key}-{expected.pop(each.key)}"
+    assert not expected
+
+
+@pytest.mark.parametrize("option", ["causal_edges", "reaction_weight"])
+def test_an_added_option_that_is_used_gives_another_folder(data: Path, tmp_path: Path, option: str):
+    """Both stand together: a weight of reactions needs causal edges."""
+    used = {"causal_edges": True} | ({"reaction_weight": 2.0} if option == "reaction_weight" else {})
+    base, plain = config(data, tmp_path), line("dgvae")
+    more = replace(plain, train=plain.train | used)
+    less = replace(plain, train=plain.train | {k: v for k, v in used.items() if k != option})
+    assert line_folder(base, more) != line_folder(base, less)
+
+
 def test_suite_runs_what_is_missing_and_nothing_else(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     settings = config(data, tmp_path, lines=("constant-velocity", "mlp"), workers=2)
     content = run_suite(settings)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -48,7 +49,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def config(data: Path, out: Path, **changes: Any) -> TrainConfig:
     small = {"steps": 7, "batch_size": 5, "history_steps": 3, "horizon_steps": 2, "val_fraction": 0.34, "eval_every": 2}
-    return TrainConfig(data=(data,), out=out, **(small | changes))
+    return TrainConfig(data=(data,), out=out, **({"preset": "fast"} | small | changes))
 
 
 def weights(trainer: Trainer) -> list[torch.Tensor]:
@@ -391,7 +392,7 @@ def test_killed_process_is_resumed_to_the_same_weights(
 def arguments(settings: TrainConfig) -> list[str]:
     """The command line of a config."""
     names = (
-        "out", "model", "steps", "batch_size", "history_steps", "horizon_steps", "val_fraction", "eval_every",
+        "out", "model", "preset", "steps", "batch_size", "history_steps", "horizon_steps", "val_fraction", "eval_every",
         "threads",
     )  # fmt: skip
     pairs = [(f"--{name.replace('_', '-')}", str(getattr(settings, name))) for name in names]
@@ -453,10 +454,7 @@ def test_bad_input_ends_a_real_process_with_one_line(tmp_path: Path):
         (["--set", "rnn_dim=wide"], "rnn_dim of DGVAEConfig must be of type int, got 'wide'"),
         (["--set", "rnn_dim=0"], "rnn_dim must be at least 1, got 0"),
         (["--set", "delta_scales=1,2"], "delta_scales needs 4 positive numbers, got (1.0, 2.0)"),
-        (
-            ["--model", "mlp", "--input-changes"],
-            "--input-changes belongs to the dG-VAE; leave it out for --model mlp",
-        ),
+        (["--set", "rollout_graph=evolving"], "num_modes needs rollout_graph=frozen"),
         (["--device", "cuda"], "device 'cuda' was asked for but torch finds no CUDA device; use --device cpu"),
     ],
 )
@@ -509,6 +507,59 @@ def test_resuming_with_other_arguments_names_them(
     changed = arguments(config(circles, tmp_path / "run", **change))
     assert message in refused(monkeypatch, capsys, *changed, "--resume")
     assert contents(tmp_path) == before
+
+
+def test_the_options_that_a_message_names_continue_a_run_whose_defaults_have_changed(
+    tiny: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], circles: Path, tmp_path: Path
+):
+    """Without them, the same command is another one than when the run began."""
+    began = config(circles, tmp_path / "run", input_changes=False, set=("rnn_dim=4", "head_dim=3"), val_data=(circles,))
+    train(replace(began, steps=2))
+    capsys.readouterr()
+    command = ["--data", str(circles), "--out", str(tmp_path / "run"), "--steps", "3", "--resume"]
+    given = refused(monkeypatch, capsys, *command)
+    assert "preset was fast and is now plural, " in given and "input_changes was False and is now True, " in given
+    options = shlex.split(given.partition("use the same arguments, with ")[2])
+    assert {"--preset", "fast", "--no-input-changes", "--val-data", "rnn_dim=4"} <= set(options)
+    assert not {"--edge-geometry", "--fit-inputs"} & set(options)
+    monkeypatch.setattr(sys, "argv", ["train", *command, *options])
+    training.main()
+    assert state(tmp_path / "run")["step"] == 3
+
+
+@pytest.mark.parametrize("option", ["input_changes", "fit_inputs", "edge_geometry"])
+def test_a_run_begun_before_an_option_existed_goes_on_without_it(
+    tiny: None, circles: Path, tmp_path: Path, option: str
+):
+    """Its network has no such inputs, whatever the default is today."""
+    settings = config(circles, tmp_path / "run", **{option: False})
+    train(replace(settings, steps=2))
+    forget(tmp_path / "run", option)
+    message = f"cannot resume: {option} was False and is now True; .* with --no-{option.replace('_', '-')}$"
+    with pytest.raises(UserError, match=message):
+        train(replace(settings, resume=True, **{option: True}))
+    train(replace(settings, resume=True))
+    assert state(tmp_path / "run")["step"] == 7
+
+
+def forget(out: Path, option: str) -> None:
+    """Removes an option from what a run folder says, as if it had not existed when the run began."""
+    recorded = json.loads((out / "config.json").read_text())
+    del recorded["config"][option]
+    (out / "config.json").write_text(json.dumps(recorded))
+
+
+def test_options_without_effect_do_not_stop_a_run(tiny: None, circles: Path, tmp_path: Path):
+    other = config(circles, tmp_path / "mlp", model="mlp", input_changes=False, edge_geometry=False)
+    train(replace(other, steps=2))
+    train(replace(other, input_changes=True, edge_geometry=True, resume=True))
+    assert state(tmp_path / "mlp")["step"] == 7
+    first = train(config(circles, tmp_path / "first", steps=2))
+    settings = config(circles, tmp_path / "run", init=str(first), preset="plural")
+    train(replace(settings, steps=2))
+    forget(tmp_path / "run", "edge_geometry")
+    train(replace(settings, resume=True))
+    assert state(tmp_path / "run")["step"] == 7
 
 
 def test_foreign_folder_is_not_written_into(

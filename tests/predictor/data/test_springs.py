@@ -410,6 +410,7 @@ def test_charges_train_a_model_of_three_edge_types(tmp_path: Path):
         (tmp_path / "data" / "train",),
         tmp_path / "run",
         val_data=(tmp_path / "data" / "val",),
+        preset="fast",
         set=("num_edge_types=3", "hidden_dim=6", "rnn_dim=4"),
         type_label_weight=1.0,
         label_weight=1.0,

@@ -346,7 +346,8 @@ def test_one_mode_is_no_choice(count: int):
 def test_modes_need_a_frozen_graph():
     with pytest.raises(UserError) as error:
         replace(PLURAL, rollout_graph="evolving")
-    assert str(error.value) == "num_modes needs rollout_graph=frozen: what is drawn is held for the whole roll-out"
+    message = "num_modes needs rollout_graph=frozen: what is drawn is held for the whole roll-out; or set num_modes=0"
+    assert str(error.value) == message
     assert replace(PLURAL, rollout_graph="evolving", num_modes=0).rollout_graph == "evolving"
 
 

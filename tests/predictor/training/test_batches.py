@@ -183,7 +183,9 @@ def test_device_batches_give_the_same_windows(step: int, shapes: Shapes | None):
 @pytest.mark.parametrize("changes", [{}, {"min_history_steps": 1, "curriculum_steps": 4}], ids=["plain", "schedules"])
 def test_training_on_resident_data_is_training(tmp_path: Path, changes: dict[str, Any]):
     data = write_circles(tmp_path / "circles")
-    settings = TrainConfig((data,), tmp_path / "run", batch_size=16, history_steps=4, horizon_steps=3, **changes)
+    settings = TrainConfig(
+        (data,), tmp_path / "run", preset="fast", batch_size=16, history_steps=4, horizon_steps=3, **changes
+    )
     host, resident = (Trainer(s, load_data(s)) for s in (settings, replace(settings, data_device="device")))
     assert isinstance(host.batches, HostBatches) and isinstance(resident.batches, DeviceBatches)
     for _ in range(5):

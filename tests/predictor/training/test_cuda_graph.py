@@ -66,7 +66,7 @@ pytestmark = pytest.mark.usefixtures("tiny")
 
 def config(data: Path, out: Path, **changes: Any) -> TrainConfig:
     small = {"steps": 7, "batch_size": 5, "history_steps": 3, "horizon_steps": 2, "val_fraction": 0.34, "eval_every": 2}
-    return TrainConfig(data=(data,), out=out, **(small | changes))
+    return TrainConfig(data=(data,), out=out, **({"preset": "fast"} | small | changes))
 
 
 def made(settings: TrainConfig, recorder: FakeRecorder | None = None, padded: bool = False) -> Trainer:

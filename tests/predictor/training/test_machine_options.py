@@ -26,6 +26,7 @@ pytestmark = pytest.mark.usefixtures("tiny")
 
 def config(data: Path, out: Path, **changes: Any) -> TrainConfig:
     small = {
+        "preset": "fast",
         "steps": 4,
         "batch_size": 16,
         "history_steps": 3,

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from predictor.checkpoint import load_checkpoint
 from predictor.data.store import Episode, StoreInfo, write_store
+from predictor.dgvae.config import PRESETS
 from predictor.models import name_of
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from predictor.support.errors import UserError
@@ -25,11 +26,12 @@ from predictor.training.trainer import Trainer, load_data, model_config
 from tests.predictor.helpers import FAST_LIKE, circling_episode, random_states, spec, write_circles
 
 SMALL = {"steps": 2, "batch_size": 4, "history_steps": 3, "horizon_steps": 2, "val_fraction": 0.34, "eval_every": 2}
+INPUTS = {"input_changes": "change_scales", "fit_inputs": "input_scales", "edge_geometry": "geometry_scales"}
 # Every kind of model at a size that trains in milliseconds, as a user would ask for it.
 MODELS: dict[str, dict[str, Any]] = {
     "dgvae": {"set": ("hidden_dim=5", "rnn_dim=4")},
+    "dgvae-bare": {"input_changes": False, "fit_inputs": False, "edge_geometry": False},
     "dgvae-rich": {
-        "input_changes": True,
         "set": ("static_dim=2", "innovation_rounds=1", "substeps=2", "gated_messages=true", "residual=trapezoid"),
     },
     "dgvae-plural": {"set": ("num_modes=3", "rollout_graph=frozen")},
@@ -43,7 +45,8 @@ pytestmark = pytest.mark.usefixtures("tiny")
 
 
 def config(data: Path, out: Path, **changes: Any) -> TrainConfig:
-    return TrainConfig(data=(data,), out=out, **(SMALL | changes))
+    preset: dict[str, Any] = {} if "init" in changes else {"preset": "fast"}  # the tiny network, without modes
+    return TrainConfig(data=(data,), out=out, **(preset | SMALL | changes))
 
 
 def made(settings: TrainConfig) -> Trainer:
@@ -133,18 +136,29 @@ def test_teacher_forced_training_takes_no_free_run(circles: Path, tmp_path: Path
 
 
 def test_scales_are_fitted_to_the_training_episodes(circles: Path, tmp_path: Path):
-    settings = config(circles, tmp_path, input_changes=True, edge_geometry=True, set=("residual=trapezoid",))
+    """All of them, unless options say otherwise."""
+    settings = config(circles, tmp_path, set=("residual=trapezoid",))
     data = load_data(settings)
     fitted = model_config(settings, data)
     assert fitted.delta_scales == typical_change(data.train_episodes, spec(), "trapezoid")
     assert fitted.change_scales == typical_change(data.train_episodes, spec(), "state")
+    assert fitted.input_scales == typical_spread(data.train_episodes, spec())
     assert fitted.geometry_scales == typical_neighbour(data.train_episodes, spec())
     assert fitted.delta_scales[:2] != fitted.change_scales[:2]
     assert fitted.delta_scales[2:] == fitted.change_scales[2:]
-    plain = replace(fitted, delta_scales=(), change_scales=(), geometry_scales=())
+    plain = replace(fitted, delta_scales=(), change_scales=(), input_scales=(), geometry_scales=())
     assert plain == replace(FAST_LIKE, residual="trapezoid")
-    unset = model_config(replace(settings, input_changes=False, edge_geometry=False), data)
-    assert unset.change_scales == unset.geometry_scales == ()
+    for option, scales in INPUTS.items():
+        unset = model_config(replace(settings, **{option: False}), data)
+        assert unset == replace(fitted, **{scales: ()}) != fitted
+
+
+def test_a_network_that_nothing_was_said_about_is_plural_and_has_all_inputs(circles: Path, tmp_path: Path):
+    settings = TrainConfig((circles,), tmp_path)
+    made_of = model_config(settings, load_data(settings))
+    plural = PRESETS["plural"]
+    assert plural.num_modes and all(getattr(made_of, scales) for scales in INPUTS.values())
+    assert replace(made_of, delta_scales=(), **dict.fromkeys(INPUTS.values(), ())) == plural
 
 
 def test_given_scales_win_over_fitted_ones(circles: Path, tmp_path: Path):
@@ -152,14 +166,21 @@ def test_given_scales_win_over_fitted_ones(circles: Path, tmp_path: Path):
     assert model_config(settings, load_data(settings)).delta_scales == (1.0, 2.0, 3.0, 4.0)
 
 
-@pytest.mark.parametrize("option", ["input_changes", "fit_inputs", "edge_geometry"])
 @pytest.mark.parametrize("model", ["dnri", "imma", "lstm", "mlp"])
-def test_changes_and_scales_are_of_the_dgvae_only(circles: Path, tmp_path: Path, model: Any, option: str):
-    settings = config(circles, tmp_path, model=model, **{option: True})
-    message = f"--{option.replace('_', '-')} belongs to the dG-VAE; leave it out for --model {model}"
-    with pytest.raises(UserError) as error:
-        model_config(settings, load_data(settings))
-    assert str(error.value) == message
+def test_inputs_of_the_dgvae_have_no_effect_on_other_models(circles: Path, tmp_path: Path, model: Any):
+    settings = config(circles, tmp_path, model=model)
+    data = load_data(settings)
+    without = replace(settings, **dict.fromkeys(INPUTS, False))
+    assert model_config(settings, data) == model_config(without, data)
+    assert settings.without_effect == tuple(INPUTS) and replace(settings, model="dgvae").without_effect == ()
+
+
+def test_geometry_is_left_out_where_no_step_has_two_agents(tmp_path: Path):
+    settings = config(write_circles(tmp_path / "alone", agents=1), tmp_path / "run")
+    trainer = made(settings)
+    fitted = trainer.model.config
+    assert fitted.geometry_scales == () and fitted.change_scales and fitted.input_scales
+    assert math.isfinite(trainer.read(trainer.train_step())["loss"])
 
 
 @pytest.mark.parametrize(
@@ -367,17 +388,18 @@ def test_typical_neighbours_are_the_nearest_ones():
     assert typical_neighbour([episode], spec()) == pytest.approx((7.0, 2.0))
 
 
-def test_edge_geometry_needs_two_agents():
+def test_an_agent_alone_has_no_typical_neighbour():
     alone = Episode(np.zeros((3, 1, 4), dtype=np.float32), np.ones((3, 1), dtype=np.bool_), np.arange(1))
-    with pytest.raises(UserError, match="--edge-geometry needs steps with two agents"):
-        typical_neighbour([alone], spec())
+    assert typical_neighbour([alone], spec()) == ()
+    apart = Episode(np.zeros((2, 2, 4), dtype=np.float32), np.eye(2, dtype=np.bool_), np.arange(2))  # never together
+    assert typical_neighbour([alone, apart], spec()) == ()
 
 
 # --- From a checkpoint ------------------------------------------------------------------------------------------------
 
 
 def test_training_may_start_from_a_checkpoint(circles: Path, tmp_path: Path):
-    first = train(config(circles, tmp_path / "first", set=("num_modes=3", "rollout_graph=frozen"), fit_inputs=True))
+    first = train(config(circles, tmp_path / "first", set=("num_modes=3", "rollout_graph=frozen")))
     began = made(config(circles, tmp_path / "second", init=str(tmp_path / "first"), horizon_steps=1))
     source, info = load_checkpoint(first)
     assert began.model.config == info.config and began.model.horizon_steps == 1
@@ -395,7 +417,7 @@ def test_what_began_well_is_kept_if_training_makes_it_worse(circles: Path, tmp_p
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"fit_inputs": True}, "init takes the network of 'RUN'; leave out fit_inputs"),
+        ({"fit_inputs": False}, "init takes the network of 'RUN'; leave out fit_inputs"),
         ({"preset": "paper", "set": ("rnn_dim=3",)}, "leave out preset, set"),
         ({"model": "lstm"}, "is of model dgvae; pass --model dgvae"),
         ({"init": "nowhere"}, "nowhere"),
