@@ -5,7 +5,8 @@ its agents, perceived again or not (`envs.rollouts.episode`). Constant velocity 
 recorded data, so does a memoryless nearest-neighbour forecaster. Counted are all agents but an ego, whose future is
 the policy's choice, and landmarks. Several checkpoints make a transfer matrix: trained on A, measured on B.
 
-`--reactions` measures instead how forecasts react when an agent brakes or is taken out (docs/reactions.md).
+`--reactions` measures instead how forecasts react when an agent brakes or is taken out, `--graph` the inferred edges
+against causal labels (docs/reactions.md).
 """
 
 import multiprocessing
@@ -22,7 +23,7 @@ from rich.console import Console
 from rich.progress import track
 
 from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, checkpoint_for
-from envs.rollouts import reaction_report, report
+from envs.rollouts import graph_report, reaction_report, report
 from envs.rollouts.branches import check_can_branch
 from envs.rollouts.episode import (
     MODEL,
@@ -36,7 +37,8 @@ from envs.rollouts.episode import (
     memory_key,
     play,
 )
-from envs.rollouts.reaction_run import EnvReactions, ReactionRun, measure_reactions
+from envs.rollouts.graph_run import GraphRun, measure_graph
+from envs.rollouts.reaction_run import ReactionRun, measure_reactions
 from envs.rollouts.report import EnvAccuracy
 from envs.rollouts.world import default_drivers, open_world
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, name_of_folder, read_info, resolve
@@ -106,6 +108,10 @@ class EvaluateConfig:
     """Number of perturbations of each kind for --reactions."""
     most_episodes: int = 400
     """Largest number of episodes that --reactions plays in each environment to find so many."""
+    graph: bool = False
+    """Whether to measure, instead of accuracy, the inferred edges against causal labels (whose future changes when an
+    agent brakes or is taken out), beside distance, "the leader" and the commoner answer, in --episodes episodes:
+    graph.json, graph.md and a figure per environment under --out."""
 
     def __post_init__(self) -> None:
         """Checks ranges.
@@ -280,39 +286,67 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
     return results, misfits
 
 
-def evaluate_reactions(config: EvaluateConfig, console: Console) -> list[EnvReactions]:
-    """Measures the reactions of all checkpoints in all environments; writes them under `config.out`.
+def evaluate_causes(config: EvaluateConfig, console: Console) -> None:
+    """Measures reactions, inferred edges, or both, of all checkpoints in all environments; writes `config.out`.
 
     Raises:
         UserError: an environment cannot be perturbed or copied, or no checkpoint fits it.
     """
     drivers = {env_id: config.driver or default_drivers(env_id)[0] for env_id in config.env_ids}
-    for env_id in config.env_ids:  # raises before hours of work
-        check_can_branch(env_id, "idle" if drivers[env_id].endswith(".zip") else drivers[env_id])
+    for env_id, driver in drivers.items():  # raises before hours of work
+        check_can_branch(env_id, "idle" if driver.endswith(".zip") else driver)
+    if config.reactions:
+        runs = [_reaction_run(config, env_id, driver) for env_id, driver in drivers.items()]
+        _measure_all(config, console, "reactions", runs, measure_reactions, reaction_report)
+    if config.graph:
+        edges = [_graph_run(config, env_id, driver) for env_id, driver in drivers.items()]
+        _measure_all(config, console, "graph", edges, measure_graph, graph_report)
+
+
+def _reaction_run(config: EvaluateConfig, env_id: str, driver: str) -> ReactionRun:
+    return ReactionRun(
+        env_id, driver, config.checkpoint or (checkpoint_for(env_id),), config.perturbations, config.most_episodes,
+        config.seed, config.max_steps, config.workers, config.horizon_steps, _stores_of(config.data, env_id),
+    )  # fmt: skip
+
+
+def _graph_run(config: EvaluateConfig, env_id: str, driver: str) -> GraphRun:
+    checkpoints = config.checkpoint or (checkpoint_for(env_id),)
+    return GraphRun(env_id, driver, checkpoints, config.episodes, config.seed, config.max_steps, config.workers)
+
+
+def _measure_all(
+    config: EvaluateConfig, console: Console, name: str, runs: Sequence[Any], measure: Any, reports: Any
+) -> None:
+    """Measures each run, prints it, and writes NAME.json, NAME.md and figures.
+
+    Args:
+        config: settings of the command.
+        console: terminal.
+        name: name of the files.
+        runs: settings of the measurement in each environment.
+        measure: function from such settings to a result.
+        reports: module that shows a result.
+    """
     results = []
-    for env_id, driver in drivers.items():
-        run = ReactionRun(
-            env_id, driver, config.checkpoint or (checkpoint_for(env_id),), config.perturbations, config.most_episodes,
-            config.seed, config.max_steps, config.workers, config.horizon_steps, _stores_of(config.data, env_id),
-        )  # fmt: skip
-        results.append(measure_reactions(run))
-        console.print(reaction_report.shown(results[-1]))
-        for remark in reaction_report.remarks(results[-1]):
+    for run in runs:
+        results.append(measure(run))
+        console.print(reports.shown(results[-1]))
+        for remark in reports.remarks(results[-1]):
             console.print(remark)
         if config.out is not None:
-            reaction_report.write_picture(config.out, results[-1])
+            reports.write_picture(config.out, results[-1])
     if config.out is not None:
-        content = {"config": asdict(config), "results": [reaction_report.as_json(r) for r in results]}
-        write_json(config.out / "reactions.json", finite(content | {"provenance": provenance(PACKAGES)}))
-        write_text(config.out / "reactions.md", reaction_report.markdown(results))
-    return results
+        content = {"config": asdict(config), "results": [reports.as_json(result) for result in results]}
+        write_json(config.out / f"{name}.json", finite(content | {"provenance": provenance(PACKAGES)}))
+        write_text(config.out / f"{name}.md", reports.markdown(results))
 
 
 def main() -> None:
     """Entry point."""
     keep_freed_memory()
     config = parse(EvaluateConfig, __doc__)
-    console = Console(width=200 if config.reactions else 170)
+    console = Console(width=200 if config.reactions or config.graph else 170)
     if config.out is not None and config.out.is_file():
         raise UserError(f"{config.out} is a file; choose another --out")
     for env_id in config.env_ids:  # unknown ids and drivers raise before hours of work
@@ -321,8 +355,8 @@ def main() -> None:
     for checkpoint in config.checkpoint:
         if checkpoint != CONSTANT_VELOCITY:
             resolve(checkpoint)
-    if config.reactions:
-        evaluate_reactions(config, console)
+    if config.reactions or config.graph:
+        evaluate_causes(config, console)
         return
     results, misfits = evaluate(config, console)
     if not results:

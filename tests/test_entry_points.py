@@ -123,6 +123,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--env-ids merge-v1 --out file", "file is a file; choose another --out"),
         ("--checkpoint runs/a/checkpoint runs/a", "each checkpoint needs a name of its own, got a, a"),
         ("--reactions --perturbations 0", "perturbations must be at least 1, got 0"),
+        ("--graph --env-ids pursuit_v5", "raw_env cannot be perturbed; use an environment of highway-env"),
         ("--reactions --env-ids pursuit_v5", "raw_env cannot be perturbed; use an environment of highway-env"),
     ],
     "envs.export_levelx": [

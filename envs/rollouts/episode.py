@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 from envs.multiagent_observation import MultiagentStream
 from envs.observation import ForecastStream
 from envs.readers.highway_labels import SceneLabels
+from envs.rollouts.moving import moving_agents
 from envs.rollouts.side_forecasts import SideForecaster, kept_forecaster
 from envs.rollouts.world import EgoWorld, MultiagentWorld, World, open_world
 from envs.scene_stream import ForecastConfig
@@ -35,8 +36,6 @@ from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 MODEL, STRAIGHT, NEIGHBOURS = "model", "constant velocity", "nearest neighbours"
 NOISY, RESIDUAL = "constant velocity + noise", "model + Gaussian noise"
 """Keys of the forecasters of an episode; `memory_key(steps)` gives those of the memory ablations."""
-LANDMARK = "landmark"
-"""Feature that marks agents that never move."""
 CASE_HISTORY_STEPS = 20
 """Number of past steps shown of a worst case."""
 
@@ -223,13 +222,12 @@ def futures(
         spec: layout of the scenes.
     """
     agents = len(scenes[0].ids)
-    fixed = spec.feature_names.index(LANDMARK) if LANDMARK in spec.feature_names else None
     future = np.zeros((len(scenes), agents, horizon_steps, 2))
     valid = np.zeros((len(scenes), agents, horizon_steps), dtype=np.bool_)
     positions = [dict(zip(t.ids.tolist(), t.states[:, :2], strict=True)) for t in truths]
     for now, scene in enumerate(scenes):
         origin = scene.states[0, :2] if spec.has_ego else np.zeros(2)
-        moving = scene.valid if fixed is None else scene.valid & (scene.states[:, fixed] == 0)
+        moving = moving_agents(scene, spec)
         for agent in range(int(spec.has_ego), agents):
             for ahead in range(horizon_steps):
                 later = now + ahead + 1

@@ -5,7 +5,6 @@ which their drivers are free. Elsewhere (arenas, several learners) who reacts is
 *near* moves the receiver by more than the threshold of the causal labels, a *bystander* by less than a tenth of it.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,12 +15,10 @@ from envs.readers.highway import is_highway_env
 from envs.readers.highway_labels import LEADER, NO_EDGE, SceneLabels
 from envs.rollouts.causal_labels import settings_for
 from envs.rollouts.interventions import body_of, interventions_of
+from envs.rollouts.moving import moving_agents
 from envs.rollouts.world import EgoWorld, World
 from envs.simulators.interventions import Intervention, Kind
-from predictor.scene import Scene
 
-LANDMARK = "landmark"
-"""Feature that marks agents that never move."""
 STILL_M = 0.1
 """True shift below which a receiver on a road counts as not moved [m]."""
 STILL_SHARE = 0.1
@@ -97,7 +94,7 @@ def pairs_of(cell: Cell, world: World) -> list[Pair]:
     scene, spec = world.perceived(), world.spec
     settings, labels = settings_for(world), world.labels()
     place = {int(agent): i for i, agent in enumerate(world.full_scene().ids)}
-    moving = _moving(scene, world)
+    moving = [int(i) for i in np.flatnonzero(moving_agents(scene, spec))]
     busy = interventions_of(world)
     found = []
     for sender in moving:
@@ -114,13 +111,6 @@ def pairs_of(cell: Cell, world: World) -> list[Pair]:
             if _fits(cell.role, world, pair, labels, place):
                 found.append(pair)
     return found
-
-
-def _moving(scene: Scene, world: World) -> Sequence[int]:
-    """Returns the indices of perceived agents but landmarks."""
-    names = world.spec.feature_names
-    fixed = scene.states[:, names.index(LANDMARK)] != 0 if LANDMARK in names else np.zeros_like(scene.valid)
-    return [int(i) for i in np.flatnonzero(scene.valid & ~fixed)]
 
 
 def _is_too_slow(cell: Cell, state: Float[np.ndarray, " state"], axes: int) -> bool:

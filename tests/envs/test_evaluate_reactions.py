@@ -1,12 +1,15 @@
-"""The command `python -m envs.evaluate --reactions`."""
+"""The commands `python -m envs.evaluate --reactions` and `--graph`."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from envs import evaluate
-from envs.rollouts import reactions
+from envs.rollouts import graph_run, reactions
+from envs.rollouts.causal_labels import IN_ARENAS
+from envs.rollouts.graph_run import DISTANCE, MAJORITY
 from envs.rollouts.reaction_cells import ELSEWHERE
 from envs.rollouts.reactions import STRAIGHT
 from tests.envs.evaluation import TAG, forget, no_processes, read_json, save_tag
@@ -47,11 +50,30 @@ def test_the_command_writes_table_figure_and_numbers(
     assert f"| {ELSEWHERE[0].name} | 2 (" in (out / "reactions.md").read_text()
 
 
+def test_the_graph_is_written_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
+    """Both measurements in one run; labels are of one sender, as quick as they can be."""
+    quick = replace(IN_ARENAS, horizon_s=0.2, senders=1)
+    monkeypatch.setattr(graph_run, "settings_for", lambda world: quick)
+    out = tmp_path / "results"
+    arguments = ["--reactions", "--graph", "--env-ids", TAG, "--checkpoint", save_tag(tmp_path / "tag")]
+    arguments += ["--perturbations", "1", "--most-episodes", "1", "--episodes", "2", "--max-steps", "8"]
+    arguments += ["--workers", "1", "--out", str(out)]
+    code, errors, output = run_command(evaluate.main, arguments, monkeypatch, capsys)
+    assert (code, errors) == (0, [])
+    assert "edges by" in output and "false reaction" in output
+    assert {"graph.json", "graph.md", f"{TAG}.graph.png", "reactions.json"} <= {path.name for path in out.iterdir()}
+    (result,) = read_json(out / "graph.json")["results"]
+    assert list(result["scores"]) == ["tag", MAJORITY, DISTANCE]
+    assert result["settings"]["senders"] == 1 and result["scores"]["tag"]["pairs"] > 0
+    assert "| tag | " in (out / "graph.md").read_text()
+
+
 ERRORS = {
     "no-copies": (["--env-ids", TAG, "pursuit_v5"], "raw_env cannot be perturbed; use an environment of highway-env"),
     "zero": (["--perturbations", "0"], "perturbations must be at least 1, got 0"),
     "no-episodes": (["--most-episodes", "0"], "most_episodes must be at least 1, got 0"),
     "no-store": (["--data", "nowhere"], "nowhere is not a readable episode store"),
+    "no-copies-for-a-graph": (["--graph", "--env-ids", "pursuit_v5"], "raw_env cannot be perturbed"),
     "no-checkpoint": (["--checkpoint", "nowhere"], "no checkpoint 'nowhere'"),
 }
 

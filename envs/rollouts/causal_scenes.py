@@ -1,0 +1,102 @@
+"""Plays episodes and pairs inferred edges with causal labels at some of their steps, for `envs.evaluate --graph`.
+
+At every fifth step, from a random one on, copies of the simulator say whose future changes when another agent brakes or
+is taken out (`envs.rollouts.causal_labels`). Beside each known label stand each checkpoint's probability of an edge,
+the distance, and whether the simulator says that the receiver follows the sender. Pairs of which one agent is not
+perceived have no inferred edge and are left out, and so are landmarks.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from envs.readers.highway_labels import LEADER
+from envs.rollouts.causal_labels import CausalSettings, causal_labels
+from envs.rollouts.moving import moving_agents
+from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters, kept_world
+from envs.rollouts.world import World
+from envs.seeding import label_rng
+
+EVERY = 5
+"""Number of steps from one with labels to the next."""
+FIRST_STEP = 3
+"""First step with labels; forecasters have seen the motion by then."""
+
+
+@dataclass(frozen=True)
+class GraphTask:
+    """Settings of one episode; can be pickled."""
+
+    env_id: str
+    """Id of the environment."""
+    driver: str
+    """Name of the driver."""
+    checkpoints: tuple[str, ...]
+    """Checkpoints that infer edges; the first one's perception holds for all."""
+    seed: int
+    """Seed of the episode."""
+    max_steps: int
+    """Largest length of an episode [policy steps]."""
+    settings: CausalSettings
+    """How labels are measured."""
+
+
+@dataclass(frozen=True)
+class EdgeScene:
+    """Pairs of one step whose causal label is known."""
+
+    shift_m: Float[np.ndarray, " pairs"]
+    """Causal shift [m]."""
+    receiver: Int[np.ndarray, " pairs"]
+    """Id of the receiver."""
+    distance_m: Float[np.ndarray, " pairs"]
+    """Distance of the two agents [m]."""
+    leads: Bool[np.ndarray, " pairs"] | None
+    """Whether the simulator says that the receiver follows the sender; None where it says nothing."""
+    edge_prob: dict[str, Float[np.ndarray, " pairs"]]
+    """Probability of an edge of any type, by checkpoint."""
+
+
+def play_graph(task: GraphTask) -> list[EdgeScene]:
+    """Plays one episode and returns its scenes with labels."""
+    world = kept_world(task.env_id, task.driver, task.checkpoints)
+    world.reset(task.seed)
+    found = checkpoint_forecasters(task.checkpoints, world.spec, task.env_id)
+    forecasters = {name: SideForecaster(forecaster, world.spec, 1) for name, forecaster in found.items()}
+    first = int(label_rng(task.seed).integers(EVERY))
+    scenes = []
+    for step in range(task.max_steps):
+        for forecaster in forecasters.values():
+            forecaster.observe(world.perceived())
+        if step >= FIRST_STEP and step % EVERY == first:
+            scenes.append(labelled_scene(world, forecasters, task.settings))
+        if world.step():
+            break
+    return scenes
+
+
+def labelled_scene(world: World, forecasters: dict[str, SideForecaster], settings: CausalSettings) -> EdgeScene:
+    """Returns the pairs of the present scene whose causal label is known.
+
+    Args:
+        world: a running world; it is not changed.
+        forecasters: forecasters that have observed the present scene.
+        settings: how labels are measured.
+    """
+    scene, labels, leaders = world.perceived(), causal_labels(world, settings), world.labels()
+    moving = moving_agents(scene, world.spec)
+    seen = {int(agent): i for i, agent in enumerate(scene.ids) if moving[i]}
+    place = np.array([seen.get(agent, -1) for agent in labels.ids], dtype=np.int64)
+    known = np.isfinite(labels.shift_m) & (place[:, None] >= 0) & (place >= 0)
+    receiver, sender = np.nonzero(known)
+    at = place[receiver], place[sender]
+    positions = scene.states[:, : world.spec.position_dim]
+    probs = {name: forecaster.forecast().edge_probs[0].cpu().numpy() for name, forecaster in forecasters.items()}
+    return EdgeScene(
+        labels.shift_m[receiver, sender].astype(np.float64),
+        np.asarray(labels.ids, dtype=np.int64)[receiver],
+        np.linalg.norm(positions[at[0]] - positions[at[1]], axis=-1),
+        None if leaders is None else leaders.edge_types[receiver, sender] == LEADER,
+        {name: (1 - one[at[0], at[1], 0]).astype(np.float64) for name, one in probs.items()},
+    )

@@ -1,0 +1,127 @@
+"""Reports of `envs.evaluate --graph`: a table for a terminal and a page, precision against recall, calibration."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from rich.table import Table
+
+from envs.rollouts.graph_run import DISTANCE, LEADERS, MAJORITY, EnvGraph
+from predictor.evaluation.causal_graph import CausalScores
+from predictor.evaluation.standard_errors import Estimate
+from predictor.support.markdown import table
+
+HEADS = (
+    "edges by", "accuracy", "precision", "recall", "F1 (95 %)", "F1, fitted bound", "AUC (95 %)", "average precision",
+    "calibration error", "r with shift (95 %)", "spread over senders",
+)  # fmt: skip
+"""Columns of the table."""
+COLORS = {DISTANCE: "tab:green", LEADERS: "black", MAJORITY: "grey"}
+"""Colors of the rules that need no network."""
+
+
+def title(result: EnvGraph) -> str:
+    """Returns the title of one environment's table."""
+    first = next(iter(result.scores.values()))
+    return (
+        f"{result.env_id}, driven {result.driver}: {first.pairs} pairs of {first.episodes} episodes, "
+        f"{100 * first.share:.0f} % are edges"
+    )
+
+
+def remarks(result: EnvGraph) -> list[str]:
+    """Returns which checkpoints were left out, and why."""
+    return [f"left out: {name}: {why}" for name, why in result.misfits.items()]
+
+
+def shown(result: EnvGraph) -> Table:
+    """Returns the table of one environment for a terminal."""
+    lines = Table(title=title(result))
+    for i, heading in enumerate(HEADS):
+        lines.add_column(heading, justify="right" if i else "left", no_wrap=heading.endswith("(95 %)"))
+    for cells in _lines(result):
+        lines.add_row(*cells)
+    return lines
+
+
+def markdown(results: Sequence[EnvGraph]) -> str:
+    """Returns all tables as Markdown."""
+    parts = []
+    for result in results:
+        notes = "".join(f"\n* {remark}" for remark in remarks(result))
+        parts.append(f"### {title(result)}\n\n{table(HEADS, _lines(result))}\n{notes}\n")
+    return "\n".join(parts)
+
+
+def _lines(result: EnvGraph) -> list[list[str]]:
+    lines = []
+    for name, found in result.scores.items():
+        spread = found.spread_between_senders
+        lines.append(
+            [
+                name, _value(found.accuracy), _value(found.precision), _value(found.recall), _with_interval(found.f1),
+                _value(found.fitted), _with_interval(found.auc), _value(found.average_precision),
+                _value(found.calibration_error), _with_interval(found.strength),
+                "–" if spread is None or not found.bins else f"{spread:.2f}",
+            ]
+        )  # fmt: skip
+    return lines
+
+
+def _value(estimate: Estimate | None) -> str:
+    return "–" if estimate is None else f"{estimate.value:.2f}"
+
+
+def _with_interval(estimate: Estimate | None) -> str:
+    if estimate is None or estimate.interval is None:
+        return _value(estimate)
+    return f"{_value(estimate)} ({estimate.interval[0]:.2f} to {estimate.interval[1]:.2f})"
+
+
+def as_json(result: EnvGraph) -> dict[str, Any]:
+    """Returns one environment's results for `graph.json`."""
+    return asdict(result)
+
+
+def write_picture(out: Path, result: EnvGraph) -> None:
+    """Writes `ENV.graph.png` under `out`: precision against recall, and calibration."""
+    matplotlib.use("Agg")
+    out.mkdir(parents=True, exist_ok=True)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
+    for name, found in result.scores.items():
+        plot_curve(left, name, found)
+        plot_calibration(right, name, found)
+    right.plot([0, 1], [0, 1], color="0.8", lw=0.8, zorder=0)
+    for ax, x, y in ((left, "recall", "precision"), (right, "probability of an edge", "share of causal edges")):
+        ax.set(xlabel=x, ylabel=y, xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
+        ax.grid(alpha=0.3)
+    left.legend(frameon=False, fontsize=8)
+    figure.suptitle(title(result), fontsize=11)
+    figure.savefig(out / f"{result.env_id.replace('/', '-')}.graph.png", dpi=130)
+    plt.close(figure)
+
+
+def plot_curve(ax: Axes, name: str, found: CausalScores) -> Axes:
+    """Plots precision against recall over all bounds, with a mark at the rule's own bound."""
+    if name != MAJORITY and found.curve:
+        own = [float("nan") if one is None else one.value for one in (found.recall, found.precision)]
+        (mark,) = ax.plot(own[0], own[1], marker="o", ms=6, color=COLORS.get(name), label=name)
+        if len(found.curve) > 2:  # a rule that only says yes or no is one place
+            ax.plot(*zip(*found.curve, strict=True), lw=1.3, color=mark.get_color())
+    if name == MAJORITY:
+        ax.axhline(found.share, color=COLORS[MAJORITY], lw=0.8, ls=":", label="share of edges")
+    return ax
+
+
+def plot_calibration(ax: Axes, name: str, found: CausalScores) -> Axes:
+    """Plots the share of edges against the probability, by bin; the area of a mark shows the number of pairs."""
+    filled = [(one.mean_prob, one.share, one.pairs) for one in found.bins if one.pairs]
+    if filled:
+        prob, share, pairs = zip(*filled, strict=True)
+        (line,) = ax.plot(prob, share, lw=1.0, label=name)
+        ax.scatter(prob, share, s=[8 + 300 * count / found.pairs for count in pairs], color=line.get_color(), alpha=0.6)
+    return ax

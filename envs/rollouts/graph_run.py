@@ -1,0 +1,118 @@
+"""Measures inferred edges against causal labels in one environment, beside rules that need no network."""
+
+import multiprocessing
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from rich.progress import track
+
+from envs.rollouts.causal_labels import CausalSettings, settings_for
+from envs.rollouts.causal_scenes import EdgeScene, GraphTask, play_graph
+from envs.rollouts.side_forecasts import fitting_checkpoints
+from envs.rollouts.world import open_world
+from predictor.evaluation.causal_graph import CausalPairs, CausalScores, halves, score_rule
+from predictor.support.errors import UserError
+
+MAJORITY, DISTANCE, LEADERS = "the commoner answer", "distance", "the leader"
+"""Names of the rules that need no network."""
+EDGE = 0.5
+"""Probability above which a model infers an edge."""
+
+
+@dataclass(frozen=True)
+class GraphRun:
+    """Settings of the measurement in one environment."""
+
+    env_id: str
+    """Id of the environment."""
+    driver: str
+    """Name of the driver."""
+    checkpoints: tuple[str, ...]
+    """Checkpoints to measure."""
+    episodes: int
+    """Number of episodes: bounds are fitted on the first half, all else is measured on the second."""
+    seed: int
+    """Seed of the first episode."""
+    max_steps: int
+    """Largest length of an episode [policy steps]."""
+    workers: int
+    """Number of parallel processes."""
+
+
+@dataclass(frozen=True)
+class EnvGraph:
+    """Scores of inferred edges in one environment."""
+
+    env_id: str
+    """Id of the environment."""
+    driver: str
+    """Name of the driver."""
+    episodes: int
+    """Number of episodes played."""
+    settings: CausalSettings
+    """How labels were measured."""
+    scores: dict[str, CausalScores]
+    """Scores of each checkpoint and each rule, by name."""
+    misfits: dict[str, str]
+    """Reason for each checkpoint that was left out, by its name."""
+
+
+def measure_graph(run: GraphRun) -> EnvGraph:
+    """Plays the episodes of one environment and scores all checkpoints and rules on the same pairs.
+
+    Raises:
+        UserError: the environment cannot be perturbed or copied, checkpoints perceive differently, none fits, or no
+            label is known.
+    """
+    world = open_world(run.env_id, run.driver if not run.driver.endswith(".zip") else "idle")
+    spec, settings = world.spec, settings_for(world)
+    world.close()
+    fitting, misfits = fitting_checkpoints(run.env_id, run.checkpoints, spec)
+    tasks = [
+        GraphTask(run.env_id, run.driver, fitting, run.seed + i, run.max_steps, settings) for i in range(run.episodes)
+    ]
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(min(run.workers, len(tasks)), initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        played = pool.imap(play_graph, tasks, chunksize=1)
+        episodes = list(track(played, f"graph {run.env_id}", total=len(tasks)))
+    scores = scores_of(episodes, settings.threshold_m)
+    if not next(iter(scores.values())).pairs:
+        raise UserError(f"{run.env_id}: no causal label is known in {run.episodes} episodes; add --episodes")
+    return EnvGraph(run.env_id, run.driver, run.episodes, settings, scores, misfits)
+
+
+def scores_of(episodes: Sequence[Sequence[EdgeScene]], threshold_m: float) -> dict[str, CausalScores]:
+    """Returns the scores of all checkpoints and rules, by name."""
+    scenes = [(number, step, scene) for number, found in enumerate(episodes) for step, scene in enumerate(found)]
+    if not sum(len(scene.shift_m) for *_, scene in scenes):
+        return {MAJORITY: CausalScores(0, 0, 0.0, None)}
+    ids = 1 + max(int(scene.receiver.max(initial=0)) for *_, scene in scenes)
+    pairs = CausalPairs.concatenate(
+        [
+            CausalPairs(
+                scene.shift_m,
+                scene.shift_m > threshold_m,
+                np.full(len(scene.shift_m), number),
+                step * ids + scene.receiver,
+            )
+            for number, step, scene in scenes
+        ]
+    )
+
+    def joined(parts: Sequence[np.ndarray]) -> np.ndarray:
+        return np.concatenate(parts).astype(np.float64)
+
+    scores = {
+        name: score_rule(joined([scene.edge_prob[name] for *_, scene in scenes]), pairs, EDGE, probability=True)
+        for name in scenes[0][2].edge_prob
+    }
+    fit, _ = halves(pairs)
+    common = float(pairs.exists[fit].mean()) if fit.any() else 0.0
+    scores[MAJORITY] = score_rule(np.full(len(pairs), common), pairs, EDGE)
+    scores[DISTANCE] = score_rule(-joined([scene.distance_m for *_, scene in scenes]), pairs, None)
+    if all(scene.leads is not None for *_, scene in scenes):
+        leads = joined([np.asarray(scene.leads) for *_, scene in scenes])
+        scores[LEADERS] = score_rule(leads, pairs, EDGE)
+    return scores
