@@ -44,7 +44,8 @@ class TrainConfig:
     """Fields of the network's config to change, as field=value: --set hidden_dim=64 static_dim=16."""
     init: str = ""
     """Checkpoint to start from: a shipped name, a folder or a run folder. Network and scales are the checkpoint's, so
-    leave out the options of the network. Empty starts from random weights."""
+    leave out the options of the network; frame and range of perception are the data's. Empty starts from random
+    weights."""
     input_changes: bool = True
     """Whether changes since the last step are inputs of the dG-VAE's encoder (`change_scales`, fitted to the data). No
     effect on other models."""

@@ -8,7 +8,7 @@ import math
 import pickle
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -144,10 +144,11 @@ def model_config(config: TrainConfig, data: TrainingData) -> Any:
 
 
 def initial_model(config: TrainConfig, data: TrainingData) -> Any:
-    """Builds the model with random weights, or with those of the checkpoint to start from.
+    """Builds the model with random weights, or with those of the checkpoint to start from, for the data's scenes.
 
     Raises:
-        UserError: as `model_config`; or the checkpoint cannot be read, is of another model, or has other features.
+        UserError: as `model_config`; or the checkpoint cannot be read, is of another model, or its scenes have other
+            features, or an ego where the data's have none, or none where the data's have one.
     """
     if not config.init:
         return build(config.model, data.spec, model_config(config, data), config.horizon_steps)
@@ -155,7 +156,13 @@ def initial_model(config: TrainConfig, data: TrainingData) -> Any:
     if info.model != config.model:
         raise UserError(f"checkpoint '{config.init}' is of model {info.model}; pass --model {info.model}")
     info.spec.check_compatible(data.spec, f"checkpoint '{config.init}'", f"store {config.data[0]}")
-    model = build(info.model, info.spec, info.config, config.horizon_steps)
+    if info.spec.has_ego != data.spec.has_ego:
+        raise UserError(
+            f"checkpoint '{config.init}' has has_ego={info.spec.has_ego} but store {config.data[0]} has "
+            f"has_ego={data.spec.has_ego}; start from a checkpoint that agrees, or without --init"
+        )
+    spec = replace(data.spec, feature_scales=info.spec.feature_scales)  # scales are the network's, the rest the data's
+    model = build(info.model, spec, info.config, config.horizon_steps)
     model.load_state_dict(source.state_dict())
     return model
 

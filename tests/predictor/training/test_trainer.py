@@ -407,6 +407,23 @@ def test_training_may_start_from_a_checkpoint(circles: Path, tmp_path: Path):
         assert torch.equal(began.model.state_dict()[name], value), name
 
 
+def test_a_start_takes_the_frame_and_range_of_the_data(circles: Path, tmp_path: Path):
+    first = str(train(config(circles, tmp_path / "first")))
+    seen = replace(spec(frame=("ego", "world"), perception_m=50.0), feature_scales=(7.0, 7.0, 7.0, 7.0))
+    write_store(tmp_path / "moving", StoreInfo(seen, "circles"), [circling_episode(i) for i in range(6)])
+    began = made(config(tmp_path / "moving", tmp_path / "second", init=first))
+    assert began.model.spec == replace(seen, feature_scales=spec().feature_scales)
+    kept = load_checkpoint(train(config(tmp_path / "moving", tmp_path / "second", init=first)))[1]
+    assert kept.spec == began.model.spec
+
+
+def test_a_start_with_another_ego_is_named(circles: Path, tmp_path: Path):
+    first = str(train(config(circles, tmp_path / "first")))
+    write_store(tmp_path / "equals", StoreInfo(spec(has_ego=False), "circles"), [circling_episode(i) for i in range(6)])
+    with pytest.raises(UserError, match="has has_ego=True but store .*equals has has_ego=False; start from"):
+        made(config(tmp_path / "equals", tmp_path / "second", init=first))
+
+
 def test_what_began_well_is_kept_if_training_makes_it_worse(circles: Path, tmp_path: Path):
     first = train(config(circles, tmp_path / "first", steps=30, lr=1e-2))
     harmed = train(config(circles, tmp_path / "second", init=str(first), lr=200.0))
