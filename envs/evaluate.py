@@ -6,7 +6,7 @@ recorded data, so does a memoryless nearest-neighbour forecaster. Counted are al
 the policy's choice, and landmarks. Several checkpoints make a transfer matrix: trained on A, measured on B.
 
 `--reactions` measures instead how forecasts react when an agent brakes or is taken out, `--graph` the inferred edges
-against causal labels (docs/reactions.md).
+against causal labels (docs/reactions.md), `--plans` what-if forecasts for plans of the ego (docs/what_if.md).
 """
 
 import multiprocessing
@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.progress import track
 
 from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, checkpoint_for
-from envs.rollouts import graph_report, reaction_report, report
+from envs.rollouts import graph_report, plan_report, reaction_report, report
 from envs.rollouts.branches import check_can_branch
 from envs.rollouts.episode import (
     MODEL,
@@ -38,6 +38,7 @@ from envs.rollouts.episode import (
     play,
 )
 from envs.rollouts.graph_run import GraphRun, measure_graph
+from envs.rollouts.plan_run import PlanRun, check_has_plans, measure_plans
 from envs.rollouts.reaction_run import ReactionRun, measure_reactions
 from envs.rollouts.report import EnvAccuracy
 from envs.rollouts.world import default_drivers, open_world
@@ -112,6 +113,10 @@ class EvaluateConfig:
     """Whether to measure, instead of accuracy, the inferred edges against causal labels (whose future changes when an
     agent brakes or is taken out), beside distance, "the leader" and the commoner answer, in --episodes episodes:
     graph.json, graph.md and a figure per environment under --out."""
+    plans: bool = False
+    """Whether to measure, instead of accuracy, what-if forecasts: each plan of the ego is played in copies of the
+    simulator at every fifth step of --episodes episodes. plans.json, plans.md and a figure per environment under
+    --out."""
 
     def __post_init__(self) -> None:
         """Checks ranges.
@@ -287,7 +292,9 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
 
 
 def evaluate_causes(config: EvaluateConfig, console: Console) -> None:
-    """Measures reactions, inferred edges, or both, of all checkpoints in all environments; writes `config.out`.
+    """Measures reactions, inferred edges and plans, as asked, of all checkpoints in all environments.
+
+    Results are written under `config.out`.
 
     Raises:
         UserError: an environment cannot be perturbed or copied, or no checkpoint fits it.
@@ -295,12 +302,17 @@ def evaluate_causes(config: EvaluateConfig, console: Console) -> None:
     drivers = {env_id: config.driver or default_drivers(env_id)[0] for env_id in config.env_ids}
     for env_id, driver in drivers.items():  # raises before hours of work
         check_can_branch(env_id, "idle" if driver.endswith(".zip") else driver)
+        if config.plans:
+            check_has_plans(env_id)
     if config.reactions:
         runs = [_reaction_run(config, env_id, driver) for env_id, driver in drivers.items()]
         _measure_all(config, console, "reactions", runs, measure_reactions, reaction_report)
     if config.graph:
         edges = [_graph_run(config, env_id, driver) for env_id, driver in drivers.items()]
         _measure_all(config, console, "graph", edges, measure_graph, graph_report)
+    if config.plans:
+        plans = [_plan_run(config, env_id, driver) for env_id, driver in drivers.items()]
+        _measure_all(config, console, "plans", plans, measure_plans, plan_report)
 
 
 def _reaction_run(config: EvaluateConfig, env_id: str, driver: str) -> ReactionRun:
@@ -313,6 +325,13 @@ def _reaction_run(config: EvaluateConfig, env_id: str, driver: str) -> ReactionR
 def _graph_run(config: EvaluateConfig, env_id: str, driver: str) -> GraphRun:
     checkpoints = config.checkpoint or (checkpoint_for(env_id),)
     return GraphRun(env_id, driver, checkpoints, config.episodes, config.seed, config.max_steps, config.workers)
+
+
+def _plan_run(config: EvaluateConfig, env_id: str, driver: str) -> PlanRun:
+    return PlanRun(
+        env_id, driver, config.checkpoint or (checkpoint_for(env_id),), config.episodes, config.seed, config.max_steps,
+        config.workers, config.horizon_steps,
+    )  # fmt: skip
 
 
 def _measure_all(
@@ -346,7 +365,8 @@ def main() -> None:
     """Entry point."""
     keep_freed_memory()
     config = parse(EvaluateConfig, __doc__)
-    console = Console(width=200 if config.reactions or config.graph else 170)
+    causes = config.reactions or config.graph or config.plans
+    console = Console(width=200 if causes else 170)
     if config.out is not None and config.out.is_file():
         raise UserError(f"{config.out} is a file; choose another --out")
     for env_id in config.env_ids:  # unknown ids and drivers raise before hours of work
@@ -355,7 +375,7 @@ def main() -> None:
     for checkpoint in config.checkpoint:
         if checkpoint != CONSTANT_VELOCITY:
             resolve(checkpoint)
-    if config.reactions or config.graph:
+    if causes:
         evaluate_causes(config, console)
         return
     results, misfits = evaluate(config, console)

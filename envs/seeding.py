@@ -3,13 +3,13 @@
 Environments draw from `numpy.random.default_rng(seed)`: Gymnasium, PettingZoo and mpe2 make their generators so. A
 driver whose generator had the same seed would draw the numbers that set the environment's start, and its hidden habits
 could be inferred from the first scene. Each driver therefore draws from a child of the seed's `SeedSequence`. So do
-random interventions, the choice of the steps that get causal labels, branches, and what is perturbed to measure
-reactions, whatever the number of drivers.
+random interventions, the choice of the steps that get causal labels, branches, what is perturbed to measure reactions,
+and the steps at which plans are played, whatever the number of drivers.
 """
 
 import numpy as np
 
-_PERTURBATIONS, _LABELS, _BRANCHES, _REACTIONS = (2**16 + i for i in range(4))
+_PERTURBATIONS, _LABELS, _BRANCHES, _REACTIONS, _PLANS = (2**16 + i for i in range(5))
 """Numbers of the children for what is not a driver; drivers have the first ones."""
 
 
@@ -31,6 +31,11 @@ def branch_rng(seed: int) -> np.random.Generator:
 def reaction_rng(seed: int) -> np.random.Generator:
     """Returns the generator that chooses an episode's steps and agents at which reactions are measured."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_REACTIONS,)))
+
+
+def plan_rng(seed: int) -> np.random.Generator:
+    """Returns the generator that chooses an episode's steps at which what-if forecasts are measured."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_PLANS,)))
 
 
 def driver_rng(seed: int | None, group: int = 0) -> np.random.Generator:

@@ -26,6 +26,8 @@ class Plans:
     """Whether the ego has collided with a fixed obstacle by each step; None takes False."""
     size_m: tuple[float, float] = (5.0, 2.0)
     """Length and width of every agent [m], with which collisions are found; default: highway-env's vehicles."""
+    later_actions: tuple[tuple[Any, ...], ...] | None = None
+    """Actions of each plan's steps after the first; needed to play plans in a simulator (`envs.evaluate --plans`)."""
 
 
 @runtime_checkable
@@ -50,7 +52,7 @@ def checked_plans(model: PlanModel, env: gym.Env, horizon_steps: int, num_featur
         num_features: number of features of a state.
 
     Raises:
-        UserError: plans of another shape, not finite numbers, or not one action for each plan.
+        UserError: plans of another shape, not finite numbers, or not one action for each plan and step.
     """
     plans, count = model.plans(env, horizon_steps), len(model.names)
     source = f"plan model {type(model).__name__}"
@@ -70,4 +72,7 @@ def checked_plans(model: PlanModel, env: gym.Env, horizon_steps: int, num_featur
             raise UserError(f"{source}: {name} must be finite, got NaN or infinity")
     if count < 1 or len(plans.actions) != count:
         raise UserError(f"{source}: each of its {count} plans needs one action, got {len(plans.actions)}")
+    later = None if plans.later_actions is None else [len(actions) for actions in plans.later_actions]
+    if later not in (None, [horizon_steps - 1] * count):
+        raise UserError(f"{source}: later_actions need {horizon_steps - 1} for each of {count} plans, got {later}")
     return plans

@@ -9,6 +9,7 @@ on the ramp) see an empty road.
 import copy
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -76,27 +77,29 @@ class HighwayPlans:
         """Returns the plans from the environment's present state, which stays as it is."""
         runs = [_simulate(env.unwrapped, candidate, horizon_steps) for candidate in self._candidates.values()]
         states, actions, rewards, crash_rewards, crashed = zip(*runs, strict=True)
-        return Plans(np.stack(states), actions, np.array(rewards), np.array(crash_rewards), np.array(crashed))
+        first, later = tuple(a[0] for a in actions), tuple(tuple(a[1:]) for a in actions)
+        made = Plans(np.stack(states), first, np.array(rewards), np.array(crash_rewards), np.array(crashed))
+        return replace(made, later_actions=later)
 
 
 def _simulate(env: Any, candidate: str | _Control, horizon_steps: int) -> tuple[Any, ...]:
-    """Returns states, first action, rewards without and with a collision, and collisions of a candidate."""
+    """Returns states, actions, rewards without and with a collision, and collisions of a candidate, for each step."""
     alone = _Alone(env)
     frames = int(env.config["simulation_frequency"] // env.config["policy_frequency"])
-    states, rewards, crash_rewards, crashed, first = [], [], [], [], None
+    states, actions, rewards, crash_rewards, crashed = [], [], [], [], []
     target = alone.lane_beside(candidate.lane) if isinstance(candidate, _Control) else None
     for step in range(horizon_steps):
         if isinstance(candidate, _Control):
             action, target = alone.controls(candidate.throttle, target, frames)
         else:
             action = alone.action_type.actions_indexes[candidate if step == 0 else "IDLE"]
-        first = action if first is None else first
+        actions.append(action)
         alone.advance(action, frames)
         states.append(alone.state())
         crashed.append(bool(alone.ego.crashed))
         rewards.append(alone.reward(action, crashed=crashed[-1]))
         crash_rewards.append(alone.reward(action, crashed=True))
-    return np.array(states), first, rewards, crash_rewards, crashed
+    return np.array(states), actions, rewards, crash_rewards, crashed
 
 
 class _Alone:

@@ -17,7 +17,7 @@ True
 """
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +26,7 @@ from highway_env.envs.common.abstract import AbstractEnv
 from jaxtyping import Bool, Float, Int
 
 from envs.rollouts.interventions import body_of, hold_others, intervene, kinds_of
-from envs.rollouts.world import World, open_world
+from envs.rollouts.world import EgoWorld, World, open_world
 from envs.simulators.interventions import Intervention, log_motion, simulator_of
 from predictor.scene import Scene
 from predictor.support.errors import UserError
@@ -112,6 +112,21 @@ class BranchPoint:
             UserError: the agent does not allow it.
         """
         return self._branches(copied(self._world), intervention)
+
+    def driven(self, driver: Callable[[Any], Any]) -> Branch:
+        """Plays the moment with another driver of the ego, and without an intervention.
+
+        Args:
+            driver: function from the ego's observation to its action.
+
+        Raises:
+            UserError: the environment has no ego.
+        """
+        other = copied(self._world)
+        if not isinstance(other, EgoWorld):
+            raise UserError("another driver of the ego needs an environment with one ego, this one has several agents")
+        other.hand_over(driver)
+        return _play(other, self.ids, self._horizon, self._streams)[0]
 
     def direct(self, intervention: Intervention, receiver: int) -> Branches:
         """Plays an intervention to which one agent alone may react: all others move as without it.

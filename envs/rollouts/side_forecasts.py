@@ -7,6 +7,7 @@ import functools
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from envs.drivers.trained import sees_forecasts
 from envs.rollouts.world import World, open_world
@@ -68,6 +69,10 @@ class SideForecaster:
         """Forecasts the latest scene, agents as in it; dense."""
         forecast = self._online.forecast(self._horizon, self._samples, self._noise)
         return forecast.without_first(self._front)
+
+    def forecast_plans(self, plans: Float[np.ndarray, "plans horizon state"]) -> Forecast:
+        """Forecasts the latest scene, which needs an ego, for each plan of the ego [SI, world frame]."""
+        return self._online.forecast(self._horizon, self._samples, self._noise, plans[None])
 
 
 @functools.lru_cache(maxsize=8)

@@ -5,6 +5,7 @@ of the wrappers that a policy is trained with, so that the deployed scenes are r
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -104,6 +105,10 @@ class EgoWorld:
         self.observation, _ = self.env.reset(seed=seed)
         self._rng = driver_rng(seed)
         self._ego = make_ego_driver(self._name, self.env, self._rng)
+
+    def hand_over(self, driver: Callable[[Any], Any]) -> None:
+        """Lets another driver act from now on, until the next reset: a function from observations to actions."""
+        self._ego = driver
 
     def step(self) -> bool:
         """Lets the ego act."""

@@ -1,4 +1,4 @@
-"""The commands `python -m envs.evaluate --reactions` and `--graph`."""
+"""The commands `python -m envs.evaluate --reactions`, `--graph` and `--plans`."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -68,12 +68,25 @@ def test_the_graph_is_written_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "| tag | " in (out / "graph.md").read_text()
 
 
+def test_plans_are_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
+    out = tmp_path / "results"
+    arguments = ["--plans", "--env-ids", "merge-v1", "--checkpoint", STILL, "--episodes", "2", "--max-steps", "9"]
+    arguments += ["--horizon-steps", "2", "--workers", "1", "--out", str(out)]
+    code, errors, output = run_command(evaluate.main, arguments, monkeypatch, capsys)
+    assert (code, errors) == (0, [])
+    assert "right choices" in output and "collisions by plan: IDLE" in output
+    assert {path.name for path in out.iterdir()} == {"plans.json", "plans.md", "merge-v1.plans.png"}
+    (result,) = read_json(out / "plans.json")["results"]
+    assert list(result["scores"]) == [STRAIGHT] and result["moments"] >= 1 and result["horizon_steps"] == 2
+
+
 ERRORS = {
     "no-copies": (["--env-ids", TAG, "pursuit_v5"], "raw_env cannot be perturbed; use an environment of highway-env"),
     "zero": (["--perturbations", "0"], "perturbations must be at least 1, got 0"),
     "no-episodes": (["--most-episodes", "0"], "most_episodes must be at least 1, got 0"),
     "no-store": (["--data", "nowhere"], "nowhere is not a readable episode store"),
     "no-copies-for-a-graph": (["--graph", "--env-ids", "pursuit_v5"], "raw_env cannot be perturbed"),
+    "no-plans": (["--plans", "--env-ids", TAG], "plans are those of one ego, and simple_tag_v3 has several"),
     "no-checkpoint": (["--checkpoint", "nowhere"], "no checkpoint 'nowhere'"),
 }
 

@@ -47,20 +47,22 @@ def test_a_plan_is_what_the_ego_then_does_and_earns_alone(env_id: str):
     idle = plans.actions[model.names.index("IDLE")]
     assert plans.rewards is not None
     for plan, action in enumerate(plans.actions):
-        states, rewards = driven(deepcopy(env), [action] + [idle] * (HORIZON - 1))
+        assert plans.later_actions is not None and plans.later_actions[plan] == (idle,) * (HORIZON - 1)
+        states, rewards = driven(deepcopy(env), [action, *plans.later_actions[plan]])
         np.testing.assert_allclose(plans.states[plan], states, atol=1e-6, err_msg=model.names[plan])
         np.testing.assert_allclose(plans.rewards[plan], rewards, atol=1e-9, err_msg=model.names[plan])
 
 
-def test_continuous_plans_are_repeated_by_their_first_action():
+def test_continuous_plans_are_repeated_by_their_actions():
     env = alone("racetrack-v1")
     model = plan_model_for(env)
     assert model.names == ("keep", "keep left", "keep right")
     plans = model.plans(env, HORIZON)
     for plan, action in enumerate(plans.actions):
         assert action in env.action_space
-        states, _ = driven(deepcopy(env), [action])
-        np.testing.assert_allclose(plans.states[plan, 0], states[0], atol=1e-5)
+        assert plans.later_actions is not None
+        states, _ = driven(deepcopy(env), [action, *plans.later_actions[plan]])
+        np.testing.assert_allclose(plans.states[plan], states, atol=1e-4)
     lateral_m = [env.unwrapped.vehicle.lane.local_coordinates(state[:2])[1] for state in plans.states[:, -1]]  # type: ignore[attr-defined]
     assert abs(lateral_m[0]) < 1.5
 
@@ -145,9 +147,11 @@ class TwoPlans:
         return self.found
 
 
-def given(states: np.ndarray, actions: tuple[int, ...], rewards: np.ndarray | None = None) -> Any:
+def given(states: np.ndarray, actions: tuple[int, ...], rewards: np.ndarray | None = None, later: Any = None) -> Any:
     """What a careless model may return; `Plans` itself refuses such shapes while shapes are checked."""
-    return SimpleNamespace(states=states, actions=actions, rewards=rewards, crash_rewards=None, crashed=None)
+    return SimpleNamespace(
+        states=states, actions=actions, rewards=rewards, crash_rewards=None, crashed=None, later_actions=later
+    )
 
 
 def test_a_registered_model_serves_its_class_and_others_are_refused(monkeypatch: pytest.MonkeyPatch):
@@ -165,6 +169,10 @@ def test_a_registered_model_serves_its_class_and_others_are_refused(monkeypatch:
     [
         (given(np.zeros((2, 2, 4)), (0, 1)), r"states need the shape \(2, 3, 4\), got \(2, 2, 4\)"),
         (given(np.full((2, 3, 4), np.nan), (0, 1)), "states must be finite, got NaN or infinity"),
+        (
+            given(np.zeros((2, 3, 4)), (0, 1), later=((0, 0), (0,))),
+            r"later_actions need 2 for each of 2 plans, got \[2, 1\]",
+        ),
         (given(np.zeros((2, 3, 4)), (0,)), "each of its 2 plans needs one action, got 1"),
         (given(np.zeros((2, 3, 4)), (0, 1), np.zeros((2, 2))), r"rewards need the shape \(2, 3\), got \(2, 2\)"),
     ],

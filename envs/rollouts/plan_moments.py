@@ -1,0 +1,191 @@
+"""Plays episodes, and what follows at some of their steps if the ego takes each plan, for `envs.evaluate --plans`.
+
+At every fifth step, from a random one on, the world is copied and played for the horizon with the ego's own driver, and
+with each plan of the environment's plan model, all with equal random numbers. Each forecaster says beforehand what the
+others will do if the ego does what it then did, or follows the plan; and how likely the plan ends in a collision.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from envs.plans import PlanModel, checked_plans, plan_model_for
+from envs.plans.base import Plans
+from envs.plans.contact import contacts
+from envs.rollouts.branches import Branch, BranchPoint
+from envs.rollouts.moving import moving_agents
+from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters, kept_world
+from envs.rollouts.world import World
+from envs.seeding import plan_rng
+from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.forecaster import has_scale
+from predictor.scene import Forecast, Scene, SceneBatch
+from predictor.support.errors import UserError
+
+EVERY = 5
+"""Number of steps from one at which plans are played to the next."""
+FIRST_STEP = 3
+"""First such step; forecasters have seen the motion by then."""
+MODES = 20
+"""Number of futures of a forecaster with modes, as the planner takes; others have their single forecast."""
+STRAIGHT = "constant velocity"
+
+
+@dataclass(frozen=True)
+class PlanTask:
+    """Settings of one episode; can be pickled."""
+
+    env_id: str
+    """Id of the environment."""
+    driver: str
+    """Name of the driver."""
+    checkpoints: tuple[str, ...]
+    """Checkpoints that forecast; the first one's perception holds for all."""
+    seed: int
+    """Seed of the episode."""
+    max_steps: int
+    """Largest length of an episode [policy steps]."""
+    horizon_steps: int
+    """Number of steps forecast and played."""
+
+
+@dataclass(frozen=True)
+class PlanMoment:
+    """One step of an episode with what followed; branch 0 is the ego's own driver, the others are its plans."""
+
+    seed: int
+    """Seed of the episode."""
+    step: int
+    """Step within the episode."""
+    crashed: Bool[np.ndarray, " branches"]
+    """Whether the ego had collided by the end of the horizon."""
+    agents: Int[np.ndarray, " branches"]
+    """Number of agents whose forecasts are compared: perceived, there for the whole horizon; 0 after a collision."""
+    without_m: dict[str, Float[np.ndarray, " branches"]]
+    """Sum over those agents of the mean displacement of the single forecast that knows no plan, by forecaster [m]."""
+    with_m: dict[str, Float[np.ndarray, " branches"]]
+    """The same with the plan given; in branch 0 the plan is what the ego then did."""
+    risk: dict[str, Float[np.ndarray, " plans"]]
+    """Forecast probability of a collision within the horizon, by forecaster; the own driver has none."""
+
+
+def play_plans(task: PlanTask) -> list[PlanMoment]:
+    """Plays one episode and returns its moments."""
+    world = kept_world(task.env_id, task.driver, task.checkpoints)
+    world.reset(task.seed)
+    model = plan_model_for(world.env)
+    found = {STRAIGHT: ConstantVelocity(world.spec)} | checkpoint_forecasters(task.checkpoints, world.spec, task.env_id)
+    forecasters = {
+        name: SideForecaster(
+            forecaster, world.spec, task.horizon_steps, samples=MODES if has_scale(forecaster) else 1, seed=task.seed
+        )
+        for name, forecaster in found.items()
+    }
+    first = int(plan_rng(task.seed).integers(EVERY))
+    moments = []
+    for step in range(task.max_steps):
+        for forecaster in forecasters.values():
+            forecaster.observe(world.perceived())
+        if step >= FIRST_STEP and step % EVERY == first:
+            moments.append(moment(world, model, forecasters, task.seed, step, task.horizon_steps))
+        if world.step():
+            break
+    return moments
+
+
+def moment(
+    world: World,
+    model: PlanModel,
+    forecasters: dict[str, SideForecaster],
+    seed: int,
+    step: int,
+    horizon_steps: int,
+) -> PlanMoment:
+    """Plays the present step with every plan.
+
+    Args:
+        world: a running world with one ego; it is not changed.
+        model: source of the plans.
+        forecasters: forecasters that have observed the present scene.
+        seed: seed of the episode.
+        step: step within the episode.
+        horizon_steps: number of steps to play.
+
+    Raises:
+        UserError: the environment cannot be copied, or its plan model does not say how plans go on.
+    """
+    scene = world.perceived()
+    plans = checked_plans(model, world.env, horizon_steps, world.spec.num_features)
+    point = BranchPoint(world, horizon_steps)
+    played = [point.plain, *(point.driven(_Script(actions)) for actions in _scripts(plans, model))]
+    ego = int(point.ids[0])
+    crashed = np.array([ego in branch.crashed for branch in played])
+    future = [_future(scene, branch, point.ids) for branch in played]
+    counted = [
+        valid & moving_agents(scene, world.spec) & (not hit) for (_, valid), hit in zip(future, crashed, strict=True)
+    ]
+    for valid in counted:
+        valid[0] = False  # the ego
+    followed = np.concatenate([point.plain.states[None, 1:, 0], plans.states])
+    without_m, with_m, risk = {}, {}, {}
+    for name, forecaster in forecasters.items():
+        plain, planned = forecaster.forecast(), forecaster.forecast_plans(followed)
+        without_m[name] = np.array(
+            [_error_m(plain.xy[0, 0].cpu().numpy(), xy, ok) for (xy, _), ok in zip(future, counted, strict=True)]
+        )
+        with_m[name] = np.array(
+            [
+                _error_m(planned.xy[0, branch, 0].cpu().numpy(), xy, ok)
+                for branch, ((xy, _), ok) in enumerate(zip(future, counted, strict=True))
+            ]
+        )
+        risk[name] = _risk(planned, scene, plans)
+    return PlanMoment(seed, step, crashed, np.array([ok.sum() for ok in counted]), without_m, with_m, risk)
+
+
+class _Script:
+    """Driver that takes given actions, whatever it sees."""
+
+    def __init__(self, actions: tuple[object, ...]) -> None:
+        self._actions = iter(actions)
+
+    def __call__(self, obs: object) -> object:
+        return next(self._actions)
+
+
+def _scripts(plans: Plans, model: PlanModel) -> list[tuple[object, ...]]:
+    if plans.later_actions is None:
+        raise UserError(
+            f"plan model {type(model).__name__} gives the first action of each plan alone; give later_actions too, to "
+            "have its plans played"
+        )
+    return [(first, *later) for first, later in zip(plans.actions, plans.later_actions, strict=True)]
+
+
+def _future(
+    scene: Scene, branch: Branch, ids: Int[np.ndarray, " present"]
+) -> tuple[Float[np.ndarray, "agents horizon 2"], Bool[np.ndarray, " agents"]]:
+    """Returns the true positions of the agents of a scene, relative to the ego's now, and who is there all the time."""
+    column = {int(agent): i for i, agent in enumerate(ids)}
+    place = np.array([column.get(int(agent), -1) for agent in scene.ids])
+    there = scene.valid & (place >= 0)
+    xy = branch.states[1:, place, :2].swapaxes(0, 1) - scene.states[0, :2]
+    return xy, there & branch.valid[1:, place].all(axis=0)
+
+
+def _error_m(
+    forecast: Float[np.ndarray, "agents horizon 2"],
+    future: Float[np.ndarray, "agents horizon 2"],
+    counted: Bool[np.ndarray, " agents"],
+) -> float:
+    """Computes the sum over agents of the mean displacement [m]."""
+    return float(np.linalg.norm(forecast[counted] - future[counted], axis=-1).mean(axis=-1).sum())
+
+
+def _risk(planned: Forecast, scene: Scene, plans: Plans) -> Float[np.ndarray, " plans"]:
+    """Computes the probability of a collision of each plan, as the planner does; the first entry is no plan's."""
+    survival = contacts(planned, SceneBatch.stack([scene]), plans.size_m).survival()[0, 1:, -1]
+    if plans.crashed is not None:
+        survival = survival * ~plans.crashed[:, -1]
+    return 1.0 - survival

@@ -1,0 +1,200 @@
+"""Measures what-if forecasts in one environment: errors with and without the ego's plan, and choices between plans."""
+
+import multiprocessing
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from rich.progress import track
+
+from envs.plans import plan_model_for
+from envs.rollouts.plan_moments import PlanMoment, PlanTask, play_plans
+from envs.rollouts.side_forecasts import fitting_checkpoints
+from envs.rollouts.world import open_world
+from predictor.checkpoint import load_forecaster
+from predictor.evaluation.standard_errors import Estimate, bootstrap_interval
+from predictor.support.errors import UserError
+
+
+@dataclass(frozen=True)
+class PlanRun:
+    """Settings of the measurement in one environment."""
+
+    env_id: str
+    """Id of the environment."""
+    driver: str
+    """Name of the driver."""
+    checkpoints: tuple[str, ...]
+    """Checkpoints to measure."""
+    episodes: int
+    """Number of episodes."""
+    seed: int
+    """Seed of the first episode."""
+    max_steps: int
+    """Largest length of an episode [policy steps]."""
+    workers: int
+    """Number of parallel processes."""
+    horizon_steps: int | None = None
+    """Number of steps forecast and played; None takes the first checkpoint's."""
+
+
+@dataclass(frozen=True)
+class Benefit:
+    """Errors of the others' single forecasts without and with the ego's plan; None where nothing is compared."""
+
+    agents: int
+    """Number of forecasts."""
+    without_m: float | None
+    """Mean displacement of the forecasts that know no plan [m]."""
+    with_m: float | None
+    """Mean displacement with the plan given [m]."""
+    reduction: Estimate | None
+    """1 − with / without, paired; above 0 the plan helps."""
+
+
+@dataclass(frozen=True)
+class PlanScores:
+    """Scores of one forecaster."""
+
+    own: Benefit
+    """With the true plan given: what the ego then did."""
+    plans: Benefit
+    """With the plans of the plan model, each against what followed when it was played."""
+    choices: int
+    """Number of pairs of plans of one moment of which one alone ended in a collision."""
+    right: Estimate | None
+    """Share of those pairs in which that plan had the higher risk; equal risks count half."""
+    brier: Estimate | None
+    """Mean squared difference of risk and outcome over all plans."""
+
+
+@dataclass(frozen=True)
+class EnvPlans:
+    """Scores of what-if forecasts in one environment."""
+
+    env_id: str
+    """Id of the environment."""
+    driver: str
+    """Name of the driver."""
+    dt_s: float
+    """Time step [s]."""
+    horizon_steps: int
+    """Number of steps forecast and played."""
+    episodes: int
+    """Number of episodes played."""
+    plan_names: tuple[str, ...]
+    """Name of each plan."""
+    moments: int
+    """Number of moments."""
+    crashed: list[float]
+    """Share of the moments in which each plan ended in a collision."""
+    scores: dict[str, PlanScores]
+    """Scores by forecaster."""
+    misfits: dict[str, str]
+    """Reason for each checkpoint that was left out, by its name."""
+
+
+def check_has_plans(env_id: str) -> None:
+    """Checks that the ego of an environment has plans.
+
+    Raises:
+        UserError: it has none, or the environment is unknown.
+    """
+    world = open_world(env_id, "idle")
+    try:
+        if not world.spec.has_ego:
+            raise UserError(f"plans are those of one ego, and {env_id} has several agents; use an env with one ego")
+        plan_model_for(world.env)
+    finally:
+        world.close()
+
+
+def measure_plans(run: PlanRun) -> EnvPlans:
+    """Plays the episodes of one environment and scores all forecasters on the same moments.
+
+    Raises:
+        UserError: the environment has no plan model, cannot be copied, checkpoints perceive differently, none fits, or
+            no episode is long enough.
+    """
+    check_has_plans(run.env_id)
+    world = open_world(run.env_id, run.driver if not run.driver.endswith(".zip") else "idle")
+    spec = world.spec
+    world.reset(run.seed)
+    names = plan_model_for(world.env).names
+    world.close()
+    fitting, misfits = fitting_checkpoints(run.env_id, run.checkpoints, spec)
+    horizon = run.horizon_steps or load_forecaster(fitting[0], spec, run.env_id).horizon_steps
+    tasks = [
+        PlanTask(run.env_id, run.driver, fitting, run.seed + i, run.max_steps, horizon) for i in range(run.episodes)
+    ]
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(min(run.workers, len(tasks)), initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        played = pool.imap(play_plans, tasks, chunksize=1)
+        episodes = [found for found in track(played, f"plans {run.env_id}", total=len(tasks)) if found]
+    if not episodes:
+        raise UserError(f"{run.env_id}: none of {run.episodes} episodes has a step to measure; add --episodes")
+    moments = [moment for found in episodes for moment in found]
+    crashed = np.mean([moment.crashed[1:] for moment in moments], axis=0)
+    return EnvPlans(
+        run.env_id,
+        run.driver,
+        spec.dt_s,
+        horizon,
+        run.episodes,
+        names,
+        len(moments),
+        crashed.tolist(),
+        {name: scores_of(episodes, name) for name in moments[0].risk},
+        misfits,
+    )
+
+
+def scores_of(episodes: Sequence[Sequence[PlanMoment]], name: str) -> PlanScores:
+    """Returns the scores of one forecaster.
+
+    Args:
+        episodes: moments of each episode.
+        name: name of the forecaster.
+    """
+    own, plans, choices, squares = (
+        np.array(sums) for sums in zip(*(_sums(found, name) for found in episodes), strict=True)
+    )
+    return PlanScores(_benefit(own), _benefit(plans), int(choices[:, 1].sum()), _ratio(choices), _ratio(squares))
+
+
+def _sums(moments: Sequence[PlanMoment], name: str) -> tuple[Float[np.ndarray, " parts"], ...]:
+    """Returns the sums of an episode: errors without, with and agents (own, plans), right and all choices, squares."""
+    errors = np.array([[m.without_m[name], m.with_m[name], m.agents] for m in moments])  # moments, parts, branches
+    choices = np.sum([right_choices(m.risk[name], m.crashed[1:]) for m in moments], axis=0)
+    squares = np.sum([[((m.risk[name] - m.crashed[1:]) ** 2).sum(), len(m.risk[name])] for m in moments], axis=0)
+    return errors[:, :, 0].sum(axis=0), errors[:, :, 1:].sum(axis=(0, 2)), choices, squares
+
+
+def right_choices(risk: Float[np.ndarray, " plans"], crashed: Bool[np.ndarray, " plans"]) -> tuple[float, int]:
+    """Returns how many pairs of a plan that collides and one that does not have their risks in order, and all pairs."""
+    ahead = risk[crashed][:, None] - risk[~crashed]
+    return float((ahead > 0).sum() + 0.5 * (ahead == 0).sum()), ahead.size
+
+
+def _benefit(sums: Float[np.ndarray, "episodes 3"]) -> Benefit:
+    without, given, agents = sums.sum(axis=0)
+    if not agents:
+        return Benefit(0, None, None, None)
+    reduction = Estimate(
+        float(1 - given / without), bootstrap_interval(sums[:, :2], lambda drawn: 1 - _over(drawn[:, 1], drawn[:, 0]))
+    )
+    return Benefit(int(agents), float(without / agents), float(given / agents), reduction)
+
+
+def _ratio(sums: Float[np.ndarray, "episodes 2"]) -> Estimate | None:
+    top, bottom = sums.sum(axis=0)
+    if not bottom:
+        return None
+    return Estimate(float(top / bottom), bootstrap_interval(sums, lambda drawn: _over(drawn[:, 0], drawn[:, 1])))
+
+
+def _over(top: Float[np.ndarray, " draws"], bottom: Float[np.ndarray, " draws"]) -> Float[np.ndarray, " draws"]:
+    """Returns the ratio; NaN where the denominator is 0."""
+    return np.where(bottom > 0, top / np.where(bottom > 0, bottom, 1.0), np.nan)

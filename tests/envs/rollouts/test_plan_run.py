@@ -1,0 +1,91 @@
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from envs.rollouts import plan_run
+from envs.rollouts.plan_moments import STRAIGHT, PlanMoment
+from envs.rollouts.plan_run import PlanRun, measure_plans, right_choices, scores_of
+from predictor.support.errors import UserError
+from tests.envs.evaluation import TAG, forget, no_processes
+
+
+@pytest.fixture(autouse=True)
+def in_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    no_processes(monkeypatch)
+    forget()
+    yield
+    forget()
+
+
+def found(seed: int, crashed: list[bool], risk: list[float], with_m: float = 1.0) -> PlanMoment:
+    """The own driver and two plans, three agents each; an error of 2 m per agent without a plan."""
+    hit = np.array([False, *crashed])
+    agents = np.where(hit, 0, 3)
+    return PlanMoment(
+        seed, 5, hit, agents, {"model": 2.0 * agents}, {"model": with_m * agents}, {"model": np.array(risk)}
+    )
+
+
+def test_a_choice_is_right_if_the_plan_that_collides_has_the_higher_risk():
+    crashed = np.array([True, False, False, True])
+    assert right_choices(np.array([0.9, 0.1, 0.2, 0.3]), crashed) == (4.0, 4)
+    assert right_choices(np.array([0.9, 0.1, 0.5, 0.3]), crashed) == (3.0, 4)
+    assert right_choices(np.array([0.0, 0.0, 0.0, 0.0]), crashed) == (2.0, 4)
+    assert right_choices(np.array([0.9, 0.1]), np.array([True, True])) == (0.0, 0)
+
+
+def test_scores_of_known_moments():
+    episodes = [
+        [found(0, [True, False], [0.8, 0.2]), found(0, [False, False], [0.0, 0.0])],
+        [found(1, [True, False], [0.1, 0.6])],
+    ]
+    scores = scores_of(episodes, "model")
+    assert (scores.own.agents, scores.own.without_m, scores.own.with_m) == (9, 2.0, 1.0)
+    assert scores.own.reduction is not None and scores.own.reduction.value == 0.5
+    assert scores.plans.agents == 12 and scores.choices == 2
+    assert scores.right is not None and scores.right.value == 0.5 and scores.right.interval == (0.0, 1.0)
+    assert scores.brier is not None
+    assert scores.brier.value == pytest.approx((0.04 + 0.04 + 0.0 + 0.0 + 0.81 + 0.36) / 6)
+
+
+def test_a_plan_that_harms_lowers_the_reduction_below_zero():
+    scores = scores_of([[found(i, [False, False], [0.0, 0.0], with_m=3.0)] for i in range(2)], "model")
+    assert scores.own.reduction is not None and scores.own.reduction.value == -0.5
+    assert scores.choices == 0 and scores.right is None
+
+
+def test_nothing_to_compare_is_none_and_no_error():
+    hit = PlanMoment(
+        0, 5, np.array([True, True]), np.array([0, 0]), {"model": np.zeros(2)}, {"model": np.zeros(2)},
+        {"model": np.ones(1)},
+    )  # fmt: skip
+    scores = scores_of([[hit]], "model")
+    assert (scores.own.agents, scores.own.reduction, scores.right) == (0, None, None)
+
+
+def run(env_id: str = "highway-fast-v0", episodes: int = 2, max_steps: int = 6, workers: int = 1) -> PlanRun:
+    return PlanRun(env_id, "idle", ("constant-velocity",), episodes, 900_000, max_steps, workers, 2)
+
+
+def test_an_environment_is_measured_whatever_the_number_of_workers():
+    one, two = (measure_plans(run(max_steps=14, workers=workers)) for workers in (1, 2))
+    assert one == two
+    assert list(one.scores) == [STRAIGHT] and one.moments >= 2
+    assert one.plan_names[0] == "IDLE" and len(one.crashed) == len(one.plan_names) == 5
+    assert one.scores[STRAIGHT].own.agents > 3
+    reduction = one.scores[STRAIGHT].own.reduction
+    assert reduction is not None and reduction.value == 0.0
+
+
+def test_episodes_without_a_moment_are_an_error():
+    with pytest.raises(UserError, match="highway-fast-v0: none of 2 episodes has a step to measure; add --episodes"):
+        measure_plans(run(max_steps=2))
+
+
+def test_what_has_no_plans_is_said(monkeypatch: pytest.MonkeyPatch):
+    with pytest.raises(UserError, match="plans are those of one ego, and simple_tag_v3 has several"):
+        measure_plans(run(TAG))
+    monkeypatch.setattr(plan_run, "play_plans", lambda task: [])
+    with pytest.raises(UserError, match="add --episodes"):
+        measure_plans(run())
