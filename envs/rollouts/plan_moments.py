@@ -65,7 +65,7 @@ class PlanMoment:
     without_m: dict[str, Float[np.ndarray, " branches"]]
     """Sum over those agents of the mean displacement of the single forecast that knows no plan, by forecaster [m]."""
     with_m: dict[str, Float[np.ndarray, " branches"]]
-    """The same with the plan given; in branch 0 the plan is what the ego then did."""
+    """Such a sum for the forecast that is given the plan; in branch 0 the plan is what the ego then did."""
     risk: dict[str, Float[np.ndarray, " plans"]]
     """Forecast probability of a collision within the horizon, by forecaster; the own driver has none."""
 

@@ -1,0 +1,32 @@
+from pathlib import Path
+
+import pytest
+from matplotlib import pyplot as plt
+
+from docs import draw_pictures
+from tests.envs.helpers import run_command
+
+
+def test_pictures_of_a_moment_are_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
+    monkeypatch.setattr(draw_pictures, "DOCS", tmp_path)
+    code, errors, _ = run_command(draw_pictures.main, ["--only", "braking_leader"], monkeypatch, capsys)
+    assert (code, errors) == (0, [])
+    assert [path.name for path in tmp_path.iterdir()] == ["braking_leader.png"]
+    assert plt.imread(tmp_path / "braking_leader.png")[..., :3].std() > 0.03
+
+
+def test_an_unknown_picture_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
+    monkeypatch.setattr(draw_pictures, "DOCS", tmp_path)
+    code, errors, _ = run_command(draw_pictures.main, ["--only", "film"], monkeypatch, capsys)
+    assert (code, errors) == (
+        2,
+        ["error: only must be among highway, braking_leader, causal_graph, got film"],
+    )
+    assert not list(tmp_path.iterdir())
+
+
+def test_every_picture_is_shown_on_a_page():
+    root = Path(draw_pictures.__file__).resolve().parents[1]
+    pages = (root / "README.md").read_text() + (root / "docs/reactions.md").read_text()
+    for name in draw_pictures.PICTURES:
+        assert f"{name}.png)" in pages and (root / "docs" / f"{name}.png").exists()
