@@ -49,6 +49,7 @@ class Moment:
 
 
 FILMED = Moment(900_001, 7)
+PLANNED = Moment(900_004, 5)
 BRAKING = Moment(900_014, 6)
 GRAPH = Moment(900_010, 5)
 
@@ -58,7 +59,7 @@ class DrawConfig:
     """Draws the pictures of live traffic in README.md and docs/."""
 
     only: tuple[str, ...] = ()
-    """Names of pictures (highway, braking_leader, causal_graph); none given draws all."""
+    """Names of pictures (highway, what_if, braking_leader, causal_graph); none given draws all."""
 
     def __post_init__(self) -> None:
         """Checks the names.
@@ -77,7 +78,15 @@ def draw_highway(path: Path) -> None:
     played = record_episode(
         env, Planner(env, env.forecaster), seed=FILMED.seed, max_steps=FILMED.step + 6, num_samples=FUTURES
     )
-    played.write_frame(path, played.frame_of_step(min(FILMED.step, played.num_steps)))
+    played.write_frame(path, played.frame_of_step(FILMED.step))
+    env.close()
+
+
+def draw_what_if(path: Path) -> None:
+    """Draws a frame of such a film with the plans of the ego, and the others' forecasts for each."""
+    env = ForecastObservation(make_env(ROAD, render_mode="rgb_array"), what_if=True, num_samples=FUTURES)
+    played = record_episode(env, Planner(env, env.forecaster), seed=PLANNED.seed, max_steps=PLANNED.step + 6)
+    played.write_frame(path, played.frame_of_step(PLANNED.step))
     env.close()
 
 
@@ -213,6 +222,7 @@ def _plot_edges(ax: Axes, scene: Scene, edges: Sequence[tuple[int, int, float]])
 
 PICTURES: dict[str, Callable[[Path], None]] = {
     "highway": draw_highway,
+    "what_if": draw_what_if,
     "braking_leader": draw_braking_leader,
     "causal_graph": draw_causal_graph,
 }

@@ -1,22 +1,16 @@
-"""Draws forecasts (dashed), true futures (thin) and edges (as wide as they are likely); writes PNG and MP4.
+"""Draws forecasts (dashed), true futures (thin), edges (as wide as they are likely) and plans of the ego.
 
 Takes positions and returns RGB arrays. `envs.video.highway` and `envs.video.multiagent` play the episodes.
 """
 
-import io
 import math
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
-import imageio_ffmpeg  # type: ignore[import-untyped]
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
-
-from predictor.support.files import new_file
 
 Color = tuple[int, int, int]
 Polyline = Float[np.ndarray, "_ 2"]
@@ -54,12 +48,24 @@ class OverlayStyle:
     """Width of an edge of probability 1 [px]."""
     edge_alpha: int = 150
     """Opacity of edges, 0–255."""
+    safe_color: Color = (70, 220, 120)
+    """Colour of a plan without any risk."""
+    risky_color: Color = (240, 70, 60)
+    """Colour of a plan that is sure to collide; risks between get colours between."""
+    plan_width_px: float = 3.0
+    """Width of the ego's path in a plan [px]."""
     min_edge_prob: float = 0.02
     """Smallest probability of an edge that is drawn."""
     text_px: int = 15
     """Height of text [px]."""
     text_color: Color = (240, 240, 240)
     """Colour of caption and legend."""
+
+    def risk_color(self, risk: float) -> Color:
+        """Returns the colour of a plan with this risk."""
+        ends = zip(self.safe_color, self.risky_color, strict=True)
+        red, green, blue = (round(safe + risk * (risky - safe)) for safe, risky in ends)
+        return red, green, blue
 
 
 @dataclass(frozen=True)
@@ -76,6 +82,18 @@ class AgentOverlay:
     """Probability that it interacts with the ego."""
     shares: tuple[float, ...] = ()
     """Probability of each sample; empty draws all of them opaque."""
+
+
+@dataclass(frozen=True)
+class PlanOverlay:
+    """Path of the ego in one of its plans, and what the others are forecast to do then; world positions [m]."""
+
+    path_m: Polyline
+    """Path of the ego, from its position when the plan was made."""
+    others_m: tuple[Polyline, ...]
+    """Single forecast of each other agent, from its position then."""
+    risk: float
+    """Probability of a collision within the horizon; sets the colour."""
 
 
 @dataclass(frozen=True)
@@ -148,8 +166,12 @@ def draw_overlay(
     agents: list[AgentOverlay],
     caption: str,
     style: OverlayStyle,
+    plans: Sequence[PlanOverlay] = (),
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Draws edges, true futures, forecasts, caption and legend over a picture; returns the result."""
+    """Draws edges, true futures, forecasts, caption and legend over a picture; returns the result.
+
+    With plans of the ego, the forecasts are those for each plan, in the colour of its risk, the riskiest first.
+    """
     size = (picture.width * SMOOTHING, picture.height * SMOOTHING)
     overlay = Image.new("RGBA", size, (0, 0, 0, 0))
     pen = Pen(ImageDraw.Draw(overlay), style)
@@ -160,52 +182,18 @@ def draw_overlay(
     for agent in agents:
         pen.truth(view.pixels(agent.truth_m))
     for agent in agents:
-        for line, share in fan(agent.forecast_m, agent.shares):
+        for line, share in () if plans else fan(agent.forecast_m, agent.shares):
             pen.forecast(view.pixels(line), opacity=share)
-    _draw_captions(pen, picture.size, caption)
+    for plan in sorted(plans, key=lambda plan: -plan.risk):
+        color = style.risk_color(plan.risk)
+        pen.line(view.pixels(plan.path_m), style.plan_width_px, (*color, 255))
+        for line in plan.others_m:
+            pen.forecast(view.pixels(line), color)
+    _draw_captions(pen, picture.size, caption, PLAN_LEGEND if plans else FORECAST_LEGEND)
     smooth = overlay.resize(picture.size, Image.Resampling.BOX)
     result = picture.convert("RGB")
     result.paste(smooth, mask=smooth)
     return np.asarray(result)
-
-
-def decode_png(data: bytes) -> Image.Image:
-    """Returns the picture in PNG data."""
-    return Image.open(io.BytesIO(data))
-
-
-def encode_png(pixels: UInt8[np.ndarray, "height width 3"]) -> bytes:
-    """Returns a picture as PNG data, about a hundredth of its size for highway-env's flat colours."""
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=1)
-    return buffer.getvalue()
-
-
-def write_video(path: str | Path, pictures: Iterable[UInt8[np.ndarray, "height width 3"]], fps: int) -> None:
-    """Writes a video as MP4 (H.264, yuv420p); `path` is never a partial file.
-
-    Args:
-        path: path of the video.
-        pictures: at least one, all of one size; height and width must be even for H.264.
-        fps: number of pictures per second.
-    """
-    path = Path(path)
-    rest = iter(pictures)
-    first = next(rest)
-    with new_file(path) as partial:
-        writer = imageio_ffmpeg.write_frames(
-            partial, first.shape[1::-1], fps=fps, codec="libx264", quality=7, macro_block_size=2
-        )
-        with closing(writer):
-            writer.send(None)
-            writer.send(np.ascontiguousarray(first))
-            for picture in rest:
-                writer.send(np.ascontiguousarray(picture))
-
-
-def write_picture(path: str | Path, picture: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Writes a picture as PNG."""
-    Image.fromarray(picture).save(path, format="PNG")
 
 
 def fan(lines: Iterable[Polyline], shares: Iterable[float] = ()) -> list[tuple[Polyline, float]]:
@@ -345,17 +333,29 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size)
 
 
-def _draw_captions(pen: Pen, size: tuple[int, int], caption: str) -> None:
+FORECAST_LEGEND: Legend = (
+    ("forecast", Pen.forecast),
+    ("what happened", Pen.truth),
+    ("edge to the ego (probability)", lambda pen, line: pen.edge(line, 0.7)),
+)
+PLAN_LEGEND: Legend = (
+    ("plan of the ego without risk, and the others then", lambda pen, line: _plan_sample(pen, line, 0.0)),
+    ("with a sure collision", lambda pen, line: _plan_sample(pen, line, 1.0)),
+    *FORECAST_LEGEND[1:],
+)
+
+
+def _plan_sample(pen: Pen, line: Polyline, risk: float) -> None:
+    color = pen.style.risk_color(risk)
+    pen.line(line - (0.0, 4.0), pen.style.plan_width_px, (*color, 255))
+    pen.forecast(line + (0.0, 4.0), color)
+
+
+def _draw_captions(pen: Pen, size: tuple[int, int], caption: str, entries: Legend) -> None:
     """Draws the caption in the upper left corner, the legend in the lower left one."""
     height = pen.style.text_px + 8.0
     pen.box(MARGIN_PX, MARGIN_PX, 3 * MARGIN_PX + pen.text_width(caption), MARGIN_PX + height)
     pen.text(2 * MARGIN_PX, MARGIN_PX + height / 2, caption)
-
-    entries: Legend = (
-        ("forecast", Pen.forecast),
-        ("what happened", Pen.truth),
-        ("edge to the ego (probability)", lambda pen, line: pen.edge(line, 0.7)),
-    )
     top = size[1] - MARGIN_PX - height
     pen.box(MARGIN_PX, top, 4 * MARGIN_PX + pen.legend_width(entries), top + height)
     pen.legend(2 * MARGIN_PX, top + height / 2, entries)

@@ -14,20 +14,20 @@ from typing import Any, cast
 
 import numpy as np
 from highway_env.envs.common.graphics import EnvViewer
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
+from envs.plans.contact import contacts
 from envs.readers.highway import HighwayReader, is_highway_env
 from envs.video.drawing import (
     AgentOverlay,
     OverlayStyle,
+    PlanOverlay,
     View,
-    decode_png,
     draw_overlay,
-    encode_png,
-    write_picture,
-    write_video,
 )
+from envs.video.files import decode_png, encode_png, write_picture, write_video
 from envs.wrappers import ForecastObservation
+from predictor.scene import SceneBatch
 from predictor.support.errors import UserError
 
 ENLARGE = 2.0
@@ -56,6 +56,7 @@ class _Step:
     forecast_m: Float[np.ndarray, "agents samples horizon 2"]
     shares: Float[np.ndarray, "agents samples"]
     edge_probs: Float[np.ndarray, " agents"]
+    plans: tuple[PlanOverlay, ...] = ()
 
 
 @dataclass
@@ -113,7 +114,7 @@ class Recording:
         ]
         caption = f"{self.env_id}   t = {index / self.frames_per_step * self.dt_s:.1f} s   {frame.speed_mps:.1f} m/s"
         return draw_overlay(
-            decode_png(frame.png), frame.view, frame.positions_m[self._ego], agents, caption, self.style
+            decode_png(frame.png), frame.view, frame.positions_m[self._ego], agents, caption, self.style, step.plans
         )
 
     def write_video(self, path: str | Path) -> None:
@@ -143,7 +144,8 @@ def record_episode(
     """Plays one episode and records it for drawing.
 
     Args:
-        env: a highway-env environment made with `render_mode="rgb_array"`, wrapped in `ForecastObservation`.
+        env: a highway-env environment made with `render_mode="rgb_array"`, wrapped in `ForecastObservation`; with
+            `what_if`, the plans of the ego and the forecasts for each are drawn instead of those without a plan.
         act: function from its observation to an action.
         seed: seed of the reset.
         max_steps: largest number of policy steps.
@@ -238,8 +240,35 @@ class _Recorder:
         xy_m = forecast.xy[0].double().cpu().numpy() + scene.states[0, :2]
         probs = 1 - forecast.ego_edges()[0][0, :, 0, 0].double().cpu().numpy()  # agent → ego
         shares = forecast.sample_probs()[0].double().cpu().numpy()[:, others].T
-        step = _Step(len(self.recording._frames), keys, xy_m[:, others].swapaxes(0, 1), shares, probs[others])
+        step = _Step(
+            len(self.recording._frames),
+            keys,
+            xy_m[:, others].swapaxes(0, 1),
+            shares,
+            probs[others],
+            self._plans(others),
+        )
         self.recording._steps.append(step)
+
+    def _plans(self, others: Int[np.ndarray, " others"]) -> tuple[PlanOverlay, ...]:
+        """Returns the plans of this step with the single forecast of each other agent; none without `what_if`."""
+        env = self._env
+        if env.plans is None or env.what_if is None:
+            return ()
+        scene, plans = env.scene, env.plans
+        now_m = scene.states[:, :2]
+        futures_m = env.what_if.xy[0, :, 0].double().cpu().numpy() + now_m[0]
+        safe = contacts(env.what_if, SceneBatch.stack([scene]), plans.size_m).survival()[0, :, -1]
+        if plans.crashed is not None:
+            safe = safe * ~plans.crashed[:, -1]
+        return tuple(
+            PlanOverlay(
+                np.vstack([now_m[:1], path[:, :2]]),
+                tuple(np.vstack([now_m[agent : agent + 1], future[agent]]) for agent in others),
+                1.0 - float(survived),
+            )
+            for path, future, survived in zip(plans.states, futures_m, safe, strict=True)
+        )
 
 
 def _make_viewer(base: Any, config: dict[str, Any]) -> EnvViewer:

@@ -32,9 +32,8 @@ from envs.video.drawing import (
     draw_page,
     fan,
     page_width,
-    write_picture,
-    write_video,
 )
+from envs.video.files import write_picture, write_video
 from envs.video.roles import LANDMARK, OTHER, mean_by_role, named_role, unnamed_role
 from predictor.support.errors import UserError
 

@@ -20,13 +20,13 @@ def test_an_unknown_picture_is_one_line(tmp_path: Path, monkeypatch: pytest.Monk
     code, errors, _ = run_command(draw_pictures.main, ["--only", "film"], monkeypatch, capsys)
     assert (code, errors) == (
         2,
-        ["error: only must be among highway, braking_leader, causal_graph, got film"],
+        ["error: only must be among highway, what_if, braking_leader, causal_graph, got film"],
     )
     assert not list(tmp_path.iterdir())
 
 
 def test_every_picture_is_shown_on_a_page():
     root = Path(draw_pictures.__file__).resolve().parents[1]
-    pages = (root / "README.md").read_text() + (root / "docs/reactions.md").read_text()
+    pages = (root / "README.md").read_text() + "".join(path.read_text() for path in (root / "docs").glob("*.md"))
     for name in draw_pictures.PICTURES:
         assert f"{name}.png)" in pages and (root / "docs" / f"{name}.png").exists()

@@ -10,7 +10,7 @@ from PIL import Image
 
 from envs.drivers.ego import idle_action
 from envs.registry import make_env
-from envs.video.drawing import AgentOverlay, OverlayStyle, View, dashes, draw_overlay
+from envs.video.drawing import AgentOverlay, OverlayStyle, PlanOverlay, View, dashes, draw_overlay
 from envs.video.highway import Recording, record_episode
 from envs.wrappers import ForecastObservation
 from predictor.support.errors import UserError
@@ -141,3 +141,41 @@ def test_dashes_alternate_and_keep_corners():
     pieces = dashes(np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 4.0]]), dash=2.0)
     assert [p.tolist() for p in pieces] == [[[0, 0], [2, 0]], [[3, 1], [3, 3]]]
     assert dashes(np.array([[1.0, 1.0], [1.0, 1.0]]), dash=2.0) == []
+
+
+# --- Plans of the ego -------------------------------------------------------------------------------------------------
+
+
+def test_plans_are_drawn_in_the_colour_of_their_risk():
+    env = ForecastObservation(
+        make_env("highway-fast-v0", render_mode="rgb_array"), "constant-velocity", what_if=True, horizon_steps=3
+    )
+    action = idle_action(env)
+    played = record_episode(env, lambda obs: action, seed=1, max_steps=2)
+    style = played.style
+    env.reset(seed=1)
+    assert env.plans is not None and env.what_if is not None
+    plans = played._steps[0].plans
+    assert len(plans) == len(env.plan_model.names)  # type: ignore[union-attr]
+    np.testing.assert_allclose(plans[1].path_m[1:], env.plans.states[1, :, :2])
+    np.testing.assert_allclose(plans[1].path_m[0], env.scene.states[0, :2])
+    agents = np.flatnonzero(env.scene.valid)[1:]
+    assert len(plans[1].others_m) == len(agents)
+    expected = env.what_if.xy[0, 1, 0, int(agents[0])].numpy() + env.scene.states[0, :2]
+    np.testing.assert_allclose(plans[1].others_m[0][1:], expected, atol=1e-4)
+    colors = played.draw(0).reshape(-1, 3)
+    assert (colors == style.risk_color(min(plan.risk for plan in plans))).all(-1).sum() > 20
+    assert (colors == style.forecast_color).all(-1).sum() == 0  # forecasts without a plan are not drawn
+    env.close()
+
+
+def test_a_risky_plan_is_red_and_a_safe_one_green():
+    style = OverlayStyle()
+    assert style.risk_color(0.0) == style.safe_color and style.risk_color(1.0) == style.risky_color
+    half = style.risk_color(0.5)
+    assert all(min(a, b) <= c <= max(a, b) for a, b, c in zip(style.safe_color, style.risky_color, half, strict=True))
+    line = np.array([[0.0, 0.0], [150.0, 0.0]])
+    plan = PlanOverlay(line, (line + (0.0, 20.0),), 1.0)
+    blank = Image.new("RGB", (200, 100))
+    drawn = draw_overlay(blank, View((0.0, -50.0), 1.0), (0.0, 0.0), [], "", style, [plan]).reshape(-1, 3)
+    assert (drawn == style.risky_color).all(-1).sum() > 300

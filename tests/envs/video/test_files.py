@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from envs.video.drawing import write_picture, write_video
+from envs.video.files import write_picture, write_video
 
 PICTURE = np.arange(32 * 48 * 3, dtype=np.uint8).reshape(32, 48, 3)
 
