@@ -13,7 +13,7 @@ import torch  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 # The same examples in every run, however busy the machine is.
-settings.register_profile("suite", deadline=None, derandomize=True, database=None, print_blob=True)
+settings.register_profile("suite", max_examples=50, deadline=None, derandomize=True, database=None, print_blob=True)
 settings.load_profile("suite")
 
 # Tensors are tiny here: a second thread costs more than it brings, above all when tests run in parallel.
