@@ -1,11 +1,27 @@
 """Settings for every test; nothing of this project is imported here, so that the shape checks see each module first."""
 
-import torch
-from hypothesis import settings
+import os
+from collections.abc import Iterator
+
+import pytest
+
+# Processes that tests start have one thread too; read when torch and numpy are imported, in this process as well.
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+
+import torch  # noqa: E402
+from hypothesis import settings  # noqa: E402
 
 # The same examples in every run, however busy the machine is.
-settings.register_profile("suite", deadline=None, derandomize=True, database=None, print_blob=True)
+settings.register_profile("suite", max_examples=50, deadline=None, derandomize=True, database=None, print_blob=True)
 settings.load_profile("suite")
 
 # Tensors are tiny here: a second thread costs more than it brings, above all when tests run in parallel.
 torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Commands set the threads of their process; the tests after one that ran here have one thread again."""
+    yield
+    torch.set_num_threads(1)

@@ -77,11 +77,11 @@ def test_a_broken_block_fails_with_its_place_and_its_output(tmp_path: Path, bloc
 
 def test_a_block_that_takes_too_long_is_stopped(tmp_path: Path):
     done = results(
-        tmp_path, "~~~bash\nsleep 5 && touch late\n~~~\n~~~python\nimport time\ntime.sleep(30)\n~~~\n", limit_s=0.5
+        tmp_path, "~~~bash\nsleep 2 && touch late\n~~~\n~~~python\nimport time\ntime.sleep(30)\n~~~\n", limit_s=0.5
     )
     assert ["took more than 0 s: give the block a short form" in result.error for result in done] == [True, True]
     assert all(result.seconds < 4 for result in done)
-    time.sleep(6)
+    time.sleep(2.5)
     assert not (tmp_path / "late").exists()  # what the block had started is stopped as well
 
 

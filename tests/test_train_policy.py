@@ -366,7 +366,7 @@ def test_interrupted_run_goes_on_where_it_was(
 @pytest.mark.slow
 def test_kill_nine_then_resume(command: Callable[..., None], tmp_path: Path):
     run = tmp_path / "run"
-    arguments = [*DQN[:-1], "240", "--out", str(run), "--no-video"]
+    arguments = [*DQN[:-1], "80", "--out", str(run), "--no-video"]
     root = Path(train_policy.__file__).parent
     process = subprocess.Popen([sys.executable, "train_policy.py", *arguments], cwd=root, stderr=subprocess.DEVNULL)
     while not (run / "checkpoint.zip").exists():
@@ -375,9 +375,9 @@ def test_kill_nine_then_resume(command: Callable[..., None], tmp_path: Path):
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     reached = load_model(run / "checkpoint.zip", "dqn").num_timesteps
-    assert 0 < reached < 240
+    assert 0 < reached < 80
     command(*arguments, "--resume")
-    assert load_model(run / "checkpoint.zip", "dqn").num_timesteps == 240
+    assert load_model(run / "checkpoint.zip", "dqn").num_timesteps == 80
 
 
 def test_resume_with_another_config_names_the_field(

@@ -39,12 +39,13 @@ def with_another_future(states: Tensor, valid: Tensor, last_observed: Tensor, se
 
 def streamed(forecaster: Any, states: Tensor, valid: Tensor, last_observed: Tensor) -> list[Tensor]:
     """Belief and forecast of each window at its last observation, from one stream over the whole window."""
-    memory, beliefs = forecaster.empty_memory(BATCH, AGENTS), []
-    for now, present in zip(states.unbind(1), valid.unbind(1), strict=True):
+    memory, beliefs, last = forecaster.empty_memory(BATCH, AGENTS), {}, last_observed.tolist()
+    for t, (now, present) in enumerate(zip(states.unbind(1), valid.unbind(1), strict=True)):
         memory, belief = forecaster.observe(memory, now, present)
-        forecast = forecaster.rollout(belief, HORIZON, 2, torch.Generator().manual_seed(3)).states
-        beliefs.append((belief.edge_probs, belief.edge_features, forecast))
-    return [torch.stack([beliefs[t][i][window] for window, t in enumerate(last_observed.tolist())]) for i in range(3)]
+        if t in last:
+            forecast = forecaster.rollout(belief, HORIZON, 2, torch.Generator().manual_seed(3)).states
+            beliefs[t] = (belief.edge_probs, belief.edge_features, forecast)
+    return [torch.stack([beliefs[t][i][window] for window, t in enumerate(last)]) for i in range(3)]
 
 
 def in_window(forecaster: Any, states: Tensor, valid: Tensor, last_observed: Tensor) -> Tensor:

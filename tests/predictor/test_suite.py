@@ -1,6 +1,7 @@
 """The suite: lines are trained and measured once, failures say why, and the table says what was run."""
 
 import json
+import os
 import sys
 from collections.abc import Mapping
 from dataclasses import replace
@@ -31,16 +32,23 @@ from tests.predictor.helpers import spec
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data")
-    make(SpringsConfig(folder / "springs", train=30, val=12, test=24, ood=24))
+    make(SpringsConfig(folder / "springs", train=20, val=6, test=12, ood=12))
     return folder
 
 
 def config(data: Path, out: Path, **changes: Any) -> SuiteConfig:
-    return SuiteConfig("springs", data, out, "smoke", **({"steps": 2, "workers": 1} | changes))
+    """Two steps of training, with one thread in each process."""
+    return SuiteConfig("springs", data, out, "smoke", **({"steps": 2, "workers": os.cpu_count()} | changes))
 
 
 def line(key: str) -> Line:
     return next(r for r in TABLES["springs"].lines if r.key == key)
+
+
+def few_validations(monkeypatch: pytest.MonkeyPatch, table: str) -> None:
+    """Models are selected by a few windows; not for lines that run in processes of their own."""
+    budgets = TABLES[table].budgets
+    monkeypatch.setitem(budgets, "smoke", replace(budgets["smoke"], val_windows=10))
 
 
 # --- Lines --------------------------------------------------------------------------------------------------------
@@ -57,11 +65,14 @@ def test_least_squares_is_the_limit(data: Path, tmp_path: Path):
 
 
 @pytest.mark.parametrize("key", ["dgvae-rl", "dvae", "dnri", "lstm-joint"])
-def test_every_kind_of_line_is_trained_and_measured(data: Path, tmp_path: Path, key: str):
+def test_every_kind_of_line_is_trained_and_measured(
+    data: Path, tmp_path: Path, key: str, monkeypatch: pytest.MonkeyPatch
+):
+    few_validations(monkeypatch, "springs")
     result = run_line(config(data, tmp_path), line(key))
     measured = result["tests"]["test"]
     assert result["parameters"] > 0
-    assert measured["windows"] == 24
+    assert measured["windows"] == 12
     horizon, whole = measured["horizon_only"], measured["whole_sequence"]
     assert len(horizon["by_step_m"]) == 10 and len(whole["by_step_m"]) == 49
     assert whole["by_step_m"][-1] == pytest.approx(horizon["by_step_m"][-1], rel=0.3)  # best by another mean
@@ -156,8 +167,14 @@ def test_types_without_labels_are_renamed_and_types_with_labels_are_not(
     assert kept["accuracy"] == 0 and list(kept["permutation"]) == [0, 1, 2]
 
 
-def test_a_model_is_trained_within_49_frames_and_measured_beside_nris_figures(nri_data: Path, tmp_path: Path):
-    settings = SuiteConfig("nri-springs", nri_data, tmp_path, "smoke", ("dvae", "majority"), steps=2, workers=1)
+def test_a_model_is_trained_within_49_frames_and_measured_beside_nris_figures(
+    nri_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    few_validations(monkeypatch, "nri-springs")
+    in_this_process(monkeypatch)
+    settings = SuiteConfig(
+        "nri-springs", nri_data, tmp_path, "smoke", ("dvae", "majority"), steps=2, workers=os.cpu_count() or 1
+    )
     made = line_config(settings, nri_line("nri-springs", "dvae"), tmp_path)
     assert made.history_steps + made.horizon_steps == 49 and made.val_history_steps == 39
     content = run_suite(settings)
@@ -212,9 +229,12 @@ def test_an_added_option_that_is_used_gives_another_folder(data: Path, tmp_path:
 
 
 def test_suite_runs_what_is_missing_and_nothing_else(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Only the line that is trained is started, in a process of its own."""
     settings = config(data, tmp_path, lines=("constant-velocity", "mlp"), workers=2)
+    before = run_line(settings, line("constant-velocity"))
     content = run_suite(settings)
     assert [r["key"] for r in content["rows"]] == ["constant-velocity", "mlp"]
+    assert content["rows"][0]["train_seconds"] == before["train_seconds"]
     assert not content["failed"]
     for name in ("table.md", "table.tex", "table.json", "by_step.png"):
         assert (settings.folder / name).exists()
@@ -248,6 +268,7 @@ def test_seeds_are_jobs_of_their_own_and_trained_lines_alone_have_several(data: 
 def test_several_seeds_are_shown_by_mean_and_range_and_resumed(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
+    few_validations(monkeypatch, "springs")
     in_this_process(monkeypatch)
     settings = config(data, tmp_path, lines=("constant-velocity", "mlp"), seeds=2)
     for job in jobs_of(settings)[:2]:
@@ -263,12 +284,13 @@ def test_several_seeds_are_shown_by_mean_and_range_and_resumed(
     shown = next(line for line in markdown_report(content).splitlines() if line.startswith("| Linear (MLP)"))
     assert f"{np.mean(errors):.3f} ({min(errors):.3f} to {max(errors):.3f})" in shown
     windows = {tuple(r["tests"]["test"][key] for key in ("windows",)) for r in mlp["runs"]}
-    assert windows == {(24,)}
+    assert windows == {(12,)}
 
 
 def test_a_single_forecast_with_noise_is_measured_after_its_model_and_of_the_same_weights(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
+    few_validations(monkeypatch, "springs")
     started = in_this_process(monkeypatch)
     content = run_suite(config(data, tmp_path, lines=("dgvae-gaussian", "dgvae"), workers=2))
     assert started == ["dgvae, seed 0", "dgvae-gaussian, seed 0"] and not content["failed"]
@@ -306,7 +328,10 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 # --- Tables -------------------------------------------------------------------------------------------------------
 
 
-def test_reports_have_a_line_for_each_model_and_the_papers_figures(data: Path, tmp_path: Path):
+def test_reports_have_a_line_for_each_model_and_the_papers_figures(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    in_this_process(monkeypatch)
     settings = config(data, tmp_path, lines=("constant-velocity", "least-squares"), workers=2)
     content = run_suite(settings)
     content["paper"] = {"least-squares": {"rmse": 0.125, "ade": 0.25, "fde": 0.5}}
@@ -316,8 +341,9 @@ def test_reports_have_a_line_for_each_model_and_the_papers_figures(data: Path, t
     assert latex.count(r"\begin{tabular}") == 4 and latex.count(r"\\") == 4 + 3 * 2 + 1
 
 
-def test_every_line_has_k_samples_and_says_so(data: Path, tmp_path: Path):
+def test_every_line_has_k_samples_and_says_so(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Constant velocity gets them from a Gaussian: its single forecast is the same, its best of 20 is better."""
+    in_this_process(monkeypatch)
     content = run_suite(config(data, tmp_path, lines=("constant-velocity", "constant-velocity-noise"), workers=2))
     drawn, noisy = (r["tests"]["test"]["horizon_only"] for r in content["rows"])
     assert drawn["num_samples"] == noisy["num_samples"] == NUM_SAMPLES

@@ -34,6 +34,7 @@ from tests.predictor.helpers import FAST_LIKE, PLURAL, circling_episode, followi
 
 ROOT = Path(__file__).parents[2]
 State = dict[str, Any]
+WITH_DROPOUT = replace(FAST_LIKE, dropout=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,7 @@ def circles(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     """The "fast" preset at a size that trains in milliseconds; dropout, so that its noise is part of what is tested."""
-    monkeypatch.setitem(PRESETS, "fast", replace(FAST_LIKE, dropout=0.1))
+    monkeypatch.setitem(PRESETS, "fast", WITH_DROPOUT)
 
 
 def config(data: Path, out: Path, **changes: Any) -> TrainConfig:
@@ -213,23 +214,33 @@ def interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
+@pytest.fixture(scope="module")
+def uninterrupted(circles: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with every schedule that nothing stopped."""
+    out = tmp_path_factory.mktemp("uninterrupted") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "fast", WITH_DROPOUT)
+        train(config(circles, out, **SCHEDULES))
+    return out
+
+
 @pytest.mark.parametrize(
     "stop",
     [stop_at(0), stop_at(1), stop_at(5), stop_before_the_checkpoint, stop_between_checkpoint_and_state],
     ids=["at_once", "before_the_first_save", "between_saves", "before_the_checkpoint", "before_the_state"],
 )
 def test_interrupted_run_ends_like_one_that_was_not(
-    tiny: None, circles: Path, tmp_path: Path, stop: Callable[[pytest.MonkeyPatch], None]
+    tiny: None, circles: Path, uninterrupted: Path, tmp_path: Path, stop: Callable[[pytest.MonkeyPatch], None]
 ):
-    train(config(circles, tmp_path / "whole", **SCHEDULES))
     settings = config(circles, tmp_path / "run", **SCHEDULES)
     with pytest.MonkeyPatch.context() as patch:
         stop(patch)
         with pytest.raises(KeyboardInterrupt):
             train(settings)
     train(replace(settings, resume=True))
-    assert_same_state(state(tmp_path / "run"), state(tmp_path / "whole"))
-    for ours, expected in zip(*(sorted(checkpoint_of(tmp_path / n).items()) for n in ("run", "whole")), strict=True):
+    assert_same_state(state(tmp_path / "run"), state(uninterrupted))
+    folders = (tmp_path / "run", uninterrupted)
+    for ours, expected in zip(*(sorted(checkpoint_of(folder).items()) for folder in folders), strict=True):
         assert ours[0] == expected[0] and torch.equal(ours[1], expected[1])
 
 
@@ -363,6 +374,14 @@ train.main()
 """
 
 
+@pytest.fixture(scope="module")
+def never_killed(circles: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run that killed ones must end like."""
+    out = tmp_path_factory.mktemp("never_killed") / "run"
+    train(config(circles, out, threads=1))
+    return out
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("where", "when"),
@@ -371,7 +390,7 @@ train.main()
     ids=["before_the_first_save", "between_saves", "in_the_first_save", "replacing_the_checkpoint"],
 )
 def test_killed_process_is_resumed_to_the_same_weights(
-    circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str, when: int
+    circles: Path, never_killed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str, when: int
 ):
     settings = config(circles, tmp_path / "run", threads=1)
     code = KILLED.replace("WHERE", repr(where)).replace("WHEN", repr(when))
@@ -380,13 +399,10 @@ def test_killed_process_is_resumed_to_the_same_weights(
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     monkeypatch.setattr(sys, "argv", ["train", *arguments(settings), "--resume"])
     training.main()
-    train(config(circles, tmp_path / "whole", threads=1))
-    assert_same_state(state(tmp_path / "run"), state(tmp_path / "whole"))
-    assert checkpoint_of(tmp_path / "run").keys() == checkpoint_of(tmp_path / "whole").keys()
-    assert all(
-        torch.equal(value, checkpoint_of(tmp_path / "whole")[name])
-        for name, value in checkpoint_of(tmp_path / "run").items()
-    )
+    assert_same_state(state(tmp_path / "run"), state(never_killed))
+    ours, expected = checkpoint_of(tmp_path / "run"), checkpoint_of(never_killed)
+    assert ours.keys() == expected.keys()
+    assert all(torch.equal(value, expected[name]) for name, value in ours.items())
 
 
 def arguments(settings: TrainConfig) -> list[str]:

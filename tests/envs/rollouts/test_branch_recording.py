@@ -6,8 +6,8 @@ import pytest
 from envs.collect import CollectConfig, collect
 from envs.rollouts.branch_recording import IN_ARENAS as ARENA_MIX
 from envs.rollouts.branch_recording import ON_ROADS as ROAD_MIX
-from envs.rollouts.branch_recording import BranchRecording, _play, _sender, record_branches
-from envs.rollouts.causal_labels import IN_ARENAS, ON_ROADS
+from envs.rollouts.branch_recording import BranchRecording, _branch, _play, _sender, record_branches
+from envs.rollouts.causal_labels import IN_ARENAS, ON_ROADS, senders_of
 from envs.rollouts.recording import Recording, record
 from envs.rollouts.world import open_world
 from predictor.data.store import PERTURBATIONS, Episode
@@ -89,10 +89,17 @@ def test_no_window_has_an_intervention_that_nobody_could_foresee():
 
 def test_who_has_just_appeared_is_not_perturbed():
     """On the intersection vehicles appear all the time: one that was never seen could not be missed."""
-    settings = BranchRecording(3, 10, ROAD_MIX, ON_ROADS)
-    for branch in record_branches(open_world("intersection-v2", "random"), 120_040, "random", 200, settings):
-        step, agent = moment_of(branch)
-        assert branch.valid[step, agent]
+    world = open_world(ROAD, "idle")
+    world.reset(5)
+    now = world.full_scene()
+    near = senders_of(world, ON_ROAD.causal)
+    assert len(near) == 4
+    for agent in near:
+        before = replace(now, valid=now.ids == agent)
+        branch = _branch(world, [before], ON_ROAD, np.random.default_rng(agent))
+        assert branch is not None and branch.ids[moment_of(branch)[1]] == agent
+    nobody = replace(now, valid=np.zeros_like(now.valid))
+    assert _branch(world, [nobody], ON_ROAD, np.random.default_rng(0)) is None
 
 
 def test_branches_are_a_function_of_the_seed(branches: list[Episode]):

@@ -14,7 +14,7 @@ from predictor.scene import SceneSpec
 from predictor.training.config import TrainConfig
 from predictor.training.trainer import Trainer, load_data
 
-BEFORE, AFTER, AGENTS, MODES = 4, 5, 3, 20
+BEFORE, AFTER, AGENTS, MODES = 3, 4, 3, 20
 SPEC = SceneSpec(dt_s=1.0, feature_scales=(30.0, 30.0, 5.0, 5.0), has_ego=False, max_agents=AGENTS)
 SIZES = ("hidden_dim=32", "rnn_dim=16", "head_dim=32", "message_dim=32", "decoder_dim=48")
 
@@ -53,9 +53,9 @@ def forecast(store: Path, modes: int) -> tuple[Futures, Tensor, Tensor]:
         input_changes=False,
         fit_inputs=False,
         edge_geometry=False,
-        steps=500 if modes else 300,
-        batch_size=32,
-        lr=4e-3,
+        steps=200 if modes else 150,
+        batch_size=24,
+        lr=8e-3,
         history_steps=BEFORE,
         horizon_steps=AFTER,
         device="cpu",
