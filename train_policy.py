@@ -13,6 +13,7 @@ from typing import Annotated
 
 import torch
 from rich.console import Console
+from rich.markup import escape
 
 from agents.evaluate import PACKAGES, evaluate_with_progress
 from agents.presets import Algorithm
@@ -146,6 +147,8 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
     )
     evaluation.write(config.folder, algorithm=config.algorithm, observe=config.observe)
     console.print(evaluation.table())
+    if evaluation.constant_policies:
+        console.print(escape(evaluation.constant_policies))
     console.print(f"policy: {policy}")
     if config.video:
         shown = film(plan.task, model, config.folder / "video.mp4")

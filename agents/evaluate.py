@@ -1,12 +1,14 @@
 """Evaluates a policy in closed loop on held-out seeds: `python -m agents.evaluate --run-dir runs/highway`.
 
 Every policy drives the same seeds; the table compares the trained policy with random and idle drivers, and with others
-that `--drivers` names. `--policy planner --env-id highway-fast-v0 --out results` evaluates a driver without a training
-run. Evaluation seeds are disjoint from those of training and of model selection (`agents.task`).
+that `--drivers` names, such as every constant action. `--policy planner --env-id highway-fast-v0 --out results`
+evaluates a driver without a training run. Evaluation seeds are disjoint from those of training and of model selection
+(`agents.task`).
 """
 
 import math
 import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -20,11 +22,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from agents.arena import open_arena
+from agents.arena import EgoArena, open_arena
 from agents.runs import POLICY_FILE, load_model, read_config
 from agents.task import EVALUATION_SEED, Task
 from agents.vec_envs import EpisodeResult
-from envs.drivers.ego import make_ego_driver
+from envs.drivers.ego import CONSTANT_ACTIONS, make_ego_driver, named_drivers
 from envs.registry import make_env
 from envs.sb3.policy_file import read_policy_note
 from predictor.support import markdown
@@ -35,9 +37,8 @@ from predictor.support.files import finite, write_json, write_text
 from predictor.support.provenance import provenance
 from predictor.support.runtime import keep_freed_memory, resolve_device
 
-NUM_POLICIES = 3
-"""Number of policies of a table: the trained one and an arena's two baselines."""
-
+NEARLY_CONSTANT = 0.95
+"""Least share of one action from which on a policy is called nearly constant."""
 _WILSON_Z = 1.959963984540054  # two-sided 95 %
 NOT_PINNED = "note: {} does not say which forecaster it was trained on; it gets the one of its run's config"
 PACKAGES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2", "envpool", "torch", "numpy")
@@ -69,6 +70,8 @@ class PolicySummary:
     """Mean over episodes of the mean speed [m/s]; NaN if the env does not report speeds."""
     role_returns: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Mean return of the learners of each role, with its standard error; empty if there is one role."""
+    action_shares: dict[str, float] = field(default_factory=dict)
+    """Share of each action among the steps of all episodes, the commonest first; empty if actions are not discrete."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,16 @@ class Evaluation:
         """Summaries, one per policy."""
         return [summarize(policy, episodes) for policy, episodes in self.results.items()]
 
+    @property
+    def constant_policies(self) -> str:
+        """A line on the policies that (nearly) always take one action, but for drivers that are named after it."""
+        found = []
+        for summary in self.summaries:
+            action, share = next(iter(summary.action_shares.items()), ("", 0.0))
+            if share >= NEARLY_CONSTANT and summary.policy not in (action, "idle"):
+                found.append(f"{summary.policy} takes {action} in {100 * share:.1f} % of its steps")
+        return f"(Nearly) constant: {'; '.join(found)}." if found else ""
+
     def write(self, folder: Path, **extra: Any) -> None:
         """Writes ``summary.json`` (with every episode and the provenance) and ``summary.md``."""
         content = {
@@ -105,7 +118,8 @@ class Evaluation:
     def markdown(self) -> str:
         """Returns the table as Markdown."""
         header, cells = self._cells()
-        return f"{markdown.table(header, cells)}\n\n{self.env_id}: {self._caption()}\n"
+        paragraphs = [markdown.table(header, cells), f"{self.env_id}: {self._caption()}", self.constant_policies]
+        return "\n\n".join(filter(None, paragraphs)) + "\n"
 
     def table(self) -> Table:
         """Returns the table for a terminal."""
@@ -173,6 +187,7 @@ def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
     crashes = [e.crashed for e in episodes if e.crashed is not None]
     interval = wilson_interval(sum(crashes), len(crashes)) if crashes else (None, None)
     roles = list(dict.fromkeys(role for e in episodes for role in e.returns_by_role))
+    actions = sum((Counter(e.action_counts) for e in episodes), Counter())
     return PolicySummary(
         policy,
         len(episodes),
@@ -185,6 +200,7 @@ def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
         interval[1],
         float(np.mean([e.mean_speed_mps for e in episodes])),
         {role: mean_and_standard_error([e.returns_by_role[role] for e in episodes]) for role in roles},
+        {action: count / actions.total() for action, count in actions.most_common()},
     )
 
 
@@ -234,7 +250,8 @@ def evaluate_with_progress(
     """Runs `evaluate_policy_on_seeds` with a progress bar."""
     columns = (TextColumn(f"evaluate {task.env_id}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns) as progress:
-        bar = progress.add_task("", total=num_episodes * (NUM_POLICIES + len(drivers)))
+        policies = {name, *drivers, *EgoArena.baselines}  # an arena without an ego has as many baselines
+        bar = progress.add_task("", total=num_episodes * len(policies))
         return evaluate_policy_on_seeds(
             task, model, name, num_episodes, num_envs, first_seed, lambda: progress.advance(bar), drivers
         )
@@ -274,8 +291,8 @@ class EvaluateConfig:
     env_id: str | None = None
     """Environment of --policy; a training run has its own."""
     drivers: tuple[str, ...] = ()
-    """Further drivers of the ego, each a line of the table: planner, planner:CHECKPOINT, or another of
-    envs.drivers.ego."""
+    """Further drivers of the ego, each a line of the table: planner, planner:CHECKPOINT, one action in every step
+    (slower, action-4), constant-actions for all of these, or another of envs.drivers.ego."""
     episodes: int = 50
     """Number of episodes per policy."""
     seed: int = EVALUATION_SEED
@@ -300,6 +317,8 @@ class EvaluateConfig:
             raise UserError("--policy and --env-id go together; a training run has its own environment")
         if self.policy is not None and self.out is None:
             raise UserError("--policy has no run folder; say with --out where the results go")
+        if self.policy == CONSTANT_ACTIONS:
+            raise UserError(f"{CONSTANT_ACTIONS} stands for several drivers; give it to --drivers, and one to --policy")
         check_at_least(self, 0, "seed")
         object.__setattr__(self, "device", resolve_device(self.device))
 
@@ -316,6 +335,8 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     evaluation.write(out, **noted)
     Console().print(evaluation.table())
+    if evaluation.constant_policies:
+        Console().print(escape(evaluation.constant_policies))
     Console().print(f"written to {out / 'summary.json'} and {out / 'summary.md'}")
 
 
@@ -324,21 +345,29 @@ def _of_driver(config: EvaluateConfig) -> tuple[Evaluation, dict[str, str]]:
     assert config.policy is not None and config.env_id is not None
     task = Task(config.env_id, "none", device=config.device)
     task.check()
-    check_drivers(task, (config.policy, *config.drivers))
+    _, *drivers = checked_drivers(task, (config.policy, *config.drivers))
     evaluation = evaluate_with_progress(
-        task, config.policy, config.policy, config.episodes, config.num_envs, config.seed, config.drivers
+        task, config.policy, config.policy, config.episodes, config.num_envs, config.seed, drivers
     )
     return evaluation, {"driver": config.policy}
 
 
-def check_drivers(task: Task, names: Sequence[str]) -> None:
-    """Raises a `UserError` unless each of these drivers can drive the ego of a task."""
-    if names and task.is_multiagent:
+def checked_drivers(task: Task, names: Sequence[str]) -> tuple[str, ...]:
+    """Returns the drivers that these names stand for, each once; each can drive the ego of the task.
+
+    Raises:
+        UserError: one of them cannot.
+    """
+    if not names:
+        return ()
+    if task.is_multiagent:
         raise UserError(f"drivers of an ego need an environment with one ego, {task.env_id} has several agents")
-    for name in names:
-        env = make_env(task.env_id, disable_env_checker=True)
+    env = make_env(task.env_id, disable_env_checker=True)
+    drivers = named_drivers(names, env)
+    for name in drivers:
         make_ego_driver(name, env, np.random.default_rng(0))
-        env.close()
+    env.close()
+    return drivers
 
 
 def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str, str]]:
@@ -353,7 +382,7 @@ def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str
         driver=run.get("partner", "heuristic"),
     )
     task.check()
-    check_drivers(task, config.drivers)
+    drivers = checked_drivers(task, config.drivers)
     policy = run_dir / POLICY_FILE
     model = load_model(policy, run["algorithm"])
     note, now = read_policy_note(policy), task.note
@@ -363,9 +392,7 @@ def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str
     elif note.forecaster is not None and now.forecaster is not None:
         note.forecaster.check(now.forecaster, f"policy {policy}")
     name = f"{run['algorithm']} ({run['observe']})"
-    evaluation = evaluate_with_progress(
-        task, model, name, config.episodes, config.num_envs, config.seed, config.drivers
-    )
+    evaluation = evaluate_with_progress(task, model, name, config.episodes, config.num_envs, config.seed, drivers)
     return evaluation, {"algorithm": run["algorithm"], "observe": run["observe"]}
 
 

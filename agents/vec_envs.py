@@ -7,6 +7,7 @@ policy sees, so that training, evaluation and video agree.
 """
 
 import multiprocessing
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,7 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 from agents.task import Task
 from envs.drivers.all_agents import Driver, make_driver
-from envs.drivers.ego import make_ego_driver
+from envs.drivers.ego import constant_actions, make_ego_driver
 from envs.drivers.trained import EgoDriver
 from envs.parallel import ForecastParallelEnv
 from envs.registry import envpool_task_of, make_env, make_multiagent_env
@@ -52,6 +53,9 @@ class EpisodeResult:
     """Mean over steps of the ego's speed [m/s]; NaN if the env does not report it."""
     returns_by_role: dict[str, float] = field(default_factory=dict)
     """Mean return of the learners of each role; empty if there is one role."""
+    action_counts: dict[str, int] = field(default_factory=dict)
+    """Number of steps with each action that the ego took, by its name in `envs.drivers.ego.constant_actions`; empty if
+    actions are not discrete or there is no ego."""
 
 
 class DrivenEnv(BaseParallelWrapper):
@@ -196,6 +200,7 @@ class SeededEpisodes(gym.Wrapper):
     def __init__(self, env: gym.Env) -> None:
         """Wraps the environment with an empty queue."""
         super().__init__(env)
+        self._action_names = {number: name for name, number in constant_actions(env).items()}
         self._seeds: list[int] = []
         self._driver_name: str | None = None
         self._driver: EgoDriver | None = None
@@ -214,6 +219,7 @@ class SeededEpisodes(gym.Wrapper):
             self._driver = make_ego_driver(self._driver_name, self.env, driver_rng(self._seed))
         self._rewards: list[float] = []
         self._speeds_mps: list[float] = []
+        self._actions: Counter[str] = Counter()
         self._crashed: bool | None = None
         self._obs = obs
         return obs, info
@@ -226,11 +232,18 @@ class SeededEpisodes(gym.Wrapper):
         self._obs = obs
         self._rewards.append(float(reward))
         self._speeds_mps.append(float(info.get("speed", np.nan)))
+        if self._action_names:
+            self._actions[self._action_names[int(action)]] += 1
         if "crashed" in info:
             self._crashed = bool(self._crashed) or bool(info["crashed"])
         if (terminated or truncated) and self._seed is not None:
             speed = float(np.mean(self._speeds_mps))
             info[EPISODE_INFO] = EpisodeResult(
-                self._seed, float(np.sum(self._rewards)), len(self._rewards), self._crashed, speed
+                self._seed,
+                float(np.sum(self._rewards)),
+                len(self._rewards),
+                self._crashed,
+                speed,
+                action_counts=dict(self._actions),
             )
         return obs, reward, terminated, truncated, info

@@ -145,6 +145,10 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--policy planner --out new", "--policy and --env-id go together"),
         ("--policy planner --env-id merge-v1", "--policy has no run folder; say with --out where the results go"),
         ("--policy nobody --env-id merge-v1 --out new", "driver must be one of random, idle, varied, keep-lane"),
+        (
+            "--policy constant-actions --env-id merge-v1 --out new",
+            "constant-actions stands for several drivers; give it to --drivers, and one to --policy",
+        ),
         ("--policy planner --env-id simple_tag_v3 --out new", "drivers of an ego need an environment with one ego"),
     ],
     "train_policy": [

@@ -3,6 +3,7 @@
 A driver is a partial or a bound method, not a closure: `copy.deepcopy` of a running world copies its state too.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -17,6 +18,8 @@ from predictor.support.errors import UserError
 
 WHO = "random egos"
 EGO_DRIVER_NAMES = ("random", "idle", "varied", "keep-lane", PLANNER)
+CONSTANT_ACTIONS = "constant-actions"
+"""Name that stands for the drivers of all constant actions in a list of drivers."""
 
 
 def make_ego_driver(name: str, env: gym.Env, rng: np.random.Generator) -> EgoDriver:
@@ -25,8 +28,9 @@ def make_ego_driver(name: str, env: gym.Env, rng: np.random.Generator) -> EgoDri
     Args:
         name: "random" (uniform actions), "idle" (no action), "varied" (each episode draws its own preferences and how
             long a choice is kept), "keep-lane" (steers along its lane; continuous steering only), "planner" (the best
-            of its plans by what-if forecasts, `envs.drivers.planner`; "planner:CHECKPOINT" names the forecaster), or
-            the path of a Stable-Baselines3 ``.zip``.
+            of its plans by what-if forecasts, `envs.drivers.planner`; "planner:CHECKPOINT" names the forecaster), an
+            action that is taken in every step, by its name in `constant_actions` ("slower", "action-4"), or the path of
+            a Stable-Baselines3 ``.zip``.
         env: the environment that will be driven.
         rng: source of all randomness of this episode.
 
@@ -46,18 +50,52 @@ def make_ego_driver(name: str, env: gym.Env, rng: np.random.Generator) -> EgoDri
     if name.endswith(".zip"):
         kept_policy(name)
         return partial(_trained, name)
-    raise UserError(f"driver must be one of {', '.join(EGO_DRIVER_NAMES)} or the path of a policy .zip, got '{name}'")
+    constants = constant_actions(env)
+    if name in constants:
+        return partial(_constant, constants[name])
+    names = ", ".join(dict.fromkeys((*EGO_DRIVER_NAMES, *constants)))
+    raise UserError(f"driver must be one of {names} or the path of a policy .zip, got '{name}'")
+
+
+def constant_actions(env: gym.Env) -> dict[str, int]:
+    """Returns the actions of a discrete-action environment by the names of the drivers that take nothing else.
+
+    highway-env's meta-actions have their own names: "lane-left", "idle", "lane-right", "faster", "slower". Others are
+    "action-0", "action-1", … Other action spaces have none.
+    """
+    space = env.action_space
+    if not isinstance(space, gym.spaces.Discrete):
+        return {}
+    labels = {number: label.lower().replace("_", "-") for label, number in _meta_actions(env).items()}
+    return {labels.get(n, f"action-{n}"): n for n in range(int(space.start), int(space.start + space.n))}
+
+
+def named_drivers(names: Sequence[str], env: gym.Env) -> tuple[str, ...]:
+    """Returns names of drivers in their order, each once, with those of all constant actions for "constant-actions".
+
+    Raises:
+        UserError: all constant actions of an environment whose actions are not discrete.
+    """
+    if CONSTANT_ACTIONS in names and not constant_actions(env):
+        raise UserError(f"{CONSTANT_ACTIONS} needs an environment with discrete actions, got {env.action_space}")
+    found = [constant_actions(env) if name == CONSTANT_ACTIONS else (name,) for name in names]
+    return tuple(dict.fromkeys(name for group in found for name in group))
 
 
 def idle_action(env: gym.Env) -> Any:
     """Returns the action that changes nothing: highway-env's IDLE, or zeros."""
     space = env.action_space
     if isinstance(space, gym.spaces.Discrete):
-        indexes = getattr(getattr(env.unwrapped, "action_type", None), "actions_indexes", {})
-        return int(indexes.get("IDLE", 0))
+        return _meta_actions(env).get("IDLE", 0)
     if isinstance(space, gym.spaces.Box):
         return np.zeros(space.shape, dtype=space.dtype)
     raise UserError(f"no idle action is known for {space}")
+
+
+def _meta_actions(env: gym.Env) -> dict[str, int]:
+    """Returns highway-env's meta-actions; none for other action types and environments."""
+    found: dict[str, int] = getattr(getattr(env.unwrapped, "action_type", None), "actions_indexes", {})
+    return found
 
 
 def _keep_lane(env: gym.Env, rng: np.random.Generator) -> EgoDriver:

@@ -6,10 +6,10 @@ import pytest
 
 from agents.arena import MultiagentArena
 from agents.evaluate import (
-    NUM_POLICIES,
     Evaluation,
-    check_drivers,
+    checked_drivers,
     evaluate_policy_on_seeds,
+    main,
     mean_and_standard_error,
     summarize,
     wilson_interval,
@@ -136,7 +136,7 @@ def test_all_policies_play_the_same_held_out_seeds():
     model, calls = policy_for(task), []
     evaluation = evaluate_policy_on_seeds(task, model, "ppo", 3, on_episode=lambda: calls.append(None))
     assert list(evaluation.results) == ["ppo", "random", "idle"]
-    assert len(calls) == 3 * NUM_POLICIES
+    assert len(calls) == 3 * 3
     seeds = range(EVALUATION_SEED, EVALUATION_SEED + 3)
     for name, found in evaluation.results.items():
         expected = MultiagentArena(task).play(model if name == "ppo" else name, seeds)
@@ -157,7 +157,55 @@ def test_the_planner_is_a_policy_and_a_line_of_the_table():
 
 def test_drivers_that_cannot_drive_are_refused_before_anything_runs():
     with pytest.raises(UserError, match="drivers of an ego need an environment with one ego, simple_tag_v3 has"):
-        check_drivers(Task("simple_tag_v3", "none"), ("planner",))
+        checked_drivers(Task("simple_tag_v3", "none"), ("planner",))
     with pytest.raises(UserError, match="no scene reader knows|no plan model knows"):
-        check_drivers(Task("CartPole-v1", "none"), ("planner",))
-    check_drivers(Task("simple_tag_v3", "none"), ())
+        checked_drivers(Task("CartPole-v1", "none"), ("planner",))
+    with pytest.raises(UserError, match=r"constant-actions needs an environment with discrete actions, got Box\("):
+        checked_drivers(Task("racetrack-v1", "none"), ("constant-actions",))
+    assert checked_drivers(Task("simple_tag_v3", "none"), ()) == ()
+
+
+def test_constant_actions_stand_for_one_driver_each():
+    names = checked_drivers(Task("merge-v1", "none"), ("slower", "constant-actions", "random"))
+    assert names == ("slower", "lane-left", "idle", "lane-right", "faster", "random")
+    assert checked_drivers(Task("CartPole-v1", "none"), ("constant-actions",)) == ("action-0", "action-1")
+
+
+def test_shares_are_of_all_steps_not_of_episodes():
+    long = EpisodeResult(1, 0.0, 30, False, 20.0, {}, {"slower": 29, "idle": 1})
+    short = EpisodeResult(2, 0.0, 2, True, 20.0, {}, {"faster": 2})
+    assert summarize("ppo", [short, long]).action_shares == {"slower": 29 / 32, "faster": 2 / 32, "idle": 1 / 32}
+    assert summarize("ppo", EPISODES).action_shares == {}
+
+
+def driven(**steps: int) -> list[EpisodeResult]:
+    """Returns an episode with so many steps of each action."""
+    return [EpisodeResult(1, 0.0, sum(steps.values()), False, 20.0, {}, steps)]
+
+
+def test_a_nearly_constant_policy_is_named_under_the_table(tmp_path: Path):
+    found = {"ppo": driven(slower=95, idle=5), "planner": driven(slower=94, idle=6), "dqn": driven(idle=7)}
+    known = {"slower": driven(slower=9), "idle": driven(idle=9), "random": driven(idle=4, slower=5)}
+    evaluation = Evaluation("toy-v0", 1, found | known)
+    evaluation.write(tmp_path)
+    line = "(Nearly) constant: ppo takes slower in 95.0 % of its steps; dqn takes idle in 100.0 % of its steps."
+    assert (tmp_path / "summary.md").read_text().splitlines()[-1] == line
+    content = json.loads((tmp_path / "summary.json").read_text(), parse_constant=refuse)
+    assert [list(policy["action_shares"].items()) for policy in content["policies"][:2]] == [
+        [("slower", 0.95), ("idle", 0.05)],
+        [("slower", 0.94), ("idle", 0.06)],
+    ]
+    varied = Evaluation("toy-v0", 1, known).markdown()
+    assert "constant" not in varied and varied.endswith("Wilson interval.\n")
+
+
+def test_one_table_of_planner_and_constant_actions(tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]):
+    command = "--policy planner:constant-velocity --env-id intersection-v2 --drivers constant-actions --episodes 1"
+    monkeypatch.setattr("sys.argv", ["evaluate", *command.split(), "--num-envs", "1", "--out", str(tmp_path)])
+    main()
+    content = json.loads((tmp_path / "summary.json").read_text(), parse_constant=refuse)
+    lines = {policy["policy"]: policy["action_shares"] for policy in content["policies"]}
+    assert list(lines) == ["planner:constant-velocity", "slower", "idle", "faster", "random"]
+    assert all(lines[name] == {name: 1.0} for name in ("slower", "idle", "faster"))
+    assert {e["seed"] for episodes in content["episodes"].values() for e in episodes} == {EVALUATION_SEED}
+    assert "5/5" in capsys.readouterr().out  # the bar knows that idle is one line, not two

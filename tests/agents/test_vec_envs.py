@@ -51,7 +51,7 @@ def expected(seed: int) -> EpisodeResult:
     env.reset(seed=seed)
     length, crashes = env._left, env._crashes
     speeds = [10.0 + left for left in range(length)]
-    return EpisodeResult(seed, 2.0 * length, length, crashes, float(np.mean(speeds)))
+    return EpisodeResult(seed, 2.0 * length, length, crashes, float(np.mean(speeds)), {}, {"action-2": length})
 
 
 @pytest.mark.parametrize("num_envs", [1, 2, 5, 9])
@@ -80,6 +80,22 @@ def test_random_ego_depends_on_the_seed_alone(num_envs: int):
 
 def test_idle_ego_ignores_the_actions_that_arrive():
     assert all(e.episode_return == 0 for e in run_episodes(dice_venv(2), "idle", range(4)))
+
+
+def test_one_action_in_every_step_is_a_driver_and_every_step_is_counted():
+    assert run_episodes(dice_venv(2), "action-2", range(4)) == [expected(seed) for seed in range(4)]
+    for episode in run_episodes(dice_venv(2), "random", range(20)):  # each reward is the number of the action
+        counts = {int(name.removeprefix("action-")): count for name, count in episode.action_counts.items()}
+        assert sum(counts.values()) == episode.length
+        assert sum(number * count for number, count in counts.items()) == episode.episode_return
+
+
+def test_continuous_actions_are_not_counted():
+    class Plain(Dice):
+        action_space = gym.spaces.Box(-1, 1, (), np.float32)
+
+    venv = VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Plain())]))
+    assert [e.action_counts for e in run_episodes(venv, "idle", range(2))] == [{}, {}]
 
 
 def test_progress_is_reported_per_episode():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import DQN, PPO
 
-from envs.drivers.ego import EGO_DRIVER_NAMES, idle_action, make_ego_driver
+from envs.drivers.ego import EGO_DRIVER_NAMES, constant_actions, idle_action, make_ego_driver, named_drivers
 from envs.drivers.trained import env_for_driver, sees_forecasts
 from envs.registry import CHECKPOINTS, make_env
 from envs.sb3.policy_file import NOTE_ENTRY
@@ -76,6 +76,27 @@ def test_idle_keeps_speed_and_lane():
     speed, lane = ego.speed, ego.lane_index
     env.step(idle_action(env))
     assert (ego.speed, ego.lane_index) == (pytest.approx(speed), lane)
+
+
+def test_constant_actions_have_the_simulators_names(discrete: gym.Env, continuous: gym.Env):
+    names = {"lane-left": 0, "idle": 1, "lane-right": 2, "faster": 3, "slower": 4}
+    assert constant_actions(discrete) == names
+    for name, action in names.items():
+        assert actions_of(name, discrete, seed=0, count=5) == [action] * 5
+    assert constant_actions(continuous) == {}
+
+
+def test_actions_without_names_are_counted_from_the_spaces_start():
+    env = gym.make("CartPole-v1")
+    env.action_space = gym.spaces.Discrete(2, start=3)
+    assert constant_actions(env) == {"action-3": 3, "action-4": 4}
+    assert actions_of("action-4", env, seed=0, count=2) == [4, 4]
+
+
+def test_a_list_of_drivers_names_each_constant_action_once(discrete: gym.Env, continuous: gym.Env):
+    names = named_drivers(("planner", "slower", "constant-actions", "planner"), discrete)
+    assert names == ("planner", "slower", "lane-left", "idle", "lane-right", "faster")
+    assert named_drivers(("idle",), continuous) == ("idle",)
 
 
 def test_random_takes_every_action_equally(discrete: gym.Env):
@@ -151,7 +172,8 @@ def test_policies_trained_on_forecasts_get_those_of_their_run(
 
 
 def test_unknown_names_are_listed(discrete: gym.Env):
-    expected = rf"driver must be one of {', '.join(EGO_DRIVER_NAMES)} or the path of a policy .zip, got 'fast'"
+    names = ", ".join((*EGO_DRIVER_NAMES, "lane-left", "lane-right", "faster", "slower"))
+    expected = rf"driver must be one of {names} or the path of a policy .zip, got 'fast'"
     with pytest.raises(UserError, match=expected):
         make_ego_driver("fast", discrete, np.random.default_rng(0))
 
