@@ -16,9 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import torch
-from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track
 
@@ -26,31 +24,20 @@ from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, checkpoint_for
 from envs.rollouts import graph_report, plan_report, reaction_report, report
 from envs.rollouts.branches import check_can_branch
 from envs.rollouts.episode import (
-    MODEL,
-    NEIGHBOURS,
-    NOISY,
-    RESIDUAL,
-    STRAIGHT,
     Case,
     Episode,
     EpisodeTask,
-    memory_key,
     play,
 )
 from envs.rollouts.graph_run import GraphRun, measure_graph
 from envs.rollouts.plan_run import PlanRun, check_has_plans, measure_plans
 from envs.rollouts.reaction_run import ReactionRun, measure_reactions
 from envs.rollouts.report import EnvAccuracy
+from envs.rollouts.summary import summarise_episodes
 from envs.rollouts.world import default_drivers, open_world
-from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, name_of_folder, read_info, resolve
+from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, name_of_folder, resolve
 from predictor.data.store import read_info_of
-from predictor.evaluation.accuracy import Accuracy, Tally, fitted_std_m
-from predictor.evaluation.displacement import MISS_THRESHOLD_M, min_ade
-from predictor.evaluation.graph_accuracy import GraphAccuracy, GraphTally
-from predictor.evaluation.outcomes import Outcome
-from predictor.graph import pair_mask
-from predictor.reports.tables import MODEL_NAMES, accuracy_table
-from predictor.scene import SceneSpec
+from predictor.reports.tables import accuracy_table
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_positive
 from predictor.support.errors import UserError, run_entry_point
@@ -60,8 +47,6 @@ from predictor.support.runtime import keep_freed_memory
 
 PACKAGES = ("highway-env", "mpe2", "pettingzoo", "envpool", "gymnasium", "torch", "numpy")
 
-CONTROLS = (RESIDUAL, NEIGHBOURS, NOISY)
-"""Keys of the controls, in the order of the table's lines."""
 GALLERY_CASES = 6
 """Number of worst forecasts that are drawn, at most one per episode."""
 
@@ -89,6 +74,9 @@ class EvaluateConfig:
     """Number of steps to forecast; None takes each checkpoint's."""
     memory_steps: Annotated[tuple[int, ...], Renamed("history_steps")] = ()
     """Numbers of steps to which the model's memory is limited, each measured as well: the value of its memory."""
+    edge_ablations: bool = False
+    """Whether to measure as well the model with every receiver's edges averaged over its senders, and with all edges
+    cut: the value of its graph."""
     data: Annotated[tuple[Path, ...], Renamed("neighbours")] = ()
     """Recorded data to which the controls are fitted (constant velocity with noise, the model's single forecast with
     noise, nearest neighbours): stores, or folders of stores named by env id; stores of other environments are left
@@ -156,7 +144,7 @@ def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = N
     world.close()
     horizon = config.horizon_steps or load_forecaster(checkpoint, spec, f"env '{env_id}'").horizon_steps
     episodes = _play_all(config, env_id, checkpoint, driver, horizon)
-    result = _summary(config, env_id, checkpoint, driver, spec, episodes)
+    result = summarise_episodes(env_id, checkpoint, driver, spec, episodes, config.memory_steps, config.miss_m)
     if not result.model.agents:
         raise UserError(f"{env_id}: no forecast has {horizon} steps of truth; lower --horizon-steps or add episodes")
     cases = sorted((e.worst for e in episodes if e.worst is not None), key=lambda case: -case.error_m)
@@ -168,7 +156,7 @@ def _play_all(config: EvaluateConfig, env_id: str, checkpoint: str, driver: str,
     tasks = [
         EpisodeTask(
             env_id, checkpoint, driver, config.seed + i, config.num_samples, horizon, config.max_steps,
-            stores, config.memory_steps,
+            stores, config.memory_steps, config.edge_ablations,
         )
         for i in range(config.episodes)
     ]  # fmt: skip
@@ -191,78 +179,6 @@ def _stores_of(roots: Sequence[Path], env_id: str) -> tuple[str, ...]:
             f"data: no store of {env_id} in {', '.join(map(str, roots))}; record one with python -m envs.collect"
         )
     return tuple(found)
-
-
-def _summary(
-    config: EvaluateConfig, env_id: str, checkpoint: str, driver: str, spec: SceneSpec, episodes: Sequence[Episode]
-) -> EnvAccuracy:
-    miss_m = config.miss_m or (MISS_THRESHOLD_M if spec.feature_scales[0] >= 50 else 0.1 * spec.feature_scales[0])
-    outcomes = {key: [e.outcomes[key] for e in episodes] for key in episodes[0].outcomes}
-    first = [outcome.single() for outcome in outcomes[MODEL]]
-    learned = checkpoint != CONSTANT_VELOCITY
-    std_m = read_info(Path(checkpoint)).std_m if learned else fitted_std_m(first)
-    name = MODEL_NAMES.get(read_info(Path(checkpoint)).model, "model") if learned else "constant velocity (deployed)"
-
-    def line(title: str, found: Sequence[Outcome], spread: Sequence[float]) -> Accuracy:
-        tally = Tally(spread, miss_m)
-        for outcome in found:
-            tally.add(outcome)
-        return tally.accuracy(title, batch_intervals=True)
-
-    # The spread of the baselines is fitted on these very errors, in their favour: they have no validation data.
-    straight = line("constant velocity", outcomes[STRAIGHT], fitted_std_m(outcomes[STRAIGHT]))
-    reduction, interval = _reduction(first, outcomes[STRAIGHT])
-    latencies_ms = 1e3 * np.concatenate([e.latencies_s[1:] or e.latencies_s for e in episodes])  # the first warms up
-    return EnvAccuracy(
-        env_id,
-        name_of_folder(checkpoint) if learned else checkpoint,
-        driver,
-        spec.dt_s,
-        line(name, first, std_m),
-        line(name, outcomes[MODEL], std_m),
-        straight,
-        reduction,
-        interval,
-        {key: line(key, outcomes[key], fitted_std_m(outcomes[key])) for key in CONTROLS if key in outcomes},
-        {
-            n: line(f"{name}, {n} step{'s' * (n > 1)} of history", outcomes[memory_key(n)], std_m)
-            for n in config.memory_steps
-        },
-        _graph(episodes) if learned else None,
-        float(np.median(latencies_ms)),
-        float(np.percentile(latencies_ms, 95)),
-    )
-
-
-def _graph(episodes: Sequence[Episode]) -> GraphAccuracy | None:
-    """Returns the accuracy of inferred against true edges over all scenes; None where the simulator has none."""
-    if not any(e.edge_types for e in episodes):
-        return None
-    tally = GraphTally(episodes[0].edge_probs[0].shape[-1])
-    for episode in episodes:
-        types = torch.from_numpy(np.stack(episode.edge_types))
-        known = pair_mask((types != -1).any(-1) | (types != -1).any(-2)) & (types != -1)
-        tally.add(torch.from_numpy(np.stack(episode.edge_probs)), types, known)
-    return tally.results()
-
-
-def _reduction(model: Sequence[Outcome], baseline: Sequence[Outcome]) -> tuple[float, tuple[float, float]]:
-    """Returns the relative reduction of ADE and its 95 % interval, by a bootstrap over paired episodes."""
-    sums = np.zeros((len(model), 2))
-    for i, outcomes in enumerate(zip(model, baseline, strict=True)):
-        for j, outcome in enumerate(outcomes):
-            error, _ = min_ade(outcome.forecast, outcome.future, outcome.valid)
-            sums[i, j] = float(error[outcome.valid.all(-1)].sum())
-    draws = np.random.default_rng(0).integers(len(sums), size=(2000, len(sums)))
-    totals = sums[draws].sum(axis=1)
-    low, high = np.percentile(_relative(totals), [2.5, 97.5])
-    return float(_relative(sums.sum(axis=0))), (float(low), float(high))
-
-
-def _relative(totals: Float[np.ndarray, "*draws 2"]) -> Float[np.ndarray, "*draws"]:
-    """Returns 1 − first / second; 0 where second is 0."""
-    first, second = totals[..., 0], totals[..., 1]
-    return np.where(second > 0, 1 - first / np.where(second > 0, second, 1.0), 0.0)
 
 
 def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy], dict[tuple[str, str], str]]:

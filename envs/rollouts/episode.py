@@ -27,15 +27,20 @@ from envs.scene_stream import ForecastConfig
 from envs.wrappers import ForecastObservation
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.baselines.nearest_neighbour import fit_from_stores
+from predictor.dgvae import DGVAE
+from predictor.dgvae.edge_ablation import Ablation, EdgeAblation
 from predictor.evaluation.controls import fit_noise, fit_residual, training_windows
 from predictor.evaluation.displacement import displacement
 from predictor.evaluation.outcomes import Outcome
 from predictor.forecaster import Forecaster
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
+from predictor.support.errors import UserError
 
 MODEL, STRAIGHT, NEIGHBOURS = "model", "constant velocity", "nearest neighbours"
 NOISY, RESIDUAL = "constant velocity + noise", "model + Gaussian noise"
 """Keys of the forecasters of an episode; `memory_key(steps)` gives those of the memory ablations."""
+EDGES: dict[str, Ablation] = {"edges averaged over senders": "averaged", "edges cut": "cut"}
+"""Ablations of the model's edges, by key."""
 CASE_HISTORY_STEPS = 20
 """Number of past steps shown of a worst case."""
 
@@ -67,6 +72,8 @@ class EpisodeTask:
     """Stores to fit the controls to; empty leaves them out."""
     histories: tuple[int, ...] = ()
     """Numbers of steps to which the model's memory is limited in ablations."""
+    edge_ablations: bool = False
+    """Whether the model forecasts with changed edges, too."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +178,19 @@ def _baselines(task: EpisodeTask, spec: SceneSpec) -> dict[str, SideForecaster]:
     for steps in task.histories:
         model = kept_forecaster(task.checkpoint, spec, task.env_id)
         found[memory_key(steps)] = SideForecaster(model, spec, task.horizon_steps, steps)
+    if task.edge_ablations:
+        for key, ablated in _kept_ablations(task.checkpoint, spec, task.env_id).items():
+            found[key] = SideForecaster(ablated, spec, task.horizon_steps)
     return found
+
+
+@functools.lru_cache(maxsize=2)
+def _kept_ablations(checkpoint: str, spec: SceneSpec, source: str) -> dict[str, Forecaster]:
+    """Returns the model with changed edges, by key."""
+    model = kept_forecaster(checkpoint, spec, source)
+    if not isinstance(model, DGVAE):
+        raise UserError(f"edge ablations need the edges of a dG-VAE, and {checkpoint} is {type(model).__name__}")
+    return {key: EdgeAblation(model, kind) for key, kind in EDGES.items()}
 
 
 def _outcome(forecasts: Sequence[Forecast], future: torch.Tensor, valid: torch.Tensor) -> Outcome:

@@ -49,6 +49,8 @@ class EnvAccuracy:
     """Median time to observe one scene and forecast it (K = 1), one thread, all workers busy [ms]."""
     latency_p95_ms: float = float("nan")
     """95th percentile of that time [ms]."""
+    edges: dict[str, Accuracy] = field(default_factory=dict)
+    """Accuracy of the model (K = 1) by what was done to its edges; empty unless asked for."""
 
     @property
     def lines(self) -> list[Accuracy]:
@@ -81,6 +83,10 @@ def remarks(result: "EnvAccuracy") -> str:
     for steps, line in result.histories.items():
         low, high = line.intervals.get("min_ade_m", (np.nan, np.nan))
         lines.append(f"… with {steps} step(s) of history {line.min_ade_m:.3f} m, {low:.3f} to {high:.3f}")
+    for key, line in result.edges.items():
+        low, high = line.intervals.get("min_ade_m", (np.nan, np.nan))
+        more = 100 * (line.min_ade_m / result.model.min_ade_m - 1)
+        lines.append(f"… with {key} {line.min_ade_m:.3f} m ({more:+.0f} %), {low:.3f} to {high:.3f}")
     graph = result.graph
     if graph is not None and graph.accuracy is not None:
         f1 = "–" if graph.f1 is None else f"{graph.f1:.2f}"

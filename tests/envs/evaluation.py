@@ -49,6 +49,7 @@ def forget() -> None:
     for kept in (
         live._kept_world,
         live._kept_controls,
+        live._kept_ablations,
         kept_world,
         reactions._kept_neighbours,
         kept_forecaster,

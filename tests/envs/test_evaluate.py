@@ -12,11 +12,13 @@ from matplotlib import pyplot as plt
 
 from envs import evaluate
 from envs.collect import CollectConfig, collect
-from envs.evaluate import CONTROLS, EvaluateConfig, _graph, _reduction, _summary, evaluate_env
+from envs.evaluate import EvaluateConfig, evaluate_env
 from envs.readers.highway import HighwayReader
 from envs.registry import make_env
-from envs.rollouts.episode import MODEL, STRAIGHT, Episode
+from envs.rollouts import report
+from envs.rollouts.episode import EDGES, MODEL, STRAIGHT, Episode
 from envs.rollouts.report import EnvAccuracy
+from envs.rollouts.summary import CONTROLS, _graph, _reduction, summarise_episodes
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.data.store import StoreInfo, write_store
 from predictor.evaluation.outcomes import Outcome
@@ -64,7 +66,22 @@ def summary(spec: SceneSpec, errors_m: list[float], latencies_s: list[list[float
         Episode({MODEL: outcome(error), STRAIGHT: outcome(2 * error)}, latencies)
         for error, latencies in zip(errors_m, latencies_s, strict=True)
     ]
-    return _summary(EvaluateConfig(**changes), "here", STILL, "idle", spec, episodes)
+    return summarise_episodes("here", STILL, "idle", spec, episodes, **changes)
+
+
+def test_edges_are_measured_averaged_and_cut(tmp_path: Path):
+    checkpoint = save_tag(tmp_path / "tag")
+    plain, result = (measure(TAG, checkpoint, horizon_steps=None, edge_ablations=on) for on in (False, True))
+    assert plain.edges == {} and list(result.edges) == list(EDGES)
+    assert result.model.min_ade_m == plain.model.min_ade_m
+    errors_m = {result.model.min_ade_m, *(line.min_ade_m for line in result.edges.values())}
+    assert len(errors_m) == 3 and all(line.agents == result.model.agents for line in result.edges.values())
+    assert f"… with {list(EDGES)[1]} {result.edges['edges cut'].min_ade_m:.3f} m" in report.remarks(result)
+
+
+def test_a_forecaster_without_edges_has_none_to_change():
+    with pytest.raises(UserError, match="edge ablations need the edges of a dG-VAE, and constant-velocity is Constant"):
+        measure(TAG, STILL, edge_ablations=True)
 
 
 def test_lines_and_intervals_closed_form():

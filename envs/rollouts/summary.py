@@ -1,0 +1,110 @@
+"""Summarises the episodes of one environment: the accuracy of the deployed forecasts, of controls and of ablations."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from envs.rollouts.episode import EDGES, MODEL, NEIGHBOURS, NOISY, RESIDUAL, STRAIGHT, Episode, memory_key
+from envs.rollouts.report import EnvAccuracy
+from predictor.checkpoint import CONSTANT_VELOCITY, name_of_folder, read_info
+from predictor.evaluation.accuracy import Accuracy, Tally, fitted_std_m
+from predictor.evaluation.displacement import MISS_THRESHOLD_M, min_ade
+from predictor.evaluation.graph_accuracy import GraphAccuracy, GraphTally
+from predictor.evaluation.outcomes import Outcome
+from predictor.graph import pair_mask
+from predictor.reports.tables import MODEL_NAMES
+from predictor.scene import SceneSpec
+
+CONTROLS = (RESIDUAL, NEIGHBOURS, NOISY)
+"""Keys of the controls, in the order of the table's lines."""
+
+
+def summarise_episodes(
+    env_id: str,
+    checkpoint: str,
+    driver: str,
+    spec: SceneSpec,
+    episodes: Sequence[Episode],
+    histories: Sequence[int] = (),
+    miss_m: float | None = None,
+) -> EnvAccuracy:
+    """Returns the accuracy of one checkpoint in one environment.
+
+    Args:
+        env_id: id of the environment.
+        checkpoint: folder of the checkpoint, or "constant-velocity".
+        driver: name of the driver.
+        spec: layout of the scenes.
+        episodes: episodes that were played.
+        histories: numbers of steps to which the memory was limited in ablations.
+        miss_m: final displacement above which a forecast misses [m]; None takes 2 m on roads, a tenth of a small
+            arena's scale.
+    """
+    miss_m = miss_m or (MISS_THRESHOLD_M if spec.feature_scales[0] >= 50 else 0.1 * spec.feature_scales[0])
+    outcomes = {key: [e.outcomes[key] for e in episodes] for key in episodes[0].outcomes}
+    first = [outcome.single() for outcome in outcomes[MODEL]]
+    learned = checkpoint != CONSTANT_VELOCITY
+    std_m = read_info(Path(checkpoint)).std_m if learned else fitted_std_m(first)
+    name = MODEL_NAMES.get(read_info(Path(checkpoint)).model, "model") if learned else "constant velocity (deployed)"
+
+    def line(title: str, found: Sequence[Outcome], spread: Sequence[float]) -> Accuracy:
+        tally = Tally(spread, miss_m)
+        for outcome in found:
+            tally.add(outcome)
+        return tally.accuracy(title, batch_intervals=True)
+
+    # The spread of the baselines is fitted on these very errors, in their favour: they have no validation data.
+    straight = line("constant velocity", outcomes[STRAIGHT], fitted_std_m(outcomes[STRAIGHT]))
+    reduction, interval = _reduction(first, outcomes[STRAIGHT])
+    latencies_ms = 1e3 * np.concatenate([e.latencies_s[1:] or e.latencies_s for e in episodes])  # the first warms up
+    return EnvAccuracy(
+        env_id,
+        name_of_folder(checkpoint) if learned else checkpoint,
+        driver,
+        spec.dt_s,
+        line(name, first, std_m),
+        line(name, outcomes[MODEL], std_m),
+        straight,
+        reduction,
+        interval,
+        {key: line(key, outcomes[key], fitted_std_m(outcomes[key])) for key in CONTROLS if key in outcomes},
+        {n: line(f"{name}, {n} step{'s' * (n > 1)} of history", outcomes[memory_key(n)], std_m) for n in histories},
+        _graph(episodes) if learned else None,
+        float(np.median(latencies_ms)),
+        float(np.percentile(latencies_ms, 95)),
+        {key: line(f"{name}, {key}", outcomes[key], std_m) for key in EDGES if key in outcomes},
+    )
+
+
+def _graph(episodes: Sequence[Episode]) -> GraphAccuracy | None:
+    """Returns the accuracy of inferred against true edges over all scenes; None where the simulator has none."""
+    if not any(e.edge_types for e in episodes):
+        return None
+    tally = GraphTally(episodes[0].edge_probs[0].shape[-1])
+    for episode in episodes:
+        types = torch.from_numpy(np.stack(episode.edge_types))
+        known = pair_mask((types != -1).any(-1) | (types != -1).any(-2)) & (types != -1)
+        tally.add(torch.from_numpy(np.stack(episode.edge_probs)), types, known)
+    return tally.results()
+
+
+def _reduction(model: Sequence[Outcome], baseline: Sequence[Outcome]) -> tuple[float, tuple[float, float]]:
+    """Returns the relative reduction of ADE and its 95 % interval, by a bootstrap over paired episodes."""
+    sums = np.zeros((len(model), 2))
+    for i, outcomes in enumerate(zip(model, baseline, strict=True)):
+        for j, outcome in enumerate(outcomes):
+            error, _ = min_ade(outcome.forecast, outcome.future, outcome.valid)
+            sums[i, j] = float(error[outcome.valid.all(-1)].sum())
+    draws = np.random.default_rng(0).integers(len(sums), size=(2000, len(sums)))
+    totals = sums[draws].sum(axis=1)
+    low, high = np.percentile(_relative(totals), [2.5, 97.5])
+    return float(_relative(sums.sum(axis=0))), (float(low), float(high))
+
+
+def _relative(totals: Float[np.ndarray, "*draws 2"]) -> Float[np.ndarray, "*draws"]:
+    """Returns 1 − first / second; 0 where second is 0."""
+    first, second = totals[..., 0], totals[..., 1]
+    return np.where(second > 0, 1 - first / np.where(second > 0, second, 1.0), 0.0)
