@@ -152,7 +152,8 @@ class Planner:
         if plans.rewards is None:
             raise UserError(f"the planner needs rewards, but plan model {type(self.plan_model).__name__} gives none")
         forecast = self._online.forecast(self._horizon, self._samples, self._noise, plans.states[None])
-        survival = contacts(forecast, scenes, plans.size_m).survival()[0]
+        length_m, width_m = (size + plans.margin_m for size in plans.size_m)  # half of it around each agent
+        survival = contacts(forecast, scenes, (length_m, width_m)).survival()[0]
         self.survival = survival if plans.crashed is None else survival * ~plans.crashed
         self.plans, self.chosen = plans, choose(plans, self.survival, self.config.max_risk)
         return plans.actions[self.chosen]

@@ -26,6 +26,8 @@ class Plans:
     """Whether the ego has collided with a fixed obstacle by each step; None takes False."""
     size_m: tuple[float, float] = (5.0, 2.0)
     """Length and width of every agent [m], with which collisions are found; default: highway-env's vehicles."""
+    margin_m: float = 0.0
+    """Gap below which the planner counts a contact [m]: what straight moves between steps leave out."""
     later_actions: tuple[tuple[Any, ...], ...] | None = None
     """Actions of each plan's steps after the first; needed to play plans in a simulator (`envs.evaluate --plans`)."""
 
@@ -72,6 +74,8 @@ def checked_plans(model: PlanModel, env: gym.Env, horizon_steps: int, num_featur
             raise UserError(f"{source}: {name} must be finite, got NaN or infinity")
     if count < 1 or len(plans.actions) != count:
         raise UserError(f"{source}: each of its {count} plans needs one action, got {len(plans.actions)}")
+    if not 0 <= plans.margin_m < np.inf:
+        raise UserError(f"{source}: margin_m must be finite and at least 0, got {plans.margin_m}")
     later = None if plans.later_actions is None else [len(actions) for actions in plans.later_actions]
     if later not in (None, [horizon_steps - 1] * count):
         raise UserError(f"{source}: later_actions need {horizon_steps - 1} for each of {count} plans, got {later}")

@@ -25,6 +25,14 @@ META_ACTIONS = ("IDLE", "SLOWER", "FASTER", "LANE_LEFT", "LANE_RIGHT")
 """Meta-actions in the order of plans; those that an environment lacks are left out."""
 THROTTLES = {"keep": 0.0, "brake": -1.0, "accelerate": 1.0}
 """Accelerations of plans with continuous controls, as fractions of the strongest."""
+MARGIN_M = 1.0
+"""Gap below which the planner counts a contact [m].
+
+A lane change is quickest at its beginning, where a straight move between two steps is still short, and highway-env
+counts vehicles that would overlap in the next frame as collided. Of 250 lane changes beside a vehicle of constant speed
+163 collided: without a margin 15 of these were called free, with 0.5 m 2, with 1 m none. Of the others 0, 3 and 17 were
+called collisions.
+"""
 LANES = {"": 0, " left": -1, " right": 1}
 """Lanes of plans with continuous steering, relative to the present one."""
 
@@ -79,7 +87,7 @@ class HighwayPlans:
         states, actions, rewards, crash_rewards, crashed = zip(*runs, strict=True)
         first, later = tuple(a[0] for a in actions), tuple(tuple(a[1:]) for a in actions)
         made = Plans(np.stack(states), first, np.array(rewards), np.array(crash_rewards), np.array(crashed))
-        return replace(made, later_actions=later)
+        return replace(made, later_actions=later, margin_m=MARGIN_M)
 
 
 def _simulate(env: Any, candidate: str | _Control, horizon_steps: int) -> tuple[Any, ...]:

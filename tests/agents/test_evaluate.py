@@ -185,7 +185,7 @@ def driven(**steps: int) -> list[EpisodeResult]:
 
 def test_a_nearly_constant_policy_is_named_under_the_table(tmp_path: Path):
     found = {"ppo": driven(slower=95, idle=5), "planner": driven(slower=94, idle=6), "dqn": driven(idle=7)}
-    known = {"slower": driven(slower=9), "idle": driven(idle=9), "random": driven(idle=4, slower=5)}
+    known = {"slower": driven(slower=9), "idle": driven(**{"action-0": 9}), "random": driven(idle=4, slower=5)}
     evaluation = Evaluation("toy-v0", 1, found | known)
     evaluation.write(tmp_path)
     line = "(Nearly) constant: ppo takes slower in 95.0 % of its steps; dqn takes idle in 100.0 % of its steps."

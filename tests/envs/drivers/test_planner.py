@@ -91,6 +91,20 @@ def test_a_slow_vehicle_ahead_is_avoided_where_idle_collides():
     assert any(idle.step(1)[4]["crashed"] for _ in range(6))
 
 
+@pytest.mark.parametrize(("behind_m", "collides"), [(-3.0, True), (-2.25, True), (-1.5, True), (-8.0, False)])
+def test_a_lane_change_beside_a_vehicle_is_risky_where_it_collides(behind_m: float, collides: bool):
+    """Contacts of the first second are on the way: at its end the ego has passed the vehicle."""
+    env = traffic(behind_m, 20.0)
+    ego, other = env.unwrapped.road.vehicles  # type: ignore[attr-defined]
+    side, action = (4.0, "LANE_RIGHT") if ego.lane_index[2] < 2 else (-4.0, "LANE_LEFT")
+    other.position = other.position + [0.0, side]
+    planner = Planner(env, ConstantVelocity(ROAD))
+    planner()
+    plan = planner.plan_model.names.index(action)
+    assert planner.survival[plan, 0] == (0.0 if collides else 1.0)
+    assert env.step(planner.plans.actions[plan])[4]["crashed"] == collides  # type: ignore[union-attr]
+
+
 def test_an_empty_road_is_driven_fast():
     env = traffic(400.0, 40.0)
     planner = Planner(env, ConstantVelocity(ROAD))

@@ -147,10 +147,22 @@ class TwoPlans:
         return self.found
 
 
-def given(states: np.ndarray, actions: tuple[int, ...], rewards: np.ndarray | None = None, later: Any = None) -> Any:
+def given(
+    states: np.ndarray,
+    actions: tuple[int, ...],
+    rewards: np.ndarray | None = None,
+    later: Any = None,
+    margin_m: float = 0.0,
+) -> Any:
     """What a careless model may return; `Plans` itself refuses such shapes while shapes are checked."""
     return SimpleNamespace(
-        states=states, actions=actions, rewards=rewards, crash_rewards=None, crashed=None, later_actions=later
+        states=states,
+        actions=actions,
+        rewards=rewards,
+        crash_rewards=None,
+        crashed=None,
+        later_actions=later,
+        margin_m=margin_m,
     )
 
 
@@ -173,6 +185,7 @@ def test_a_registered_model_serves_its_class_and_others_are_refused(monkeypatch:
             given(np.zeros((2, 3, 4)), (0, 1), later=((0, 0), (0,))),
             r"later_actions need 2 for each of 2 plans, got \[2, 1\]",
         ),
+        (given(np.zeros((2, 3, 4)), (0, 1), margin_m=-0.1), "margin_m must be finite and at least 0, got -0.1"),
         (given(np.zeros((2, 3, 4)), (0,)), "each of its 2 plans needs one action, got 1"),
         (given(np.zeros((2, 3, 4)), (0, 1), np.zeros((2, 2))), r"rewards need the shape \(2, 3\), got \(2, 2\)"),
     ],
