@@ -48,7 +48,7 @@ class Moment:
     """Step within it."""
 
 
-FILMED = Moment(900_001, 7)
+FILMED = Moment(900_021, 6)
 PLANNED = Moment(900_004, 5)
 BRAKING = Moment(900_014, 6)
 GRAPH = Moment(900_010, 5)
