@@ -43,9 +43,9 @@ class CollectConfig:
     episodes: int = 400
     """Number of episodes to record."""
     driver: Annotated[tuple[str, ...], Renamed("ego")] = ()
-    """Driver; several take turns, one per episode. One ego: random, idle, varied, keep-lane, planner, or the path of a
-    policy .zip. Many learners: random, idle, varied, heuristic, mixed. None given: varied random idle, or heuristic
-    mixed varied."""
+    """Driver; several take turns, one per episode. One ego: random, idle, varied, keep-lane, planner, one action in
+    every step (slower, action-4), or the path of a policy .zip. Many learners: random, idle, varied, heuristic, mixed.
+    None given: varied random idle, or heuristic mixed varied."""
     seed: int = 0
     """Random seed: episode i is reset with seed + i; keep test seeds apart from training seeds."""
     max_steps: int = 200
