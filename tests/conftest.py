@@ -10,6 +10,7 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
 import torch  # noqa: E402
+from highway_env.vehicle.behavior import IDMVehicle  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 # The same examples in every run, however busy the machine is.
@@ -18,6 +19,20 @@ settings.load_profile("suite")
 
 # Tensors are tiny here: a second thread costs more than it brings, above all when tests run in parallel.
 torch.set_num_threads(1)
+
+
+AS_SHIPPED = {name: getattr(IDMVehicle, name) for name in ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN")}
+
+
+@pytest.fixture(autouse=True)
+def pristine_drivers() -> Iterator[None]:
+    """highway-env's intersection changes every IDM driver of the process; no test may depend on who ran before it.
+
+    Values are put back after each test, so that fixtures of a module, which come before those of a test, see them too.
+    """
+    yield
+    for name, value in AS_SHIPPED.items():
+        setattr(IDMVehicle, name, value)
 
 
 @pytest.fixture(autouse=True)

@@ -67,6 +67,9 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--data absent --num-samples 0", "num_samples must be at least 1, got 0"),
         ("--data absent --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
     ],
+    "docs.draw_pictures": [
+        ("--only film", "only must be among highway, what_if, braking_leader, causal_graph, got film")
+    ],
     "predictor.card": [("--checkpoint absent --data absent --accuracy absent", "no checkpoint 'absent'")],
     "predictor.data.springs": [
         ("--out file", "file is a file; choose another --out"),

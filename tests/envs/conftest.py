@@ -1,16 +1,6 @@
 """Fixtures of these tests; nothing of this project is imported at the top, so that the shape checks see it first."""
 
 import pytest
-from highway_env.vehicle.behavior import IDMVehicle
-
-AS_SHIPPED = {name: getattr(IDMVehicle, name) for name in ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN")}
-
-
-@pytest.fixture(autouse=True)
-def pristine_drivers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """highway-env's intersection changes every IDM driver of the process; no test may depend on who ran before it."""
-    for name, value in AS_SHIPPED.items():
-        monkeypatch.setattr(IDMVehicle, name, value)
 
 
 @pytest.fixture(scope="session")
