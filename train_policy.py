@@ -42,9 +42,18 @@ class TrainPolicyConfig:
     algorithm: Algorithm = "ppo"
     """Learning algorithm; its hyperparameters are in agents/presets.py."""
     observe: Observe = "forecast"
-    """What the policy sees: learned forecasts, the env's own observation alone, or constant-velocity forecasts."""
+    """What the policy sees: learned forecasts ("forecast"), constant-velocity forecasts, no forecasts ("none"), or an
+    arm of a controlled comparison (docs/arms.md)."""
     checkpoint: str | None = None
     """Forecaster: shipped name, folder or run folder; None takes the checkpoint that ships for the env id."""
+    num_samples: int = 1
+    """Number of futures per agent in the observation."""
+    horizon_steps: int | None = None
+    """Number of steps to forecast; None takes what the checkpoint was trained for."""
+    what_if: bool = False
+    """Show also what the others do in each candidate plan of the ego."""
+    env_kwargs: str = ""
+    """Arguments of the environment as a JSON object, for example '{"config": {"vehicles_density": 2}}'."""
     steps: int = 20_000
     """Number of environment steps to train for, over all environments."""
     num_envs: Annotated[int | None, Renamed("envs")] = None
@@ -96,7 +105,10 @@ class TrainPolicyConfig:
     def plan(self) -> TrainingPlan:
         """Plan of the training."""
         learners = entry_for(self.env_id).learners if self.learners is None else self.learners
-        task = Task(self.env_id, self.observe, self.checkpoint, self.device, self.backend, tuple(learners), self.driver)
+        task = Task(
+            self.env_id, self.observe, self.checkpoint, self.device, self.backend, tuple(learners), self.driver,
+            self.num_samples, self.horizon_steps, self.what_if, self.env_kwargs,
+        )  # fmt: skip
         return TrainingPlan(
             task,
             self.algorithm,

@@ -24,10 +24,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.arena import EgoArena, open_arena
 from agents.runs import POLICY_FILE, load_model, read_config
-from agents.task import EVALUATION_SEED, Task
+from agents.task import EVALUATION_SEED, Task, task_of
 from agents.vec_envs import EpisodeResult
 from envs.drivers.ego import CONSTANT_ACTIONS, make_ego_driver, named_drivers
-from envs.registry import make_env
 from envs.sb3.policy_file import read_policy_note
 from predictor.support import markdown
 from predictor.support.command_line import Renamed, parse
@@ -362,7 +361,7 @@ def checked_drivers(task: Task, names: Sequence[str]) -> tuple[str, ...]:
         return ()
     if task.is_multiagent:
         raise UserError(f"drivers of an ego need an environment with one ego, {task.env_id} has several agents")
-    env = make_env(task.env_id, disable_env_checker=True)
+    env = task.make(disable_env_checker=True)
     drivers = named_drivers(names, env)
     for name in drivers:
         make_ego_driver(name, env, np.random.default_rng(0))
@@ -373,14 +372,7 @@ def checked_drivers(task: Task, names: Sequence[str]) -> tuple[str, ...]:
 def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str, str]]:
     """Evaluates the policy of a training run; returns what is noted beside the results, too."""
     run = read_config(run_dir)
-    task = Task(
-        run["env_id"],
-        run["observe"],
-        run["checkpoint"],
-        config.device,
-        learners=tuple(run.get("learners", ())),
-        driver=run.get("partner", "heuristic"),
-    )
+    task = task_of(run, config.device)
     task.check()
     drivers = checked_drivers(task, config.drivers)
     policy = run_dir / POLICY_FILE

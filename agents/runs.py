@@ -148,7 +148,7 @@ def _check_same(file: Path, config: dict[str, Any], free: Sequence[str]) -> list
     stored = _read(file)
     before = stored["config"]
     for name in config:
-        if name not in free and before.get(name) != config[name]:
+        if name not in free and before.get(name, config[name]) != config[name]:  # runs of older versions lack some
             raise UserError(
                 f"cannot resume {file.parent}: {name} was {before.get(name)!r}, now {config[name]!r}; "
                 "pass the old value or choose another --out"

@@ -1,16 +1,22 @@
 """Task of a policy (environment, observation, forecaster, drivers), shared by training, evaluation and video."""
 
+import functools
 import importlib.util
-from dataclasses import dataclass
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 
+from envs.arms import Arm, EntryBank, EntryLayout
 from envs.drivers.all_agents import DRIVER_NAMES, make_driver
+from envs.entry_bank import record_bank
 from envs.parallel import ForecastParallelEnv
 from envs.registry import (
     checkpoint_for,
+    entry_for,
     envpool_task_of,
     is_multiagent_id,
     make_env,
@@ -20,9 +26,10 @@ from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.sb3.padded_spaces import learners_named
 from envs.sb3.policy_file import PolicyNote, pin_forecaster
 from envs.wrappers import ForecastObservation
-from predictor.checkpoint import CONSTANT_VELOCITY
+from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint
+from predictor.forecaster import Forecaster
 from predictor.scene import SceneSpec
-from predictor.support.config_checks import check_choice, check_choices
+from predictor.support.config_checks import check_at_least, check_choice, check_choices
 from predictor.support.errors import UserError
 from predictor.support.runtime import resolve_device
 
@@ -32,7 +39,11 @@ EVALUATION_SEED = 2_000_000_000
 SELECTION_SEED = 1_000_000_000
 """First seed of model selection; training seeds are below it, those of the final evaluation start at 2e9."""
 
-Observe = Literal["forecast", "none", "constant-velocity"]
+Observe = Literal[
+    "forecast", "none", "constant-velocity", "zeros", "shuffled", "single", "no-edges", "modes", "what-if", "oracle",
+    "oracle-what-if",
+]  # fmt: skip
+"""What a policy sees: an arm of `envs.arms`, constant-velocity forecasts, or the env's own observation alone."""
 Backend = Literal["gymnasium", "envpool"]
 
 
@@ -43,7 +54,8 @@ class Task:
     env_id: str
     """Gymnasium id (highway-fast-v0) or PettingZoo parallel id (simple_tag_v3)."""
     observe: Observe = "forecast"
-    """What the policy sees: learned forecasts, the env's own observation alone, or constant-velocity forecasts."""
+    """What the policy sees beside the env's own observation: an arm of `envs.arms`, or constant-velocity forecasts;
+    "none" shows no forecasts."""
     checkpoint: str | None = None
     """Forecaster for `observe="forecast"`: shipped name or path; None takes the one that ships for the id."""
     device: str = "cpu"
@@ -54,6 +66,14 @@ class Task:
     """PettingZoo: agents or roles ("adversary") that learn; () takes all agents."""
     driver: str = "heuristic"
     """PettingZoo: driver of the agents that do not learn (`envs.drivers.all_agents`)."""
+    num_samples: int = 1
+    """Number of futures per agent that the observation has room for."""
+    horizon_steps: int | None = None
+    """Number of steps to forecast; None takes what the checkpoint was trained for."""
+    what_if: bool = False
+    """Whether the observation has room for what the others do in each candidate plan of the ego."""
+    env_kwargs: str = ""
+    """Arguments of the environment, as the text of a JSON object."""
 
     def __post_init__(self) -> None:
         """Checks choices, and that the fields fit together; replaces `device="auto"` by the device that is taken."""
@@ -67,8 +87,13 @@ class Task:
             envpool_task_of(self.env_id)
             if importlib.util.find_spec("envpool") is None:
                 raise UserError("backend envpool needs the envpool package; pip install 'dgvae-rl[envpool]'")
-        if self.checkpoint is not None and self.observe != "forecast":
+        if self.checkpoint is not None and self.observe in ("none", CONSTANT_VELOCITY):
             raise UserError(f"checkpoint '{self.checkpoint}' has no effect with observe={self.observe}; leave one out")
+        check_at_least(self, 1, "num_samples", "horizon_steps")
+        if self.what_if and self.is_multiagent:
+            raise UserError(f"what_if needs an environment with one ego, {self.env_id} has several learners")
+        if self.make_kwargs and self.backend == "envpool":
+            raise UserError("env_kwargs are for the gymnasium backend; leave them or backend envpool out")
         object.__setattr__(self, "device", resolve_device(self.device))
 
     @property
@@ -80,6 +105,69 @@ class Task:
     def forecaster(self) -> str | None:
         """Value for the argument `checkpoint` of the wrappers."""
         return CONSTANT_VELOCITY if self.observe == CONSTANT_VELOCITY else self.checkpoint
+
+    @property
+    def make_kwargs(self) -> dict[str, Any]:
+        """Arguments of the environment.
+
+        Raises:
+            UserError: `env_kwargs` is no JSON object.
+        """
+        try:
+            kwargs = json.loads(self.env_kwargs or "{}")
+        except json.JSONDecodeError as error:
+            raise UserError(f"env_kwargs must be a JSON object, got {self.env_kwargs!r}: {error}") from error
+        if not isinstance(kwargs, dict):
+            raise UserError(f"env_kwargs must be a JSON object, got {self.env_kwargs!r}")
+        return kwargs
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Arguments of the wrappers with forecasts, `VecForecast` included.
+
+        All arms of an id have the entries of the checkpoint that ships for it, so that one network reads each of them.
+
+        Raises:
+            UserError: see `scene_spec`.
+        """
+        options: dict[str, Any] = {
+            "checkpoint": self.forecaster, "horizon_steps": self.horizon_steps, "num_samples": self.num_samples,
+            "device": self.device,
+        }  # fmt: skip
+        if self.what_if:
+            options["what_if"] = True
+        if self.observe == "forecast":
+            return options
+        shipped = _shipped_for(self.env_id)
+        if shipped is not None and self.horizon_steps is None:
+            options["horizon_steps"] = shipped.horizon_steps
+        name = "forecast" if self.observe == CONSTANT_VELOCITY else self.observe
+        layout = None if shipped is None else EntryLayout.of(shipped)
+        bank = _bank_of(replace(self, observe="forecast")) if self.observe == "shuffled" else None
+        return options | {"arm": Arm(name, layout, bank)}
+
+    def wrapped(self, env: Any) -> Any:
+        """Returns an environment of the task in its wrapper with forecasts.
+
+        Raises:
+            UserError: see `scene_spec`.
+        """
+        options = self.options
+        if self.is_multiagent:
+            return ForecastParallelEnv(env, **options)
+        shipped = _shipped_for(self.env_id) if self.observe != "forecast" else None
+        if shipped is not None:  # constant velocity has no range of its own
+            options |= {"perception_m": shipped.spec.perception_m, "max_agents": shipped.spec.max_agents}
+        return ForecastObservation(env, **options)
+
+    def make(self, **kwargs: Any) -> Any:
+        """Makes the environment, without forecasts.
+
+        Raises:
+            UserError: unknown id, or arguments that the environment refuses.
+        """
+        make = make_multiagent_env if self.is_multiagent else make_env
+        return make(self.env_id, **self.make_kwargs, **kwargs)
 
     @property
     def scene_spec(self) -> SceneSpec | None:
@@ -99,19 +187,17 @@ class Task:
         """
         pin = None
         if self.observe != "none":
-            pin = pin_forecaster(self.forecaster or checkpoint_for(self.env_id), *self._forecasts())
+            name = self.forecaster or checkpoint_for(self.env_id)
+            pin = pin_forecaster(name, *self._forecasts(), self.options.get("arm"))
         return PolicyNote(pin, self.learners, self.driver)
 
     def _forecasts(self) -> tuple[gym.spaces.Dict, SceneSpec]:
         """Returns an observation space with forecasts, and the layout of the scenes behind them."""
-        space: Any
+        env = self.wrapped(self.make())
         if self.is_multiagent:
-            many = ForecastParallelEnv(make_multiagent_env(self.env_id), self.forecaster, device=self.device)
-            space, spec = many.observation_space(many.possible_agents[0]), many.scene_spec
-            many.close()
-            return space, spec
-        env = ForecastObservation(make_env(self.env_id), self.forecaster, device=self.device)
-        space, spec = env.observation_space, env.get_wrapper_attr("scene_spec")
+            space, spec = env.observation_space(env.possible_agents[0]), env.scene_spec
+        else:
+            space, spec = env.observation_space, env.get_wrapper_attr("scene_spec")
         env.close()
         return space, spec
 
@@ -123,15 +209,15 @@ class Task:
         """
         if self.is_multiagent:
             return self._check_multiagent()
-        env = make_env(self.env_id)
+        env = self.make()
         env.close()
         _ = self.scene_spec
         return env.action_space
 
     def _check_multiagent(self) -> gym.Space:
-        env = make_multiagent_env(self.env_id)
+        env = self.make()
         if self.observe != "none":
-            env = ForecastParallelEnv(env, self.forecaster, device=self.device)
+            env = self.wrapped(env)
         learners = learners_named(env.possible_agents, self.learners, self.env_id)
         has_others = len(learners) < len(env.possible_agents)
         if has_others:
@@ -139,3 +225,43 @@ class Task:
         space = ParallelVecEnv([lambda: env], agents=learners, partner="random" if has_others else None).action_space
         env.close()
         return space
+
+
+def task_of(run: Mapping[str, Any], device: str = "cpu") -> Task:
+    """Returns the task of a training run.
+
+    Args:
+        run: the run's config (`agents.runs.read_config`).
+        device: device that runs the forecaster.
+
+    Raises:
+        UserError: the config does not fit this version, or names what is missing.
+    """
+    return Task(
+        run["env_id"],
+        run["observe"],
+        run["checkpoint"],
+        device,
+        learners=tuple(run.get("learners", ())),
+        driver=run.get("partner", "heuristic"),
+        num_samples=run.get("num_samples", 1),
+        horizon_steps=run.get("horizon_steps"),
+        what_if=run.get("what_if", False),
+        env_kwargs=run.get("env_kwargs", ""),
+    )
+
+
+@functools.lru_cache(maxsize=8)
+def _shipped_for(env_id: str) -> Forecaster | None:
+    """Returns the forecaster that ships for an id; None if none does."""
+    name = entry_for(env_id).checkpoint
+    if name is None:
+        return None
+    forecaster: Forecaster = load_checkpoint(name)[0]
+    return forecaster
+
+
+@functools.lru_cache(maxsize=8)
+def _bank_of(task: Task) -> EntryBank:
+    """Returns forecast entries of other episodes of a task."""
+    return record_bank(task.wrapped(task.make()), str(task))

@@ -23,8 +23,7 @@ from agents.task import Task
 from envs.drivers.all_agents import Driver, make_driver
 from envs.drivers.ego import constant_actions, make_ego_driver
 from envs.drivers.trained import EgoDriver
-from envs.parallel import ForecastParallelEnv
-from envs.registry import envpool_task_of, make_env, make_multiagent_env
+from envs.registry import envpool_task_of
 from envs.sb3.agents_as_rows import AgentMonitor, ParallelVecEnv
 from envs.sb3.envpool import EnvPoolVecEnv
 from envs.sb3.forecast import VecForecast
@@ -120,10 +119,8 @@ class MakeCopy:
     def __call__(self) -> ParallelEnv:
         """Makes the environment in a `DrivenEnv`, with forecasts around it unless the task observes none."""
         options = {} if self.render_mode is None else {"render_mode": self.render_mode}
-        env = DrivenEnv(make_multiagent_env(self.task.env_id, **options), self.task.driver)
-        if self.task.observe == "none":
-            return env
-        return ForecastParallelEnv(env, self.task.forecaster, device=self.task.device)
+        env = DrivenEnv(self.task.make(**options), self.task.driver)
+        return env if self.task.observe == "none" else self.task.wrapped(env)
 
 
 def learners_of(task: Task, env: ParallelEnv) -> list[str]:
@@ -163,10 +160,10 @@ def make_venv(task: Task, num_envs: int, seeded: bool = False) -> VecEnv:
             max_agents=None if spec is None else spec.max_agents,
         )
     else:
-        make = _MakeEnv(task.env_id, spec, seeded)
+        make = _MakeEnv(task, spec, seeded)
         venv = DummyVecEnv([make]) if num_envs == 1 else SubprocVecEnv([make] * num_envs, start_method="spawn")
     if task.observe != "none":
-        venv = VecForecast(venv, task.forecaster, device=task.device)
+        venv = VecForecast(venv, **task.options)
     return VecMonitor(venv)
 
 
@@ -174,14 +171,14 @@ def make_venv(task: Task, num_envs: int, seeded: bool = False) -> VecEnv:
 class _MakeEnv:
     """Picklable constructor of one environment."""
 
-    env_id: str
+    task: Task
     scene_spec: SceneSpec | None
     seeded: bool
 
     def __call__(self) -> gym.Env:
         if multiprocessing.parent_process() is not None:
             torch.set_num_threads(1)  # the environments already fill the cores
-        env = make_env(self.env_id, disable_env_checker=True)
+        env = self.task.make(disable_env_checker=True)
         if self.scene_spec is not None:
             env = SceneObservation(env, self.scene_spec.perception_m, self.scene_spec.max_agents)
         return SeededEpisodes(env) if self.seeded else env

@@ -14,11 +14,10 @@ from agents.vec_envs import MakeCopy, learners_of, make_multiagent_venv, own_obs
 from envs.parallel import ForecastParallelEnv
 from envs.readers import multiagent_reader_for
 from envs.readers.highway import is_highway_env
-from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, make_env, make_multiagent_env
+from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, make_multiagent_env
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.video.highway import record_episode
 from envs.video.multiagent import MultiagentRecording, record_multiagent_episode
-from envs.wrappers import ForecastObservation
 from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.forecaster import Forecaster, has_scale
 from predictor.support.errors import UserError
@@ -99,15 +98,16 @@ def film(task: Task, model: BaseAlgorithm, path: Path) -> Path | None:
             return None
         recording.write_video(path)
         return path
-    checkpoint = task.forecaster
-    if task.observe == "none" and task.env_id not in CHECKPOINTS:
-        checkpoint = CONSTANT_VELOCITY
-    plain = make_env(task.env_id)
+    plain = task.make()
     drawn = is_highway_env(plain)
     plain.close()
     if not drawn:
         return None
-    env = ForecastObservation(make_env(task.env_id, render_mode="rgb_array"), checkpoint)
+    shown = task
+    if task.observe == "none":
+        seen = None if task.env_id in CHECKPOINTS else CONSTANT_VELOCITY
+        shown = replace(task, observe="forecast", checkpoint=seen)
+    env = shown.wrapped(task.make(render_mode="rgb_array"))
     try:
         played = record_episode(
             env,

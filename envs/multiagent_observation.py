@@ -5,7 +5,8 @@ The forecaster runs once per step for the scenes of all environments. Each agent
 An agent's view is cut to its perception; the forecast itself is made from all agents.
 """
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import reduce
 from typing import Any
@@ -24,6 +25,8 @@ from predictor.forecaster import Forecaster
 from predictor.scene import PADDING_ID, Forecast, Scene, SceneBatch, SceneSpec, perceived_agents
 from predictor.support.errors import UserError
 
+Entries = dict[str, NDArray[np.float32]]
+"""Entries of many views, by key."""
 AgentEntries = dict[str, dict[str, NDArray[np.float32]]]
 """Forecast entries by agent."""
 
@@ -78,6 +81,7 @@ class MultiagentStream(SceneStream):
         # A forecaster with an ego gets an ego that is not valid at index 0.
         self._front = int(forecaster.spec.has_ego)
         super().__init__(forecaster, envs, scene_spec.max_agents + self._front, config)
+        self._spaces = self.spaces()
 
     def spaces(self) -> dict[str, gym.Space]:
         """Returns the spaces of one agent's entries; new objects at each call, since a space has its own generator."""
@@ -96,14 +100,19 @@ class MultiagentStream(SceneStream):
         self, scenes: Sequence[MultiagentScene], envs: Int[np.ndarray, " some"] | None = None
     ) -> list[AgentEntries]:
         """Takes in one scene for each environment (of `envs`, if given); returns the learners' entries for each."""
-        return view_entries(scenes, self.take(_batch(scenes), envs), self.view_spec, self.config.shows_uncertainty)
+        return self._views(scenes, self.take(_batch(scenes), envs))
 
     def observe_boundary(
         self, scenes: Sequence[MultiagentScene], ended: Int[np.ndarray, " ended"], successors: Sequence[MultiagentScene]
     ) -> list[AgentEntries]:
         """Takes in scenes like `observe_each`, ended episodes with their last; appends their successors' entries."""
         forecast = self.take_boundary(_batch(scenes), ended, _batch(successors))
-        return view_entries([*scenes, *successors], forecast, self.view_spec, self.config.shows_uncertainty)
+        return self._views([*scenes, *successors], forecast)
+
+    def _views(self, scenes: Sequence[MultiagentScene], forecast: Forecast) -> list[AgentEntries]:
+        arm = self.config.arm
+        fill = None if arm.changes_nothing else functools.partial(arm.filled, spaces=self._spaces)
+        return view_entries(scenes, forecast, self.view_spec, self.config.shows_uncertainty, fill)
 
     def _given(self, scenes: SceneBatch) -> SceneBatch:
         front = (0, 0), (self._front, 0)
@@ -141,9 +150,16 @@ def agent_entries(
 
 
 def view_entries(
-    scenes: Sequence[MultiagentScene], forecast: Forecast, view: SceneSpec, uncertainty: bool = False
+    scenes: Sequence[MultiagentScene],
+    forecast: Forecast,
+    view: SceneSpec,
+    uncertainty: bool = False,
+    fill: Callable[[Entries], Entries] | None = None,
 ) -> list[AgentEntries]:
-    """Returns `agent_entries` for each of several scenes, whose forecasts are one batch."""
+    """Returns `agent_entries` for each of several scenes, whose forecasts are one batch.
+
+    `fill` changes the entries of all views at once.
+    """
     named = [(env, name) for env, one in enumerate(scenes) for name in one.index_of]
     entries: list[AgentEntries] = [{} for _ in scenes]
     if not named:
@@ -175,7 +191,8 @@ def view_entries(
         mode_probs=of_views(forecast.mode_probs),
         xy_scale=of_views(forecast.xy_scale),
     )
-    for key, values in ego_entries(views, seen_by_each, uncertainty).items():
+    found = ego_entries(views, seen_by_each, uncertainty)
+    for key, values in (fill(found) if fill else found).items():
         for (place, name), value in zip(named, values, strict=True):
             entries[place].setdefault(name, {})[key] = value
     return entries

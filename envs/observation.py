@@ -1,10 +1,12 @@
 """Makes observations of scenes and forecasts, for single environments and vector environments of gymnasium and SB3."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
@@ -14,7 +16,7 @@ from envs.plans.contact import FAR_M, contacts
 from envs.registry import checkpoint_for
 from envs.scene_stream import ForecastConfig, SceneStream
 from predictor.checkpoint import load_forecaster
-from predictor.forecaster import Forecaster, has_scale
+from predictor.forecaster import Forecaster
 from predictor.online import use_one_thread_after_fork
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 from predictor.support.errors import UserError
@@ -133,6 +135,7 @@ class ForecastStream(SceneStream):
         super().__init__(forecaster, envs, scene_spec.max_agents, config)
         self.scene_spec = scene_spec
         self.planned: Forecast | None = None
+        self._spaces = self.spaces()
 
     def spaces(self) -> dict[str, gym.Space]:
         """Returns the spaces of the forecast entries."""
@@ -164,11 +167,25 @@ class ForecastStream(SceneStream):
     def _entries(
         self, scenes: SceneBatch, forecast: Forecast, plans: PlanBatch | None
     ) -> dict[str, NDArray[np.float32]]:
+        arm = self.config.arm
+        true = plans.true_xy if plans is not None and arm.shown.true_futures else None
+        if true is not None:
+            forecast = _with_positions(forecast, scenes, true[:, :1]).of_plan(0)
         entries = ego_entries(scenes, forecast, self.config.shows_uncertainty)
-        if plans is None:
-            return entries
-        self.planned = self.what_if(plans.states)
-        return entries | what_if_entries(scenes, self.planned, plans.size_m)
+        if plans is not None and self.config.num_plans:
+            planned = self.what_if(plans.states) if true is None else _with_positions(forecast, scenes, true)
+            entries |= what_if_entries(scenes, planned, plans.size_m)
+            self.planned = planned
+        return entries if arm.changes_nothing else arm.filled(entries, self._spaces)
+
+
+def _with_positions(
+    forecast: Forecast, scenes: SceneBatch, xy: Float[np.ndarray, "batch plans agents horizon 2"]
+) -> Forecast:
+    """Returns a forecast that says these positions [m], world frame, and nothing of their spread."""
+    local = (xy - scenes.states[:, None, :1, None, :2]) * scenes.valid[:, None, :, None, None]
+    positions = torch.from_numpy(local.astype(np.float32)).to(forecast.xy.device)
+    return replace(forecast, xy=positions[:, :, None], mode_probs=None, xy_scale=None)
 
 
 def entry_spaces(forecaster: Forecaster, view: SceneSpec, config: ForecastConfig) -> dict[str, gym.Space]:
@@ -179,7 +196,7 @@ def entry_spaces(forecaster: Forecaster, view: SceneSpec, config: ForecastConfig
         view: layout of the view of one policy.
         config: settings of the forecast.
     """
-    others = view.max_agents - 1
+    others, layout = view.max_agents - 1, config.arm.layout_for(forecaster)
     samples = (config.num_samples,) if config.num_samples > 1 else ()
 
     def unbounded(*shape: int) -> gym.Space:
@@ -189,7 +206,7 @@ def entry_spaces(forecaster: Forecaster, view: SceneSpec, config: ForecastConfig
     uncertain: dict[str, gym.Space] = {}
     if config.shows_uncertainty:
         uncertain["mode_probs"] = gym.spaces.Box(0, 1, (others, *samples), np.float32)
-        if has_scale(forecaster):
+        if layout.has_scale:
             uncertain["xy_scale"] = gym.spaces.Box(0, np.inf, (others, *samples, horizon, 2), np.float32)
     supposed: dict[str, gym.Space] = {}
     if config.num_plans:
@@ -201,8 +218,8 @@ def entry_spaces(forecaster: Forecaster, view: SceneSpec, config: ForecastConfig
         "agents": unbounded(others, view.num_features),
         "forecast": unbounded(others, *samples, horizon, 2),
         **uncertain,
-        "edge_probs": gym.spaces.Box(0, 1, (others, 2 * (forecaster.num_edge_types - 1)), np.float32),
-        "edge_features": unbounded(others, 2 * forecaster.edge_feature_dim),
+        "edge_probs": gym.spaces.Box(0, 1, (others, 2 * (layout.num_edge_types - 1)), np.float32),
+        "edge_features": unbounded(others, 2 * layout.edge_feature_dim),
         "valid": gym.spaces.Box(0, 1, (others,), np.float32),
         **supposed,
     }

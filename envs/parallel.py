@@ -18,6 +18,7 @@ import gymnasium as gym
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
+from envs.arms import Arm
 from envs.batched_forward import BatchedForward, can_share
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout
 from envs.multiagent_observation import MultiagentStream, check_multiagent_scene
@@ -57,6 +58,8 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         forecaster: forecaster on `device`, instead of a checkpoint.
         seed: random seed of the samples' noise, until `reset(seed=…)` gives another.
         reader: function or class that makes a reader for the env; None picks one by env family.
+        arm: part of the forecast that observations show, for controlled comparisons (`envs.arms`, docs/arms.md);
+            none with true futures.
 
     Raises:
         UserError: not a parallel env, no reader, no checkpoint, a forecaster of another spec (features, dt) or relative
@@ -77,6 +80,7 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         forecaster: Forecaster | None = None,
         seed: int = 0,
         reader: MakeReader | None = None,
+        arm: Arm | None = None,
     ) -> None:
         """Loads the forecaster and extends the observation spaces."""
         if not isinstance(env, ParallelEnv):
@@ -93,7 +97,9 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         env_id = multiagent_env_id(env)
         forecaster = open_forecaster(checkpoint, spec, env_id, device, forecaster)
         perception_m = forecaster.spec.perception_m if perception_m is None else perception_m
-        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten)
+        if arm is not None and arm.shown.true_futures:
+            raise UserError(f"arm '{arm.name}' needs an environment with one ego, {self._source} has several learners")
+        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, arm=arm or Arm())
         self.stream: MultiagentStream = MultiagentStream(forecaster, spec, config, perception_m, max_agents)
         self._layouts: dict[str, ObservationLayout] = {}
         self._forward: BatchedForward | None = None

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from envs.arms import Arm
 from predictor.forecaster import Forecaster
 from predictor.online import OnlineForecaster
 from predictor.scene import Forecast, SceneBatch
@@ -40,6 +41,8 @@ class ForecastConfig:
 
     num_plans: int = 0
     """Number of candidate plans of the ego whose what-if forecasts are in the observation."""
+    arm: Arm = Arm()
+    """Part of the forecast that the observation shows."""
 
     @property
     def shows_uncertainty(self) -> bool:

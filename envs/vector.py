@@ -13,6 +13,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from envs.arms import Arm
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
 from envs.observation import (
     ForecastStream,
@@ -60,6 +61,7 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         what_if: whether observations also hold what the others are forecast to do for each candidate plan of the ego,
             as in `ForecastObservation`. True takes the environments' plan model; or a `PlanModel`, which is copied to
             where they run.
+        arm: part of the forecast that observations show, for controlled comparisons (`envs.arms`, docs/arms.md).
 
     Attributes:
         plan_names: names of the candidate plans; none without `what_if`.
@@ -82,6 +84,7 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         seed: int = 0,
         reader: MakeReader | None = None,
         what_if: bool | PlanModel = False,
+        arm: Arm | None = None,
     ) -> None:
         """Loads the forecaster and extends the observation space."""
         gym.vector.VectorWrapper.__init__(self, env)
@@ -92,8 +95,12 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         forecaster = open_forecaster(checkpoint, spec, source, device, forecaster)
         steps = horizon_steps or forecaster.horizon_steps
         base: Any = env.unwrapped  # vector wrappers do not pass calls on
-        self.plan_names = ask_for_plans(lambda *a: base.call(*a), what_if, steps, "VectorForecast", base)
-        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, num_plans=len(self.plan_names))
+        arm = arm or Arm()
+        self.plan_names = ask_for_plans(
+            lambda *a: base.call(*a), what_if, steps, "VectorForecast", base, arm.plays(bool(what_if))
+        )
+        num_plans = len(self.plan_names) if what_if else 0
+        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, num_plans=num_plans, arm=arm)
         self.stream: ForecastStream = ForecastStream(forecaster, spec, env.num_envs, config)
         self._layout = ObservationLayout(space["observation"], self.stream.spaces(), flatten)
         self.single_observation_space = self._layout.space

@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 
+from envs.arms import Arm
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
 from envs.observation import (
     ForecastStream,
@@ -23,6 +24,7 @@ from envs.observation import (
 )
 from envs.plans import PlanModel, Plans, checked_plans, plan_model_for
 from envs.plans.batch import PlanBatch, plans_info
+from envs.plans.playing import with_true_futures
 from envs.readers import MakeReader, reader_for
 from envs.readers.base import build_reader, require_scene, show
 from envs.scene_stream import ForecastConfig
@@ -79,6 +81,7 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         self._scene: Scene | None = None
         self._plan_model: PlanModel | None = None
         self._plan_steps = 0
+        self._played: int | None = 0
         self.observation_space = gym.spaces.Dict({"observation": own, **scene_spaces(self.reader.spec)})
 
     @property
@@ -98,12 +101,15 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
             raise ProtocolError("there is no scene yet; call reset() first")
         return self._scene
 
-    def propose_plans(self, what_if: bool | PlanModel, horizon_steps: int) -> tuple[str, ...] | UserError:
+    def propose_plans(
+        self, what_if: bool | PlanModel, horizon_steps: int, played: int | None = 0
+    ) -> tuple[str, ...] | UserError:
         """Puts candidate plans of the ego into all later infos, for vector wrappers with `what_if`.
 
         Args:
             what_if: True for the env's own plan model; or a `PlanModel`.
             horizon_steps: number of steps of a plan.
+            played: number of plans that are played in a copy of the simulator, the first ones; None plays all.
 
         Returns:
             Names of the plans; or the error that there is no plan model, which another process could not raise.
@@ -112,7 +118,7 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
             self._plan_model = plan_model_for(self) if isinstance(what_if, bool) else what_if
         except UserError as error:
             return error
-        self._plan_steps = horizon_steps
+        self._plan_steps, self._played = horizon_steps, played
         return tuple(self._plan_model.names)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -130,8 +136,21 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
     def _with_plans(self, info: dict[str, Any]) -> dict[str, Any]:
         if self._plan_model is None:
             return info
-        features = self.reader.spec.num_features
-        return {**info, **plans_info(checked_plans(self._plan_model, self, self._plan_steps, features))}
+        return {**info, **plans_info(self.make_plans(self._plan_model, self._plan_steps, self._played))}
+
+    def make_plans(self, plan_model: PlanModel, horizon_steps: int, played: int | None = 0) -> Plans:
+        """Returns the checked plans of a model from the present state.
+
+        Args:
+            plan_model: plan model.
+            horizon_steps: number of steps of a plan.
+            played: number of plans that are played in a copy of the simulator, the first ones; None plays all.
+
+        Raises:
+            UserError: see `envs.plans.checked_plans` and `envs.plans.playing.with_true_futures`.
+        """
+        plans = checked_plans(plan_model, self, horizon_steps, self.reader.spec.num_features)
+        return plans if played == 0 else with_true_futures(plans, self.env, self.reader, self.scene, played)
 
     def _observe(self, obs: Any) -> dict[str, Any]:
         show(self.reader, obs)
@@ -170,6 +189,7 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         what_if: whether the observation also holds what the others are forecast to do for each candidate plan of the
             ego: `what_if_gap`, `what_if_contact`, `what_if_risk` (`envs.observation.what_if_entries`). True takes the
             environment's plan model; or a `PlanModel` (docs/what_if.md).
+        arm: part of the forecast that observations show, for controlled comparisons (`envs.arms`, docs/arms.md).
 
     Attributes:
         plans: candidate plans of the latest step; None without `what_if`.
@@ -195,16 +215,20 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         seed: int = 0,
         reader: MakeReader | None = None,
         what_if: bool | PlanModel = False,
+        arm: Arm | None = None,
     ) -> None:
         """Loads the forecaster and extends the observation space."""
         RecordConstructorArgs.__init__(
             self, checkpoint=checkpoint, horizon_steps=horizon_steps, num_samples=num_samples, flatten=flatten,
             perception_m=perception_m, max_agents=max_agents, device=device, forecaster=forecaster, seed=seed,
-            what_if=what_if, _disable_deepcopy=True,
+            what_if=what_if, arm=arm, _disable_deepcopy=True,
         )  # the reader is recorded by the SceneObservation below  # fmt: skip
-        plan_model = (plan_model_for(env) if what_if else None) if isinstance(what_if, bool) else what_if
-        num_plans = 0 if plan_model is None else len(plan_model.names)
-        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, num_plans=num_plans)
+        arm = arm or Arm()
+        self._played = arm.plays(bool(what_if))
+        needs_plans = bool(what_if) or self._played != 0
+        plan_model = (plan_model_for(env) if needs_plans else None) if isinstance(what_if, bool) else what_if
+        num_plans = len(plan_model.names) if plan_model is not None and what_if else 0
+        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, num_plans=num_plans, arm=arm)
         ready = carries_scenes(env.observation_space)
         source = scene_source(env)
         if ready:
@@ -253,8 +277,8 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
     def _observe(self, obs: dict[str, Any]) -> Any:
         plans = None
         if self.plan_model is not None:
-            horizon, features = self.stream.horizon_steps, self.stream.scene_spec.num_features
-            self.plans = checked_plans(self.plan_model, self.env, horizon, features)
+            make: Any = self.env.get_wrapper_attr("make_plans")
+            self.plans = make(self.plan_model, self.stream.horizon_steps, self._played)
             plans = PlanBatch.stack([self.plans])
         entries = self.stream.observe(SceneBatch.stack([self.scene]), plans=plans)
         self.what_if = self.stream.planned

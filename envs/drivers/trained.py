@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
+from envs.arms import Arm, EntryLayout
 from envs.drivers.all_agents import Driver, make_driver
 from envs.sb3.padded_spaces import PaddedObservation, learners_named, own_action, roles_of
 from predictor.scene import SceneSpec
@@ -22,7 +23,7 @@ from predictor.support.errors import UserError
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-    from envs.sb3.policy_file import PolicyNote
+    from envs.sb3.policy_file import ForecasterPin, PolicyNote
 
 EgoDriver = Callable[[Any], Any]
 """Maps an observation to an action."""
@@ -98,15 +99,29 @@ def env_for_driver(env: gym.Env, name: str) -> gym.Env:
     if sees_forecasts(name):
         from envs.wrappers import ForecastObservation  # most drivers need no wrapper
 
-        checkpoint = forecaster_of(name)
-        env = ForecastObservation(env, checkpoint)
+        note = note_of(name)
+        pin = None if note is None else note.forecaster
+        env = ForecastObservation(env, **({} if pin is None else _wrapper_options(name, pin)))
         require_view(env, name)
-        if checkpoint is not None:
+        if pin is not None:
             space: Any = env.observation_space
-            require_forecaster(name, checkpoint, space, env.get_wrapper_attr("scene_spec"))
+            arm = env.stream.config.arm
+            require_forecaster(name, pin.checkpoint, space, env.get_wrapper_attr("scene_spec"), arm)
         return env
     require_view(env, name)
     return env
+
+
+def _wrapper_options(path: str, pin: "ForecasterPin") -> dict[str, Any]:
+    """Returns the arguments of the wrapper that shows what a policy was trained on."""
+    arm = Arm(pin.arm, None if pin.layout is None else EntryLayout(*pin.layout))
+    if arm.shown.other_scene:
+        raise UserError(f"policy {path} was trained on arm '{pin.arm}', a control: only agents.evaluate can play it")
+    return {
+        "checkpoint": pin.checkpoint, "horizon_steps": pin.horizon_steps, "num_samples": pin.num_samples,
+        "max_agents": pin.max_agents, "perception_m": np.inf if pin.perception_m is None else pin.perception_m,
+        "what_if": pin.num_plans > 0, "arm": arm,
+    }  # fmt: skip
 
 
 def require_view(env: gym.Env, name: str) -> None:
@@ -151,7 +166,9 @@ def forecaster_of(path: str) -> str | None:
     return None if note is None or note.forecaster is None else note.forecaster.checkpoint
 
 
-def require_forecaster(path: str, checkpoint: str, space: gym.spaces.Dict, spec: SceneSpec) -> None:
+def require_forecaster(
+    path: str, checkpoint: str, space: gym.spaces.Dict, spec: SceneSpec, arm: Arm | None = None
+) -> None:
     """Raises a `UserError` if a policy was trained on another forecaster, or with other options.
 
     Args:
@@ -159,10 +176,11 @@ def require_forecaster(path: str, checkpoint: str, space: gym.spaces.Dict, spec:
         checkpoint: checkpoint whose forecasts it gets.
         space: observation space with that forecaster's forecasts.
         spec: layout of the scenes.
+        arm: arm of the wrapper; None shows everything.
     """
     from envs.sb3.policy_file import pin_forecaster
 
     note = note_of(path)
     if note is not None and note.forecaster is not None:
-        found = pin_forecaster(checkpoint, space, spec)
+        found = pin_forecaster(checkpoint, space, spec, arm)
         note.forecaster.check(found, f"policy {path}")

@@ -30,6 +30,8 @@ class Plans:
     """Gap below which the planner counts a contact [m]: what straight moves between steps leave out."""
     later_actions: tuple[tuple[Any, ...], ...] | None = None
     """Actions of each plan's steps after the first; needed to play plans in a simulator (`envs.evaluate --plans`)."""
+    true_xy: Float[np.ndarray, "played agents horizon 2"] | None = None
+    """Positions of all agents of the scene if a plan is played [m], world frame (`envs.plans.playing`)."""
 
 
 @runtime_checkable

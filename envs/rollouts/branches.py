@@ -16,7 +16,6 @@ copied, and drawn from at each step alike.
 True
 """
 
-import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -27,6 +26,7 @@ from jaxtyping import Bool, Float, Int
 
 from envs.rollouts.interventions import body_of, hold_others, intervene, kinds_of
 from envs.rollouts.world import EgoWorld, World, open_world
+from envs.simulators.copies import running_copy
 from envs.simulators.interventions import Intervention, log_motion, simulator_of
 from predictor.scene import Scene
 from predictor.support.errors import UserError
@@ -170,11 +170,7 @@ def copied(world: World) -> World:
     Raises:
         UserError: the environment cannot be copied (EnvPool).
     """
-    simulator = simulator_of(world.env)
-    memo: dict[int, Any] = {}
-    if isinstance(simulator, AbstractEnv) and simulator.road is not None:
-        memo[id(simulator.road.network)] = simulator.road.network
-    return copy.deepcopy(world, memo)
+    return running_copy(world, simulator_of(world.env))
 
 
 def _play(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from envs.arms import Arm
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
 from envs.observation import (
     ForecastStream,
@@ -56,6 +57,7 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         what_if: whether observations also hold what the others are forecast to do for each candidate plan of the ego,
             as in `ForecastObservation`. True takes the environments' plan model; or a `PlanModel`, which is copied to
             where they run.
+        arm: part of the forecast that observations show, for controlled comparisons (`envs.arms`, docs/arms.md).
 
     Attributes:
         plan_names: names of the candidate plans; none without `what_if`.
@@ -78,6 +80,7 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         seed: int = 0,
         reader: MakeReader | None = None,
         what_if: bool | PlanModel = False,
+        arm: Arm | None = None,
     ) -> None:
         """Loads the forecaster and extends the observation space."""
         refuse_reader(reader, "VecForecast")
@@ -86,8 +89,12 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         source = common_value(venv.get_attr("scene_source"), "env id")
         forecaster = open_forecaster(checkpoint, spec, source, device, forecaster)
         steps = horizon_steps or forecaster.horizon_steps
-        self.plan_names = ask_for_plans(venv.env_method, what_if, steps, "VecForecast", venv.unwrapped)
-        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, num_plans=len(self.plan_names))
+        arm = arm or Arm()
+        self.plan_names = ask_for_plans(
+            venv.env_method, what_if, steps, "VecForecast", venv.unwrapped, arm.plays(bool(what_if))
+        )
+        num_plans = len(self.plan_names) if what_if else 0
+        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, num_plans=num_plans, arm=arm)
         self.stream: ForecastStream = ForecastStream(forecaster, spec, venv.num_envs, config)
         self._layout = ObservationLayout(space["observation"], self.stream.spaces(), flatten)
         VecEnvWrapper.__init__(self, venv, observation_space=self._layout.space)

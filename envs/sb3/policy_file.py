@@ -11,7 +11,7 @@ import json
 import math
 import zipfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from envs.arms import Arm
 from predictor.checkpoint import CONSTANT_VELOCITY, WEIGHTS, resolve
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
@@ -48,6 +49,12 @@ class ForecasterPin:
     """Number of agents of a view, the viewer included."""
     perception_m: float | None
     """Range of perception [m]; None is unbounded, since JSON has no infinity."""
+    arm: str = "forecast"
+    """Part of the forecast that the policy sees (`envs.arms`)."""
+    num_plans: int = 0
+    """Number of candidate plans of the ego whose what-if forecasts it sees."""
+    layout: tuple[int, int, bool] | None = None
+    """Sizes of the entries (`envs.arms.EntryLayout`); None for the forecaster's own."""
 
     def check(self, found: "ForecasterPin", policy: str) -> None:
         """Raises a `UserError` if `found` is another forecaster or has other options; its folder does not matter."""
@@ -56,7 +63,7 @@ class ForecasterPin:
                 f"{policy} was trained on forecaster {self._named}, but gets {found._named}; pass the checkpoint it "
                 "was trained on, or train a policy on this one"
             )
-        for name in ("horizon_steps", "num_samples", "max_agents", "perception_m"):
+        for name in ("arm", "horizon_steps", "num_samples", "num_plans", "max_agents", "perception_m"):
             if getattr(self, name) != getattr(found, name):
                 raise UserError(
                     f"{policy} was trained on forecasts with {name}={getattr(self, name)}, but gets "
@@ -66,6 +73,9 @@ class ForecasterPin:
     @property
     def _named(self) -> str:
         return f"'{self.checkpoint}'" + (f" (SHA-256 {self.sha256[:12]}…)" if self.sha256 else "")
+
+
+_PIN = fields(ForecasterPin)
 
 
 @dataclass(frozen=True)
@@ -80,13 +90,14 @@ class PolicyNote:
     """PettingZoo: name of the driver of the agents that did not learn."""
 
 
-def pin_forecaster(checkpoint: str, space: gym.spaces.Dict, spec: SceneSpec) -> ForecasterPin:
+def pin_forecaster(checkpoint: str, space: gym.spaces.Dict, spec: SceneSpec, arm: Arm | None = None) -> ForecasterPin:
     """Returns the pin of a forecaster with the options of an observation space.
 
     Args:
         checkpoint: shipped name, folder, or "constant-velocity".
         space: space of an observation with forecasts.
         spec: layout of the scenes that are forecast.
+        arm: arm of the wrapper; None shows everything.
 
     Raises:
         UserError: no such checkpoint.
@@ -98,7 +109,12 @@ def pin_forecaster(checkpoint: str, space: gym.spaces.Dict, spec: SceneSpec) -> 
             digest = hashlib.file_digest(file, "sha256").hexdigest()
     samples = shape[1] if len(shape) == 4 else 1
     perception_m = float(spec.perception_m) if math.isfinite(spec.perception_m) else None
-    return ForecasterPin(checkpoint, digest, shape[-2], samples, 1 + shape[0], perception_m)
+    plans = space["what_if_risk"].shape or (0,) if "what_if_risk" in space.spaces else (0,)
+    arm = arm or Arm()
+    layout = None if arm.layout is None else astuple(arm.layout)
+    return ForecasterPin(
+        checkpoint, digest, shape[-2], samples, 1 + shape[0], perception_m, arm.name, plans[-1], layout
+    )
 
 
 def write_note(path: Path, policy: PolicyNote | None, extra: Mapping[str, Any]) -> None:
@@ -133,7 +149,7 @@ def read_policy_note(path: Path) -> PolicyNote | None:
         return None
     try:
         pin = content["forecaster"]
-        forecaster = None if pin is None else ForecasterPin(**{f.name: pin[f.name] for f in fields(ForecasterPin)})
+        forecaster = None if pin is None else ForecasterPin(**{f.name: pin[f.name] for f in _PIN if f.name in pin})
         return PolicyNote(forecaster, tuple(content["learners"]), str(content["driver"]))
     except (KeyError, TypeError) as error:
         raise UserError(f"the note inside {path} cannot be understood ({error!r}); save the policy again") from error

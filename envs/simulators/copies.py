@@ -6,9 +6,13 @@ carries the simulator's state along. Simulators in C++ whose state cannot be rea
 or for EnvPool a `UserError`.
 """
 
-from typing import Any
+import copy
+from typing import Any, TypeVar
 
 from gymnasium.utils import EzPickle
+from highway_env.envs.common.abstract import AbstractEnv
+
+Owner = TypeVar("Owner")
 
 
 class RunningCopy:
@@ -40,3 +44,19 @@ def _simulator_state(simulator: Any) -> dict[str, Any]:
 
 def _drawn(value: Any) -> bool:
     return type(value).__module__.partition(".")[0] == "pygame"
+
+
+def running_copy(owner: Owner, simulator: Any) -> Owner:
+    """Returns a copy of whatever holds a simulator, which continues exactly.
+
+    Args:
+        owner: object to copy, with everything that it refers to.
+        simulator: its simulator; of highway-env the road network is shared, as no step changes it.
+
+    Raises:
+        UserError: the simulator cannot be copied (EnvPool).
+    """
+    memo: dict[int, Any] = {}
+    if isinstance(simulator, AbstractEnv) and simulator.road is not None:
+        memo[id(simulator.road.network)] = simulator.road.network
+    return copy.deepcopy(owner, memo)

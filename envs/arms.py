@@ -1,0 +1,198 @@
+"""Arms of a controlled comparison: which part of a forecast an observation shows.
+
+All arms have the same entries in the same shapes, so that the same network reads them; what an arm does not show is
+zero. The other agents' present states (`agents`, `valid`) are part of every arm. Arms therefore differ only in what
+they tell about the future, or about who interacts with whom.
+"""
+
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from predictor.forecaster import Forecaster, has_scale
+from predictor.support.config_checks import check_choice
+
+PRESENT_KEYS = ("agents", "valid")
+"""Entries on the present, which every arm shows."""
+EDGE_KEYS = ("edge_probs", "edge_features")
+"""Entries on who interacts with whom."""
+_PROBS = "mode_probs"
+_OF_SAMPLES = ("forecast", _PROBS, "xy_scale")
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Parts of a forecast that an arm shows."""
+
+    what: str
+    """What the arm shows, in words."""
+    future: bool = True
+    """Whether it shows where the others will be: one future of each agent."""
+    modes: bool = True
+    """Whether it shows all futures of each agent, where the observation has room for several."""
+    edges: bool = True
+    """Whether it shows probabilities and features of edges."""
+    what_if: bool = True
+    """Whether it shows what the others do in each candidate plan, where the observation has room for it."""
+    true_futures: bool = False
+    """Whether the futures are those that the simulator plays, instead of the forecaster's."""
+    other_scene: bool = False
+    """Whether everything is taken from a scene of another episode."""
+
+
+ARMS: dict[str, Shown] = {
+    "forecast": Shown("everything that the observation has room for"),
+    "single": Shown("the single forecast and edges", modes=False, what_if=False),
+    "no-edges": Shown("the single forecast", modes=False, edges=False, what_if=False),
+    "modes": Shown("all futures with their probabilities, and edges", what_if=False),
+    "what-if": Shown("the single forecast, edges, and the others in each candidate plan", modes=False),
+    "zeros": Shown("nothing", future=False, modes=False, edges=False, what_if=False),
+    "shuffled": Shown("a forecast of another episode's scene", other_scene=True),
+    "oracle": Shown("what happens if the ego keeps on", modes=False, edges=False, what_if=False, true_futures=True),
+    "oracle-what-if": Shown(
+        "what happens if the ego keeps on, and in each candidate plan", modes=False, edges=False, true_futures=True
+    ),
+}
+"""Name of an arm → what it shows."""
+
+
+@dataclass(frozen=True)
+class EntryLayout:
+    """Sizes of forecast entries that depend on the forecaster."""
+
+    num_edge_types: int
+    """Number of edge types, "no edge" included."""
+    edge_feature_dim: int
+    """Number of features of an edge."""
+    has_scale: bool
+    """Whether there is a standard deviation around each future."""
+
+    @classmethod
+    def of(cls, forecaster: Forecaster) -> "EntryLayout":
+        """Returns the sizes of a forecaster's own entries."""
+        return cls(forecaster.num_edge_types, forecaster.edge_feature_dim, has_scale(forecaster))
+
+
+@dataclass(frozen=True)
+class EntryBank:
+    """Forecast entries of scenes of other episodes, each with at least one agent beside the ego."""
+
+    source: str
+    """Description of the episodes; banks of the same source are equal."""
+    entries: Mapping[str, Float[np.ndarray, "scenes others ..."]] = field(compare=False, repr=False)
+    """Entries by key, agents as in `envs.observation.ego_entries`."""
+
+    def drawn_for(self, present: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[np.float32]]:
+        """Returns entries of recorded scenes, for the agents of present ones.
+
+        The recorded scene is chosen by a checksum of the present one: the same in every run, and unrelated to what is
+        seen. Where it has fewer agents, they are repeated.
+
+        Args:
+            present: entries of the present scenes, `agents` and `valid` among them.
+        """
+        valid = present["valid"]
+        sums = [zlib.crc32(np.ascontiguousarray(scene).tobytes()) for scene in present["agents"]]
+        chosen = np.array(sums, dtype=np.int64) % len(self.entries["valid"])
+        others = self.entries["valid"][chosen].sum(axis=1).astype(np.int64)
+        slots = np.arange(valid.shape[1]) % others[:, None]
+        drawn = {}
+        for key, recorded in self.entries.items():
+            if key not in PRESENT_KEYS:
+                values = recorded[chosen[:, None], slots]
+                drawn[key] = values * valid.reshape(*valid.shape, *(1,) * (values.ndim - 2))
+        return drawn
+
+
+@dataclass(frozen=True)
+class Arm:
+    """Fills the entries of an observation with what an arm shows.
+
+    Args:
+        name: a key of `ARMS`.
+        layout: sizes of the entries; None takes the forecaster's own. What the forecaster lacks is zero.
+        bank: scenes of other episodes, for the arm "shuffled".
+
+    Raises:
+        UserError: unknown name.
+    """
+
+    name: str = "forecast"
+    layout: EntryLayout | None = None
+    bank: EntryBank | None = None
+
+    def __post_init__(self) -> None:
+        """Checks the name."""
+        check_choice("arm", self.name, tuple(ARMS))
+
+    @property
+    def shown(self) -> Shown:
+        """Parts of a forecast that the arm shows."""
+        return ARMS[self.name]
+
+    @property
+    def changes_nothing(self) -> bool:
+        """Whether entries are shown as they are."""
+        return self.name == "forecast" and self.layout is None
+
+    def plays(self, what_if: bool) -> int | None:
+        """Returns how many of the ego's plans a simulator plays for this arm: 0, 1, or None for all of them.
+
+        Args:
+            what_if: whether the observation has room for what the others do in each candidate plan.
+        """
+        if not self.shown.true_futures:
+            return 0
+        return None if what_if and self.shown.what_if else 1
+
+    def layout_for(self, forecaster: Forecaster) -> EntryLayout:
+        """Returns the sizes of the entries with this forecaster."""
+        return self.layout or EntryLayout.of(forecaster)
+
+    def filled(
+        self, entries: Mapping[str, NDArray[np.float32]], spaces: Mapping[str, gym.Space]
+    ) -> dict[str, NDArray[np.float32]]:
+        """Returns the entries of a batch of scenes as the arm shows them, in the shapes of `spaces`.
+
+        Args:
+            entries: entries of the forecast, a batch of scenes each; keys and trailing sizes may be missing.
+            spaces: space of each entry of one scene.
+        """
+        batch = len(entries["valid"])
+        if self.bank is not None and self.shown.other_scene:
+            entries = {**entries, **self.bank.drawn_for(entries)}
+        found = {}
+        for key, space in spaces.items():
+            full = np.zeros((batch, *(space.shape or ())), dtype=np.float32)
+            if key in entries and self._shows(key):
+                _fill(full, entries[key], only_first=key in _OF_SAMPLES and not self.shown.modes)
+            found[key] = full
+        return found
+
+    def _shows(self, key: str) -> bool:
+        if key in PRESENT_KEYS:
+            return True
+        if key in EDGE_KEYS:
+            return self.shown.edges
+        return self.shown.what_if if key.startswith("what_if") else self.shown.future
+
+
+def _fill(full: NDArray[np.float32], values: NDArray[np.float32], only_first: bool) -> None:
+    """Writes values into the leading places of `full`, which may have an axis of samples that they lack.
+
+    Args:
+        full: array to fill.
+        values: values with as many axes, or without the third one.
+        only_first: whether of several samples the first alone is written.
+    """
+    if values.ndim < full.ndim:
+        values = values[:, :, None]
+    elif only_first and full.ndim > 2:
+        values = values[:, :, :1]
+    full[tuple(slice(size) for size in values.shape)] = values

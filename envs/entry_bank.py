@@ -1,0 +1,64 @@
+"""Records forecast entries of other episodes, which the arm "shuffled" shows instead of those of the present scene."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.arms import Arm, EntryBank
+from envs.parallel import ForecastParallelEnv
+from envs.seeding import driver_rng
+from envs.wrappers import ForecastObservation
+from predictor.support.errors import UserError
+
+FIRST_SEED = 3_000_000_000
+"""Seed of the first recorded episode; training, model selection and evaluation use lower ones (`agents.task`)."""
+EPISODES = 20
+"""Number of recorded episodes."""
+MAX_STEPS = 50
+"""Number of steps of an episode that are recorded at most."""
+
+Wrapper = ForecastObservation | ForecastParallelEnv
+
+
+def record_bank(env: Wrapper, source: str, episodes: int = EPISODES) -> EntryBank:
+    """Plays episodes with random actions and keeps the forecast entries of all scenes with another agent; closes `env`.
+
+    Args:
+        env: environment in a wrapper with forecasts, of the arm "forecast" and not flattened.
+        source: description of environment and forecaster.
+        episodes: number of episodes; episode i is reset with FIRST_SEED + i.
+
+    Raises:
+        UserError: no scene had another agent.
+    """
+    assert env.stream.config.arm.name == Arm().name
+    found: list[dict[str, NDArray[Any]]] = []
+    for episode in range(episodes):
+        rng = driver_rng(FIRST_SEED + episode)
+        observations, _ = env.reset(seed=FIRST_SEED + episode)
+        for _ in range(MAX_STEPS):
+            seen = observations.values() if isinstance(env, ForecastParallelEnv) else [observations]
+            found += [one for one in seen if one["valid"].any()]
+            observations, over = _random_step(env, rng)
+            if over:
+                break
+    env.close()
+    if not found:
+        raise UserError(f"the arm 'shuffled' needs scenes with another agent, {source} had none in {episodes} episodes")
+    return EntryBank(source, {key: np.stack([one[key] for one in found]) for key in found[0] if key != "observation"})
+
+
+def _random_step(env: Wrapper, rng: np.random.Generator) -> tuple[Any, bool]:
+    """Steps with random actions; returns the observations and whether the episode is over."""
+    if isinstance(env, ForecastParallelEnv):
+        observations, *_ = env.step({agent: _drawn(env.action_space(agent), rng) for agent in env.agents})
+        return observations, not env.agents
+    observation, _, terminated, truncated, _ = env.step(_drawn(env.action_space, rng))
+    return observation, bool(terminated or truncated)
+
+
+def _drawn(space: gym.Space, rng: np.random.Generator) -> Any:
+    space.seed(int(rng.integers(2**31)))
+    return space.sample()

@@ -1,0 +1,67 @@
+"""True futures: plays plans of the ego in a copy of the running simulator and reports where every agent goes.
+
+This is what a perfect forecaster would say: the copy has the simulator's state and random streams, so that the others
+do in it exactly what they will do if the ego takes the plan's actions. It is the upper bound of what forecasts can
+bring, for measurements; an agent in the world has no such copy.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from highway_env.envs.common.abstract import AbstractEnv
+from jaxtyping import Float
+
+from envs.plans.base import Plans
+from envs.readers.base import SceneReader
+from envs.simulators.copies import running_copy
+from predictor.scene import Scene
+from predictor.support.errors import UserError
+
+
+def with_true_futures(
+    plans: Plans, env: gym.Env, reader: SceneReader, scene: Scene, played: int | None = None
+) -> Plans:
+    """Returns the plans with the positions of all agents of the scene when they are played.
+
+    An agent that leaves, or that the simulator no longer steps because the episode is over, goes on at its last
+    velocity.
+
+    Args:
+        plans: plans with the actions of every step.
+        env: the environment, which is not changed.
+        reader: its reader, which is not changed.
+        scene: scene that the reader has just read.
+        played: number of plans that are played, the first ones; None plays all.
+
+    Raises:
+        UserError: the plans lack later actions, or the environment cannot be copied.
+    """
+    if plans.later_actions is None:
+        raise UserError("true futures need plans with later_actions, the actions of every step after the first")
+    actions = [(first, *later) for first, later in zip(plans.actions, plans.later_actions, strict=True)][:played]
+    return replace(plans, true_xy=np.stack([_played(env, reader, scene, each) for each in actions]))
+
+
+def _played(
+    env: gym.Env, reader: SceneReader, scene: Scene, actions: tuple[Any, ...]
+) -> Float[np.ndarray, "agents horizon 2"]:
+    """Returns where each agent of the scene goes while the ego takes these actions."""
+    env, reader = running_copy((env, reader), env.unwrapped)
+    goes_on = isinstance(env.unwrapped, AbstractEnv)  # highway-env simulates on after the end of an episode
+    place_of = {int(agent): i for i, agent in enumerate(scene.ids) if scene.valid[i]}
+    states = np.where(scene.valid[:, None], scene.states, 0.0)
+    xy_m, dt_s, over = np.zeros((len(states), len(actions), 2)), reader.spec.dt_s, False
+    for step, action in enumerate(actions):
+        states = states.copy()
+        states[:, :2] += dt_s * states[:, 2:4]
+        if not over:
+            _, _, terminated, truncated, _ = env.step(action)
+            over = bool(terminated or truncated) and not goes_on
+            now = reader.read_all(env)
+            for agent, state, valid in zip(now.ids, now.states, now.valid, strict=True):
+                if valid and (place := place_of.get(int(agent))) is not None:
+                    states[place] = state
+        xy_m[:, step] = states[:, :2]
+    return xy_m

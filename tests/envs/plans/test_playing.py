@@ -1,0 +1,115 @@
+"""True futures: what a copy of the simulator does is what then happens."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from envs import ForecastObservation, make_env
+from envs.arms import Arm
+from envs.plans.playing import with_true_futures
+from envs.sb3.forecast import VecForecast
+from envs.wrappers import SceneObservation
+from predictor.support.errors import UserError
+
+
+def positions_m(env: SceneObservation | ForecastObservation) -> dict[int, np.ndarray]:
+    """Returns the present position of every agent by its id."""
+    scene = env.get_wrapper_attr("reader").read_all(env)
+    return {int(i): s[:2] for i, s, v in zip(scene.ids, scene.states, scene.valid, strict=True) if v}
+
+
+@pytest.mark.parametrize("env_id", ["highway-fast-v0", "merge-v1", "intersection-v2", "roundabout-v1"])
+@pytest.mark.parametrize("plan", [0, 1])
+def test_the_oracle_is_what_then_happens(env_id: str, plan: int):
+    env = ForecastObservation(make_env(env_id), what_if=True, arm=Arm("oracle-what-if"))
+    env.reset(seed=3)
+    idle = env.plans.actions[0]
+    env.step(idle)
+    true, plans, scene = env.plans.true_xy, env.plans, env.scene
+    assert true.shape == (len(plans.actions), len(scene.ids), env.stream.horizon_steps, 2)
+    moved = 0
+    for step, action in enumerate((plans.actions[plan], *plans.later_actions[plan])):
+        _, _, terminated, truncated, _ = env.step(action)
+        now = positions_m(env)
+        for place in np.flatnonzero(scene.valid):
+            if int(scene.ids[place]) in now:
+                np.testing.assert_allclose(true[plan, place, step], now[int(scene.ids[place])], atol=1e-9)
+                moved += 1
+        if terminated or truncated:
+            break
+    assert moved > 3
+    env.close()
+
+
+def test_plans_have_different_futures_of_the_others():
+    """Others react: behind an ego that brakes, they brake."""
+    env = ForecastObservation(make_env("highway-fast-v0"), what_if=True, arm=Arm("oracle-what-if"))
+    env.reset(seed=3)
+    others = env.plans.true_xy[:, 1:]
+    assert np.abs(others[0] - others[1]).max() > 1.0
+    env.close()
+
+
+def test_the_environment_is_not_touched():
+    plain, watched = (make_env("intersection-v2") for _ in range(2))
+    watched = ForecastObservation(watched, arm=Arm("oracle"))
+    seen, _ = plain.reset(seed=1)
+    shown, _ = watched.reset(seed=1)
+    for _ in range(4):
+        np.testing.assert_array_equal(seen, shown["observation"])
+        seen, *_ = plain.step(1)
+        shown, *_ = watched.step(1)
+    plain.close()
+    watched.close()
+
+
+def test_vector_observations_are_those_of_one_environment():
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    def make() -> gym.Env:
+        return SceneObservation(make_env("merge-v1", disable_env_checker=True))
+
+    env = ForecastObservation(make_env("merge-v1"), arm=Arm("oracle"))
+    venv = VecForecast(DummyVecEnv([make, make]), arm=Arm("oracle"))
+    venv.seed(7)
+    shown: Any = venv.reset()
+    one, _ = env.reset(seed=8)
+    for _ in range(4):
+        np.testing.assert_allclose(shown["forecast"][1], one["forecast"], atol=1e-5)
+        shown, _, dones, _ = venv.step(np.array([1, 1]))
+        one, _, terminated, *_ = env.step(1)
+        assert dones[1] == terminated
+        if terminated:
+            break
+    env.close()
+    venv.close()
+
+
+def test_an_agent_that_leaves_goes_on_at_its_last_velocity():
+    env = SceneObservation(make_env("merge-v1"))
+    env.reset(seed=0)
+    model_plans = ForecastObservation(make_env("merge-v1"), what_if=True)
+    model_plans.reset(seed=0)
+    scene = env.scene
+    ghost = scene.ids.copy()
+    place = int(np.flatnonzero(scene.valid)[-1])
+    ghost[place] = 10**6  # no such agent in the copy: as one that has left
+    unknown = type(scene)(scene.states, ghost, scene.valid, scene.heading_rad)
+    plans = with_true_futures(model_plans.plans, env.env, env.reader, unknown, played=1)
+    steps = np.arange(1, 6)[:, None] * env.reader.spec.dt_s
+    expected = scene.states[place, :2] + steps * scene.states[place, 2:4]
+    np.testing.assert_allclose(plans.true_xy[0, place], expected)
+    for each in (env, model_plans):
+        each.close()
+
+
+def test_plans_without_later_actions_are_refused():
+    env = ForecastObservation(make_env("highway-fast-v0"), what_if=True)
+    env.reset(seed=0)
+    from dataclasses import replace
+
+    with pytest.raises(UserError, match="true futures need plans with later_actions"):
+        with_true_futures(replace(env.plans, later_actions=None), env.env, env.env.reader, env.scene)
+    env.close()

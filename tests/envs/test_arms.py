@@ -1,0 +1,142 @@
+"""Arms of a controlled comparison: equal shapes, and nothing shown but what the arm names."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agents.task import Task
+from envs import ForecastObservation, make_env
+from envs.arms import ARMS, Arm, EntryBank, EntryLayout
+from envs.entry_bank import record_bank
+from envs.parallel import ForecastParallelEnv
+from envs.registry import make_multiagent_env
+from predictor.checkpoint import load_checkpoint
+from predictor.support.errors import UserError
+
+FAST = "highway-fast-v0"
+PRESENT = ("observation", "agents", "valid")
+ROOM = {"num_samples": 6, "what_if": True}
+
+
+@pytest.fixture(scope="module")
+def bank() -> EntryBank:
+    return record_bank(ForecastObservation(make_env(FAST), "highway", **ROOM), "highway", episodes=3)
+
+
+def observed(name: str, bank: EntryBank, **options: Any) -> dict[str, Any]:
+    """Returns the third observation of one episode in an arm."""
+    env = ForecastObservation(make_env(FAST), "highway", arm=Arm(name, bank=bank), **ROOM | options)
+    env.reset(seed=5)
+    env.step(1)
+    found, *_ = env.step(1)
+    assert env.observation_space.contains(found)
+    env.close()
+    return found
+
+
+@pytest.fixture(scope="module")
+def everything(bank: EntryBank) -> dict[str, Any]:
+    return observed("forecast", bank)
+
+
+SHOWN = {
+    "single": {"forecast", "mode_probs", "xy_scale", "edge_probs", "edge_features"},
+    "no-edges": {"forecast", "mode_probs", "xy_scale"},
+    "modes": {"forecast", "mode_probs", "xy_scale", "edge_probs", "edge_features"},
+    "what-if": {
+        *("forecast", "mode_probs", "xy_scale", "edge_probs", "edge_features"),
+        *("what_if_gap", "what_if_contact", "what_if_risk"),
+    },
+    "zeros": set(),
+    "oracle": {"forecast", "mode_probs"},
+    "oracle-what-if": {"forecast", "mode_probs", "what_if_gap", "what_if_contact", "what_if_risk"},
+}
+
+
+@pytest.mark.parametrize("name", [name for name in ARMS if name != "forecast"])
+def test_arms_have_equal_shapes_and_the_same_present(name: str, bank: EntryBank, everything: dict[str, Any]):
+    found = observed(name, bank)
+    assert {key: value.shape for key, value in found.items()} == {key: v.shape for key, v in everything.items()}
+    for key in PRESENT:
+        np.testing.assert_array_equal(found[key], everything[key])
+
+
+@pytest.mark.parametrize("name", SHOWN)
+def test_an_arm_shows_its_part_alone(name: str, bank: EntryBank, everything: dict[str, Any]):
+    found = observed(name, bank)
+    for key in set(found) - set(PRESENT):
+        assert found[key].any() == (key in SHOWN[name]), key
+    if not name.startswith("oracle"):
+        for key in SHOWN[name]:
+            few = key in ("forecast", "mode_probs", "xy_scale") and name != "modes"
+            shown, full = (values[:, :1] if few else values for values in (found[key], everything[key]))
+            np.testing.assert_allclose(shown, full, atol=1e-4)  # 1 or 6 samples: other products of matrices
+            assert not few or not found[key][:, 1:].any()
+
+
+def test_shuffled_is_another_scene_and_the_same_in_every_run(bank: EntryBank, everything: dict[str, Any]):
+    found, again = observed("shuffled", bank), observed("shuffled", bank)
+    present = found["valid"] > 0
+    for key in set(found) - set(PRESENT):
+        np.testing.assert_array_equal(found[key], again[key])
+        assert not found[key][~present].any(), key
+    assert (np.abs(found["forecast"][present] - everything["forecast"][present]) > 1.0).any(axis=(1, 2, 3)).all()
+    recorded = bank.entries["forecast"].reshape(-1, *found["forecast"].shape[1:])
+    assert all((recorded == one).all(axis=(1, 2, 3)).any() for one in found["forecast"][present])
+
+
+@pytest.mark.parametrize("name", ["forecast", "zeros", "shuffled"])
+def test_a_probe_predicts_the_scene_from_forecasts_alone(name: str, bank: EntryBank):
+    """Ridge regression from the hidden entries to the nearest agent's present x: of use with forecasts alone."""
+    env = ForecastObservation(make_env(FAST), "highway", arm=Arm(name, bank=bank), **ROOM)
+    inputs, targets = [], []
+    for seed in range(12):
+        found, _ = env.reset(seed=seed)
+        for _ in range(8):
+            inputs.append(np.concatenate([found[k][0].ravel() for k in sorted(found) if k not in PRESENT]))
+            targets.append(found["agents"][0, 0])
+            found, _, terminated, *_ = env.step(env.unwrapped.np_random.integers(0, 2))
+            if terminated:
+                break
+    env.close()
+    x, y = np.array(inputs), np.array(targets)
+    half = len(x) // 2
+    mean, scale = x[:half].mean(axis=0), x[:half].std(axis=0) + 1e-6
+    x = np.hstack([(x - mean) / scale, np.ones((len(x), 1))])
+    weights = np.linalg.solve(x[:half].T @ x[:half] + 1.0 * np.eye(x.shape[1]), x[:half].T @ y[:half])
+    r2 = 1 - np.mean((x[half:] @ weights - y[half:]) ** 2) / np.var(y[half:])
+    assert r2 > 0.8 if name == "forecast" else r2 < 0.1, r2
+
+
+def test_constant_velocity_has_the_shapes_of_the_shipped_checkpoint():
+    spaces = [Task(FAST, observe).wrapped(Task(FAST, observe).make()).observation_space for observe in ROWS]
+    assert all(space == spaces[0] for space in spaces)
+
+
+ROWS = ("forecast", "zeros", "constant-velocity", "oracle")
+
+
+def test_multiagent_views_are_filled_too():
+    env = ForecastParallelEnv(make_multiagent_env("simple_tag_v3"), "simple-tag", arm=Arm("zeros"))
+    observations, _ = env.reset(seed=0)
+    for seen in observations.values():
+        assert seen["agents"].any() and seen["valid"].all()
+        assert not any(seen[key].any() for key in ("forecast", "edge_probs", "edge_features"))
+    with pytest.raises(UserError, match=r"arm 'oracle' needs an environment with one ego, env 'simple_tag_v3' has"):
+        ForecastParallelEnv(make_multiagent_env("simple_tag_v3"), "simple-tag", arm=Arm("oracle"))
+    env.close()
+
+
+def test_layout_adds_room_for_edges():
+    layout = EntryLayout.of(load_checkpoint("highway")[0])
+    env = ForecastObservation(make_env(FAST), "constant-velocity", arm=Arm(layout=layout), num_samples=2)
+    found, _ = env.reset(seed=0)
+    assert found["edge_probs"].shape == (11, 2) and not found["edge_probs"].any()
+    assert found["xy_scale"].shape == (11, 2, 5, 2) and found["forecast"].any()
+    env.close()
+
+
+def test_an_unknown_arm_is_refused():
+    with pytest.raises(UserError, match=r"arm must be one of forecast, .*, got 'psychic'"):
+        Arm("psychic")
