@@ -126,7 +126,7 @@ def check_forecaster(run_dir: Path, found: ForecasterPin | None) -> bool:
         return found is None
     pinned = stored[FORECASTER]
     if found is not None and pinned is not None:
-        ForecasterPin(**pinned).check(found, f"run {run_dir}")
+        ForecasterPin.from_json(pinned).check(found, f"run {run_dir}")
     return True
 
 

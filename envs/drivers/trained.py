@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
-from envs.arms import Arm, EntryLayout
+from envs.arms import Arm
 from envs.drivers.all_agents import Driver, make_driver
 from envs.sb3.padded_spaces import PaddedObservation, learners_named, own_action, roles_of
 from predictor.scene import SceneSpec
@@ -23,7 +23,7 @@ from predictor.support.errors import UserError
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-    from envs.sb3.policy_file import ForecasterPin, PolicyNote
+    from envs.sb3.policy_file import PolicyNote
 
 EgoDriver = Callable[[Any], Any]
 """Maps an observation to an action."""
@@ -99,29 +99,38 @@ def env_for_driver(env: gym.Env, name: str) -> gym.Env:
     if sees_forecasts(name):
         from envs.wrappers import ForecastObservation  # most drivers need no wrapper
 
-        note = note_of(name)
-        pin = None if note is None else note.forecaster
-        env = ForecastObservation(env, **({} if pin is None else _wrapper_options(name, pin)))
+        options = wrapper_options(name)
+        env = ForecastObservation(env, **options)
         require_view(env, name)
-        if pin is not None:
+        if options:
             space: Any = env.observation_space
-            arm = env.stream.config.arm
-            require_forecaster(name, pin.checkpoint, space, env.get_wrapper_attr("scene_spec"), arm)
+            require_forecaster(
+                name, options["checkpoint"], space, env.get_wrapper_attr("scene_spec"), options.get("arm")
+            )
         return env
     require_view(env, name)
     return env
 
 
-def _wrapper_options(path: str, pin: "ForecasterPin") -> dict[str, Any]:
-    """Returns the arguments of the wrapper that shows what a policy was trained on."""
-    arm = Arm(pin.arm, None if pin.layout is None else EntryLayout(*pin.layout))
+def wrapper_options(path: str) -> dict[str, Any]:
+    """Returns the arguments of the wrapper that shows what a policy was trained on; none if it has no note on it.
+
+    Raises:
+        UserError: the policy was trained on forecasts of other scenes, which only `agents.evaluate` can make.
+    """
+    note = note_of(path)
+    if note is None or note.forecaster is None:
+        return {}
+    pin = note.forecaster
+    arm = Arm(pin.arm, pin.layout)
     if arm.shown.other_scene:
         raise UserError(f"policy {path} was trained on arm '{pin.arm}', a control: only agents.evaluate can play it")
+    what_if = {"what_if": True} if pin.num_plans else {}
     return {
         "checkpoint": pin.checkpoint, "horizon_steps": pin.horizon_steps, "num_samples": pin.num_samples,
         "max_agents": pin.max_agents, "perception_m": np.inf if pin.perception_m is None else pin.perception_m,
-        "what_if": pin.num_plans > 0, "arm": arm,
-    }  # fmt: skip
+        "arm": arm,
+    } | what_if  # fmt: skip
 
 
 def require_view(env: gym.Env, name: str) -> None:
@@ -158,12 +167,6 @@ def note_of(path: str) -> "PolicyNote | None":
             stacklevel=2,
         )
     return note
-
-
-def forecaster_of(path: str) -> str | None:
-    """Returns the checkpoint that a policy was trained on; None if its note names none."""
-    note = note_of(path)
-    return None if note is None or note.forecaster is None else note.forecaster.checkpoint
 
 
 def require_forecaster(

@@ -14,11 +14,11 @@ from envs.drivers.all_agents import Driver, has_heuristic, make_driver
 from envs.drivers.ego import make_ego_driver
 from envs.drivers.trained import (
     env_for_driver,
-    forecaster_of,
     require_forecaster,
     require_view,
     sees_forecasts,
     trained_driver,
+    wrapper_options,
 )
 from envs.parallel import ForecastParallelEnv
 from envs.readers.base import SceneReader
@@ -245,12 +245,16 @@ def open_world(
         UserError: unknown env, driver or checkpoint, or ones that do not fit together.
     """
     if is_multiagent_id(env_id):
-        checkpoint = checkpoint or _forecaster_for(env_id, driver)
-        wrapped = ForecastParallelEnv(make_multiagent_env(env_id), checkpoint, horizon_steps=horizon_steps)
+        options = wrapper_options(driver) if sees_forecasts(driver) else {}
+        checkpoint = checkpoint or options.get("checkpoint") or _forecaster_for(env_id, driver)
+        if checkpoint != options.get("checkpoint"):
+            options = {"checkpoint": checkpoint}
+        options |= {} if horizon_steps is None else {"horizon_steps": horizon_steps}
+        wrapped = ForecastParallelEnv(make_multiagent_env(env_id), **options)
         multiagent = MultiagentWorld(wrapped, driver)
         if sees_forecasts(driver):
             space: Any = wrapped.observation_space(wrapped.possible_agents[0])
-            require_forecaster(driver, checkpoint, space, wrapped.scene_spec)
+            require_forecaster(driver, checkpoint, space, wrapped.scene_spec, options.get("arm"))
         return multiagent
     env = make_env(env_id, disable_env_checker=True)
     if checkpoint is None:
@@ -277,10 +281,8 @@ def _unpadded(scene: Scene) -> Scene:
 
 
 def _forecaster_for(env_id: str, driver: str) -> str:
-    """Returns the checkpoint for recording a PettingZoo environment: the driver's, or constant velocity."""
-    if not sees_forecasts(driver):
-        return CONSTANT_VELOCITY
-    return forecaster_of(driver) or checkpoint_for(env_id)
+    """Returns the checkpoint for recording a PettingZoo environment with a driver that names none."""
+    return checkpoint_for(env_id) if sees_forecasts(driver) else CONSTANT_VELOCITY
 
 
 def default_drivers(env_id: str) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ import json
 import math
 import zipfile
 from collections.abc import Mapping
-from dataclasses import asdict, astuple, dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from envs.arms import Arm
+from envs.arms import Arm, EntryLayout
 from predictor.checkpoint import CONSTANT_VELOCITY, WEIGHTS, resolve
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
@@ -53,8 +53,19 @@ class ForecasterPin:
     """Part of the forecast that the policy sees (`envs.arms`)."""
     num_plans: int = 0
     """Number of candidate plans of the ego whose what-if forecasts it sees."""
-    layout: tuple[int, int, bool] | None = None
-    """Sizes of the entries (`envs.arms.EntryLayout`); None for the forecaster's own."""
+    layout: EntryLayout | None = None
+    """Sizes of the entries; None for the forecaster's own."""
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> "ForecasterPin":
+        """Returns the pin that `asdict` and JSON made; fields that older versions lacked get their defaults.
+
+        Raises:
+            TypeError: a field is missing or of another type.
+        """
+        known = {field.name: content[field.name] for field in fields(cls) if field.name in content}
+        layout = known.get("layout")
+        return cls(**known | {"layout": None if layout is None else EntryLayout(**layout)})
 
     def check(self, found: "ForecasterPin", policy: str) -> None:
         """Raises a `UserError` if `found` is another forecaster or has other options; its folder does not matter."""
@@ -73,9 +84,6 @@ class ForecasterPin:
     @property
     def _named(self) -> str:
         return f"'{self.checkpoint}'" + (f" (SHA-256 {self.sha256[:12]}…)" if self.sha256 else "")
-
-
-_PIN = fields(ForecasterPin)
 
 
 @dataclass(frozen=True)
@@ -111,9 +119,8 @@ def pin_forecaster(checkpoint: str, space: gym.spaces.Dict, spec: SceneSpec, arm
     perception_m = float(spec.perception_m) if math.isfinite(spec.perception_m) else None
     plans = space["what_if_risk"].shape or (0,) if "what_if_risk" in space.spaces else (0,)
     arm = arm or Arm()
-    layout = None if arm.layout is None else astuple(arm.layout)
     return ForecasterPin(
-        checkpoint, digest, shape[-2], samples, 1 + shape[0], perception_m, arm.name, plans[-1], layout
+        checkpoint, digest, shape[-2], samples, 1 + shape[0], perception_m, arm.name, plans[-1], arm.layout
     )
 
 
@@ -149,7 +156,7 @@ def read_policy_note(path: Path) -> PolicyNote | None:
         return None
     try:
         pin = content["forecaster"]
-        forecaster = None if pin is None else ForecasterPin(**{f.name: pin[f.name] for f in _PIN if f.name in pin})
+        forecaster = None if pin is None else ForecasterPin.from_json(pin)
         return PolicyNote(forecaster, tuple(content["learners"]), str(content["driver"]))
     except (KeyError, TypeError) as error:
         raise UserError(f"the note inside {path} cannot be understood ({error!r}); save the policy again") from error

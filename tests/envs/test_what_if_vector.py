@@ -190,7 +190,7 @@ def test_environments_that_make_no_plans_are_refused(highway_checkpoint: str):
     with pytest.raises(UserError, match=message):
         VectorForecast(SyncVectorEnv([unplanned]), highway_checkpoint, what_if=True)
     venv = DummyVecEnv(MAKERS[:2])
-    venv.envs[0].propose_plans = lambda what_if, steps: ("other",)  # type: ignore[attr-defined]
+    venv.envs[0].propose_plans = lambda what_if, steps, played: ("other",)  # type: ignore[attr-defined]
     with pytest.raises(UserError, match="all environments must have the same plans"):
         VecForecast(venv, highway_checkpoint, what_if=True)
     silent = VecForecast(DummyVecEnv([lambda: WithoutInfo(MAKERS[0]())]), highway_checkpoint, what_if=True)

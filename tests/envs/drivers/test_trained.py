@@ -11,7 +11,6 @@ from agents.runs import save_model
 from agents.task import Task
 from envs.drivers.trained import trained_driver
 from envs.parallel import ForecastParallelEnv
-from envs.registry import make_multiagent_env
 from envs.rollouts.world import MultiagentWorld, open_world
 from envs.seeding import driver_rng
 from predictor.support.errors import UserError
@@ -29,7 +28,8 @@ def save_run(folder: Path, task: Task, noted: bool = True) -> tuple[str, PPO]:
 
 
 def forecast_env(env_id: str = SPREAD, **settings: Any) -> ForecastParallelEnv:
-    return ForecastParallelEnv(make_multiagent_env(env_id), "constant-velocity", **settings)
+    task = Task(env_id, "constant-velocity")
+    return ForecastParallelEnv(task.make(), **task.options | settings)
 
 
 def played(env: ForecastParallelEnv, path: str) -> tuple[dict[str, float], list[dict[str, Any]]]:
