@@ -24,8 +24,10 @@ from predictor.support.errors import UserError
 EGO_KEY = "observation"
 VALID_KEY = "valid"
 WHAT_IF_GAP = "what_if_gap"
+EGO_PATH = "ego_path"
+CLOSEST = "closest"
 TOKEN_KEYS = (
-    *("agents", "forecast", "mode_probs", "xy_scale", "edge_probs", "edge_features"),
+    *("agents", "forecast", CLOSEST, "mode_probs", "xy_scale", "edge_probs", "edge_features"),
     *(WHAT_IF_GAP, "what_if_contact", "what_if_risk"),
 )
 """Entries of an observation that become tokens; others are not read. Those without a scale here are of order one."""
@@ -131,7 +133,10 @@ class ForecastAttention(BaseFeaturesExtractor):
             return null, torch.zeros(len(ego), 1, dtype=torch.long, device=ego.device)
         valid = self._valid(observations)
         env, slot = valid.nonzero(as_tuple=True)
-        inputs = self._token_inputs({k: observations[k][env, slot] for k in self._keys})
+        present = {k: observations[k][env, slot] for k in self._keys}
+        if EGO_PATH in observations:
+            present[EGO_PATH] = observations[EGO_PATH][env]
+        inputs = self._token_inputs(present)
         # embedding() is indexing with a faster gradient
         of_ego = functional.embedding(env, functional.linear(ego, self.token_ego.weight, self.token_in.bias))
         tokens = self.token_out(torch.addmm(of_ego, inputs, self.token_in.weight.T))
@@ -153,17 +158,24 @@ class ForecastAttention(BaseFeaturesExtractor):
             parts += [self._squash(agents[:, :2]), agents[:, 2:4] / self.config.speed_mps, agents[:, 4:]]
         if "forecast" in self._keys:
             forecast = present["forecast"]  # agents [samples] horizon 2
+            path = present.get(EGO_PATH)  # agents horizon 2
+            if path is not None:  # where the ego is at the same time: what counts for a collision
+                forecast = forecast - (path if forecast.ndim == 3 else path[:, None])
             parts.append(self._squash(forecast).flatten(1))
+            forecast = present["forecast"]
             if "agents" in self._keys:
                 now = present["agents"][:, :2]
                 now = now.reshape(len(now), *(1,) * (forecast.ndim - 2), 2)
                 parts.append(self._squash(forecast - now).flatten(1))
         if "xy_scale" in self._keys:
             parts.append(torch.tanh(present["xy_scale"] / self.config.near_m).flatten(1))
+        if CLOSEST in self._keys:
+            distance, time = present[CLOSEST].split(1, dim=-1)
+            parts += [torch.tanh(distance / self.config.near_m), distance / self.config.far_m, time]
         if WHAT_IF_GAP in self._keys:
             gap = present[WHAT_IF_GAP]
             parts += [torch.tanh(gap / self.config.near_m), gap / self.config.far_m]
-        scaled = ("agents", "forecast", "xy_scale", WHAT_IF_GAP)
+        scaled = ("agents", "forecast", CLOSEST, "xy_scale", WHAT_IF_GAP)
         parts += [present[k].flatten(1) for k in self._keys if k not in scaled]
         return torch.cat(parts, dim=-1)
 
@@ -174,7 +186,10 @@ class ForecastAttention(BaseFeaturesExtractor):
         """Returns the size of `_token_inputs`, measured on zeros."""
         if not self._keys:
             return 0
-        return self._token_inputs({k: torch.zeros(1, *shapes[k][1:]) for k in self._keys}).shape[-1]
+        empty = {k: torch.zeros(1, *shapes[k][1:]) for k in self._keys}
+        if EGO_PATH in shapes:
+            empty[EGO_PATH] = torch.zeros(1, *shapes[EGO_PATH])
+        return self._token_inputs(empty).shape[-1]
 
     def _attend(
         self,

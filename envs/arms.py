@@ -1,8 +1,8 @@
 """Arms of a controlled comparison: which part of a forecast an observation shows.
 
 All arms have the same entries in the same shapes, so that the same network reads them; what an arm does not show is
-zero. The other agents' present states (`agents`, `valid`) are part of every arm. Arms therefore differ only in what
-they tell about the future, or about who interacts with whom.
+zero. The other agents' present states (`agents`, `valid`) and the ego's own path are part of every arm. Arms therefore
+differ only in what they tell about the others' future, or about who interacts with whom.
 """
 
 import zlib
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from predictor.forecaster import Forecaster, has_scale
 from predictor.support.config_checks import check_choice
 
-PRESENT_KEYS = ("agents", "valid")
-"""Entries on the present, which every arm shows."""
+PRESENT_KEYS = ("agents", "valid", "ego_path")
+"""Entries on the present and on the ego itself, which every arm shows."""
 EDGE_KEYS = ("edge_probs", "edge_features")
 """Entries on who interacts with whom."""
 _PROBS = "mode_probs"
@@ -86,7 +86,7 @@ class EntryBank:
     source: str
     """Description of the episodes; banks of the same source are equal."""
     entries: Mapping[str, Float[np.ndarray, "scenes others ..."]] = field(compare=False, repr=False)
-    """Entries by key, agents as in `envs.observation.ego_entries`."""
+    """Entries by key, agents as in `envs.entries.ego_entries`."""
 
     def drawn_for(self, present: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[np.float32]]:
         """Returns entries of recorded scenes, for the agents of present ones.

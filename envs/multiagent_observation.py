@@ -1,7 +1,7 @@
 """Cuts each agent's own view from the one forecast of a scene, for environments with many learners.
 
 The forecaster runs once per step for the scenes of all environments. Each agent then gets what a single ego would get
-(`envs.observation.ego_entries`): itself as origin, its heading as x axis, its own edges, the others by distance.
+(`envs.entries.ego_entries`): itself as origin, its heading as x axis, its own edges, the others by distance.
 An agent's view is cut to its perception; the forecast itself is made from all agents.
 """
 
@@ -18,7 +18,7 @@ from jaxtyping import Bool, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from envs.observation import ego_entries, entry_spaces
+from envs.entries import ego_entries, entry_spaces, path_entries
 from envs.readers.base import MultiagentScene
 from envs.scene_stream import ForecastConfig, SceneStream
 from predictor.forecaster import Forecaster
@@ -134,7 +134,7 @@ def _batch(scenes: Sequence[MultiagentScene]) -> SceneBatch:
 def agent_entries(
     scene: MultiagentScene, forecast: Forecast, view: SceneSpec, uncertainty: bool = False
 ) -> AgentEntries:
-    """Returns each agent's forecast entries, cut from one forecast; `envs.observation.ego_entries` gives the shapes.
+    """Returns each agent's forecast entries, cut from one forecast; `envs.entries.ego_entries` gives the shapes.
 
     Args:
         scene: scene that was forecast.
@@ -192,6 +192,7 @@ def view_entries(
         xy_scale=of_views(forecast.xy_scale),
     )
     found = ego_entries(views, seen_by_each, uncertainty)
+    found |= path_entries(views, found["forecast"], view.dt_s)
     for key, values in (fill(found) if fill else found).items():
         for (place, name), value in zip(named, values, strict=True):
             entries[place].setdefault(name, {})[key] = value

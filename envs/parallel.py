@@ -40,7 +40,7 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     Observation of an agent: Dict with `observation` (its own, untouched) and, for the other agents sorted by distance
     from it, `agents` (relative current states), `forecast` (future positions in its frame [m]; a samples axis when
     num_samples > 1), `edge_probs` and `edge_features` (other → agent, then agent → other), `valid`.
-    `envs.observation.ego_entries` gives the shapes. Agents may differ in their own spaces, die and join at any step. An
+    `envs.entries.ego_entries` gives the shapes. Agents may differ in their own spaces, die and join at any step. An
     agent's last observation has forecasts too; if the reader no longer reports the agent, all its entries are zero,
     `valid` too. With `flatten=True` an observation is one Box, in the Dict's key order.
 

@@ -15,13 +15,7 @@ from gymnasium.utils import RecordConstructorArgs
 
 from envs.arms import Arm
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
-from envs.observation import (
-    ForecastStream,
-    carries_scenes,
-    open_forecaster,
-    scene_entries,
-    scene_spaces,
-)
+from envs.observation import ForecastStream, carries_scenes, open_forecaster, scene_entries, scene_spaces
 from envs.plans import PlanModel, Plans, checked_plans, plan_model_for
 from envs.plans.batch import PlanBatch, plans_info
 from envs.plans.playing import with_true_futures
@@ -167,7 +161,7 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
     Observation: Dict with `observation` (the env's own, untouched) and, for the other agents sorted by distance,
     `agents` (relative current states), `forecast` (future positions in the ego's frame [m]; a samples axis when
     num_samples > 1), `edge_probs` and `edge_features` (agent → ego, then ego → agent), `valid`.
-    `envs.observation.ego_entries` gives the shapes. With `flatten=True` it is one Box, in the Dict's key order.
+    `envs.entries.ego_entries` gives the shapes. With `flatten=True` it is one Box, in the Dict's key order.
 
     The history is cleared at reset. After each step, `scene` and `forecast` hold the observed scene and its forecast in
     the world frame.
@@ -187,7 +181,7 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         reader: function or class that makes a reader for the env; None picks one by env family. Refused over a
             `SceneObservation`, which has its own.
         what_if: whether the observation also holds what the others are forecast to do for each candidate plan of the
-            ego: `what_if_gap`, `what_if_contact`, `what_if_risk` (`envs.observation.what_if_entries`). True takes the
+            ego: `what_if_gap`, `what_if_contact`, `what_if_risk` (`envs.entries.what_if_entries`). True takes the
             environment's plan model; or a `PlanModel` (docs/what_if.md).
         arm: part of the forecast that observations show, for controlled comparisons (`envs.arms`, docs/arms.md).
 

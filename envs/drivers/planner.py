@@ -21,10 +21,12 @@ from jaxtyping import Float
 
 from envs.plans import PlanModel, Plans, checked_plans, plan_model_for
 from envs.plans.contact import contacts
+from envs.plans.playing import as_forecast, with_true_futures
 from envs.readers import reader_for
-from envs.registry import checkpoint_for
+from envs.readers.base import SceneReader
+from envs.registry import checkpoint_for, entry_for
 from envs.wrappers import scene_source
-from predictor.checkpoint import load_forecaster
+from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster
 from predictor.forecaster import Forecaster, has_scale
 from predictor.online import OnlineForecaster
 from predictor.scene import Scene, SceneBatch
@@ -33,6 +35,8 @@ from predictor.support.errors import UserError
 
 PLANNER = "planner"
 """Name of the driver; `planner:CHECKPOINT` names its forecaster too."""
+ORACLE = "oracle"
+"""Name in the place of a checkpoint: the planner gets the true futures, an upper bound for measurements."""
 MODES = 20
 """Number of futures of a forecaster with modes; others give the planner their single forecast."""
 EQUAL = 1e-6
@@ -49,6 +53,8 @@ class PlannerConfig:
     """Number of futures of each plan; None takes 20 for a forecaster with modes, else the single forecast."""
     horizon_steps: int | None = None
     """Number of steps that are planned; None takes what the checkpoint was trained for."""
+    true_futures: bool = False
+    """Whether the futures are those that a copy of the simulator plays, instead of the forecaster's."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
@@ -66,7 +72,7 @@ def planner_driver(name: str, env: gym.Env, rng: np.random.Generator) -> "Planne
     """Returns the planner as a driver for one episode.
 
     Args:
-        name: "planner", or "planner:CHECKPOINT" with a shipped name, a folder or "constant-velocity".
+        name: "planner", or "planner:CHECKPOINT" with a shipped name, a folder, "constant-velocity" or "oracle".
         env: environment that will be driven.
         rng: source of the samples' noise.
 
@@ -75,6 +81,9 @@ def planner_driver(name: str, env: gym.Env, rng: np.random.Generator) -> "Planne
     """
     checkpoint = name.partition(":")[2]
     model = plan_model_for(env)
+    if checkpoint == ORACLE:
+        forecaster = forecaster_for(env, entry_for(scene_source(env)).checkpoint or CONSTANT_VELOCITY)
+        return Planner(env, forecaster, model, rng, PlannerConfig(true_futures=True))
     return Planner(env, forecaster_for(env, checkpoint or None), model, rng)
 
 
@@ -127,10 +136,13 @@ class Planner:
         self.env = env
         self.plan_model = plan_model or plan_model_for(env)
         trained = forecaster.spec
-        self._reader = None
-        if not env.has_wrapper_attr("scene_spec"):
-            self._reader = reader_for(env, trained.perception_m, trained.max_agents)
-        self._spec = env.get_wrapper_attr("scene_spec") if self._reader is None else self._reader.spec
+        self._own_reader = not env.has_wrapper_attr("scene_spec")
+        self._reader: SceneReader = (
+            reader_for(env, trained.perception_m, trained.max_agents)
+            if self._own_reader
+            else env.get_wrapper_attr("reader")
+        )
+        self._spec = self._reader.spec
         trained.check_compatible(self._spec, "the planner's forecaster", f"env '{scene_source(env)}'")
         self._online = OnlineForecaster(forecaster, 1, self._spec.max_agents)
         self._samples = self.config.num_samples or (MODES if has_scale(forecaster) else 1)
@@ -146,12 +158,17 @@ class Planner:
         Raises:
             UserError: plans of another shape, or without rewards.
         """
-        scenes = SceneBatch.stack([self._scene()])
+        scene = self._scene()
+        scenes = SceneBatch.stack([scene])
         self._online.observe(scenes)
         plans = checked_plans(self.plan_model, self.env, self._horizon, self._spec.num_features)
         if plans.rewards is None:
             raise UserError(f"the planner needs rewards, but plan model {type(self.plan_model).__name__} gives none")
         forecast = self._online.forecast(self._horizon, self._samples, self._noise, plans.states[None])
+        if self.config.true_futures:
+            true = with_true_futures(plans, self.env, self._reader, scene).true_xy
+            assert true is not None
+            forecast = as_forecast(true[None], scenes, forecast)
         length_m, width_m = (size + plans.margin_m for size in plans.size_m)  # half of it around each agent
         survival = contacts(forecast, scenes, (length_m, width_m)).survival()[0]
         self.survival = survival if plans.crashed is None else survival * ~plans.crashed
@@ -159,7 +176,7 @@ class Planner:
         return plans.actions[self.chosen]
 
     def _scene(self) -> Scene:
-        if self._reader is not None:
+        if self._own_reader:
             return self._reader.read(self.env)
         scene: Scene = self.env.get_wrapper_attr("scene")
         return scene

@@ -10,13 +10,14 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 from highway_env.envs.common.abstract import AbstractEnv
 from jaxtyping import Float
 
 from envs.plans.base import Plans
 from envs.readers.base import SceneReader
 from envs.simulators.copies import running_copy
-from predictor.scene import Scene
+from predictor.scene import Forecast, Scene, SceneBatch
 from predictor.support.errors import UserError
 
 
@@ -42,6 +43,21 @@ def with_true_futures(
         raise UserError("true futures need plans with later_actions, the actions of every step after the first")
     actions = [(first, *later) for first, later in zip(plans.actions, plans.later_actions, strict=True)][:played]
     return replace(plans, true_xy=np.stack([_played(env, reader, scene, each) for each in actions]))
+
+
+def as_forecast(
+    true_xy: Float[np.ndarray, "batch plans agents horizon 2"], scenes: SceneBatch, like: Forecast
+) -> Forecast:
+    """Returns a forecast that says the true positions and nothing of their spread.
+
+    Args:
+        true_xy: positions of all agents of each scene for each plan [m], world frame.
+        scenes: the scenes.
+        like: a forecast of them, for everything else.
+    """
+    local = (true_xy - scenes.states[:, None, :1, None, :2]) * scenes.valid[:, None, :, None, None]
+    positions = torch.from_numpy(local.astype(np.float32)).to(like.xy.device)
+    return replace(like, xy=positions[:, :, None], mode_probs=None, xy_scale=None)
 
 
 def _played(

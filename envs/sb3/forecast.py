@@ -16,14 +16,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from envs.arms import Arm
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
-from envs.observation import (
-    ForecastStream,
-    common_value,
-    observe_ended,
-    open_forecaster,
-    require_scenes,
-    scenes_from,
-)
+from envs.observation import ForecastStream, common_value, observe_ended, open_forecaster, require_scenes, scenes_from
 from envs.plans import PlanModel
 from envs.plans.batch import PLANS_INFO, PlanBatch, ask_for_plans
 from envs.readers import MakeReader

@@ -6,11 +6,11 @@ import torch
 from gymnasium import spaces
 from stable_baselines3 import PPO
 
-from agents.features import TOKEN_KEYS, VALID_KEY, AttentionConfig, ForecastAttention
+from agents.features import EGO_PATH, TOKEN_KEYS, VALID_KEY, AttentionConfig, ForecastAttention
 from agents.task import Task
 from agents.training import TrainingPlan, make_model
 from agents.vec_envs import make_venv
-from envs.observation import FORECAST_KEYS, UNCERTAINTY_KEYS, WHAT_IF_KEYS
+from envs.entries import FORECAST_KEYS, PATH_KEYS, UNCERTAINTY_KEYS, WHAT_IF_KEYS
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
@@ -25,6 +25,8 @@ SHAPES = {
 }
 UNCERTAIN = SHAPES | {
     "forecast": (AGENTS, 3, HORIZON, 2),
+    "ego_path": (HORIZON, 2),
+    "closest": (AGENTS, 2),
     "mode_probs": (AGENTS, 3),
     "xy_scale": (AGENTS, 3, HORIZON, 2),
     "what_if_gap": (AGENTS, 2),
@@ -55,7 +57,7 @@ def make_extractor(shapes: dict[str, tuple[int, ...]], config: AttentionConfig |
 
 
 def permuted(observations: dict[str, torch.Tensor], order: list[int]) -> dict[str, torch.Tensor]:
-    return {k: v if k == "observation" else v[:, order] for k, v in observations.items()}
+    return {k: v if k in ("observation", "ego_path") else v[:, order] for k, v in observations.items()}
 
 
 def test_size_is_ego_and_attended():
@@ -75,10 +77,14 @@ def by_loop(extractor: ForecastAttention, observations: dict[str, torch.Tensor])
             now, motion = observations["agents"][b, a, :2], observations["agents"][b, a, 2:]
             forecast = observations["forecast"][b, a].flatten(0, -2)
             parts = [torch.tanh(now / config.near_m), now / config.far_m, motion / config.speed_mps]
-            for places in (forecast, forecast - now):
+            path = observations[EGO_PATH][b].repeat(3, 1) if EGO_PATH in observations else 0.0
+            for places in (forecast - path, forecast - now):
                 parts.append(torch.cat([torch.tanh(places / config.near_m), places / config.far_m], -1).flatten())
             if "xy_scale" in observations:
                 parts.append(torch.tanh(observations["xy_scale"][b, a] / config.near_m).flatten())
+            if "closest" in observations:
+                distance, time = observations["closest"][b, a].split(1)
+                parts += [torch.tanh(distance / config.near_m), distance / config.far_m, time]
             if "what_if_gap" in observations:
                 gap = observations["what_if_gap"][b, a]
                 parts += [torch.tanh(gap / config.near_m), gap / config.far_m]
@@ -143,6 +149,18 @@ def test_padding_equals_a_smaller_scene():
     torch.testing.assert_close(extractor(permuted(observations, [0, 1, 2])), extractor(observations))
 
 
+def test_forecasts_count_from_where_the_ego_then_is():
+    """An agent that keeps pace with the ego is a constant, wherever both are going."""
+    extractor, observations = make_extractor(UNCERTAIN), make_observations(UNCERTAIN)
+    present = {key: observations[key][0, :1] for key in TOKEN_KEYS} | {EGO_PATH: observations[EGO_PATH][0][None]}
+    before = extractor._token_inputs(present)
+    further = torch.tensor([30.0, 4.0]) * torch.arange(1, HORIZON + 1)[:, None]
+    moved = present | {EGO_PATH: present[EGO_PATH] + further, "forecast": present["forecast"] + further}
+    changed = ((extractor._token_inputs(moved) - before).abs() > 1e-4).sum()
+    own = extractor._squash(present["forecast"]).numel()
+    assert 0 < changed <= own  # the displacement from now alone; not what is relative to the ego's path
+
+
 def test_a_valid_agent_does_change_something():
     extractor, observations = make_extractor(SHAPES), make_observations(SHAPES)
     before = extractor(observations)
@@ -162,7 +180,7 @@ def test_empty_scene_is_finite_with_finite_gradients():
 
 def test_every_entry_of_the_wrappers_is_read():
     """One that is added to the wrappers alone would change no policy, without a word."""
-    assert {*TOKEN_KEYS, VALID_KEY} == {*FORECAST_KEYS, *UNCERTAINTY_KEYS, *WHAT_IF_KEYS}
+    assert {*TOKEN_KEYS, VALID_KEY, EGO_PATH} == {*FORECAST_KEYS, *PATH_KEYS, *UNCERTAINTY_KEYS, *WHAT_IF_KEYS}
 
 
 def test_a_new_token_key_is_read(monkeypatch: pytest.MonkeyPatch):

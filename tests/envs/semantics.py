@@ -19,8 +19,9 @@ import pytest
 import torch
 from pettingzoo import ParallelEnv
 
+from envs.entries import FORECAST_KEYS, PATH_KEYS, ego_entries, path_entries
 from envs.multiagent_observation import MultiagentStream, agent_entries
-from envs.observation import FORECAST_KEYS, ForecastStream, ego_entries
+from envs.observation import ForecastStream
 from envs.parallel import ForecastParallelEnv
 from envs.readers import multiagent_reader_for, reader_for
 from envs.readers.base import MultiagentScene, Reader, pad_multiagent_scene
@@ -467,7 +468,9 @@ class Session:
         forecast = full_window(self.model, [moment.multi.scene for moment in moments])
         if self.subject.multiagent:
             return agent_entries(multi, forecast, self.view)
-        entries = ego_entries(SceneBatch.stack([multi.scene]), forecast)
+        scenes = SceneBatch.stack([multi.scene])
+        entries = ego_entries(scenes, forecast)
+        entries |= path_entries(scenes, entries["forecast"], self.model.spec.dt_s)
         return {EGO: {key: value[0] for key, value in entries.items()}}
 
     def _step(self, rng: np.random.Generator) -> Any:
@@ -484,7 +487,7 @@ class Session:
         if not self.subject.multiagent:
             scene, seen = MultiagentScene(scene, {EGO: 0}, np.full(len(scene.ids), scene.heading_rad)), {EGO: seen}
         views = {name: {key: view[key] for key in view if key != "observation"} for name, view in seen.items()}
-        assert all(set(view) == set(FORECAST_KEYS) for view in views.values())
+        assert all(set(view) == {*FORECAST_KEYS, *PATH_KEYS} for view in views.values())
         return Moment(scene, views, self.env.forecast, self.subject.bodies(self.env))
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from agents.task import Task
 from envs import ForecastObservation, make_env
-from envs.arms import ARMS, Arm, EntryBank, EntryLayout
+from envs.arms import ARMS, PRESENT_KEYS, Arm, EntryBank, EntryLayout
 from envs.entry_bank import record_bank
 from envs.parallel import ForecastParallelEnv
 from envs.registry import make_multiagent_env
@@ -15,7 +15,7 @@ from predictor.checkpoint import load_checkpoint
 from predictor.support.errors import UserError
 
 FAST = "highway-fast-v0"
-PRESENT = ("observation", "agents", "valid")
+PRESENT = ("observation", *PRESENT_KEYS)
 ROOM = {"num_samples": 6, "what_if": True}
 
 
@@ -41,16 +41,16 @@ def everything(bank: EntryBank) -> dict[str, Any]:
 
 
 SHOWN = {
-    "single": {"forecast", "mode_probs", "xy_scale", "edge_probs", "edge_features"},
-    "no-edges": {"forecast", "mode_probs", "xy_scale"},
-    "modes": {"forecast", "mode_probs", "xy_scale", "edge_probs", "edge_features"},
+    "single": {"forecast", "closest", "mode_probs", "xy_scale", "edge_probs", "edge_features"},
+    "no-edges": {"forecast", "closest", "mode_probs", "xy_scale"},
+    "modes": {"forecast", "closest", "mode_probs", "xy_scale", "edge_probs", "edge_features"},
     "what-if": {
-        *("forecast", "mode_probs", "xy_scale", "edge_probs", "edge_features"),
+        *("forecast", "closest", "mode_probs", "xy_scale", "edge_probs", "edge_features"),
         *("what_if_gap", "what_if_contact", "what_if_risk"),
     },
     "zeros": set(),
-    "oracle": {"forecast", "mode_probs"},
-    "oracle-what-if": {"forecast", "mode_probs", "what_if_gap", "what_if_contact", "what_if_risk"},
+    "oracle": {"forecast", "closest", "mode_probs"},
+    "oracle-what-if": {"forecast", "closest", "mode_probs", "what_if_gap", "what_if_contact", "what_if_risk"},
 }
 
 

@@ -9,8 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from envs.entries import FORECAST_KEYS, PATH_KEYS
 from envs.multiagent_observation import MultiagentStream, agent_entries, check_multiagent_scene
-from envs.observation import FORECAST_KEYS
 from envs.readers.base import MultiagentScene
 from envs.scene_stream import ForecastConfig
 from predictor.baselines.constant_velocity import ConstantVelocity
@@ -94,8 +94,10 @@ def view_by_loops(multi: MultiagentScene, forecast: Forecast, index: int, view: 
         "edge_probs": np.zeros((places, 2 * (probs.shape[2] - 1))),
         "edge_features": np.zeros((places, 2 * features.shape[2])),
         "valid": np.zeros(places),
+        "ego_path": np.array([[view.dt_s * (t + 1) * v for v in turned(*states[index, 2:4])] for t in range(horizon)]),
+        "closest": np.zeros((places, 2)),
     }
-    for place, (_, other) in enumerate(sorted(near)[:places]):
+    for place, (distance_m, other) in enumerate(sorted(near)[:places]):
         relative = states[other] - states[index]
         entries["agents"][place] = [*turned(*relative[:2]), *turned(*relative[2:4]), *states[other, 4:]]
         for k in range(samples):
@@ -104,6 +106,9 @@ def view_by_loops(multi: MultiagentScene, forecast: Forecast, index: int, view: 
         entries["edge_probs"][place] = [*probs[index, other, 1:], *probs[other, index, 1:]]
         entries["edge_features"][place] = [*features[index, other], *features[other, index]]
         entries["valid"][place] = 1
+        path, first = entries["ego_path"], entries["forecast"][place, 0]
+        apart = [distance_m, *(math.dist(first[t], path[t]) for t in range(horizon))]
+        entries["closest"][place] = [min(apart), apart.index(min(apart)) / horizon]
     if samples == 1:
         entries["forecast"] = entries["forecast"][:, 0]
     return entries
@@ -213,7 +218,7 @@ def test_padding_is_not_seen_however_far_an_agent_sees():
     forecast = random_world_forecast(np.random.default_rng(0), 6, 1, 2, 2, 1)
     entries = agent_entries(multi, forecast, replace(WORLD, perception_m=np.inf))
     assert entries["0"]["valid"].tolist() == [1, 0, 0, 0, 0]
-    assert all((value[1:] == 0).all() for value in entries["0"].values())
+    assert all((value[1:] == 0).all() for key, value in entries["0"].items() if key != "ego_path")
 
 
 def test_views_wider_than_the_scene_are_padded():
@@ -221,6 +226,7 @@ def test_views_wider_than_the_scene_are_padded():
     forecast = random_world_forecast(np.random.default_rng(0), 2, 2, 2, 2, 1)
     wide = agent_entries(multi, forecast, replace(WORLD, max_agents=9))["0"]
     narrow = agent_entries(multi, forecast, replace(WORLD, max_agents=2))["0"]
+    np.testing.assert_array_equal(wide.pop("ego_path"), narrow.pop("ego_path"))
     assert_same({key: value[:1] for key, value in wide.items()}, narrow)
     assert all(len(value) == 8 and (value[1:] == 0).all() for value in wide.values())
 
@@ -348,7 +354,8 @@ def test_an_empty_scene_is_no_accident(spec: SceneSpec, samples: int):
 def test_alone_is_an_empty_view(spec: SceneSpec):
     multi = multiagent_scene((1, 2, 3, 4), size=1)
     entries = stream(replace(spec, max_agents=1)).observe(multi)["0"]
-    assert {key: len(value) for key, value in entries.items()} == dict.fromkeys(FORECAST_KEYS, 0)
+    of_others = {key: len(value) for key, value in entries.items() if key != "ego_path"}
+    assert of_others == dict.fromkeys((*FORECAST_KEYS, "closest"), 0)
     assert (stream(spec).observe(multiagent_scene((1, 2, 3, 4)))["0"]["valid"] == 0).all()
 
 
@@ -368,7 +375,7 @@ def test_samples_repeat_with_the_seed_and_the_first_is_the_most_likely():
 def test_spaces_hold_the_entries(samples: int, horizon_steps: int | None, max_agents: int | None):
     made = stream(WORLD, max_agents=max_agents, num_samples=samples, horizon_steps=horizon_steps)
     entries, spaces = made.observe(multiagent_scene((1, 2, 3, 4), (5, 6, 7, 8)))["0"], made.spaces()
-    assert set(spaces) == {*FORECAST_KEYS, *(("mode_probs",) if samples > 1 else ())}
+    assert set(spaces) == {*FORECAST_KEYS, *PATH_KEYS, *(("mode_probs",) if samples > 1 else ())}
     assert set(entries) == set(spaces)
     for key, space in spaces.items():
         assert space.contains(entries[key]), key

@@ -10,16 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
 
+from envs.entries import FORECAST_KEYS, PATH_KEYS, ego_entries, into_ego_axes, others_by_distance, path_entries
 from envs.observation import (
-    FORECAST_KEYS,
     SCENE_KEYS,
     ForecastConfig,
     ForecastStream,
     carries_scenes,
-    ego_entries,
-    into_ego_axes,
     open_forecaster,
-    others_by_distance,
     require_scenes,
     scene_entries,
     scene_spaces,
@@ -258,7 +255,7 @@ def test_ego_alone_is_an_empty_observation():
         for scene in scenes:
             entries = alone.observe(scene)
             assert entries["valid"].shape == (1, spec.max_agents - 1)
-            assert all((value == 0).all() for value in entries.values())
+            assert all((value == 0).all() for key, value in entries.items() if key != "ego_path")
 
 
 def test_memory_follows_ids_when_agents_are_sorted_anew():
@@ -332,7 +329,7 @@ def test_spaces_hold_the_entries(samples: int, horizon_steps: int | None):
     made = stream(HIGHWAY_SPEC, 2, num_samples=samples, horizon_steps=horizon_steps)
     entries, spaces = made.observe(scenes), made.spaces()
     uncertain = {"mode_probs"} if samples > 1 else set()  # these samples are draws, without a scale
-    assert set(spaces) == set(entries) == {*FORECAST_KEYS, *uncertain}
+    assert set(spaces) == set(entries) == {*FORECAST_KEYS, *PATH_KEYS, *uncertain}
     for key, space in spaces.items():
         assert space.contains(entries[key][0]), key
     axis = () if samples == 1 else (samples,)
@@ -450,3 +447,29 @@ def test_devices_that_are_not_there_are_named(monkeypatch: pytest.MonkeyPatch):
         ForecastConfig(device="cuda")
     with pytest.raises(UserError, match="device must be cpu, cuda or auto, got 'tpu'"):
         ForecastConfig(device="tpu")
+
+
+# --- path_entries: the ego's own path, and who comes close to it ------------------------------------------------------
+
+
+def test_path_entries_of_a_head_on_meeting():
+    """The ego drives north at 10 m/s; an agent 40 m ahead comes at 10 m/s: they meet after 2 s, half of the horizon."""
+    states = np.array([[[5.0, 5.0, 0.0, 10.0], [5.0, 45.0, 0.0, -10.0], [35.0, 5.0, 0.0, 10.0], [0.0] * 4]])
+    valid = np.array([[True, True, True, False]])
+    scenes = SceneBatch(states, np.array([[0, 1, 2, -1]]), valid, np.array([np.pi / 2]))
+    times_s = np.arange(1, 5)[:, None]
+    forecast = np.zeros((1, 3, 4, 2), dtype=np.float32)
+    forecast[0, 0] = np.hstack([0 * times_s - 0.0, -30.0 + 0 * times_s])  # the nearest, beside: keeps pace
+    forecast[0, 0] += np.hstack([10.0 * times_s, 0 * times_s])
+    forecast[0, 1] = np.hstack([40.0 - 10.0 * times_s, 0 * times_s])
+    found = path_entries(scenes, forecast, dt_s=1.0)
+    np.testing.assert_allclose(found["ego_path"][0], np.hstack([10.0 * times_s, 0 * times_s]), atol=1e-5)
+    np.testing.assert_allclose(found["closest"][0], [[30.0, 0.0], [0.0, 0.5], [0.0, 0.0]], atol=1e-5)
+
+
+def test_path_entries_take_the_most_probable_of_several_futures():
+    states = np.array([[[0.0, 0.0, 0.0, 0.0], [9.0, 0.0, 0.0, 0.0]]])
+    scenes = SceneBatch(states, np.array([[0, 1]]), np.array([[True, True]]), np.zeros(1))
+    forecast = np.array([[[[[4.0, 3.0]], [[1.0, 0.0]]]]], dtype=np.float32)  # two futures of one step
+    found = path_entries(scenes, forecast, dt_s=1.0)["closest"]
+    np.testing.assert_allclose(found, [[[5.0, 1.0]]])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from envs.observation import FORECAST_KEYS
+from envs.entries import FORECAST_KEYS
 from envs.readers.base import MultiagentScene
 from envs.readers.mpe import MPE_FEATURES
 from envs.readers.pursuit import PURSUIT_FEATURES
@@ -246,7 +246,7 @@ def test_the_viewer_alone_works(name: str, bounds: dict[str, Any], fresh: Callab
         for view in moment.views.values():
             assert view["valid"].shape == (session.view.max_agents - 1,)
             if name != "pursuit":  # where several stand in one cell
-                assert not any(value.any() for value in view.values())
+                assert not any(value.any() for key, value in view.items() if key != "ego_path")
 
 
 # --- 6. Frame ---------------------------------------------------------------------------------------------------------
@@ -334,4 +334,6 @@ def test_views_hold_nothing_but_features_and_forecasts(name: str, take: Callable
                 "edge_probs": (others, 2 * (model.num_edge_types - 1)),
                 "edge_features": (others, 2 * model.edge_feature_dim),
                 "valid": (others,),
+                "ego_path": (model.horizon_steps, 2),
+                "closest": (others, 2),
             }

@@ -14,8 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from envs.entries import FORECAST_KEYS, PATH_KEYS, ego_entries
 from envs.multiagent_observation import MultiagentStream
-from envs.observation import FORECAST_KEYS, ForecastStream, ego_entries
+from envs.observation import ForecastStream
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.sb3.forecast import VecForecast
 from envs.scene_stream import ForecastConfig
@@ -176,7 +177,7 @@ def test_entries_are_there_with_several_samples_or_on_request(kind: str, samples
     entries, spaces = stream.observe(scenes), stream.spaces()
     shown = samples > 1 if uncertainty is None else uncertainty
     expected = {"mode_probs", *(("xy_scale",) if has_scale else ())} if shown else set()
-    assert set(entries) == set(spaces) == {*FORECAST_KEYS, *expected}
+    assert set(entries) == set(spaces) == {*FORECAST_KEYS, *PATH_KEYS, *expected}
     others, axis = HIGHWAY_SPEC.max_agents - 1, (samples,) * (samples > 1)
     for key, space in spaces.items():
         assert all(space.contains(one) for one in entries[key]), key
@@ -232,7 +233,7 @@ def test_every_view_has_the_numbers_of_the_one_forecast(spec: SceneSpec, samples
     assert forecast is not None and forecast.xy_scale is not None
     shares = forecast.sample_probs()[0].T.numpy()
     for name, index in multi.index_of.items():
-        assert set(entries[name]) == {*FORECAST_KEYS, *BOTH} == set(stream.spaces())
+        assert set(entries[name]) == {*FORECAST_KEYS, *PATH_KEYS, *BOTH} == set(stream.spaces())
         distance = np.linalg.norm(multi.scene.states[:4, :2] - multi.scene.states[index, :2], axis=1)
         cos, sin = np.cos(headings[index]), np.sin(headings[index])
         for place, other in enumerate(np.argsort(distance)[1:]):
@@ -249,7 +250,7 @@ def test_who_sees_nothing_has_zeros_for_every_entry():
     config = ForecastConfig(num_samples=3)
     stream = MultiagentStream(tiny_model(WORLD, **PLURAL), WORLD, config)
     nothing = stream.nothing_seen()
-    assert set(nothing) == {*FORECAST_KEYS, *BOTH}
+    assert set(nothing) == {*FORECAST_KEYS, *PATH_KEYS, *BOTH}
     assert all(space.contains(nothing[key]) and not nothing[key].any() for key, space in stream.spaces().items())
 
 

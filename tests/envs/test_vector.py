@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
 import envs.vector
-from envs.observation import FORECAST_KEYS
+from envs.entries import FORECAST_KEYS, PATH_KEYS
 from envs.registry import make_env
 from envs.sb3.forecast import VecForecast
 from envs.vector import VectorForecast
@@ -117,7 +117,7 @@ def test_sb3_observations_lie_in_the_space(highway_checkpoint: str):
     venv = VecForecast(VecMonitor(DummyVecEnv(MAKERS)), highway_checkpoint, num_samples=2, horizon_steps=4)
     space = venv.observation_space
     assert isinstance(space, gym.spaces.Dict)
-    assert set(space) == {"observation", *FORECAST_KEYS, "mode_probs"}
+    assert set(space) == {"observation", *FORECAST_KEYS, *PATH_KEYS, "mode_probs"}
     observations: list[Any] = [one_of(venv.reset(), i) for i in range(3)]
     for t in range(3):
         obs, _, dones, infos = venv.step(ACTIONS[t])

@@ -10,7 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from agents.features import ForecastAttention
-from envs.observation import FORECAST_KEYS, WHAT_IF_KEYS, others_by_distance, what_if_entries
+from envs.entries import FORECAST_KEYS, PATH_KEYS, WHAT_IF_KEYS, others_by_distance, what_if_entries
 from envs.plans import Plans
 from envs.plans.contact import contacts
 from envs.registry import make_env
@@ -96,7 +96,7 @@ def test_gymnasium_accepts_it():
 def test_the_policy_reads_it():
     env = wrapped(what_if=True)
     extractor = ForecastAttention(env.observation_space)
-    assert set(extractor._keys) == {*WHAT_IF_KEYS, *FORECAST_KEYS} - {"valid"}
+    assert set(extractor._keys) == {*WHAT_IF_KEYS, *FORECAST_KEYS, *PATH_KEYS} - {"valid", "ego_path"}
 
 
 class Stay:

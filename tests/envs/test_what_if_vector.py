@@ -11,7 +11,7 @@ import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
-from envs.observation import FORECAST_KEYS, WHAT_IF_KEYS
+from envs.entries import FORECAST_KEYS, WHAT_IF_KEYS
 from envs.plans import Plans
 from envs.plans.batch import PLANS_INFO
 from envs.registry import make_env

@@ -9,7 +9,8 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
-from envs.observation import FORECAST_KEYS, SCENE_KEYS, ego_entries
+from envs.entries import FORECAST_KEYS, PATH_KEYS, ego_entries
+from envs.observation import SCENE_KEYS
 from envs.registry import CHECKPOINTS, checkpoint_for, make_env
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import load_checkpoint
@@ -128,6 +129,8 @@ def test_forecast_entries_take_their_sizes_from_the_checkpoint(highway_checkpoin
         "edge_probs": (others, 2),
         "edge_features": (others, 6),
         "valid": (others,),
+        "ego_path": (HORIZON, 2),
+        "closest": (others, 2),
     }
     assert {value.dtype for value in obs.values()} == {np.dtype(np.float32)}
     assert env.get_wrapper_attr("scene_spec") == HIGHWAY_SPEC
@@ -206,7 +209,7 @@ def test_each_forecast_comes_from_the_history_of_its_episode_alone(highway_check
         scenes: list[Scene] = [env.scene]
         for action in random_actions(env, 10):
             entries = forecast_of_history(model, HIGHWAY_SPEC, scenes)
-            assert_same({key: obs[key] for key in FORECAST_KEYS}, entries)
+            assert_same({key: obs[key] for key in (*FORECAST_KEYS, *PATH_KEYS)}, entries)
             obs, _, terminated, truncated, _ = env.step(action)
             scenes.append(env.scene)
             if terminated or truncated:
