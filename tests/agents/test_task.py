@@ -1,9 +1,14 @@
+from pathlib import Path
+
 import gymnasium as gym
 import pytest
 
-from agents.task import Task
+from agents.runs import save_model
+from agents.task import Task, task_of
+from envs import ForecastObservation, make_env
+from envs.drivers.trained import env_for_driver
 from predictor.support.errors import UserError
-from tests.agents.helpers import TOY
+from tests.agents.helpers import TOY, policy_for
 
 TAG = "simple_tag_v3"
 
@@ -22,6 +27,15 @@ def without_envpool(monkeypatch: pytest.MonkeyPatch) -> None:
         ("highway-fast-v0", {"learners": ("adversary",)}, "highway-fast-v0 has one ego; leave them out"),
         (TAG, {"driver": "fast"}, "driver must be one of random, idle, varied, heuristic, mixed, got 'fast'"),
         (TAG, {"observe": "none", "checkpoint": "highway"}, "has no effect with observe=none"),
+        (TAG, {"what_if": True}, f"what_if needs an environment with one ego, {TAG} has several learners"),
+        ("merge-v1", {"env_kwargs": "{"}, "env_kwargs must be a JSON object, got '{': Expecting"),
+        ("merge-v1", {"env_kwargs": "[1]"}, r"env_kwargs must be a JSON object, got '\[1\]'"),
+        (
+            "highway-fast-v0",
+            {"env_kwargs": '{"a": 1}', "backend": "envpool"},
+            "env_kwargs are for the gymnasium backend",
+        ),
+        ("merge-v1", {"num_samples": 0}, "num_samples must be at least 1, got 0"),
         (TAG, {"device": "tpu9"}, "device must be cpu, cuda or auto, got 'tpu9'"),
     ],
 )
@@ -70,3 +84,42 @@ def test_the_check_finds_drivers_that_cannot_drive():
 def test_the_check_needs_a_reader_for_forecasts():
     with pytest.raises(UserError, match="no scene reader knows meadow_v0"):
         Task(TOY, "constant-velocity").check()
+
+
+def test_arguments_reach_the_environment():
+    task = Task("highway-fast-v0", "none", env_kwargs='{"config": {"lanes_count": 2}}')
+    env = task.make()
+    assert env.unwrapped.config["lanes_count"] == 2
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", ["highway-fast-v0", TAG])
+def test_every_arm_has_the_same_space(env_id: str):
+    arms = ("forecast", "zeros", "single", "no-edges", "constant-velocity")
+    spaces = []
+    for arm in arms:
+        env = Task(env_id, arm).wrapped(Task(env_id, arm).make())
+        spaces.append(env.observation_space(env.possible_agents[0]) if env_id == TAG else env.observation_space)
+        env.close()
+    assert all(space == spaces[0] for space in spaces)
+
+
+def test_the_note_of_an_arm_gives_its_wrapper_back(tmp_path: Path):
+    """A policy that was trained on an arm sees that arm wherever it drives."""
+    task = Task("merge-v1", "modes", num_samples=3, what_if=True)
+    path = tmp_path / "policy.zip"
+    save_model(policy_for(task), path, note=task.note)
+    env = env_for_driver(make_env("merge-v1"), str(path))
+    assert isinstance(env, ForecastObservation) and env.stream.config.arm.name == "modes"
+    env.reset(seed=0)
+    seen, *_ = env.step(1)
+    assert seen["mode_probs"].shape == (len(seen["valid"]), 3) and seen["mode_probs"][0].all()
+    assert "what_if_risk" in seen and not seen["what_if_risk"].any()
+    env.close()
+
+
+def test_a_run_of_an_older_version_has_the_old_options():
+    old = {"env_id": "merge-v1", "observe": "forecast", "checkpoint": None}
+    assert task_of(old) == Task("merge-v1")
+    new = {**old, "observe": "modes", "num_samples": 6, "what_if": True, "env_kwargs": "{}", "horizon_steps": 4}
+    assert task_of(new) == Task("merge-v1", "modes", num_samples=6, what_if=True, env_kwargs="{}", horizon_steps=4)
