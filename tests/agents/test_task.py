@@ -5,10 +5,12 @@ import pytest
 
 from agents.runs import save_model
 from agents.task import Task, task_of
+from agents.training import TrainingPlan, make_model
+from agents.vec_envs import make_venv
 from envs import ForecastObservation, make_env
 from envs.drivers.trained import env_for_driver
 from predictor.support.errors import UserError
-from tests.agents.helpers import TOY, policy_for
+from tests.agents.helpers import TOY
 
 TAG = "simple_tag_v3"
 
@@ -108,7 +110,9 @@ def test_the_note_of_an_arm_gives_its_wrapper_back(tmp_path: Path):
     """A policy that was trained on an arm sees that arm wherever it drives."""
     task = Task("merge-v1", "modes", num_samples=3, what_if=True)
     path = tmp_path / "policy.zip"
-    save_model(policy_for(task), path, note=task.note)
+    venv = make_venv(task, 1)
+    save_model(make_model(TrainingPlan(task, "ppo", steps=1, num_envs=1, seed=0), venv), path, note=task.note)
+    venv.close()
     env = env_for_driver(make_env("merge-v1"), str(path))
     assert isinstance(env, ForecastObservation) and env.stream.config.arm.name == "modes"
     env.reset(seed=0)
