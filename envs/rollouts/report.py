@@ -51,6 +51,11 @@ class EnvAccuracy:
     """95th percentile of that time [ms]."""
     edges: dict[str, Accuracy] = field(default_factory=dict)
     """Accuracy of the model (K = 1) by what was done to its edges; empty unless asked for."""
+    to_the_end: tuple[Accuracy, Accuracy] | None = None
+    """Accuracy of the model (K = 1) and of constant velocity over all forecasts, also those whose horizon passes the
+    episode's end: each counts up to that end."""
+    before_crash: tuple[Accuracy, Accuracy] | None = None
+    """The same for the last `BEFORE_CRASH_S` before a crash of the ego; None without a crash."""
 
     @property
     def lines(self) -> list[Accuracy]:
@@ -63,6 +68,8 @@ class EnvAccuracy:
         return self.controls.get(NEIGHBOURS)
 
 
+BEFORE_CRASH_S = 5.0
+"""Time before a crash whose forecasts are reported on their own [s]."""
 HEADS = (
     "env", "checkpoint", "dt [s]", "steps", "ADE₁ [m]", "FDE₁ [m]", "minADE_K [m]", "joint ADE_K [m]", "energy [m]",
     "cover", "model + noise minADE_K [m]", "neighbours ADE₁ [m]", "CV ADE / FDE [m]", "ADE below CV", "95 % interval",
@@ -87,6 +94,17 @@ def remarks(result: "EnvAccuracy") -> str:
         low, high = line.intervals.get("min_ade_m", (np.nan, np.nan))
         more = 100 * (line.min_ade_m / result.model.min_ade_m - 1)
         lines.append(f"… with {key} {line.min_ade_m:.3f} m ({more:+.0f} %), {low:.3f} to {high:.3f}")
+    for key, pair in (
+        ("counting forecasts that pass the episode's end up to it", result.to_the_end),
+        (f"the same in the last {BEFORE_CRASH_S:g} s before a crash", result.before_crash),
+    ):
+        if pair is not None:
+            own, straight = pair
+            low, high = own.intervals.get("min_ade_m", (np.nan, np.nan))
+            lines.append(
+                f"{key}: minADE {own.min_ade_m:.3f} m, {low:.3f} to {high:.3f}, constant velocity "
+                f"{straight.min_ade_m:.3f} m, {own.agents} forecasts"
+            )
     graph = result.graph
     if graph is not None and graph.accuracy is not None:
         f1 = "–" if graph.f1 is None else f"{graph.f1:.2f}"

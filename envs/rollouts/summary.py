@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 
 from envs.rollouts.episode import EDGES, MODEL, NEIGHBOURS, NOISY, RESIDUAL, STRAIGHT, Episode, memory_key
-from envs.rollouts.report import EnvAccuracy
+from envs.rollouts.report import BEFORE_CRASH_S, EnvAccuracy
 from predictor.checkpoint import CONSTANT_VELOCITY, name_of_folder, read_info
 from predictor.evaluation.accuracy import Accuracy, Tally, fitted_std_m
 from predictor.evaluation.displacement import MISS_THRESHOLD_M, min_ade
@@ -50,8 +50,8 @@ def summarise_episodes(
     std_m = read_info(Path(checkpoint)).std_m if learned else fitted_std_m(first)
     name = MODEL_NAMES.get(read_info(Path(checkpoint)).model, "model") if learned else "constant velocity (deployed)"
 
-    def line(title: str, found: Sequence[Outcome], spread: Sequence[float]) -> Accuracy:
-        tally = Tally(spread, miss_m)
+    def line(title: str, found: Sequence[Outcome], spread: Sequence[float], partial: bool = False) -> Accuracy:
+        tally = Tally(spread, miss_m, partial)
         for outcome in found:
             tally.add(outcome)
         return tally.accuracy(title, batch_intervals=True)
@@ -59,6 +59,15 @@ def summarise_episodes(
     # The spread of the baselines is fitted on these very errors, in their favour: they have no validation data.
     straight = line("constant velocity", outcomes[STRAIGHT], fitted_std_m(outcomes[STRAIGHT]))
     reduction, interval = _reduction(first, outcomes[STRAIGHT])
+    pairs = [first, outcomes[STRAIGHT]]
+    last = round(BEFORE_CRASH_S / spec.dt_s)
+    crashes = [[o.last_windows(last) for o, e in zip(p, episodes, strict=True) if e.crashed] for p in pairs]
+    to_the_end, before_crash = (
+        (line(name, own, (), partial=True), line("constant velocity", straight_ahead, (), partial=True))
+        if any(bool(o.valid.any()) for o in own)
+        else None
+        for own, straight_ahead in (pairs, crashes)
+    )
     latencies_ms = 1e3 * np.concatenate([e.latencies_s[1:] or e.latencies_s for e in episodes])  # the first warms up
     return EnvAccuracy(
         env_id,
@@ -76,6 +85,8 @@ def summarise_episodes(
         float(np.median(latencies_ms)),
         float(np.percentile(latencies_ms, 95)),
         {key: line(f"{name}, {key}", outcomes[key], std_m) for key in EDGES if key in outcomes},
+        to_the_end,
+        before_crash,
     )
 
 

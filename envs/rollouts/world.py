@@ -85,6 +85,9 @@ class EgoWorld:
     Args:
         env: environment in `SceneObservation` or `ForecastObservation`.
         driver: name of a driver from `envs.drivers.ego`, or the path of a policy .zip.
+
+    Attributes:
+        crashed: whether the environment has reported a crash of the ego in this episode.
     """
 
     def __init__(self, env: SceneObservation | ForecastObservation, driver: str) -> None:
@@ -94,6 +97,7 @@ class EgoWorld:
         self._reader: SceneReader = env.get_wrapper_attr("reader")
         self._whole = driver.endswith(".zip") and sees_forecasts(driver)
         self.observation: dict[str, Any] = {}
+        self.crashed = False
 
     @property
     def spec(self) -> SceneSpec:
@@ -103,6 +107,7 @@ class EgoWorld:
     def reset(self, seed: int) -> None:
         """Begins the episode of a seed."""
         self.observation, _ = self.env.reset(seed=seed)
+        self.crashed = False
         self._rng = driver_rng(seed)
         self._ego = make_ego_driver(self._name, self.env, self._rng)
 
@@ -112,7 +117,8 @@ class EgoWorld:
 
     def step(self) -> bool:
         """Lets the ego act."""
-        self.observation, _, terminated, truncated, _ = self.env.step(self._ego(self._seen()))
+        self.observation, _, terminated, truncated, info = self.env.step(self._ego(self._seen()))
+        self.crashed = self.crashed or bool(info.get("crashed", False))
         return bool(terminated or truncated)
 
     def generators(self) -> list[np.random.Generator]:

@@ -6,7 +6,8 @@ observing (`run_sequence_batch`).
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -51,6 +52,14 @@ class Outcome:
             mode_probs=None,
             scale=None if self.scale is None else self.scale[:, :1],
         )
+
+    def last_windows(self, count: int) -> "Outcome":
+        """Returns the last windows of the batch; all, if there are fewer."""
+        kept: dict[str, Any] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            kept[field.name] = None if value is None else value[-count:]
+        return Outcome(**kept)
 
     def tail(self, steps: int) -> "Outcome":
         """Returns the last steps only: the horizon-only view of a whole sequence.

@@ -95,6 +95,29 @@ def test_lines_and_intervals_closed_form():
     assert [line.name for line in found.lines] == ["constant velocity (deployed)", "constant velocity"]
 
 
+def steps_of(errors_m: list[float], known: list[int], crashed: bool) -> Episode:
+    """An episode of one agent: the error at each step, and how many of the future steps were reached."""
+    forecast = torch.zeros(len(errors_m), 1, 1, HORIZON, 2)
+    forecast[..., 0] = torch.tensor(errors_m)[:, None, None, None]
+    valid = torch.arange(HORIZON) < torch.tensor(known)[:, None, None]
+    found = Outcome(forecast, torch.zeros(len(errors_m), 1, HORIZON, 2), valid)
+    return Episode({MODEL: found, STRAIGHT: found}, [0.1], crashed=crashed)
+
+
+def test_forecasts_that_pass_the_end_count_up_to_it_and_the_last_before_a_crash_alone():
+    """HORIZON whole forecasts of 1 m, then one with a single step left, 4 m off, and one with none."""
+    errors, known = [1.0] * HORIZON + [4.0, 9.0], [HORIZON] * HORIZON + [1, 0]
+    episodes = [steps_of(errors, known, crashed) for crashed in (True, False)]
+    found = summarise_episodes("here", STILL, "idle", replace(HIGHWAY_SPEC, dt_s=2.5), episodes)  # 5 s: two steps
+    assert found.model.min_ade_m == 1.0 and found.model.agents == 2 * HORIZON
+    assert found.to_the_end[0].agents == 2 * (HORIZON + 1)
+    assert found.to_the_end[0].min_ade_m == pytest.approx((HORIZON + 4.0) / (HORIZON + 1))
+    assert found.before_crash[0].agents == 1 and found.before_crash[1].min_ade_m == 4.0
+    assert "the same in the last 5 s before a crash: minADE 4.000 m" in report.remarks(found)
+    quiet = summarise_episodes("here", STILL, "idle", HIGHWAY_SPEC, [episodes[1]])
+    assert quiet.before_crash is None and quiet.to_the_end is not None
+
+
 def test_an_episodes_first_scene_warms_up_and_is_not_timed():
     found = summary(HIGHWAY_SPEC, [1.0] * 3, [[9.0, 0.001, 0.003], [9.0, 0.002], [0.002]])
     assert found.latency_median_ms == pytest.approx(2.0)
