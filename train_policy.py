@@ -15,8 +15,9 @@ import torch
 from rich.console import Console
 from rich.markup import escape
 
-from agents.evaluate import PACKAGES, evaluate_with_progress
+from agents.evaluate import evaluate_with_progress
 from agents.presets import Algorithm
+from agents.results import PACKAGES
 from agents.runs import FORECASTER, check_forecaster, load_model, open_run
 from agents.task import Backend, Observe, Task
 from agents.training import TrainingPlan, train

@@ -6,202 +6,32 @@ evaluates a driver without a training run. Evaluation seeds are disjoint from th
 (`agents.task`).
 """
 
-import math
 import os
-from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import torch
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.arena import EgoArena, open_arena
+from agents.results import Evaluation
 from agents.runs import POLICY_FILE, load_model, read_config
 from agents.task import EVALUATION_SEED, Task
-from agents.vec_envs import EpisodeResult
 from envs.drivers.ego import CONSTANT_ACTIONS, make_ego_driver, named_drivers
 from envs.registry import make_env
 from envs.sb3.policy_file import read_policy_note
-from predictor.support import markdown
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import finite, write_json, write_text
-from predictor.support.provenance import provenance
 from predictor.support.runtime import keep_freed_memory, resolve_device
 
-NEARLY_CONSTANT = 0.95
-"""Least share of one action from which on a policy is called nearly constant."""
-_WILSON_Z = 1.959963984540054  # two-sided 95 %
 NOT_PINNED = "note: {} does not say which forecaster it was trained on; it gets the one of its run's config"
-PACKAGES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2", "envpool", "torch", "numpy")
-
-
-@dataclass(frozen=True)
-class PolicySummary:
-    """Results of one policy over all episodes: a line of the table."""
-
-    policy: str
-    """Name of the policy or driver."""
-    episodes: int
-    """Number of episodes."""
-    return_mean: float
-    """Mean undiscounted return."""
-    return_se: float
-    """Standard error of `return_mean`; NaN for a single episode."""
-    length_mean: float
-    """Mean length [policy steps]."""
-    length_se: float
-    """Standard error of `length_mean`; NaN for a single episode."""
-    crash_rate: float | None
-    """Share of episodes with a crash; None if the env does not report crashes."""
-    crash_low: float | None
-    """Lower end of the 95 % Wilson interval of `crash_rate`."""
-    crash_high: float | None
-    """Upper end of the 95 % Wilson interval of `crash_rate`."""
-    mean_speed_mps: float
-    """Mean over episodes of the mean speed [m/s]; NaN if the env does not report speeds."""
-    role_returns: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Mean return of the learners of each role, with its standard error; empty if there is one role."""
-    action_shares: dict[str, float] = field(default_factory=dict)
-    """Share of each action among the steps of all episodes, the commonest first; empty if actions are not discrete."""
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Results of several policies on the same seeds."""
-
-    env_id: str
-    """Gymnasium or PettingZoo id."""
-    first_seed: int
-    """Seed of the first episode; episode i was reset with first_seed + i."""
-    results: dict[str, list[EpisodeResult]]
-    """Results of the episodes, by policy."""
-    has_ego: bool = True
-    """Whether one agent is driven: the table then has its crash rate and speed, "–" if the env does not report them."""
-
-    @property
-    def summaries(self) -> list[PolicySummary]:
-        """Summaries, one per policy."""
-        return [summarize(policy, episodes) for policy, episodes in self.results.items()]
-
-    @property
-    def constant_policies(self) -> str:
-        """A line on the policies that (nearly) always take one action, but for drivers that are named after it."""
-        found = []
-        for summary in self.summaries:
-            action, share = next(iter(summary.action_shares.items()), ("", 0.0))
-            if share >= NEARLY_CONSTANT and summary.policy not in (action, "idle"):
-                found.append(f"{summary.policy} takes {action} in {100 * share:.1f} % of its steps")
-        return f"(Nearly) constant: {'; '.join(found)}." if found else ""
-
-    def write(self, folder: Path, **extra: Any) -> None:
-        """Writes ``summary.json`` (with every episode and the provenance) and ``summary.md``."""
-        content = {
-            "env_id": self.env_id,
-            "first_seed": self.first_seed,
-            **extra,
-            "policies": [asdict(summary) for summary in self.summaries],
-            "episodes": {name: [asdict(e) for e in found] for name, found in self.results.items()},
-            "provenance": provenance(PACKAGES),
-        }
-        write_json(folder / "summary.json", finite(content))
-        write_text(folder / "summary.md", self.markdown())
-
-    def markdown(self) -> str:
-        """Returns the table as Markdown."""
-        header, cells = self._cells()
-        paragraphs = [markdown.table(header, cells), f"{self.env_id}: {self._caption()}", self.constant_policies]
-        return "\n\n".join(filter(None, paragraphs)) + "\n"
-
-    def table(self) -> Table:
-        """Returns the table for a terminal."""
-        header, lines = self._cells()
-        table = Table(title=self.env_id, caption=self._caption())
-        for i, name in enumerate(header):
-            table.add_column(escape(name), justify="right" if i else "left")
-        for line in lines:
-            table.add_row(*line)
-        return table
-
-    def _cells(self) -> tuple[list[str], list[list[str]]]:
-        """Returns the header and the cells of each line; without an ego there are no columns of crashes and speed."""
-        summaries = self.summaries
-        roles = list(dict.fromkeys(role for summary in summaries for role in summary.role_returns))
-        header = ["policy", "return", *(f"return of {role}" for role in roles), "length"]
-        header += ["crash rate (95 %)", "speed [m/s]"] if self.has_ego else []
-        return header, [_cells_of(summary, roles, self.has_ego) for summary in summaries]
-
-    def _caption(self) -> str:
-        count = max(len(found) for found in self.results.values())
-        caption = (
-            f"{count} episodes each, the same seeds from {self.first_seed} on; mean ± standard error, length in policy "
-            "steps"
-        )
-        if not self.has_ego:
-            return f"{caption}; return: mean over the learners."
-        if all(summary.crash_rate is None for summary in self.summaries):
-            return f"{caption}; the environment reports no crashes."
-        return f"{caption}, crash rate with its 95 % Wilson interval."
-
-
-def wilson_interval(successes: int, trials: int, z: float = _WILSON_Z) -> tuple[float, float]:
-    """Computes the Wilson score interval of a rate, which lies within [0, 1] and never has zero width.
-
-    Args:
-        successes: number of events.
-        trials: number of trials; at least 1.
-        z: normal quantile; the default gives 95 %.
-
-    Raises:
-        UserError: `successes` or `trials` is out of range.
-    """
-    if not 0 <= successes <= trials or trials < 1:
-        raise UserError(f"need 0 <= successes <= trials and trials >= 1, got {successes} of {trials}")
-    rate = successes / trials
-    centre = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
-    half = z / (1 + z**2 / trials) * math.sqrt(rate * (1 - rate) / trials + z**2 / (4 * trials**2))
-    low = 0.0 if successes == 0 else centre - half  # exact at the ends, where rounding would leave 1e-17
-    high = 1.0 if successes == trials else centre + half
-    return low, high
-
-
-def mean_and_standard_error(values: Sequence[float]) -> tuple[float, float]:
-    """Returns the mean and its standard error (sample standard deviation / √n; NaN for a single value)."""
-    array = np.asarray(values, dtype=np.float64)
-    error = float(array.std(ddof=1) / math.sqrt(len(array))) if len(array) > 1 else math.nan
-    return float(array.mean()), error
-
-
-def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
-    """Computes the summary of one policy's episodes."""
-    return_mean, return_se = mean_and_standard_error([e.episode_return for e in episodes])
-    length_mean, length_se = mean_and_standard_error([float(e.length) for e in episodes])
-    crashes = [e.crashed for e in episodes if e.crashed is not None]
-    interval = wilson_interval(sum(crashes), len(crashes)) if crashes else (None, None)
-    roles = list(dict.fromkeys(role for e in episodes for role in e.returns_by_role))
-    actions = sum((Counter(e.action_counts) for e in episodes), Counter())
-    return PolicySummary(
-        policy,
-        len(episodes),
-        return_mean,
-        return_se,
-        length_mean,
-        length_se,
-        sum(crashes) / len(crashes) if crashes else None,
-        interval[0],
-        interval[1],
-        float(np.mean([e.mean_speed_mps for e in episodes])),
-        {role: mean_and_standard_error([e.returns_by_role[role] for e in episodes]) for role in roles},
-        {action: count / actions.total() for action, count in actions.most_common()},
-    )
 
 
 def evaluate_policy_on_seeds(
@@ -255,28 +85,6 @@ def evaluate_with_progress(
         return evaluate_policy_on_seeds(
             task, model, name, num_episodes, num_envs, first_seed, lambda: progress.advance(bar), drivers
         )
-
-
-def _cells_of(summary: PolicySummary, roles: Sequence[str], has_ego: bool) -> list[str]:
-    cells = [summary.policy, f"{summary.return_mean:.2f}{_plus_minus(summary.return_se, 2)}"]
-    for role in roles:
-        mean, error = summary.role_returns.get(role, (math.nan, math.nan))
-        cells.append(f"{mean:.2f}{_plus_minus(error, 2)}")
-    cells.append(f"{summary.length_mean:.1f}{_plus_minus(summary.length_se, 1)}")
-    if has_ego:
-        cells.append(_crashes(summary))
-        cells.append("–" if math.isnan(summary.mean_speed_mps) else f"{summary.mean_speed_mps:.1f}")
-    return cells
-
-
-def _crashes(summary: PolicySummary) -> str:
-    if summary.crash_rate is None or summary.crash_low is None or summary.crash_high is None:
-        return "–"
-    return f"{100 * summary.crash_rate:.0f} % ({100 * summary.crash_low:.0f}–{100 * summary.crash_high:.0f} %)"
-
-
-def _plus_minus(error: float, digits: int) -> str:
-    return "" if math.isnan(error) else f" ± {error:.{digits}f}"
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ import imageio_ffmpeg
 import pytest
 
 import train_policy
-from agents import evaluate
-from agents.evaluate import Evaluation
+from agents import evaluate, results
 from agents.presets import Algorithm, PPOPreset, Preset, preset_for
+from agents.results import Evaluation
 from agents.runs import load_model
 from agents.task import Backend
 from agents.training import SaveCheckpoint
@@ -86,7 +86,7 @@ def trained(run: Path, *arguments: str, short: bool = True) -> tuple[Path, str]:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Returns a finished run on the highway; every policy counts as constant in its table."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evaluate, "NEARLY_CONSTANT", 0.0)
+        patch.setattr(results, "NEARLY_CONSTANT", 0.0)
         return trained(tmp_path_factory.mktemp("finished") / "run", *PPO)
 
 
