@@ -1,16 +1,16 @@
 """Evaluates a policy in closed loop on held-out seeds: `python -m agents.evaluate --run-dir runs/highway`.
 
-Every policy drives the same seeds; the table compares the trained policy with random and idle drivers, and with others
-that `--drivers` names, such as every constant action. `--policy planner --env-id highway-fast-v0 --out results`
-evaluates a driver without a training run. Evaluation seeds are disjoint from those of training and of model selection
-(`agents.task`).
+Every policy drives the same seeds; the table compares the trained policy with random and idle drivers, with every
+constant action where actions are discrete, and with others that `--drivers` names. `--policy planner --env-id
+highway-fast-v0 --out results` evaluates a driver without a training run. Evaluation seeds are disjoint from those of
+training and of model selection (`agents.task`). docs/protocol.md defines each measure.
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -20,10 +20,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.arena import EgoArena, open_arena
+from agents.episode_file import NO_PYARROW, has_pyarrow
 from agents.results import Evaluation
 from agents.runs import POLICY_FILE, load_model, read_config
 from agents.task import EVALUATION_SEED, Task
-from envs.drivers.ego import CONSTANT_ACTIONS, make_ego_driver, named_drivers
+from agents.video import EXTREMES, film_extremes
+from envs.drivers.ego import CONSTANT_ACTIONS, constant_actions, make_ego_driver, named_drivers
 from envs.registry import make_env
 from envs.sb3.policy_file import read_policy_note
 from predictor.support.command_line import Renamed, parse
@@ -31,6 +33,8 @@ from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.runtime import keep_freed_memory, resolve_device
 
+NO_DRIVERS = "none"
+"""Word that stands for no further drivers."""
 NOT_PINNED = "note: {} does not say which forecaster it was trained on; it gets the one of its run's config"
 
 
@@ -98,15 +102,20 @@ class EvaluateConfig:
     envs.drivers.ego; needs --env-id and --out."""
     env_id: str | None = None
     """Environment of --policy; a training run has its own."""
-    drivers: tuple[str, ...] = ()
+    drivers: tuple[str, ...] | None = None
     """Further drivers of the ego, each a line of the table: planner, planner:CHECKPOINT, one action in every step
-    (slower, action-4), constant-actions for all of these, or another of envs.drivers.ego."""
+    (slower, action-4), constant-actions for all of these, or another of envs.drivers.ego. None takes constant-actions
+    where actions are discrete; `--drivers none` adds no line. The planner is no default since it takes minutes: it
+    simulates and forecasts every plan at every step."""
     episodes: int = 50
     """Number of episodes per policy."""
     seed: int = EVALUATION_SEED
     """Random seed: episode i is reset with seed + i; the default is disjoint from all training seeds."""
     out: Path | None = None
-    """Folder for summary.json and summary.md; None takes RUN_DIR/evaluation."""
+    """Folder for summary.json, summary.md and, where pyarrow is installed, episodes.parquet; None takes
+    RUN_DIR/evaluation."""
+    films: bool = False
+    """Film the trained policy's best, median and worst episode by return: best.mp4, median.mp4, worst.mp4."""
     num_envs: Annotated[int, Renamed("workers")] = os.cpu_count() or 1
     """Number of parallel environments; the results do not depend on it."""
     device: str = "cpu"
@@ -127,6 +136,10 @@ class EvaluateConfig:
             raise UserError("--policy has no run folder; say with --out where the results go")
         if self.policy == CONSTANT_ACTIONS:
             raise UserError(f"{CONSTANT_ACTIONS} stands for several drivers; give it to --drivers, and one to --policy")
+        if self.films and self.policy is not None:
+            raise UserError("--films are of a trained policy; leave it out with --policy, or give --run-dir")
+        if self.films and self.episodes < len(EXTREMES):
+            raise UserError(f"--films needs at least {len(EXTREMES)} --episodes, got {self.episodes}")
         check_at_least(self, 0, "seed")
         object.__setattr__(self, "device", resolve_device(self.device))
 
@@ -142,10 +155,19 @@ def main() -> None:
     evaluation, noted = _of_driver(config) if config.run_dir is None else _of_run(config, config.run_dir)
     out.mkdir(parents=True, exist_ok=True)
     evaluation.write(out, **noted)
-    Console().print(evaluation.table())
-    if evaluation.constant_policies:
-        Console().print(escape(evaluation.constant_policies))
+    show(evaluation, Console())
+    if config.films and config.run_dir is not None:
+        evaluation.write(out, **noted, films=_film(config, config.run_dir, evaluation, out))
     Console().print(f"written to {out / 'summary.json'} and {out / 'summary.md'}")
+
+
+def show(evaluation: Evaluation, console: Console) -> None:
+    """Prints the table of an evaluation, the policies that are nearly constant, and a note if pyarrow is missing."""
+    console.print(evaluation.table())
+    if evaluation.constant_policies:
+        console.print(escape(evaluation.constant_policies))
+    if not has_pyarrow():
+        console.print(escape(NO_PYARROW))
 
 
 def _of_driver(config: EvaluateConfig) -> tuple[Evaluation, dict[str, str]]:
@@ -153,11 +175,39 @@ def _of_driver(config: EvaluateConfig) -> tuple[Evaluation, dict[str, str]]:
     assert config.policy is not None and config.env_id is not None
     task = Task(config.env_id, "none", device=config.device)
     task.check()
-    _, *drivers = checked_drivers(task, (config.policy, *config.drivers))
+    checked_drivers(task, (config.policy,))
+    drivers = compared_drivers(task, config.drivers)
     evaluation = evaluate_with_progress(
         task, config.policy, config.policy, config.episodes, config.num_envs, config.seed, drivers
     )
     return evaluation, {"driver": config.policy}
+
+
+def compared_drivers(task: Task, names: Sequence[str] | None = None) -> tuple[str, ...]:
+    """Returns the drivers that stand beside a policy and the baselines.
+
+    Args:
+        task: task of the policy.
+        names: names of drivers; ("none",) for none, None for every constant action where actions are discrete.
+
+    Raises:
+        UserError: "none" among others, or see `checked_drivers`.
+    """
+    if names is None:
+        return constant_drivers(task)
+    if NO_DRIVERS in names and len(names) > 1:
+        raise UserError(f"--drivers {NO_DRIVERS} adds no line and stands alone, got {' '.join(names)}")
+    return () if NO_DRIVERS in names else checked_drivers(task, names)
+
+
+def constant_drivers(task: Task) -> tuple[str, ...]:
+    """Returns the drivers that take one action in every step; none without an ego or without discrete actions."""
+    if task.is_multiagent:
+        return ()
+    env = make_env(task.env_id, disable_env_checker=True)
+    drivers = tuple(constant_actions(env))
+    env.close()
+    return drivers
 
 
 def checked_drivers(task: Task, names: Sequence[str]) -> tuple[str, ...]:
@@ -181,16 +231,9 @@ def checked_drivers(task: Task, names: Sequence[str]) -> tuple[str, ...]:
 def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str, str]]:
     """Evaluates the policy of a training run; returns what is noted beside the results, too."""
     run = read_config(run_dir)
-    task = Task(
-        run["env_id"],
-        run["observe"],
-        run["checkpoint"],
-        config.device,
-        learners=tuple(run.get("learners", ())),
-        driver=run.get("partner", "heuristic"),
-    )
+    task = _task_of(run, config.device)
     task.check()
-    drivers = checked_drivers(task, config.drivers)
+    drivers = compared_drivers(task, config.drivers)
     policy = run_dir / POLICY_FILE
     model = load_model(policy, run["algorithm"])
     note, now = read_policy_note(policy), task.note
@@ -202,6 +245,28 @@ def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str
     name = f"{run['algorithm']} ({run['observe']})"
     evaluation = evaluate_with_progress(task, model, name, config.episodes, config.num_envs, config.seed, drivers)
     return evaluation, {"algorithm": run["algorithm"], "observe": run["observe"]}
+
+
+def _task_of(run: Mapping[str, Any], device: str) -> Task:
+    """Returns the task of a training run, by its config."""
+    return Task(
+        run["env_id"],
+        run["observe"],
+        run["checkpoint"],
+        device,
+        learners=tuple(run.get("learners", ())),
+        driver=run.get("partner", "heuristic"),
+    )
+
+
+def _film(config: EvaluateConfig, run_dir: Path, evaluation: Evaluation, out: Path) -> dict[str, dict[str, Any]]:
+    """Films episodes of the trained policy, which is the first of the evaluation; returns what the films show."""
+    run, episodes = read_config(run_dir), next(iter(evaluation.results.values()))
+    model = load_model(run_dir / POLICY_FILE, run["algorithm"])
+    films = film_extremes(_task_of(run, config.device), model, episodes, out)
+    names = ", ".join(film["file"] for film in films.values())
+    Console().print(f"films: {names or 'none, only highway-env and PettingZoo environments are drawn'}")
+    return films
 
 
 if __name__ == "__main__":

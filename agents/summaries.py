@@ -3,11 +3,12 @@
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
 from agents.vec_envs import EpisodeResult
+from envs.rollouts.driving_measures import DrivingMeasures
 from predictor.support.errors import UserError
 
 _WILSON_Z = 1.959963984540054  # two-sided 95 %
@@ -41,6 +42,15 @@ class PolicySummary:
     """Mean return of the learners of each role, with its standard error; empty if there is one role."""
     action_shares: dict[str, float] = field(default_factory=dict)
     """Share of each action among the steps of all episodes, the commonest first; empty if actions are not discrete."""
+    success_rate: float | None = None
+    """Share of episodes with success; None if the env does not report success."""
+    success_low: float | None = None
+    """Lower end of the 95 % Wilson interval of `success_rate`."""
+    success_high: float | None = None
+    """Upper end of the 95 % Wilson interval of `success_rate`."""
+    driving: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Mean of each field of `DrivingMeasures` over the episodes that have it, with its standard error; empty if driving
+    is not measured."""
 
 
 def wilson_interval(successes: int, trials: int, z: float = _WILSON_Z) -> tuple[float, float]:
@@ -75,8 +85,6 @@ def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
     """Computes the summary of one policy's episodes."""
     return_mean, return_se = mean_and_standard_error([e.episode_return for e in episodes])
     length_mean, length_se = mean_and_standard_error([float(e.length) for e in episodes])
-    crashes = [e.crashed for e in episodes if e.crashed is not None]
-    interval = wilson_interval(sum(crashes), len(crashes)) if crashes else (None, None)
     roles = list(dict.fromkeys(role for e in episodes for role in e.returns_by_role))
     actions = sum((Counter(e.action_counts) for e in episodes), Counter())
     return PolicySummary(
@@ -86,10 +94,25 @@ def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
         return_se,
         length_mean,
         length_se,
-        sum(crashes) / len(crashes) if crashes else None,
-        interval[0],
-        interval[1],
+        *_rate([e.crashed for e in episodes]),
         float(np.mean([e.mean_speed_mps for e in episodes])),
         {role: mean_and_standard_error([e.returns_by_role[role] for e in episodes]) for role in roles},
         {action: count / actions.total() for action, count in actions.most_common()},
+        *_rate([e.success for e in episodes]),
+        _mean_driving([e.driving for e in episodes if e.driving is not None]),
     )
+
+
+def _rate(events: Sequence[bool | None]) -> tuple[float, float, float] | tuple[None, None, None]:
+    """Returns the share of episodes with an event and its Wilson interval; None if no episode reports it."""
+    known = [event for event in events if event is not None]
+    return (sum(known) / len(known), *wilson_interval(sum(known), len(known))) if known else (None, None, None)
+
+
+def _mean_driving(measured: Sequence[DrivingMeasures]) -> dict[str, tuple[float, float]]:
+    """Returns mean and standard error of each measure over the episodes in which it is defined."""
+    found = {}
+    for measure in fields(DrivingMeasures) if measured else ():
+        values = [float(value) for e in measured if (value := getattr(e, measure.name)) is not None]
+        found[measure.name] = mean_and_standard_error(values) if values else (math.nan, math.nan)
+    return found

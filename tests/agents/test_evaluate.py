@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from agents.arena import MultiagentArena
-from agents.evaluate import checked_drivers, evaluate_policy_on_seeds, main
+from agents.evaluate import checked_drivers, compared_drivers, evaluate_policy_on_seeds, main
 from agents.task import EVALUATION_SEED, Task
 from predictor.support.errors import UserError
 from tests.agents.helpers import TOY, policy_for, refuse
@@ -51,12 +51,37 @@ def test_constant_actions_stand_for_one_driver_each():
 
 
 def test_one_table_of_planner_and_constant_actions(tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]):
-    command = "--policy planner:constant-velocity --env-id intersection-v2 --drivers constant-actions --episodes 1"
+    command = "--policy planner:constant-velocity --env-id intersection-v2 --episodes 1"
     monkeypatch.setattr("sys.argv", ["evaluate", *command.split(), "--num-envs", "1", "--out", str(tmp_path)])
     main()
     content = json.loads((tmp_path / "summary.json").read_text(), parse_constant=refuse)
     lines = {policy["policy"]: policy["action_shares"] for policy in content["policies"]}
     assert list(lines) == ["planner:constant-velocity", "slower", "idle", "faster", "random"]
     assert all(lines[name] == {name: 1.0} for name in ("slower", "idle", "faster"))
+    assert content["differences"]["reference"] in ("slower", "idle", "faster")
+    assert all(policy["success_rate"] in (0.0, 1.0) for policy in content["policies"])
+    assert all(e["driving"]["time_s"] == e["length"] for episodes in content["episodes"].values() for e in episodes)
     assert {e["seed"] for episodes in content["episodes"].values() for e in episodes} == {EVALUATION_SEED}
     assert "5/5" in capsys.readouterr().out  # the bar knows that idle is one line, not two
+
+
+def test_constant_actions_are_compared_unless_others_are_named():
+    merge, racetrack = Task("merge-v1", "none"), Task("racetrack-v1", "none")
+    constants = ("lane-left", "idle", "lane-right", "faster", "slower")
+    assert compared_drivers(merge) == constants
+    assert compared_drivers(merge, ("none",)) == compared_drivers(merge, ()) == ()
+    assert compared_drivers(merge, ("varied",)) == ("varied",)
+    assert compared_drivers(merge, ("varied", "constant-actions")) == ("varied", *constants)
+    assert compared_drivers(racetrack) == ()  # steering is not discrete
+    assert compared_drivers(Task("simple_tag_v3", "none")) == ()  # no ego
+    with pytest.raises(UserError, match="--drivers none adds no line and stands alone, got varied none"):
+        compared_drivers(merge, ("varied", "none"))
+
+
+def test_no_further_drivers_on_demand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    command = "--policy slower --env-id merge-v1 --drivers none --episodes 1 --num-envs 1"
+    monkeypatch.setattr("sys.argv", ["evaluate", *command.split(), "--out", str(tmp_path)])
+    main()
+    content = json.loads((tmp_path / "summary.json").read_text(), parse_constant=refuse)
+    assert [policy["policy"] for policy in content["policies"]] == ["slower", "random", "idle"]
+    assert all(policy["success_rate"] is None for policy in content["policies"])

@@ -1,9 +1,14 @@
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
+
+import pytest
+from rich.console import Console
 
 from agents.results import Evaluation
 from agents.vec_envs import EpisodeResult
+from envs.rollouts.driving_measures import DrivingMeasures
 from tests.agents.helpers import EPISODES, refuse
 
 
@@ -19,7 +24,7 @@ def test_written_summary_is_valid_json_and_a_table(tmp_path: Path):
     lines = (tmp_path / "summary.md").read_text().splitlines()
     assert lines[2].startswith("| ppo | 17.00 ± 3.51 | 24.0 ± 6.0 | 33 % (")
     assert lines[3].endswith("| – |")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["summary.json", "summary.md"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["episodes.parquet", "summary.json", "summary.md"]
 
 
 def herd(seed: int, ants: float, bees: float) -> EpisodeResult:
@@ -36,7 +41,7 @@ def test_without_an_ego_there_are_roles_but_no_crashes(tmp_path: Path):
     assert lines[0] == "| policy | return | return of ant | return of bee | length |"
     assert lines[2] == "| ppo | 4.00 ± 1.50 | 2.00 ± 1.00 | 6.00 ± 2.00 | 5.0 ± 0.0 |"
     assert lines[3] == "| random | 0.25 | 0.00 | 0.50 | 5.0 |"
-    assert lines[-1].endswith("return: mean over the learners.")
+    assert lines[5].endswith("return: mean over the learners.")
     assert [column.header for column in evaluation.table().columns] == lines[0].strip("| ").split(" | ")
     content = json.loads((tmp_path / "summary.json").read_text(), parse_constant=refuse)
     line = content["policies"][0]
@@ -86,4 +91,74 @@ def test_a_nearly_constant_policy_is_named_under_the_table(tmp_path: Path):
         [("slower", 0.94), ("idle", 0.06)],
     ]
     varied = Evaluation("toy-v0", 1, known).markdown()
-    assert "constant" not in varied and varied.endswith("Wilson interval.\n")
+    assert "constant" not in varied
+
+
+MEASURED = DrivingMeasures(30.0, 0.1, 4, 1.25, 2.5, 0.5, None)
+"""Measures of an episode that is too short for a jerk."""
+
+
+def with_driving(success: bool | None) -> list[EpisodeResult]:
+    """Returns two episodes with measures."""
+    later = DrivingMeasures(20.0, 0.0, 2, 0.75, 1.5, 0.0, 2.0)
+    return [replace(EPISODES[0], driving=MEASURED, success=success), replace(EPISODES[2], driving=later)]
+
+
+def test_driving_has_a_table_of_its_own(tmp_path: Path):
+    evaluation = Evaluation("road-v0", 10, {"ppo": with_driving(None), "unmeasured": EPISODES})
+    evaluation.write(tmp_path)
+    lines = (tmp_path / "summary.md").read_text().splitlines()
+    assert lines[0] == "| policy | return | length | crash rate (95 %) | speed [m/s] |"
+    header = lines.index(
+        "| policy | time [s] | off-road | lane changes | least time to contact [s] | its 5 % quantile [s] "
+        "| hard braking | jerk [m/s³] |"
+    )
+    assert lines[header + 2] == (
+        "| ppo | 25.0 ± 5.0 | 5.0 ± 5.0 % | 3.0 ± 1.0 | 1.00 ± 0.25 | 2.00 ± 0.50 | 25.0 ± 25.0 % | 2.00 |"
+    )
+    assert lines[header + 3] == "| unmeasured | – | – | – | – | – | – | – |"
+    policies = json.loads((tmp_path / "summary.json").read_text(), parse_constant=refuse)["policies"]
+    assert policies[0]["driving"]["lane_changes"] == [3.0, 1.0]
+    assert policies[0]["driving"]["jerk_rms_mps3"] == [2.0, None]
+    assert (policies[1]["driving"], policies[0]["success_rate"]) == ({}, None)
+
+
+def test_driving_that_is_not_measured_is_said_so_once():
+    assert "\n\nDriving measures: not reported.\n" in Evaluation("toy-v0", 10, {"ppo": EPISODES}).markdown()
+    herds = Evaluation("meadow", 1, {"ppo": [herd(1, 1.0, 4.0)]}, has_ego=False).markdown()
+    assert "Driving" not in herds
+
+
+def test_success_is_a_column_where_it_is_reported():
+    reported = [replace(e, success=e.seed == 10) for e in EPISODES]
+    evaluation = Evaluation("goal-v0", 10, {"ppo": reported, "silent": EPISODES})
+    lines = evaluation.markdown().splitlines()
+    assert lines[0] == "| policy | return | length | crash rate (95 %) | success rate (95 %) | speed [m/s] |"
+    assert lines[2].endswith("| 33 % (6–79 %) | 33 % (6–79 %) | 25.0 |")
+    assert lines[3].endswith("| 33 % (6–79 %) | – | 25.0 |")
+
+
+@pytest.mark.parametrize("success", [None, True])
+def test_the_table_fits_into_eighty_columns(success: bool | None):
+    long = [replace(e, success=success, episode_return=10 * e.episode_return) for e in EPISODES]
+    console = Console(width=80, record=True, quiet=False, file=open("/dev/null", "w"))
+    console.print(Evaluation("intersection-v2", 2_000_000_000, {"ppo (constant-velocity)": long}).table())
+    text = console.export_text()
+    assert "…" not in text and "170.00 ± 35.12" in text and "24.0 ± 6.0" in text
+    assert ("33 % (6–79 %)" in text) == (success is None)
+    assert ("100 %" in text) == bool(success)
+
+
+def test_differences_stand_in_both_files(tmp_path: Path):
+    slower = [replace(e, episode_return=e.episode_return - 2.0, action_counts={"slower": e.length}) for e in EPISODES]
+    Evaluation("toy-v0", 10, {"ppo": EPISODES, "slower": slower}).write(tmp_path)
+    text = (tmp_path / "summary.md").read_text()
+    assert "| policy | return − return of slower (95 %) |\n|---|---|\n| ppo | +2.00 (+2.00 to +2.00) |\n\n" in text
+    content = json.loads((tmp_path / "summary.json").read_text(), parse_constant=refuse)
+    assert content["differences"] == {
+        "reference": "slower",
+        "policies": {"ppo": {"value": 2.0, "interval": [2.0, 2.0]}},
+    }
+    single = Evaluation("toy-v0", 10, {"ppo": EPISODES[:1], "slower": slower[:1]}).markdown()
+    assert "| ppo | +2.00 |" in single
+    assert "return − return" not in Evaluation("toy-v0", 10, {"ppo": EPISODES}).markdown()
