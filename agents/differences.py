@@ -3,6 +3,7 @@
 Seeds differ more than policies do, so the interval of a paired difference is smaller than those of the means suggest.
 """
 
+import functools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -41,13 +42,14 @@ def return_differences(
         interval.
     """
     subtracted = {e.seed: e.episode_return for e in results[reference]}
-    found = {}
+    found: dict[str, Estimate] = {}
+    drawn = functools.cache(lambda count: bootstrap_draws(count, seed, DRAWS))  # most policies have as many episodes
     for name, episodes in results.items():
         pairs = np.array([e.episode_return - subtracted[e.seed] for e in episodes if e.seed in subtracted])
         if name == reference or not len(pairs):
             continue
-        drawn = bootstrap_draws(len(pairs), seed, DRAWS) @ pairs / len(pairs)
-        found[name] = Estimate(float(pairs.mean()), central_interval(drawn) if len(pairs) > 1 else None)
+        interval = central_interval(drawn(len(pairs)) @ pairs / len(pairs)) if len(pairs) > 1 else None
+        found[name] = Estimate(float(pairs.mean()), interval)
     return found
 
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ class Evaluation:
         """Policy that the others are compared with, seed by seed (`agents.differences`)."""
         return reference_policy(self.results)
 
-    @property
+    @cached_property
     def differences(self) -> dict[str, Estimate]:
         """Mean difference of each policy's returns to those of the reference on the same seeds, with its interval."""
         return {} if self.reference is None else return_differences(self.results, self.reference)
@@ -100,7 +101,8 @@ class Evaluation:
         header, lines = _returns(summaries, self.has_ego, intervals)
         table = Table(title=self.env_id, caption=self._caption(intervals))
         for i, name in enumerate(header):
-            table.add_column(escape(name), justify="right" if i else "left")
+            broken = escape(name.replace(" [", "\n[").replace(" (", "\n("))
+            table.add_column(broken, justify="right" if i else "left", overflow="fold")
         for line in lines:
             table.add_row(*line)
         return table
@@ -132,9 +134,9 @@ class Evaluation:
 
     def _compared(self) -> list[str]:
         """Returns the table of paired differences and what it shows; nothing if there is nothing to compare."""
-        if not self.differences:
-            return []
         lines = [[name, _difference(found)] for name, found in self.differences.items()]
+        if not lines:
+            return []
         return [
             markdown.table(["policy", f"return − return of {self.reference} (95 %)"], lines),
             f"Differences: mean over the same seeds, 95 % bootstrap over episodes ({DRAWS:,} draws).",
