@@ -103,7 +103,7 @@ def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
     )
 
 
-def _rate(events: Sequence[bool | None]) -> tuple[float, float, float] | tuple[None, None, None]:
+def _rate(events: Sequence[bool | None]) -> tuple[float | None, float | None, float | None]:
     """Returns the share of episodes with an event and its Wilson interval; None if no episode reports it."""
     known = [event for event in events if event is not None]
     return (sum(known) / len(known), *wilson_interval(sum(known), len(known))) if known else (None, None, None)

@@ -59,16 +59,16 @@ def test_steady_driving_alone(env: gym.Env):
     assert measures == DrivingMeasures(4.0, 0.0, 0, LONGEST_S, LONGEST_S, 0.0, 0.0)
 
 
-def test_time_is_what_the_simulator_simulates():
-    env = make_env("racetrack-v1")  # policy steps of 0.2 s
+def test_times_are_those_that_the_simulator_simulates():
+    """Policy steps of 0.2 s; decelerations of 2.5, 3.5 and 2.5 m/s², so jerks of −5 and 5 m/s³."""
+    env = make_env("racetrack-v1")
     env.reset(seed=0)
-    recorder = recorder_for(env)
-    assert recorder is not None
-    recorder.begin()
-    for _ in range(3):
-        env.step(env.action_space.sample() * 0)
-        recorder.note()
-    assert recorder.measures().time_s == pytest.approx(0.6)
+    base: Any = env.unwrapped
+    speeds = [base.vehicle.speed - drop for drop in (0.5, 1.2, 1.7)]
+    measures = drive(env, *map(at_speed, speeds))
+    assert measures.time_s == pytest.approx(0.6)
+    assert measures.hard_brake_share == pytest.approx(1 / 3)
+    assert measures.jerk_rms_mps3 == pytest.approx(5.0)
 
 
 def test_braking_is_hard_above_three_metres_per_second_squared(env: gym.Env):
