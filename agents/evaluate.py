@@ -93,7 +93,7 @@ def evaluate_with_progress(
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """Evaluates the policy of a training run on held-out seeds, beside random and idle drivers."""
+    """Evaluates the policy of a training run on held-out seeds, beside random, idle and constant actions."""
 
     run_dir: Path | None = None
     """Folder of the training run, as train_policy.py wrote it; leave it out with --policy."""
