@@ -1,9 +1,9 @@
 """Trains a policy that sees forecasts of the other agents: `python train_policy.py --out runs/highway`.
 
-Ends with a table over held-out seeds (trained policy, random and idle drivers on the same seeds) and a video with the
-forecasts drawn in. The run folder holds config.json, tb/ (TensorBoard), checkpoint.zip (the latest model),
-best_model.zip (the model selected so far), policy.zip (the final policy: the selected model), summary.json, summary.md
-and video.mp4.
+Ends with a table over held-out seeds (trained policy, every constant action, random and idle drivers on the same seeds)
+and a video with the forecasts drawn in. The run folder holds config.json, tb/ (TensorBoard), checkpoint.zip (the latest
+model), best_model.zip (the model selected so far), policy.zip (the final policy: the selected model), summary.json,
+summary.md, episodes.parquet (where pyarrow is installed) and video.mp4.
 """
 
 import os
@@ -13,10 +13,10 @@ from typing import Annotated
 
 import torch
 from rich.console import Console
-from rich.markup import escape
 
-from agents.evaluate import PACKAGES, evaluate_with_progress
+from agents.evaluate import constant_drivers, evaluate_with_progress, show
 from agents.presets import Algorithm
+from agents.results import PACKAGES
 from agents.runs import FORECASTER, check_forecaster, load_model, open_run
 from agents.task import Backend, Observe, Task
 from agents.training import TrainingPlan, train
@@ -155,12 +155,15 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
     policy = train(plan, config.folder)
     model = load_model(policy, config.algorithm)
     evaluation = evaluate_with_progress(
-        plan.task, model, f"{config.algorithm} ({config.observe})", config.eval_episodes, config.measuring_envs
+        plan.task,
+        model,
+        f"{config.algorithm} ({config.observe})",
+        config.eval_episodes,
+        config.measuring_envs,
+        drivers=constant_drivers(plan.task),
     )
     evaluation.write(config.folder, algorithm=config.algorithm, observe=config.observe)
-    console.print(evaluation.table())
-    if evaluation.constant_policies:
-        console.print(escape(evaluation.constant_policies))
+    show(evaluation, console)
     console.print(f"policy: {policy}")
     if config.video:
         shown = film(plan.task, model, config.folder / "video.mp4")

@@ -77,6 +77,13 @@ EXTRAS: dict[str, Extra] = {
         ),
         absent=("envpool",),
     ),
+    "study": Extra(
+        (
+            "agents.evaluate --policy idle --env-id highway-fast-v0 --episodes 2 --num-envs 1 --out study",
+            "\nimport pyarrow.parquet\nassert pyarrow.parquet.read_table('study/episodes.parquet').num_rows == 12\n",
+        ),
+        absent=("envpool",),
+    ),
     "envpool": Extra((WRAPPED.format(env_id="envpool/HighwayFast-v0"), "\nfrom envs import EnvPoolVecEnv\n")),
 }
 """Extras by name; "core" is the package alone."""

@@ -10,20 +10,24 @@ from typing import TYPE_CHECKING
 from predictor.support.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
-    from agents.evaluate import Evaluation, PolicySummary, evaluate_policy_on_seeds
+    from agents.evaluate import evaluate_policy_on_seeds
     from agents.features import AttentionConfig, ForecastAttention
     from agents.presets import DQNPreset, PPOPreset, preset_for
+    from agents.results import Evaluation
     from agents.runs import load_model, save_model
+    from agents.summaries import PolicySummary
     from agents.task import Task
     from agents.training import TrainingPlan, train
 
 __getattr__, __all__ = lazy_exports(
     __name__,
     {
-        "agents.evaluate": ("Evaluation", "PolicySummary", "evaluate_policy_on_seeds"),
+        "agents.evaluate": ("evaluate_policy_on_seeds",),
         "agents.features": ("AttentionConfig", "ForecastAttention"),
         "agents.presets": ("DQNPreset", "PPOPreset", "preset_for"),
+        "agents.results": ("Evaluation",),
         "agents.runs": ("load_model", "save_model"),
+        "agents.summaries": ("PolicySummary",),
         "agents.task": ("Task",),
         "agents.training": ("TrainingPlan", "train"),
     },

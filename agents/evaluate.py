@@ -1,16 +1,14 @@
 """Evaluates a policy in closed loop on held-out seeds: `python -m agents.evaluate --run-dir runs/highway`.
 
-Every policy drives the same seeds; the table compares the trained policy with random and idle drivers, and with others
-that `--drivers` names, such as every constant action. `--policy planner --env-id highway-fast-v0 --out results`
-evaluates a driver without a training run. Evaluation seeds are disjoint from those of training and of model selection
-(`agents.task`).
+Every policy drives the same seeds; the table compares the trained policy with random and idle drivers, with every
+constant action where actions are discrete, and with others that `--drivers` names. `--policy planner --env-id
+highway-fast-v0 --out results` evaluates a driver without a training run. Evaluation seeds are disjoint from those of
+training and of model selection (`agents.task`). docs/protocol.md defines each measure.
 """
 
-import math
 import os
-from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,188 +17,24 @@ import torch
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.arena import EgoArena, open_arena
+from agents.episode_file import NO_PYARROW, has_pyarrow
+from agents.results import Evaluation
 from agents.runs import POLICY_FILE, load_model, read_config
 from agents.task import EVALUATION_SEED, Task, task_of
-from agents.vec_envs import EpisodeResult
-from envs.drivers.ego import CONSTANT_ACTIONS, make_ego_driver, named_drivers
+from agents.video import EXTREMES, film_extremes
+from envs.drivers.ego import CONSTANT_ACTIONS, constant_actions, make_ego_driver, named_drivers
 from envs.sb3.policy_file import read_policy_note
-from predictor.support import markdown
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import finite, write_json, write_text
-from predictor.support.provenance import provenance
 from predictor.support.runtime import keep_freed_memory, resolve_device
 
-NEARLY_CONSTANT = 0.95
-"""Least share of one action from which on a policy is called nearly constant."""
-_WILSON_Z = 1.959963984540054  # two-sided 95 %
+NO_DRIVERS = "none"
+"""Word that stands for no further drivers."""
 NOT_PINNED = "note: {} does not say which forecaster it was trained on; it gets the one of its run's config"
-PACKAGES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2", "envpool", "torch", "numpy")
-
-
-@dataclass(frozen=True)
-class PolicySummary:
-    """Results of one policy over all episodes: a line of the table."""
-
-    policy: str
-    """Name of the policy or driver."""
-    episodes: int
-    """Number of episodes."""
-    return_mean: float
-    """Mean undiscounted return."""
-    return_se: float
-    """Standard error of `return_mean`; NaN for a single episode."""
-    length_mean: float
-    """Mean length [policy steps]."""
-    length_se: float
-    """Standard error of `length_mean`; NaN for a single episode."""
-    crash_rate: float | None
-    """Share of episodes with a crash; None if the env does not report crashes."""
-    crash_low: float | None
-    """Lower end of the 95 % Wilson interval of `crash_rate`."""
-    crash_high: float | None
-    """Upper end of the 95 % Wilson interval of `crash_rate`."""
-    mean_speed_mps: float
-    """Mean over episodes of the mean speed [m/s]; NaN if the env does not report speeds."""
-    role_returns: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Mean return of the learners of each role, with its standard error; empty if there is one role."""
-    action_shares: dict[str, float] = field(default_factory=dict)
-    """Share of each action among the steps of all episodes, the commonest first; empty if actions are not discrete."""
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Results of several policies on the same seeds."""
-
-    env_id: str
-    """Gymnasium or PettingZoo id."""
-    first_seed: int
-    """Seed of the first episode; episode i was reset with first_seed + i."""
-    results: dict[str, list[EpisodeResult]]
-    """Results of the episodes, by policy."""
-    has_ego: bool = True
-    """Whether one agent is driven: the table then has its crash rate and speed, "–" if the env does not report them."""
-
-    @property
-    def summaries(self) -> list[PolicySummary]:
-        """Summaries, one per policy."""
-        return [summarize(policy, episodes) for policy, episodes in self.results.items()]
-
-    @property
-    def constant_policies(self) -> str:
-        """A line on the policies that (nearly) always take one action, but for drivers that are named after it."""
-        found = []
-        for summary in self.summaries:
-            action, share = next(iter(summary.action_shares.items()), ("", 0.0))
-            if share >= NEARLY_CONSTANT and summary.policy not in (action, "idle"):
-                found.append(f"{summary.policy} takes {action} in {100 * share:.1f} % of its steps")
-        return f"(Nearly) constant: {'; '.join(found)}." if found else ""
-
-    def write(self, folder: Path, **extra: Any) -> None:
-        """Writes ``summary.json`` (with every episode and the provenance) and ``summary.md``."""
-        content = {
-            "env_id": self.env_id,
-            "first_seed": self.first_seed,
-            **extra,
-            "policies": [asdict(summary) for summary in self.summaries],
-            "episodes": {name: [asdict(e) for e in found] for name, found in self.results.items()},
-            "provenance": provenance(PACKAGES),
-        }
-        write_json(folder / "summary.json", finite(content))
-        write_text(folder / "summary.md", self.markdown())
-
-    def markdown(self) -> str:
-        """Returns the table as Markdown."""
-        header, cells = self._cells()
-        paragraphs = [markdown.table(header, cells), f"{self.env_id}: {self._caption()}", self.constant_policies]
-        return "\n\n".join(filter(None, paragraphs)) + "\n"
-
-    def table(self) -> Table:
-        """Returns the table for a terminal."""
-        header, lines = self._cells()
-        table = Table(title=self.env_id, caption=self._caption())
-        for i, name in enumerate(header):
-            table.add_column(escape(name), justify="right" if i else "left")
-        for line in lines:
-            table.add_row(*line)
-        return table
-
-    def _cells(self) -> tuple[list[str], list[list[str]]]:
-        """Returns the header and the cells of each line; without an ego there are no columns of crashes and speed."""
-        summaries = self.summaries
-        roles = list(dict.fromkeys(role for summary in summaries for role in summary.role_returns))
-        header = ["policy", "return", *(f"return of {role}" for role in roles), "length"]
-        header += ["crash rate (95 %)", "speed [m/s]"] if self.has_ego else []
-        return header, [_cells_of(summary, roles, self.has_ego) for summary in summaries]
-
-    def _caption(self) -> str:
-        count = max(len(found) for found in self.results.values())
-        caption = (
-            f"{count} episodes each, the same seeds from {self.first_seed} on; mean ± standard error, length in policy "
-            "steps"
-        )
-        if not self.has_ego:
-            return f"{caption}; return: mean over the learners."
-        if all(summary.crash_rate is None for summary in self.summaries):
-            return f"{caption}; the environment reports no crashes."
-        return f"{caption}, crash rate with its 95 % Wilson interval."
-
-
-def wilson_interval(successes: int, trials: int, z: float = _WILSON_Z) -> tuple[float, float]:
-    """Computes the Wilson score interval of a rate, which lies within [0, 1] and never has zero width.
-
-    Args:
-        successes: number of events.
-        trials: number of trials; at least 1.
-        z: normal quantile; the default gives 95 %.
-
-    Raises:
-        UserError: `successes` or `trials` is out of range.
-    """
-    if not 0 <= successes <= trials or trials < 1:
-        raise UserError(f"need 0 <= successes <= trials and trials >= 1, got {successes} of {trials}")
-    rate = successes / trials
-    centre = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
-    half = z / (1 + z**2 / trials) * math.sqrt(rate * (1 - rate) / trials + z**2 / (4 * trials**2))
-    low = 0.0 if successes == 0 else centre - half  # exact at the ends, where rounding would leave 1e-17
-    high = 1.0 if successes == trials else centre + half
-    return low, high
-
-
-def mean_and_standard_error(values: Sequence[float]) -> tuple[float, float]:
-    """Returns the mean and its standard error (sample standard deviation / √n; NaN for a single value)."""
-    array = np.asarray(values, dtype=np.float64)
-    error = float(array.std(ddof=1) / math.sqrt(len(array))) if len(array) > 1 else math.nan
-    return float(array.mean()), error
-
-
-def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
-    """Computes the summary of one policy's episodes."""
-    return_mean, return_se = mean_and_standard_error([e.episode_return for e in episodes])
-    length_mean, length_se = mean_and_standard_error([float(e.length) for e in episodes])
-    crashes = [e.crashed for e in episodes if e.crashed is not None]
-    interval = wilson_interval(sum(crashes), len(crashes)) if crashes else (None, None)
-    roles = list(dict.fromkeys(role for e in episodes for role in e.returns_by_role))
-    actions = sum((Counter(e.action_counts) for e in episodes), Counter())
-    return PolicySummary(
-        policy,
-        len(episodes),
-        return_mean,
-        return_se,
-        length_mean,
-        length_se,
-        sum(crashes) / len(crashes) if crashes else None,
-        interval[0],
-        interval[1],
-        float(np.mean([e.mean_speed_mps for e in episodes])),
-        {role: mean_and_standard_error([e.returns_by_role[role] for e in episodes]) for role in roles},
-        {action: count / actions.total() for action, count in actions.most_common()},
-    )
 
 
 def evaluate_policy_on_seeds(
@@ -256,31 +90,9 @@ def evaluate_with_progress(
         )
 
 
-def _cells_of(summary: PolicySummary, roles: Sequence[str], has_ego: bool) -> list[str]:
-    cells = [summary.policy, f"{summary.return_mean:.2f}{_plus_minus(summary.return_se, 2)}"]
-    for role in roles:
-        mean, error = summary.role_returns.get(role, (math.nan, math.nan))
-        cells.append(f"{mean:.2f}{_plus_minus(error, 2)}")
-    cells.append(f"{summary.length_mean:.1f}{_plus_minus(summary.length_se, 1)}")
-    if has_ego:
-        cells.append(_crashes(summary))
-        cells.append("–" if math.isnan(summary.mean_speed_mps) else f"{summary.mean_speed_mps:.1f}")
-    return cells
-
-
-def _crashes(summary: PolicySummary) -> str:
-    if summary.crash_rate is None or summary.crash_low is None or summary.crash_high is None:
-        return "–"
-    return f"{100 * summary.crash_rate:.0f} % ({100 * summary.crash_low:.0f}–{100 * summary.crash_high:.0f} %)"
-
-
-def _plus_minus(error: float, digits: int) -> str:
-    return "" if math.isnan(error) else f" ± {error:.{digits}f}"
-
-
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """Evaluates the policy of a training run on held-out seeds, beside random and idle drivers."""
+    """Evaluates the policy of a training run on held-out seeds, beside random, idle and constant actions."""
 
     run_dir: Path | None = None
     """Folder of the training run, as train_policy.py wrote it; leave it out with --policy."""
@@ -289,15 +101,20 @@ class EvaluateConfig:
     envs.drivers.ego; needs --env-id and --out."""
     env_id: str | None = None
     """Environment of --policy; a training run has its own."""
-    drivers: tuple[str, ...] = ()
+    drivers: tuple[str, ...] | None = None
     """Further drivers of the ego, each a line of the table: planner, planner:CHECKPOINT, one action in every step
-    (slower, action-4), constant-actions for all of these, or another of envs.drivers.ego."""
+    (slower, action-4), constant-actions for all of these, or another of envs.drivers.ego. None takes constant-actions
+    where actions are discrete; `--drivers none` adds no line. The planner is no default since it takes minutes: it
+    simulates and forecasts every plan at every step."""
     episodes: int = 50
     """Number of episodes per policy."""
     seed: int = EVALUATION_SEED
     """Random seed: episode i is reset with seed + i; the default is disjoint from all training seeds."""
     out: Path | None = None
-    """Folder for summary.json and summary.md; None takes RUN_DIR/evaluation."""
+    """Folder for summary.json, summary.md and, where pyarrow is installed, episodes.parquet; None takes
+    RUN_DIR/evaluation."""
+    films: bool = False
+    """Film the trained policy's best, median and worst episode by return: best.mp4, median.mp4, worst.mp4."""
     num_envs: Annotated[int, Renamed("workers")] = os.cpu_count() or 1
     """Number of parallel environments; the results do not depend on it."""
     device: str = "cpu"
@@ -318,6 +135,10 @@ class EvaluateConfig:
             raise UserError("--policy has no run folder; say with --out where the results go")
         if self.policy == CONSTANT_ACTIONS:
             raise UserError(f"{CONSTANT_ACTIONS} stands for several drivers; give it to --drivers, and one to --policy")
+        if self.films and self.policy is not None:
+            raise UserError("--films are of a trained policy; leave it out with --policy, or give --run-dir")
+        if self.films and self.episodes < len(EXTREMES):
+            raise UserError(f"--films needs at least {len(EXTREMES)} --episodes, got {self.episodes}")
         check_at_least(self, 0, "seed")
         object.__setattr__(self, "device", resolve_device(self.device))
 
@@ -333,10 +154,19 @@ def main() -> None:
     evaluation, noted = _of_driver(config) if config.run_dir is None else _of_run(config, config.run_dir)
     out.mkdir(parents=True, exist_ok=True)
     evaluation.write(out, **noted)
-    Console().print(evaluation.table())
-    if evaluation.constant_policies:
-        Console().print(escape(evaluation.constant_policies))
+    show(evaluation, Console())
+    if config.films and config.run_dir is not None:
+        evaluation.write(out, **noted, films=_film(config, config.run_dir, evaluation, out))
     Console().print(f"written to {out / 'summary.json'} and {out / 'summary.md'}")
+
+
+def show(evaluation: Evaluation, console: Console) -> None:
+    """Prints the table of an evaluation, the policies that are nearly constant, and a note if pyarrow is missing."""
+    console.print(evaluation.table())
+    if evaluation.constant_policies:
+        console.print(escape(evaluation.constant_policies))
+    if not has_pyarrow():
+        console.print(escape(NO_PYARROW))
 
 
 def _of_driver(config: EvaluateConfig) -> tuple[Evaluation, dict[str, str]]:
@@ -344,11 +174,39 @@ def _of_driver(config: EvaluateConfig) -> tuple[Evaluation, dict[str, str]]:
     assert config.policy is not None and config.env_id is not None
     task = Task(config.env_id, "none", device=config.device)
     task.check()
-    _, *drivers = checked_drivers(task, (config.policy, *config.drivers))
+    checked_drivers(task, (config.policy,))
+    drivers = compared_drivers(task, config.drivers)
     evaluation = evaluate_with_progress(
         task, config.policy, config.policy, config.episodes, config.num_envs, config.seed, drivers
     )
     return evaluation, {"driver": config.policy}
+
+
+def compared_drivers(task: Task, names: Sequence[str] | None = None) -> tuple[str, ...]:
+    """Returns the drivers that stand beside a policy and the baselines.
+
+    Args:
+        task: task of the policy.
+        names: names of drivers; ("none",) for none, None for every constant action where actions are discrete.
+
+    Raises:
+        UserError: "none" among others, or see `checked_drivers`.
+    """
+    if names is None:
+        return constant_drivers(task)
+    if NO_DRIVERS in names and len(names) > 1:
+        raise UserError(f"--drivers {NO_DRIVERS} adds no line and stands alone, got {' '.join(names)}")
+    return () if NO_DRIVERS in names else checked_drivers(task, names)
+
+
+def constant_drivers(task: Task) -> tuple[str, ...]:
+    """Returns the drivers that take one action in every step; none without an ego or without discrete actions."""
+    if task.is_multiagent:
+        return ()
+    env = task.make(disable_env_checker=True)
+    drivers = tuple(constant_actions(env))
+    env.close()
+    return drivers
 
 
 def checked_drivers(task: Task, names: Sequence[str]) -> tuple[str, ...]:
@@ -374,7 +232,7 @@ def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str
     run = read_config(run_dir)
     task = task_of(run, config.device)
     task.check()
-    drivers = checked_drivers(task, config.drivers)
+    drivers = compared_drivers(task, config.drivers)
     policy = run_dir / POLICY_FILE
     model = load_model(policy, run["algorithm"])
     note, now = read_policy_note(policy), task.note
@@ -386,6 +244,16 @@ def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str
     name = f"{run['algorithm']} ({run['observe']})"
     evaluation = evaluate_with_progress(task, model, name, config.episodes, config.num_envs, config.seed, drivers)
     return evaluation, {"algorithm": run["algorithm"], "observe": run["observe"]}
+
+
+def _film(config: EvaluateConfig, run_dir: Path, evaluation: Evaluation, out: Path) -> dict[str, dict[str, Any]]:
+    """Films episodes of the trained policy, which is the first of the evaluation; returns what the films show."""
+    run, episodes = read_config(run_dir), next(iter(evaluation.results.values()))
+    model = load_model(run_dir / POLICY_FILE, run["algorithm"])
+    films = film_extremes(task_of(run, config.device), model, episodes, out)
+    names = ", ".join(film["file"] for film in films.values())
+    Console().print(f"films: {names or 'none, only highway-env and PettingZoo environments are drawn'}")
+    return films
 
 
 if __name__ == "__main__":

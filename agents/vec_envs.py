@@ -24,6 +24,7 @@ from envs.drivers.all_agents import Driver, make_driver
 from envs.drivers.ego import constant_actions, make_ego_driver
 from envs.drivers.trained import EgoDriver
 from envs.registry import envpool_task_of
+from envs.rollouts.driving_measures import DrivingMeasures, recorder_for
 from envs.sb3.agents_as_rows import AgentMonitor, ParallelVecEnv
 from envs.sb3.envpool import EnvPoolVecEnv
 from envs.sb3.forecast import VecForecast
@@ -55,6 +56,10 @@ class EpisodeResult:
     action_counts: dict[str, int] = field(default_factory=dict)
     """Number of steps with each action that the ego took, by its name in `envs.drivers.ego.constant_actions`; empty if
     actions are not discrete or there is no ego."""
+    success: bool | None = None
+    """Whether the env reported success in the last step, and no crash; None if it does not report success."""
+    driving: DrivingMeasures | None = None
+    """Measures of the ego's driving; None if the env is not highway-env's or has no ego."""
 
 
 class DrivenEnv(BaseParallelWrapper):
@@ -198,6 +203,7 @@ class SeededEpisodes(gym.Wrapper):
         """Wraps the environment with an empty queue."""
         super().__init__(env)
         self._action_names = {number: name for name, number in constant_actions(env).items()}
+        self._recorder = recorder_for(env)
         self._seeds: list[int] = []
         self._driver_name: str | None = None
         self._driver: EgoDriver | None = None
@@ -219,6 +225,8 @@ class SeededEpisodes(gym.Wrapper):
         self._actions: Counter[str] = Counter()
         self._crashed: bool | None = None
         self._obs = obs
+        if self._recorder is not None:
+            self._recorder.begin()
         return obs, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -233,14 +241,35 @@ class SeededEpisodes(gym.Wrapper):
             self._actions[self._action_names[int(action)]] += 1
         if "crashed" in info:
             self._crashed = bool(self._crashed) or bool(info["crashed"])
+        if self._recorder is not None:
+            self._recorder.note()
         if (terminated or truncated) and self._seed is not None:
-            speed = float(np.mean(self._speeds_mps))
-            info[EPISODE_INFO] = EpisodeResult(
-                self._seed,
-                float(np.sum(self._rewards)),
-                len(self._rewards),
-                self._crashed,
-                speed,
-                action_counts=dict(self._actions),
-            )
+            info[EPISODE_INFO] = self._result(self._seed, info)
         return obs, reward, terminated, truncated, info
+
+    def _result(self, seed: int, last_info: Mapping[str, Any]) -> EpisodeResult:
+        success = reported_success(last_info)
+        return EpisodeResult(
+            seed,
+            float(np.sum(self._rewards)),
+            len(self._rewards),
+            self._crashed,
+            float(np.mean(self._speeds_mps)),
+            action_counts=dict(self._actions),
+            success=None if success is None else success and not self._crashed,
+            driving=None if self._recorder is None else self._recorder.measures(),
+        )
+
+
+def reported_success(info: Mapping[str, Any]) -> bool | None:
+    """Returns whether an info reports success; None if it says nothing of it.
+
+    Many environments have the key "is_success", highway-env's exit and parking among them; its intersections report the
+    arrival among the parts of the reward.
+    """
+    if "is_success" in info:
+        return bool(np.all(info["is_success"]))
+    parts = info.get("rewards")
+    if isinstance(parts, Mapping) and "arrived_reward" in parts:
+        return bool(parts["arrived_reward"])
+    return None

@@ -1,6 +1,6 @@
 """Films an episode of a trained policy, with the forecasts drawn in."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from agents.arena import actions_of_others
 from agents.features import EGO_KEY
 from agents.task import EVALUATION_SEED, Task
-from agents.vec_envs import MakeCopy, learners_of, make_multiagent_venv, own_observations
+from agents.vec_envs import EpisodeResult, MakeCopy, learners_of, make_multiagent_venv, own_observations
 from envs.parallel import ForecastParallelEnv
 from envs.readers import multiagent_reader_for
 from envs.readers.highway import is_highway_env
@@ -26,6 +26,8 @@ FAN = 6
 """Number of futures that are drawn of a forecaster with modes."""
 MAX_VIDEO_STEPS = 200
 """Maximum length of a video [policy steps]; a racetrack episode has 1500."""
+EXTREMES = ("best", "median", "worst")
+"""Names of the films of several episodes."""
 
 
 def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) -> MultiagentRecording | None:
@@ -81,19 +83,20 @@ def _has_reader(env_id: str) -> bool:
     return True
 
 
-def film(task: Task, model: BaseAlgorithm, path: Path) -> Path | None:
-    """Films the first evaluation episode with the forecasts drawn in, also for a policy that sees none.
+def film(task: Task, model: BaseAlgorithm, path: Path, seed: int = EVALUATION_SEED) -> Path | None:
+    """Films an evaluation episode with the forecasts drawn in, also for a policy that sees none.
 
     Args:
         task: environment and what the policy sees.
         model: the policy.
         path: path of the video to write.
+        seed: seed of the episode; the default is the first one's.
 
     Returns:
         `path`; None if the environment cannot be drawn.
     """
     if task.is_multiagent:
-        recording = record_task(task, model, EVALUATION_SEED, MAX_VIDEO_STEPS)
+        recording = record_task(task, model, seed, MAX_VIDEO_STEPS)
         if recording is None:
             return None
         recording.write_video(path)
@@ -112,7 +115,7 @@ def film(task: Task, model: BaseAlgorithm, path: Path) -> Path | None:
         played = record_episode(
             env,
             _act(task, model),
-            seed=EVALUATION_SEED,
+            seed=seed,
             max_steps=MAX_VIDEO_STEPS,
             num_samples=_num_drawn(env.forecaster),
         )
@@ -120,6 +123,31 @@ def film(task: Task, model: BaseAlgorithm, path: Path) -> Path | None:
     finally:
         env.close()
     return path
+
+
+def film_extremes(
+    task: Task, model: BaseAlgorithm, episodes: Sequence[EpisodeResult], folder: Path
+) -> dict[str, dict[str, Any]]:
+    """Films the best, the median and the worst of a policy's episodes by return, as ``best.mp4`` and so on.
+
+    Args:
+        task: environment and what the policy sees.
+        model: the policy.
+        episodes: results of the policy's episodes, at least one. Of an even number the lower median is taken; equal
+            returns are in the order of the seeds.
+        folder: folder of the videos.
+
+    Returns:
+        Seed, return and file of each film; empty if the environment cannot be drawn.
+    """
+    by_return = sorted(episodes, key=lambda episode: episode.episode_return)
+    places = dict(zip(EXTREMES, (-1, (len(by_return) - 1) // 2, 0), strict=True))
+    films: dict[str, dict[str, Any]] = {}
+    for name, place in places.items():
+        episode, path = by_return[place], folder / f"{name}.mp4"
+        if film(task, model, path, episode.seed) is not None:
+            films[name] = {"seed": episode.seed, "return": episode.episode_return, "file": path.name}
+    return films
 
 
 def _act(task: Task, model: BaseAlgorithm) -> Callable[[Any], Any]:

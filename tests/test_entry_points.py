@@ -153,6 +153,9 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
             "constant-actions stands for several drivers; give it to --drivers, and one to --policy",
         ),
         ("--policy planner --env-id simple_tag_v3 --out new", "drivers of an ego need an environment with one ego"),
+        ("--policy idle --env-id merge-v1 --out new --films", "--films are of a trained policy; leave it out with"),
+        ("--run-dir absent --films --episodes 2", "--films needs at least 3 --episodes, got 2"),
+        ("--policy idle --env-id merge-v1 --out new --drivers none slower", "--drivers none adds no line and stands"),
     ],
     "train_policy": [
         ("--env-id nope-v0 --observe none", "cannot make env 'nope-v0'"),

@@ -19,13 +19,14 @@ import imageio_ffmpeg
 import pytest
 
 import train_policy
-from agents import evaluate
-from agents.evaluate import Evaluation
+from agents import evaluate, results
 from agents.presets import Algorithm, PPOPreset, Preset, preset_for
+from agents.results import Evaluation
 from agents.runs import load_model
 from agents.task import Backend
 from agents.training import SaveCheckpoint
 from envs.sb3.policy_file import NOTE_ENTRY, read_note, read_policy_note
+from envs.video.highway import record_episode
 from predictor.support.errors import run_entry_point
 from tests.agents.helpers import TOY
 
@@ -36,6 +37,8 @@ TINY = (
     "--observe", "constant-velocity", "--num-envs", "1", "--selections", "1", "--selection-episodes", "1",
     "--eval-episodes", "1", "--checkpoint-every", "1",
 )  # fmt: skip
+CONSTANT = ("lane-left", "idle", "lane-right", "faster", "slower")
+"""Constant actions of the highway."""
 ROLLOUT = 20
 PPO = (*TINY, "--steps", str(2 * ROLLOUT))
 DQN = (*TINY, "--algorithm", "dqn", "--steps", str(2 * ROLLOUT))  # learns from step 10 on
@@ -86,7 +89,7 @@ def trained(run: Path, *arguments: str, short: bool = True) -> tuple[Path, str]:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Returns a finished run on the highway; every policy counts as constant in its table."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evaluate, "NEARLY_CONSTANT", 0.0)
+        patch.setattr(results, "NEARLY_CONSTANT", 0.0)
         return trained(tmp_path_factory.mktemp("finished") / "run", *PPO)
 
 
@@ -117,10 +120,11 @@ def test_one_command_trains_evaluates_and_films(finished: tuple[Path, str]):
     names = {p.name for p in run.iterdir()}
     assert names == {
         "config.json", "tb", "checkpoint.zip", "best_model.zip", "policy.zip",
-        "summary.json", "summary.md", "video.mp4",
+        "summary.json", "summary.md", "episodes.parquet", "video.mp4",
     }  # fmt: skip
     summary = json.loads((run / "summary.json").read_text())
-    assert [line["policy"] for line in summary["policies"]] == ["ppo (constant-velocity)", "random", "idle"]
+    assert [line["policy"] for line in summary["policies"]] == ["ppo (constant-velocity)", *CONSTANT, "random"]
+    assert summary["differences"]["reference"] in CONSTANT
     assert {e["seed"] for found in summary["episodes"].values() for e in found} == {evaluate.EVALUATION_SEED}
     assert "(Nearly) constant: ppo (constant-velocity) takes" in printed
     config = json.loads((run / "config.json").read_text())
@@ -148,6 +152,32 @@ def test_a_finished_policy_is_evaluated_again(finished: tuple[Path, str], monkey
     run_entry_point(evaluate.main)
     again = json.loads((run / "evaluation" / "summary.json").read_text())
     assert again["episodes"] == json.loads((run / "summary.json").read_text())["episodes"]
+
+
+def test_best_median_and_worst_episodes_are_filmed(
+    finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Each film shows the episode that was measured."""
+    recorded: list[tuple[int, float]] = []
+
+    def record(*arguments: Any, **options: Any) -> Any:
+        recording = record_episode(*arguments, **options | {"max_steps": None})
+        recorded.append((options["seed"], recording.total_reward))
+        return recording
+
+    monkeypatch.setattr("agents.video.record_episode", record)
+    words = f"--run-dir {finished[0]} --episodes 3 --num-envs 1 --drivers none --films --out {tmp_path}"
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", *words.split()])
+    run_entry_point(evaluate.main)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    returns = {e["seed"]: e["episode_return"] for e in summary["episodes"]["ppo (constant-velocity)"]}
+    films = summary["films"]
+    assert [film["file"] for film in films.values()] == ["best.mp4", "median.mp4", "worst.mp4"]
+    assert [film["return"] for film in films.values()] == sorted(returns.values(), reverse=True)
+    assert recorded == [(film["seed"], pytest.approx(returns[film["seed"]])) for film in films.values()]
+    for film in films.values():
+        assert_video(tmp_path / film["file"], least_s=0.5)
+    assert "films: best.mp4, median.mp4, worst.mp4" in capsys.readouterr().out
 
 
 def with_note(run: Path, target: Path, change: Callable[[dict[str, Any]], None]) -> Path:
@@ -291,7 +321,7 @@ def test_policies_trained_on_envpool_are_measured_on_the_original(tmp_path: Path
     assert load_model(run / "policy.zip", "ppo").num_timesteps == 512
     summary = json.loads((run / "summary.json").read_text())
     assert summary["env_id"] == "highway-fast-v0"
-    assert [line["policy"] for line in summary["policies"]] == ["ppo (forecast)", "random", "idle"]
+    assert [line["policy"] for line in summary["policies"]] == ["ppo (forecast)", *CONSTANT, "random"]
     assert all(0 < line["return_mean"] <= 30 for line in summary["policies"])
     assert not (run / "video.mp4").exists()
 

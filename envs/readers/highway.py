@@ -47,7 +47,7 @@ def vehicles_of(env: gym.Env) -> list[Vehicle]:
     return [ego] + [v for v in road.vehicles if v is not ego]
 
 
-def _dt_s(config: dict[str, Any]) -> float:
+def policy_step_s(config: dict[str, Any]) -> float:
     """Returns the time that a policy step really simulates: whole simulation frames, rounded down."""
     frames = config["simulation_frequency"] // config["policy_frequency"]
     return float(frames / config["simulation_frequency"])
@@ -68,7 +68,7 @@ class HighwayReader(Reader):
             raise UserError(f"HighwayReader needs a highway-env environment, got {env.unwrapped.__class__.__name__}")
         config = env.unwrapped.config  # type: ignore[attr-defined]
         env_id = env.unwrapped.spec.id if env.unwrapped.spec is not None else ""
-        spec = SceneSpec(dt_s=_dt_s(config), frame=_FRAMES.get(env_id, _FIXED_MAP))
+        spec = SceneSpec(dt_s=policy_step_s(config), frame=_FRAMES.get(env_id, _FIXED_MAP))
         if perception_m is not None:
             spec = replace(spec, perception_m=float(perception_m))
         if max_agents is not None:
@@ -91,7 +91,7 @@ class HighwayReader(Reader):
         Raises:
             UserError: the environment's time step is no longer the one of the spec.
         """
-        dt_s = _dt_s(env.unwrapped.config)  # type: ignore[attr-defined]
+        dt_s = policy_step_s(env.unwrapped.config)  # type: ignore[attr-defined]
         if dt_s != self._spec.dt_s:
             raise UserError(
                 f"the env was wrapped at dt_s={self._spec.dt_s:g} but now steps at dt_s={dt_s:g}; "

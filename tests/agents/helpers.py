@@ -1,4 +1,4 @@
-"""Helpers of several test files of `agents`: untrained policies; an environment without reader and heuristic driver."""
+"""Helpers of several test files: untrained policies, episodes, an environment without reader and heuristic driver."""
 
 from typing import Any
 
@@ -9,11 +9,17 @@ from pettingzoo import ParallelEnv
 from stable_baselines3 import PPO
 
 from agents.task import Task
-from agents.vec_envs import make_multiagent_venv
+from agents.vec_envs import EpisodeResult, make_multiagent_venv
 
 TOY = f"{__name__}:Meadow"
 LIVES = {"ant_0": 2, "bee_0": 5}
 """Number of steps that each agent lives."""
+EPISODES = [
+    EpisodeResult(seed=10, episode_return=20.0, length=30, crashed=False, mean_speed_mps=22.0),
+    EpisodeResult(seed=11, episode_return=10.0, length=12, crashed=True, mean_speed_mps=28.0),
+    EpisodeResult(seed=12, episode_return=21.0, length=30, crashed=False, mean_speed_mps=25.0),
+]
+"""Episodes of one policy."""
 
 
 class Meadow(ParallelEnv):
@@ -61,3 +67,8 @@ def policy_for(task: Task) -> PPO:
         for parameter in model.policy.parameters():
             parameter.mul_(5.0)
     return model
+
+
+def refuse(constant: str) -> None:
+    """Refuses a constant that JSON does not have, as `parse_constant` of `json.loads`."""
+    raise AssertionError(f"{constant} is not JSON")

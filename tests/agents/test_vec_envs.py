@@ -7,7 +7,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 from agents.arena import run_episodes
 from agents.task import Task
-from agents.vec_envs import EpisodeResult, SeededEpisodes, make_venv
+from agents.vec_envs import EpisodeResult, SeededEpisodes, make_venv, reported_success
+from envs.registry import make_env
+from envs.rollouts.driving_measures import recorder_for
 from predictor.support.errors import UserError
 
 
@@ -64,6 +66,58 @@ def test_a_crash_flag_that_is_never_reported_is_unknown():
     venv = VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Silent())]))
     assert [e.crashed for e in run_episodes(venv, always_two, range(4))] == [None] * 4
     assert {e.crashed for e in run_episodes(dice_venv(1), always_two, range(8))} == {False, True}
+
+
+class Reporting(Dice):
+    """Reports success in every step, although half of its episodes crash."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        obs, reward, terminated, truncated, info = super().step(action)
+        return obs, reward, terminated, truncated, info | {"is_success": self._left == 0}
+
+
+def test_success_is_that_of_the_last_step_and_not_with_a_crash():
+    venv = VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Reporting())]))
+    found = run_episodes(venv, always_two, range(8))
+    assert {(e.success, e.crashed) for e in found} == {(True, False), (False, True)}
+    assert {e.success for e in run_episodes(dice_venv(1), always_two, range(8))} == {None}
+
+
+def test_what_infos_say_of_success():
+    assert reported_success({"is_success": True}) is True
+    assert reported_success({"is_success": (True, False)}) is False  # of two egos
+    assert reported_success({"rewards": {"arrived_reward": 1.0}}) is True
+    assert reported_success({"rewards": {"arrived_reward": False}}) is False
+    assert reported_success({"rewards": {"collision_reward": 1.0}}) is None
+    assert reported_success({"rewards": 3.0}) is None
+    assert reported_success({}) is None
+
+
+@pytest.mark.parametrize(("env_id", "reports"), [("intersection-v2", True), ("exit-v1", True), ("merge-v1", False)])
+def test_who_reports_success(env_id: str, reports: bool):
+    env = make_env(env_id)
+    env.reset(seed=0)
+    info = env.step(env.action_space.sample())[-1]
+    assert (reported_success(info) is not None) == reports
+
+
+def test_driving_is_measured_in_the_episode_that_is_played():
+    """The result has the measures of a plain loop over the same episode."""
+    env = make_env("highway-fast-v0")
+    recorder = recorder_for(env)
+    assert recorder is not None
+    env.reset(seed=3)
+    recorder.begin()
+    ended = False
+    while not ended:
+        _, _, terminated, truncated, _ = env.step(3)
+        recorder.note()
+        ended = terminated or truncated
+    venv = make_venv(Task("highway-fast-v0", "none"), 1, seeded=True)
+    (again, other) = run_episodes(venv, "faster", [4, 3])
+    assert other.driving == recorder.measures() != again.driving
+    assert other.length == other.driving.time_s
+    venv.close()
 
 
 def test_second_evaluation_starts_afresh():

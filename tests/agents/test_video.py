@@ -6,7 +6,8 @@ from stable_baselines3 import PPO
 
 from agents.arena import MultiagentArena
 from agents.task import Task
-from agents.video import film, record_task
+from agents.vec_envs import EpisodeResult
+from agents.video import film, film_extremes, record_task
 from tests.agents.helpers import TOY, policy_for
 
 SPREAD, TAG = "simple_spread_v3", "simple_tag_v3"
@@ -38,4 +39,35 @@ def test_what_cannot_be_drawn_gives_no_video_and_no_error(tmp_path: Path):
     assert film(Task("CartPole-v1", "none"), PPO("MlpPolicy", "CartPole-v1", device="cpu"), path) is None
     toy = Task(TOY, "none")
     assert film(toy, policy_for(toy), path) is None
+    assert not list(tmp_path.iterdir())
+
+
+def played(*returns: float) -> list[EpisodeResult]:
+    """Returns episodes with these returns, of the seeds 10, 11, …"""
+    return [EpisodeResult(10 + i, value, 3, None, float("nan")) for i, value in enumerate(returns)]
+
+
+@pytest.mark.parametrize(
+    ("returns", "seeds"),
+    [((1.0, 5.0, 3.0), (11, 12, 10)), ((4.0, 1.0, 9.0, 6.0), (12, 10, 11)), ((2.0,), (10, 10, 10))],
+)
+def test_best_median_and_worst_are_filmed(
+    returns: tuple[float, ...], seeds: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    filmed: list[tuple[str, int]] = []
+
+    def note(task: Task, model: Any, path: Path, seed: int) -> Path:
+        filmed.append((path.name, seed))
+        return path
+
+    monkeypatch.setattr("agents.video.film", note)
+    films = film_extremes(Task(TOY, "none"), policy_for(Task(TOY, "none")), played(*returns), tmp_path)
+    assert filmed == [(f"{name}.mp4", seed) for name, seed in zip(("best", "median", "worst"), seeds, strict=True)]
+    assert [(film["seed"], film["file"]) for film in films.values()] == [(seed, name) for name, seed in filmed]
+    assert (films["best"]["return"], films["worst"]["return"]) == (max(returns), min(returns))
+
+
+def test_what_cannot_be_drawn_has_no_films(tmp_path: Path):
+    toy = Task(TOY, "none")
+    assert film_extremes(toy, policy_for(toy), played(1.0, 2.0, 3.0), tmp_path) == {}
     assert not list(tmp_path.iterdir())

@@ -1,0 +1,118 @@
+"""Summaries of a policy's episodes: means with standard errors, rates with Wilson intervals."""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+from agents.vec_envs import EpisodeResult
+from envs.rollouts.driving_measures import DrivingMeasures
+from predictor.support.errors import UserError
+
+_WILSON_Z = 1.959963984540054  # two-sided 95 %
+
+
+@dataclass(frozen=True)
+class PolicySummary:
+    """Results of one policy over all episodes: a line of the table."""
+
+    policy: str
+    """Name of the policy or driver."""
+    episodes: int
+    """Number of episodes."""
+    return_mean: float
+    """Mean undiscounted return."""
+    return_se: float
+    """Standard error of `return_mean`; NaN for a single episode."""
+    length_mean: float
+    """Mean length [policy steps]."""
+    length_se: float
+    """Standard error of `length_mean`; NaN for a single episode."""
+    crash_rate: float | None
+    """Share of episodes with a crash; None if the env does not report crashes."""
+    crash_low: float | None
+    """Lower end of the 95 % Wilson interval of `crash_rate`."""
+    crash_high: float | None
+    """Upper end of the 95 % Wilson interval of `crash_rate`."""
+    mean_speed_mps: float
+    """Mean over episodes of the mean speed [m/s]; NaN if the env does not report speeds."""
+    role_returns: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Mean return of the learners of each role, with its standard error; empty if there is one role."""
+    action_shares: dict[str, float] = field(default_factory=dict)
+    """Share of each action among the steps of all episodes, the commonest first; empty if actions are not discrete."""
+    success_rate: float | None = None
+    """Share of episodes with success; None if the env does not report success."""
+    success_low: float | None = None
+    """Lower end of the 95 % Wilson interval of `success_rate`."""
+    success_high: float | None = None
+    """Upper end of the 95 % Wilson interval of `success_rate`."""
+    driving: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Mean of each field of `DrivingMeasures` over the episodes that have it, with its standard error; empty if driving
+    is not measured."""
+
+
+def wilson_interval(successes: int, trials: int, z: float = _WILSON_Z) -> tuple[float, float]:
+    """Computes the Wilson score interval of a rate, which lies within [0, 1] and never has zero width.
+
+    Args:
+        successes: number of events.
+        trials: number of trials; at least 1.
+        z: normal quantile; the default gives 95 %.
+
+    Raises:
+        UserError: `successes` or `trials` is out of range.
+    """
+    if not 0 <= successes <= trials or trials < 1:
+        raise UserError(f"need 0 <= successes <= trials and trials >= 1, got {successes} of {trials}")
+    rate = successes / trials
+    centre = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
+    half = z / (1 + z**2 / trials) * math.sqrt(rate * (1 - rate) / trials + z**2 / (4 * trials**2))
+    low = 0.0 if successes == 0 else centre - half  # exact at the ends, where rounding would leave 1e-17
+    high = 1.0 if successes == trials else centre + half
+    return low, high
+
+
+def mean_and_standard_error(values: Sequence[float]) -> tuple[float, float]:
+    """Returns the mean and its standard error (sample standard deviation / √n; NaN for a single value)."""
+    array = np.asarray(values, dtype=np.float64)
+    error = float(array.std(ddof=1) / math.sqrt(len(array))) if len(array) > 1 else math.nan
+    return float(array.mean()), error
+
+
+def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
+    """Computes the summary of one policy's episodes."""
+    return_mean, return_se = mean_and_standard_error([e.episode_return for e in episodes])
+    length_mean, length_se = mean_and_standard_error([float(e.length) for e in episodes])
+    roles = list(dict.fromkeys(role for e in episodes for role in e.returns_by_role))
+    actions = sum((Counter(e.action_counts) for e in episodes), Counter())
+    return PolicySummary(
+        policy,
+        len(episodes),
+        return_mean,
+        return_se,
+        length_mean,
+        length_se,
+        *_rate([e.crashed for e in episodes]),
+        float(np.mean([e.mean_speed_mps for e in episodes])),
+        {role: mean_and_standard_error([e.returns_by_role[role] for e in episodes]) for role in roles},
+        {action: count / actions.total() for action, count in actions.most_common()},
+        *_rate([e.success for e in episodes]),
+        _mean_driving([e.driving for e in episodes if e.driving is not None]),
+    )
+
+
+def _rate(events: Sequence[bool | None]) -> tuple[float | None, float | None, float | None]:
+    """Returns the share of episodes with an event and its Wilson interval; None if no episode reports it."""
+    known = [event for event in events if event is not None]
+    return (sum(known) / len(known), *wilson_interval(sum(known), len(known))) if known else (None, None, None)
+
+
+def _mean_driving(measured: Sequence[DrivingMeasures]) -> dict[str, tuple[float, float]]:
+    """Returns mean and standard error of each measure over the episodes in which it is defined."""
+    found = {}
+    for measure in fields(DrivingMeasures) if measured else ():
+        values = [float(value) for e in measured if (value := getattr(e, measure.name)) is not None]
+        found[measure.name] = mean_and_standard_error(values) if values else (math.nan, math.nan)
+    return found
