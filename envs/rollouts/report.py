@@ -55,7 +55,7 @@ class EnvAccuracy:
     """Accuracy of the model (K = 1) and of constant velocity over all forecasts, also those whose horizon passes the
     episode's end: each counts up to that end."""
     before_crash: tuple[Accuracy, Accuracy] | None = None
-    """Accuracy of both over the forecasts of the last `BEFORE_CRASH_S` before a crash of the ego; None without a crash."""
+    """Accuracy of both over the forecasts of the last `BEFORE_CRASH_S` before a crash; None without a crash."""
 
     @property
     def lines(self) -> list[Accuracy]:
