@@ -44,7 +44,7 @@ class Coin(gym.Env[np.ndarray, np.int64]):
 def make_selection(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], EgoArena]:
     """Function from a number of environments to an arena of coins."""
 
-    def make_venv(task: Task, num_envs: int, seeded: bool) -> VecMonitor:
+    def make_venv(task: Task, num_envs: int, seeded: bool, in_process: bool) -> VecMonitor:
         assert seeded
         return VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Coin())] * num_envs))
 
