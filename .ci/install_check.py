@@ -77,6 +77,9 @@ EXTRAS: dict[str, Extra] = {
         ),
         absent=("envpool",),
     ),
+    "study": Extra(
+        ("agents.study --list", "\nfrom agents.studies.report import write_report\nimport pyarrow.parquet\n")
+    ),
     "envpool": Extra((WRAPPED.format(env_id="envpool/HighwayFast-v0"), "\nfrom envs import EnvPoolVecEnv\n")),
 }
 """Extras by name; "core" is the package alone."""

@@ -154,6 +154,13 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ),
         ("--policy planner --env-id simple_tag_v3 --out new", "drivers of an ego need an environment with one ego"),
     ],
+    "agents.study": [
+        ("--study absent", "no study 'absent': neither a file nor one that ships (quick)"),
+        ("--study file", "file is not valid TOML: "),
+        ("--workers -1", "workers must not be negative, got -1"),
+        ("--out file", "file is a file; choose another --out"),
+        ("--out .", ". holds file but no study (study.toml); choose another --out"),
+    ],
     "train_policy": [
         ("--env-id nope-v0 --observe none", "cannot make env 'nope-v0'"),
         ("--num-envs 0", "num_envs must be at least 1, got 0"),

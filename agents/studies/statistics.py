@@ -14,8 +14,8 @@ from scipy import stats
 
 from predictor.support.errors import UserError
 
-Runs = Sequence[Float[np.ndarray, " runs"]]
-"""Scores of the runs of each scenario."""
+Runs = Sequence[Float[np.ndarray, " _"]]
+"""Scores of the runs of each scenario; their numbers may differ."""
 RESAMPLES = 2_000
 CONFIDENCE = 0.95
 
