@@ -2,9 +2,8 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +12,7 @@ from jaxtyping import Float
 from agents.studies.plan import Study
 from agents.studies.results import Result
 from agents.studies.statistics import (
+    RESAMPLES,
     Estimate,
     Runs,
     bootstrapped,
@@ -64,14 +64,16 @@ class Findings:
     """The study."""
     results: Mapping[tuple[str, Line], Sequence[Result]]
     """Results by scenario and line, in the order of the seeds."""
+    resamples: int = RESAMPLES
+    """Number of draws of each bootstrap."""
 
     @classmethod
-    def of(cls, study: Study, results: Sequence[Result]) -> "Findings":
+    def of(cls, study: Study, results: Sequence[Result], resamples: int = RESAMPLES) -> "Findings":
         """Sorts results by scenario and line."""
         found: dict[tuple[str, Line], list[Result]] = {}
         for result in results:
             found.setdefault((result.scenario, Line(result.arm, result.algorithm)), []).append(result)
-        return cls(study, found)
+        return cls(study, found, resamples)
 
     @property
     def scenarios(self) -> tuple[str, ...]:
@@ -101,7 +103,7 @@ class Findings:
     def middle_return(self, scenario: str, line: Line) -> Estimate:
         """Returns the interquartile mean over runs with its bootstrap interval."""
         runs = [self.runs(scenario, line)]
-        return bootstrapped(interquartile_mean, runs, generator=generator_of("iqm", scenario, *line))
+        return self.estimate(interquartile_mean, runs, about=("iqm", scenario, *line))
 
     def crash_rate(self, scenario: str, line: Line) -> Estimate | None:
         """Returns the share of test episodes with a crash and its bootstrap interval over runs; None if not reported.
@@ -112,7 +114,7 @@ class Findings:
         if any(len(found) == 0 for found in reported):
             return None
         rates = reported[0] if line.algorithm is None else np.array([np.mean(found) for found in reported])
-        return bootstrapped(mean, [rates], generator=generator_of("crashes", scenario, *line))
+        return self.estimate(mean, [rates], about=("crashes", scenario, *line))
 
     def mean_of(self, scenario: str, line: Line, field: str) -> float:
         """Returns the mean of a field over all episodes of all runs; NaN if it is not reported."""
@@ -128,6 +130,10 @@ class Findings:
             if taken and taken >= NEARLY_CONSTANT * counts.total():
                 found[action] += 1
         return found
+
+    def estimate(self, statistic: Callable[..., float], *samples: Runs, about: Sequence[str | None]) -> Estimate:
+        """Returns a statistic of samples with its bootstrap interval; `about` names what it is, and seeds the draws."""
+        return bootstrapped(statistic, *samples, generator=generator_of(*about), resamples=self.resamples)
 
     def pairs(self, scenarios: Sequence[str]) -> list[Pair]:
         """Compares every arm with every rival, under each algorithm, over scenarios in which both have results.
@@ -145,12 +151,12 @@ class Findings:
     def _pair(self, ours: Line, rival: Line, scenarios: Sequence[str]) -> Pair:
         runs = self.scaled_runs if len(scenarios) > 1 else self.raw_runs
         samples = (runs(ours, scenarios), runs(rival, scenarios))
-        draws = partial(generator_of, *scenarios, *ours, *rival)
+        about = (*scenarios, *ours, *rival)
         return Pair(
             ours,
             rival,
-            bootstrapped(probability_of_improvement, *samples, generator=draws("probability")),
-            bootstrapped(gain, *samples, generator=draws("gain")),
+            self.estimate(probability_of_improvement, *samples, about=("probability", *about)),
+            self.estimate(gain, *samples, about=("gain", *about)),
         )
 
     def raw_runs(self, line: Line, scenarios: Sequence[str]) -> Runs:
@@ -176,7 +182,7 @@ class Findings:
         if any((scenario, end) not in self.results for end in ends):
             return None
         high, low = ([self.runs(scenario, end)] for end in ends)
-        return bootstrapped(gain, high, low, generator=generator_of("headroom", scenario, algorithm))
+        return self.estimate(gain, high, low, about=("headroom", scenario, algorithm))
 
     def headroom_used(self, scenario: str, line: Line) -> Estimate | None:
         """Returns the share of the headroom that an arm uses; None where there is none to be seen.
@@ -189,7 +195,7 @@ class Findings:
             return None
         ends = [Line(name, line.algorithm) for name in (self.study.floor, self.study.ceiling)]
         samples = [[self.runs(scenario, x)] for x in (line, *ends)]
-        return bootstrapped(share_of_headroom, *samples, generator=generator_of("share", scenario, *line))
+        return self.estimate(share_of_headroom, *samples, about=("share", scenario, *line))
 
     def best_constant(self, scenario: str) -> Line | None:
         """Returns the best of the drivers that take one action in every step; None if there is none."""

@@ -129,7 +129,7 @@ def _profile_panel(ax: Axes, findings: Findings, runs: Mapping[Line, Any], title
     margin = 0.05 * (np.ptp(scores) or 1.0)
     thresholds = np.linspace(scores.min() - margin, scores.max() + margin, _THRESHOLDS)
     for line, found in runs.items():
-        band = profile_band(found, thresholds, generator_of("profile", title, *line))
+        band = profile_band(found, thresholds, generator_of("profile", title, *line), findings.resamples)
         count = sum(len(one) for one in found)
         label = f"{findings.label(line)} (n = {count})"
         style = style_of(_index(findings, line))

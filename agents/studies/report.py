@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from agents.studies.document import PICTURES, Block, Code, Heading, Paragraph, Picture, Table, as_html, as_markdown
-from agents.studies.findings import NEARLY_CONSTANT, Findings, Line, generator_of
+from agents.studies.findings import NEARLY_CONSTANT, Findings, Line
 from agents.studies.pictures import learning_curves, profiles
-from agents.studies.statistics import Estimate, bootstrapped, interquartile_mean
+from agents.studies.statistics import Estimate, interquartile_mean
 from predictor.support.files import write_text
 
 REPORT, PAGE, HEADROOM = Path("report.md"), Path("report.html"), Path("headroom.md")
@@ -108,7 +108,7 @@ def _scenario(findings: Findings, scenario: str) -> list[Block]:
                 str(len(runs)) if trained else NOTHING,
                 interval(findings.mean_return(scenario, line)),
                 interval(findings.middle_return(scenario, line)) if trained else NOTHING,
-                NOTHING if crashes is None else interval(crashes, 0, 100, " %"),
+                NOTHING if crashes is None else interval(crashes, 0, 100.0, " %"),
                 _number(findings.mean_of(scenario, line, "length")),
                 _number(findings.mean_of(scenario, line, "mean_speed_mps")),
             ]
@@ -178,7 +178,7 @@ def _headroom(findings: Findings) -> list[Block]:
 
 def _share(findings: Findings, scenario: str, line: Line) -> str:
     used = findings.headroom_used(scenario, line) if (scenario, line) in findings.results else None
-    return NOTHING if used is None else interval(used, 0, 100, " %")
+    return NOTHING if used is None else interval(used, 0, 100.0, " %")
 
 
 def _return_of(findings: Findings, scenario: str, line: Line | None) -> str:
@@ -192,7 +192,7 @@ def _all_scenarios(findings: Findings) -> list[Block]:
     lines = []
     for line in findings.common_lines():
         runs = findings.scaled_runs(line, findings.scenarios)
-        middle = bootstrapped(interquartile_mean, runs, generator=generator_of("all", *line))
+        middle = findings.estimate(interquartile_mean, runs, about=("all", *line))
         lines.append([findings.label(line), str(sum(len(found) for found in runs)), interval(middle)])
     told = "Rescaled scores: 0 is the lowest and 1 the highest mean return of any line of the scenario's table."
     table = Table(["policy", "runs", "interquartile mean of rescaled scores"], lines)

@@ -17,6 +17,10 @@ MADE = {"command": "python -m agents.study", "commit": "abc", "machine": "m", "t
 ZEROS, SEEN, ORACLE = Line("zeros", "ppo"), Line("forecast", "ppo"), Line("oracle", "ppo")
 
 
+def found_in(study: Study, results: list[Result]) -> Findings:
+    return Findings.of(study, results, resamples=100)
+
+
 def study(scenarios: tuple[str, ...] = ("one",), **changes: Any) -> Study:
     arms = tuple(Arm(name, "none", {}) for name in ("zeros", "forecast", "oracle"))
     made = tuple(Scenario(name, "toy-v0", {}, 10, 1, ()) for name in scenarios)
@@ -33,7 +37,7 @@ def results(scenario: str = "one", lift: float = 0.0) -> list[Result]:
 
 
 def test_runs_are_scored_by_their_means():
-    findings = Findings.of(study(), results())
+    findings = found_in(study(), results())
     assert findings.runs("one", SEEN).tolist() == [4.5, 5.0, 5.5]
     found = findings.mean_return("one", SEEN)
     half = 4.302652729911275 * 0.5 / np.sqrt(3)
@@ -44,31 +48,31 @@ def test_runs_are_scored_by_their_means():
 
 
 def test_headroom_is_shared_where_there_is_some():
-    findings = Findings.of(study(), results())
+    findings = found_in(study(), results())
     headroom, used = findings.headroom("one", "ppo"), findings.headroom_used("one", SEEN)
     assert headroom is not None and headroom.value == 8.0 and headroom.low > 7
     assert used is not None and used.value == pytest.approx(3 / 8) and used.low < 3 / 8 < used.high
     level = [r for r in results() if r.arm != "oracle"]
     level += [result("oracle", [2 + d, 2 - d], seed) for seed, d in enumerate((3.0, 0.0, 1.0))]
-    assert Findings.of(study(), level).headroom_used("one", SEEN) is None, "the same mean as zeros"
-    assert Findings.of(study(), results()[:-3]).headroom("one", "ppo") is None, "no oracle"
+    assert found_in(study(), level).headroom_used("one", SEEN) is None, "the same mean as zeros"
+    assert found_in(study(), results()[:-3]).headroom("one", "ppo") is None, "no oracle"
 
 
 def test_pairs_are_those_with_the_rivals():
-    (seen, oracle) = Findings.of(study(), results()).pairs(["one"])
+    (seen, oracle) = found_in(study(), results()).pairs(["one"])
     assert (seen.ours, seen.rival, oracle.ours) == (SEEN, ZEROS, ORACLE)
     assert seen.probability == (1.0, 1.0, 1.0) and seen.gain.value == 3.0
-    assert Findings.of(study(rivals=()), results()).pairs(["one"]) == []
+    assert found_in(study(rivals=()), results()).pairs(["one"]) == []
 
 
 def test_references_are_told_apart():
-    findings = Findings.of(study(), results())
+    findings = found_in(study(), results())
     assert findings.best_constant("one") == Line("slower", None)
     assert findings.planner("one") == Line("planner", None)
 
 
 def test_scores_of_several_scenarios_are_rescaled():
-    findings = Findings.of(study(("one", "two")), results() + results("two", lift=2.0))
+    findings = found_in(study(("one", "two")), results() + results("two", lift=2.0))
     scaled = findings.scaled_runs(SEEN, ["one", "two"])
     assert [float(np.mean(runs)) for runs in scaled] == pytest.approx([3 / 8, 5 / 8]), "2 is the lowest, 10 the highest"
 
@@ -76,19 +80,19 @@ def test_scores_of_several_scenarios_are_rescaled():
 def test_a_run_that_takes_one_action_is_called_constant():
     episodes = tuple({**e, "action_counts": {"slower": 19, "idle": 1}} for e in result("zeros", [1.0], 0).episodes)
     made = [result("zeros", [1.0], 0, episodes=episodes), result("zeros", [1.0], 1)]
-    assert Findings.of(study(), made).constant_runs("one", ZEROS) == {"slower": 1}
+    assert found_in(study(), made).constant_runs("one", ZEROS) == {"slower": 1}
 
 
 def test_an_interval_does_not_depend_on_other_arms():
     alone = [r for r in results() if r.arm == "forecast"]
-    assert Findings.of(study(), alone).middle_return("one", SEEN) == Findings.of(study(), results()).middle_return(
+    assert found_in(study(), alone).middle_return("one", SEEN) == found_in(study(), results()).middle_return(
         "one", SEEN
     )
 
 
 def written(folder: Path, found: list[Result], **changes: Any) -> tuple[str, str]:
     scenarios = tuple(dict.fromkeys(r.scenario for r in found))
-    write_report(folder, Findings.of(study(scenarios, **changes), found), 'arms = ["zeros"]\n', MADE, [])
+    write_report(folder, found_in(study(scenarios, **changes), found), 'arms = ["zeros"]\n', MADE, [])
     return (folder / "report.md").read_text(), (folder / "report.html").read_text()
 
 
@@ -129,7 +133,7 @@ def test_reports_of_equal_results_are_equal(tmp_path: Path):
 
 
 def test_what_failed_is_named(tmp_path: Path):
-    write_report(tmp_path, Findings.of(study(), results()[:-1]), "", MADE, ["one, oracle, ppo, seed 2"])
+    write_report(tmp_path, found_in(study(), results()[:-1]), "", MADE, ["one, oracle, ppo, seed 2"])
     text = (tmp_path / "report.md").read_text()
     assert "Without a result: one, oracle, ppo, seed 2." in text and "| oracle | 2 |" in text
 
@@ -140,13 +144,13 @@ def test_drivers_alone_make_a_report(tmp_path: Path):
 
 
 def test_headroom_alone(tmp_path: Path):
-    text = write_headroom(tmp_path, Findings.of(study(), results()), MADE)
+    text = write_headroom(tmp_path, found_in(study(), results()), MADE)
     assert "| scenario | best constant action | planner | zeros | oracle | headroom | forecast uses |" in text
     assert "minutes of a training" in text
     assert "## Provenance" in (tmp_path / "headroom.md").read_text()
 
 
 def test_intervals_as_text():
-    assert interval(Estimate(0.25, 0.1, 0.4), 0, 100, " %") == "25 % (10 to 40)"
+    assert interval(Estimate(0.25, 0.1, 0.4), 0, 100.0, " %") == "25 % (10 to 40)"
     assert interval(Estimate(1.0, float("nan"), float("nan"))) == "1.00"
     assert interval(Estimate(float("nan"), 0.0, 0.0)) == "–"
