@@ -125,15 +125,15 @@ def _profile_panel(ax: Axes, findings: Findings, runs: Mapping[Line, Any], title
     ax.set_ylim(-0.02, 1.02)
     if not runs:
         return
+    counts = sorted({sum(len(one) for one in found) for found in runs.values()})
+    ax.set_title(f"{title}, n = {' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))}")
     scores = np.concatenate([np.concatenate(list(found)) for found in runs.values()])
     margin = 0.05 * (np.ptp(scores) or 1.0)
     thresholds = np.linspace(scores.min() - margin, scores.max() + margin, _THRESHOLDS)
     for line, found in runs.items():
         band = profile_band(found, thresholds, generator_of("profile", title, *line), findings.resamples)
-        count = sum(len(one) for one in found)
-        label = f"{findings.label(line)} (n = {count})"
         style = style_of(_index(findings, line))
-        plot_profile(ax, thresholds, performance_profile(found, thresholds), *band, label, **style)
+        plot_profile(ax, thresholds, performance_profile(found, thresholds), *band, findings.label(line), **style)
 
 
 def _references(findings: Findings, scenario: str) -> dict[str, float]:

@@ -258,6 +258,7 @@ class Killed(Exception):
     """Stands for a kill."""
 
 
+@pytest.mark.filterwarnings("ignore:rich is experimental")
 @pytest.mark.parametrize(
     ("algorithm", "task", "preset"),
     [

@@ -98,7 +98,7 @@ def written(folder: Path, found: list[Result], **changes: Any) -> tuple[str, str
 
 def test_the_report_says_what_was_found(tmp_path: Path):
     text, page = written(tmp_path, results())
-    assert "| forecast | 3 | 5.00 (3.76 to 6.24) | 5.00 (4.50 to 5.50) | 50 % (50 to 50) | 10.0 | 20.0 |" in text
+    assert "| forecast | 3 | 5.00 (3.76 to 6.24) | 5.00 (4.67 to 5.33) | 50 % (50 to 50) | 10.0 | 20.0 |" in text
     assert "| slower | – | 4.00 (-8.71 to 16.71) | – |" in text
     assert "| forecast > zeros | one | 1.00 (1.00 to 1.00) | 3.00" in text
     assert re.search(r"\| one \| slower: 4.00 .* \| 7.00 .* \| 2.00 .* \| 10.00 .* \| 8.00 .* \| 38 % \(", text)
