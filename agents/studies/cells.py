@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.arena import open_arena
 from agents.presets import Algorithm
@@ -120,7 +121,8 @@ def cells_of(study: Study, where: str) -> list[Cell]:
 def run_cell(cell: Cell, folder: Path) -> Result:
     """Trains from where an earlier start was stopped, plays the test seeds, writes the result into the folder."""
     torch.set_num_threads(1)
-    trained_s, policy, curve = 0.0, None, list[dict[str, Any]]()
+    policy: BaseAlgorithm | None = None
+    trained_s, curve = 0.0, list[dict[str, Any]]()
     if cell.plan is not None:
         run = folder / RUN_FOLDER
         free = (FORECASTER, "device", "checkpoint")  # the folder's name has the forecaster's hash

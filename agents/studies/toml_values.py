@@ -3,7 +3,7 @@
 import dataclasses
 import types
 from collections.abc import Mapping
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from predictor.support.errors import UserError
 
@@ -26,8 +26,8 @@ def from_table(
     Raises:
         UserError: an unknown or missing key, a value of another type, or one that the dataclass refuses.
     """
-    given = given or {}
-    known = {field.name: field for field in dataclasses.fields(kind) if field.name not in given}  # type: ignore[arg-type]
+    given, make = given or {}, cast(Any, kind)
+    known = {field.name: field for field in dataclasses.fields(make) if field.name not in given}
     hints = get_type_hints(kind)
     for key in table:
         if key not in known:
@@ -38,7 +38,7 @@ def from_table(
             raise UserError(f"{where}: key '{name}' is missing")
     values = {key: converted(value, hints[key], f"{where}: {key}") for key, value in table.items()}
     try:
-        return kind(**given, **values)
+        return cast(Table, make(**given, **values))
     except UserError as error:
         raise UserError(f"{where}: {error}") from error
 
