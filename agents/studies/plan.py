@@ -243,7 +243,8 @@ def _arm(entry: Any, where: str) -> Arm:
         raise UserError(f"{where} must hold names or tables with a name, got {entry!r}")
     name = table["name"]
     _check_name(name, where)
-    observe, known = table.get("observe", name), get_args(Observe)
+    observe: Any = table.get("observe", name)
+    known = get_args(Observe)
     if observe not in known:
         missing = "" if "observe" in table else "; a table with another name needs the key observe"
         raise UserError(f"{where}: unknown arm {observe!r}; there are {', '.join(known)}{missing}")
