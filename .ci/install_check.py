@@ -79,6 +79,8 @@ EXTRAS: dict[str, Extra] = {
     ),
     "study": Extra(
         (
+            "agents.study --list",
+            "\nfrom agents.studies.report import write_report\n",
             "agents.evaluate --policy idle --env-id highway-fast-v0 --episodes 2 --num-envs 1 --out study",
             "\nimport pyarrow.parquet\nassert pyarrow.parquet.read_table('study/episodes.parquet').num_rows == 12\n",
         ),

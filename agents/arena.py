@@ -39,13 +39,14 @@ class EgoArena:
     Args:
         task: environment and what the policy sees.
         num_envs: number of parallel environments.
+        in_process: whether they run in this process.
     """
 
     baselines = ("random", "idle")
 
-    def __init__(self, task: Task, num_envs: int) -> None:
+    def __init__(self, task: Task, num_envs: int, in_process: bool = False) -> None:
         """Starts the environments."""
-        self._venv = make_venv(replace(task, backend="gymnasium"), num_envs, seeded=True)
+        self._venv = make_venv(replace(task, backend="gymnasium"), num_envs, seeded=True, in_process=in_process)
 
     def play(
         self, policy: BaseAlgorithm | str, seeds: Sequence[int], on_episode: Callable[[], None] = lambda: None
@@ -60,9 +61,9 @@ class EgoArena:
         self._venv.close()
 
 
-def open_arena(task: Task, num_envs: int) -> Arena:
-    """Returns the arena that fits a task."""
-    return MultiagentArena(task) if task.is_multiagent else EgoArena(task, num_envs)
+def open_arena(task: Task, num_envs: int, in_process: bool = False) -> Arena:
+    """Returns the arena that fits a task; `in_process` keeps all of its environments in this process."""
+    return MultiagentArena(task) if task.is_multiagent else EgoArena(task, num_envs, in_process)
 
 
 def run_episodes(

@@ -4,9 +4,12 @@
 Those seeds are disjoint from training and from the final evaluation, so selection does not bias the final numbers.
 """
 
+import json
+import time
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +22,13 @@ from stable_baselines3.common.vec_env import VecEnv
 from agents.arena import Arena, open_arena
 from agents.features import AttentionConfig, ForecastAttention
 from agents.presets import Algorithm, PPOPreset, Preset, preset_for
-from agents.runs import BEST_FILE, CHECKPOINT_FILE, POLICY_FILE, load_model, save_model
+from agents.runs import BEST_FILE, CHECKPOINT_FILE, CURVE_FILE, POLICY_FILE, load_model, save_model
 from agents.task import SELECTION_SEED, Task
-from agents.vec_envs import make_venv
+from agents.vec_envs import EpisodeResult, make_venv
 from envs.sb3.policy_file import ALGORITHMS, PolicyNote, read_note
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError
-from predictor.support.files import copy_file
+from predictor.support.files import copy_file, write_json
 from predictor.support.runtime import resolve_device
 
 _NORMAL_95 = 1.959963984540054  # two-sided 95 % quantile of the normal distribution
@@ -55,6 +58,11 @@ class TrainingPlan:
     """Number of parallel environments that measure the policy."""
     checkpoint_every: int = 2_000
     """Number of environment steps between checkpoints."""
+    in_process: bool = False
+    """Whether all environments run in the process that trains, for several trainings side by side."""
+    repeatable: bool = False
+    """Whether a run that was stopped and resumed equals one that was not: environments and random streams then start
+    anew at every checkpoint."""
 
     def __post_init__(self) -> None:
         """Checks choices and ranges; replaces `device="auto"` by the device that is taken."""
@@ -94,8 +102,8 @@ def train(plan: TrainingPlan, run_dir: Path) -> Path:
         Path of the final policy, `run_dir/policy.zip`.
     """
     note = plan.task.note  # loads the forecaster, which draws random numbers: before the model is seeded
-    venv = make_venv(plan.task, plan.num_envs)
-    selection = open_arena(plan.task, min(plan.selection_envs, plan.selection_episodes))
+    venv = make_venv(plan.task, plan.num_envs, in_process=plan.in_process)
+    selection = open_arena(plan.task, min(plan.selection_envs, plan.selection_episodes), plan.in_process)
     try:
         model = _resume_or_make(plan, venv, run_dir)
         if model.num_timesteps < plan.steps:
@@ -111,12 +119,21 @@ def train(plan: TrainingPlan, run_dir: Path) -> Path:
 def _learn(plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: Path, note: PolicyNote) -> None:
     """Trains for the remaining steps, with SB3's progress bar."""
     every = max(plan.steps // plan.selections, 1)
+    checkpoint = run_dir / CHECKPOINT_FILE
+    restart = partial(_restart_streams, plan, model) if plan.repeatable else None
     progress = ProgressBarCallback()
-    callbacks = [
-        SaveCheckpoint(run_dir / CHECKPOINT_FILE, plan.checkpoint_every, note),
-        SelectBest(selection, run_dir / BEST_FILE, plan.selection_episodes, every, note),
-        progress,
-    ]
+    select = SelectBest(
+        selection,
+        run_dir / BEST_FILE,
+        plan.selection_episodes,
+        every,
+        note,
+        curve=run_dir / CURVE_FILE,
+        at_multiples=plan.repeatable,
+        seconds=read_note(checkpoint).get("seconds", 0.0),
+    )
+    save = SaveCheckpoint(checkpoint, plan.checkpoint_every, note, lambda: {"seconds": select.seconds}, restart)
+    callbacks = [save, select, progress]
     try:
         model.learn(
             plan.steps - model.num_timesteps,
@@ -169,20 +186,40 @@ def _resume_or_make(plan: TrainingPlan, venv: VecEnv, run_dir: Path) -> BaseAlgo
         return make_model(plan, venv, logs)
     model = load_model(checkpoint, plan.algorithm, venv, plan.device)
     model.tensorboard_log = logs  # the folder may have moved
-    # The episodes after a resume are new ones, still a function of the seed.
+    _seed_from_steps(plan, model)
+    return model
+
+
+def _seed_from_steps(plan: TrainingPlan, model: BaseAlgorithm) -> None:
+    """Seeds a model for the episodes from its current step on: new ones, still a function of the plan's seed."""
     fresh = np.random.SeedSequence([plan.seed, model.num_timesteps]).generate_state(1)[0]
     model.set_random_seed(int(fresh) % SELECTION_SEED)
-    return model
+
+
+def _restart_streams(plan: TrainingPlan, model: BaseAlgorithm) -> None:
+    """Puts a running training where a resumed one begins: random streams of its step, environments reset."""
+    assert model.env is not None
+    _seed_from_steps(plan, model)
+    model._last_obs = model.env.reset()  # type: ignore[assignment]
+    model._last_episode_starts = np.ones(model.env.num_envs, dtype=bool)
 
 
 class SaveCheckpoint(BaseCallback):
     """Keeps the latest model on disk, taken between updates so that no collected step is lost or counted twice."""
 
-    def __init__(self, path: Path, every_steps: int, note: PolicyNote | None = None) -> None:
-        """Saves to `path` about every `every_steps` environment steps, with the note inside."""
+    def __init__(
+        self,
+        path: Path,
+        every_steps: int,
+        note: PolicyNote | None = None,
+        extra: Callable[[], dict[str, Any]] = dict,
+        after: Callable[[], None] | None = None,
+    ) -> None:
+        """Saves to `path` about every `every_steps` environment steps, note and `extra` inside; then calls `after`."""
         super().__init__()
         self._note = note
         self._path, self._every = path, every_steps
+        self._extra, self._after = extra, after
         self._saved_at = 0
 
     def _on_training_start(self) -> None:
@@ -191,7 +228,9 @@ class SaveCheckpoint(BaseCallback):
     def _on_rollout_start(self) -> None:
         if self.model.num_timesteps - self._saved_at >= self._every:
             self._saved_at = self.model.num_timesteps
-            save_model(self.model, self._path, note=self._note, buffer=True)
+            save_model(self.model, self._path, self._extra(), self._note, buffer=True)
+            if self._after is not None:
+                self._after()
 
     def _on_step(self) -> bool:
         return True
@@ -210,18 +249,41 @@ class SelectBest(BaseCallback):
         num_episodes: number of episodes per measurement.
         every_steps: number of environment steps between measurements; there is always one at the end.
         note: what the policy needs beside its weights.
+        curve: path of a JSON file with a line per measurement, written atomically; None writes none.
+        at_multiples: whether to measure at the multiples of `every_steps`, wherever the training was resumed.
+        seconds: time that was learned before this start [s].
+
+    Attributes:
+        seconds: time that was learned, without measurements [s].
     """
 
     def __init__(
-        self, arena: Arena, path: Path, num_episodes: int, every_steps: int, note: PolicyNote | None = None
+        self,
+        arena: Arena,
+        path: Path,
+        num_episodes: int,
+        every_steps: int,
+        note: PolicyNote | None = None,
+        *,
+        curve: Path | None = None,
+        at_multiples: bool = False,
+        seconds: float = 0.0,
     ) -> None:
         """Prepares the measurements; none is made yet."""
         super().__init__()
         self._note = note
         self._arena, self._path, self._every = arena, path, every_steps
+        self._curve, self._at_multiples, self._learned_s = curve, at_multiples, seconds
         self._seeds = range(SELECTION_SEED, SELECTION_SEED + num_episodes)
         self._measured_at = 0
         self._highest: list[float] = []
+        self._points: list[dict[str, Any]] = []
+        self._since = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Time that was learned, without measurements [s]."""
+        return self._learned_s + time.perf_counter() - self._since
 
     def _on_training_start(self) -> None:
         """Continues from the results inside an existing file."""
@@ -230,9 +292,16 @@ class SelectBest(BaseCallback):
             self._highest = list(read_note(self._path).get("highest_returns", []))
         except zipfile.BadZipFile as error:
             raise UserError(f"{self._path} is damaged; remove it to go on without it") from error
+        if self._curve is not None:
+            self._points = [p for p in read_curve(self._curve) if p["steps"] <= self._measured_at]
+        self._since = time.perf_counter()
 
     def _on_step(self) -> bool:
-        if self.num_timesteps - self._measured_at >= self._every:
+        if self._at_multiples:
+            due = self.num_timesteps // self._every > self._measured_at // self._every
+        else:
+            due = self.num_timesteps - self._measured_at >= self._every
+        if due:
             self._measure()
         return True
 
@@ -241,10 +310,20 @@ class SelectBest(BaseCallback):
             self._measure()
 
     def _measure(self) -> None:
-        self._measured_at = self.num_timesteps
+        """Plays the seeds, keeps the model unless it is worse, and adds a point to the curve."""
+        self._measured_at, self._learned_s = self.num_timesteps, self.seconds
         results = self._arena.play(self.model, self._seeds)
+        mean = float(np.mean([r.episode_return for r in results]))
+        self._keep(results, mean)
+        if self._curve is not None:
+            self._points.append(
+                {"steps": self.num_timesteps, "return": mean, "episodes": len(results), "seconds": self._learned_s}
+            )
+            write_json(self._curve, self._points)
+        self._since = time.perf_counter()
+
+    def _keep(self, results: Sequence[EpisodeResult], mean: float) -> None:
         returns = [r.episode_return for r in results]
-        mean = float(np.mean(returns))
         self.logger.record("eval/mean_reward", mean)
         self.logger.record("eval/mean_ep_length", float(np.mean([r.length for r in results])))
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
@@ -256,6 +335,18 @@ class SelectBest(BaseCallback):
             self._highest = returns
         extra = {"selection_return": mean, "steps": self.num_timesteps, "highest_returns": self._highest}
         save_model(self.model, self._path, extra, self._note)
+
+
+def read_curve(path: Path) -> list[dict[str, Any]]:
+    """Reads the measurements of a training, in the order of their steps; none if there is no such file.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    try:
+        return json.loads(path.read_text()) if path.exists() else []
+    except ValueError as error:
+        raise UserError(f"{path} is damaged; remove it to go on without it") from error
 
 
 def significantly_worse(returns: Sequence[float], best: Sequence[float]) -> bool:

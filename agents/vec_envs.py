@@ -143,7 +143,7 @@ def make_multiagent_venv(task: Task, copies: int) -> AgentMonitor:
     return AgentMonitor(ParallelVecEnv([make] * copies, agents=learners, partner=partner))
 
 
-def make_venv(task: Task, num_envs: int, seeded: bool = False) -> VecEnv:
+def make_venv(task: Task, num_envs: int, seeded: bool = False, in_process: bool = False) -> VecEnv:
     """Makes the parallel environments of a task, with episode statistics and (unless `observe` is none) forecasts.
 
     Args:
@@ -151,6 +151,7 @@ def make_venv(task: Task, num_envs: int, seeded: bool = False) -> VecEnv:
         num_envs: number of environments. With Gymnasium, one runs in this process and several run in spawned ones; of a
             PettingZoo environment it is the number of copies, each with one environment of the vector per learner.
         seeded: whether to wrap each environment in `SeededEpisodes`, for evaluation (gymnasium backend only).
+        in_process: whether several environments run in this process, too.
     """
     if task.is_multiagent:
         return make_multiagent_venv(task, num_envs)
@@ -166,7 +167,8 @@ def make_venv(task: Task, num_envs: int, seeded: bool = False) -> VecEnv:
         )
     else:
         make = _MakeEnv(task, spec, seeded)
-        venv = DummyVecEnv([make]) if num_envs == 1 else SubprocVecEnv([make] * num_envs, start_method="spawn")
+        here = in_process or num_envs == 1
+        venv = DummyVecEnv([make] * num_envs) if here else SubprocVecEnv([make] * num_envs, start_method="spawn")
     if task.observe != "none":
         venv = VecForecast(venv, **task.options)
     return VecMonitor(venv)

@@ -157,6 +157,13 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--run-dir absent --films --episodes 2", "--films needs at least 3 --episodes, got 2"),
         ("--policy idle --env-id merge-v1 --out new --drivers none slower", "--drivers none adds no line and stands"),
     ],
+    "agents.study": [
+        ("--study absent", "no study 'absent': neither a file nor one that ships (quick)"),
+        ("--study file", "file is not valid TOML: "),
+        ("--workers -1", "workers must not be negative, got -1"),
+        ("--out file", "file is a file; choose another --out"),
+        ("--out .", ". holds file but no study (study.toml); choose another --out"),
+    ],
     "train_policy": [
         ("--env-id nope-v0 --observe none", "cannot make env 'nope-v0'"),
         ("--num-envs 0", "num_envs must be at least 1, got 0"),

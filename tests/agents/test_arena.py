@@ -23,7 +23,7 @@ def test_policies_of_envpool_are_measured_on_the_original(monkeypatch: pytest.Mo
     pytest.importorskip("envpool")
     asked: list[tuple[Task, int, bool]] = []
 
-    def note(task: Task, num_envs: int, seeded: bool) -> Any:
+    def note(task: Task, num_envs: int, seeded: bool, in_process: bool) -> Any:
         asked.append((task, num_envs, seeded))
         return make_venv(task, num_envs, seeded)
 

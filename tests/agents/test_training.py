@@ -16,10 +16,11 @@ from agents.features import ForecastAttention
 from agents.presets import PRESETS, Algorithm, DQNPreset, PPOPreset, preset_for
 from agents.runs import save_model
 from agents.task import EVALUATION_SEED, SELECTION_SEED, Task
-from agents.training import SaveCheckpoint, SelectBest, TrainingPlan, make_model, significantly_worse
+from agents.training import SaveCheckpoint, SelectBest, TrainingPlan, make_model, read_curve, significantly_worse, train
 from agents.vec_envs import EpisodeResult, SeededEpisodes, make_venv
 from envs.sb3.policy_file import _MARKS, ALGORITHMS, read_note
 from predictor.support.errors import UserError
+from tests.agents.studies.helpers import TOY
 
 CONSTANT_VELOCITY = Task("highway-fast-v0", "constant-velocity")
 
@@ -44,7 +45,7 @@ class Coin(gym.Env[np.ndarray, np.int64]):
 def make_selection(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], EgoArena]:
     """Function from a number of environments to an arena of coins."""
 
-    def make_venv(task: Task, num_envs: int, seeded: bool) -> VecMonitor:
+    def make_venv(task: Task, num_envs: int, seeded: bool, in_process: bool) -> VecMonitor:
         assert seeded
         return VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Coin())] * num_envs))
 
@@ -252,3 +253,65 @@ def test_a_batch_is_never_larger_than_a_rollout():
     model = make_model(few, venv)
     assert few.preset.n_steps * 2 < few.preset.batch_size
     assert model.batch_size == few.preset.n_steps * 2
+
+
+class Killed(Exception):
+    """Stands for a kill."""
+
+
+@pytest.mark.filterwarnings("ignore:rich is experimental")
+@pytest.mark.parametrize(
+    ("algorithm", "task", "preset"),
+    [
+        ("ppo", CONSTANT_VELOCITY, PPOPreset(n_steps=8, batch_size=8, n_epochs=2, net_arch=(8,))),
+        ("dqn", Task(TOY, "none"), DQNPreset(learning_starts=8, batch_size=4, net_arch=(8,))),
+    ],
+)
+def test_a_repeatable_run_that_was_killed_ends_as_one_that_was_not(
+    algorithm: Algorithm, task: Task, preset: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Killed right after a measurement that no checkpoint has seen; every weight and every point is as without."""
+    monkeypatch.setattr("agents.training.preset_for", lambda *_: preset)
+    sizes = {"steps": 64, "num_envs": 2, "selections": 4, "selection_episodes": 1, "selection_envs": 1}
+    training = plan(
+        task=task, algorithm=algorithm, checkpoint_every=24, in_process=True, repeatable=True, seed=5, **sizes
+    )
+    for name in ("whole", "killed"):
+        (tmp_path / name).mkdir()
+    train(training, tmp_path / "whole")
+
+    measure, left = SelectBest._measure, [3]
+
+    def measure_and_die(self: SelectBest) -> None:
+        measure(self)
+        left[0] -= 1
+        if left[0] == 0:
+            raise Killed
+
+    monkeypatch.setattr(SelectBest, "_measure", measure_and_die)
+    with pytest.raises(Killed):
+        train(training, tmp_path / "killed")
+    saved = ALGORITHMS[algorithm].load(tmp_path / "killed" / "checkpoint.zip", device="cpu").num_timesteps
+    assert 0 < saved < 48, "the last measurement is younger than the checkpoint"
+    train(training, tmp_path / "killed")
+
+    whole, killed = (
+        ALGORITHMS[algorithm].load(tmp_path / n / "checkpoint.zip", device="cpu") for n in ("whole", "killed")
+    )
+    assert whole.num_timesteps == killed.num_timesteps >= 64
+    for name, weights in whole.policy.state_dict().items():
+        assert torch.equal(weights, killed.policy.state_dict()[name]), name
+    points = [
+        [{k: v for k, v in p.items() if k != "seconds"} for p in read_curve(tmp_path / n / "curve.json")]
+        for n in ("whole", "killed")
+    ]
+    assert points[0] == points[1] and [p["steps"] for p in points[0]] == [16, 32, 48, 64]
+    notes = [read_note(tmp_path / n / "policy.zip") for n in ("whole", "killed")]
+    assert notes[0] == notes[1]
+
+
+def test_a_damaged_curve_is_named(tmp_path: Path):
+    (tmp_path / "curve.json").write_text("[{")
+    with pytest.raises(UserError, match="curve.json is damaged; remove it to go on without it"):
+        read_curve(tmp_path / "curve.json")
+    assert read_curve(tmp_path / "absent.json") == []

@@ -1,0 +1,237 @@
+"""Cells of a study: one training under one seed, or one driver, measured on the test seeds.
+
+A cell is named by a hash of everything that determines its result, so that a change of the study runs what it changed
+and keeps the rest. A cell that was killed goes on from its checkpoint and ends as if it had not been (`repeatable` in
+`agents.training`).
+"""
+
+import functools
+import hashlib
+import importlib.metadata
+import json
+import shlex
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from agents.arena import open_arena
+from agents.presets import Algorithm
+from agents.runs import CURVE_FILE, FORECASTER, load_model, open_run
+from agents.studies.plan import Arm, Scenario, Study, task_of
+from agents.studies.results import RESULT_FILE, Result, write_result
+from agents.task import EVALUATION_SEED, Task
+from agents.training import TrainingPlan, read_curve, train
+from envs.drivers.all_agents import make_driver
+from envs.drivers.ego import make_ego_driver, named_drivers
+from envs.drivers.planner import PLANNER, is_planner
+from envs.registry import checkpoint_for, make_env, make_multiagent_env
+from predictor.checkpoint import CONSTANT_VELOCITY, WEIGHTS, resolve
+from predictor.support.errors import UserError
+from predictor.support.provenance import provenance
+
+PACKAGES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2", "torch", "numpy")
+RULES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2")
+"""Packages whose versions are part of a cell's name: the simulators and the learning algorithms."""
+MEASURING = 1
+"""Number of the way of running and measuring; a cell of another one is another cell."""
+RUN_FOLDER = "run"
+LOG_FILE = "log.txt"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Training under one seed, or a driver, in one scenario."""
+
+    scenario: str
+    """Name of the scenario."""
+    line: str
+    """Name of the arm, or of the driver."""
+    task: Task
+    """Environment, and what the policy is shown; drivers are shown nothing."""
+    plan: TrainingPlan | None
+    """Plan of the training; None for a driver."""
+    episodes: int
+    """Number of test episodes."""
+    forecaster: Mapping[str, Any] | None
+    """Pin of the forecaster whose forecasts are shown, or by which the planner drives; None if there is none."""
+
+    @property
+    def algorithm(self) -> Algorithm | None:
+        """Learning algorithm; None for a driver."""
+        return None if self.plan is None else self.plan.algorithm
+
+    @property
+    def seed(self) -> int | None:
+        """Training seed; None for a driver."""
+        return None if self.plan is None else self.plan.seed
+
+    @property
+    def title(self) -> str:
+        """Name in messages."""
+        trained = "" if self.plan is None else f", {self.plan.algorithm}, seed {self.plan.seed}"
+        return f"{self.scenario}, {self.line}{trained}"
+
+    @functools.cached_property
+    def name(self) -> str:
+        """Name of the cell's folder; it ends with a hash of everything that determines the result."""
+        parts = [self.scenario, self.line, *([] if self.plan is None else [self.plan.algorithm, str(self.plan.seed)])]
+        written = json.dumps(self.content, sort_keys=True, default=str)
+        digest = hashlib.sha256(written.encode()).hexdigest()[:10]
+        return "".join(sign if sign.isalnum() or sign in ".-_" else "-" for sign in f"{'.'.join(parts)}-{digest}")
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """Everything that determines the result, as JSON content."""
+        task = {key: value for key, value in asdict(self.task).items() if key not in ("device", "checkpoint")}
+        content: dict[str, Any] = {
+            "measuring": MEASURING,
+            "task": task,
+            "forecaster": None if self.forecaster is None else {**self.forecaster, "checkpoint": None},
+            "test": [EVALUATION_SEED, self.episodes],
+            "versions": {name: _version(name) for name in RULES},
+        }
+        if self.plan is None:
+            return content | {"driver": self.line}
+        skipped = ("task", "device", "in_process", "selection_envs")
+        values = {key: value for key, value in asdict(self.plan).items() if key not in skipped}
+        return content | {"plan": values, "preset": asdict(self.plan.preset)}
+
+
+def cells_of(study: Study, where: str) -> list[Cell]:
+    """Returns all cells of a study: in each scenario the drivers first, then each arm under each algorithm and seed.
+
+    Raises:
+        UserError: an environment, a checkpoint, a driver or an algorithm does not fit; the message begins with `where`.
+    """
+    cells: list[Cell] = []
+    for scenario in study.scenarios:
+        cells += _drivers(study, scenario, where)
+        for arm in study.arms:
+            cells += _trainings(study, scenario, arm, where)
+    return cells
+
+
+def run_cell(cell: Cell, folder: Path) -> Result:
+    """Trains from where an earlier start was stopped, plays the test seeds, writes the result into the folder."""
+    torch.set_num_threads(1)
+    policy: BaseAlgorithm | None = None
+    trained_s, curve = 0.0, list[dict[str, Any]]()
+    if cell.plan is not None:
+        run = folder / RUN_FOLDER
+        free = (FORECASTER, "device", "checkpoint")  # the folder's name has the forecaster's hash
+        open_run(run, _run_config(cell), provenance(PACKAGES, _command()), resume=True, free=free)
+        policy = load_model(train(cell.plan, run), cell.plan.algorithm)
+        curve = read_curve(run / CURVE_FILE)
+        trained_s = curve[-1]["seconds"]
+    began = time.perf_counter()
+    num_envs = 1 if cell.plan is None else min(cell.plan.num_envs, cell.episodes)
+    arena = open_arena(cell.task, num_envs, in_process=True)
+    try:
+        seeds = range(EVALUATION_SEED, EVALUATION_SEED + cell.episodes)
+        episodes = arena.play(cell.line if policy is None else policy, seeds)
+    finally:
+        arena.close()
+    result = Result(
+        cell.scenario,
+        cell.task.env_id,
+        cell.line,
+        cell.algorithm,
+        cell.seed,
+        tuple(asdict(episode) for episode in episodes),
+        tuple(curve),
+        trained_s,
+        time.perf_counter() - began,
+        provenance(PACKAGES, _command()),
+    )
+    write_result(folder / RESULT_FILE, result)
+    return result
+
+
+def _drivers(study: Study, scenario: Scenario, where: str) -> list[Cell]:
+    """Returns the cells of a scenario's references, each checked by making its driver once."""
+    task = task_of(scenario, Arm("none", "none", {}), where)
+    names, place = scenario.references, f"{where}: scenario {scenario.name}"
+    try:
+        task.check()
+        if task.is_multiagent:
+            many = make_multiagent_env(task.env_id)
+            many.reset(seed=0)
+            for name in names:
+                make_driver(name, many, np.random.default_rng(0))
+            many.close()
+        else:
+            env = make_env(task.env_id, disable_env_checker=True)
+            names = named_drivers(names, env)
+            for name in names:
+                make_ego_driver(name, env, np.random.default_rng(0))
+            env.close()
+        return [Cell(scenario.name, name, task, None, study.episodes, _planner_pin(name, task)) for name in names]
+    except UserError as error:
+        raise UserError(f"{place}: {error}") from error
+
+
+def _trainings(study: Study, scenario: Scenario, arm: Arm, where: str) -> list[Cell]:
+    """Returns the cells of an arm in a scenario."""
+    task = task_of(scenario, arm, where)
+    cells = []
+    try:
+        space, pin = task.check(), task.note.forecaster
+        for algorithm in study.algorithms:
+            for seed in study.training_seeds:
+                plan = TrainingPlan(
+                    task,
+                    algorithm,
+                    scenario.steps,
+                    scenario.num_envs,
+                    seed,
+                    task.device,
+                    study.selections,
+                    study.selection_episodes,
+                    min(scenario.num_envs, study.selection_episodes),
+                    study.checkpoint_every,
+                    in_process=True,
+                    repeatable=True,
+                )
+                plan.check_action_space(space)
+                shown = None if pin is None else asdict(pin)
+                cells.append(Cell(scenario.name, arm.name, task, plan, study.episodes, shown))
+    except UserError as error:
+        raise UserError(f"{where}: scenario {scenario.name}, arm {arm.name}: {error}") from error
+    return cells
+
+
+def _planner_pin(name: str, task: Task) -> dict[str, Any] | None:
+    """Returns what the planner's forecasts come from; None for other drivers."""
+    if not is_planner(name):
+        return None
+    checkpoint = name.removeprefix(PLANNER).removeprefix(":") or checkpoint_for(task.env_id)
+    if checkpoint == CONSTANT_VELOCITY:
+        return {"sha256": CONSTANT_VELOCITY}
+    with (resolve(checkpoint) / WEIGHTS).open("rb") as file:
+        return {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+
+
+def _run_config(cell: Cell) -> dict[str, Any]:
+    """Returns the config of the training's folder, as `agents.evaluate` and others read it."""
+    assert cell.plan is not None
+    plan = {key: value for key, value in asdict(cell.plan).items() if key not in ("task", "in_process")}
+    pin = None if cell.forecaster is None else dict(cell.forecaster)
+    return {**asdict(cell.task), **plan, "partner": cell.task.driver, FORECASTER: pin}
+
+
+def _command() -> str:
+    return shlex.join(["python", "-m", "agents.study", *sys.argv[1:]])  # a cell's process has the study's arguments
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"

@@ -1,0 +1,177 @@
+"""Pictures of a study: learning curves and performance profiles. Functions take arrays and an axis and return the axis.
+
+Files are SVG, and equal from run to run.
+"""
+
+import io
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy import stats
+
+from agents.studies.findings import Findings, Line, generator_of
+from agents.studies.statistics import CONFIDENCE, performance_profile, profile_band
+
+_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f7f7f", "#8c564b", "#9467bd")
+_GREYS = (("#777777", "--"), ("#777777", ":"), ("#aaaaaa", "-."))
+_THRESHOLDS = 201
+_WIDTH_IN, _HEIGHT_IN = 5.4, 4.0
+
+
+def style_of(index: int) -> dict[str, Any]:
+    """Returns colour and dashes of the arm with this number; the same arm looks the same in all pictures."""
+    return {"color": _COLORS[index % len(_COLORS)], "ls": ("-", "--", "-.")[index // len(_COLORS) % 3]}
+
+
+def plot_curve(
+    ax: Axes, steps: Float[np.ndarray, " points"], returns: Float[np.ndarray, "runs points"], label: str, **style: Any
+) -> Axes:
+    """Draws the mean return over runs against the steps of training, with its 95 % Student interval.
+
+    Args:
+        ax: axis to draw on.
+        steps: number of environment steps at each measurement.
+        returns: mean return of each run at each measurement.
+        label: name in the legend; the number of runs is added.
+        **style: colour and dashes.
+    """
+    runs = len(returns)
+    centre = returns.mean(axis=0)
+    ax.plot(steps, centre, marker="o", ms=3.5, label=f"{label} (n = {runs})", **style)
+    if runs > 1:
+        half = stats.t.ppf(0.5 + CONFIDENCE / 2, runs - 1) * returns.std(axis=0, ddof=1) / np.sqrt(runs)
+        ax.fill_between(steps, centre - half, centre + half, color=style.get("color"), alpha=0.15, lw=0)
+    return ax
+
+
+def plot_references(ax: Axes, references: Mapping[str, float], upright: bool = False) -> Axes:
+    """Draws the mean return of drivers as grey lines over the whole axis."""
+    draw = ax.axvline if upright else ax.axhline
+    for i, (name, value) in enumerate(references.items()):
+        color, dashes = _GREYS[i % len(_GREYS)]
+        draw(value, color=color, ls=dashes, lw=1.2, label=name, zorder=0)
+    return ax
+
+
+def plot_profile(
+    ax: Axes,
+    thresholds: Float[np.ndarray, " thresholds"],
+    profile: Float[np.ndarray, " thresholds"],
+    low: Float[np.ndarray, " thresholds"],
+    high: Float[np.ndarray, " thresholds"],
+    label: str,
+    **style: Any,
+) -> Axes:
+    """Draws the share of runs above each threshold, with its band."""
+    ax.plot(thresholds, profile, label=label, **style)
+    ax.fill_between(thresholds, low, high, color=style.get("color"), alpha=0.12, lw=0)
+    return ax
+
+
+def learning_curves(findings: Findings) -> str:
+    """Returns the picture of all learning curves, a panel per scenario, as SVG."""
+    figure, axes = _panels(len(findings.scenarios))
+    for ax, scenario in zip(axes, findings.scenarios, strict=True):
+        for line in findings.lines(scenario, trained=True):
+            steps, returns = curve_of(findings, scenario, line)
+            plot_curve(ax, steps, returns, findings.label(line), **style_of(_index(findings, line)))
+        plot_references(ax, _references(findings, scenario))
+        ax.set_title(scenario)
+        ax.set_xlabel("environment steps")
+        ax.set_xlim(left=0)
+    axes[0].set_ylabel("return on the selection seeds")
+    return _svg(figure, axes)
+
+
+def profiles(findings: Findings) -> str:
+    """Returns the picture of the performance profiles as SVG: a panel per scenario, one over all if there are several.
+
+    The panel over all has the arms with runs in every scenario, by rescaled scores.
+    """
+    several = len(findings.scenarios) > 1
+    figure, axes = _panels(len(findings.scenarios) + several)
+    for ax, scenario in zip(axes, findings.scenarios, strict=False):
+        lines = findings.lines(scenario, trained=True)
+        _profile_panel(ax, findings, {line: findings.raw_runs(line, [scenario]) for line in lines}, scenario)
+        plot_references(ax, _references(findings, scenario), upright=True)
+        ax.set_xlabel("return τ")
+    if several:
+        lines = findings.common_lines()
+        scaled = {line: findings.scaled_runs(line, findings.scenarios) for line in lines}
+        _profile_panel(axes[-1], findings, scaled, "all scenarios")
+        axes[-1].set_xlabel("rescaled score τ")
+    axes[0].set_ylabel("share of runs above τ")
+    return _svg(figure, axes)
+
+
+def curve_of(
+    findings: Findings, scenario: str, line: Line
+) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "runs points"]]:
+    """Returns the steps at which every run of a line was measured, and the return of each run there."""
+    curves = [{point["steps"]: point["return"] for point in r.curve} for r in findings.results[scenario, line]]
+    steps = sorted(set.intersection(*(set(curve) for curve in curves)))
+    return np.array(steps, dtype=np.float64), np.array([[curve[step] for step in steps] for curve in curves])
+
+
+def _profile_panel(ax: Axes, findings: Findings, runs: Mapping[Line, Any], title: str) -> None:
+    ax.set_title(title)
+    ax.set_ylim(-0.02, 1.02)
+    if not runs:
+        return
+    counts = sorted({sum(len(one) for one in found) for found in runs.values()})
+    ax.set_title(f"{title}, n = {' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))}")
+    scores = np.concatenate([np.concatenate(list(found)) for found in runs.values()])
+    margin = 0.05 * (np.ptp(scores) or 1.0)
+    thresholds = np.linspace(scores.min() - margin, scores.max() + margin, _THRESHOLDS)
+    for line, found in runs.items():
+        band = profile_band(found, thresholds, generator_of("profile", title, *line), findings.resamples)
+        style = style_of(_index(findings, line))
+        plot_profile(ax, thresholds, performance_profile(found, thresholds), *band, findings.label(line), **style)
+
+
+def _references(findings: Findings, scenario: str) -> dict[str, float]:
+    """Returns the mean returns of the planner and of the best constant action, by their names in the legend."""
+    planner, constant = findings.planner(scenario), findings.best_constant(scenario)
+    shown = {"planner": planner, "best constant action": constant}
+    return {name: findings.mean_return(scenario, line).value for name, line in shown.items() if line is not None}
+
+
+def _index(findings: Findings, line: Line) -> int:
+    return findings.lines(trained=True).index(line)
+
+
+def _panels(count: int) -> tuple[Figure, list[Axes]]:
+    matplotlib.use("Agg")
+    columns = min(count, 2)
+    lines = -(-count // columns)
+    figure, grid = plt.subplots(
+        lines, columns, figsize=(_WIDTH_IN * columns, _HEIGHT_IN * lines + 0.6), squeeze=False, layout="constrained"
+    )
+    axes = list(grid.flat)
+    for spare in axes[count:]:
+        spare.set_axis_off()
+    return figure, axes[:count]
+
+
+def _svg(figure: Figure, axes: Sequence[Axes]) -> str:
+    """Returns a figure as SVG without XML header, with one legend below the panels."""
+    entries: dict[str, Any] = {}
+    for ax in axes:
+        ax.grid(alpha=0.3)
+        ax.spines[["top", "right"]].set_visible(False)
+        handles, labels = ax.get_legend_handles_labels()
+        entries |= {label: entries.get(label, handle) for handle, label in zip(handles, labels, strict=True)}
+    if entries:
+        figure.legend(entries.values(), entries, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    written = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": "dgvae-rl"}):
+        figure.savefig(written, format="svg", metadata={"Date": None, "Creator": None})
+    plt.close(figure)
+    return re.sub(r"^.*?(?=<svg)", "", written.getvalue(), flags=re.DOTALL).strip()

@@ -1,0 +1,289 @@
+"""Study files: what is compared on what, with how many seeds; read from TOML and checked before anything runs.
+
+`docs/study.md` explains every key. A file that ships is named by its stem ("quick"), any other one by its path.
+"""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+from agents.presets import Algorithm
+from agents.studies.toml_values import converted, from_table
+from agents.task import SELECTION_SEED, Observe, Task
+from envs.drivers.ego import CONSTANT_ACTIONS
+from envs.drivers.planner import PLANNER
+from predictor.support.config_checks import check_at_least, check_choices
+from predictor.support.errors import UserError
+
+SHIPPED = Path(__file__).resolve().parent
+"""Folder of the studies that ship."""
+REFERENCES = (PLANNER, CONSTANT_ACTIONS, "random", "idle")
+RIVALS = ("zeros", "constant-velocity")
+FLOOR, CEILING = "zeros", "oracle"
+_PLACES = ("scenario", "env_id")
+"""Names that a text of an arm may hold in braces."""
+_OWN = ("env_id", "observe")
+"""Fields of `Task` that are no options: a scenario and an arm say them in keys of their own."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """What the policy of an arm is shown."""
+
+    name: str
+    """Name of the arm in tables."""
+    observe: str
+    """Value of `Task.observe`."""
+    options: Mapping[str, Any]
+    """Further fields of `Task`; texts may hold {scenario} and {env_id}."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Environment of a study."""
+
+    name: str
+    """Name of the scenario in tables."""
+    env_id: str
+    """Gymnasium or PettingZoo id."""
+    options: Mapping[str, Any]
+    """Further fields of `Task`, for every arm."""
+    steps: int
+    """Number of environment steps of a training."""
+    num_envs: int
+    """Number of environments of a training, all in its process."""
+    references: tuple[str, ...]
+    """Drivers that are measured without training."""
+
+    def __post_init__(self) -> None:
+        """Checks ranges."""
+        check_at_least(self, 1, "steps", "num_envs")
+
+
+@dataclass(frozen=True)
+class Study:
+    """Everything that a study file says; the keys of the file are the fields from `title` on."""
+
+    name: str
+    """Name of the study: the stem of its file."""
+    scenarios: tuple[Scenario, ...]
+    """Environments."""
+    arms: tuple[Arm, ...]
+    """Arms, in the order of the tables."""
+    title: str = ""
+    """Heading of the report; the name of the study if left out."""
+    algorithms: tuple[Algorithm, ...] = ("ppo",)
+    """Learning algorithms."""
+    seeds: int | tuple[int, ...] = 3
+    """Training seeds, or their number, counted from 0."""
+    steps: int = 20_000
+    """Number of environment steps of each training, where a scenario has no number of its own."""
+    num_envs: int = 6
+    """Number of environments of each training, all in its process, where a scenario has no number of its own."""
+    episodes: int = 200
+    """Number of test episodes of each policy and driver; all play the same seeds."""
+    selections: int = 8
+    """Number of times in a training that the policy is measured on the selection seeds, a point of the curve each."""
+    selection_episodes: int = 20
+    """Number of episodes of each such measurement."""
+    checkpoint_every: int = 2_000
+    """Number of environment steps between checkpoints, from which a killed training goes on."""
+    references: tuple[str, ...] = REFERENCES
+    """Drivers that are measured without training, where a scenario names none of its own."""
+    rivals: tuple[str, ...] | None = None
+    """Arms that every other arm is compared with; None: zeros and constant-velocity, where the study has them."""
+    floor: str = FLOOR
+    """Arm whose policy is shown nothing of the future, from which headroom is counted."""
+    ceiling: str = CEILING
+    """Arm whose policy is shown the true future, up to which headroom is counted."""
+
+    def __post_init__(self) -> None:
+        """Checks ranges and names."""
+        check_choices(self)
+        check_at_least(self, 1, "steps", "num_envs", "episodes", "selections", "selection_episodes", "checkpoint_every")
+        if isinstance(self.seeds, int):
+            check_at_least(self, 1, "seeds")
+        elif not self.seeds or len(set(self.seeds)) < len(self.seeds):
+            raise UserError(f"seeds must be a number or different numbers, got {list(self.seeds)}")
+        for seed in self.training_seeds:
+            if not 0 <= seed < SELECTION_SEED:
+                raise UserError(f"seeds must lie in [0, {SELECTION_SEED}), got {seed}")
+        if not self.algorithms:
+            raise UserError("algorithms must name at least one")
+        for rival in self.rivals or ():
+            if rival not in self.arm_names:
+                raise UserError(f"rivals names '{rival}', which is no arm; there are {', '.join(self.arm_names)}")
+
+    @property
+    def training_seeds(self) -> tuple[int, ...]:
+        """Seeds of the trainings."""
+        return tuple(range(self.seeds)) if isinstance(self.seeds, int) else self.seeds
+
+    @property
+    def arm_names(self) -> tuple[str, ...]:
+        """Names of the arms."""
+        return tuple(arm.name for arm in self.arms)
+
+    @property
+    def compared_with(self) -> tuple[str, ...]:
+        """Names of the arms that every other arm is compared with."""
+        named = RIVALS if self.rivals is None else self.rivals
+        return tuple(name for name in named if name in self.arm_names)
+
+    def headroom_only(self) -> "Study":
+        """Returns the study with floor and ceiling alone, and the references constant-actions and planner.
+
+        Raises:
+            UserError: floor or ceiling is neither an arm of the study nor something that a policy can be shown.
+        """
+        arms = tuple(self._arm_called(name, key) for key, name in (("floor", self.floor), ("ceiling", self.ceiling)))
+        wanted = (PLANNER, CONSTANT_ACTIONS)
+        scenarios = tuple(
+            replace(s, references=tuple(name for name in wanted if name in s.references)) for s in self.scenarios
+        )
+        return replace(self, arms=arms, scenarios=scenarios, rivals=None)
+
+    def _arm_called(self, name: str, key: str) -> Arm:
+        for arm in self.arms:
+            if arm.name == name:
+                return arm
+        known = get_args(Observe)
+        if name not in known:
+            raise UserError(f"{key} must be an arm of the study or one of {', '.join(known)}, got '{name}'")
+        return Arm(name, name, {})
+
+
+def shipped_studies() -> tuple[str, ...]:
+    """Returns the names of the studies that ship."""
+    return tuple(sorted(path.stem for path in SHIPPED.glob("*.toml")))
+
+
+def study_file(name: str) -> Path:
+    """Returns the file of a study that ships, or the path itself.
+
+    Raises:
+        UserError: there is no such study and no such file.
+    """
+    if name in shipped_studies():
+        return SHIPPED / f"{name}.toml"
+    path = Path(name)
+    if not path.is_file():
+        raise UserError(f"no study '{name}': neither a file nor one that ships ({', '.join(shipped_studies())})")
+    return path
+
+
+def read_study(path: Path) -> Study:
+    """Reads a study file.
+
+    Raises:
+        UserError: the file is no TOML, or a key or value of it does not fit; the message names file and key.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path.name} is not valid TOML: {error}") from error
+    content = dict(content)
+    where = path.name
+    arms = _arms(content.pop("arms", None), where)
+    tables = converted(content.pop("scenarios", None) or {}, dict, f"{where}: scenarios")
+    if not tables:
+        raise UserError(f"{where}: key 'scenarios' is missing; add a table such as [scenarios.highway-fast-v0]")
+    study = from_table(Study, content, where, {"name": path.stem, "scenarios": (), "arms": arms})
+    scenarios = tuple(_scenario(name, table, study, f"{where}: scenarios.{name}") for name, table in tables.items())
+    return replace(study, scenarios=scenarios)
+
+
+def task_of(scenario: Scenario, arm: Arm, where: str) -> Task:
+    """Returns the task of an arm in a scenario.
+
+    A scenario's checkpoint goes to the arms that take one and name none of their own.
+
+    Raises:
+        UserError: the options of arm and scenario do not fit together; the message begins with `where`.
+    """
+    places = {"scenario": scenario.name, "env_id": scenario.env_id}
+    options = {key: _filled(value, places) for key, value in arm.options.items()}
+    shared = dict(scenario.options)
+    if "checkpoint" in shared and not takes_checkpoint(arm.observe):
+        del shared["checkpoint"]
+    values: dict[str, Any] = {"env_id": scenario.env_id, "observe": arm.observe, **shared, **options}
+    try:
+        return Task(**values)
+    except UserError as error:
+        raise UserError(f"{where}: scenario {scenario.name}, arm {arm.name}: {error}") from error
+
+
+def takes_checkpoint(observe: str) -> bool:
+    """Returns whether a task with this observation accepts a checkpoint."""
+    values: dict[str, Any] = {"observe": observe, "checkpoint": "any"}
+    try:
+        Task("highway-fast-v0", **values)
+    except UserError:
+        return False
+    return True
+
+
+def _arms(listed: Any, where: str) -> tuple[Arm, ...]:
+    """Returns the arms: each entry is a value of `Observe`, or a table with name, observe and fields of `Task`."""
+    if not isinstance(listed, list) or not listed:
+        raise UserError(f"{where}: key 'arms' must be an array of at least one arm")
+    arms = tuple(_arm(entry, f"{where}: arms") for entry in listed)
+    names = [arm.name for arm in arms]
+    for name in names:
+        if names.count(name) > 1:
+            raise UserError(f"{where}: arms has '{name}' {names.count(name)} times; give each a name of its own")
+    return arms
+
+
+def _arm(entry: Any, where: str) -> Arm:
+    table = {"name": entry} if isinstance(entry, str) else entry
+    if not isinstance(table, dict) or not isinstance(table.get("name"), str):
+        raise UserError(f"{where} must hold names or tables with a name, got {entry!r}")
+    name = table["name"]
+    _check_name(name, where)
+    observe: Any = table.get("observe", name)
+    known = get_args(Observe)
+    if observe not in known:
+        missing = "" if "observe" in table else "; a table with another name needs the key observe"
+        raise UserError(f"{where}: unknown arm {observe!r}; there are {', '.join(known)}{missing}")
+    options = {key: value for key, value in table.items() if key not in ("name", "observe")}
+    return Arm(name, observe, _task_options(options, f"{where}.{name}"))
+
+
+def _scenario(name: str, table: Any, study: Study, where: str) -> Scenario:
+    table = dict(converted(table, dict, where))
+    _check_name(name, where)
+    hints = get_type_hints(Scenario)
+    own = {"env_id": name, "steps": study.steps, "num_envs": study.num_envs, "references": study.references}
+    for key in own:
+        if key in table:
+            own[key] = converted(table.pop(key), hints[key], f"{where}: {key}")
+    try:
+        return Scenario(name=name, options=_task_options(table, where, tuple(own)), **own)  # type: ignore[arg-type]
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from error
+
+
+def _task_options(table: Mapping[str, Any], where: str, others: Sequence[str] = ("name", "observe")) -> dict[str, Any]:
+    """Returns fields of `Task` from a table, converted to their types."""
+    hints = get_type_hints(Task)
+    known = [field.name for field in fields(Task) if field.name not in _OWN]
+    for key in table:
+        if key not in known:
+            raise UserError(f"{where}: unknown key '{key}'; there are {', '.join((*others, *known))}")
+    return {key: converted(value, hints[key], f"{where}: {key}") for key, value in table.items()}
+
+
+def _check_name(name: str, where: str) -> None:
+    if not name or not all(sign.isalnum() or sign in "-_" for sign in name):
+        raise UserError(f"{where}: a name has letters, digits, - and _ alone, got '{name}'")
+
+
+def _filled(value: Any, places: Mapping[str, str]) -> Any:
+    if not isinstance(value, str):
+        return value
+    for place in _PLACES:
+        value = value.replace(f"{{{place}}}", places[place])
+    return value

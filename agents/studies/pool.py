@@ -1,0 +1,153 @@
+"""Runs cells side by side, each in a process of its own, in a folder that one study uses at a time.
+
+On Linux all processes are forked from a server that has imported everything once (5 s); elsewhere they are spawned.
+
+A process ends when the study that started it does, however that ends: it waits for a pipe to close. A cell that is
+being run is locked, so that a study that follows a killed one waits for the last of its processes.
+"""
+
+import contextlib
+import fcntl
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import IO, Any
+
+from agents.studies.cells import LOG_FILE, Cell, run_cell
+from agents.studies.results import RESULT_FILE
+from predictor.support.errors import UserError
+from predictor.support.runtime import keep_freed_memory
+
+LOCK_FILE = ".lock"
+START_METHOD = "forkserver" if sys.platform == "linux" else "spawn"
+_PATIENCE_S = 5.0
+"""Time that a process gets to end when it is asked to, before it is killed [s]."""
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Holds the lock of a study's folder, which the operating system takes back when the process ends.
+
+    Raises:
+        UserError: another process holds it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / LOCK_FILE).open("a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            file.seek(0)
+            raise UserError(
+                f"another study runs in {folder} (process {file.read().strip() or 'unknown'}); wait for its end or "
+                "choose another --out"
+            ) from error
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+        yield
+
+
+@dataclass(frozen=True)
+class Running:
+    """Cell whose process runs."""
+
+    cell: Cell
+    """Cell that is run."""
+    process: Any
+    """Process that runs it."""
+    lifeline: Connection
+    """End of a pipe; the process ends when it closes."""
+
+
+def run_cells(cells: Sequence[Cell], folder: Path, workers: int, on_end: Callable[[Cell, bool], None]) -> None:
+    """Runs cells in processes, at most `workers` at a time; returns when all have ended.
+
+    Args:
+        cells: cells without a result.
+        folder: folder of the cells' folders.
+        workers: largest number of processes.
+        on_end: called with each cell that ended, and whether it has a result.
+    """
+    waiting, running = list(cells), list[Running]()
+    try:
+        while waiting or running:
+            while waiting and len(running) < workers:
+                running.append(_start(waiting.pop(0), folder))
+            ended = wait([one.process.sentinel for one in running])
+            for one in [one for one in running if one.process.sentinel in ended]:
+                one.process.join()
+                one.lifeline.close()
+                running.remove(one)
+                on_end(one.cell, one.process.exitcode == 0 and (folder / one.cell.name / RESULT_FILE).exists())
+    finally:
+        _stop(running)
+
+
+def last_line(log: Path) -> str:
+    """Returns the last line of a log; a few words if there is none."""
+    lines = log.read_text(errors="replace").strip().splitlines() if log.exists() else []
+    return lines[-1] if lines else "it ended without a message"
+
+
+def _start(cell: Cell, folder: Path) -> Running:
+    """Starts the process of a cell; what it prints goes into the cell's log."""
+    context: Any = multiprocessing.get_context(START_METHOD)
+    if START_METHOD == "forkserver":
+        context.set_forkserver_preload([__name__])
+    theirs, ours = context.Pipe(duplex=False)
+    process = context.Process(target=_work, args=(cell, folder / cell.name, theirs), name=cell.name)
+    process.start()
+    theirs.close()
+    return Running(cell, process, ours)
+
+
+def _stop(running: Sequence[Running]) -> None:
+    for one in running:
+        one.process.terminate()
+    for one in running:
+        one.process.join(_PATIENCE_S)
+        if one.process.is_alive():
+            one.process.kill()
+            one.process.join()
+        one.lifeline.close()
+
+
+def _work(cell: Cell, folder: Path, lifeline: Connection) -> None:
+    """Runs one cell in a process of its own."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the study ends this process
+    threading.Thread(target=_end_with, args=(lifeline,), daemon=True).start()
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / LOG_FILE).open("a", buffering=1) as log, (folder / LOCK_FILE).open("a") as lock:
+        _print_into(log)
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the last process of a killed study may still be here, for a moment
+        if (folder / RESULT_FILE).exists():
+            return
+        keep_freed_memory()
+        try:
+            run_cell(cell, folder)
+        except UserError as error:
+            print(f"error: {error}")
+            sys.exit(2)
+        except Exception:
+            traceback.print_exc(file=log)
+            sys.exit(1)
+
+
+def _end_with(lifeline: Connection) -> None:
+    """Ends this process when the other end of the pipe closes."""
+    with contextlib.suppress(EOFError, OSError):
+        lifeline.recv()
+    os._exit(1)
+
+
+def _print_into(log: IO[str]) -> None:
+    sys.stdout.flush(), sys.stderr.flush()
+    for number in (1, 2):
+        os.dup2(log.fileno(), number)

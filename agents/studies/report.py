@@ -1,0 +1,246 @@
+"""Report of a study: tables, pictures and provenance, as Markdown and as one HTML page."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.studies.document import PICTURES, Block, Code, Heading, Paragraph, Picture, Table, as_html, as_markdown
+from agents.studies.findings import NEARLY_CONSTANT, Findings, Line
+from agents.studies.pictures import learning_curves, profiles
+from agents.studies.statistics import Estimate, interquartile_mean
+from predictor.support.files import write_text
+
+REPORT, PAGE, HEADROOM = Path("report.md"), Path("report.html"), Path("headroom.md")
+NOTHING = "–"
+
+
+def write_report(
+    folder: Path, findings: Findings, text: str, provenance: dict[str, Any], failed: Sequence[str]
+) -> None:
+    """Writes the report as Markdown, with its pictures beside it, and as one HTML page.
+
+    Args:
+        folder: folder of the study.
+        findings: results.
+        text: the study file.
+        provenance: provenance of this start.
+        failed: names of the cells without a result.
+    """
+    blocks = blocks_of(findings, text, provenance, failed)
+    for block in blocks:
+        if isinstance(block, Picture):
+            write_text(folder / PICTURES / block.file, block.svg + "\n")
+    write_text(folder / REPORT, as_markdown(blocks))
+    write_text(folder / PAGE, as_html(title_of(findings), blocks))
+
+
+def write_headroom(folder: Path, findings: Findings, provenance: dict[str, Any]) -> str:
+    """Writes the headroom table with what it took, and returns it as Markdown."""
+    blocks = [
+        Heading(f"Headroom: {title_of(findings)}", 1),
+        *_headroom(findings),
+        *_times(findings),
+        *_provenance(provenance, ""),
+    ]
+    written = as_markdown(blocks)
+    write_text(folder / HEADROOM, written)
+    return as_markdown([*_headroom(findings), *_times(findings)])
+
+
+def title_of(findings: Findings) -> str:
+    """Returns the heading of the report."""
+    return findings.study.title or f"Study {findings.study.name}"
+
+
+def blocks_of(findings: Findings, text: str, provenance: dict[str, Any], failed: Sequence[str]) -> list[Block]:
+    """Returns the blocks of the report; what differs between two runs of one study stands at its end."""
+    study = findings.study
+    blocks: list[Block] = [Heading(title_of(findings), 1), Paragraph(_summary(findings))]
+    if failed:
+        blocks.append(Paragraph(f"Without a result: {'; '.join(failed)}. The numbers below are of the others."))
+    for scenario in findings.scenarios:
+        blocks += _scenario(findings, scenario)
+    if study.compared_with and findings.lines(trained=True):
+        blocks += _pairs(findings)
+    blocks += _headroom(findings)
+    if len(findings.scenarios) > 1 and findings.common_lines():
+        blocks += _all_scenarios(findings)
+    if findings.lines(trained=True):
+        blocks += _pictures(findings)
+    return [*blocks, *_times(findings), *_provenance(provenance, text)]
+
+
+def interval(estimate: Estimate, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
+    """Returns an estimate as text, with its interval behind it."""
+    if np.isnan(estimate.value):
+        return NOTHING
+    value = f"{scale * estimate.value:.{digits}f}{unit}"
+    if not estimate.has_interval:
+        return value
+    return f"{value} ({scale * estimate.low:.{digits}f} to {scale * estimate.high:.{digits}f})"
+
+
+def _summary(findings: Findings) -> str:
+    study = findings.study
+    seeds = len(study.training_seeds)
+    return (
+        f"{seeds} training {'seed' if seeds == 1 else 'seeds'} per arm; {study.episodes} test episodes per policy and "
+        "driver, on seeds that are the same for all and that neither training nor selection uses. A run is one "
+        "training; its score is its mean return over these episodes. Intervals are 95 %: Student's for means over "
+        "runs, percentiles of a bootstrap over runs for everything else. Drivers are not trained: their intervals are "
+        "over episodes and cannot be compared with those over runs."
+    )
+
+
+def _scenario(findings: Findings, scenario: str) -> list[Block]:
+    """Returns the table of a scenario, arms first, and what is nearly constant."""
+    headings = ["policy", "runs", "mean return", "interquartile mean", "crash rate", "length [steps]", "speed [m/s]"]
+    lines, notes = [], []
+    for line in (*findings.lines(scenario, trained=True), *findings.lines(scenario, trained=False)):
+        trained = line.algorithm is not None
+        crashes = findings.crash_rate(scenario, line)
+        runs = findings.results[scenario, line]
+        lines.append(
+            [
+                findings.label(line),
+                str(len(runs)) if trained else NOTHING,
+                interval(findings.mean_return(scenario, line)),
+                interval(findings.middle_return(scenario, line)) if trained else NOTHING,
+                NOTHING if crashes is None else interval(crashes, 0, 100.0, " %"),
+                _number(findings.mean_of(scenario, line, "length")),
+                _number(findings.mean_of(scenario, line, "mean_speed_mps")),
+            ]
+        )
+        if trained and (constant := findings.constant_runs(scenario, line)):
+            taken = ", ".join(f"{count} × {action}" for action, count in constant.items())
+            notes.append(f"{findings.label(line)} {constant.total()} of {len(runs)} ({taken})")
+    env_id = next(iter(findings.results[scenario, findings.lines(scenario)[0]])).env_id
+    blocks: list[Block] = [Heading(f"{scenario} ({env_id})"), Table(headings, lines)]
+    if notes:
+        share = f"{100 * NEARLY_CONSTANT:.0f} %"
+        blocks.append(Paragraph(f"Runs that take one action in at least {share} of their steps: {'; '.join(notes)}."))
+    return blocks
+
+
+def _pairs(findings: Findings) -> list[Block]:
+    """Returns the table of probabilities of improvement."""
+    headings = ["comparison", "scenario", "probability of improvement", "difference of means"]
+    groups = [([scenario], scenario) for scenario in findings.scenarios]
+    if len(groups) > 1:
+        groups.append((list(findings.scenarios), "all, rescaled scores"))
+    lines = [
+        [
+            f"{findings.label(pair.ours)} > {findings.label(pair.rival)}",
+            name,
+            interval(pair.probability),
+            interval(pair.gain),
+        ]
+        for scenarios, name in groups
+        for pair in findings.pairs(scenarios)
+    ]
+    if not lines:
+        return []
+    told = (
+        "How probable it is that a run of the first arm has a higher score than a run of the second one in the same "
+        "scenario; 0.5 is a draw. With few runs an interval that excludes 0.5 is weak evidence."
+    )
+    return [Heading("Probability of improvement"), Paragraph(told), Table(headings, lines)]
+
+
+def _headroom(findings: Findings) -> list[Block]:
+    """Returns the table of headroom; none where the study has no floor or no ceiling."""
+    study = findings.study
+    lines: list[list[str]] = []
+    others = [x for x in findings.lines(trained=True) if x.arm not in (study.floor, study.ceiling)]
+    arms = tuple(dict.fromkeys(x.arm for x in others))
+    for scenario in findings.scenarios:
+        for algorithm in study.algorithms:
+            headroom = findings.headroom(scenario, algorithm)
+            if headroom is None:
+                continue
+            named = [findings.best_constant(scenario), findings.planner(scenario)]
+            named += [Line(study.floor, algorithm), Line(study.ceiling, algorithm)]
+            shares = [_share(findings, scenario, Line(arm, algorithm)) for arm in arms]
+            several = f" ({algorithm})" if len(study.algorithms) > 1 else ""
+            cells = [f"{scenario}{several}", *(_return_of(findings, scenario, x) for x in named)]
+            lines.append([*cells, interval(headroom), *shares])
+    if not lines:
+        return []
+    headings = ["scenario", "best constant action", "planner", study.floor, study.ceiling, "headroom"]
+    told = (
+        f"Headroom is the mean return of {study.ceiling} above that of {study.floor}. The share of it that an arm uses "
+        "is given where the interval of the headroom lies above 0; elsewhere there is nothing that could be shared."
+    )
+    return [Heading("Headroom"), Paragraph(told), Table([*headings, *(f"{arm} uses" for arm in arms)], lines)]
+
+
+def _share(findings: Findings, scenario: str, line: Line) -> str:
+    used = findings.headroom_used(scenario, line) if (scenario, line) in findings.results else None
+    return NOTHING if used is None else interval(used, 0, 100.0, " %")
+
+
+def _return_of(findings: Findings, scenario: str, line: Line | None) -> str:
+    if line is None:
+        return NOTHING
+    value = interval(findings.mean_return(scenario, line))
+    return f"{line.arm}: {value}" if line == findings.best_constant(scenario) else value
+
+
+def _all_scenarios(findings: Findings) -> list[Block]:
+    lines = []
+    for line in findings.common_lines():
+        runs = findings.scaled_runs(line, findings.scenarios)
+        middle = findings.estimate(interquartile_mean, runs, about=("all", *line))
+        lines.append([findings.label(line), str(sum(len(found) for found in runs)), interval(middle)])
+    told = "Rescaled scores: 0 is the lowest and 1 the highest mean return of any line of the scenario's table."
+    table = Table(["policy", "runs", "interquartile mean of rescaled scores"], lines)
+    return [Heading("All scenarios"), Paragraph(told), table]
+
+
+def _pictures(findings: Findings) -> list[Block]:
+    episodes = findings.study.selection_episodes
+    curves = (
+        f"Mean return on the {episodes} selection seeds during training; bands: 95 % interval over runs. "
+        "Grey lines: drivers on the test seeds."
+    )
+    shares = "Share of runs whose score is above τ; bands: 95 % bootstrap over runs."
+    return [
+        Heading("Learning curves"),
+        Picture("learning_curves.svg", learning_curves(findings), curves),
+        Heading("Performance profiles"),
+        Picture("profiles.svg", profiles(findings), shares),
+    ]
+
+
+def _times(findings: Findings) -> list[Block]:
+    """Returns the table of what trainings and measurements took."""
+    lines = []
+    for (scenario, line), results in findings.results.items():
+        trained = [r for r in results if r.curve]
+        steps = sum(r.curve[-1]["steps"] for r in trained)
+        seconds = sum(r.train_seconds for r in trained)
+        lines.append(
+            [
+                findings.label(line),
+                scenario,
+                f"{seconds / len(trained) / 60:.1f}" if trained else NOTHING,
+                f"{1000 * seconds / steps:.1f}" if steps else NOTHING,
+                f"{np.mean([r.measure_seconds for r in results]) / 60:.1f}",
+            ]
+        )
+    headings = ["policy", "scenario", "minutes of a training", "ms per environment step", "minutes of test episodes"]
+    told = "Times of one process with one thread, beside others; a training's are without its measurements."
+    return [Heading("Time"), Paragraph(told), Table(headings, lines)]
+
+
+def _provenance(provenance: dict[str, Any], text: str) -> list[Block]:
+    versions = ", ".join(f"{name} {version}" for name, version in provenance["versions"].items())
+    told = f"{provenance['command']}; commit {provenance['commit']}; {provenance['machine']}; {provenance['time']}."
+    blocks: list[Block] = [Heading("Provenance"), Paragraph(told), Paragraph(f"Versions: {versions}.")]
+    return [*blocks, Code(text, "toml")] if text else blocks
+
+
+def _number(value: float) -> str:
+    return NOTHING if np.isnan(value) else f"{value:.1f}"

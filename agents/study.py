@@ -1,0 +1,187 @@
+"""Studies what a policy gains from forecasts: `python -m agents.study --study quick`.
+
+A study is a TOML file: scenarios × arms × algorithms × seeds, and drivers beside them (docs/study.md). Every cell is
+one training with its test episodes, in a process of its own. The same command continues a study that was stopped, and
+never runs a finished cell again. The folder then holds report.html, report.md, episodes.parquet and curves.parquet.
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from agents.studies.cells import LOG_FILE, PACKAGES, Cell, cells_of
+from agents.studies.findings import Findings
+from agents.studies.plan import Study, read_study, shipped_studies, study_file
+from agents.studies.pool import last_line, locked, run_cells
+from agents.studies.progress import Progress
+from agents.studies.report import HEADROOM, PAGE, REPORT, write_headroom, write_report
+from agents.studies.results import RESULT_FILE, Result, read_result, require_tables, write_tables
+from predictor.support.command_line import parse
+from predictor.support.config_checks import check_at_least
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import check_out, delete_leftovers, write_text
+from predictor.support.provenance import provenance
+
+CELLS = "cells"
+STUDY_FILE = "study.toml"
+FAILED, STOPPED = 1, 128
+"""Exit status if a cell failed; if a signal stopped the study, its number is added."""
+
+
+@dataclass(frozen=True)
+class StudyConfig:
+    """Runs all cells of a study side by side, and writes its tables and its report."""
+
+    study: str = "quick"
+    """Study: the name of one that ships (see --list), or the path of a TOML file."""
+    out: Path | None = None
+    """Folder of the study; None takes runs/study-NAME. The same command continues what is in it."""
+    workers: int = 0
+    """Number of cells that run side by side, each in a process with one thread; 0 is one per core."""
+    headroom: bool = False
+    """Run the arms of no and of perfect foresight alone, beside constant actions and planner: is there anything to
+    gain? Writes headroom.md."""
+    list: bool = False
+    """Print the studies that ship, and run nothing."""
+
+    def __post_init__(self) -> None:
+        """Checks ranges."""
+        check_at_least(self, 0, "workers")
+
+    @property
+    def num_processes(self) -> int:
+        """Number of cells that run side by side."""
+        return self.workers or os.cpu_count() or 1
+
+
+class Stopped(BaseException):
+    """Raised in the main thread when a signal asks the study to stop."""
+
+    def __init__(self, number: int) -> None:
+        """Keeps the number of the signal."""
+        super().__init__(number)
+        self.number = number
+
+
+def run_study(config: StudyConfig) -> int:
+    """Runs the cells without a result, writes tables and report; returns the exit status.
+
+    Raises:
+        UserError: the study file, the folder or a result in it is not as it must be; nothing has been run then.
+    """
+    require_tables()
+    file = study_file(config.study)
+    study = read_study(file)
+    if config.headroom:
+        study = _with_file(study, file)
+    folder = config.out or Path("runs") / f"study-{study.name}"
+    check_out(folder)
+    _check_folder(folder)
+    cells = cells_of(study, file.name)
+    with locked(folder):
+        delete_leftovers(folder)
+        results = _results_of(folder, cells)
+        write_text(folder / STUDY_FILE, file.read_text(encoding="utf-8"))
+        failed = _run_missing(config, folder, cells, results)
+        done = [results[cell.name] for cell in cells if cell.name in results]
+        _write(config, folder, study, done, file.read_text(encoding="utf-8"), failed)
+    for cell in failed:
+        log = folder / CELLS / cell.name / LOG_FILE
+        print(f"failed: {cell.title}: {last_line(log)}; its log is {log}", file=sys.stderr)
+    return FAILED if failed else 0
+
+
+def _with_file(study: Study, file: Path) -> Study:
+    try:
+        return study.headroom_only()
+    except UserError as error:
+        raise UserError(f"{file.name}: {error}") from error
+
+
+def _check_folder(folder: Path) -> None:
+    """Checks that a folder holds a study, or nothing.
+
+    Raises:
+        UserError: it holds something else.
+    """
+    if folder.exists() and not (folder / STUDY_FILE).exists():
+        found = [path.name for path in folder.iterdir() if not path.name.startswith(".")]
+        if found:
+            raise UserError(f"{folder} holds {found[0]} but no study ({STUDY_FILE}); choose another --out")
+
+
+def _results_of(folder: Path, cells: Sequence[Cell]) -> dict[str, Result]:
+    """Reads the results that are there, by the names of their cells.
+
+    Raises:
+        UserError: one of them is damaged.
+    """
+    files = {cell.name: folder / CELLS / cell.name / RESULT_FILE for cell in cells}
+    return {name: read_result(file) for name, file in files.items() if file.exists()}
+
+
+def _run_missing(config: StudyConfig, folder: Path, cells: Sequence[Cell], results: dict[str, Result]) -> list[Cell]:
+    """Runs the cells without a result and adds theirs; returns those that failed."""
+    missing, failed = [cell for cell in cells if cell.name not in results], list[Cell]()
+    progress = Progress(folder, len(cells), missing, config.num_processes)
+
+    def note(cell: Cell, has_result: bool) -> None:
+        if has_result:
+            results[cell.name] = read_result(folder / CELLS / cell.name / RESULT_FILE)
+            progress.finished(cell, results[cell.name])
+        else:
+            failed.append(cell)
+            progress.failed(cell)
+
+    run_cells(missing, folder / CELLS, config.num_processes, note)
+    return failed
+
+
+def _write(
+    config: StudyConfig, folder: Path, study: Study, results: Sequence[Result], text: str, failed: Sequence[Cell]
+) -> None:
+    """Writes what the study found, and says where."""
+    if not results:
+        return
+    findings, made = Findings.of(study, results), provenance(PACKAGES)
+    if config.headroom:
+        print(write_headroom(folder, findings, made))
+        print(f"written to {folder / HEADROOM}")
+        return
+    write_tables(folder, results)
+    write_report(folder, findings, text, made, [cell.title for cell in failed])
+    print(f"written to {folder}: {REPORT}, {PAGE}, episodes.parquet, curves.parquet")
+
+
+def _stop(number: int, frame: FrameType | None) -> Any:
+    raise Stopped(number)
+
+
+def main() -> None:
+    """Runs the command."""
+    config = parse(StudyConfig, __doc__)
+    if config.list:
+        print("\n".join(f"{name}: {read_study(study_file(name)).title}" for name in shipped_studies()))
+        return
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ[name] = "1"  # of the cells' processes: each fills one core
+    before = {number: signal.signal(number, _stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        status = run_study(config)
+    except Stopped as stopped:
+        print("stopped; the same command goes on: finished cells are kept, others continue", file=sys.stderr)
+        status = STOPPED + stopped.number
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if status:
+        sys.exit(status)
+
+
+if __name__ == "__main__":
+    run_entry_point(main)

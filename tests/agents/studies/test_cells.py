@@ -1,0 +1,76 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from agents.studies.cells import Cell, cells_of
+from agents.studies.plan import read_study
+from predictor.support.errors import UserError
+from tests.agents.studies.helpers import study_path, study_text
+
+HIGHWAY = "highway-fast-v0"
+
+
+@pytest.fixture
+def cells(tmp_path: Path) -> Callable[..., list[Cell]]:
+    return lambda **changes: cells_of(read_study(study_path(tmp_path, study_text(**changes))), "corridor.toml")
+
+
+def test_cells_are_the_product_and_the_drivers(cells: Callable[..., list[Cell]]):
+    found = cells(algorithms='["ppo", "dqn"]')
+    assert [(c.line, c.algorithm, c.seed) for c in found] == [
+        ("random", None, None), ("action-0", None, None), ("action-1", None, None),
+        ("none", "ppo", 0), ("none", "ppo", 1), ("none", "dqn", 0), ("none", "dqn", 1),
+    ]  # fmt: skip
+    assert found[3].title == "corridor, none, ppo, seed 0" and found[0].title == "corridor, random"
+    assert len({cell.name for cell in found}) == 7 and found[3].name.startswith("corridor.none.ppo.0-")
+
+
+def test_what_determines_a_result_is_in_the_name(cells: Callable[..., list[Cell]], monkeypatch: pytest.MonkeyPatch):
+    before = {cell.title: cell.name for cell in cells()}
+    same = {"seeds": "3", "title": '"other"', "rivals": '["none"]'}
+    assert before.items() <= {cell.title: cell.name for cell in cells(**same)}.items(), "finished cells stay"
+    trained, drivers = {t for t in before if "none" in t}, {t for t in before if "none" not in t}
+    for changes, other in (
+        ({"steps": "513"}, trained),
+        ({"num_envs": "2"}, trained),
+        ({"selection_episodes": "4"}, trained),
+        ({"checkpoint_every": "99"}, trained),
+        ({"episodes": "5"}, trained | drivers),
+    ):
+        after = {cell.title: cell.name for cell in cells(**changes)}
+        assert {title for title in before if after[title] != before[title]} == other, changes
+    monkeypatch.setattr("agents.studies.cells._version", lambda name: "0.0")
+    assert not set(before.values()) & {cell.name for cell in cells()}
+
+
+def test_the_forecaster_is_in_the_name(cells: Callable[..., list[Cell]]):
+    one, other, third = (
+        cells(env_id=HIGHWAY, seeds="1", arms=f'[{{name = "a", observe = "forecast", checkpoint = "{name}"}}]')[-1]
+        for name in ("highway", "merge", "highway")
+    )
+    assert one.name == third.name != other.name and one.forecaster != other.forecaster
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"env_id": "nope-v0"}, "scenario corridor: cannot make env 'nope-v0'"),
+        ({"references": '["planer"]'}, "scenario corridor: driver must be one of random, idle, .*, got 'planer'"),
+        ({"references": '["planner"]'}, "scenario corridor: "),
+        ({"references": '["idle"]', "env_id": "simple_tag_v3", "algorithms": '["dqn"]'}, None),
+        ({"env_id": "racetrack-v1", "references": '["constant-actions"]'}, "corridor: constant-actions needs an env"),
+        ({"env_id": "racetrack-v1", "references": "[]", "algorithms": '["dqn"]'}, "arm none: dqn needs a discrete act"),
+        ({"env_id": HIGHWAY, "arms": '[{name = "forecast", checkpoint = "absent"}]'}, "arm forecast: no checkpoint 'a"),
+        ({"arms": '["constant-velocity"]', "references": "[]"}, "arm constant-velocity: "),
+    ],
+)  # fmt: skip
+def test_what_cannot_run_is_said_before_anything_runs(
+    changes: dict[str, str], message: str | None, cells: Callable[..., list[Cell]]
+):
+    if message is None:
+        assert [cell.line for cell in cells(**changes)] == ["idle", "none", "none"]
+        return
+    with pytest.raises(UserError, match=f"^corridor.toml: .*{message}") as error:
+        cells(**changes)
+    assert "\n" not in str(error.value)

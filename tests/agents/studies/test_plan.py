@@ -1,0 +1,95 @@
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from agents.studies.plan import Arm, read_study, shipped_studies, study_file, takes_checkpoint, task_of
+from agents.task import Observe
+from predictor.support.errors import UserError
+from tests.agents.studies.helpers import study_path, study_text
+
+
+def test_every_study_that_ships_is_read():
+    assert "quick" in shipped_studies()
+    for name in shipped_studies():
+        study = read_study(study_file(name))
+        assert study.name == name and study.title and study.scenarios and study.arms
+
+
+def test_a_study_is_read(tmp_path: Path):
+    text = study_text(seeds="[4, 7]", arms='["none", {name = "cv", observe = "constant-velocity"}]', rivals='["none"]')
+    text += 'steps = 99\nreferences = ["idle"]\n[scenarios.merge-v1]\n'
+    study = read_study(study_path(tmp_path, text))
+    assert study.name == "corridor" and study.training_seeds == (4, 7) and study.compared_with == ("none",)
+    assert study.arms == (Arm("none", "none", {}), Arm("cv", "constant-velocity", {}))
+    first, second = study.scenarios
+    assert (first.steps, first.references) == (99, ("idle",)), "a scenario's own"
+    assert (second.env_id, second.steps, second.references) == ("merge-v1", 512, ("random", "constant-actions"))
+
+
+def test_an_arm_names_a_checkpoint_by_scenario(tmp_path: Path):
+    text = study_text(arms='["none", {name = "lstm", observe = "forecast", checkpoint = "runs/{scenario}/{env_id}"}]')
+    text = text.replace(text[text.rindex("env_id") :], 'env_id = "merge-v1"\ncheckpoint = "shared"\n')
+    study = read_study(study_path(tmp_path, text))
+    none, lstm = (task_of(study.scenarios[0], arm, "file") for arm in study.arms)
+    assert lstm.checkpoint == "runs/corridor/merge-v1" and none.checkpoint is None
+    assert task_of(study.scenarios[0], Arm("forecast", "forecast", {}), "file").checkpoint == "shared"
+    assert takes_checkpoint("forecast") and not takes_checkpoint("none")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("title = ", r"corridor.toml is not valid TOML: Invalid value"),
+        (study_text(arms='["nobody"]'), "corridor.toml: arms: unknown arm 'nobody'; there are forecast, none"),
+        (study_text(arms="[]"), "corridor.toml: key 'arms' must be an array of at least one arm"),
+        (study_text(arms='["none", "none"]'), "corridor.toml: arms has 'none' 2 times; give each a name of its own"),
+        (study_text(arms='[{name = "lstm"}]'), "unknown arm 'lstm'; .*; a table with another name needs the"),
+        (study_text(arms="[3]"), "corridor.toml: arms must hold names or tables with a name, got 3"),
+        (study_text(arms='[{name = "none", chekpoint = "a"}]'), "corridor.toml: arms.none: unknown key 'chekpoint'"),
+        (study_text(arms='[{name = "none", checkpoint = 3}]'), "arms.none: checkpoint must be a text, got 3"),
+        (study_text(arms='[{name = "a/b", observe = "none"}]'), "a name has letters, digits, - and _ alone, got 'a/b'"),
+        (study_text(step="3"), "corridor.toml: unknown key 'step'; there are title, algorithms, seeds, steps"),
+        (study_text(steps="0"), "corridor.toml: steps must be at least 1, got 0"),
+        (study_text(steps='"many"'), "corridor.toml: steps must be a whole number, got 'many'"),
+        (study_text(steps="true"), "corridor.toml: steps must be a whole number, got True"),
+        (study_text(seeds="0"), "corridor.toml: seeds must be at least 1, got 0"),
+        (study_text(seeds="[1, 1]"), r"corridor.toml: seeds must be a number or different numbers, got \[1, 1\]"),
+        (study_text(seeds="[-1]"), r"corridor.toml: seeds must lie in \[0, 1000000000\), got -1"),
+        (study_text(algorithms='["sacc"]'), "corridor.toml: algorithms must be one of ppo, dqn.*, got 'sacc'"),
+        (study_text(algorithms='"ppo"'), "corridor.toml: algorithms must be an array, got 'ppo'"),
+        (study_text(rivals='["zeroes"]'), "corridor.toml: rivals names 'zeroes', which is no arm; there are none"),
+        (study_text() + "backend = 3\n", "corridor.toml: scenarios.corridor: backend must be one of gymnasium"),
+        (study_text() + "arm = 3\n", "corridor.toml: scenarios.corridor: unknown key 'arm'; there are env_id, steps"),
+        (study_text() + "num_envs = 0\n", "corridor.toml: scenarios.corridor: num_envs must be at least 1, got 0"),
+        ('arms = ["none"]\n', "corridor.toml: key 'scenarios' is missing"),
+    ],
+)  # fmt: skip
+def test_bad_files_are_named_with_their_key(text: str, message: str, tmp_path: Path):
+    with pytest.raises(UserError, match=message) as error:
+        read_study(study_path(tmp_path, text))
+    assert str(error.value).startswith("corridor.toml") and "\n" not in str(error.value)
+
+
+def test_options_that_do_not_fit_an_arm_are_named(tmp_path: Path):
+    study = read_study(study_path(tmp_path, study_text(arms='[{name = "none", checkpoint = "highway"}]')))
+    with pytest.raises(UserError, match="^f.toml: scenario corridor, arm none: checkpoint 'highway' has no effect"):
+        task_of(study.scenarios[0], study.arms[0], "f.toml")
+
+
+def test_an_unknown_study_is_named():
+    with pytest.raises(UserError, match=r"no study 'quik': neither a file nor one that ships \(.*quick"):
+        study_file("quik")
+
+
+def test_headroom_has_floor_and_ceiling_alone(tmp_path: Path):
+    text = study_text(floor='"none"', ceiling='"forecast"', references='["random", "planner"]')
+    study = read_study(study_path(tmp_path, text)).headroom_only()
+    assert study.arm_names == ("none", "forecast") and study.scenarios[0].references == ("planner",)
+    text = study_text(floor='"ground"', ceiling='"forecast"')
+    with pytest.raises(UserError, match="floor must be an arm of the study or one of .*, got 'ground'"):
+        read_study(study_path(tmp_path, text)).headroom_only()
+
+
+def test_arms_are_those_of_the_task():
+    assert {"none", "constant-velocity", "forecast"} <= set(get_args(Observe))

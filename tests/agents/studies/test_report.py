@@ -1,0 +1,156 @@
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agents.studies.findings import Findings, Line
+from agents.studies.plan import Arm, Scenario, Study
+from agents.studies.report import interval, write_headroom, write_report
+from agents.studies.results import Result
+from agents.studies.statistics import Estimate
+from tests.agents.studies.helpers import result
+
+MADE = {"command": "python -m agents.study", "commit": "abc", "machine": "m", "time": "now", "versions": {"numpy": "2"}}
+ZEROS, SEEN, ORACLE = Line("zeros", "ppo"), Line("forecast", "ppo"), Line("oracle", "ppo")
+
+
+def found_in(study: Study, results: list[Result]) -> Findings:
+    return Findings.of(study, results, resamples=100)
+
+
+def study(scenarios: tuple[str, ...] = ("one",), **changes: Any) -> Study:
+    arms = tuple(Arm(name, "none", {}) for name in ("zeros", "forecast", "oracle"))
+    made = tuple(Scenario(name, "toy-v0", {}, 10, 1, ()) for name in scenarios)
+    return Study("made-up", made, arms, **({"rivals": ("zeros",), "episodes": 2} | changes))
+
+
+def results(scenario: str = "one", lift: float = 0.0) -> list[Result]:
+    """Three runs of each arm; means of zeros, forecast, oracle are 2, 5, 10; the best constant action has 4."""
+    found = [result("idle", [1.0, 3.0], scenario=scenario), result("slower", [3.0, 5.0], scenario=scenario)]
+    found += [result("random", [9.0, 9.0], scenario=scenario), result("planner", [6.0, 8.0], scenario=scenario)]
+    for arm, base in (("zeros", 2.0), ("forecast", 5.0 + lift), ("oracle", 10.0)):
+        found += [result(arm, [base + d - 1, base + d + 1], seed, scenario) for seed, d in enumerate((-0.5, 0.0, 0.5))]
+    return found
+
+
+def test_runs_are_scored_by_their_means():
+    findings = found_in(study(), results())
+    assert findings.runs("one", SEEN).tolist() == [4.5, 5.0, 5.5]
+    found = findings.mean_return("one", SEEN)
+    half = 4.302652729911275 * 0.5 / np.sqrt(3)
+    assert found == pytest.approx((5.0, 5 - half, 5 + half))
+    assert findings.middle_return("one", SEEN).value == 5.0
+    crashes = findings.crash_rate("one", SEEN)
+    assert crashes is not None and crashes.value == 0.5, "the first of two episodes"
+
+
+def test_headroom_is_shared_where_there_is_some():
+    findings = found_in(study(), results())
+    headroom, used = findings.headroom("one", "ppo"), findings.headroom_used("one", SEEN)
+    assert headroom is not None and headroom.value == 8.0 and headroom.low > 7
+    assert used is not None and used.value == pytest.approx(3 / 8) and used.low < 3 / 8 < used.high
+    level = [r for r in results() if r.arm != "oracle"]
+    level += [result("oracle", [2 + d, 2 - d], seed) for seed, d in enumerate((3.0, 0.0, 1.0))]
+    assert found_in(study(), level).headroom_used("one", SEEN) is None, "the same mean as zeros"
+    assert found_in(study(), results()[:-3]).headroom("one", "ppo") is None, "no oracle"
+
+
+def test_pairs_are_those_with_the_rivals():
+    (seen, oracle) = found_in(study(), results()).pairs(["one"])
+    assert (seen.ours, seen.rival, oracle.ours) == (SEEN, ZEROS, ORACLE)
+    assert seen.probability == (1.0, 1.0, 1.0) and seen.gain.value == 3.0
+    assert found_in(study(rivals=()), results()).pairs(["one"]) == []
+
+
+def test_references_are_told_apart():
+    findings = found_in(study(), results())
+    assert findings.best_constant("one") == Line("slower", None)
+    assert findings.planner("one") == Line("planner", None)
+
+
+def test_scores_of_several_scenarios_are_rescaled():
+    findings = found_in(study(("one", "two")), results() + results("two", lift=2.0))
+    scaled = findings.scaled_runs(SEEN, ["one", "two"])
+    assert [float(np.mean(runs)) for runs in scaled] == pytest.approx([3 / 8, 5 / 8]), "2 is the lowest, 10 the highest"
+
+
+def test_a_run_that_takes_one_action_is_called_constant():
+    episodes = tuple({**e, "action_counts": {"slower": 19, "idle": 1}} for e in result("zeros", [1.0], 0).episodes)
+    made = [result("zeros", [1.0], 0, episodes=episodes), result("zeros", [1.0], 1)]
+    assert found_in(study(), made).constant_runs("one", ZEROS) == {"slower": 1}
+
+
+def test_an_interval_does_not_depend_on_other_arms():
+    alone = [r for r in results() if r.arm == "forecast"]
+    assert found_in(study(), alone).middle_return("one", SEEN) == found_in(study(), results()).middle_return(
+        "one", SEEN
+    )
+
+
+def written(folder: Path, found: list[Result], **changes: Any) -> tuple[str, str]:
+    scenarios = tuple(dict.fromkeys(r.scenario for r in found))
+    write_report(folder, found_in(study(scenarios, **changes), found), 'arms = ["zeros"]\n', MADE, [])
+    return (folder / "report.md").read_text(), (folder / "report.html").read_text()
+
+
+def test_the_report_says_what_was_found(tmp_path: Path):
+    text, page = written(tmp_path, results())
+    assert "| forecast | 3 | 5.00 (3.76 to 6.24) | 5.00 (4.67 to 5.33) | 50 % (50 to 50) | 10.0 | 20.0 |" in text
+    assert "| slower | – | 4.00 (-8.71 to 16.71) | – |" in text
+    assert "| forecast > zeros | one | 1.00 (1.00 to 1.00) | 3.00" in text
+    assert re.search(r"\| one \| slower: 4.00 .* \| 7.00 .* \| 2.00 .* \| 10.00 .* \| 8.00 .* \| 38 % \(", text)
+    assert "| forecast | one | 0.2 | 60.0 | 0.1 |" in text, "12 s for 200 steps"
+    assert text.rstrip().endswith('arms = ["zeros"]\n```')
+    for cell in re.findall(r"\| (\S+ > \S+|[\d.]+ \([^)]*\)) ", text):
+        assert cell.replace(">", "&gt;") in page, "both forms have the same cells"
+
+
+def test_the_page_needs_nothing_else(tmp_path: Path):
+    _, page = written(tmp_path, results())
+    tags: list[tuple[str, dict[str, str | None]]] = []
+
+    class Reader(HTMLParser):
+        def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+            tags.append((tag, dict(attrs)))
+
+    Reader().feed(page)
+    names = [tag for tag, _ in tags]
+    assert names.count("svg") == 2 and "script" not in names and "link" not in names and "img" not in names
+    links = [value for _, found in tags for key, value in found.items() if key in ("src", "href", "xlink:href")]
+    assert all(str(link).startswith("#") for link in links)
+    assert (tmp_path / "pictures" / "learning_curves.svg").read_text().startswith("<svg")
+
+
+def test_reports_of_equal_results_are_equal(tmp_path: Path):
+    both = results() + results("two", lift=1.0)
+    first = written(tmp_path / "a", both)
+    assert written(tmp_path / "b", both) == first
+    assert "## All scenarios" in first[0] and "| forecast > zeros | all, rescaled scores | 1.00" in first[0]
+    assert written(tmp_path / "c", results() + results("two", lift=1.1)) != first
+
+
+def test_what_failed_is_named(tmp_path: Path):
+    write_report(tmp_path, found_in(study(), results()[:-1]), "", MADE, ["one, oracle, ppo, seed 2"])
+    text = (tmp_path / "report.md").read_text()
+    assert "Without a result: one, oracle, ppo, seed 2." in text and "| oracle | 2 |" in text
+
+
+def test_drivers_alone_make_a_report(tmp_path: Path):
+    text, _ = written(tmp_path, results()[:4])
+    assert "| planner | – | 7.00" in text and "Learning curves" not in text and "## Headroom" not in text
+
+
+def test_headroom_alone(tmp_path: Path):
+    text = write_headroom(tmp_path, found_in(study(), results()), MADE)
+    assert "| scenario | best constant action | planner | zeros | oracle | headroom | forecast uses |" in text
+    assert "minutes of a training" in text
+    assert "## Provenance" in (tmp_path / "headroom.md").read_text()
+
+
+def test_intervals_as_text():
+    assert interval(Estimate(0.25, 0.1, 0.4), 0, 100.0, " %") == "25 % (10 to 40)"
+    assert interval(Estimate(1.0, float("nan"), float("nan"))) == "1.00"
+    assert interval(Estimate(float("nan"), 0.0, 0.0)) == "–"

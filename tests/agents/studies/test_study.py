@@ -1,0 +1,215 @@
+"""The command: whole studies of a toy, in processes, stopped in several ways."""
+
+import fcntl
+import json
+import multiprocessing
+import os
+import re
+import signal
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as parquet
+import pytest
+
+import agents.study
+from agents.studies.pool import START_METHOD
+from agents.study import StudyConfig, run_study
+from predictor.support.errors import UserError, run_entry_point
+from tests.agents.studies.helpers import SLOW_TOY, study_path, study_text
+
+LEFT_OUT = re.compile(r"(## Time\n|<h2>Time</h2>).*", re.DOTALL)
+"""What differs between two runs of one study."""
+
+
+def config(folder: Path, text: str, workers: int = 2) -> StudyConfig:
+    return StudyConfig(str(study_path(folder, text)), folder / "out", workers)
+
+
+def start(folder: Path, text: str) -> Any:
+    """Starts the command in a process that is forked from the pool's server, which has imported everything."""
+    words = ["--study", str(study_path(folder, text)), "--out", str(folder / "out"), "--workers", "2"]
+    context: Any = multiprocessing.get_context(START_METHOD)
+    process = context.Process(target=run_command, args=(words, folder / "errors"))
+    process.start()
+    return process
+
+
+def run_command(words: list[str], errors: Path) -> None:
+    """Runs the command in its process, with what it says of errors in a file."""
+    sys.argv = ["study.py", *words]
+    with errors.open("a") as file:
+        os.dup2(file.fileno(), 2)
+        sys.stderr = file
+        run_entry_point(agents.study.main)
+
+
+def results(folder: Path) -> dict[str, str]:
+    return {path.parent.name: path.read_text() for path in (folder / "out").glob("cells/*/result.json")}
+
+
+def reports(folder: Path) -> list[str]:
+    return [LEFT_OUT.sub("", (folder / "out" / name).read_text()) for name in ("report.md", "report.html")]
+
+
+def ended_cells(folder: Path) -> Counter[str]:
+    """Returns how often the log says that a cell ended."""
+    log = (folder / "out" / "study.log").read_text()
+    return Counter(re.findall(r"\] (corridor, .*?): return", log))
+
+
+def wait_for(folder: Path, pattern: str, process: Any, limit_s: float = 120) -> None:
+    until = time.monotonic() + limit_s
+    while not list((folder / "out").glob(pattern)):
+        assert process.is_alive() and time.monotonic() < until, (folder / "errors").read_text()
+        time.sleep(0.02)
+
+
+def running_cells(folder: Path) -> list[str]:
+    """Returns the cells whose lock a process holds."""
+    found = []
+    for path in (folder / "out").glob("cells/*/.lock"):
+        with path.open("a") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                found.append(path.parent.name)
+    return found
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with a study of the slow toy that nothing interrupted."""
+    folder = tmp_path_factory.mktemp("whole")
+    assert run_study(config(folder, study_text(SLOW_TOY))) == 0
+    return folder
+
+
+def test_a_study_has_tables_a_report_and_a_log(whole: Path):
+    assert len(results(whole)) == 5 and set(ended_cells(whole).values()) == {1}
+    episodes = parquet.read_table(whole / "out" / "episodes.parquet").to_pylist()
+    assert len(episodes) == 5 * 4 and {e["length"] for e in episodes} == {6}
+    assert {e["episode_seed"] for e in episodes} == {2_000_000_000 + i for i in range(4)}
+    curves = parquet.read_table(whole / "out" / "curves.parquet").to_pylist()
+    assert [c["steps"] for c in curves if c["seed"] == 1] == [128, 256, 384, 512]
+    assert "| none | 2 |" in (whole / "out" / "report.md").read_text()
+    assert "5 cells, 0 of them finished before" in (whole / "out" / "study.log").read_text()
+
+
+def test_finished_cells_are_not_run_again(whole: Path, monkeypatch: pytest.MonkeyPatch):
+    before, report = results(whole), reports(whole)
+    monkeypatch.setattr("agents.studies.pool._start", lambda *_: pytest.fail("nothing is missing"))
+    assert run_study(config(whole, study_text(SLOW_TOY))) == 0
+    assert results(whole) == before and reports(whole) == report
+
+
+def test_a_study_that_was_killed_ends_as_one_that_was_not(whole: Path, tmp_path: Path):
+    """Killed twice, once while policies train; nothing is lost or doubled, and the report is the same."""
+    text, kept = study_text(SLOW_TOY), dict[str, str]()
+    for pattern in ("cells/corridor.none*/run/checkpoint.zip", "cells/corridor.none*/result.json"):
+        process = start(tmp_path, text)
+        wait_for(tmp_path, pattern, process)
+        process.kill()
+        process.join()
+        now = results(tmp_path)
+        assert kept.items() <= now.items(), "a finished cell stays as it is"
+        kept = now
+    assert 3 < len(kept) <= 5
+    assert run_study(config(tmp_path, text)) == 0
+    assert kept.items() <= results(tmp_path).items()
+    assert results(tmp_path).keys() == results(whole).keys()
+    assert set(ended_cells(tmp_path).values()) <= {1}
+    assert reports(tmp_path) == reports(whole)
+    assert (tmp_path / "out" / "episodes.parquet").read_bytes() == (whole / "out" / "episodes.parquet").read_bytes()
+
+
+def test_no_process_outlives_a_killed_study(tmp_path: Path):
+    process = start(tmp_path, study_text(SLOW_TOY, steps="100000"))
+    wait_for(tmp_path, "cells/corridor.none*/run/checkpoint.zip", process)
+    assert running_cells(tmp_path)
+    process.kill()
+    process.join()
+    until = time.monotonic() + 10
+    while running_cells(tmp_path) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert running_cells(tmp_path) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_stops_all_processes_with_one_line(number: signal.Signals, tmp_path: Path):
+    process = start(tmp_path, study_text(SLOW_TOY, steps="100000"))
+    wait_for(tmp_path, "cells/corridor.none*/run/checkpoint.zip", process)
+    os.kill(process.pid, number)
+    process.join(60)
+    assert process.exitcode == 128 + number and running_cells(tmp_path) == []
+    said = (tmp_path / "errors").read_text()
+    assert said == "stopped; the same command goes on: finished cells are kept, others continue\n"
+
+
+def test_two_studies_in_one_folder_are_refused(whole: Path):
+    with (whole / "out" / ".lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(UserError, match=r"another study runs in .*out \(process \d+\); wait for its end or choose"):
+            run_study(config(whole, study_text(SLOW_TOY)))
+    assert run_study(config(whole, study_text(SLOW_TOY))) == 0, "the lock ends with the process that holds it"
+
+
+def test_a_damaged_result_stops_the_study_and_keeps_the_rest(whole: Path):
+    before = results(whole)
+    name = next(name for name in before if "random" in name)
+    file = whole / "out" / "cells" / name / "result.json"
+    file.write_text(before[name][:50])
+    with pytest.raises(UserError, match=f"{name}/result.json is damaged .* delete this file"):
+        run_study(config(whole, study_text(SLOW_TOY)))
+    file.unlink()
+    assert run_study(config(whole, study_text(SLOW_TOY))) == 0
+    after = results(whole)
+    assert {k: v for k, v in after.items() if k != name} == {k: v for k, v in before.items() if k != name}
+    assert json.loads(after[name])["episodes"] == json.loads(before[name])["episodes"]
+
+
+def test_a_cell_that_fails_does_not_stop_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    text = study_text(steps="64", selections="1")
+    run = config(tmp_path, text)
+    cells = agents.study.cells_of(agents.study.read_study(Path(run.study)), "corridor.toml")
+    broken = tmp_path / "out" / "cells" / cells[3].name / "run"
+    broken.mkdir(parents=True)
+    (broken / "config.json").write_text("{")
+    (tmp_path / "out" / "study.toml").write_text(text)
+    assert run_study(run) == 1
+    out = capsys.readouterr()
+    assert f"failed: corridor, none, ppo, seed 0: error: {broken}/config.json is not a run's config" in out.err
+    assert f"its log is {broken.parent}/log.txt" in out.err
+    assert len(results(tmp_path)) == 4
+    report = (tmp_path / "out" / "report.md").read_text()
+    assert "Without a result: corridor, none, ppo, seed 0." in report and "| none | 1 |" in report
+
+
+def test_a_folder_with_something_else_is_refused(tmp_path: Path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").write_text("mine")
+    with pytest.raises(UserError, match=r"out holds thesis.tex but no study \(study.toml\); choose another --out"):
+        run_study(config(tmp_path, study_text()))
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.tex"]
+
+
+def test_headroom_runs_floor_and_ceiling_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    arms = '["none", {name = "all", observe = "none"}, {name = "other", observe = "none"}]'
+    text = study_text(arms=arms, floor='"none"', ceiling='"all"', steps="64", selections="1")
+    run = StudyConfig(str(study_path(tmp_path, text)), tmp_path / "out", 2, headroom=True)
+    assert run_study(run) == 0
+    lines = {re.split(r"[.]|-[0-9a-f]{10}$", name)[1] for name in results(tmp_path)}
+    assert lines == {"none", "all", "action-0", "action-1"}
+    printed = capsys.readouterr().out
+    assert "| scenario | best constant action | planner | none | all | headroom |" in printed
+    assert (tmp_path / "out" / "headroom.md").exists() and not (tmp_path / "out" / "report.md").exists()
+
+
+def test_without_pyarrow_nothing_begins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    with pytest.raises(UserError, match=r"need pyarrow; pip install 'dgvae-rl\[study\]'"):
+        run_study(config(tmp_path, study_text()))
+    assert not (tmp_path / "out").exists()
