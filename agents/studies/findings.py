@@ -9,9 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from agents.studies.plan import Study
-from agents.studies.results import Result
-from agents.studies.statistics import (
+from agents.studies.estimators import (
     RESAMPLES,
     Estimate,
     Runs,
@@ -23,6 +21,8 @@ from agents.studies.statistics import (
     probability_of_improvement,
     share_of_headroom,
 )
+from agents.studies.plan import Study
+from agents.studies.results import Result
 from envs.drivers.planner import is_planner
 
 NEARLY_CONSTANT = 0.95

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from agents.studies.document import PICTURES, Block, Code, Heading, Paragraph, Picture, Table, as_html, as_markdown
+from agents.studies.estimators import Estimate, interquartile_mean
 from agents.studies.findings import NEARLY_CONSTANT, Findings, Line
 from agents.studies.pictures import learning_curves, profiles
-from agents.studies.statistics import Estimate, interquartile_mean
 from predictor.support.files import write_text
 
 REPORT, PAGE, HEADROOM = Path("report.md"), Path("report.html"), Path("headroom.md")

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from agents.studies.estimators import Estimate
 from agents.studies.findings import Findings, Line
 from agents.studies.plan import Arm, Scenario, Study
 from agents.studies.report import interval, write_headroom, write_report
 from agents.studies.results import Result
-from agents.studies.statistics import Estimate
 from tests.agents.studies.helpers import result
 
 MADE = {"command": "python -m agents.study", "commit": "abc", "machine": "m", "time": "now", "versions": {"numpy": "2"}}
