@@ -120,7 +120,7 @@ def test_one_command_trains_evaluates_and_films(finished: tuple[Path, str]):
     names = {p.name for p in run.iterdir()}
     assert names == {
         "config.json", "tb", "checkpoint.zip", "best_model.zip", "policy.zip",
-        "summary.json", "summary.md", "episodes.parquet", "video.mp4",
+        "curve.json", "summary.json", "summary.md", "episodes.parquet", "video.mp4",
     }  # fmt: skip
     summary = json.loads((run / "summary.json").read_text())
     assert [line["policy"] for line in summary["policies"]] == ["ppo (constant-velocity)", *CONSTANT, "random"]

@@ -30,8 +30,8 @@ from agents.task import EVALUATION_SEED, Task
 from agents.training import TrainingPlan, read_curve, train
 from envs.drivers.all_agents import make_driver
 from envs.drivers.ego import make_ego_driver, named_drivers
-from envs.drivers.planner import PLANNER, is_planner
-from envs.registry import checkpoint_for, make_env, make_multiagent_env
+from envs.drivers.planner import ORACLE, PLANNER, is_planner
+from envs.registry import checkpoint_for
 from predictor.checkpoint import CONSTANT_VELOCITY, WEIGHTS, resolve
 from predictor.support.errors import UserError
 from predictor.support.provenance import provenance
@@ -161,13 +161,13 @@ def _drivers(study: Study, scenario: Scenario, where: str) -> list[Cell]:
     try:
         task.check()
         if task.is_multiagent:
-            many = make_multiagent_env(task.env_id)
+            many = task.make()
             many.reset(seed=0)
             for name in names:
                 make_driver(name, many, np.random.default_rng(0))
             many.close()
         else:
-            env = make_env(task.env_id, disable_env_checker=True)
+            env = task.make(disable_env_checker=True)
             names = named_drivers(names, env)
             for name in names:
                 make_ego_driver(name, env, np.random.default_rng(0))
@@ -212,8 +212,8 @@ def _planner_pin(name: str, task: Task) -> dict[str, Any] | None:
     if not is_planner(name):
         return None
     checkpoint = name.removeprefix(PLANNER).removeprefix(":") or checkpoint_for(task.env_id)
-    if checkpoint == CONSTANT_VELOCITY:
-        return {"sha256": CONSTANT_VELOCITY}
+    if checkpoint in (CONSTANT_VELOCITY, ORACLE):
+        return {"sha256": checkpoint}
     with (resolve(checkpoint) / WEIGHTS).open("rb") as file:
         return {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
 

@@ -9,9 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from agents.studies.plan import Study
-from agents.studies.results import Result
-from agents.studies.statistics import (
+from agents.studies.estimators import (
     RESAMPLES,
     Estimate,
     Runs,
@@ -23,7 +21,9 @@ from agents.studies.statistics import (
     probability_of_improvement,
     share_of_headroom,
 )
-from envs.drivers.planner import is_planner
+from agents.studies.plan import Study
+from agents.studies.results import Result
+from envs.drivers.planner import PLANNER_ORACLE, is_planner
 
 NEARLY_CONSTANT = 0.95
 """Least share of one action from which on a run is called nearly constant."""
@@ -203,9 +203,10 @@ class Findings:
         constant = [x for x in drivers if x.arm not in NOT_CONSTANT and not is_planner(x.arm) and ".zip" not in x.arm]
         return max(constant, key=lambda x: self.mean_return(scenario, x).value, default=None)
 
-    def planner(self, scenario: str) -> Line | None:
-        """Returns the line of the planner; None if there is none."""
-        return next((x for x in self.lines(scenario, trained=False) if is_planner(x.arm)), None)
+    def planner(self, scenario: str, true_futures: bool = False) -> Line | None:
+        """Returns the line of the planner, with forecasts or with true futures; None if there is none."""
+        planners = [x for x in self.lines(scenario, trained=False) if is_planner(x.arm)]
+        return next((x for x in planners if (x.arm == PLANNER_ORACLE) == true_futures), None)
 
 
 def column(result: Result, field: str) -> Float[np.ndarray, " episodes"]:

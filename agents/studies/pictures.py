@@ -16,8 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy import stats
 
+from agents.studies.estimators import CONFIDENCE, performance_profile, profile_band
 from agents.studies.findings import Findings, Line, generator_of
-from agents.studies.statistics import CONFIDENCE, performance_profile, profile_band
 
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f7f7f", "#8c564b", "#9467bd")
 _GREYS = (("#777777", "--"), ("#777777", ":"), ("#aaaaaa", "-."))

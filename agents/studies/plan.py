@@ -3,6 +3,7 @@
 `docs/study.md` explains every key. A file that ships is named by its stem ("quick"), any other one by its path.
 """
 
+import json
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -13,7 +14,7 @@ from agents.presets import Algorithm
 from agents.studies.toml_values import converted, from_table
 from agents.task import SELECTION_SEED, Observe, Task
 from envs.drivers.ego import CONSTANT_ACTIONS
-from envs.drivers.planner import PLANNER
+from envs.drivers.planner import PLANNER, PLANNER_ORACLE
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError
 
@@ -133,13 +134,13 @@ class Study:
         return tuple(name for name in named if name in self.arm_names)
 
     def headroom_only(self) -> "Study":
-        """Returns the study with floor and ceiling alone, and the references constant-actions and planner.
+        """Returns the study with floor and ceiling alone, and of its references constant actions and planners.
 
         Raises:
             UserError: floor or ceiling is neither an arm of the study nor something that a policy can be shown.
         """
         arms = tuple(self._arm_called(name, key) for key, name in (("floor", self.floor), ("ceiling", self.ceiling)))
-        wanted = (PLANNER, CONSTANT_ACTIONS)
+        wanted = (PLANNER, PLANNER_ORACLE, CONSTANT_ACTIONS)
         scenarios = tuple(
             replace(s, references=tuple(name for name in wanted if name in s.references)) for s in self.scenarios
         )
@@ -273,7 +274,10 @@ def _task_options(table: Mapping[str, Any], where: str, others: Sequence[str] = 
     for key in table:
         if key not in known:
             raise UserError(f"{where}: unknown key '{key}'; there are {', '.join((*others, *known))}")
-    return {key: converted(value, hints[key], f"{where}: {key}") for key, value in table.items()}
+    texts = dict(table)
+    if isinstance(texts.get("env_kwargs"), dict):
+        texts["env_kwargs"] = json.dumps(texts["env_kwargs"])
+    return {key: converted(value, hints[key], f"{where}: {key}") for key, value in texts.items()}
 
 
 def _check_name(name: str, where: str) -> None:

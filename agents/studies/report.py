@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from agents.studies.document import PICTURES, Block, Code, Heading, Paragraph, Picture, Table, as_html, as_markdown
+from agents.studies.estimators import Estimate, interquartile_mean
 from agents.studies.findings import NEARLY_CONSTANT, Findings, Line
 from agents.studies.pictures import learning_curves, profiles
-from agents.studies.statistics import Estimate, interquartile_mean
 from predictor.support.files import write_text
 
 REPORT, PAGE, HEADROOM = Path("report.md"), Path("report.html"), Path("headroom.md")
@@ -160,7 +160,7 @@ def _headroom(findings: Findings) -> list[Block]:
             headroom = findings.headroom(scenario, algorithm)
             if headroom is None:
                 continue
-            named = [findings.best_constant(scenario), findings.planner(scenario)]
+            named = [findings.best_constant(scenario), findings.planner(scenario), findings.planner(scenario, True)]
             named += [Line(study.floor, algorithm), Line(study.ceiling, algorithm)]
             shares = [_share(findings, scenario, Line(arm, algorithm)) for arm in arms]
             several = f" ({algorithm})" if len(study.algorithms) > 1 else ""
@@ -168,7 +168,7 @@ def _headroom(findings: Findings) -> list[Block]:
             lines.append([*cells, interval(headroom), *shares])
     if not lines:
         return []
-    headings = ["scenario", "best constant action", "planner", study.floor, study.ceiling, "headroom"]
+    headings = ["scenario", "best constant action", "planner", "planner:oracle", study.floor, study.ceiling, "headroom"]
     told = (
         f"Headroom is the mean return of {study.ceiling} above that of {study.floor}. The share of it that an arm uses "
         "is given where the interval of the headroom lies above 0; elsewhere there is nothing that could be shared."

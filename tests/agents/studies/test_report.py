@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from agents.studies.estimators import Estimate
 from agents.studies.findings import Findings, Line
 from agents.studies.plan import Arm, Scenario, Study
 from agents.studies.report import interval, write_headroom, write_report
 from agents.studies.results import Result
-from agents.studies.statistics import Estimate
 from tests.agents.studies.helpers import result
 
 MADE = {"command": "python -m agents.study", "commit": "abc", "machine": "m", "time": "now", "versions": {"numpy": "2"}}
@@ -145,7 +145,10 @@ def test_drivers_alone_make_a_report(tmp_path: Path):
 
 def test_headroom_alone(tmp_path: Path):
     text = write_headroom(tmp_path, found_in(study(), results()), MADE)
-    assert "| scenario | best constant action | planner | zeros | oracle | headroom | forecast uses |" in text
+    assert (
+        "| scenario | best constant action | planner | planner:oracle | zeros | oracle | headroom | forecast uses |"
+        in text
+    )
     assert "minutes of a training" in text
     assert "## Provenance" in (tmp_path / "headroom.md").read_text()
 

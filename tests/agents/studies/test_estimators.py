@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from agents.studies.statistics import (
+from agents.studies.estimators import (
     bootstrapped,
     gain,
     interquartile_mean,
