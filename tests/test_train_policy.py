@@ -154,6 +154,7 @@ def test_a_finished_policy_is_evaluated_again(finished: tuple[Path, str], monkey
     assert again["episodes"] == json.loads((run / "summary.json").read_text())["episodes"]
 
 
+@pytest.mark.slow
 def test_best_median_and_worst_episodes_are_filmed(
     finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
