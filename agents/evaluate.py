@@ -23,8 +23,8 @@ from agents.arena import EgoArena, open_arena
 from agents.episode_file import NO_PYARROW, has_pyarrow
 from agents.results import Evaluation
 from agents.runs import POLICY_FILE, load_model, read_config
+from agents.summaries import EXTREMES
 from agents.task import EVALUATION_SEED, Task, task_of
-from agents.video import EXTREMES, film_extremes
 from envs.drivers.ego import CONSTANT_ACTIONS, constant_actions, make_ego_driver, named_drivers
 from envs.sb3.policy_file import read_policy_note
 from predictor.support.command_line import Renamed, parse
@@ -248,6 +248,8 @@ def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str
 
 def _film(config: EvaluateConfig, run_dir: Path, evaluation: Evaluation, out: Path) -> dict[str, dict[str, Any]]:
     """Films episodes of the trained policy, which is the first of the evaluation; returns what the films show."""
+    from agents.video import film_extremes  # films alone need a video encoder
+
     run, episodes = read_config(run_dir), next(iter(evaluation.results.values()))
     model = load_model(run_dir / POLICY_FILE, run["algorithm"])
     films = film_extremes(task_of(run, config.device), model, episodes, out)

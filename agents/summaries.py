@@ -13,6 +13,9 @@ from predictor.support.errors import UserError
 
 _WILSON_Z = 1.959963984540054  # two-sided 95 %
 
+EXTREMES = ("best", "median", "worst")
+"""Names of the extreme episodes of a policy, by return; each can be filmed."""
+
 
 @dataclass(frozen=True)
 class PolicySummary:

@@ -9,6 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.arena import actions_of_others
 from agents.features import EGO_KEY
+from agents.summaries import EXTREMES
 from agents.task import EVALUATION_SEED, Task
 from agents.vec_envs import EpisodeResult, MakeCopy, learners_of, make_multiagent_venv, own_observations
 from envs.parallel import ForecastParallelEnv
@@ -26,8 +27,6 @@ FAN = 6
 """Number of futures that are drawn of a forecaster with modes."""
 MAX_VIDEO_STEPS = 200
 """Maximum length of a video [policy steps]; a racetrack episode has 1500."""
-EXTREMES = ("best", "median", "worst")
-"""Names of the films of several episodes."""
 
 
 def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) -> MultiagentRecording | None:

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -86,21 +87,30 @@ def test_shuffled_is_another_scene_and_the_same_in_every_run(bank: EntryBank, ev
     assert all((recorded == one).all(axis=(1, 2, 3)).any() for one in found["forecast"][present])
 
 
-@pytest.mark.parametrize("name", ["forecast", "zeros", "shuffled"])
-def test_a_probe_predicts_the_scene_from_forecasts_alone(name: str, bank: EntryBank):
-    """Ridge regression from the hidden entries to the nearest agent's present x: of use with forecasts alone."""
-    env = ForecastObservation(make_env(FAST), "highway", arm=Arm(name, bank=bank), **ROOM)
-    inputs, targets = [], []
+@pytest.fixture(scope="module")
+def driven() -> list[dict[str, Any]]:
+    """Observations of some episodes in the arm that shows everything."""
+    env = ForecastObservation(make_env(FAST), "highway", **ROOM)
+    found = []
     for seed in range(12):
-        found, _ = env.reset(seed=seed)
+        seen, _ = env.reset(seed=seed)
         for _ in range(8):
-            inputs.append(np.concatenate([found[k][0].ravel() for k in sorted(found) if k not in PRESENT]))
-            targets.append(found["agents"][0, 0])
-            found, _, terminated, *_ = env.step(env.unwrapped.np_random.integers(0, 2))
+            found.append(seen)
+            seen, _, terminated, *_ = env.step(env.unwrapped.np_random.integers(0, 2))
             if terminated:
                 break
     env.close()
-    x, y = np.array(inputs), np.array(targets)
+    return found
+
+
+@pytest.mark.parametrize("name", ["forecast", "zeros", "shuffled"])
+def test_a_probe_predicts_the_scene_from_forecasts_alone(name: str, bank: EntryBank, driven: list[dict[str, Any]]):
+    """Ridge regression from the hidden entries to the nearest agent's present x: of use with forecasts alone."""
+    entries = {key: np.stack([seen[key] for seen in driven]) for key in driven[0] if key != "observation"}
+    spaces = {key: gym.spaces.Box(-np.inf, np.inf, values.shape[1:]) for key, values in entries.items()}
+    shown = Arm(name, bank=bank).filled(entries, spaces)
+    x = np.hstack([shown[key][:, 0].reshape(len(driven), -1) for key in sorted(shown) if key not in PRESENT])
+    y = entries["agents"][:, 0, 0]
     half = len(x) // 2
     mean, scale = x[:half].mean(axis=0), x[:half].std(axis=0) + 1e-6
     x = np.hstack([(x - mean) / scale, np.ones((len(x), 1))])

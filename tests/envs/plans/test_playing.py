@@ -20,8 +20,9 @@ def positions_m(env: SceneObservation | ForecastObservation) -> dict[int, np.nda
     return {int(i): s[:2] for i, s, v in zip(scene.ids, scene.states, scene.valid, strict=True) if v}
 
 
-@pytest.mark.parametrize("env_id", ["highway-fast-v0", "merge-v1", "intersection-v2", "roundabout-v1"])
-@pytest.mark.parametrize("plan", [0, 1])
+@pytest.mark.parametrize(
+    ("env_id", "plan"), [("highway-fast-v0", 1), ("merge-v1", 0), ("intersection-v2", 1), ("roundabout-v1", 0)]
+)
 def test_the_oracle_is_what_then_happens(env_id: str, plan: int):
     env = ForecastObservation(make_env(env_id), what_if=True, arm=Arm("oracle-what-if"))
     env.reset(seed=3)
