@@ -7,6 +7,7 @@ Those seeds are disjoint from training and from the final evaluation, so selecti
 import json
 import time
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -326,6 +327,8 @@ class SelectBest(BaseCallback):
         returns = [r.episode_return for r in results]
         self.logger.record("eval/mean_reward", mean)
         self.logger.record("eval/mean_ep_length", float(np.mean([r.length for r in results])))
+        for name, value in driving_scalars(results).items():
+            self.logger.record(f"eval/{name}", value)
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
         comparable = len(self._highest) == len(returns)
@@ -335,6 +338,22 @@ class SelectBest(BaseCallback):
             self._highest = returns
         extra = {"selection_return": mean, "steps": self.num_timesteps, "highest_returns": self._highest}
         save_model(self.model, self._path, extra, self._note)
+
+
+def driving_scalars(results: Sequence[EpisodeResult]) -> dict[str, float]:
+    """Returns what TensorBoard shows of episodes beside their returns: crash rate, speed [m/s], share of each action.
+
+    What an environment does not report is left out.
+    """
+    scalars: dict[str, float] = {}
+    crashes = [r.crashed for r in results if r.crashed is not None]
+    if crashes:
+        scalars["crash_rate"] = float(np.mean(crashes))
+    speeds_mps = [r.mean_speed_mps for r in results if np.isfinite(r.mean_speed_mps)]
+    if speeds_mps:
+        scalars["speed_mps"] = float(np.mean(speeds_mps))
+    actions = sum((Counter(r.action_counts) for r in results), Counter())
+    return scalars | {f"share_{name}": count / actions.total() for name, count in sorted(actions.items())}
 
 
 def read_curve(path: Path) -> list[dict[str, Any]]:

@@ -16,7 +16,16 @@ from agents.features import ForecastAttention
 from agents.presets import PRESETS, Algorithm, DQNPreset, PPOPreset, preset_for
 from agents.runs import save_model
 from agents.task import EVALUATION_SEED, SELECTION_SEED, Task
-from agents.training import SaveCheckpoint, SelectBest, TrainingPlan, make_model, read_curve, significantly_worse, train
+from agents.training import (
+    SaveCheckpoint,
+    SelectBest,
+    TrainingPlan,
+    driving_scalars,
+    make_model,
+    read_curve,
+    significantly_worse,
+    train,
+)
 from agents.vec_envs import EpisodeResult, SeededEpisodes, make_venv
 from envs.sb3.policy_file import _MARKS, ALGORITHMS, read_note
 from predictor.support.errors import UserError
@@ -315,3 +324,12 @@ def test_a_damaged_curve_is_named(tmp_path: Path):
     with pytest.raises(UserError, match="curve.json is damaged; remove it to go on without it"):
         read_curve(tmp_path / "curve.json")
     assert read_curve(tmp_path / "absent.json") == []
+
+
+def test_tensorboard_shows_crashes_speed_and_actions():
+    """Two episodes of 1 and 3 steps; the second one reports no crash, and neither does a toy."""
+    first = EpisodeResult(0, 1.0, 1, True, 20.0, action_counts={"idle": 1})
+    second = EpisodeResult(1, 2.0, 3, False, 30.0, action_counts={"faster": 2, "idle": 1})
+    shown = driving_scalars([first, second])
+    assert shown == {"crash_rate": 0.5, "speed_mps": 25.0, "share_faster": 0.5, "share_idle": 0.5}
+    assert driving_scalars([EpisodeResult(0, 1.0, 1, None, float("nan"))]) == {}
