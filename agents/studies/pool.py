@@ -20,6 +20,8 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import IO, Any
 
+from tqdm import tqdm  # type: ignore[import-untyped]
+
 from agents.studies.cells import LOG_FILE, Cell, run_cell
 from agents.studies.results import RESULT_FILE
 from predictor.support.errors import UserError
@@ -130,6 +132,7 @@ def _work(cell: Cell, folder: Path, lifeline: Connection) -> None:
         if (folder / RESULT_FILE).exists():
             return
         keep_freed_memory()
+        tqdm.set_lock(threading.RLock())  # a progress bar's own lock is a semaphore, which a stopped process would leak
         try:
             run_cell(cell, folder)
         except UserError as error:
