@@ -57,7 +57,8 @@ class Task:
     """What the policy sees beside the env's own observation: an arm of `envs.arms`, or constant-velocity forecasts;
     "none" shows no forecasts."""
     checkpoint: str | None = None
-    """Forecaster for `observe="forecast"`: shipped name or path; None takes the one that ships for the id."""
+    """Forecaster behind every arm but none and constant-velocity: shipped name or path; None takes the one that ships
+    for the id."""
     device: str = "cpu"
     """Device that runs the forecaster: cpu, cuda or auto."""
     backend: Backend = "gymnasium"

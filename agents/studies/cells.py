@@ -24,7 +24,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from agents.arena import open_arena
 from agents.presets import Algorithm
 from agents.runs import CURVE_FILE, FORECASTER, load_model, open_run
-from agents.studies.plan import Arm, Scenario, Study, task_of
+from agents.studies.plan import Scenario, Study, StudyArm, task_for
 from agents.studies.results import RESULT_FILE, Result, write_result
 from agents.task import EVALUATION_SEED, Task
 from agents.training import TrainingPlan, read_curve, train
@@ -156,7 +156,7 @@ def run_cell(cell: Cell, folder: Path) -> Result:
 
 def _drivers(study: Study, scenario: Scenario, where: str) -> list[Cell]:
     """Returns the cells of a scenario's references, each checked by making its driver once."""
-    task = task_of(scenario, Arm("none", "none", {}), where)
+    task = task_for(scenario, StudyArm("none", "none", {}), where)
     names, place = scenario.references, f"{where}: scenario {scenario.name}"
     try:
         task.check()
@@ -177,9 +177,9 @@ def _drivers(study: Study, scenario: Scenario, where: str) -> list[Cell]:
         raise UserError(f"{place}: {error}") from error
 
 
-def _trainings(study: Study, scenario: Scenario, arm: Arm, where: str) -> list[Cell]:
+def _trainings(study: Study, scenario: Scenario, arm: StudyArm, where: str) -> list[Cell]:
     """Returns the cells of an arm in a scenario."""
-    task = task_of(scenario, arm, where)
+    task = task_for(scenario, arm, where)
     cells = []
     try:
         space, pin = task.check(), task.note.forecaster

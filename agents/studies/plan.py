@@ -30,7 +30,7 @@ _OWN = ("env_id", "observe")
 
 
 @dataclass(frozen=True)
-class Arm:
+class StudyArm:
     """What the policy of an arm is shown."""
 
     name: str
@@ -71,7 +71,7 @@ class Study:
     """Name of the study: the stem of its file."""
     scenarios: tuple[Scenario, ...]
     """Environments."""
-    arms: tuple[Arm, ...]
+    arms: tuple[StudyArm, ...]
     """Arms, in the order of the tables."""
     title: str = ""
     """Heading of the report; the name of the study if left out."""
@@ -146,14 +146,14 @@ class Study:
         )
         return replace(self, arms=arms, scenarios=scenarios, rivals=None)
 
-    def _arm_called(self, name: str, key: str) -> Arm:
+    def _arm_called(self, name: str, key: str) -> StudyArm:
         for arm in self.arms:
             if arm.name == name:
                 return arm
         known = get_args(Observe)
         if name not in known:
             raise UserError(f"{key} must be an arm of the study or one of {', '.join(known)}, got '{name}'")
-        return Arm(name, name, {})
+        return StudyArm(name, name, {})
 
 
 def shipped_studies() -> tuple[str, ...]:
@@ -196,7 +196,7 @@ def read_study(path: Path) -> Study:
     return replace(study, scenarios=scenarios)
 
 
-def task_of(scenario: Scenario, arm: Arm, where: str) -> Task:
+def task_for(scenario: Scenario, arm: StudyArm, where: str) -> Task:
     """Returns the task of an arm in a scenario.
 
     A scenario's checkpoint goes to the arms that take one and name none of their own.
@@ -226,7 +226,7 @@ def takes_checkpoint(observe: str) -> bool:
     return True
 
 
-def _arms(listed: Any, where: str) -> tuple[Arm, ...]:
+def _arms(listed: Any, where: str) -> tuple[StudyArm, ...]:
     """Returns the arms: each entry is a value of `Observe`, or a table with name, observe and fields of `Task`."""
     if not isinstance(listed, list) or not listed:
         raise UserError(f"{where}: key 'arms' must be an array of at least one arm")
@@ -238,7 +238,7 @@ def _arms(listed: Any, where: str) -> tuple[Arm, ...]:
     return arms
 
 
-def _arm(entry: Any, where: str) -> Arm:
+def _arm(entry: Any, where: str) -> StudyArm:
     table = {"name": entry} if isinstance(entry, str) else entry
     if not isinstance(table, dict) or not isinstance(table.get("name"), str):
         raise UserError(f"{where} must hold names or tables with a name, got {entry!r}")
@@ -250,7 +250,7 @@ def _arm(entry: Any, where: str) -> Arm:
         missing = "" if "observe" in table else "; a table with another name needs the key observe"
         raise UserError(f"{where}: unknown arm {observe!r}; there are {', '.join(known)}{missing}")
     options = {key: value for key, value in table.items() if key not in ("name", "observe")}
-    return Arm(name, observe, _task_options(options, f"{where}.{name}"))
+    return StudyArm(name, observe, _task_options(options, f"{where}.{name}"))
 
 
 def _scenario(name: str, table: Any, study: Study, where: str) -> Scenario:

@@ -3,7 +3,7 @@ from typing import get_args
 
 import pytest
 
-from agents.studies.plan import Arm, read_study, shipped_studies, study_file, takes_checkpoint, task_of
+from agents.studies.plan import StudyArm, read_study, shipped_studies, study_file, takes_checkpoint, task_for
 from agents.task import Observe
 from predictor.support.errors import UserError
 from tests.agents.studies.helpers import study_path, study_text
@@ -21,7 +21,7 @@ def test_a_study_is_read(tmp_path: Path):
     text += 'steps = 99\nreferences = ["idle"]\n[scenarios.merge-v1]\n'
     study = read_study(study_path(tmp_path, text))
     assert study.name == "corridor" and study.training_seeds == (4, 7) and study.compared_with == ("none",)
-    assert study.arms == (Arm("none", "none", {}), Arm("cv", "constant-velocity", {}))
+    assert study.arms == (StudyArm("none", "none", {}), StudyArm("cv", "constant-velocity", {}))
     first, second = study.scenarios
     assert (first.steps, first.references) == (99, ("idle",)), "a scenario's own"
     assert (second.env_id, second.steps, second.references) == ("merge-v1", 512, ("random", "constant-actions"))
@@ -31,9 +31,9 @@ def test_an_arm_names_a_checkpoint_by_scenario(tmp_path: Path):
     text = study_text(arms='["none", {name = "lstm", observe = "forecast", checkpoint = "runs/{scenario}/{env_id}"}]')
     text = text.replace(text[text.rindex("env_id") :], 'env_id = "merge-v1"\ncheckpoint = "shared"\n')
     study = read_study(study_path(tmp_path, text))
-    none, lstm = (task_of(study.scenarios[0], arm, "file") for arm in study.arms)
+    none, lstm = (task_for(study.scenarios[0], arm, "file") for arm in study.arms)
     assert lstm.checkpoint == "runs/corridor/merge-v1" and none.checkpoint is None
-    assert task_of(study.scenarios[0], Arm("forecast", "forecast", {}), "file").checkpoint == "shared"
+    assert task_for(study.scenarios[0], StudyArm("forecast", "forecast", {}), "file").checkpoint == "shared"
     assert takes_checkpoint("forecast") and not takes_checkpoint("none")
 
 
@@ -74,7 +74,7 @@ def test_bad_files_are_named_with_their_key(text: str, message: str, tmp_path: P
 def test_options_that_do_not_fit_an_arm_are_named(tmp_path: Path):
     study = read_study(study_path(tmp_path, study_text(arms='[{name = "none", checkpoint = "highway"}]')))
     with pytest.raises(UserError, match="^f.toml: scenario corridor, arm none: checkpoint 'highway' has no effect"):
-        task_of(study.scenarios[0], study.arms[0], "f.toml")
+        task_for(study.scenarios[0], study.arms[0], "f.toml")
 
 
 def test_an_unknown_study_is_named():

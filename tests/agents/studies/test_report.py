@@ -8,7 +8,7 @@ import pytest
 
 from agents.studies.estimators import Estimate
 from agents.studies.findings import Findings, Line
-from agents.studies.plan import Arm, Scenario, Study
+from agents.studies.plan import Scenario, Study, StudyArm
 from agents.studies.report import interval, write_headroom, write_report
 from agents.studies.results import Result
 from tests.agents.studies.helpers import result
@@ -22,7 +22,7 @@ def found_in(study: Study, results: list[Result]) -> Findings:
 
 
 def study(scenarios: tuple[str, ...] = ("one",), **changes: Any) -> Study:
-    arms = tuple(Arm(name, "none", {}) for name in ("zeros", "forecast", "oracle"))
+    arms = tuple(StudyArm(name, "none", {}) for name in ("zeros", "forecast", "oracle"))
     made = tuple(Scenario(name, "toy-v0", {}, 10, 1, ()) for name in scenarios)
     return Study("made-up", made, arms, **({"rivals": ("zeros",), "episodes": 2} | changes))
 
