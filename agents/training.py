@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.arena import Arena, open_arena
 from agents.features import AttentionConfig, ForecastAttention
+from agents.forecast_errors import ForecastErrors
 from agents.presets import Algorithm, PPOPreset, Preset, preset_for
 from agents.runs import BEST_FILE, CHECKPOINT_FILE, CURVE_FILE, POLICY_FILE, load_model, save_model
 from agents.task import SELECTION_SEED, Task
@@ -121,8 +122,8 @@ def _learn(plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: 
     """Trains for the remaining steps, with SB3's progress bar."""
     every = max(plan.steps // plan.selections, 1)
     checkpoint = run_dir / CHECKPOINT_FILE
-    restart = partial(_restart_streams, plan, model) if plan.repeatable else None
-    progress = ProgressBarCallback()
+    errors, progress = ForecastErrors(), ProgressBarCallback()
+    restart = partial(_restart_streams, plan, model, errors) if plan.repeatable else None
     select = SelectBest(
         selection,
         run_dir / BEST_FILE,
@@ -132,9 +133,10 @@ def _learn(plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: 
         curve=run_dir / CURVE_FILE,
         at_multiples=plan.repeatable,
         seconds=read_note(checkpoint).get("seconds", 0.0),
+        scalars=errors.scalars,
     )
     save = SaveCheckpoint(checkpoint, plan.checkpoint_every, note, lambda: {"seconds": select.seconds}, restart)
-    callbacks = [save, select, progress]
+    callbacks = [errors, save, select, progress]
     try:
         model.learn(
             plan.steps - model.num_timesteps,
@@ -197,12 +199,13 @@ def _seed_from_steps(plan: TrainingPlan, model: BaseAlgorithm) -> None:
     model.set_random_seed(int(fresh) % SELECTION_SEED)
 
 
-def _restart_streams(plan: TrainingPlan, model: BaseAlgorithm) -> None:
+def _restart_streams(plan: TrainingPlan, model: BaseAlgorithm, errors: ForecastErrors) -> None:
     """Puts a running training where a resumed one begins: random streams of its step, environments reset."""
     assert model.env is not None
     _seed_from_steps(plan, model)
     model._last_obs = model.env.reset()  # type: ignore[assignment]
     model._last_episode_starts = np.ones(model.env.num_envs, dtype=bool)
+    errors.begin()
 
 
 class SaveCheckpoint(BaseCallback):
@@ -253,6 +256,7 @@ class SelectBest(BaseCallback):
         curve: path of a JSON file with a line per measurement, written atomically; None writes none.
         at_multiples: whether to measure at the multiples of `every_steps`, wherever the training was resumed.
         seconds: time that was learned before this start [s].
+        scalars: called at each measurement; what it returns stands in TensorBoard and in the curve.
 
     Attributes:
         seconds: time that was learned, without measurements [s].
@@ -269,12 +273,14 @@ class SelectBest(BaseCallback):
         curve: Path | None = None,
         at_multiples: bool = False,
         seconds: float = 0.0,
+        scalars: Callable[[], dict[str, float]] = dict,
     ) -> None:
         """Prepares the measurements; none is made yet."""
         super().__init__()
         self._note = note
         self._arena, self._path, self._every = arena, path, every_steps
         self._curve, self._at_multiples, self._learned_s = curve, at_multiples, seconds
+        self._scalars = scalars
         self._seeds = range(SELECTION_SEED, SELECTION_SEED + num_episodes)
         self._measured_at = 0
         self._highest: list[float] = []
@@ -314,12 +320,13 @@ class SelectBest(BaseCallback):
         """Plays the seeds, keeps the model unless it is worse, and adds a point to the curve."""
         self._measured_at, self._learned_s = self.num_timesteps, self.seconds
         results = self._arena.play(self.model, self._seeds)
-        mean = float(np.mean([r.episode_return for r in results]))
+        mean, scalars = float(np.mean([r.episode_return for r in results])), self._scalars()
+        for name, value in scalars.items():
+            self.logger.record(f"loop/{name}", value)
         self._keep(results, mean)
         if self._curve is not None:
-            self._points.append(
-                {"steps": self.num_timesteps, "return": mean, "episodes": len(results), "seconds": self._learned_s}
-            )
+            point = {"steps": self.num_timesteps, "return": mean, "episodes": len(results), "seconds": self._learned_s}
+            self._points.append(point | scalars)
             write_json(self._curve, self._points)
         self._since = time.perf_counter()
 

@@ -73,6 +73,7 @@ class SceneStream:
         scenes: latest scene of each environment; None before the first. Where an episode just ended, the one that
             opens the next episode.
         forecast: forecast of each of `scenes`.
+        seen: scenes that were taken in last; where an episode just ended, its last.
     """
 
     def __init__(self, forecaster: Forecaster, envs: int, agents: int, config: ForecastConfig) -> None:
@@ -81,6 +82,7 @@ class SceneStream:
         self.horizon_steps = config.horizon_steps or forecaster.horizon_steps
         self.scenes: SceneBatch | None = None
         self.forecast: Forecast | None = None
+        self.seen: SceneBatch | None = None
         self._online = OnlineForecaster(forecaster, envs, agents, config.device)
         self._noise: list[np.random.Generator] = [_noise(config.seed + env) for env in range(envs)]
         self._before: list[np.random.Generator] = self._noise
@@ -138,6 +140,7 @@ class SceneStream:
             self.scenes, self.forecast = scenes, forecast
         else:
             self._keep_some(scenes, forecast, envs)
+        self.seen = self.scenes
         return forecast
 
     def take_boundary(self, scenes: SceneBatch, ended: Int[np.ndarray, " ended"], successors: SceneBatch) -> Forecast:
@@ -149,7 +152,7 @@ class SceneStream:
         kept = np.arange(len(scenes))
         kept[ended] = len(scenes) + np.arange(len(ended))
         index = torch.from_numpy(kept).to(forecast.xy.device)
-        self.scenes = SceneBatch.concatenate(scenes, successors)[kept]
+        self.scenes, self.seen = SceneBatch.concatenate(scenes, successors)[kept], scenes
         self.forecast = _changed(lambda field: field[index], forecast)
         return forecast
 

@@ -1,0 +1,148 @@
+"""Actor that scores each candidate plan of the ego by what the others would do in it.
+
+An observation with `what_if` says, for each plan and agent, how close they come, when they touch, and how probable that
+is. `PlanAttention` adds a summary of each plan to the features of `ForecastAttention`. `PlanScores` gives the plan's
+summary to one small network, the same for all plans, and adds its score to the logit of the action with which the plan
+begins. A network that has learned once that a contact is bad then knows it for every action.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import torch
+from jaxtyping import Float
+from stable_baselines3.common.policies import MultiInputActorCriticPolicy
+from stable_baselines3.common.torch_layers import MlpExtractor
+from torch import Tensor, nn
+
+from agents.features import VALID_KEY, WHAT_IF_GAP, AttentionConfig, ForecastAttention
+from predictor.support.errors import UserError
+
+CONTACT, RISK = "what_if_contact", "what_if_risk"
+SUMMARY = 5
+"""Number of values that summarise a plan."""
+_HIDDEN = 32
+
+
+class PlanAttention(ForecastAttention):
+    """`ForecastAttention` with a summary of each candidate plan behind its features.
+
+    Args:
+        observation_space: as for `ForecastAttention`, with the entries of `what_if`.
+        config: sizes and scales.
+
+    Attributes:
+        num_plans: number of plans.
+    """
+
+    def __init__(self, observation_space: gym.Space, config: AttentionConfig | None = None) -> None:
+        """Makes the layers in the sizes of the space.
+
+        Raises:
+            UserError: the space has no entries of `what_if`.
+        """
+        super().__init__(observation_space, config)
+        assert isinstance(observation_space, gym.spaces.Dict)
+        if WHAT_IF_GAP not in observation_space.spaces:
+            raise UserError(f"PlanAttention needs the entry '{WHAT_IF_GAP}'; wrap the environment with what_if=True")
+        self.num_plans = (observation_space[WHAT_IF_GAP].shape or (0,))[-1]
+        self._features_dim += SUMMARY * self.num_plans
+
+    def forward(self, observations: dict[str, Tensor]) -> Float[Tensor, "batch features"]:
+        """Returns the features of `ForecastAttention`, then `SUMMARY` values of each plan."""
+        return torch.cat([super().forward(observations), self._summaries(observations).flatten(1)], dim=-1)
+
+    def _summaries(self, observations: dict[str, Tensor]) -> Float[Tensor, "batch plans summary"]:
+        """Returns smallest gap at two scales, first contact, largest risk and risk of any contact.
+
+        Absent agents count as far away.
+        """
+        absent = (observations[VALID_KEY] < 0.5)[..., None]
+        gap = observations[WHAT_IF_GAP].masked_fill(absent, 2 * self.config.far_m).amin(1)
+        contact = observations[CONTACT].masked_fill(absent, 1.0).amin(1)
+        risk = observations[RISK]
+        any_contact = 1 - (1 - risk).prod(1)
+        near, far = torch.tanh(gap / self.config.near_m), (gap / self.config.far_m).clamp(-1, 2)
+        return torch.stack([near, far, contact, risk.amax(1), any_contact], dim=-1)
+
+
+class PlanScores(MultiInputActorCriticPolicy):
+    """SB3 policy for `PlanAttention`: the logit of an action is that of SB3's actor, plus the score of its plan.
+
+    Args:
+        args: arguments of SB3's policy.
+        plan_actions: action with which each plan begins.
+        kwargs: arguments of SB3's policy.
+    """
+
+    def __init__(self, *args: Any, plan_actions: Sequence[int], **kwargs: Any) -> None:
+        """Makes the networks."""
+        self.plan_actions = tuple(plan_actions)
+        super().__init__(*args, **kwargs)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | {"plan_actions": self.plan_actions}
+
+    def _build_mlp_extractor(self) -> None:
+        extractor = self.features_extractor
+        assert isinstance(extractor, PlanAttention) and isinstance(self.action_space, gym.spaces.Discrete)
+        super()._build_mlp_extractor()
+        self.mlp_extractor: Any = _WithScores(self.mlp_extractor, extractor.num_plans, self.features_dim)
+
+    def _build(self, lr_schedule: Any) -> None:
+        super()._build(lr_schedule)
+        extractor: Any = self.mlp_extractor
+        # SB3 has made one layer from both; the scores go to their own actions instead
+        self.action_net: nn.Module = _Logits(self.action_net, extractor.num_plans, self.plan_actions)
+        assert self.optimizer_class is not None
+        self.optimizer = self.optimizer_class(
+            self.parameters(),
+            lr=lr_schedule(1),
+            **self.optimizer_kwargs,  # type: ignore[call-arg]
+        )
+
+
+class _WithScores(nn.Module):
+    """Actor's and critic's hidden layers; the actor's end with the score of each plan."""
+
+    def __init__(self, hidden: MlpExtractor, num_plans: int, features_dim: int) -> None:
+        super().__init__()
+        self.hidden, self.num_plans = hidden, num_plans
+        self.latent_dim_pi = hidden.latent_dim_pi + num_plans
+        self.latent_dim_vf = hidden.latent_dim_vf
+        self._context = features_dim - num_plans * SUMMARY
+        self.score = nn.Sequential(
+            nn.Linear(self._context + SUMMARY, _HIDDEN), nn.Tanh(), nn.Linear(_HIDDEN, 1, bias=False)
+        )
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        return self.forward_actor(features), self.forward_critic(features)
+
+    def forward_actor(self, features: Float[Tensor, "batch features"]) -> Float[Tensor, "batch latent"]:
+        context, summaries = features[:, : self._context], features[:, self._context :].unflatten(1, (-1, SUMMARY))
+        each = torch.cat([context[:, None].expand(-1, self.num_plans, -1), summaries], dim=-1)
+        return torch.cat([self.hidden.forward_actor(features), self.score(each)[..., 0]], dim=-1)
+
+    def forward_critic(self, features: Float[Tensor, "batch features"]) -> Float[Tensor, "batch latent"]:
+        return self.hidden.forward_critic(features)
+
+
+class _Logits(nn.Module):
+    """Logits of the actions: a linear layer of the actor's hidden units, plus the score of each action's plan."""
+
+    def __init__(self, both: nn.Module, num_plans: int, plan_actions: Sequence[int]) -> None:
+        super().__init__()
+        assert isinstance(both, nn.Linear)
+        self.own = nn.Linear(both.in_features - num_plans, both.out_features)
+        with torch.no_grad():
+            self.own.weight.copy_(both.weight[:, :-num_plans])
+            self.own.bias.copy_(both.bias)
+        places = torch.zeros(num_plans, both.out_features)
+        places[torch.arange(num_plans), torch.tensor(plan_actions)] = 1.0
+        self.places: Tensor
+        self.register_buffer("places", places)
+
+    def forward(self, latent: Float[Tensor, "batch latent"]) -> Float[Tensor, "batch actions"]:
+        count = len(self.places)
+        return self.own(latent[:, :-count]) + latent[:, -count:] @ self.places
