@@ -8,6 +8,9 @@ from envs.observation import ForecastStream
 from envs.rollouts.loop_errors import LoopErrors
 from envs.sb3.forecast import VecForecast
 
+FORECAST_ERROR, CONSTANT_ERROR = "forecast_error_m", "constant_velocity_error_m"
+"""Names of the errors in TensorBoard and in the curve."""
+
 
 class ForecastErrors(BaseCallback):
     """Compares the forecasts of a `VecForecast` with what then happens; other environments have no errors."""
@@ -30,7 +33,7 @@ class ForecastErrors(BaseCallback):
     def scalars(self) -> dict[str, float]:
         """Returns the mean errors [m] since the last call, of the forecasts and of constant velocity."""
         found = None if self._errors is None else self._errors.errors_m()
-        return {} if found is None else {"forecast_error_m": found[0], "constant_velocity_error_m": found[1]}
+        return {} if found is None else dict(zip((FORECAST_ERROR, CONSTANT_ERROR), found, strict=True))
 
     def _on_training_start(self) -> None:
         self.begin()

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from agents.forecast_errors import CONSTANT_ERROR, FORECAST_ERROR
 from agents.studies.document import PICTURES, Block, Code, Heading, Paragraph, Picture, Table, as_html, as_markdown
 from agents.studies.estimators import Estimate, interquartile_mean
 from agents.studies.findings import NEARLY_CONSTANT, Findings, Line
@@ -69,7 +70,7 @@ def blocks_of(findings: Findings, text: str, provenance: dict[str, Any], failed:
         blocks += _all_scenarios(findings)
     if findings.lines(trained=True):
         blocks += _pictures(findings)
-    return [*blocks, *_times(findings), *_provenance(provenance, text)]
+    return [*blocks, *_loop_errors(findings), *_times(findings), *_provenance(provenance, text)]
 
 
 def interval(estimate: Estimate, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
@@ -212,6 +213,31 @@ def _pictures(findings: Findings) -> list[Block]:
         Heading("Performance profiles"),
         Picture("profiles.svg", profiles(findings), shares),
     ]
+
+
+def _loop_errors(findings: Findings) -> list[Block]:
+    """Returns the table of the errors of the forecasts that policies acted on; nothing where no arm has forecasts."""
+    lines = []
+    for (scenario, line), results in findings.results.items():
+        curves = [r.curve for r in results if r.curve and all(FORECAST_ERROR in point for point in r.curve)]
+        if curves:
+            first, last, constant = (
+                float(np.mean([curve[place][key] for curve in curves]))
+                for place, key in ((0, FORECAST_ERROR), (-1, FORECAST_ERROR), (-1, CONSTANT_ERROR))
+            )
+            returns = float(np.mean([curve[-1]["return"] for curve in curves]))
+            lines.append(
+                [findings.label(line), scenario, f"{first:.2f}", f"{last:.2f}", f"{constant:.2f}", f"{returns:.2f}"]
+            )
+    if not lines:
+        return []
+    headings = ["policy", "scenario", "before the first measurement [m]", "before the last [m]"]
+    headings += ["constant velocity before the last [m]", "return at the last"]
+    told = (
+        "Mean error of the forecasts behind the observations while the policy learned, up to the end of each episode. "
+        "Arms that show something else (zeros, oracle) have the same forecaster behind them."
+    )
+    return [Heading("Forecast errors in the loop"), Paragraph(told), Table(headings, lines)]
 
 
 def _times(findings: Findings) -> list[Block]:

@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -6,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from agents.forecast_errors import CONSTANT_ERROR, FORECAST_ERROR
 from agents.studies.estimators import Estimate
 from agents.studies.findings import Findings, Line
 from agents.studies.plan import Scenario, Study, StudyArm
@@ -157,3 +159,19 @@ def test_intervals_as_text():
     assert interval(Estimate(0.25, 0.1, 0.4), 0, 100.0, " %") == "25 % (10 to 40)"
     assert interval(Estimate(1.0, float("nan"), float("nan"))) == "1.00"
     assert interval(Estimate(float("nan"), 0.0, 0.0)) == "–"
+
+
+def test_errors_in_the_loop_stand_beside_returns(tmp_path: Path):
+    errors = ((3.0, 9.0), (1.0, 8.0))
+    curve = tuple(
+        {"steps": 100 * (i + 1), "return": 5.0 + i, "seconds": 6.0, FORECAST_ERROR: ours, CONSTANT_ERROR: constant}
+        for i, (ours, constant) in enumerate(errors)
+    )
+    found = [r if r.arm != "forecast" else replace(r, curve=curve) for r in results()]
+    write_report(tmp_path, found_in(study(), found), "", MADE, [])
+    lines = (tmp_path / "report.md").read_text().splitlines()
+    start = lines.index("## Forecast errors in the loop")
+    table = [line for line in lines[start : start + 10] if line.startswith("| ")]
+    assert table[1:] == ["| forecast | one | 3.00 | 1.00 | 8.00 | 6.00 |"], "arms without errors have no line"
+    write_report(tmp_path, found_in(study(), results()), "", MADE, [])
+    assert "errors in the loop" not in (tmp_path / "report.md").read_text()
