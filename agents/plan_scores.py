@@ -17,12 +17,26 @@ from stable_baselines3.common.torch_layers import MlpExtractor
 from torch import Tensor, nn
 
 from agents.features import VALID_KEY, WHAT_IF_GAP, AttentionConfig, ForecastAttention
+from agents.task import Task
+from envs.plans import plan_model_for
 from predictor.support.errors import UserError
 
 CONTACT, RISK = "what_if_contact", "what_if_risk"
 SUMMARY = 5
 """Number of values that summarise a plan."""
 _HIDDEN = 32
+
+
+def plan_actions(task: Task) -> tuple[int, ...] | None:
+    """Returns the action with which each plan begins; None if that is not the same action in every state.
+
+    Args:
+        task: task whose observation has room for what-if forecasts.
+    """
+    env = task.make(disable_env_checker=True)
+    env.close()
+    actions: tuple[int, ...] | None = getattr(plan_model_for(env), "actions", None)
+    return actions
 
 
 class PlanAttention(ForecastAttention):

@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from agents.arena import Arena, open_arena
 from agents.features import AttentionConfig, ForecastAttention
 from agents.forecast_errors import ForecastErrors
+from agents.plan_scores import PlanAttention, PlanScores, plan_actions
 from agents.presets import Algorithm, PPOPreset, Preset, preset_for
 from agents.runs import BEST_FILE, CHECKPOINT_FILE, CURVE_FILE, POLICY_FILE, load_model, save_model
 from agents.task import SELECTION_SEED, Task
@@ -162,11 +163,14 @@ def make_model(plan: TrainingPlan, venv: VecEnv, tensorboard_log: str | None = N
     policy_kwargs: dict[str, Any] = {
         "net_arch": {"pi": layers, "vf": layers} if isinstance(preset, PPOPreset) else layers
     }
-    policy = "MlpPolicy"
+    policy: str | type[PlanScores] = "MlpPolicy"
     if isinstance(venv.observation_space, spaces.Dict):
-        policy = "MultiInputPolicy"
+        policy, extractor = "MultiInputPolicy", ForecastAttention
+        if plan.task.what_if and isinstance(preset, PPOPreset) and (actions := plan_actions(plan.task)) is not None:
+            policy, extractor = PlanScores, PlanAttention
+            policy_kwargs["plan_actions"] = actions
         policy_kwargs |= {
-            "features_extractor_class": ForecastAttention,
+            "features_extractor_class": extractor,
             "features_extractor_kwargs": {"config": plan.attention},
         }
     make: Any = ALGORITHMS[plan.algorithm]

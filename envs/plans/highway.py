@@ -64,8 +64,10 @@ class HighwayPlans:
             raise UserError(f"HighwayPlans needs a highway-env environment, got {type(env.unwrapped).__name__}")
         kind: Any = env.unwrapped.action_type  # type: ignore[attr-defined]
         self._candidates: dict[str, Any] = {}
+        self._actions: tuple[int, ...] | None = None
         if isinstance(kind, DiscreteMetaAction):
             self._candidates = {name: name for name in META_ACTIONS if name in kind.actions_indexes}
+            self._actions = tuple(kind.actions_indexes[name] for name in self._candidates)
         elif isinstance(kind, ContinuousAction) and not isinstance(kind, DiscreteAction):
             throttles = THROTTLES if kind.longitudinal else {"keep": 0.0}
             lanes = LANES if kind.lateral else {"": 0}
@@ -80,6 +82,11 @@ class HighwayPlans:
     def names(self) -> tuple[str, ...]:
         """Name of each plan."""
         return tuple(self._candidates)
+
+    @property
+    def actions(self) -> tuple[int, ...] | None:
+        """Meta-action with which each plan begins; None with continuous controls, which depend on the state."""
+        return self._actions
 
     def plans(self, env: gym.Env, horizon_steps: int) -> Plans:
         """Returns the plans from the environment's present state, which stays as it is."""

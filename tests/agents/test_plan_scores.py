@@ -1,0 +1,163 @@
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from agents.features import ForecastAttention
+from agents.plan_scores import SUMMARY, PlanAttention, PlanScores, plan_actions
+from agents.task import Task
+from agents.training import TrainingPlan, make_model
+from agents.vec_envs import make_venv
+from predictor.support.errors import UserError
+
+OTHERS, PLANS = 3, 4
+PLAN_ACTIONS = (2, 0, 3, 1)
+
+
+class OneFreePlan(gym.Env[dict[str, np.ndarray], np.int64]):
+    """Environment in which one plan touches nobody; the reward is 1 for the action with which it begins."""
+
+    observation_space = gym.spaces.Dict(
+        {
+            "observation": gym.spaces.Box(-1, 1, (2,), np.float32),
+            "valid": gym.spaces.Box(0, 1, (OTHERS,), np.float32),
+            "what_if_gap": gym.spaces.Box(-np.inf, np.inf, (OTHERS, PLANS), np.float32),
+            "what_if_contact": gym.spaces.Box(0, 1, (OTHERS, PLANS), np.float32),
+            "what_if_risk": gym.spaces.Box(0, 1, (OTHERS, PLANS), np.float32),
+        }
+    )
+    action_space = gym.spaces.Discrete(PLANS)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self._look(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        reward = float(int(action) == PLAN_ACTIONS[self._free])
+        return self._look(), reward, False, bool(self.np_random.random() < 0.1), {}
+
+    def _look(self) -> dict[str, np.ndarray]:
+        self._free = int(self.np_random.integers(PLANS))
+        valid = np.array([1, 1, 0], np.float32)
+        touched = np.zeros((OTHERS, PLANS), np.float32)
+        touched[self.np_random.integers(2, size=PLANS), np.arange(PLANS)] = 1.0
+        touched[:, self._free] = 0.0
+        gap = np.where(touched > 0, -0.5, self.np_random.uniform(2, 30, touched.shape)).astype(np.float32)
+        entries = {"what_if_gap": gap, "what_if_contact": 1 - 0.5 * touched, "what_if_risk": touched}
+        own = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+        shown = {k: (v * valid[:, None]).astype(np.float32) for k, v in entries.items()}
+        return {"observation": own, "valid": valid, **shown}
+
+
+def make_ppo(**changes: Any) -> PPO:
+    kwargs = {"features_extractor_class": PlanAttention, "plan_actions": PLAN_ACTIONS, "net_arch": [32]}
+    options: dict[str, Any] = {"n_steps": 256, "batch_size": 64, "learning_rate": 1e-3, "seed": 0, "gamma": 0.0}
+    return PPO(PlanScores, DummyVecEnv([OneFreePlan]), policy_kwargs=kwargs, device="cpu", **(options | changes))
+
+
+def observed(count: int = 50, seed: int = 0) -> dict[str, torch.Tensor]:
+    env = OneFreePlan()
+    shown = [env.reset(seed=seed)[0], *(env.step(0)[0] for _ in range(count - 1))]
+    return {key: torch.tensor(np.stack([one[key] for one in shown])) for key in shown[0]}
+
+
+def logits(model: PPO, shown: dict[str, torch.Tensor]) -> torch.Tensor:
+    with torch.no_grad():
+        return model.policy.get_distribution(shown).distribution.logits
+
+
+def test_what_is_learned_of_one_plan_holds_for_all():
+    model = make_ppo().learn(2048)
+    shown = observed(400, seed=1)
+    free = shown["what_if_risk"].amax(1).argmin(-1)
+    wanted = torch.tensor(PLAN_ACTIONS)[free]
+    assert (logits(model, shown).argmax(-1) == wanted).float().mean() > 0.95
+
+
+def test_scores_go_to_the_actions_of_their_plans():
+    model, shown = make_ppo(), observed()
+    extractor: Any = model.policy.mlp_extractor
+    torch.nn.init.normal_(extractor.score[-1].weight)
+    before = logits(model, shown)
+    with torch.no_grad():  # the scores alone: SB3's own actor says nothing
+        for parameter in model.policy.action_net.own.parameters():
+            parameter.zero_()
+    alone = logits(model, shown)
+    features = model.policy.extract_features(shown)
+    scores = extractor.forward_actor(features)[:, -PLANS:]
+    assert (scores.std(1) > 0.01).all() and not torch.allclose(alone, before)
+    placed = torch.stack([scores[:, PLAN_ACTIONS.index(action)] for action in range(PLANS)], dim=1)
+    torch.testing.assert_close(alone, placed.log_softmax(-1))
+
+
+def test_plans_that_look_alike_have_equal_scores():
+    model, shown = make_ppo(), observed()
+    for key in ("what_if_gap", "what_if_contact", "what_if_risk"):
+        shown[key] = shown[key][..., :1].expand(-1, -1, PLANS)
+    torch.nn.init.normal_(model.policy.mlp_extractor.score[-1].weight)
+    scores = model.policy.mlp_extractor.forward_actor(model.policy.extract_features(shown))[:, -PLANS:]
+    torch.testing.assert_close(scores, scores[:, :1].expand(-1, PLANS))
+
+
+def test_absent_agents_are_far_away():
+    shown, extractor = observed(), PlanAttention(OneFreePlan.observation_space)
+    features = extractor(shown)
+    for key in ("what_if_gap", "what_if_contact", "what_if_risk"):
+        assert (shown[key][:, 2] == 0).all(), "padding looks like a contact"
+    summary = features[:, -PLANS * SUMMARY :].unflatten(1, (PLANS, SUMMARY))
+    free = shown["what_if_risk"].amax(1) == 0
+    gap, contact = shown["what_if_gap"][:, :2].amin(1), shown["what_if_contact"][:, :2].amin(1)
+    torch.testing.assert_close(summary[..., 0], torch.tanh(gap / 10))
+    torch.testing.assert_close(summary[..., 1], gap / 50)
+    torch.testing.assert_close(summary[..., 2], contact)
+    torch.testing.assert_close(summary[..., 4], 1.0 - free.float())
+    nobody = {**shown, "valid": torch.zeros_like(shown["valid"])}
+    alone = extractor(nobody)[:, -PLANS * SUMMARY :].unflatten(1, (PLANS, SUMMARY))
+    assert (alone[..., 0] > 0.99).all() and (alone[..., 2] == 1).all() and (alone[..., 1] == 2).all()
+
+
+def test_the_policy_is_saved_with_its_plans(tmp_path: Path):
+    model = make_ppo().learn(256)
+    model.save(tmp_path / "policy.zip")
+    loaded = PPO.load(tmp_path / "policy.zip", device="cpu")
+    torch.testing.assert_close(logits(loaded, observed()), logits(model, observed()), rtol=0, atol=0)
+    assert loaded.policy.plan_actions == PLAN_ACTIONS
+
+
+def test_a_space_without_plans_is_refused():
+    with pytest.raises(UserError, match="needs the entry 'what_if_gap'; wrap the environment with what_if=True"):
+        PlanAttention(gym.spaces.Dict({"observation": gym.spaces.Box(-1, 1, (2,))}))
+
+
+def test_actions_of_plans_are_those_that_the_planner_takes():
+    task = Task("highway-fast-v0", "constant-velocity", what_if=True)
+    env = task.make()
+    env.reset(seed=0)
+    names = {number: name for name, number in env.unwrapped.action_type.actions_indexes.items()}
+    assert [names[action] for action in plan_actions(task) or ()] == [
+        "IDLE", "SLOWER", "FASTER", "LANE_LEFT", "LANE_RIGHT"
+    ]  # fmt: skip
+    assert plan_actions(Task("racetrack-v1", "constant-velocity", what_if=True)) is None, "continuous controls"
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "what_if", "extractor"),
+    [("ppo", True, PlanAttention), ("ppo", False, ForecastAttention), ("dqn", True, ForecastAttention)],
+)
+def test_policies_with_what_if_score_plans(algorithm: Any, what_if: bool, extractor: type):
+    task = Task("highway-fast-v0", "constant-velocity", what_if=what_if)
+    plan = TrainingPlan(task, algorithm, 10, 1, 0)
+    venv = make_venv(task, 1, in_process=True)
+    model = make_model(plan, venv)
+    assert (
+        type(model.policy.features_extractor if algorithm == "ppo" else model.policy.q_net.features_extractor)
+        is extractor
+    )
+    obs = venv.reset()
+    assert model.predict(obs)[0].shape == (1,)
+    venv.close()
