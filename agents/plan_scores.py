@@ -22,8 +22,10 @@ from envs.plans import plan_model_for
 from predictor.support.errors import UserError
 
 CONTACT, RISK = "what_if_contact", "what_if_risk"
-SUMMARY = 5
+SUMMARY = 6
 """Number of values that summarise a plan."""
+TOUCHING = 0.2
+"""Scale of gaps that nearly touch, as a fraction of `AttentionConfig.near_m`: 2 m on roads."""
 _HIDDEN = 32
 
 
@@ -68,7 +70,7 @@ class PlanAttention(ForecastAttention):
         return torch.cat([super().forward(observations), self._summaries(observations).flatten(1)], dim=-1)
 
     def _summaries(self, observations: dict[str, Tensor]) -> Float[Tensor, "batch plans summary"]:
-        """Returns smallest gap at two scales, first contact, largest risk and risk of any contact.
+        """Returns smallest gap at three scales, first contact, largest risk and risk of any contact.
 
         Absent agents count as far away.
         """
@@ -77,8 +79,9 @@ class PlanAttention(ForecastAttention):
         contact = observations[CONTACT].masked_fill(absent, 1.0).amin(1)
         risk = observations[RISK]
         any_contact = 1 - (1 - risk).prod(1)
-        near, far = torch.tanh(gap / self.config.near_m), (gap / self.config.far_m).clamp(-1, 2)
-        return torch.stack([near, far, contact, risk.amax(1), any_contact], dim=-1)
+        scales = (TOUCHING * self.config.near_m, self.config.near_m)
+        gaps = [torch.tanh(gap / scale) for scale in scales] + [(gap / self.config.far_m).clamp(-1, 2)]
+        return torch.stack([*gaps, contact, risk.amax(1), any_contact], dim=-1)
 
 
 class PlanScores(MultiInputActorCriticPolicy):

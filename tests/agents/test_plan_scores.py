@@ -112,13 +112,14 @@ def test_absent_agents_are_far_away():
     summary = features[:, -PLANS * SUMMARY :].unflatten(1, (PLANS, SUMMARY))
     free = shown["what_if_risk"].amax(1) == 0
     gap, contact = shown["what_if_gap"][:, :2].amin(1), shown["what_if_contact"][:, :2].amin(1)
-    torch.testing.assert_close(summary[..., 0], torch.tanh(gap / 10))
-    torch.testing.assert_close(summary[..., 1], gap / 50)
-    torch.testing.assert_close(summary[..., 2], contact)
-    torch.testing.assert_close(summary[..., 4], 1.0 - free.float())
+    torch.testing.assert_close(summary[..., 0], torch.tanh(gap / 2))
+    torch.testing.assert_close(summary[..., 1], torch.tanh(gap / 10))
+    torch.testing.assert_close(summary[..., 2], gap / 50)
+    torch.testing.assert_close(summary[..., 3], contact)
+    torch.testing.assert_close(summary[..., 5], 1.0 - free.float())
     nobody = {**shown, "valid": torch.zeros_like(shown["valid"])}
     alone = extractor(nobody)[:, -PLANS * SUMMARY :].unflatten(1, (PLANS, SUMMARY))
-    assert (alone[..., 0] > 0.99).all() and (alone[..., 2] == 1).all() and (alone[..., 1] == 2).all()
+    assert (alone[..., :2] > 0.99).all() and (alone[..., 2] == 2).all() and (alone[..., 3] == 1).all()
 
 
 def test_the_policy_is_saved_with_its_plans(tmp_path: Path):
