@@ -158,7 +158,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--policy idle --env-id merge-v1 --out new --drivers none slower", "--drivers none adds no line and stands"),
     ],
     "agents.study": [
-        ("--study absent", "no study 'absent': neither a file nor one that ships (quick)"),
+        ("--study absent", "no study 'absent': neither a file nor one that ships (foresight, quick)"),
         ("--study file", "file is not valid TOML: "),
         ("--workers -1", "workers must not be negative, got -1"),
         ("--out file", "file is a file; choose another --out"),

@@ -39,8 +39,8 @@ from predictor.support.provenance import provenance
 PACKAGES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2", "torch", "numpy")
 RULES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2")
 """Packages whose versions are part of a cell's name: the simulators and the learning algorithms."""
-MEASURING = 1
-"""Number of the way of running and measuring; a cell of another one is another cell."""
+MEASURING = 2
+"""Number of the way of running and measuring, networks included; a cell of another one is another cell."""
 RUN_FOLDER = "run"
 LOG_FILE = "log.txt"
 
