@@ -50,6 +50,8 @@ class TrainPolicyConfig:
     """Number of futures per agent in the observation."""
     horizon_steps: int | None = None
     """Number of steps to forecast; None takes what the checkpoint was trained for."""
+    perception_m: float | None = None
+    """Distance up to which the policy sees other agents, now and forecast [m]; None takes the checkpoint's."""
     what_if: bool = False
     """Show also what the others do in each candidate plan of the ego."""
     env_kwargs: str = ""
@@ -107,7 +109,7 @@ class TrainPolicyConfig:
         learners = entry_for(self.env_id).learners if self.learners is None else self.learners
         task = Task(
             self.env_id, self.observe, self.checkpoint, self.device, self.backend, tuple(learners), self.driver,
-            self.num_samples, self.horizon_steps, self.what_if, self.env_kwargs,
+            self.num_samples, self.horizon_steps, self.perception_m, self.what_if, self.env_kwargs,
         )  # fmt: skip
         return TrainingPlan(
             task,

@@ -71,6 +71,8 @@ class Task:
     """Number of futures per agent that the observation has room for."""
     horizon_steps: int | None = None
     """Number of steps to forecast; None takes what the checkpoint was trained for."""
+    perception_m: float | None = None
+    """Distance up to which the policy sees other agents, now and forecast [m]; None takes the checkpoint's."""
     what_if: bool = False
     """Whether the observation has room for what the others do in each candidate plan of the ego."""
     env_kwargs: str = ""
@@ -91,6 +93,10 @@ class Task:
         if self.checkpoint is not None and self.observe in ("none", CONSTANT_VELOCITY):
             raise UserError(f"checkpoint '{self.checkpoint}' has no effect with observe={self.observe}; leave one out")
         check_at_least(self, 1, "num_samples", "horizon_steps")
+        if self.perception_m is not None and not self.perception_m > 0:
+            raise UserError(f"perception_m must be positive, got {self.perception_m}")
+        if self.perception_m is not None and self.observe == "none":
+            raise UserError("perception_m has no effect with observe=none; leave one out")
         if self.what_if and self.is_multiagent:
             raise UserError(f"what_if needs an environment with one ego, {self.env_id} has several learners")
         if self.make_kwargs and self.backend == "envpool":
@@ -154,12 +160,12 @@ class Task:
             UserError: see `scene_spec`.
         """
         options = self.options
-        if self.is_multiagent:
-            return ForecastParallelEnv(env, **options)
-        shipped = _shipped_for(self.env_id) if self.observe != "forecast" else None
+        shipped = _shipped_for(self.env_id) if self.observe != "forecast" and not self.is_multiagent else None
         if shipped is not None:  # constant velocity has no range of its own
             options |= {"perception_m": shipped.spec.perception_m, "max_agents": shipped.spec.max_agents}
-        return ForecastObservation(env, **options)
+        if self.perception_m is not None:
+            options["perception_m"] = self.perception_m
+        return ForecastParallelEnv(env, **options) if self.is_multiagent else ForecastObservation(env, **options)
 
     def make(self, **kwargs: Any) -> Any:
         """Makes the environment, without forecasts.
@@ -247,6 +253,7 @@ def task_of(run: Mapping[str, Any], device: str = "cpu") -> Task:
         driver=run.get("partner", "heuristic"),
         num_samples=run.get("num_samples", 1),
         horizon_steps=run.get("horizon_steps"),
+        perception_m=run.get("perception_m"),
         what_if=run.get("what_if", False),
         env_kwargs=run.get("env_kwargs", ""),
     )

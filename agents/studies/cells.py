@@ -41,6 +41,8 @@ RULES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2")
 """Packages whose versions are part of a cell's name: the simulators and the learning algorithms."""
 MEASURING = 2
 """Number of the way of running and measuring, networks included; a cell of another one is another cell."""
+YOUNGER = {"perception_m": None}
+"""Fields of `Task` that came after the first cells, with the value that those had: it does not change their names."""
 RUN_FOLDER = "run"
 LOG_FILE = "log.txt"
 
@@ -89,7 +91,8 @@ class Cell:
     @property
     def content(self) -> dict[str, Any]:
         """Everything that determines the result, as JSON content."""
-        task = {key: value for key, value in asdict(self.task).items() if key not in ("device", "checkpoint")}
+        skipped = {"device", "checkpoint"} | {key for key, value in YOUNGER.items() if getattr(self.task, key) == value}
+        task = {key: value for key, value in asdict(self.task).items() if key not in skipped}
         content: dict[str, Any] = {
             "measuring": MEASURING,
             "task": task,
@@ -99,8 +102,8 @@ class Cell:
         }
         if self.plan is None:
             return content | {"driver": self.line}
-        skipped = ("task", "device", "in_process", "selection_envs")
-        values = {key: value for key, value in asdict(self.plan).items() if key not in skipped}
+        unrelated = ("task", "device", "in_process", "selection_envs")
+        values = {key: value for key, value in asdict(self.plan).items() if key not in unrelated}
         return content | {"plan": values, "preset": asdict(self.plan.preset)}
 
 

@@ -1,6 +1,8 @@
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
 from agents.runs import save_model
@@ -125,5 +127,30 @@ def test_the_note_of_an_arm_gives_its_wrapper_back(tmp_path: Path):
 def test_a_run_of_an_older_version_has_the_old_options():
     old = {"env_id": "merge-v1", "observe": "forecast", "checkpoint": None}
     assert task_of(old) == Task("merge-v1")
-    new = {**old, "observe": "modes", "num_samples": 6, "what_if": True, "env_kwargs": "{}", "horizon_steps": 4}
-    assert task_of(new) == Task("merge-v1", "modes", num_samples=6, what_if=True, env_kwargs="{}", horizon_steps=4)
+    options = {"num_samples": 6, "what_if": True, "env_kwargs": "{}", "horizon_steps": 4, "perception_m": 30.0}
+    assert task_of({**old, "observe": "modes", **options}) == Task("merge-v1", "modes", **options)
+
+
+@pytest.mark.parametrize("env_id", ["highway-fast-v0", TAG])
+@pytest.mark.parametrize("observe", ["forecast", "zeros", "constant-velocity"])
+def test_perception_limits_what_is_seen(env_id: str, observe: Any):
+    seen = []
+    for perception_m in (None, 0.4 if env_id == TAG else 25.0):
+        task = Task(env_id, observe, perception_m=perception_m)
+        venv = make_venv(task, 1)
+        venv.seed(0)
+        obs: Any = venv.reset()
+        distances_m = np.linalg.norm(obs["agents"][..., :2], axis=-1)[obs["valid"] > 0]
+        assert len(distances_m) and (perception_m is None or distances_m.max() <= perception_m)
+        seen.append(len(distances_m))
+        pin = task.note.forecaster
+        assert pin is not None and perception_m in (None, pin.perception_m), "the policy's file tells it"
+        venv.close()
+    assert seen[0] > seen[1]
+
+
+def test_perception_must_be_positive_and_have_an_effect():
+    with pytest.raises(UserError, match="perception_m must be positive, got -1"):
+        Task("merge-v1", perception_m=-1.0)
+    with pytest.raises(UserError, match="perception_m has no effect with observe=none; leave one out"):
+        Task("merge-v1", "none", perception_m=20.0)
