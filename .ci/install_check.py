@@ -104,6 +104,14 @@ EXTRAS: dict[str, Extra] = {
         ),
         absent=("envpool", "optuna"),
     ),
+    "tune": Extra(
+        (
+            "agents.tune --trials 2 --steps 128 --num-envs 1 --episodes 1 --selections 1 --selection-episodes 1",
+            "train_policy --preset runs/tune-highway-fast-v0-ppo/best.toml --steps 128 --selections 1 "
+            "--selection-episodes 1 --eval-episodes 2 --no-video",
+        ),
+        absent=("envpool", "sb3_contrib"),
+    ),
     "envpool": Extra((WRAPPED.format(env_id="envpool/HighwayFast-v0"), "\nfrom envs import EnvPoolVecEnv\n")),
 }
 """Extras by name; "core" is the package alone."""

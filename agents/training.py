@@ -103,8 +103,13 @@ class TrainingPlan:
         check_actions(self.algorithm, space, self.task.env_id)
 
 
-def train(plan: TrainingPlan, run_dir: Path) -> Path:
+def train(plan: TrainingPlan, run_dir: Path, progress_bar: bool = True) -> Path:
     """Trains until `plan.steps`, from the checkpoint in `run_dir` if there is one.
+
+    Args:
+        plan: settings of the training.
+        run_dir: folder of the run, which exists.
+        progress_bar: whether to show SB3's progress bar.
 
     Returns:
         Path of the final policy, `run_dir/policy.zip`.
@@ -115,7 +120,7 @@ def train(plan: TrainingPlan, run_dir: Path) -> Path:
     try:
         model = _resume_or_make(plan, venv, run_dir)
         if model.num_timesteps < plan.steps:
-            _learn(plan, model, selection, run_dir, note)
+            _learn(plan, model, selection, run_dir, note, progress_bar)
             save_model(model, run_dir / CHECKPOINT_FILE, note=note, buffer=True)
     finally:
         venv.close()
@@ -124,8 +129,10 @@ def train(plan: TrainingPlan, run_dir: Path) -> Path:
     return run_dir / POLICY_FILE
 
 
-def _learn(plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: Path, note: PolicyNote) -> None:
-    """Trains for the remaining steps, with SB3's progress bar."""
+def _learn(
+    plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: Path, note: PolicyNote, progress_bar: bool
+) -> None:
+    """Trains for the remaining steps."""
     every = max(plan.steps // plan.selections, 1)
     checkpoint = run_dir / CHECKPOINT_FILE
     restart = partial(_restart_streams, plan, model) if plan.repeatable else None
@@ -141,7 +148,7 @@ def _learn(plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: 
         seconds=read_note(checkpoint).get("seconds", 0.0),
     )
     save = SaveCheckpoint(checkpoint, plan.checkpoint_every, note, lambda: {"seconds": select.seconds}, restart)
-    callbacks = [save, select, progress]
+    callbacks = [save, select, progress] if progress_bar else [save, select]
     try:
         model.learn(
             plan.steps - model.num_timesteps,

@@ -164,6 +164,17 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--out file", "file is a file; choose another --out"),
         ("--out .", ". holds file but no study (study.toml); choose another --out"),
     ],
+    "agents.tune": [
+        ("--env-id nope-v0", "cannot make env 'nope-v0'"),
+        ("--algorithm sac", "sac needs a continuous action space, highway-fast-v0 has Discrete(5); use ppo"),
+        ("--algorithm sarsa", "invalid choice 'sarsa' for argument '--algorithm'"),
+        ("--trials 0", "trials must be at least 1, got 0"),
+        ("--seed -1", "seed must lie in [0, 1000000), got -1"),
+        ("--trainings 101", "trainings must be at most 100, got 101"),
+        ("--checkpoint absent", "no checkpoint 'absent'"),
+        ("--out file", "file is a file; choose another --out"),
+        ("--out .", ". holds file but no tuning (tuning.json); choose another --out"),
+    ],
     "train_policy": [
         ("--env-id nope-v0 --observe none", "cannot make env 'nope-v0'"),
         ("--num-envs 0", "num_envs must be at least 1, got 0"),
