@@ -18,7 +18,7 @@ DISCRETE: tuple[Algorithm, ...] = ("dqn", "qrdqn")
 CONTINUOUS: tuple[Algorithm, ...] = ("sac", "tqc")
 """Algorithms that need continuous actions."""
 LOG_INTERVAL: dict[Algorithm, int] = {"ppo": 1, "recurrent-ppo": 1, "a2c": 25}
-"""Number of rollouts between lines of the log: a line every 128 steps; others count episodes, 20 by default."""
+"""Number of rollouts between lines of the log: a line about every 128 steps; others count episodes."""
 LOG_EPISODES = 20
 
 

@@ -171,7 +171,7 @@ class SACPreset(OffPolicyPreset):
     """Adam's step size; SB3's default."""
     buffer_size: int = 20_000
     """Number of transitions kept: all of a training of the default length (SB3: 1,000,000). The buffer is part of every
-    checkpoint, with 4 to 8 kB per transition."""
+    checkpoint, with 3 to 8 kB per transition with forecasts."""
     batch_size: int = 256
     """Number of samples per gradient step; SB3's default."""
     tau: float = 0.005
