@@ -1,6 +1,6 @@
 PYTHON ?= python3
 TEST_JOBS ?= 2
-EXTRAS ?= core scores envs rl study envpool
+EXTRAS ?= core scores envs rl study contrib tune envpool
 RUN_DIR ?= runs/highway-fast-ppo
 
 .DEFAULT_GOAL := help

@@ -9,12 +9,13 @@ summary.md, episodes.parquet (where pyarrow is installed) and video.mp4.
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from rich.console import Console
 
 from agents.evaluate import constant_drivers, evaluate_with_progress, show
+from agents.preset_settings import settings_from_file, settings_from_words
 from agents.presets import Algorithm
 from agents.results import PACKAGES
 from agents.runs import FORECASTER, check_forecaster, load_model, open_run
@@ -40,7 +41,13 @@ class TrainPolicyConfig:
     env_id: Annotated[str, Renamed("env")] = "highway-fast-v0"
     """Environment to train on: Gymnasium id (highway-fast-v0) or PettingZoo parallel id (simple_tag_v3)."""
     algorithm: Algorithm = "ppo"
-    """Learning algorithm; its hyperparameters are in agents/presets.py."""
+    """Learning algorithm: ppo, dqn (discrete actions), a2c, sac (continuous actions); with the extra contrib also qrdqn
+    (discrete), recurrent-ppo and tqc (continuous). Their hyperparameters are in agents/presets.py."""
+    set: tuple[str, ...] = ()
+    """Hyperparameters of the algorithm to change, as name=value: --set learning_rate=3e-4 gamma=0.95."""
+    preset: Path | None = None
+    """TOML file with hyperparameters of the algorithm to change, such as python -m agents.tune writes; --set comes
+    after it."""
     observe: Observe = "forecast"
     """What the policy sees: learned forecasts ("forecast"), constant-velocity forecasts, no forecasts ("none"), or an
     arm of a controlled comparison (docs/arms.md)."""
@@ -122,7 +129,14 @@ class TrainPolicyConfig:
             self.selection_episodes,
             self.measuring_envs,
             self.checkpoint_every,
+            settings=self.settings,
         )
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Hyperparameters in place of the preset's."""
+        read = {} if self.preset is None else settings_from_file(self.algorithm, self.preset)
+        return read | settings_from_words(self.algorithm, self.set)
 
     @property
     def parallel_envs(self) -> int:
@@ -144,13 +158,15 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
     settings |= {"learners": plan.task.learners, "envs": config.parallel_envs, "partner": config.driver}
     pin = plan.task.note.forecaster
     settings[FORECASTER] = None if pin is None else asdict(pin)
+    settings["preset_file"] = config.preset
     for name in ("out", "resume", "num_envs", "driver"):
         settings.pop(name)
     if config.resume and not check_forecaster(config.folder, pin):
         console.print(
             f"note: {config.folder} does not say which forecaster it was trained on; it goes on with this one"
         )
-    free = ("checkpoint_every", "eval_episodes", "video", "device", FORECASTER)  # the last is compared above
+    free = ("checkpoint_every", "eval_episodes", "video", "device", "set", "preset_file", FORECASTER)
+    # the forecaster is compared above, what --set and --preset say as part of the preset
     open_run(config.folder, settings, provenance(PACKAGES) | {"seed": config.seed}, config.resume, free)
     if config.backend == "envpool" and (copy := envpool_task_of(config.env_id)) in ONE_START:
         console.print(f"note: EnvPool's {copy} begins every episode in the same state; the original does not")

@@ -35,6 +35,16 @@ except UserError as error:
 else:
     raise SystemExit("made an environment of EnvPool, which is not installed")
 """
+WITHOUT_CONTRIB = """
+from agents import Task, TrainingPlan
+from predictor import UserError
+try:
+    TrainingPlan(Task("highway-fast-v0", "none"), "qrdqn", steps=1, num_envs=1, seed=0)
+except UserError as error:
+    assert "pip install 'dgvae-rl[contrib]'" in str(error), error
+else:
+    raise SystemExit("planned a training with sb3-contrib, which is not installed")
+"""
 
 
 @dataclass(frozen=True)
@@ -74,8 +84,9 @@ EXTRAS: dict[str, Extra] = {
         (
             "\nfrom agents import *\nfrom envs import VecForecast, ParallelVecEnv\n",
             "train_policy --steps 128 --selections 1 --selection-episodes 1 --eval-episodes 2",
+            WITHOUT_CONTRIB,
         ),
-        absent=("envpool",),
+        absent=("envpool", "sb3_contrib", "optuna"),
     ),
     "study": Extra(
         (
@@ -85,6 +96,21 @@ EXTRAS: dict[str, Extra] = {
             "\nimport pyarrow.parquet\nassert pyarrow.parquet.read_table('study/episodes.parquet').num_rows == 12\n",
         ),
         absent=("envpool",),
+    ),
+    "contrib": Extra(
+        (
+            "train_policy --algorithm qrdqn --steps 128 --selections 1 --selection-episodes 1 --eval-episodes 2",
+            "agents.evaluate --run-dir runs/highway-fast-v0-qrdqn-forecast-0 --episodes 2 --num-envs 1",
+        ),
+        absent=("envpool", "optuna"),
+    ),
+    "tune": Extra(
+        (
+            "agents.tune --trials 2 --steps 128 --num-envs 1 --episodes 1 --selections 1 --selection-episodes 1",
+            "train_policy --preset runs/tune-highway-fast-v0-ppo/best.toml --steps 128 --selections 1 "
+            "--selection-episodes 1 --eval-episodes 2 --no-video",
+        ),
+        absent=("envpool", "sb3_contrib"),
     ),
     "envpool": Extra((WRAPPED.format(env_id="envpool/HighwayFast-v0"), "\nfrom envs import EnvPoolVecEnv\n")),
 }

@@ -12,7 +12,16 @@ from predictor.support.lazy_exports import lazy_exports
 if TYPE_CHECKING:
     from agents.evaluate import evaluate_policy_on_seeds
     from agents.features import AttentionConfig, ForecastAttention
-    from agents.presets import DQNPreset, PPOPreset, preset_for
+    from agents.presets import (
+        A2CPreset,
+        DQNPreset,
+        PPOPreset,
+        QRDQNPreset,
+        RecurrentPPOPreset,
+        SACPreset,
+        TQCPreset,
+        preset_for,
+    )
     from agents.results import Evaluation
     from agents.runs import load_model, save_model
     from agents.summaries import PolicySummary
@@ -24,7 +33,16 @@ __getattr__, __all__ = lazy_exports(
     {
         "agents.evaluate": ("evaluate_policy_on_seeds",),
         "agents.features": ("AttentionConfig", "ForecastAttention"),
-        "agents.presets": ("DQNPreset", "PPOPreset", "preset_for"),
+        "agents.presets": (
+            "A2CPreset",
+            "DQNPreset",
+            "PPOPreset",
+            "QRDQNPreset",
+            "RecurrentPPOPreset",
+            "SACPreset",
+            "TQCPreset",
+            "preset_for",
+        ),
         "agents.results": ("Evaluation",),
         "agents.runs": ("load_model", "save_model"),
         "agents.summaries": ("PolicySummary",),

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Bool
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -12,6 +13,7 @@ from agents.task import Task
 from agents.vec_envs import EPISODE_INFO, EpisodeResult, make_multiagent_venv, make_venv, own_observations
 from envs.drivers.all_agents import has_heuristic, make_driver
 from envs.readers.base import role_of
+from envs.sb3.acting import ActingPolicy
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.seeding import driver_rng
 
@@ -52,9 +54,7 @@ class EgoArena:
         self, policy: BaseAlgorithm | str, seeds: Sequence[int], on_episode: Callable[[], None] = lambda: None
     ) -> list[EpisodeResult]:
         """Plays one episode per seed, as `Arena.play` describes."""
-        if isinstance(policy, str):
-            return run_episodes(self._venv, policy, seeds, on_episode)
-        return run_episodes(self._venv, lambda obs: policy.predict(obs, deterministic=True)[0], seeds, on_episode)
+        return run_episodes(self._venv, policy if isinstance(policy, str) else ActingPolicy(policy), seeds, on_episode)
 
     def close(self) -> None:
         """Stops the environments."""
@@ -68,7 +68,7 @@ def open_arena(task: Task, num_envs: int, in_process: bool = False) -> Arena:
 
 def run_episodes(
     venv: VecEnv,
-    policy: Callable[[Any], Any] | str,
+    policy: Callable[[Any, Bool[np.ndarray, " envs"]], Any] | str,
     seeds: Sequence[int],
     on_episode: Callable[[], None] = lambda: None,
 ) -> list[EpisodeResult]:
@@ -76,8 +76,8 @@ def run_episodes(
 
     Args:
         venv: environments from `make_venv(..., seeded=True)`.
-        policy: function from a batch of observations to a batch of actions, or the name of a driver of
-            `envs.drivers.ego`.
+        policy: function from a batch of observations, and which of them are the first of an episode, to a batch of
+            actions; or the name of a driver of `envs.drivers.ego`.
         seeds: one seed per episode, all different.
         on_episode: called after each episode (progress bars).
 
@@ -91,10 +91,10 @@ def run_episodes(
         venv.env_method("queue", list(seeds[index :: venv.num_envs]), driver, indices=[index])
     no_actions = np.zeros((venv.num_envs, *(venv.action_space.shape or ())), dtype=venv.action_space.dtype)
     results: dict[int, EpisodeResult] = {}
-    obs = venv.reset()
+    obs, starts = venv.reset(), np.ones(venv.num_envs, dtype=bool)
     while len(results) < len(seeds):
-        actions = no_actions if isinstance(policy, str) else policy(obs)
-        obs, _, _, infos = venv.step(actions)
+        actions = no_actions if isinstance(policy, str) else policy(obs, starts)
+        obs, _, starts, infos = venv.step(actions)
         for info in infos:
             if EPISODE_INFO in info:
                 result = info[EPISODE_INFO]
@@ -139,11 +139,11 @@ class MultiagentArena:
     def _learned(self, policy: BaseAlgorithm, seed: int) -> EpisodeResult:
         self._venv.seed(seed)
         observations: Any = self._venv.reset()
+        act, starts = ActingPolicy(policy), np.ones(self._venv.num_envs, dtype=bool)
         episode, steps = self._env.episodes, 0
         returns = dict.fromkeys(self._venv.agents_of_envs, 0.0)
         while self._env.episodes == episode:
-            actions = policy.predict(observations, deterministic=True)[0]
-            observations, rewards, _, _ = self._venv.step(actions)
+            observations, rewards, starts, _ = self._venv.step(act(observations, starts))
             for agent, reward in zip(self._venv.agents_of_envs, rewards.tolist(), strict=True):
                 returns[agent] += reward
             steps += 1

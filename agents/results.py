@@ -22,7 +22,10 @@ from predictor.support.provenance import provenance
 
 NEARLY_CONSTANT = 0.95
 """Least share of one action from which on a policy is called nearly constant."""
-PACKAGES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2", "envpool", "torch", "numpy")
+PACKAGES = (
+    *("stable-baselines3", "sb3-contrib", "gymnasium", "pettingzoo", "highway-env", "mpe2", "envpool"),
+    *("torch", "numpy"),
+)
 """Packages whose versions the provenance names."""
 
 

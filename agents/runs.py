@@ -1,7 +1,8 @@
 """Folder of a training run: its config, and model files that stay whole when the process is killed at any moment.
 
-Every file is written under a temporary name, flushed to disk and renamed. A DQN checkpoint holds its replay buffer in
-the same zip, so that model and buffer always belong together. SB3 zips hold pickled data: load only files you trust.
+Every file is written under a temporary name, flushed to disk and renamed. The checkpoint of an off-policy algorithm
+holds its replay buffer in the same zip, so that model and buffer always belong together. SB3 zips hold pickled data:
+load only files you trust.
 """
 
 import io
@@ -17,6 +18,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.presets import Algorithm
+from envs.sb3.algorithms import algorithm_of_model
 from envs.sb3.policy_file import ForecasterPin, PolicyNote, algorithm_of, load_policy, write_note
 from predictor.support.errors import UserError
 from predictor.support.files import delete_leftovers, new_file, write_json
@@ -89,7 +91,7 @@ def save_model(
     with new_file(path) as partial:
         with partial.open("wb") as file:
             model.save(file)
-        write_note(partial, note, extra or {})
+        write_note(partial, note, extra or {}, algorithm_of_model(model))
         if buffer and isinstance(model, OffPolicyAlgorithm):
             with zipfile.ZipFile(partial, "a") as archive, archive.open(_BUFFER_ENTRY, "w", force_zip64=True) as entry:
                 pickle.dump(model.replay_buffer, entry, protocol=pickle.HIGHEST_PROTOCOL)
@@ -148,10 +150,14 @@ def _check_same(file: Path, config: dict[str, Any], free: Sequence[str]) -> list
     """Compares with the stored config; returns the provenance of earlier starts."""
     stored = _read(file)
     before = stored["config"]
-    for name in config:
-        if name not in free and before.get(name, config[name]) != config[name]:  # runs of older versions lack some
-            raise UserError(
-                f"cannot resume {file.parent}: {name} was {before.get(name)!r}, now {config[name]!r}; "
-                "pass the old value or choose another --out"
-            )
+    for name, now in config.items():
+        was = before.get(name, now)  # runs of older versions lack some
+        if name in free or was == now:
+            continue
+        if isinstance(was, dict) and isinstance(now, dict):  # name the part that differs
+            part = next(key for key in {**was, **now} if was.get(key) != now.get(key))
+            name, was, now = f"{name}.{part}", was.get(part), now.get(part)
+        raise UserError(
+            f"cannot resume {file.parent}: {name} was {was!r}, now {now!r}; pass the old value or choose another --out"
+        )
     return list(stored.get("provenance", []))

@@ -34,10 +34,13 @@ from predictor.support.errors import UserError
 from predictor.support.runtime import resolve_device
 
 EVALUATION_SEED = 2_000_000_000
-"""First seed of the final evaluation; training seeds are below 1e9, those of model selection between 1e9 and 2e9."""
+"""First seed of the final evaluation; training seeds are below 1e9, those of model selection and tuning in between."""
 
 SELECTION_SEED = 1_000_000_000
 """First seed of model selection; training seeds are below it, those of the final evaluation start at 2e9."""
+
+TUNING_SEED = 1_500_000_000
+"""First seed that measures hyperparameters (`agents.tune`); model selection takes those from 1e9 on."""
 
 Observe = Literal[
     "forecast", "none", "constant-velocity", "zeros", "shuffled", "single", "no-edges", "modes", "what-if", "oracle",

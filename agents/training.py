@@ -8,8 +8,8 @@ import json
 import time
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,15 +20,18 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from agents.algorithms import check_actions, log_interval, new_model
 from agents.arena import Arena, open_arena
-from agents.features import AttentionConfig, ForecastAttention
+from agents.features import AttentionConfig
 from agents.forecast_errors import ForecastErrors
-from agents.plan_scores import PlanAttention, PlanScores, plan_actions
-from agents.presets import Algorithm, PPOPreset, Preset, preset_for
+from agents.plan_scores import plan_actions
+from agents.preset_settings import changed
+from agents.presets import Algorithm, Preset, preset_for
 from agents.runs import BEST_FILE, CHECKPOINT_FILE, CURVE_FILE, POLICY_FILE, load_model, save_model
 from agents.task import SELECTION_SEED, Task
 from agents.vec_envs import EpisodeResult, make_venv
-from envs.sb3.policy_file import ALGORITHMS, PolicyNote, read_note
+from envs.sb3.algorithms import require_algorithm
+from envs.sb3.policy_file import PolicyNote, read_note
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError
 from predictor.support.files import copy_file, write_json
@@ -44,7 +47,7 @@ class TrainingPlan:
     task: Task
     """Environment and what the policy sees."""
     algorithm: Algorithm
-    """Learning algorithm: ppo or dqn."""
+    """Learning algorithm."""
     steps: int
     """Number of environment steps, over all environments."""
     num_envs: int
@@ -66,6 +69,8 @@ class TrainingPlan:
     repeatable: bool = False
     """Whether a run that was stopped and resumed equals one that was not: environments and random streams then start
     anew at every checkpoint."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Hyperparameters in place of the preset's."""
 
     def __post_init__(self) -> None:
         """Checks choices and ranges; replaces `device="auto"` by the device that is taken."""
@@ -76,11 +81,14 @@ class TrainingPlan:
         if not 0 <= self.seed < SELECTION_SEED:
             raise UserError(f"seed must lie in [0, {SELECTION_SEED}), got {self.seed}")
         object.__setattr__(self, "device", resolve_device(self.device))
+        require_algorithm(self.algorithm)
+        _ = self.preset  # checks the settings
 
     @property
     def preset(self) -> Preset:
-        """Hyperparameters of the algorithm for the task's environment."""
-        return preset_for(self.task.env_id, self.algorithm, self.task.backend)
+        """Hyperparameters of the algorithm for the task's environment, with the plan's settings."""
+        preset = preset_for(self.task.env_id, self.algorithm, self.task.backend)
+        return changed(preset, self.settings, self.algorithm)
 
     @property
     def attention(self) -> AttentionConfig:
@@ -92,14 +100,18 @@ class TrainingPlan:
         """Checks that the algorithm supports an action space.
 
         Raises:
-            UserError: dqn for an action space that is not discrete.
+            UserError: it does not.
         """
-        if self.algorithm == "dqn" and not isinstance(space, spaces.Discrete):
-            raise UserError(f"dqn needs a discrete action space, {self.task.env_id} has {space}; use ppo")
+        check_actions(self.algorithm, space, self.task.env_id)
 
 
-def train(plan: TrainingPlan, run_dir: Path) -> Path:
+def train(plan: TrainingPlan, run_dir: Path, progress_bar: bool = True) -> Path:
     """Trains until `plan.steps`, from the checkpoint in `run_dir` if there is one.
+
+    Args:
+        plan: settings of the training.
+        run_dir: folder of the run, which exists.
+        progress_bar: whether to show SB3's progress bar.
 
     Returns:
         Path of the final policy, `run_dir/policy.zip`.
@@ -110,7 +122,7 @@ def train(plan: TrainingPlan, run_dir: Path) -> Path:
     try:
         model = _resume_or_make(plan, venv, run_dir)
         if model.num_timesteps < plan.steps:
-            _learn(plan, model, selection, run_dir, note)
+            _learn(plan, model, selection, run_dir, note, progress_bar)
             save_model(model, run_dir / CHECKPOINT_FILE, note=note, buffer=True)
     finally:
         venv.close()
@@ -119,8 +131,10 @@ def train(plan: TrainingPlan, run_dir: Path) -> Path:
     return run_dir / POLICY_FILE
 
 
-def _learn(plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: Path, note: PolicyNote) -> None:
-    """Trains for the remaining steps, with SB3's progress bar."""
+def _learn(
+    plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: Path, note: PolicyNote, progress_bar: bool
+) -> None:
+    """Trains for the remaining steps."""
     every = max(plan.steps // plan.selections, 1)
     checkpoint = run_dir / CHECKPOINT_FILE
     errors, progress = ForecastErrors(), ProgressBarCallback()
@@ -137,14 +151,14 @@ def _learn(plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: 
         scalars=errors.scalars,
     )
     save = SaveCheckpoint(checkpoint, plan.checkpoint_every, note, lambda: {"seconds": select.seconds}, restart)
-    callbacks = [errors, save, select, progress]
+    callbacks = [errors, save, select, *([progress] if progress_bar else [])]
     try:
         model.learn(
             plan.steps - model.num_timesteps,
             callback=CallbackList(callbacks),
             tb_log_name="run",
             reset_num_timesteps=model.num_timesteps == 0,
-            log_interval=1 if plan.algorithm == "ppo" else 20,
+            log_interval=log_interval(plan.algorithm),
         )
     finally:
         if hasattr(progress, "pbar"):
@@ -153,37 +167,16 @@ def _learn(plan: TrainingPlan, model: BaseAlgorithm, selection: Arena, run_dir: 
 
 def make_model(plan: TrainingPlan, venv: VecEnv, tensorboard_log: str | None = None) -> BaseAlgorithm:
     """Makes a new model with the plan's preset; Dict observations get a `ForecastAttention` in front."""
-    preset = plan.preset
-    options = asdict(preset)
-    layers = list(options.pop("net_arch"))
-    if isinstance(preset, PPOPreset):
-        options["batch_size"] = min(
-            preset.batch_size, preset.n_steps * venv.num_envs
-        )  # few environments give small rollouts
-    policy_kwargs: dict[str, Any] = {
-        "net_arch": {"pi": layers, "vf": layers} if isinstance(preset, PPOPreset) else layers
-    }
-    policy: str | type[PlanScores] = "MlpPolicy"
-    if isinstance(venv.observation_space, spaces.Dict):
-        policy, extractor = "MultiInputPolicy", ForecastAttention
-        if plan.task.what_if and isinstance(preset, PPOPreset) and (actions := plan_actions(plan.task)) is not None:
-            policy, extractor = PlanScores, PlanAttention
-            policy_kwargs["plan_actions"] = actions
-        policy_kwargs |= {
-            "features_extractor_class": extractor,
-            "features_extractor_kwargs": {"config": plan.attention},
-        }
-    make: Any = ALGORITHMS[plan.algorithm]
-    model: BaseAlgorithm = make(
-        policy,
+    return new_model(
+        plan.algorithm,
+        plan.preset,
+        plan.attention,
         venv,
-        policy_kwargs=policy_kwargs,
-        tensorboard_log=tensorboard_log,
+        plan_actions=plan_actions(plan.task) if plan.task.what_if else None,
         seed=plan.seed,
         device=plan.device,
-        **options,
+        tensorboard_log=tensorboard_log,
     )
-    return model
 
 
 def _resume_or_make(plan: TrainingPlan, venv: VecEnv, run_dir: Path) -> BaseAlgorithm:

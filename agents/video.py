@@ -16,6 +16,7 @@ from envs.parallel import ForecastParallelEnv
 from envs.readers import multiagent_reader_for
 from envs.readers.highway import is_highway_env
 from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, make_multiagent_env
+from envs.sb3.acting import ActingPolicy
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.video.highway import record_episode
 from envs.video.multiagent import MultiagentRecording, record_multiagent_episode
@@ -46,6 +47,7 @@ def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) ->
     learners = learners_of(task, env)
     venv = make_multiagent_venv(task, 1).venv  # pads observations as in training
     assert isinstance(venv, ParallelVecEnv)
+    acting = {agent: ActingPolicy(policy) for agent in learners}
 
     def act(observations: dict[str, Any]) -> dict[str, Any]:
         own = own_observations(observations)
@@ -53,7 +55,7 @@ def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) ->
         for agent in observations:
             if agent in learners:
                 seen = own[agent] if task.observe == "none" else observations[agent]
-                chosen = policy.predict(venv.padded_observation(agent, seen), deterministic=True)[0]
+                chosen = acting[agent](venv.padded_observation(agent, seen))
                 actions[agent] = venv.own_action(agent, chosen)
         return actions
 
@@ -150,8 +152,9 @@ def film_extremes(
 
 
 def _act(task: Task, model: BaseAlgorithm) -> Callable[[Any], Any]:
+    acting = ActingPolicy(model)
+
     def act(obs: dict[str, Any]) -> Any:
-        seen = obs[EGO_KEY] if task.observe == "none" else obs
-        return model.predict(seen, deterministic=True)[0]
+        return acting(obs[EGO_KEY] if task.observe == "none" else obs)
 
     return act

@@ -67,7 +67,7 @@ def test_importing_a_package_imports_nothing_heavy(package: str):
         (("pettingzoo", "mpe2", "envpool"), "from envs import VecForecast, EnvPoolVecEnv"),
         (("stable_baselines3", "envpool"), "from envs import ForecastParallelEnv, HighwayParallelEnv"),
         (("envpool", "imageio_ffmpeg"), "from envs import ParallelVecEnv, AgentMonitor"),
-        (("envpool", "imageio_ffmpeg"), "from agents import *"),
+        (("envpool", "imageio_ffmpeg", "sb3_contrib", "optuna"), "from agents import *"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

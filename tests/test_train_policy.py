@@ -24,7 +24,7 @@ from agents.presets import Algorithm, PPOPreset, Preset, preset_for
 from agents.results import Evaluation
 from agents.runs import load_model
 from agents.task import Backend
-from agents.training import SaveCheckpoint
+from agents.training import SaveCheckpoint, TrainingPlan
 from envs.sb3.policy_file import NOTE_ENTRY, read_note, read_policy_note
 from envs.video.highway import record_episode
 from predictor.support.errors import run_entry_point
@@ -436,6 +436,40 @@ def test_resume_with_another_config_names_the_field(
     assert exit_.value.code == 2
     assert "exists; choose another --out" in error_line(capsys)
     assert (run / "config.json").read_bytes() == before
+
+
+def test_hyperparameters_are_recorded_and_compared_on_resume(
+    command: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    """From a file and from the command line, which counts more; in whatever form they are given again."""
+    run, file = tmp_path / "run", tmp_path / "mine.toml"
+    file.write_text("learning_rate = 1e-3\ngamma = 0.95\n")
+    plans: list[TrainingPlan] = []
+
+    def note(plan: TrainingPlan, folder: Path) -> None:
+        plans.append(plan)
+        sys.exit(0)
+
+    monkeypatch.setattr(train_policy, "train", note)
+    with pytest.raises(SystemExit):
+        command(*PPO, "--out", str(run), "--preset", str(file), "--set", "gamma=0.9", "net_arch=8,8")
+    expected = PPOPreset(learning_rate=1e-3, gamma=0.9, net_arch=(8, 8))
+    assert plans[0].preset == expected
+    config = json.loads((run / "config.json").read_text())["config"]
+    assert config["preset"] == {**asdict(expected), "net_arch": [8, 8]}
+    assert (config["preset_file"], config["set"]) == (str(file), ["gamma=0.9", "net_arch=8,8"])
+    words = ("--set", "net_arch=[8,8]", "learning_rate=0.001", "gamma=0.9")
+    with pytest.raises(SystemExit) as exit_:
+        command(*PPO, "--out", str(run), "--resume", *words)
+    assert exit_.value.code == 0 and plans[1].preset == expected
+    capsys.readouterr()
+    for changed, message in (
+        ((), "preset.learning_rate was 0.001, now 0.0005; pass the old value"),
+        ((*words[:-1], "gamma=0.8"), "preset.gamma was 0.9, now 0.8; pass the old value"),
+    ):
+        with pytest.raises(SystemExit) as exit_:
+            command(*PPO, "--out", str(run), "--resume", *changed)
+        assert exit_.value.code == 2 and message in error_line(capsys)
 
 
 @pytest.mark.parametrize(

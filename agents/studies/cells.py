@@ -32,11 +32,12 @@ from envs.drivers.all_agents import make_driver
 from envs.drivers.ego import make_ego_driver, named_drivers
 from envs.drivers.planner import ORACLE, PLANNER, is_planner
 from envs.registry import checkpoint_for
+from envs.sb3.algorithms import CONTRIB
 from predictor.checkpoint import CONSTANT_VELOCITY, WEIGHTS, resolve
 from predictor.support.errors import UserError
 from predictor.support.provenance import provenance
 
-PACKAGES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2", "torch", "numpy")
+PACKAGES = ("stable-baselines3", "sb3-contrib", "gymnasium", "pettingzoo", "highway-env", "mpe2", "torch", "numpy")
 RULES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2")
 """Packages whose versions are part of a cell's name: the simulators and the learning algorithms."""
 MEASURING = 2
@@ -102,7 +103,9 @@ class Cell:
         }
         if self.plan is None:
             return content | {"driver": self.line}
-        unrelated = ("task", "device", "in_process", "selection_envs")
+        if self.plan.algorithm in CONTRIB:
+            content["versions"]["sb3-contrib"] = _version("sb3-contrib")
+        unrelated = ("task", "device", "in_process", "selection_envs", "settings")
         values = {key: value for key, value in asdict(self.plan).items() if key not in unrelated}
         return content | {"plan": values, "preset": asdict(self.plan.preset)}
 
@@ -201,6 +204,7 @@ def _trainings(study: Study, scenario: Scenario, arm: StudyArm, where: str) -> l
                     study.checkpoint_every,
                     in_process=True,
                     repeatable=True,
+                    settings=study.settings.get(algorithm, {}),
                 )
                 plan.check_action_space(space)
                 shown = None if pin is None else asdict(pin)

@@ -6,15 +6,17 @@
 import json
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
+from agents.preset_settings import settings_from_table
 from agents.presets import Algorithm
-from agents.studies.toml_values import converted, from_table
 from agents.task import SELECTION_SEED, Observe, Task
+from agents.toml_values import converted, from_table
 from envs.drivers.ego import CONSTANT_ACTIONS
 from envs.drivers.planner import PLANNER, PLANNER_ORACLE
+from envs.sb3.algorithms import algorithm_named
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError
 
@@ -65,7 +67,10 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Study:
-    """Everything that a study file says; the keys of the file are the fields from `title` on."""
+    """Everything that a study file says; the keys of the file are the fields from `title` on.
+
+    `algorithms` may be a table, too, of a table of hyperparameters for each algorithm.
+    """
 
     name: str
     """Name of the study: the stem of its file."""
@@ -73,6 +78,8 @@ class Study:
     """Environments."""
     arms: tuple[StudyArm, ...]
     """Arms, in the order of the tables."""
+    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Algorithm → hyperparameters in place of those of its preset, where the file has a table for it."""
     title: str = ""
     """Heading of the report; the name of the study if left out."""
     algorithms: tuple[Algorithm, ...] = ("ppo",)
@@ -191,7 +198,9 @@ def read_study(path: Path) -> Study:
     tables = converted(content.pop("scenarios", None) or {}, dict, f"{where}: scenarios")
     if not tables:
         raise UserError(f"{where}: key 'scenarios' is missing; add a table such as [scenarios.highway-fast-v0]")
-    study = from_table(Study, content, where, {"name": path.stem, "scenarios": (), "arms": arms})
+    settings = _settings(content, where)
+    given = {"name": path.stem, "scenarios": (), "arms": arms, "settings": settings}
+    study = from_table(Study, content, where, given)
     scenarios = tuple(_scenario(name, table, study, f"{where}: scenarios.{name}") for name, table in tables.items())
     return replace(study, scenarios=scenarios)
 
@@ -224,6 +233,26 @@ def takes_checkpoint(observe: str) -> bool:
     except UserError:
         return False
     return True
+
+
+def _settings(content: dict[str, Any], where: str) -> dict[str, dict[str, Any]]:
+    """Returns the hyperparameters of each algorithm that has a table, and puts the algorithms' names in their place.
+
+    Raises:
+        UserError: an algorithm or a hyperparameter is unknown, or a value does not fit.
+    """
+    tables = content.get("algorithms")
+    if not isinstance(tables, dict):
+        return {}
+    settings = {}
+    for name, table in tables.items():
+        place = f"{where}: algorithms.{name}"
+        algorithm = algorithm_named(name)
+        if algorithm is None:
+            raise UserError(f"{place}: no such algorithm; there are {', '.join(get_args(Algorithm))}")
+        settings[name] = settings_from_table(algorithm, converted(table, dict, place), place)
+    content["algorithms"] = list(tables)
+    return settings
 
 
 def _arms(listed: Any, where: str) -> tuple[StudyArm, ...]:

@@ -34,8 +34,8 @@ _PATIENCE_S = 5.0
 
 
 @contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Holds the lock of a study's folder, which the operating system takes back when the process ends.
+def locked(folder: Path, what: str = "study") -> Iterator[None]:
+    """Holds the lock of the folder of a study, or of `what`, which the operating system takes back at the process' end.
 
     Raises:
         UserError: another process holds it.
@@ -47,7 +47,7 @@ def locked(folder: Path) -> Iterator[None]:
         except BlockingIOError as error:
             file.seek(0)
             raise UserError(
-                f"another study runs in {folder} (process {file.read().strip() or 'unknown'}); wait for its end or "
+                f"another {what} runs in {folder} (process {file.read().strip() or 'unknown'}); wait for its end or "
                 "choose another --out"
             ) from error
         file.truncate(0)

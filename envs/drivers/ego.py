@@ -1,6 +1,7 @@
 """Drivers of the ego in data collection and evaluation.
 
-A driver is a partial or a bound method, not a closure: `copy.deepcopy` of a running world copies its state too.
+A driver is a partial, a bound method or an `ActingPolicy`, not a closure: `copy.deepcopy` of a running world copies its
+state too.
 """
 
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from highway_env.vehicle.controller import ControlledVehicle
 
 from envs.drivers.planner import PLANNER, is_planner, planner_driver
 from envs.drivers.sampled_actions import uniform_action, varied_actions
-from envs.drivers.trained import EgoDriver, kept_policy
+from envs.drivers.trained import EgoDriver, trained_ego
 from predictor.support.errors import UserError
 
 WHO = "random egos"
@@ -48,8 +49,7 @@ def make_ego_driver(name: str, env: gym.Env, rng: np.random.Generator) -> EgoDri
     if is_planner(name):
         return planner_driver(name, env, rng)
     if name.endswith(".zip"):
-        kept_policy(name)
-        return partial(_trained, name)
+        return trained_ego(name)
     constants = constant_actions(env)
     if name in constants:
         return partial(_constant, constants[name])
@@ -121,7 +121,3 @@ def _random(space: gym.Space, rng: np.random.Generator, obs: Any) -> Any:
 
 def _constant(action: Any, obs: Any) -> Any:
     return np.copy(action) if isinstance(action, np.ndarray) else action
-
-
-def _trained(path: str, obs: Any) -> Any:
-    return kept_policy(path).predict(obs, deterministic=True)[0]

@@ -23,6 +23,7 @@ from predictor.support.errors import UserError
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
+    from envs.sb3.acting import ActingPolicy
     from envs.sb3.policy_file import PolicyNote
 
 EgoDriver = Callable[[Any], Any]
@@ -53,22 +54,39 @@ def trained_driver(path: str, env: Any, rng: np.random.Generator) -> Driver:
     others = (
         make_driver(note.driver, env, rng) if note is not None and set(learners) < set(env.possible_agents) else None
     )
-    return partial(_drive, path, env, padded, actions, others)
+    return partial(_drive, path, {}, env, padded, actions, others)
+
+
+def trained_ego(path: str) -> EgoDriver:
+    """Returns a driver of an ego for one episode.
+
+    Raises:
+        UserError: see `kept_policy`.
+    """
+    from envs.sb3.acting import ActingPolicy  # most drivers need no SB3
+
+    return ActingPolicy(kept_policy(path))
 
 
 def _drive(
     path: str,
+    acting: dict[str, "ActingPolicy"],
     env: Any,
     padded: PaddedObservation,
     actions: Mapping[str, gym.Space],
     others: Driver | None,
     observations: Mapping[str, Any],
 ) -> dict[str, Any]:
+    from envs.sb3.acting import ActingPolicy  # most drivers need no SB3
+
     policy = kept_policy(path)
     whole = isinstance(policy.observation_space, gym.spaces.Dict)
+    for gone in acting.keys() - observations.keys():
+        del acting[gone]  # an agent that comes back remembers nothing
     chosen = {} if others is None else others({a: s for a, s in observations.items() if a not in actions})
     for agent in (a for a in observations if a in actions and a in env.agents):
-        action, _ = policy.predict(padded.one(agent, _seen(observations[agent], whole)), deterministic=True)
+        act = acting.setdefault(agent, ActingPolicy(policy))
+        action = act(padded.one(agent, _seen(observations[agent], whole)))
         chosen[agent] = own_action(action, actions[agent])
     return chosen
 

@@ -1,9 +1,9 @@
 """Trained policies on disk: a Stable-Baselines3 zip with a note inside.
 
-The note (`note.json`) holds what a policy needs beside its weights: the forecaster whose forecasts it was trained on,
-which agents learned, and the driver of the others. It is part of the zip, so that a policy drives
-everywhere as it was trained. SB3's own ``load`` still reads the zip. It holds pickled data: load only files whose
-source you trust.
+The note (`note.json`) names the algorithm and holds what a policy needs beside its weights: the forecaster whose
+forecasts it was trained on, which agents learned, and the driver of the others. It is part of the zip, so that a policy
+drives everywhere as it was trained. SB3's own ``load`` still reads the zip. It holds pickled data: load only files
+whose source you trust.
 """
 
 import hashlib
@@ -13,24 +13,21 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import gymnasium as gym
-from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from envs.arms import Arm, EntryLayout
+from envs.sb3.algorithms import Algorithm, algorithm_class, algorithm_named, algorithm_of_parameters
 from predictor.checkpoint import CONSTANT_VELOCITY, WEIGHTS, resolve
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
 NOTE_ENTRY = "note.json"
 _POLICY_KEY = "policy"
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "dqn": DQN}
-"""Algorithms by name."""
-_MARKS = {"ppo": "clip_range", "dqn": "exploration_rate"}
-"""Parameter in SB3's JSON that only this algorithm has."""
+_ALGORITHM_KEY = "algorithm"
 
 
 @dataclass(frozen=True)
@@ -124,22 +121,26 @@ def pin_forecaster(checkpoint: str, space: gym.spaces.Dict, spec: SceneSpec, arm
     )
 
 
-def write_note(path: Path, policy: PolicyNote | None, extra: Mapping[str, Any]) -> None:
+def write_note(
+    path: Path, policy: PolicyNote | None, extra: Mapping[str, Any], algorithm: Algorithm | None = None
+) -> None:
     """Adds the note to a saved policy.
 
     Args:
         path: path of a zip without a note.
         policy: note on the policy; None writes none.
         extra: more JSON content, which `read_note` returns.
+        algorithm: algorithm that saved the zip; None leaves it out.
     """
     content = dict(extra) | ({} if policy is None else {_POLICY_KEY: asdict(policy)})
+    content |= {} if algorithm is None else {_ALGORITHM_KEY: algorithm}
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr(NOTE_ENTRY, json.dumps(content))
 
 
 def read_note(path: Path) -> dict[str, Any]:
     """Returns the extra content of a policy's note; empty if there is no such file or note."""
-    return {key: value for key, value in _note(path).items() if key != _POLICY_KEY}
+    return {key: value for key, value in _note(path).items() if key not in (_POLICY_KEY, _ALGORITHM_KEY)}
 
 
 def read_policy_note(path: Path) -> PolicyNote | None:
@@ -169,27 +170,27 @@ def _note(path: Path) -> dict[str, Any]:
         return json.loads(archive.read(NOTE_ENTRY)) if NOTE_ENTRY in archive.namelist() else {}
 
 
-def algorithm_of(path: Path) -> str:
-    """Returns "ppo" or "dqn", decided by the parameters inside the zip.
+def algorithm_of(path: Path) -> Algorithm:
+    """Returns the algorithm that the note inside a zip names; without one, it is decided by the parameters.
 
     Raises:
-        UserError: no such file, or neither PPO nor DQN.
+        UserError: no such file, or a policy of no known algorithm.
     """
     if not path.exists():
         raise UserError(f"no policy at {path}; train one with python train_policy.py")
     try:
         with zipfile.ZipFile(path) as archive:
             parameters = json.loads(archive.read("data"))
+        found = algorithm_named(_note(path).get(_ALGORITHM_KEY)) or algorithm_of_parameters(parameters)
     except (zipfile.BadZipFile, KeyError, ValueError, OSError):
-        parameters = {}
-    found = [name for name, mark in _MARKS.items() if mark in parameters]
-    if len(found) != 1:
-        raise UserError(f"{path} is neither a PPO nor a DQN policy")
-    return found[0]
+        found = None
+    if found is None:
+        raise UserError(f"{path} holds no policy of {', '.join(get_args(Algorithm))}")
+    return found
 
 
 def load_policy(path: Path, venv: VecEnv | None = None, device: str = "cpu") -> BaseAlgorithm:
-    """Loads a PPO or DQN policy. Its zip holds pickled data: load only files whose source you trust.
+    """Loads a policy of any known algorithm. Its zip holds pickled data: load only files whose source you trust.
 
     Args:
         path: path of the zip.
@@ -197,11 +198,12 @@ def load_policy(path: Path, venv: VecEnv | None = None, device: str = "cpu") -> 
         device: device of the network.
 
     Raises:
-        UserError: no such file, neither PPO nor DQN, or not made for these spaces.
+        UserError: no such file, no known algorithm, its package is not installed, or not made for these spaces.
     """
     algorithm = algorithm_of(path)
+    kind = algorithm_class(algorithm)
     try:
-        return ALGORITHMS[algorithm].load(path, env=venv, device=device)
+        return kind.load(path, env=venv, device=device)
     except (ValueError, KeyError, TypeError, AttributeError, AssertionError, EOFError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"{path} is no {algorithm} policy that fits here: {reason}") from error

@@ -12,6 +12,7 @@ from agents.task import Task
 from agents.vec_envs import EpisodeResult, make_multiagent_venv
 
 TOY = f"{__name__}:Meadow"
+STEERING = f"{__name__}:Steering-v0"
 LIVES = {"ant_0": 2, "bee_0": 5}
 """Number of steps that each agent lives."""
 EPISODES = [
@@ -54,6 +55,28 @@ class Meadow(ParallelEnv):
     def _seen(self) -> dict[str, np.ndarray]:
         return {agent: np.full(1, self.time, np.float32) for agent in self.agents}
 
+
+class Steering(gym.Env[np.ndarray, np.ndarray]):
+    """Environment with continuous actions: each episode has six steps, and the reward is the action."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._steps = 0
+        return self._look(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._steps += 1
+        return self._look(), float(action[0]), False, self._steps == 6, {}
+
+    def _look(self) -> np.ndarray:
+        return self.np_random.uniform(-1, 1, size=2).astype(np.float32)
+
+
+if "Steering-v0" not in gym.registry:
+    gym.register("Steering-v0", entry_point=Steering)
 
 _SEEN, _DONE = gym.spaces.Box(0, 10, (1,), np.float32), gym.spaces.Discrete(2)
 

@@ -148,7 +148,13 @@ def test_actions_of_plans_are_those_that_the_planner_takes():
 
 @pytest.mark.parametrize(
     ("algorithm", "what_if", "extractor"),
-    [("ppo", True, PlanAttention), ("ppo", False, ForecastAttention), ("dqn", True, ForecastAttention)],
+    [
+        ("ppo", True, PlanAttention),
+        ("a2c", True, PlanAttention),
+        ("recurrent-ppo", True, ForecastAttention),
+        ("ppo", False, ForecastAttention),
+        ("dqn", True, ForecastAttention),
+    ],
 )
 def test_policies_with_what_if_score_plans(algorithm: Any, what_if: bool, extractor: type):
     task = Task("highway-fast-v0", "constant-velocity", what_if=what_if)

@@ -161,7 +161,7 @@ def test_damaged_policy_is_one_clear_line(tmp_path: Path, venv: VecEnv, damage: 
     path = tmp_path / "model.zip"
     save_model(make_ppo(venv), path)
     path.write_bytes(path.read_bytes()[:-2000] if damage == "truncated" else b"not a zip")
-    with pytest.raises(UserError, match="is neither a PPO nor a DQN policy") as error:
+    with pytest.raises(UserError, match="holds no policy of ppo, dqn, a2c, sac, qrdqn, recurrent-ppo, tqc") as error:
         load_model(path, "ppo")
     assert "\n" not in str(error.value)
 

@@ -44,7 +44,7 @@ def dice_venv(num_envs: int) -> VecEnv:
     return VecMonitor(DummyVecEnv([lambda: SeededEpisodes(Dice())] * num_envs))
 
 
-def always_two(obs: np.ndarray) -> np.ndarray:
+def always_two(obs: np.ndarray, starts: np.ndarray) -> np.ndarray:
     return np.full(len(obs), 2)
 
 

@@ -3,6 +3,7 @@ from pathlib import Path
 
 import pytest
 
+from agents.presets import PPOPreset, QRDQNPreset
 from agents.studies.cells import Cell, cells_of
 from agents.studies.plan import read_study
 from predictor.support.errors import UserError
@@ -37,11 +38,21 @@ def test_what_determines_a_result_is_in_the_name(cells: Callable[..., list[Cell]
         ({"selection_episodes": "4"}, trained),
         ({"checkpoint_every": "99"}, trained),
         ({"episodes": "5"}, trained | drivers),
+        ({"algorithms": "{ppo = {gamma = 0.7}}"}, trained),
+        ({"algorithms": "{ppo = {gamma = 0.8}}"}, set()),
     ):
         after = {cell.title: cell.name for cell in cells(**changes)}
         assert {title for title in before if after[title] != before[title]} == other, changes
     monkeypatch.setattr("agents.studies.cells._version", lambda name: "0.0")
     assert not set(before.values()) & {cell.name for cell in cells()}
+
+
+def test_settings_of_an_algorithm_are_those_of_its_trainings(cells: Callable[..., list[Cell]]):
+    found = cells(algorithms="{ppo = {gamma = 0.7, net_arch = [64]}, qrdqn = {}}", seeds="1")
+    presets = {cell.algorithm: cell.plan.preset for cell in found if cell.plan is not None}
+    assert presets == {"ppo": PPOPreset(gamma=0.7, net_arch=(64,)), "qrdqn": QRDQNPreset()}
+    versions = {cell.algorithm: set(cell.content["versions"]) for cell in found}
+    assert versions["qrdqn"] - versions["ppo"] == {"sb3-contrib"}, "cells of other algorithms do not depend on it"
 
 
 def test_the_forecaster_is_in_the_name(cells: Callable[..., list[Cell]]):
@@ -61,6 +72,8 @@ def test_the_forecaster_is_in_the_name(cells: Callable[..., list[Cell]]):
         ({"references": '["idle"]', "env_id": "simple_tag_v3", "algorithms": '["dqn"]'}, None),
         ({"env_id": "racetrack-v1", "references": '["constant-actions"]'}, "corridor: constant-actions needs an env"),
         ({"env_id": "racetrack-v1", "references": "[]", "algorithms": '["dqn"]'}, "arm none: dqn needs a discrete act"),
+        ({"algorithms": '["tqc"]'}, r"arm none: tqc needs a continuous action space, .* has Discrete\(2\); use ppo"),
+        ({"algorithms": "{ppo = {gamma = 2}}"}, r"arm none: ppo: gamma must lie in \[0, 1\], got 2.0"),
         ({"env_id": HIGHWAY, "arms": '[{name = "forecast", checkpoint = "absent"}]'}, "arm forecast: no checkpoint 'a"),
         ({"arms": '["constant-velocity"]', "references": "[]"}, "arm constant-velocity: "),
     ],

@@ -27,6 +27,14 @@ def test_a_study_is_read(tmp_path: Path):
     assert (second.env_id, second.steps, second.references) == ("merge-v1", 512, ("random", "constant-actions"))
 
 
+def test_algorithms_may_be_tables_of_hyperparameters(tmp_path: Path):
+    text = study_text() + "[algorithms.ppo]\nlearning_rate = 3e-4\nnet_arch = [64]\n[algorithms.recurrent-ppo]\n"
+    study = read_study(study_path(tmp_path, text.replace('algorithms = ["ppo"]\n', "")))
+    assert study.algorithms == ("ppo", "recurrent-ppo")
+    assert study.settings == {"ppo": {"learning_rate": 3e-4, "net_arch": (64,)}, "recurrent-ppo": {}}
+    assert read_study(study_path(tmp_path, study_text())).settings == {}
+
+
 def test_an_arm_names_a_checkpoint_by_scenario(tmp_path: Path):
     text = study_text(arms='["none", {name = "lstm", observe = "forecast", checkpoint = "runs/{scenario}/{env_id}"}]')
     text = text.replace(text[text.rindex("env_id") :], 'env_id = "merge-v1"\ncheckpoint = "shared"\n')
@@ -58,6 +66,17 @@ def test_an_arm_names_a_checkpoint_by_scenario(tmp_path: Path):
         (study_text(seeds="[-1]"), r"corridor.toml: seeds must lie in \[0, 1000000000\), got -1"),
         (study_text(algorithms='["sacc"]'), "corridor.toml: algorithms must be one of ppo, dqn.*, got 'sacc'"),
         (study_text(algorithms='"ppo"'), "corridor.toml: algorithms must be an array, got 'ppo'"),
+        (study_text(algorithms="{sacc = {}}"), "corridor.toml: algorithms.sacc: no such algorithm; there are ppo, dqn"),
+        (study_text(algorithms="{ppo = 3}"), "corridor.toml: algorithms.ppo must be a table, got 3"),
+        (study_text(algorithms="{}"), "corridor.toml: algorithms must name at least one"),
+        (
+            study_text(algorithms="{ppo = {lr = 3e-4}}"),
+            "corridor.toml: algorithms.ppo: ppo has no hyperparameter 'lr'; there are learning_rate, gamma, ",
+        ),
+        (
+            study_text(algorithms="{ppo = {n_steps = 3.5}}"),
+            "corridor.toml: algorithms.ppo: n_steps must be a whole number, got 3.5",
+        ),
         (study_text(rivals='["zeroes"]'), "corridor.toml: rivals names 'zeroes', which is no arm; there are none"),
         (study_text() + "backend = 3\n", "corridor.toml: scenarios.corridor: backend must be one of gymnasium"),
         (study_text() + "arm = 3\n", "corridor.toml: scenarios.corridor: unknown key 'arm'; there are env_id, steps"),

@@ -207,7 +207,7 @@ def test_file_that_is_no_policy_is_named(kind: str, tmp_path: Path, policies: Pa
     else:
         with zipfile.ZipFile(path, "w") as archive:
             archive.writestr("notes.txt", "a zip, but no policy")
-    with pytest.raises(UserError, match=f"{kind}.zip is neither a PPO nor a DQN policy"):
+    with pytest.raises(UserError, match=f"{kind}.zip holds no policy of ppo, dqn, a2c, sac, qrdqn, recurrent-ppo, tqc"):
         make_ego_driver(str(path), discrete, np.random.default_rng(0))
 
 

@@ -1,18 +1,21 @@
 import shutil
+import sys
 import zipfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import gymnasium as gym
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from stable_baselines3 import A2C, DQN, PPO
+from sb3_contrib import QRDQN, TQC, TRPO, CrossQ, RecurrentPPO
+from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 
 from envs.drivers.trained import env_for_driver
 from envs.registry import make_env
 from envs.rollouts.world import open_world
+from envs.sb3.algorithms import Algorithm, algorithm_class
 from envs.sb3.policy_file import (
     ForecasterPin,
     PolicyNote,
@@ -29,16 +32,23 @@ from predictor.support.errors import UserError
 from tests.envs.helpers import save_forecast_policy
 
 ENV_ID = "two-way-v0"
-TINY: dict[str, Any] = {"policy_kwargs": {"net_arch": [4]}, "device": "cpu", "seed": 0}
+TINY: dict[str, Any] = {"device": "cpu", "seed": 0}
 PIN = ForecasterPin("highway", "ab" * 32, 5, 1, 12, 100.0)
 
 
 def saved(folder: Path, algorithm: str) -> Path:
-    env = gym.make("CartPole-v1")
+    env, steered = gym.make("CartPole-v1"), gym.make("Pendulum-v1")
     model: Any = {
         "ppo": lambda: PPO("MlpPolicy", env, n_steps=4, batch_size=4, **TINY),
         "dqn": lambda: DQN("MlpPolicy", env, buffer_size=10, **TINY),
         "a2c": lambda: A2C("MlpPolicy", env, **TINY),
+        "sac": lambda: SAC("MlpPolicy", steered, buffer_size=10, **TINY),
+        "qrdqn": lambda: QRDQN("MlpPolicy", env, buffer_size=10, **TINY),
+        "recurrent-ppo": lambda: RecurrentPPO("MlpLstmPolicy", env, n_steps=4, batch_size=4, **TINY),
+        "tqc": lambda: TQC("MlpPolicy", steered, buffer_size=10, **TINY),
+        "td3": lambda: TD3("MlpPolicy", steered, buffer_size=10, **TINY),
+        "trpo": lambda: TRPO("MlpPolicy", env, n_steps=4, batch_size=4, **TINY),
+        "crossq": lambda: CrossQ("MlpPolicy", steered, buffer_size=10, **TINY),
     }[algorithm]()
     model.save(folder / "policy.zip")
     return folder / "policy.zip"
@@ -144,16 +154,36 @@ def test_a_forecaster_trained_anew_in_place_is_noticed(tmp_path: Path, highway_c
 # --- Loading ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("algorithm", "kind"), [("ppo", PPO), ("dqn", DQN)])
-def test_the_algorithm_is_told_by_the_content(algorithm: str, kind: type, tmp_path: Path):
+ALGORITHMS = get_args(Algorithm)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_the_algorithm_is_told_by_the_content(algorithm: Algorithm, tmp_path: Path):
     path = saved(tmp_path, algorithm)
     assert algorithm_of(path) == algorithm
-    assert isinstance(load_policy(path), kind)
+    assert type(load_policy(path)) is algorithm_class(algorithm)
 
 
-def test_other_algorithms_are_refused(tmp_path: Path):
-    with pytest.raises(UserError, match="policy.zip is neither a PPO nor a DQN policy$"):
-        load_policy(saved(tmp_path, "a2c"))
+def test_the_note_names_the_algorithm(tmp_path: Path):
+    """Whatever parameters a later version of SB3 writes."""
+    path = saved(tmp_path, "a2c")
+    write_note(path, None, {"steps": 3}, "ppo")
+    assert algorithm_of(path) == "ppo"
+    assert read_note(path) == {"steps": 3}
+
+
+@pytest.mark.parametrize("algorithm", ["td3", "trpo", "crossq"])
+def test_other_algorithms_are_refused(algorithm: str, tmp_path: Path):
+    with pytest.raises(UserError, match=f"policy.zip holds no policy of {', '.join(ALGORITHMS)}$"):
+        load_policy(saved(tmp_path, algorithm))
+
+
+def test_a_policy_of_contrib_needs_its_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = saved(tmp_path, "qrdqn")
+    monkeypatch.setitem(sys.modules, "sb3_contrib", None)
+    with pytest.raises(UserError, match=r"algorithm qrdqn needs the sb3-contrib package; pip install 'dgvae-rl\[con"):
+        load_policy(path)
+    assert load_policy(saved(tmp_path, "dqn")) is not None
 
 
 def test_a_zip_that_lacks_its_weights_is_one_clear_line(tmp_path: Path):

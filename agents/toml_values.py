@@ -79,10 +79,11 @@ def converted(value: Any, kind: Any, where: str) -> Any:
 
 
 def _one_of(value: Any, kinds: list[Any], where: str) -> Any:
-    """Returns a value of the first type that takes it; the error is that of the last one."""
-    for kind in kinds[:-1]:
+    """Returns a value of the first type that takes it; if none does, the error names all of them."""
+    wanted = []
+    for kind in kinds:
         try:
             return converted(value, kind, where)
-        except UserError:
-            continue
-    return converted(value, kinds[-1], where)
+        except UserError as error:
+            wanted.append(str(error).removeprefix(f"{where} must be ").rpartition(", got ")[0])
+    raise UserError(f"{where} must be {' or '.join(wanted)}, got {value!r}")

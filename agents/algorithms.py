@@ -1,0 +1,102 @@
+"""Models of the learning algorithms: made from a preset, with `ForecastAttention` in front of each of them."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from agents.features import AttentionConfig, ForecastAttention
+from agents.plan_scores import PlanAttention, PlanScores
+from agents.presets import Algorithm, PPOPreset, Preset, RecurrentPPOPreset
+from envs.sb3.algorithms import algorithm_class
+from predictor.support.errors import UserError
+
+DISCRETE: tuple[Algorithm, ...] = ("dqn", "qrdqn")
+"""Algorithms that need discrete actions."""
+CONTINUOUS: tuple[Algorithm, ...] = ("sac", "tqc")
+"""Algorithms that need continuous actions."""
+LOG_INTERVAL: dict[Algorithm, int] = {"ppo": 1, "recurrent-ppo": 1, "a2c": 25}
+"""Number of rollouts between lines of the log: a line about every 128 steps; others count episodes."""
+LOG_EPISODES = 20
+SCORE_PLANS: tuple[Algorithm, ...] = ("ppo", "a2c")
+"""Algorithms whose actor scores candidate plans (`agents.plan_scores`); the others read them as features."""
+
+
+def check_actions(algorithm: Algorithm, space: spaces.Space, env_id: str) -> None:
+    """Checks that an algorithm supports an action space.
+
+    Raises:
+        UserError: it does not.
+    """
+    if algorithm in DISCRETE and not isinstance(space, spaces.Discrete):
+        raise UserError(f"{algorithm} needs a discrete action space, {env_id} has {space}; use ppo")
+    if algorithm in CONTINUOUS and not (isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)):
+        raise UserError(f"{algorithm} needs a continuous action space, {env_id} has {space}; use ppo")
+    if algorithm in CONTINUOUS and isinstance(space, spaces.Box) and not space.is_bounded():
+        raise UserError(f"{algorithm} needs bounded actions, {env_id} has {space}; use ppo")
+
+
+def log_interval(algorithm: Algorithm) -> int:
+    """Returns the number of rollouts (with a replay buffer: of episodes) between lines of the log."""
+    return LOG_INTERVAL.get(algorithm, LOG_EPISODES)
+
+
+def new_model(
+    algorithm: Algorithm,
+    preset: Preset,
+    attention: AttentionConfig,
+    venv: VecEnv,
+    *,
+    plan_actions: Sequence[int] | None = None,
+    seed: int,
+    device: str = "cpu",
+    tensorboard_log: str | None = None,
+) -> BaseAlgorithm:
+    """Makes a model; Dict observations get a `ForecastAttention` in front of the policy's network.
+
+    Args:
+        algorithm: learning algorithm.
+        preset: its hyperparameters.
+        attention: sizes and scales of the features extractor.
+        venv: environments to learn in.
+        plan_actions: action with which each candidate plan of the ego begins, for algorithms in `SCORE_PLANS`; None
+            where observations have no plans, or plans begin with other actions in other states.
+        seed: random seed.
+        device: device of the network.
+        tensorboard_log: folder of the log; None writes none.
+
+    Raises:
+        UserError: the algorithm's package is not installed.
+    """
+    policy_kwargs = preset.of_policy
+    options = {name: value for name, value in asdict(preset).items() if name not in policy_kwargs}
+    if isinstance(preset, PPOPreset):
+        options["batch_size"] = min(
+            preset.batch_size, preset.n_steps * venv.num_envs
+        )  # few environments give small rollouts
+    kind = "MultiInput" if isinstance(venv.observation_space, spaces.Dict) else "Mlp"
+    policy: str | type = f"{kind}LstmPolicy" if isinstance(preset, RecurrentPPOPreset) else f"{kind}Policy"
+    extractor = ForecastAttention
+    if plan_actions is not None and algorithm in SCORE_PLANS:
+        policy, extractor = PlanScores, PlanAttention
+        policy_kwargs["plan_actions"] = tuple(plan_actions)
+    if kind == "MultiInput":
+        policy_kwargs |= {
+            "features_extractor_class": extractor,
+            "features_extractor_kwargs": {"config": attention},
+        }
+    make: Any = algorithm_class(algorithm)
+    model: BaseAlgorithm = make(
+        policy,
+        venv,
+        policy_kwargs=policy_kwargs,
+        tensorboard_log=tensorboard_log,
+        seed=seed,
+        device=device,
+        **options,
+    )
+    return model
