@@ -161,10 +161,8 @@ def test_policies_with_what_if_score_plans(algorithm: Any, what_if: bool, extrac
     plan = TrainingPlan(task, algorithm, 10, 1, 0)
     venv = make_venv(task, 1, in_process=True)
     model = make_model(plan, venv)
-    assert (
-        type(model.policy.features_extractor if algorithm == "ppo" else model.policy.q_net.features_extractor)
-        is extractor
-    )
+    policy: Any = model.policy.q_net if algorithm == "dqn" else model.policy
+    assert type(policy.features_extractor) is extractor
     obs = venv.reset()
     assert model.predict(obs)[0].shape == (1,)
     venv.close()
