@@ -10,6 +10,7 @@ from agents.vec_envs import DrivenEnv, EpisodeResult, MakeCopy, drive, make_mult
 from envs.drivers.all_agents import make_driver
 from envs.registry import make_multiagent_env
 from envs.seeding import driver_rng
+from predictor.online import OnlineForecaster
 from predictor.support.errors import UserError
 from tests.agents.helpers import LIVES, TOY, policy_for
 
@@ -54,6 +55,24 @@ def test_learners_observe_what_the_task_says():
     assert isinstance(seeing.observation_space, gym.spaces.Dict)
     assert seeing.observation_space["observation"] == own.observation_space
     assert {"agents", "forecast", "valid"} <= set(seeing.observation_space)
+
+
+@pytest.mark.parametrize("observe", ["forecast", "zeros", "constant-velocity"])
+def test_a_step_of_all_copies_and_learners_is_one_forecast(observe: Any, monkeypatch: pytest.MonkeyPatch):
+    batches: list[int] = []
+    forecast = OnlineForecaster.forecast
+
+    def note(self: OnlineForecaster, horizon_steps: int, num_samples: int, noise: Any, *more: Any) -> Any:
+        batches.append(len(noise))
+        return forecast(self, horizon_steps, num_samples, noise, *more)
+
+    monkeypatch.setattr(OnlineForecaster, "forecast", note)
+    venv = make_multiagent_venv(Task(TAG, observe, learners=("adversary",)), 3)
+    venv.reset()
+    for _ in range(26):  # episodes have 25 steps: the last and the first scenes of three copies are one batch, too
+        venv.step(np.zeros(venv.num_envs, dtype=np.int64))
+    assert batches == [3] * 25 + [6, 3]
+    venv.close()
 
 
 # --- Partners ---------------------------------------------------------------------------------------------------------
