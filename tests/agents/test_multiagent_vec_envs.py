@@ -150,6 +150,18 @@ def test_results_depend_on_the_seed_alone(observe: Any):
     assert facts(MultiagentArena(task).play(model, [4])) == facts(arena.play(model, [4]))
 
 
+@pytest.mark.parametrize("observe", ["none", "constant-velocity"])
+def test_copies_side_by_side_play_as_one_after_the_other(observe: Any):
+    """With fewer seeds than copies in the last turn, and in an arena that has played before."""
+    task = Task(TAG, observe, learners=("adversary",), driver="varied")
+    model, together, calls = policy_for(task), MultiagentArena(task, most_copies=3), list[None]()
+    together.play(model, [9])
+    results = together.play(model, range(3, 8), lambda: calls.append(None))
+    assert facts(results) == facts(MultiagentArena(task, most_copies=1).play(model, range(3, 8)))
+    assert len({r.episode_return for r in results}) > 1 and len(calls) == 5
+    together.close()
+
+
 def test_a_policy_is_played_as_in_a_plain_loop():
     task = Task(SPREAD, "none")
     model = policy_for(task)
