@@ -11,7 +11,7 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict, astuple, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -327,10 +327,22 @@ def test_policies_trained_on_envpool_are_measured_on_the_original(tmp_path: Path
     assert not (run / "video.mp4").exists()
 
 
-@pytest.mark.parametrize(("backend", "envs"), [("gymnasium", 6), ("envpool", 64)])
-def test_environments_by_default(backend: Literal["gymnasium", "envpool"], envs: int):
-    assert train_policy.TrainPolicyConfig(backend=backend).parallel_envs == envs
-    assert train_policy.TrainPolicyConfig(backend=backend, num_envs=3).parallel_envs == 3
+@pytest.mark.parametrize(
+    ("env_id", "backend", "sizes"),
+    [
+        ("highway-fast-v0", "gymnasium", train_policy.Sizes(6, 20_000, 20, 50)),
+        ("highway-fast-v0", "envpool", train_policy.Sizes(64, 20_000, 20, 50)),
+        ("intersection-multi-agent-v2", "gymnasium", train_policy.Sizes(6, 20_000, 20, 50)),
+        ("simple_tag_v3", "gymnasium", train_policy.Sizes(64, 160_000, 100, 200)),
+    ],
+)
+def test_sizes_by_default(env_id: str, backend: Literal["gymnasium", "envpool"], sizes: train_policy.Sizes):
+    config = train_policy.TrainPolicyConfig(env_id, backend=backend)
+    assert config.sizes == sizes
+    plan = config.plan
+    assert (plan.num_envs, plan.steps, plan.selection_episodes) == astuple(sizes)[:3]
+    given = train_policy.Sizes(3, 100, 1, 7)
+    assert train_policy.TrainPolicyConfig(env_id, backend=backend, **asdict(given)).sizes == given
 
 
 @pytest.mark.parametrize(
