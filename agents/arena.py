@@ -183,7 +183,7 @@ class MultiagentArena:
             for copy in playing:
                 lengths[copy] += 1
             playing = {copy for copy in playing if copies[copy].episodes == episodes[copy]}
-        return [_result(seed, *found) for seed, *found in zip(seeds, lengths, returns, strict=False)]
+        return [_result(seed, lengths[copy], returns[copy]) for copy, seed in enumerate(seeds)]
 
     def _driven(self, name: str, seed: int) -> EpisodeResult:
         env = self._env
