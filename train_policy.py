@@ -49,7 +49,7 @@ class Sizes:
 
 SIZES: dict[Backend, Sizes] = {"gymnasium": Sizes(), "envpool": Sizes(num_envs=64)}
 """Sizes by backend."""
-PARTICLES_SIZES = Sizes(num_envs=64, steps=160_000, selection_episodes=100, eval_episodes=200)
+PARTICLES_SIZES = Sizes(num_envs=64, steps=60_000, selection_episodes=100, eval_episodes=200)
 """Sizes for mpe2's particle worlds. Rewards are rare (in simple_tag 10 for a touch), so that learning takes many steps
 and a mean many episodes, both of which are cheap."""
 
@@ -90,7 +90,7 @@ class TrainPolicyConfig:
     """Arguments of the environment as a JSON object, for example '{"config": {"vehicles_density": 2}}'."""
     steps: int | None = None
     """Number of environment steps to train for, over all environments; one step of a PettingZoo copy is one, however
-    many agents learn. None takes 20,000, in mpe2's particle worlds (simple_tag_v3) 160,000."""
+    many agents learn. None takes 20,000, in mpe2's particle worlds (simple_tag_v3) 60,000."""
     num_envs: Annotated[int | None, Renamed("envs")] = None
     """Number of parallel environments: processes, environments of EnvPool, or copies of a PettingZoo environment. None
     takes 6, with EnvPool and in mpe2's particle worlds 64."""
@@ -100,6 +100,9 @@ class TrainPolicyConfig:
     """PettingZoo: agents or roles that learn, for example adversary; None takes all, in simple_tag the adversaries."""
     driver: Annotated[str, Renamed("partner")] = "heuristic"
     """PettingZoo: driver of the agents that do not learn: random, idle, varied, heuristic or mixed."""
+    shaping: bool = True
+    """simple_tag: learn also from a reward of 10 for each metre that a predator comes closer to the prey; selection and
+    evaluation never count it."""
     seed: int = 0
     """Random seed for torch, NumPy and the environments; evaluation seeds do not depend on it."""
     out: Annotated[Path | None, Renamed("run_dir")] = None
@@ -157,6 +160,7 @@ class TrainPolicyConfig:
             self.measuring_envs,
             self.checkpoint_every,
             settings=self.settings,
+            shaping=self.shaping,
         )
 
     @property

@@ -72,6 +72,8 @@ class TrainingPlan:
     anew at every checkpoint."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Hyperparameters in place of the preset's."""
+    shaping: bool = True
+    """Whether to learn from shaped rewards where those of the environment are rare (`agents.shaping`)."""
 
     def __post_init__(self) -> None:
         """Checks choices and ranges; replaces `device="auto"` by the device that is taken."""
@@ -118,7 +120,7 @@ def train(plan: TrainingPlan, run_dir: Path, progress_bar: bool = True) -> Path:
         Path of the final policy, `run_dir/policy.zip`.
     """
     note = plan.task.note  # loads the forecaster, which draws random numbers: before the model is seeded
-    venv = make_venv(plan.task, plan.num_envs, in_process=plan.in_process)
+    venv = make_venv(plan.task, plan.num_envs, in_process=plan.in_process, shaping=plan.shaping)
     selection = open_arena(plan.task, min(plan.selection_envs, plan.selection_episodes), plan.in_process)
     try:
         model = _resume_or_make(plan, venv, run_dir)

@@ -333,7 +333,7 @@ def test_policies_trained_on_envpool_are_measured_on_the_original(tmp_path: Path
         ("highway-fast-v0", "gymnasium", train_policy.Sizes(6, 20_000, 20, 50)),
         ("highway-fast-v0", "envpool", train_policy.Sizes(64, 20_000, 20, 50)),
         ("intersection-multi-agent-v2", "gymnasium", train_policy.Sizes(6, 20_000, 20, 50)),
-        ("simple_tag_v3", "gymnasium", train_policy.Sizes(64, 160_000, 100, 200)),
+        ("simple_tag_v3", "gymnasium", train_policy.Sizes(64, 60_000, 100, 200)),
     ],
 )
 def test_sizes_by_default(env_id: str, backend: Literal["gymnasium", "envpool"], sizes: train_policy.Sizes):
