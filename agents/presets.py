@@ -95,7 +95,7 @@ class RecurrentPPOPreset(PPOPreset):
     """Hyperparameters of PPO with an LSTM behind the features extractor; the others are those of PPO."""
 
     lstm_hidden_size: int = 128
-    """Number of units of the actor's and of the critic's LSTM: as many as the features extractor has outputs
+    """Number of units of the actor's and of the critic's LSTM: about as many as the features extractor has outputs
     (sb3-contrib: 256)."""
     n_lstm_layers: int = 1
     """Number of layers of each LSTM; the default of sb3-contrib."""
