@@ -7,7 +7,7 @@ summary.md, episodes.parquet (where pyarrow is installed) and video.mp4.
 """
 
 import os
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,10 +18,12 @@ from agents.evaluate import constant_drivers, evaluate_with_progress, show
 from agents.preset_settings import settings_from_file, settings_from_words
 from agents.presets import Algorithm
 from agents.results import PACKAGES
-from agents.runs import FORECASTER, check_forecaster, load_model, open_run
+from agents.runs import CHECKPOINT_FILE, FORECASTER, check_forecaster, load_model, open_run
+from agents.step_count import check_step_unit
 from agents.task import Backend, Observe, Task
 from agents.training import TrainingPlan, train
 from agents.video import film
+from envs.readers.mpe import MPE_IDS
 from envs.registry import entry_for, envpool_task_of
 from envs.simulators.envpool import ONE_START
 from predictor.support.command_line import Renamed, parse
@@ -30,8 +32,31 @@ from predictor.support.errors import run_entry_point
 from predictor.support.provenance import provenance
 from predictor.support.runtime import keep_freed_memory
 
-ENVS = {"gymnasium": 6, "envpool": 64}
-"""Default number of parallel environments, by backend."""
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of a training that the command line leaves open."""
+
+    num_envs: int = 6
+    """Number of parallel environments."""
+    steps: int = 20_000
+    """Number of environment steps."""
+    selection_episodes: int = 20
+    """Number of episodes per measurement for model selection."""
+    eval_episodes: int = 50
+    """Number of episodes per policy in the final table."""
+
+
+SIZES: dict[Backend, Sizes] = {"gymnasium": Sizes(), "envpool": Sizes(num_envs=64)}
+"""Sizes by backend."""
+PARTICLES_SIZES = Sizes(num_envs=64, steps=60_000, selection_episodes=100, eval_episodes=200)
+"""Sizes for mpe2's particle worlds. Rewards are rare (in simple_tag 10 for a touch), so that learning takes many steps
+and a mean many episodes, both of which are cheap."""
+
+
+def sizes_for(env_id: str, backend: Backend) -> Sizes:
+    """Returns the sizes that fit an environment."""
+    return PARTICLES_SIZES if env_id in MPE_IDS else SIZES[backend]
 
 
 @dataclass(frozen=True)
@@ -63,17 +88,21 @@ class TrainPolicyConfig:
     """Show also what the others do in each candidate plan of the ego."""
     env_kwargs: str = ""
     """Arguments of the environment as a JSON object, for example '{"config": {"vehicles_density": 2}}'."""
-    steps: int = 20_000
-    """Number of environment steps to train for, over all environments."""
+    steps: int | None = None
+    """Number of environment steps to train for, over all environments; one step of a PettingZoo copy is one, however
+    many agents learn. None takes 20,000, in mpe2's particle worlds (simple_tag_v3) 60,000."""
     num_envs: Annotated[int | None, Renamed("envs")] = None
     """Number of parallel environments: processes, environments of EnvPool, or copies of a PettingZoo environment. None
-    takes 6, with EnvPool 64."""
+    takes 6, with EnvPool and in mpe2's particle worlds 64."""
     backend: Backend = "gymnasium"
     """Simulator in training; the policy is measured and filmed on the gymnasium environment in any case."""
     learners: tuple[str, ...] | None = None
     """PettingZoo: agents or roles that learn, for example adversary; None takes all, in simple_tag the adversaries."""
     driver: Annotated[str, Renamed("partner")] = "heuristic"
     """PettingZoo: driver of the agents that do not learn: random, idle, varied, heuristic or mixed."""
+    shaping: bool = True
+    """simple_tag: learn also from a reward of 10 for each metre that a predator comes closer to the prey; selection and
+    evaluation never count it."""
     seed: int = 0
     """Random seed for torch, NumPy and the environments; evaluation seeds do not depend on it."""
     out: Annotated[Path | None, Renamed("run_dir")] = None
@@ -82,12 +111,13 @@ class TrainPolicyConfig:
     """Continue the run in `out`, or start it if the folder holds none."""
     selections: int = 8
     """Number of times, evenly spread, that the policy is measured for model selection."""
-    selection_episodes: int = 20
-    """Number of episodes per such measurement, on seeds that neither training nor the final table uses."""
+    selection_episodes: int | None = None
+    """Number of episodes per such measurement, on seeds that neither training nor the final table uses. None takes 20,
+    in mpe2's particle worlds 100."""
     checkpoint_every: int = 2_000
     """Number of environment steps between checkpoints."""
-    eval_episodes: int = 50
-    """Number of episodes per policy in the final table."""
+    eval_episodes: int | None = None
+    """Number of episodes per policy in the final table. None takes 50, in mpe2's particle worlds 200."""
     video: bool = True
     """Film one episode at the end."""
     device: str = "cpu"
@@ -121,15 +151,16 @@ class TrainPolicyConfig:
         return TrainingPlan(
             task,
             self.algorithm,
-            self.steps,
-            self.parallel_envs,
+            self.sizes.steps,
+            self.sizes.num_envs,
             self.seed,
             self.device,
             self.selections,
-            self.selection_episodes,
+            self.sizes.selection_episodes,
             self.measuring_envs,
             self.checkpoint_every,
             settings=self.settings,
+            shaping=self.shaping,
         )
 
     @property
@@ -139,28 +170,33 @@ class TrainPolicyConfig:
         return read | settings_from_words(self.algorithm, self.set)
 
     @property
-    def parallel_envs(self) -> int:
-        """Number of parallel environments."""
-        return self.num_envs if self.num_envs is not None else ENVS[self.backend]
+    def sizes(self) -> Sizes:
+        """Sizes of the training: the given ones, and those that fit the environment."""
+        fitting = sizes_for(self.env_id, self.backend)
+        given = {name: getattr(self, name) for name in asdict(fitting)}
+        return replace(fitting, **{name: size for name, size in given.items() if size is not None})
 
     @property
     def measuring_envs(self) -> int:
         """Number of parallel environments that measure a policy; results do not depend on it."""
-        return min(self.parallel_envs, os.cpu_count() or 1)
+        return min(self.sizes.num_envs, os.cpu_count() or 1)
 
 
 def run(config: TrainPolicyConfig, console: Console) -> None:
     """Trains, evaluates and films; nothing is written before the input has been checked."""
     plan = config.plan
     plan.check_action_space(plan.task.check())
-    settings = asdict(config) | {"preset": asdict(plan.preset), "attention": asdict(plan.attention)}
+    settings = asdict(config) | asdict(config.sizes)
+    settings |= {"preset": asdict(plan.preset), "attention": asdict(plan.attention)}
     # config.json keeps the older names of two options, so that earlier runs can be read and resumed
-    settings |= {"learners": plan.task.learners, "envs": config.parallel_envs, "partner": config.driver}
+    settings |= {"learners": plan.task.learners, "envs": config.sizes.num_envs, "partner": config.driver}
     pin = plan.task.note.forecaster
     settings[FORECASTER] = None if pin is None else asdict(pin)
     settings["preset_file"] = config.preset
     for name in ("out", "resume", "num_envs", "driver"):
         settings.pop(name)
+    if config.resume:
+        check_step_unit(config.folder / CHECKPOINT_FILE, plan.task.is_multiagent)
     if config.resume and not check_forecaster(config.folder, pin):
         console.print(
             f"note: {config.folder} does not say which forecaster it was trained on; it goes on with this one"
@@ -176,7 +212,7 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
         plan.task,
         model,
         f"{config.algorithm} ({config.observe})",
-        config.eval_episodes,
+        config.sizes.eval_episodes,
         config.measuring_envs,
         drivers=constant_drivers(plan.task),
     )

@@ -75,9 +75,7 @@ def new_model(
     policy_kwargs = preset.of_policy
     options = {name: value for name, value in asdict(preset).items() if name not in policy_kwargs}
     if isinstance(preset, PPOPreset):
-        options["batch_size"] = min(
-            preset.batch_size, preset.n_steps * venv.num_envs
-        )  # few environments give small rollouts
+        options["batch_size"] = even_batches(preset.n_steps * venv.num_envs, preset.batch_size)
     kind = "MultiInput" if isinstance(venv.observation_space, spaces.Dict) else "Mlp"
     policy: str | type = f"{kind}LstmPolicy" if isinstance(preset, RecurrentPPOPreset) else f"{kind}Policy"
     extractor = ForecastAttention
@@ -100,3 +98,12 @@ def new_model(
         **options,
     )
     return model
+
+
+def even_batches(rollout: int, most: int) -> int:
+    """Returns the largest batch of at most `most` samples that divides a rollout into equal ones.
+
+    Where that is less than half of `most`, the last batch is a smaller one instead.
+    """
+    even = next(rollout // count for count in range(-(-rollout // most), rollout + 1) if rollout % count == 0)
+    return even if 2 * even >= most else min(rollout, most)

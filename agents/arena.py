@@ -10,7 +10,15 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.task import Task
-from agents.vec_envs import EPISODE_INFO, EpisodeResult, make_multiagent_venv, make_venv, own_observations
+from agents.vec_envs import (
+    EPISODE_INFO,
+    EpisodeResult,
+    MakeCopy,
+    learners_of,
+    make_multiagent_venv,
+    make_venv,
+    own_observations,
+)
 from envs.drivers.all_agents import has_heuristic, make_driver
 from envs.readers.base import role_of
 from envs.sb3.acting import ActingPolicy
@@ -106,54 +114,82 @@ def run_episodes(
 class MultiagentArena:
     """Plays seeds of a PettingZoo environment with a policy, or with a driver in place of the learners; see `Arena`.
 
+    A policy plays several copies side by side, which share one forecast per step; a driver sees no forecasts.
+
     Args:
         task: a PettingZoo task.
+        most_copies: largest number of copies side by side.
 
     Attributes:
         baselines: random and heuristic; idle where the environment has no heuristic driver.
     """
 
-    def __init__(self, task: Task) -> None:
-        """Makes one copy of the environment; results do not depend on the number of copies."""
-        self._monitor = make_multiagent_venv(task, 1)
-        venv = self._monitor.venv
-        assert isinstance(venv, ParallelVecEnv)
-        self._venv = venv
-        self._env: Any = venv.envs[0]  # has what `DrivenEnv` has
+    def __init__(self, task: Task, most_copies: int = 16) -> None:
+        """Makes the environment of the drivers; copies for a policy are made when the first one plays."""
+        self._task, self._most = task, most_copies
+        self._env: Any = MakeCopy(replace(task, observe="none"))()  # has what `DrivenEnv` has
+        self._learners = learners_of(task, self._env)
+        self._venv: ParallelVecEnv | None = None
         self.baselines = ("random", "heuristic" if has_heuristic(self._env) else "idle")
 
     def play(
         self, policy: BaseAlgorithm | str, seeds: Sequence[int], on_episode: Callable[[], None] = lambda: None
     ) -> list[EpisodeResult]:
         """Plays one episode per seed; the return is the mean over the learners."""
-        results = []
-        for seed in seeds:
-            results.append(self._driven(policy, seed) if isinstance(policy, str) else self._learned(policy, seed))
-            on_episode()
+        results: list[EpisodeResult] = []
+        if isinstance(policy, str):
+            for seed in seeds:
+                results.append(self._driven(policy, seed))
+                on_episode()
+            return results
+        venv = self._copies(min(self._most, len(seeds)))
+        for first in range(0, len(seeds), len(venv.envs)):
+            played = self._learned(venv, policy, seeds[first : first + len(venv.envs)])
+            results += played
+            for _ in played:
+                on_episode()
         return results
 
     def close(self) -> None:
-        """Closes the environment."""
-        self._venv.close()
+        """Closes the environments."""
+        self._env.close()
+        if self._venv is not None:
+            self._venv.close()
 
-    def _learned(self, policy: BaseAlgorithm, seed: int) -> EpisodeResult:
-        self._venv.seed(seed)
-        observations: Any = self._venv.reset()
-        act, starts = ActingPolicy(policy), np.ones(self._venv.num_envs, dtype=bool)
-        episode, steps = self._env.episodes, 0
-        returns = dict.fromkeys(self._venv.agents_of_envs, 0.0)
-        while self._env.episodes == episode:
-            observations, rewards, starts, _ = self._venv.step(act(observations, starts))
-            for agent, reward in zip(self._venv.agents_of_envs, rewards.tolist(), strict=True):
-                returns[agent] += reward
-            steps += 1
-        return _result(seed, steps, returns)
+    def _copies(self, count: int) -> ParallelVecEnv:
+        """Returns at least so many copies, those of before if they are enough."""
+        if self._venv is None or len(self._venv.envs) < count:
+            if self._venv is not None:
+                self._venv.close()
+            venv = make_multiagent_venv(self._task, count).venv
+            assert isinstance(venv, ParallelVecEnv)
+            self._venv = venv
+        return self._venv
+
+    def _learned(self, venv: ParallelVecEnv, policy: BaseAlgorithm, seeds: Sequence[int]) -> list[EpisodeResult]:
+        """Plays one episode in each copy; copies beyond the seeds play the last one again, and do not count."""
+        copies: list[Any] = venv.envs
+        venv.seed([seeds[min(copy, len(seeds) - 1)] for copy in range(len(copies))])
+        observations: Any = venv.reset()
+        episodes, lengths = [env.episodes for env in copies], [0] * len(copies)
+        returns = [dict.fromkeys(self._learners, 0.0) for _ in copies]
+        act, starts = ActingPolicy(policy), np.ones(venv.num_envs, dtype=bool)
+        playing = set(range(len(seeds)))
+        while playing:
+            observations, rewards, starts, _ = venv.step(act(observations, starts))
+            for copy, agent, reward in zip(venv.copies_of_envs, venv.agents_of_envs, rewards.tolist(), strict=True):
+                if copy in playing:
+                    returns[copy][agent] += reward
+            for copy in playing:
+                lengths[copy] += 1
+            playing = {copy for copy in playing if copies[copy].episodes == episodes[copy]}
+        return [_result(seed, lengths[copy], returns[copy]) for copy, seed in enumerate(seeds)]
 
     def _driven(self, name: str, seed: int) -> EpisodeResult:
         env = self._env
         observations, _ = env.reset(seed=seed)
         driver = make_driver(name, env, driver_rng(seed, group=1))  # group 0: agents that do not learn
-        returns = dict.fromkeys(self._venv.agents_of_envs, 0.0)
+        returns = dict.fromkeys(self._learners, 0.0)
         steps, lived = 0, set(env.agents)
         while env.agents and not (lived.issuperset(returns) and returns.keys().isdisjoint(env.agents)):
             own = own_observations(observations)

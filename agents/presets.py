@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from agents.task import Backend
+from envs.readers.mpe import MPE_IDS
 from envs.registry import is_multiagent_id
 from envs.sb3.algorithms import Algorithm
 from predictor.support.config_checks import check_at_least, check_choices, check_positive
@@ -18,7 +19,7 @@ _COUNTS = (
     *("n_steps", "batch_size", "n_epochs", "buffer_size", "train_freq", "target_update_interval", "net_arch"),
     *("lstm_hidden_size", "n_lstm_layers", "n_quantiles", "n_critics"),
 )
-_AMOUNTS = ("learning_starts", "ent_coef", "top_quantiles_to_drop_per_net", "gamma", "gae_lambda")
+_AMOUNTS = ("learning_starts", "ent_coef", "top_quantiles_to_drop_per_net", "gamma", "gae_lambda", "vf_coef")
 _POSITIVE = ("learning_rate", "tau", "exploration_fraction")
 _SHARES = ("gamma", "gae_lambda", "tau", "exploration_fraction", "exploration_final_eps")
 
@@ -65,6 +66,8 @@ class OnPolicyPreset(Preset):
     """Bias-variance trade-off of the advantages; SB3's default."""
     ent_coef: float = 0.0
     """Weight of the entropy bonus; SB3's default."""
+    vf_coef: float = 0.5
+    """Weight of the critic's loss, which grows with the square of the returns; SB3's default."""
 
     @property
     def of_policy(self) -> dict[str, Any]:
@@ -92,7 +95,7 @@ class RecurrentPPOPreset(PPOPreset):
     """Hyperparameters of PPO with an LSTM behind the features extractor; the others are those of PPO."""
 
     lstm_hidden_size: int = 128
-    """Number of units of the actor's and of the critic's LSTM: as many as the features extractor has outputs
+    """Number of units of the actor's and of the critic's LSTM: about as many as the features extractor has outputs
     (sb3-contrib: 256)."""
     n_lstm_layers: int = 1
     """Number of layers of each LSTM; the default of sb3-contrib."""
@@ -223,8 +226,14 @@ _FIVE_HZ_GAMMA = 0.9
 # Many EnvPool environments give large rollouts: larger batches keep the gradient steps per sample near a tenth of
 # those of one environment.
 _ENVPOOL_PPO = PPOPreset(n_steps=32, batch_size=512, n_epochs=5)
-# Episodes of the particle world have 25 steps of 0.1 s; rewards are dense.
-_PARTICLES = PPOPreset(n_steps=100, batch_size=300, n_epochs=8, learning_rate=7e-4, gamma=0.95, ent_coef=0.01)
+# Other agents' lives make returns noisy: a longer discount and an entropy bonus.
+_MULTIAGENT = PPOPreset(n_steps=100, batch_size=300, n_epochs=8, learning_rate=7e-4, gamma=0.95, ent_coef=0.01)
+# A rollout is one episode (25 steps of 0.1 s) of each copy. In simple_tag a touch pays 10 and most episodes have none;
+# at SB3's weight the critic's loss is a hundred times the actor's, and clipping its gradient slows the actor.
+_PARTICLES = PPOPreset(
+    n_steps=25, batch_size=480, n_epochs=5, learning_rate=1e-3, gamma=0.95, ent_coef=0.01, vf_coef=0.005,
+    net_arch=(64, 64),
+)  # fmt: skip
 
 
 def preset_for(env_id: str, algorithm: Algorithm, backend: Backend = "gymnasium") -> Preset:
@@ -232,7 +241,7 @@ def preset_for(env_id: str, algorithm: Algorithm, backend: Backend = "gymnasium"
     preset = PRESETS[algorithm]
     if isinstance(preset, PPOPreset):
         if is_multiagent_id(env_id):
-            return replace(preset, **asdict(_PARTICLES))
+            return replace(preset, **asdict(_PARTICLES if env_id in MPE_IDS else _MULTIAGENT))
         if backend == "envpool":
             preset = replace(preset, **asdict(_ENVPOOL_PPO))
     return replace(preset, gamma=_FIVE_HZ_GAMMA) if env_id.startswith("racetrack") else preset

@@ -151,12 +151,14 @@ def _check_same(file: Path, config: dict[str, Any], free: Sequence[str]) -> list
     stored = _read(file)
     before = stored["config"]
     for name, now in config.items():
-        was = before.get(name, now)  # runs of older versions lack some
+        was = before.get(name, now)  # runs of older versions lack some values, also among hyperparameters
+        if isinstance(was, dict) and isinstance(now, dict):
+            was = now | was
         if name in free or was == now:
             continue
         if isinstance(was, dict) and isinstance(now, dict):  # name the part that differs
-            part = next(key for key in {**was, **now} if was.get(key) != now.get(key))
-            name, was, now = f"{name}.{part}", was.get(part), now.get(part)
+            part = next(key for key in was if was[key] != now.get(key))
+            name, was, now = f"{name}.{part}", was[part], now.get(part)
         raise UserError(
             f"cannot resume {file.parent}: {name} was {was!r}, now {now!r}; pass the old value or choose another --out"
         )

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.algorithms import check_actions, log_interval, new_model
@@ -28,6 +28,7 @@ from agents.plan_scores import plan_actions
 from agents.preset_settings import changed
 from agents.presets import Algorithm, Preset, preset_for
 from agents.runs import BEST_FILE, CHECKPOINT_FILE, CURVE_FILE, POLICY_FILE, load_model, save_model
+from agents.step_count import STEP_UNIT, CountSteps, StepProgress, check_step_unit
 from agents.task import SELECTION_SEED, Task
 from agents.vec_envs import EpisodeResult, make_venv
 from envs.sb3.algorithms import require_algorithm
@@ -49,7 +50,7 @@ class TrainingPlan:
     algorithm: Algorithm
     """Learning algorithm."""
     steps: int
-    """Number of environment steps, over all environments."""
+    """Number of environment steps, over all environments; a step of a copy is one, however many agents learn."""
     num_envs: int
     """Number of parallel environments."""
     seed: int
@@ -71,6 +72,8 @@ class TrainingPlan:
     anew at every checkpoint."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Hyperparameters in place of the preset's."""
+    shaping: bool = True
+    """Whether to learn from shaped rewards where those of the environment are rare (`agents.shaping`)."""
 
     def __post_init__(self) -> None:
         """Checks choices and ranges; replaces `device="auto"` by the device that is taken."""
@@ -117,13 +120,13 @@ def train(plan: TrainingPlan, run_dir: Path, progress_bar: bool = True) -> Path:
         Path of the final policy, `run_dir/policy.zip`.
     """
     note = plan.task.note  # loads the forecaster, which draws random numbers: before the model is seeded
-    venv = make_venv(plan.task, plan.num_envs, in_process=plan.in_process)
+    venv = make_venv(plan.task, plan.num_envs, in_process=plan.in_process, shaping=plan.shaping)
     selection = open_arena(plan.task, min(plan.selection_envs, plan.selection_episodes), plan.in_process)
     try:
         model = _resume_or_make(plan, venv, run_dir)
         if model.num_timesteps < plan.steps:
             _learn(plan, model, selection, run_dir, note, progress_bar)
-            save_model(model, run_dir / CHECKPOINT_FILE, note=note, buffer=True)
+            save_model(model, run_dir / CHECKPOINT_FILE, STEP_UNIT, note, buffer=True)
     finally:
         venv.close()
         selection.close()
@@ -137,7 +140,7 @@ def _learn(
     """Trains for the remaining steps."""
     every = max(plan.steps // plan.selections, 1)
     checkpoint = run_dir / CHECKPOINT_FILE
-    errors, progress = ForecastErrors(), ProgressBarCallback()
+    errors, progress = ForecastErrors(), StepProgress(plan.num_envs)
     restart = partial(_restart_streams, plan, model, errors) if plan.repeatable else None
     select = SelectBest(
         selection,
@@ -150,8 +153,10 @@ def _learn(
         seconds=read_note(checkpoint).get("seconds", 0.0),
         scalars=errors.scalars,
     )
-    save = SaveCheckpoint(checkpoint, plan.checkpoint_every, note, lambda: {"seconds": select.seconds}, restart)
-    callbacks = [errors, save, select, *([progress] if progress_bar else [])]
+    save = SaveCheckpoint(
+        checkpoint, plan.checkpoint_every, note, lambda: STEP_UNIT | {"seconds": select.seconds}, restart
+    )
+    callbacks = [CountSteps(plan.num_envs), errors, save, select, *([progress] if progress_bar else [])]
     try:
         model.learn(
             plan.steps - model.num_timesteps,
@@ -161,8 +166,7 @@ def _learn(
             log_interval=log_interval(plan.algorithm),
         )
     finally:
-        if hasattr(progress, "pbar"):
-            progress.pbar.close()  # gives the terminal back after an interrupt
+        progress.close()
 
 
 def make_model(plan: TrainingPlan, venv: VecEnv, tensorboard_log: str | None = None) -> BaseAlgorithm:
@@ -184,6 +188,7 @@ def _resume_or_make(plan: TrainingPlan, venv: VecEnv, run_dir: Path) -> BaseAlgo
     checkpoint = run_dir / CHECKPOINT_FILE
     if not checkpoint.exists():
         return make_model(plan, venv, logs)
+    check_step_unit(checkpoint, plan.task.is_multiagent)
     model = load_model(checkpoint, plan.algorithm, venv, plan.device)
     model.tensorboard_log = logs  # the folder may have moved
     _seed_from_steps(plan, model)

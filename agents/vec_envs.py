@@ -19,6 +19,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
+from agents.shaping import shaped
 from agents.task import Task
 from envs.drivers.all_agents import Driver, make_driver
 from envs.drivers.ego import constant_actions, make_ego_driver
@@ -120,11 +121,14 @@ class MakeCopy:
     """Task whose environment is made."""
     render_mode: str | None = None
     """Render mode of the environment."""
+    for_learning: bool = False
+    """Whether rewards are shaped where those of the environment are rare (`agents.shaping`)."""
 
     def __call__(self) -> ParallelEnv:
         """Makes the environment in a `DrivenEnv`, with forecasts around it unless the task observes none."""
         options = {} if self.render_mode is None else {"render_mode": self.render_mode}
-        env = DrivenEnv(self.task.make(**options), self.task.driver)
+        made = self.task.make(**options)
+        env = DrivenEnv(shaped(made) if self.for_learning else made, self.task.driver)
         return env if self.task.observe == "none" else self.task.wrapped(env)
 
 
@@ -133,9 +137,12 @@ def learners_of(task: Task, env: ParallelEnv) -> list[str]:
     return learners_named(env.possible_agents, task.learners, task.env_id)
 
 
-def make_multiagent_venv(task: Task, copies: int) -> AgentMonitor:
-    """Makes a vector of all learners of some copies of a task's environment, with statistics of each learner's life."""
-    make = MakeCopy(task)
+def make_multiagent_venv(task: Task, copies: int, for_learning: bool = False) -> AgentMonitor:
+    """Makes a vector of all learners of some copies of a task's environment, with statistics of each learner's life.
+
+    `for_learning` shapes rewards, see `MakeCopy`.
+    """
+    make = MakeCopy(task, for_learning=for_learning)
     env = make()
     learners = learners_of(task, env)
     env.close()
@@ -143,7 +150,9 @@ def make_multiagent_venv(task: Task, copies: int) -> AgentMonitor:
     return AgentMonitor(ParallelVecEnv([make] * copies, agents=learners, partner=partner))
 
 
-def make_venv(task: Task, num_envs: int, seeded: bool = False, in_process: bool = False) -> VecEnv:
+def make_venv(
+    task: Task, num_envs: int, seeded: bool = False, in_process: bool = False, shaping: bool = False
+) -> VecEnv:
     """Makes the parallel environments of a task, with episode statistics and (unless `observe` is none) forecasts.
 
     Args:
@@ -152,9 +161,10 @@ def make_venv(task: Task, num_envs: int, seeded: bool = False, in_process: bool 
             PettingZoo environment it is the number of copies, each with one environment of the vector per learner.
         seeded: whether to wrap each environment in `SeededEpisodes`, for evaluation (gymnasium backend only).
         in_process: whether several environments run in this process, too.
+        shaping: whether rewards are shaped where those of the environment are rare (`agents.shaping`).
     """
     if task.is_multiagent:
-        return make_multiagent_venv(task, num_envs)
+        return make_multiagent_venv(task, num_envs, shaping)
     venv: VecEnv
     spec = task.scene_spec
     if task.backend == "envpool":

@@ -8,13 +8,12 @@ An agent's view is cut to its perception; the forecast itself is made from all a
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import reduce
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -22,7 +21,7 @@ from envs.entries import ego_entries, entry_spaces, path_entries
 from envs.readers.base import MultiagentScene
 from envs.scene_stream import ForecastConfig, SceneStream
 from predictor.forecaster import Forecaster
-from predictor.scene import PADDING_ID, Forecast, Scene, SceneBatch, SceneSpec, perceived_agents
+from predictor.scene import PADDING_ID, Forecast, SceneBatch, SceneSpec, perceived_agents
 from predictor.support.errors import UserError
 
 Entries = dict[str, NDArray[np.float32]]
@@ -164,18 +163,12 @@ def view_entries(
     entries: list[AgentEntries] = [{} for _ in scenes]
     if not named:
         return entries
-    origins, seen_scenes, orders = [], [], []
-    for one in scenes:
-        egos = np.array(list(one.index_of.values()), dtype=np.int64)
-        order, seen = _views(one.scene, egos, view)
-        orders.append(order)
-        origins.append(one.scene.states[egos, : view.position_dim])
-        seen_scenes.append(SceneBatch(one.scene.states[order], one.scene.ids[order], seen, one.heading_rad[egos]))
-    views = reduce(SceneBatch.concatenate, seen_scenes)
+    egos = np.array([index for one in scenes for index in one.index_of.values()], dtype=np.int64)
+    views, order, origins = _views(scenes, np.array([env for env, _ in named]), egos, view)
     device = forecast.xy.device
     env = torch.tensor([env for env, _ in named], device=device)
-    agents = torch.from_numpy(np.concatenate(orders)).to(device)
-    origin = torch.from_numpy(np.concatenate(origins)).to(forecast.xy)
+    agents = torch.from_numpy(order).to(device)
+    origin = torch.from_numpy(origins).to(forecast.xy)
     pairs = env[:, None, None], agents[:, :, None], agents[:, None, :]
 
     def of_views(samples: Tensor | None) -> Tensor | None:
@@ -228,11 +221,24 @@ def check_multiagent_scene(scene: Any, spec: SceneSpec, source: str = "reader") 
 
 
 def _views(
-    scene: Scene, egos: Int[np.ndarray, " egos"], view: SceneSpec
-) -> tuple[Int[np.ndarray, "egos seen"], Bool[np.ndarray, "egos seen"]]:
-    """Returns the agents' indices in each ego's view, itself first, then the nearest, and which are no padding."""
-    states = np.broadcast_to(scene.states, (len(egos), *scene.states.shape))
-    valid = np.broadcast_to(scene.valid, (len(egos), *scene.valid.shape))
-    order, seen = perceived_agents(states, valid, egos, view)
+    scenes: Sequence[MultiagentScene],
+    envs: Int[np.ndarray, " egos"],
+    egos: Int[np.ndarray, " egos"],
+    view: SceneSpec,
+) -> tuple[SceneBatch, Int[np.ndarray, "egos seen"], Float[np.ndarray, "egos axes"]]:
+    """Returns each ego's view, itself first, then the nearest; the indices of its agents, and where the ego is [m].
+
+    Args:
+        scenes: scenes of all environments.
+        envs: index of each ego's scene.
+        egos: index of each ego in its scene.
+        view: spec whose `perception_m` and `max_agents` bound a view.
+    """
+    every = _batch(scenes)[envs]
+    order, seen = perceived_agents(every.states, every.valid, egos, view)
     padding = ((0, 0), (0, view.max_agents - order.shape[1]))
-    return np.pad(order, padding), np.pad(seen, padding)
+    order, seen = np.pad(order, padding), np.pad(seen, padding)
+    here = np.arange(len(egos))
+    heading_rad = np.stack([scene.heading_rad for scene in scenes])[envs, egos]
+    views = SceneBatch(every.states[here[:, None], order], every.ids[here[:, None], order], seen, heading_rad)
+    return views, order, every.states[here, egos, : view.position_dim]

@@ -205,6 +205,10 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--vec thread", "invalid choice 'thread' for argument '--vec'"),
         ("--env-id racetrack-v1 --num-envs 1", "blocks are of random discrete actions, the environment has Box("),
     ],
+    "benchmarks.copies": [
+        ("--copies 1", "copies must be at least 2, got 1"),
+        ("--env-id highway-fast-v0", "unknown multiagent env 'highway-fast-v0'; known: "),
+    ],
     "benchmarks.time_shares": [("--calls 0", "calls must be at least 1, got 0")],
     "benchmarks.graph_accuracy": [
         ("--checkpoint absent --data absent", "no episode store at absent"),

@@ -11,7 +11,7 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict, astuple, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -42,7 +42,7 @@ CONSTANT = ("lane-left", "idle", "lane-right", "faster", "slower")
 ROLLOUT = 20
 PPO = (*TINY, "--steps", str(2 * ROLLOUT))
 DQN = (*TINY, "--algorithm", "dqn", "--steps", str(2 * ROLLOUT))  # learns from step 10 on
-TAG = (*TINY[2:], "--env-id", "simple_tag_v3", "--checkpoint", "constant-velocity", "--steps", str(6 * ROLLOUT))
+TAG = (*TINY[2:], "--env-id", "simple_tag_v3", "--checkpoint", "constant-velocity", "--steps", str(2 * ROLLOUT))
 """Arguments of a run with two rollouts of three pursuers."""
 
 
@@ -96,7 +96,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 @pytest.fixture(scope="module")
 def chased(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Returns a finished run of pursuers."""
-    return trained(tmp_path_factory.mktemp("chased") / "run", *TAG[:-1], str(3 * ROLLOUT))
+    return trained(tmp_path_factory.mktemp("chased") / "run", *TAG[:-1], str(ROLLOUT))
 
 
 def assert_video(path: Path, least_s: float) -> None:
@@ -285,7 +285,7 @@ def test_pursuers_are_trained_measured_and_filmed_against_a_prey_that_is_driven(
     config = json.loads((run / "config.json").read_text())["config"]
     assert (config["env_id"], config["learners"], config["partner"]) == ("simple_tag_v3", ["adversary"], "heuristic")
     assert config["envs"] == 1
-    assert load_model(run / "policy.zip", "ppo").num_timesteps == 3 * ROLLOUT
+    assert load_model(run / "policy.zip", "ppo").num_timesteps == ROLLOUT  # three pursuers learn in each
     summary = json.loads((run / "summary.json").read_text())
     assert [line["policy"] for line in summary["policies"]] == ["ppo (forecast)", "random", "heuristic"]
     assert all(line["crash_rate"] is None and line["length_mean"] == 25 for line in summary["policies"])
@@ -327,10 +327,22 @@ def test_policies_trained_on_envpool_are_measured_on_the_original(tmp_path: Path
     assert not (run / "video.mp4").exists()
 
 
-@pytest.mark.parametrize(("backend", "envs"), [("gymnasium", 6), ("envpool", 64)])
-def test_environments_by_default(backend: Literal["gymnasium", "envpool"], envs: int):
-    assert train_policy.TrainPolicyConfig(backend=backend).parallel_envs == envs
-    assert train_policy.TrainPolicyConfig(backend=backend, num_envs=3).parallel_envs == 3
+@pytest.mark.parametrize(
+    ("env_id", "backend", "sizes"),
+    [
+        ("highway-fast-v0", "gymnasium", train_policy.Sizes(6, 20_000, 20, 50)),
+        ("highway-fast-v0", "envpool", train_policy.Sizes(64, 20_000, 20, 50)),
+        ("intersection-multi-agent-v2", "gymnasium", train_policy.Sizes(6, 20_000, 20, 50)),
+        ("simple_tag_v3", "gymnasium", train_policy.Sizes(64, 60_000, 100, 200)),
+    ],
+)
+def test_sizes_by_default(env_id: str, backend: Literal["gymnasium", "envpool"], sizes: train_policy.Sizes):
+    config = train_policy.TrainPolicyConfig(env_id, backend=backend)
+    assert config.sizes == sizes
+    plan = config.plan
+    assert (plan.num_envs, plan.steps, plan.selection_episodes) == astuple(sizes)[:3]
+    given = train_policy.Sizes(3, 100, 1, 7)
+    assert train_policy.TrainPolicyConfig(env_id, backend=backend, **asdict(given)).sizes == given
 
 
 @pytest.mark.parametrize(
@@ -351,7 +363,7 @@ def test_who_learns(env_id: str, asked: tuple[str, ...] | None, learners: tuple[
 @pytest.mark.usefixtures("short")
 @pytest.mark.parametrize(
     ("arguments", "interrupted_at"),
-    [(PPO, ROLLOUT), (DQN, ROLLOUT), (TAG, 3 * ROLLOUT)],
+    [(PPO, ROLLOUT), (DQN, ROLLOUT), (TAG, ROLLOUT)],
     ids=["ppo", "dqn", "pursuers"],
 )
 def test_interrupted_run_goes_on_where_it_was(

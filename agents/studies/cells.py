@@ -22,7 +22,7 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.arena import open_arena
-from agents.presets import Algorithm
+from agents.presets import Algorithm, Preset
 from agents.runs import CURVE_FILE, FORECASTER, load_model, open_run
 from agents.studies.plan import Scenario, Study, StudyArm, task_for
 from agents.studies.results import RESULT_FILE, Result, write_result
@@ -42,8 +42,12 @@ RULES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2")
 """Packages whose versions are part of a cell's name: the simulators and the learning algorithms."""
 MEASURING = 2
 """Number of the way of running and measuring, networks included; a cell of another one is another cell."""
-YOUNGER = {"perception_m": None}
-"""Fields of `Task` that came after the first cells, with the value that those had: it does not change their names."""
+NETWORK = 2
+"""Number of the network that reads forecasts (`agents.features`); a cell of a policy with another one is another
+cell."""
+YOUNGER = {"perception_m": None, "vf_coef": 0.5}
+"""Fields of `Task` and of presets that came after the first cells, with the value that those had: it does not change
+their names."""
 RUN_FOLDER = "run"
 LOG_FILE = "log.txt"
 
@@ -92,8 +96,7 @@ class Cell:
     @property
     def content(self) -> dict[str, Any]:
         """Everything that determines the result, as JSON content."""
-        skipped = {"device", "checkpoint"} | {key for key, value in YOUNGER.items() if getattr(self.task, key) == value}
-        task = {key: value for key, value in asdict(self.task).items() if key not in skipped}
+        task = {key: value for key, value in _named(self.task).items() if key not in ("device", "checkpoint")}
         content: dict[str, Any] = {
             "measuring": MEASURING,
             "task": task,
@@ -105,9 +108,18 @@ class Cell:
             return content | {"driver": self.line}
         if self.plan.algorithm in CONTRIB:
             content["versions"]["sb3-contrib"] = _version("sb3-contrib")
-        unrelated = ("task", "device", "in_process", "selection_envs", "settings")
+        if self.task.observe != "none":
+            content["network"] = NETWORK
+        unrelated = {"task", "device", "in_process", "selection_envs", "settings"}
+        if not self.task.is_multiagent:
+            unrelated.add("shaping")
         values = {key: value for key, value in asdict(self.plan).items() if key not in unrelated}
-        return content | {"plan": values, "preset": asdict(self.plan.preset)}
+        return content | {"plan": values, "preset": _named(self.plan.preset)}
+
+
+def _named(settings: Task | Preset) -> dict[str, Any]:
+    """Returns the fields that are part of a cell's name."""
+    return {key: value for key, value in asdict(settings).items() if key not in YOUNGER or value != YOUNGER[key]}
 
 
 def cells_of(study: Study, where: str) -> list[Cell]:

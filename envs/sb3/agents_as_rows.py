@@ -124,10 +124,10 @@ class ParallelVecEnv(VecEnv):
         super().__init__(len(self.agents_of_envs), self._observation.space, shared_action(actions))
         self.metadata = {**getattr(self.envs[0], "metadata", {}), **self.metadata}
 
-    def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seeds copy i with seed + i at the next reset; later episodes go on from the copy's own generator."""
+    def seed(self, seed: int | Sequence[int] | None = None) -> Sequence[int | None]:
+        """Seeds copy i with seed + i, or seed[i], at the next reset; later episodes go on from its own generator."""
         first = int(np.random.default_rng().integers(2**31)) if seed is None else seed
-        self._seeds = [first + copy for copy in self.copies_of_envs]
+        self._seeds = [first[copy] if isinstance(first, Sequence) else first + copy for copy in self.copies_of_envs]
         return self._seeds
 
     def reset(self) -> VecEnvObs:

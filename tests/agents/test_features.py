@@ -53,6 +53,7 @@ def make_extractor(shapes: dict[str, tuple[int, ...]], config: AttentionConfig |
     extractor = ForecastAttention(make_space(shapes), config)
     with torch.no_grad():
         extractor.null_token.normal_()
+        extractor.gain.uniform_(0.5, 1.5)  # at 0, where it begins, only the own observation would be passed on
     return extractor
 
 
@@ -60,9 +61,19 @@ def permuted(observations: dict[str, torch.Tensor], order: list[int]) -> dict[st
     return {k: v if k in ("observation", "ego_path") else v[:, order] for k, v in observations.items()}
 
 
-def test_size_is_ego_and_attended():
+def test_size_is_own_observation_and_attended():
     extractor = make_extractor(SHAPES)
-    assert extractor(make_observations(SHAPES)).shape == (BATCH, extractor.features_dim) == (BATCH, 128)
+    assert extractor(make_observations(SHAPES)).shape == (BATCH, extractor.features_dim) == (BATCH, 25 + 64)
+
+
+def test_learning_begins_with_the_own_observation_alone():
+    """As without forecasts; the first gradient step lets the rest in."""
+    extractor, observations = ForecastAttention(make_space(SHAPES)), make_observations(SHAPES)
+    features = extractor(observations)
+    torch.testing.assert_close(features[:, :25], observations["observation"].flatten(1), rtol=0, atol=0)
+    assert not features[:, 25:].any()
+    features.sum().backward()
+    assert extractor.gain.grad is not None and extractor.gain.grad.abs().max() > 1e-3
 
 
 def by_loop(extractor: ForecastAttention, observations: dict[str, torch.Tensor]) -> torch.Tensor:
@@ -101,7 +112,8 @@ def by_loop(extractor: ForecastAttention, observations: dict[str, torch.Tensor])
             torch.softmax(key @ query / len(query) ** 0.5, dim=0) @ value
             for query, key, value in zip(*(p.chunk(config.heads, dim=-1) for p in projected), strict=True)
         ]
-        features.append(torch.cat([ego, extractor.attended(torch.cat(heads))]))
+        attended = extractor.gain * extractor.attended(torch.cat(heads))
+        features.append(torch.cat([observations["observation"][b].flatten(), attended]))
     return torch.stack(features)
 
 

@@ -10,6 +10,7 @@ from agents.vec_envs import DrivenEnv, EpisodeResult, MakeCopy, drive, make_mult
 from envs.drivers.all_agents import make_driver
 from envs.registry import make_multiagent_env
 from envs.seeding import driver_rng
+from predictor.online import OnlineForecaster
 from predictor.support.errors import UserError
 from tests.agents.helpers import LIVES, TOY, policy_for
 
@@ -54,6 +55,24 @@ def test_learners_observe_what_the_task_says():
     assert isinstance(seeing.observation_space, gym.spaces.Dict)
     assert seeing.observation_space["observation"] == own.observation_space
     assert {"agents", "forecast", "valid"} <= set(seeing.observation_space)
+
+
+@pytest.mark.parametrize("observe", ["forecast", "zeros", "constant-velocity"])
+def test_a_step_of_all_copies_and_learners_is_one_forecast(observe: Any, monkeypatch: pytest.MonkeyPatch):
+    batches: list[int] = []
+    forecast = OnlineForecaster.forecast
+
+    def note(self: OnlineForecaster, horizon_steps: int, num_samples: int, noise: Any, *more: Any) -> Any:
+        batches.append(len(noise))
+        return forecast(self, horizon_steps, num_samples, noise, *more)
+
+    monkeypatch.setattr(OnlineForecaster, "forecast", note)
+    venv = make_multiagent_venv(Task(TAG, observe, learners=("adversary",)), 3)
+    venv.reset()
+    for _ in range(26):  # episodes have 25 steps: the last and the first scenes of three copies are one batch, too
+        venv.step(np.zeros(venv.num_envs, dtype=np.int64))
+    assert batches == [3] * 25 + [6, 3]
+    venv.close()
 
 
 # --- Partners ---------------------------------------------------------------------------------------------------------
@@ -129,6 +148,18 @@ def test_results_depend_on_the_seed_alone(observe: Any):
         assert [r.seed for r in results] == [3, 4]
         assert facts(results)[0][1:] != facts(results)[1][1:] or policy is model
     assert facts(MultiagentArena(task).play(model, [4])) == facts(arena.play(model, [4]))
+
+
+@pytest.mark.parametrize("observe", ["none", "constant-velocity"])
+def test_copies_side_by_side_play_as_one_after_the_other(observe: Any):
+    """With fewer seeds than copies in the last turn, and in an arena that has played before."""
+    task = Task(TAG, observe, learners=("adversary",), driver="varied")
+    model, together, calls = policy_for(task), MultiagentArena(task, most_copies=3), list[None]()
+    together.play(model, [9])
+    results = together.play(model, range(3, 8), lambda: calls.append(None))
+    assert facts(results) == facts(MultiagentArena(task, most_copies=1).play(model, range(3, 8)))
+    assert len({r.episode_return for r in results}) > 1 and len(calls) == 5
+    together.close()
 
 
 def test_a_policy_is_played_as_in_a_plain_loop():

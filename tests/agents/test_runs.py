@@ -57,6 +57,13 @@ def test_existing_run_is_not_touched_without_resume(tmp_path: Path):
     assert (tmp_path / "run" / "config.json").read_bytes() == before
 
 
+def test_hyperparameters_that_older_runs_lack_have_changed_nothing(tmp_path: Path):
+    open_run(tmp_path, CONFIG | {"preset": {"gamma": 0.8}}, MADE, resume=False)
+    with pytest.raises(UserError, match="preset.gamma was 0.8, now 0.9; pass"):
+        open_run(tmp_path, CONFIG | {"preset": {"gamma": 0.9, "vf_coef": 0.5}}, MADE, resume=True)
+    open_run(tmp_path, CONFIG | {"preset": {"gamma": 0.8, "vf_coef": 0.5}}, MADE, resume=True)
+
+
 def test_foreign_folder_is_not_resumed(tmp_path: Path):
     (tmp_path / "thesis.tex").write_text("")
     for resume in (False, True):

@@ -11,6 +11,7 @@ import torch
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
+from agents.algorithms import even_batches
 from agents.arena import EgoArena
 from agents.features import ForecastAttention
 from agents.presets import (
@@ -230,7 +231,8 @@ def test_presets():
     assert preset_for("merge-v1", "dqn") == DQNPreset()
     assert preset_for("racetrack-oval-v1", "ppo").gamma == 0.9
     particles = preset_for("simple_tag_v3", "ppo")
-    assert (particles.gamma, particles.n_steps) == (0.95, 100)  # type: ignore[union-attr]
+    assert (particles.gamma, particles.n_steps) == (0.95, 25)  # type: ignore[union-attr]
+    assert preset_for("intersection-multi-agent-v2", "ppo").n_steps == 100  # type: ignore[union-attr]
     assert preset_for("simple_tag_v3", "dqn") == DQNPreset()
     envpool = preset_for("highway-fast-v0", "ppo", "envpool")
     assert (envpool.gamma, envpool.batch_size) == (0.8, 512)
@@ -253,6 +255,13 @@ def test_same_seed_same_policy(monkeypatch: pytest.MonkeyPatch):
     assert first.keys() == second.keys()
     for name, value in first.items():
         torch.testing.assert_close(second[name], value, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("rollout", "most", "batch"), [(4800, 480, 480), (75, 480, 75), (600, 480, 300), (1600, 480, 400), (7, 4, 4)]
+)
+def test_batches_divide_a_rollout(rollout: int, most: int, batch: int):
+    assert even_batches(rollout, most) == batch
 
 
 def test_a_batch_is_never_larger_than_a_rollout():

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from agents.presets import PPOPreset, QRDQNPreset
-from agents.studies.cells import Cell, cells_of
+from agents.studies.cells import NETWORK, Cell, cells_of
 from agents.studies.plan import read_study
 from predictor.support.errors import UserError
 from tests.agents.studies.helpers import study_path, study_text
@@ -45,6 +45,15 @@ def test_what_determines_a_result_is_in_the_name(cells: Callable[..., list[Cell]
         assert {title for title in before if after[title] != before[title]} == other, changes
     monkeypatch.setattr("agents.studies.cells._version", lambda name: "0.0")
     assert not set(before.values()) & {cell.name for cell in cells()}
+
+
+def test_only_what_concerns_a_cell_is_in_its_name(cells: Callable[..., list[Cell]]):
+    """So that cells which are finished stay."""
+    none, zeros = cells(env_id=HIGHWAY, seeds="1", arms='["none", "zeros"]', references="[]")
+    assert "network" not in none.content and zeros.content["network"] == NETWORK
+    assert not {"shaping", "vf_coef"} & {*none.content["plan"], *none.content["preset"]}
+    (tag,) = cells(env_id="simple_tag_v3", seeds="1", arms='["none"]', references="[]")
+    assert tag.content["plan"]["shaping"] is True and tag.content["preset"]["vf_coef"] == 0.005
 
 
 def test_settings_of_an_algorithm_are_those_of_its_trainings(cells: Callable[..., list[Cell]]):

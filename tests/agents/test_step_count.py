@@ -1,0 +1,83 @@
+"""A step of a copy is one environment step, however many of its agents learn."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from agents.presets import DQNPreset, PPOPreset
+from agents.runs import CHECKPOINT_FILE, CURVE_FILE, load_model, save_model
+from agents.step_count import STEP_UNIT, StepProgress, check_step_unit
+from agents.task import Task
+from agents.training import SaveCheckpoint, TrainingPlan, make_model, train
+from agents.vec_envs import make_venv
+from envs.sb3.agents_as_rows import ParallelVecEnv
+from envs.sb3.policy_file import read_note
+from predictor.support.errors import UserError
+
+TAG = "simple_tag_v3"
+COPIES = 2
+PRESETS: dict[Any, Any] = {
+    "ppo": PPOPreset(n_steps=8, batch_size=16, n_epochs=1, net_arch=(8,)),
+    "dqn": DQNPreset(learning_starts=8, batch_size=4, gradient_steps=1, net_arch=(8,)),
+}
+
+
+def tiny(monkeypatch: pytest.MonkeyPatch, learners: tuple[str, ...], algorithm: Any = "ppo") -> TrainingPlan:
+    """Returns a plan of 64 environment steps, measured after each 16 and saved after each 32."""
+    monkeypatch.setattr("agents.training.preset_for", lambda *_: PRESETS[algorithm])
+    task = Task(TAG, "none", learners=learners)
+    return TrainingPlan(
+        task, algorithm, 64, COPIES, 0, selections=4, selection_episodes=1, selection_envs=1, checkpoint_every=32
+    )
+
+
+@pytest.mark.filterwarnings("ignore:rich is experimental")
+@pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
+@pytest.mark.parametrize("learners", [("agent_0",), ("adversary",), ()], ids=["1", "3", "4"])
+def test_budget_measurements_checkpoints_and_progress_count_steps_of_copies(
+    algorithm: str, learners: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    stepped, shown, saved = [0], [0], list[int]()
+    step, save = ParallelVecEnv.step_wait, SaveCheckpoint._on_rollout_start
+
+    def count(self: ParallelVecEnv) -> Any:
+        stepped[0] += len(self.envs) if len(self.envs) == COPIES else 0  # one copy: that of the measurements
+        return step(self)
+
+    def note_save(self: SaveCheckpoint) -> None:
+        save(self)
+        saved.append(self._saved_at)
+
+    class Bar:
+        def update(self, steps: int) -> None:
+            shown[0] += steps
+
+        def refresh(self) -> None: ...
+        def close(self) -> None: ...
+
+    monkeypatch.setattr(ParallelVecEnv, "step_wait", count)
+    monkeypatch.setattr(SaveCheckpoint, "_on_rollout_start", note_save)
+    monkeypatch.setattr(StepProgress, "_on_training_start", lambda self: setattr(self, "pbar", Bar()))
+    train(tiny(monkeypatch, learners, algorithm), tmp_path)
+    assert stepped == shown == [64]
+    assert [point["steps"] for point in json.loads((tmp_path / CURVE_FILE).read_text())] == [16, 32, 48, 64]
+    assert sorted(set(saved)) == [0, 32]
+    assert load_model(tmp_path / CHECKPOINT_FILE, algorithm).num_timesteps == 64  # type: ignore[arg-type]
+    assert read_note(tmp_path / CHECKPOINT_FILE).items() >= STEP_UNIT.items()
+
+
+def test_a_checkpoint_that_counted_learners_is_not_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """With one learner too: what it counted cannot be seen."""
+    plan = tiny(monkeypatch, ("adversary",))
+    venv = make_venv(plan.task, COPIES)
+    checkpoint = tmp_path / CHECKPOINT_FILE
+    save_model(make_model(plan, venv), checkpoint, {"seconds": 1.0})
+    venv.close()
+    with pytest.raises(UserError, match=f"cannot resume {tmp_path}: it counted the steps of every learner, but"):
+        train(plan, tmp_path)
+    check_step_unit(checkpoint, is_multiagent=False)  # there is one learner per environment
+    checkpoint.write_text("damaged")
+    check_step_unit(checkpoint, is_multiagent=True)  # loading it says so
+    check_step_unit(tmp_path / "none.zip", is_multiagent=True)
