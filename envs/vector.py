@@ -36,7 +36,7 @@ from predictor.support.errors import UserError
 def __getattr__(name: str) -> Any:
     """Returns `VecForecast` of `envs.sb3.forecast`, which is imported, with Stable-Baselines3, when it is asked for."""
     if name == "VecForecast":
-        return import_module("envs.sb3.forecast").VecForecast
+        return import_module(f"{__package__}.sb3.forecast").VecForecast
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
 
 
