@@ -5,8 +5,8 @@ that one, to our modules too. Two cases:
 
 * `envs`, `predictor` and `agents` are ours: `dgvae_rl.envs.readers` is another name for the module `envs.readers`.
 * One of them is someone else's: our modules are loaded once more, under the names `dgvae_rl.envs` and so on, and what
-  they import from each other is looked up there. The user's `import envs` goes on to give the user's. Names that the
-  user does not have (`agents`, say) lead to ours.
+  they import from each other is looked up there. The user's `import envs` goes on to give the user's. Names
+  that the user does not have lead to ours (`agents`, or `envs.readers`): trained policies name their classes so.
 
 Which case it is, is decided at the first import from here. In the second one our modules get an `__import__` of their
 own through `__builtins__`, which CPython honours; source and byte code are the same files.
@@ -18,7 +18,7 @@ import importlib.util
 import sys
 from collections.abc import Mapping, Sequence
 from importlib.abc import Loader, MetaPathFinder
-from importlib.machinery import ModuleSpec, SourceFileLoader
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -67,24 +67,22 @@ class OwnFinder(MetaPathFinder):
                 self._decide()
             if not self.hidden:
                 return importlib.util.spec_from_loader(fullname, _Alias(rest))
-            return self._second_copy(fullname, rest)
-        if self.hidden and first in OWN and first not in self.hidden:
+            source = _source_of(rest)
+            if source is None:
+                return None
+            return importlib.util.spec_from_file_location(fullname, source, loader=_SecondCopy(fullname, source))
+        if self.hidden and first in OWN and not self._users(first, fullname, path) and _source_of(fullname):
             return importlib.util.spec_from_loader(fullname, _Alias(f"{HERE}.{fullname}"))
         return None
+
+    def _users(self, first: str, fullname: str, path: Sequence[str] | None) -> bool:
+        """Returns whether a module is the user's: their package, or a module that is in its folder."""
+        assert self.hidden is not None
+        return first in self.hidden and (first == fullname or PathFinder.find_spec(fullname, path) is not None)
 
     def _decide(self) -> None:
         self.hidden = ()  # the questions below pass by this finder
         self.hidden = tuple(name for name in OWN if not is_ours(name))
-
-    def _second_copy(self, fullname: str, rest: str) -> ModuleSpec | None:
-        place = HOME.joinpath(*rest.split("."))
-        if (place / "__init__.py").is_file():
-            loader = _SecondCopy(fullname, str(place / "__init__.py"))
-            return importlib.util.spec_from_file_location(fullname, loader.path, loader=loader)
-        if place.with_suffix(".py").is_file():
-            loader = _SecondCopy(fullname, str(place.with_suffix(".py")))
-            return importlib.util.spec_from_file_location(fullname, loader.path, loader=loader)
-        return None
 
 
 class _Alias(Loader):
@@ -109,6 +107,13 @@ class _SecondCopy(SourceFileLoader):
     def exec_module(self, module: ModuleType) -> None:
         module.__dict__["__builtins__"] = vars(builtins) | {"__import__": _import_own}
         super().exec_module(module)
+
+
+def _source_of(name: str) -> str | None:
+    """Returns the path of one of our modules; None if there is none of this name."""
+    place = HOME.joinpath(*name.split("."))
+    files = (place / "__init__.py", place.parent / f"{place.name}.py")
+    return next((str(file) for file in files if file.is_file()), None)
 
 
 def _import_own(

@@ -31,7 +31,12 @@ __getattr__, __all__ = lazy_exports(
         "predictor.dgvae": ("DGVAE", "DGVAEConfig", "PRESETS"),
         "predictor.support.errors": ("ProtocolError", "UserError"),
         "predictor.forecaster": (
-            "Belief", "Forecaster", "Futures", "Memory", "TrainableForecaster", "edgeless_belief",
+            "Belief",
+            "Forecaster",
+            "Futures",
+            "Memory",
+            "TrainableForecaster",
+            "edgeless_belief",
         ),
         "predictor.online": ("OnlineForecaster",),
         "predictor.scene": ("Forecast", "Scene", "SceneBatch", "SceneSpec"),
