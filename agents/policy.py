@@ -122,6 +122,7 @@ def task_of_policy(path: str | Path, device: str = "cpu") -> Task:
         return task_of(read_config(zipped.parent), device)
     note = read_policy_note(zipped)
     if note is None or not note.env_id:
+        policy_file.algorithm_of(zipped)  # has the message for what is no policy at all
         raise UserError(f"{zipped} does not say which environment it drives; pass env=, or the run folder it is from")
     return _task_of_note(note, device)
 
