@@ -47,3 +47,14 @@ def test_the_version_is_that_of_the_metadata():
     stated = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert dgvae_rl.__version__ in (stated, "not installed")
     assert f"version: {stated}" in (ROOT / "CITATION.cff").read_text()
+
+
+def test_checks_are_those_of_the_packages():
+    from dgvae_rl import testing
+    from envs.testing import check_reader
+    from predictor.testing import check_forecaster
+
+    assert testing.check_reader is check_reader and testing.check_forecaster is check_forecaster
+    assert set(testing.__all__) == set(testing.PACKAGE_OF)
+    with pytest.raises(AttributeError, match="module 'dgvae_rl.testing' has no attribute 'check_env'"):
+        _ = testing.check_env  # type: ignore[attr-defined]
