@@ -9,6 +9,7 @@ code.
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 from pettingzoo import ParallelEnv
 from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -29,22 +30,62 @@ class TrainedPolicy:
     """Maps observations of its environment to actions: `action = policy(observation)`.
 
     In a PettingZoo environment it takes the observations of all agents and returns the actions of all that live; the
-    driver of the training acts for those that did not learn.
+    driver of the training acts for those that did not learn. A recurrent policy remembers what it saw since the latest
+    reset of its environment.
 
     Args:
         model: network and algorithm, as Stable-Baselines3 loads them.
+        env: environment whose resets begin episodes, with a `CountedEpisodes` or a `DrivenEnv` inside.
 
     Attributes:
         model: network and algorithm.
     """
 
-    def __init__(self, model: BaseAlgorithm) -> None:
-        """Keeps the model."""
+    def __init__(self, model: BaseAlgorithm, env: Any) -> None:
+        """Begins without a state."""
         self.model = model
+        self._env = env
+        self._states: dict[str, Any] = {}
+        self._episode = -1
 
     def __call__(self, observation: Any) -> Any:
         """Returns the most likely action."""
-        return self.model.predict(observation, deterministic=True)[0]
+        return self._action("", observation)
+
+    def _action(self, agent: str, observation: Any) -> Any:
+        if is_recurrent(self.model) and self._episode != _episodes(self._env):
+            self._episode = _episodes(self._env)
+            self._states = {}
+        action, self._states[agent] = self.model.predict(observation, self._states.get(agent), deterministic=True)
+        return action
+
+
+class CountedEpisodes(gym.Wrapper[Any, Any, Any, Any]):
+    """Counts resets, by which a recurrent policy knows that an episode begins.
+
+    Attributes:
+        episodes: number of resets so far.
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        """Begins at 0."""
+        super().__init__(env)
+        self.episodes = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Resets the environment."""
+        self.episodes += 1
+        return self.env.reset(seed=seed, options=options)
+
+
+def _episodes(env: Any) -> int:
+    number: int = env.get_wrapper_attr("episodes") if isinstance(env, gym.Env) else env.episodes
+    return number
+
+
+def is_recurrent(model: BaseAlgorithm) -> bool:
+    """Returns whether a policy keeps a state from step to step, as sb3-contrib's RecurrentPPO does."""
+    return hasattr(model, "_last_lstm_states")
 
 
 class LoadedPolicy(NamedTuple):
@@ -88,7 +129,8 @@ def load_policy(
         raise UserError(f"render_mode={render_mode!r} is for a new environment; give it to the env that you pass")
     if isinstance(env, ParallelEnv):
         return _of_many_agents(str(zipped), model, env, note or PolicyNote())
-    return LoadedPolicy(TrainedPolicy(model), env_for_driver(env, str(zipped)))
+    env = env_for_driver(CountedEpisodes(env) if is_recurrent(model) else env, str(zipped))
+    return LoadedPolicy(TrainedPolicy(model, env), env)
 
 
 def policy_zip(path: str | Path) -> Path:
@@ -156,8 +198,7 @@ class _TeamPolicy(TrainedPolicy):
     """Acts for all agents of one environment, observations padded as in training."""
 
     def __init__(self, path: str, model: BaseAlgorithm, env: Any, names: tuple[str, ...]) -> None:
-        super().__init__(model)
-        self._env = env
+        super().__init__(model, env)
         learners = learners_named(env.possible_agents, names, f"policy {path}")
         self._actions = {agent: env.action_space(agent) for agent in learners}
         spaces = {agent: env.observation_space(agent) for agent in learners}
@@ -172,8 +213,7 @@ class _TeamPolicy(TrainedPolicy):
         seen = {agent: one for agent, one in observation.items() if agent in self._env.agents}
         chosen = actions_of_others(self._env, own_observations(seen), self._actions)
         for agent in (name for name in seen if name in self._actions):
-            action = super().__call__(self._padded.one(agent, seen[agent]))
-            chosen[agent] = own_action(action, self._actions[agent])
+            chosen[agent] = own_action(self._action(agent, self._padded.one(agent, seen[agent])), self._actions[agent])
         return chosen
 
 

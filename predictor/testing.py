@@ -344,7 +344,7 @@ def _of_samples(valid: Bool[Tensor, "scenes agents"]) -> Bool[Tensor, "scenes sa
 
 def _noise(trial: _Trial) -> Iterator[str]:
     _, belief = trial.observed()
-    before = torch.get_rng_state(), np.random.get_state()[1].copy()  # type: ignore[index, union-attr]  # noqa: NPY002
+    before = torch.get_rng_state(), np.random.get_state()[1].copy()  # type: ignore[index]  # noqa: NPY002
     one, two = (trial.forecaster.rollout(belief, trial.horizon, SAMPLES, trial.noise()).states for _ in range(2))
     here = _of_samples(trial.valid)
     after = np.random.get_state()[1]  # type: ignore[index]  # noqa: NPY002

@@ -160,7 +160,6 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     "agents.watch": [
         ("absent", "no policy at absent: neither a run folder nor a .zip"),
         (".", ". holds no training run (config.json is missing)"),
-        ("file", "file is neither a PPO nor a DQN policy"),
         ("absent --out film.gif", "--out is a film and ends in .mp4, got film.gif"),
         ("absent --window --out film.mp4", "--window writes no film; leave out --out or --window"),
         ("absent --seed -1", "seed must not be negative, got -1"),

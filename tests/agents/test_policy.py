@@ -11,7 +11,7 @@ import pytest
 from stable_baselines3 import PPO
 
 from agents.arena import MultiagentArena
-from agents.policy import load_policy, task_of_policy
+from agents.policy import CountedEpisodes, TrainedPolicy, is_recurrent, load_policy, task_of_policy
 from agents.runs import save_model
 from agents.task import Task
 from envs.parallel import ForecastParallelEnv
@@ -113,7 +113,7 @@ def test_another_forecaster_is_refused(tmp_path: Path):
         ("absent", "no policy at .*absent: neither a run folder nor a .zip; train one with train_policy.py"),
         ("empty", "empty holds no training run \\(config.json is missing\\)"),
         ("stopped", "stopped holds no policy.zip: its training has not ended; continue it with --resume, or name one"),
-        ("text.zip", "text.zip is neither a PPO nor a DQN policy"),
+        ("text.zip", "text.zip (is neither a PPO nor a DQN policy|holds no policy of)"),
         ("predictor", "config.json is not the config of a policy's run"),
     ],
 )
@@ -135,3 +135,20 @@ def test_actions_are_the_most_likely_ones(tmp_path: Path):
     assert len({int(policy(observation)) for _ in range(10)}) == 1
     sampled = {int(policy.model.predict(np.asarray(observation))[0]) for _ in range(50)}
     assert len(sampled) > 1
+
+
+def test_a_recurrent_policy_remembers_its_episode_alone():
+    contrib = pytest.importorskip("sb3_contrib")
+    env = CountedEpisodes(gym.make("CartPole-v1"))
+    model = contrib.RecurrentPPO("MlpLstmPolicy", env, n_steps=4, batch_size=4, device="cpu", seed=0)
+    assert is_recurrent(model) and not is_recurrent(PPO("MlpPolicy", "CartPole-v1", device="cpu"))
+    policy = TrainedPolicy(model, env)
+    observation, _ = env.reset(seed=0)
+    states = []
+    for reset in (False, False, True):
+        if reset:
+            env.reset(seed=0)
+        policy(observation)
+        states.append(policy._states[""][0].copy())
+    assert not np.allclose(states[0], states[1])
+    np.testing.assert_array_equal(states[0], states[2])
