@@ -9,38 +9,42 @@ RUN_DIR ?= runs/highway-fast-ppo
 help: ## list the targets
 	@awk -F ':.*## ' '/^[.a-z-]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-.venv: .venv/.installed ## install the package and its tools, at the versions of constraints.txt, into .venv
+.venv: .venv/.tools ## install the package and its tools, at the versions of constraints.txt, into .venv
 
-.venv/.installed: pyproject.toml constraints.txt
-	$(PYTHON) -m venv .venv
+.venv/.tools: .venv/.package
 	.venv/bin/python -m pip install -c constraints.txt -e '.[all,envpool,dev]'
 	touch $@
 
-train: .venv/.installed ## train a policy on highway-fast-v0 into RUN_DIR (continues a run that was stopped), evaluate and film it
+.venv/.package: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	.venv/bin/python -m pip install -c constraints.txt -e '.[all]'
+	touch $@
+
+train: .venv/.package ## train a policy on highway-fast-v0 into RUN_DIR (continues a run that was stopped), evaluate and film it
 	.venv/bin/python train_policy.py --resume --out $(RUN_DIR)
 
-test: .venv/.installed ## run the tests, TEST_JOBS at a time
+test: .venv/.tools ## run the tests, TEST_JOBS at a time
 	.venv/bin/python -m pytest -n $(TEST_JOBS)
 
-check: .venv/.installed ## lint, formatting, types, who may import whom, the shape of the tree, the examples in docstrings
+check: .venv/.tools ## lint, formatting, types, who may import whom, the shape of the tree, the examples in docstrings
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 	.venv/bin/lint-imports
 	.venv/bin/python -m docs.write_tables --check
 	.venv/bin/python -m pytest -q -o addopts=--import-mode=importlib --doctest-modules \
-		predictor envs agents benchmarks train_policy.py tests/test_structure.py
+		predictor envs agents dgvae_rl benchmarks train_policy.py tests/test_structure.py
 
-docs-check: .venv/.installed ## run every command and every block of README.md and docs/ as written, in a copy of the tree
+docs-check: .venv/.tools ## run every command and every block of README.md and docs/ as written, in a copy of the tree
 	.venv/bin/python .ci/docs_check.py
 
 install-check: ## build the wheel and try EXTRAS, each in a fresh environment: five minutes and 2 GB each
 	$(PYTHON) .ci/install_check.py --only $(EXTRAS)
 
-bench: .venv/.installed ## measure the speed of everything: one table, and runs/benchmarks.json
+bench: .venv/.tools ## measure the speed of everything: one table, and runs/benchmarks.json
 	.venv/bin/python -m benchmarks
 
-bench-check: .venv/.installed ## a quick run, compared with the committed baseline by ratios; fails if anything got slower
+bench-check: .venv/.tools ## a quick run, compared with the committed baseline by ratios; fails if anything got slower
 	.venv/bin/python -m benchmarks --quick --baseline benchmarks/baseline.json
 
 clean: ## remove .venv, builds and caches; keep runs and data

@@ -25,6 +25,23 @@ from envs import ForecastObservation, make_env
 observation, _ = ForecastObservation(make_env("{env_id}")).reset(seed=0)
 assert observation["forecast"].shape[-1] == 2
 """
+OWN_FOLDER = """
+from pathlib import Path
+Path("envs").mkdir()
+Path("envs/__init__.py").write_text("MINE = 1")
+import envs
+from dgvae_rl import ForecastObservation, make_env
+observation, _ = ForecastObservation(make_env("highway-fast-v0")).reset(seed=0)
+assert observation["forecast"].shape[-1] == 2 and envs.MINE == 1
+import shutil
+shutil.rmtree("envs")
+"""
+COMMAND = """
+import subprocess, sys
+from pathlib import Path
+done = subprocess.run([Path(sys.executable).parent / "dgvae", "--help"], capture_output=True, text=True, check=True)
+assert "train-predictor" in done.stdout, done.stdout
+"""
 WITHOUT_ENVPOOL = """
 from envs import make_env
 from predictor import UserError
@@ -62,6 +79,8 @@ EXTRAS: dict[str, Extra] = {
         (
             *(f"predictor.{door} --help" for door in ("train", "evaluate", "suite", "interpret", "card")),
             "\nfrom predictor import *\n",
+            "\nfrom dgvae_rl.testing import check_forecaster\nfrom dgvae_rl import Forecaster, __version__\n",
+            COMMAND,
             SPRINGS,
             TRAIN,
             EVALUATE,
@@ -75,6 +94,7 @@ EXTRAS: dict[str, Extra] = {
         (
             WRAPPED.format(env_id="highway-fast-v0"),
             WITHOUT_ENVPOOL,
+            OWN_FOLDER,
             "envs.collect --env-id highway-fast-v0 --out data --episodes 2 --max-steps 12 --workers 1",
             "envs.evaluate --env-ids highway-fast-v0 --checkpoint highway --episodes 1 --max-steps 8 --workers 1",
         ),

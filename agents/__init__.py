@@ -1,6 +1,6 @@
 """Policies that learn from forecasts, with Stable-Baselines3: features extractor, training, evaluation.
 
-    >>> from agents import ForecastAttention, Task, TrainingPlan, train
+    >>> from agents import ForecastAttention, Task, TrainingPlan, load_policy, train
 
 The names below are imported when they are used.
 """
@@ -12,6 +12,7 @@ from predictor.support.lazy_exports import lazy_exports
 if TYPE_CHECKING:
     from agents.evaluate import evaluate_policy_on_seeds
     from agents.features import AttentionConfig, ForecastAttention
+    from agents.policy import TrainedPolicy, load_policy
     from agents.presets import (
         A2CPreset,
         DQNPreset,
@@ -33,6 +34,7 @@ __getattr__, __all__ = lazy_exports(
     {
         "agents.evaluate": ("evaluate_policy_on_seeds",),
         "agents.features": ("AttentionConfig", "ForecastAttention"),
+        "agents.policy": ("TrainedPolicy", "load_policy"),
         "agents.presets": (
             "A2CPreset",
             "DQNPreset",

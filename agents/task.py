@@ -199,7 +199,7 @@ class Task:
         if self.observe != "none":
             name = self.forecaster or checkpoint_for(self.env_id)
             pin = pin_forecaster(name, *self._forecasts(), self.options.get("arm"))
-        return PolicyNote(pin, self.learners, self.driver)
+        return PolicyNote(pin, self.learners, self.driver, self.env_id, self.env_kwargs)
 
     def _forecasts(self) -> tuple[gym.spaces.Dict, SceneSpec]:
         """Returns an observation space with forecasts, and the layout of the scenes behind them."""

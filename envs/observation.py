@@ -1,6 +1,7 @@
 """Makes observations of scenes and forecasts, for single environments and vector environments of gymnasium and SB3."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -14,7 +15,7 @@ from envs.plans.playing import as_forecast
 from envs.registry import checkpoint_for
 from envs.scene_stream import ForecastConfig, SceneStream
 from predictor.checkpoint import load_forecaster
-from predictor.forecaster import Forecaster
+from predictor.forecaster import Forecaster, require_forecaster
 from predictor.online import use_one_thread_after_fork
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 from predictor.support.errors import UserError
@@ -76,7 +77,7 @@ def require_scenes(space: gym.Space, wrapper: str) -> gym.spaces.Dict:
 
 
 def open_forecaster(
-    checkpoint: str | None,
+    checkpoint: str | Path | Forecaster | None,
     scene_spec: SceneSpec,
     source: str,
     device: str = "cpu",
@@ -85,23 +86,26 @@ def open_forecaster(
     """Returns the forecaster of a checkpoint, or the given one, after checking that it fits the scenes.
 
     Args:
-        checkpoint: shipped name, folder, or "constant-velocity"; None takes the one that ships for `source`.
+        checkpoint: shipped name, folder, "constant-velocity", or a forecaster on `device`; None takes the checkpoint
+            that ships for `source`.
         scene_spec: layout of the scenes that it will get.
         source: id of the environment.
         device: device of the forecaster.
         forecaster: forecaster on `device`, instead of a checkpoint.
 
     Raises:
-        UserError: no checkpoint ships, both are given, or the forecaster is of another spec (features, dt).
+        UserError: no checkpoint ships, both are given, the object is no forecaster, or the forecaster is of another
+            spec (features, dt).
     """
     use_one_thread_after_fork()
-    if forecaster is None:
-        name = checkpoint if checkpoint is not None else checkpoint_for(source)
-        return load_forecaster(name, scene_spec, f"env '{source}'", device)
-    if checkpoint is not None:
+    if forecaster is not None and checkpoint is not None:
         raise UserError(f"give a checkpoint or a forecaster, not both (checkpoint '{checkpoint}')")
-    forecaster.spec.check_compatible(scene_spec, "the forecaster", f"env '{source}'")
-    return forecaster
+    given = forecaster if checkpoint is None else checkpoint
+    if given is None or isinstance(given, str | Path):
+        name = checkpoint_for(source) if given is None else given
+        return load_forecaster(name, scene_spec, f"env '{source}'", device)
+    require_forecaster(given).spec.check_compatible(scene_spec, "the forecaster", f"env '{source}'")
+    return given
 
 
 class ForecastStream(SceneStream):

@@ -12,6 +12,7 @@ with one ego, use `envs.wrappers.ForecastObservation`.
 """
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -48,14 +49,15 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
 
     Args:
         env: any parallel environment that a multiagent scene reader knows.
-        checkpoint: shipped name, folder, or "constant-velocity"; None takes the one that ships for the env's id.
+        checkpoint: shipped name, folder, "constant-velocity", or any `Forecaster` on `device`; None takes the
+            checkpoint that ships for the env's id.
         horizon_steps: number of steps to forecast; None takes the checkpoint's.
         num_samples: number of sampled futures per agent.
         flatten: whether an agent's observation is one Box instead of a Dict.
         perception_m: range of an agent's perception [m]; None takes what the checkpoint was trained with.
         max_agents: size of an agent's view, itself included; the nearest agents are kept. None takes all agents.
         device: device of the forecaster.
-        forecaster: forecaster on `device`, instead of a checkpoint.
+        forecaster: forecaster on `device`, instead of a checkpoint; the same as giving it as `checkpoint`.
         seed: random seed of the samples' noise, until `reset(seed=…)` gives another.
         reader: function or class that makes a reader for the env; None picks one by env family.
         arm: part of the forecast that observations show, for controlled comparisons (`envs.arms`, docs/arms.md);
@@ -69,7 +71,7 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     def __init__(
         self,
         env: ParallelEnv,
-        checkpoint: str | None = None,
+        checkpoint: str | Path | Forecaster | None = None,
         *,
         horizon_steps: int | None = None,
         num_samples: int = 1,

@@ -78,7 +78,7 @@ def _mpe(env_id: str, checkpoint: str | None = None, learners: tuple[str, ...] =
 
 
 def _intersection(env_id: str, checkpoint: str | None = None) -> EnvEntry:
-    return EnvEntry("envs.simulators.highway_multiagent:HighwayParallelEnv", {"env_id": env_id}, checkpoint)
+    return EnvEntry(f"{__package__}.simulators.highway_multiagent:HighwayParallelEnv", {"env_id": env_id}, checkpoint)
 
 
 ENVS: dict[str, EnvEntry] = {

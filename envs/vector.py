@@ -6,6 +6,7 @@ starts from one step. `envs.sb3.forecast` serves Stable-Baselines3, which this m
 """
 
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -36,7 +37,7 @@ from predictor.support.errors import UserError
 def __getattr__(name: str) -> Any:
     """Returns `VecForecast` of `envs.sb3.forecast`, which is imported, with Stable-Baselines3, when it is asked for."""
     if name == "VecForecast":
-        return import_module("envs.sb3.forecast").VecForecast
+        return import_module(f"{__package__}.sb3.forecast").VecForecast
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
 
 
@@ -50,12 +51,13 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
 
     Args:
         env: Gymnasium vector environment, wrapped or not.
-        checkpoint: shipped name, folder, or "constant-velocity"; None takes the one that ships for the env's id.
+        checkpoint: shipped name, folder, "constant-velocity", or any `Forecaster` on `device`; None takes the
+            checkpoint that ships for the env's id.
         horizon_steps: number of steps to forecast; None takes the checkpoint's.
         num_samples: number of sampled futures per agent.
         flatten: whether observations are one Box instead of a Dict.
         device: device of the forecaster.
-        forecaster: forecaster on `device`, instead of a checkpoint.
+        forecaster: forecaster on `device`, instead of a checkpoint; the same as giving it as `checkpoint`.
         seed: random seed of the samples' noise: environment i gets seed + i, until `reset(seed=…)` gives others.
         reader: refused, because the environments report their scenes; give it to `SceneObservation`.
         what_if: whether observations also hold what the others are forecast to do for each candidate plan of the ego,
@@ -74,7 +76,7 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
     def __init__(
         self,
         env: gym.vector.VectorEnv,
-        checkpoint: str | None = None,
+        checkpoint: str | Path | Forecaster | None = None,
         *,
         horizon_steps: int | None = None,
         num_samples: int = 1,

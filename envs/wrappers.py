@@ -8,6 +8,7 @@
 (11, 5, 2)
 """
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -168,7 +169,8 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
 
     Args:
         env: any environment that a scene reader knows, or one that is already a `SceneObservation`.
-        checkpoint: shipped name, folder, or "constant-velocity"; None takes the one that ships for the env's id.
+        checkpoint: shipped name, folder, "constant-velocity", or any `Forecaster` on `device`; None takes the
+            checkpoint that ships for the env's id.
         horizon_steps: number of steps to forecast; None takes the checkpoint's.
         num_samples: number of sampled futures per agent.
         flatten: whether the observation is one Box instead of a Dict, for MlpPolicy; combine it with VecNormalize,
@@ -176,7 +178,7 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         perception_m: range of the ego's perception [m]; None takes what the checkpoint was trained with.
         max_agents: size of a scene, the ego included; None takes what the checkpoint was trained with.
         device: device of the forecaster.
-        forecaster: forecaster on `device`, instead of a checkpoint.
+        forecaster: forecaster on `device`, instead of a checkpoint; the same as giving it as `checkpoint`.
         seed: random seed of the samples' noise, until `reset(seed=…)` gives another.
         reader: function or class that makes a reader for the env; None picks one by env family. Refused over a
             `SceneObservation`, which has its own.
@@ -197,7 +199,7 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
     def __init__(
         self,
         env: gym.Env,
-        checkpoint: str | None = None,
+        checkpoint: str | Path | Forecaster | None = None,
         *,
         horizon_steps: int | None = None,
         num_samples: int = 1,
@@ -212,6 +214,7 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         arm: Arm | None = None,
     ) -> None:
         """Loads the forecaster and extends the observation space."""
+        checkpoint = str(checkpoint) if isinstance(checkpoint, Path) else checkpoint  # a spec is JSON
         RecordConstructorArgs.__init__(
             self, checkpoint=checkpoint, horizon_steps=horizon_steps, num_samples=num_samples, flatten=flatten,
             perception_m=perception_m, max_agents=max_agents, device=device, forecaster=forecaster, seed=seed,

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from predictor.checkpoint import CheckpointInfo, load_checkpoint, load_forecaster, save_checkpoint
     from predictor.data.store import Episode, StoreInfo, read_store, write_store
     from predictor.dgvae import DGVAE, PRESETS, DGVAEConfig
-    from predictor.forecaster import Belief, Forecaster, Memory, TrainableForecaster
+    from predictor.forecaster import Belief, Forecaster, Futures, Memory, TrainableForecaster, edgeless_belief
     from predictor.online import OnlineForecaster
     from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
     from predictor.support.errors import ProtocolError, UserError
@@ -30,7 +30,14 @@ __getattr__, __all__ = lazy_exports(
         "predictor.data.store": ("Episode", "StoreInfo", "read_store", "write_store"),
         "predictor.dgvae": ("DGVAE", "DGVAEConfig", "PRESETS"),
         "predictor.support.errors": ("ProtocolError", "UserError"),
-        "predictor.forecaster": ("Belief", "Forecaster", "Memory", "TrainableForecaster"),
+        "predictor.forecaster": (
+            "Belief",
+            "Forecaster",
+            "Futures",
+            "Memory",
+            "TrainableForecaster",
+            "edgeless_belief",
+        ),
         "predictor.online": ("OnlineForecaster",),
         "predictor.scene": ("Forecast", "Scene", "SceneBatch", "SceneSpec"),
         "predictor.training.config": ("TrainConfig",),

@@ -16,6 +16,7 @@ from torch.nn import functional
 from predictor.graph import NO_AGENT
 from predictor.noise import Noise
 from predictor.scene import SceneSpec, dense_edges
+from predictor.support.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -202,6 +203,27 @@ class Forecaster(Protocol):
 
         With one generator per scene of the batch, a scene's samples depend on no other scene.
         """
+
+
+def require_forecaster(given: Any) -> Forecaster:
+    """Returns `given`, which must have what a `Forecaster` has.
+
+    Raises:
+        UserError: a part is missing, it is a class instead of an object, or its spec is no `SceneSpec`.
+    """
+    if isinstance(given, type):
+        raise UserError(f"a forecaster is an object, got the class {given.__name__}; call it first")
+    parts = ("spec", "horizon_steps", "num_edge_types", "edge_feature_dim", "empty_memory", "observe", "rollout")
+    missing = [part for part in parts if not hasattr(given, part)]
+    if missing:
+        raise UserError(
+            f"a forecaster needs {', '.join(parts)} (predictor.forecaster.Forecaster), but {type(given).__name__} has "
+            f"no {', '.join(missing)}"
+        )
+    if not isinstance(given.spec, SceneSpec):
+        raise UserError(f"the spec of a forecaster must be a SceneSpec, got {type(given.spec).__name__}")
+    forecaster: Forecaster = given
+    return forecaster
 
 
 class WindowOutput(NamedTuple):

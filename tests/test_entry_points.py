@@ -6,7 +6,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -157,6 +157,14 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--run-dir absent --films --episodes 2", "--films needs at least 3 --episodes, got 2"),
         ("--policy idle --env-id merge-v1 --out new --drivers none slower", "--drivers none adds no line and stands"),
     ],
+    "agents.watch": [
+        ("absent", "no policy at absent: neither a run folder nor a .zip"),
+        (".", ". holds no training run (config.json is missing)"),
+        ("absent --out film.gif", "--out is a film and ends in .mp4, got film.gif"),
+        ("absent --window --out film.mp4", "--window writes no film; leave out --out or --window"),
+        ("absent --seed -1", "seed must not be negative, got -1"),
+        ("absent --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
+    ],
     "agents.study": [
         ("--study absent", "no study 'absent': neither a file nor one that ships (foresight, quick)"),
         ("--study file", "file is not valid TOML: "),
@@ -286,6 +294,7 @@ REQUIRED: dict[str, list[str]] = {
     "envs.collect": ["--env-id", "merge-v1", "--out", "new"],
     "envs.export_levelx": ["--env-id", "merge-v1", "--out", "new"],
     "agents.evaluate": ["--run-dir", "run"],
+    "agents.watch": ["run"],
     "benchmarks.graph_accuracy": ["--checkpoint", "highway", "--data", "store"],
     "benchmarks.gpu_springs": ["--device", "cpu"],
 }
@@ -403,7 +412,8 @@ def test_help_is_whole_phrases(command: str, capsys: pytest.CaptureFixture[str])
         assert string.endswith("."), string
     for field in fields(config_of(command)):
         if not is_dataclass(get_type_hints(config_of(command))[field.name]):
-            assert f"--{field.name.replace('_', '-')}" in out, field.name
+            positional = field.default is MISSING and command == "agents.watch"
+            assert (field.name.upper() if positional else f"--{field.name.replace('_', '-')}") in out, field.name
 
 
 # --- Configs made from Python -----------------------------------------------------------------------------------------
@@ -439,6 +449,7 @@ def test_commands_that_run_a_model_take_a_device():
         "predictor.interpret",
         "predictor.nba_score",
         "agents.evaluate",
+        "agents.watch",
         "train_policy",
         "benchmarks.gpu_springs",
     ]

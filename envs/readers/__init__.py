@@ -106,7 +106,7 @@ def multiagent_reader_for(
     if make_reader is not None:
         reader: MultiagentReader = build_multiagent_reader(make_reader, env)
         return reader
-    if comes_from(env, "envs.simulators.highway_multiagent"):
+    if comes_from(env, f"{__package__.rpartition('.')[0]}.simulators.highway_multiagent"):
         from envs.readers.highway_multiagent import HighwayMultiagentReader  # needs PettingZoo
 
         return HighwayMultiagentReader(env, perception_m, max_agents)

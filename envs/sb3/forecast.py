@@ -7,6 +7,7 @@ starts from one step. `envs.vector` serves gymnasium's vector environments.
 
 import inspect
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,12 +40,13 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
 
     Args:
         venv: SB3 vector environment (Dummy or Subproc) of environments in `SceneObservation`, or an `EnvPoolVecEnv`.
-        checkpoint: shipped name, folder, or "constant-velocity"; None takes the one that ships for the env's id.
+        checkpoint: shipped name, folder, "constant-velocity", or any `Forecaster` on `device`; None takes the
+            checkpoint that ships for the env's id.
         horizon_steps: number of steps to forecast; None takes the checkpoint's.
         num_samples: number of sampled futures per agent.
         flatten: whether observations are one Box instead of a Dict.
         device: device of the forecaster.
-        forecaster: forecaster on `device`, instead of a checkpoint.
+        forecaster: forecaster on `device`, instead of a checkpoint; the same as giving it as `checkpoint`.
         seed: random seed of the samples' noise: environment i gets seed + i, until `seed(…)` gives others.
         reader: refused, because the environments report their scenes; give it to `SceneObservation`.
         what_if: whether observations also hold what the others are forecast to do for each candidate plan of the ego,
@@ -63,7 +65,7 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
     def __init__(
         self,
         venv: VecEnv,
-        checkpoint: str | None = None,
+        checkpoint: str | Path | Forecaster | None = None,
         *,
         horizon_steps: int | None = None,
         num_samples: int = 1,

@@ -93,6 +93,10 @@ class PolicyNote:
     """PettingZoo: agents or roles that learned; empty means all."""
     driver: str = "heuristic"
     """PettingZoo: name of the driver of the agents that did not learn."""
+    env_id: str = ""
+    """Environment that it was trained for; empty if it is not known."""
+    env_kwargs: str = ""
+    """Arguments of the environment, as the text of a JSON object."""
 
 
 def pin_forecaster(checkpoint: str, space: gym.spaces.Dict, spec: SceneSpec, arm: Arm | None = None) -> ForecasterPin:
@@ -158,7 +162,8 @@ def read_policy_note(path: Path) -> PolicyNote | None:
     try:
         pin = content["forecaster"]
         forecaster = None if pin is None else ForecasterPin.from_json(pin)
-        return PolicyNote(forecaster, tuple(content["learners"]), str(content["driver"]))
+        place = {name: str(content[name]) for name in ("env_id", "env_kwargs") if name in content}
+        return PolicyNote(forecaster, tuple(content["learners"]), str(content["driver"]), **place)
     except (KeyError, TypeError) as error:
         raise UserError(f"the note inside {path} cannot be understood ({error!r}); save the policy again") from error
 

@@ -60,7 +60,7 @@ def register_envpool_ids() -> None:
     """Registers `ENV_IDS` with gymnasium; may be called again, and does not import EnvPool."""
     for env_id, task_id in ENV_IDS.items():
         if env_id not in gym.registry:
-            gym.register(env_id, entry_point="envs.simulators.envpool:EnvPoolEnv", kwargs={"task_id": task_id})
+            gym.register(env_id, entry_point=f"{__name__}:EnvPoolEnv", kwargs={"task_id": task_id})
 
 
 def make_pool(task_id: str, seeds: Sequence[int], num_threads: int = 0, **settings: Any) -> Any:

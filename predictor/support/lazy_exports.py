@@ -21,10 +21,11 @@ def lazy_exports(package: str, modules: Mapping[str, Sequence[str]]) -> tuple[Ca
         names; and the sorted names.
     """
     module_of = {name: module for module, names in modules.items() for name in names}
+    above = package.rpartition(".")[0]  # "dgvae_rl" where a user's folder hides the package (dgvae_rl.own_packages)
 
     def load(name: str) -> Any:
         if name not in module_of:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        return getattr(importlib.import_module(module_of[name]), name)
+        return getattr(importlib.import_module(f"{above}.{module_of[name]}".lstrip(".")), name)
 
     return load, sorted(module_of)

@@ -15,7 +15,7 @@ from typing import Any
 def provenance(packages: Sequence[str], command: str | None = None) -> dict[str, Any]:
     """Returns command line, git commit (with "+changes" if the tree is dirty), package versions, machine, UTC time."""
     if command is None:
-        command = " ".join(["python", *(_module_or_script()), *map(shlex.quote, sys.argv[1:])])
+        command = " ".join([*_program(), *map(shlex.quote, sys.argv[1:])])
     return {
         "command": command,
         "commit": _commit(),
@@ -23,6 +23,13 @@ def provenance(packages: Sequence[str], command: str | None = None) -> dict[str,
         "machine": f"{platform.machine()}, {os.cpu_count()} logical cores",
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
+
+
+def _program() -> list[str]:
+    """Returns the words before the options: "dgvae collect", "python -m module" or "python script"."""
+    if sys.argv[0].startswith("dgvae "):
+        return [sys.argv[0]]
+    return ["python", *_module_or_script()]
 
 
 def _module_or_script() -> list[str]:

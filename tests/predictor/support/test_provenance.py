@@ -19,6 +19,11 @@ def test_provenance_says_how_a_result_was_made(monkeypatch: pytest.MonkeyPatch):
     assert json.loads(json.dumps(made)) == made
 
 
+def test_a_command_of_dgvae_is_written_as_it_was_typed(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys, "argv", ["dgvae collect", "--env-id", "merge-v1"])
+    assert provenance(())["command"] == "dgvae collect --env-id merge-v1"
+
+
 def test_given_command_is_kept():
     assert (
         provenance((), command="python -m predictor.train --steps 3")["command"]

@@ -1,0 +1,221 @@
+"""Loads a trained policy with the environment that it was trained for: `policy, env = load_policy("runs/highway")`.
+
+What the policy sees, which agents it drives and who drives the others stand in the note inside its zip
+(`envs.sb3.policy_file`). The zip itself is Stable-Baselines3's and holds pickled Python objects: **loading a policy
+runs code that is in the file.** Load only files that you made, or whose source you trust. Predictor checkpoints hold no
+code.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+from pettingzoo import ParallelEnv
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from agents.arena import actions_of_others
+from agents.runs import CONFIG_FILE, POLICY_FILE, read_config
+from agents.task import Task, task_of
+from agents.vec_envs import DrivenEnv, own_observations
+from envs.drivers.trained import env_for_driver, wrapper_options
+from envs.parallel import ForecastParallelEnv
+from envs.sb3 import policy_file
+from envs.sb3.padded_spaces import PaddedObservation, learners_named, own_action, roles_of
+from envs.sb3.policy_file import PolicyNote, read_policy_note
+from predictor.checkpoint import CONSTANT_VELOCITY
+from predictor.support.errors import UserError
+
+
+class TrainedPolicy:
+    """Maps observations of its environment to actions: `action = policy(observation)`.
+
+    In a PettingZoo environment it takes the observations of all agents and returns the actions of all that live; the
+    driver of the training acts for those that did not learn. A recurrent policy remembers what it saw since the latest
+    reset of its environment.
+
+    Args:
+        model: network and algorithm, as Stable-Baselines3 loads them.
+        env: environment whose resets begin episodes, with a `CountedEpisodes` or a `DrivenEnv` inside.
+
+    Attributes:
+        model: network and algorithm.
+    """
+
+    def __init__(self, model: BaseAlgorithm, env: Any) -> None:
+        """Begins without a state."""
+        self.model = model
+        self._env = env
+        self._states: dict[str, Any] = {}
+        self._episode = -1
+
+    def __call__(self, observation: Any) -> Any:
+        """Returns the most likely action."""
+        return self._action("", observation)
+
+    def _action(self, agent: str, observation: Any) -> Any:
+        if is_recurrent(self.model) and self._episode != _episodes(self._env):
+            self._episode = _episodes(self._env)
+            self._states = {}
+        action, self._states[agent] = self.model.predict(observation, self._states.get(agent), deterministic=True)
+        return action
+
+
+class CountedEpisodes(gym.Wrapper[Any, Any, Any, Any]):
+    """Counts resets, by which a recurrent policy knows that an episode begins.
+
+    Attributes:
+        episodes: number of resets so far.
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        """Begins at 0."""
+        super().__init__(env)
+        self.episodes = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Resets the environment."""
+        self.episodes += 1
+        return self.env.reset(seed=seed, options=options)
+
+
+def _episodes(env: Any) -> int:
+    number: int = env.get_wrapper_attr("episodes") if isinstance(env, gym.Env) else env.episodes
+    return number
+
+
+def is_recurrent(model: BaseAlgorithm) -> bool:
+    """Returns whether a policy keeps a state from step to step, as sb3-contrib's RecurrentPPO does."""
+    return hasattr(model, "_last_lstm_states")
+
+
+class LoadedPolicy(NamedTuple):
+    """Trained policy and its environment."""
+
+    policy: TrainedPolicy
+    """Function of an observation that returns an action."""
+    env: Any
+    """Environment whose observations the policy was trained on, with forecasts if it saw any."""
+
+
+def load_policy(
+    path: str | Path, env: Any = None, *, device: str = "cpu", render_mode: str | None = None
+) -> LoadedPolicy:
+    """Loads a policy and makes its environment.
+
+        >>> from agents import load_policy
+        >>> policy, env = load_policy("runs/highway")  # doctest: +SKIP
+        >>> observation, info = env.reset(seed=0)  # doctest: +SKIP
+        >>> observation, *_ = env.step(policy(observation))  # doctest: +SKIP
+
+    The zip holds pickled Python objects, and loading it runs their code: load only policies whose source you trust.
+
+    Args:
+        path: run folder of train_policy.py, or a policy's ``.zip``.
+        env: environment without forecasts, to take instead of a new one; for zips that do not name theirs.
+        device: device of the policy's network.
+        render_mode: render mode of the new environment ("human", "rgb_array").
+
+    Raises:
+        UserError: no policy there, a policy that does not name its environment, or one that was trained on other
+            observations or another forecaster.
+    """
+    zipped = policy_zip(path)
+    note = read_policy_note(zipped)
+    model = policy_file.load_policy(zipped, device=device)
+    if env is None:
+        task = task_of_policy(path)
+        env = task.make() if render_mode is None else task.make(render_mode=render_mode)
+    elif render_mode is not None:
+        raise UserError(f"render_mode={render_mode!r} is for a new environment; give it to the env that you pass")
+    if isinstance(env, ParallelEnv):
+        return _of_many_agents(str(zipped), model, env, note or PolicyNote())
+    env = env_for_driver(CountedEpisodes(env) if is_recurrent(model) else env, str(zipped))
+    return LoadedPolicy(TrainedPolicy(model, env), env)
+
+
+def policy_zip(path: str | Path) -> Path:
+    """Returns the zip of a policy: the file itself, or the final policy of a run folder.
+
+    Raises:
+        UserError: there is none; the message says what is there instead.
+    """
+    path = Path(path)
+    if path.is_file():
+        return path
+    if not path.is_dir():
+        raise UserError(f"no policy at {path}: neither a run folder nor a .zip; train one with train_policy.py")
+    if (path / POLICY_FILE).is_file():
+        return path / POLICY_FILE
+    read_config(path)
+    raise UserError(
+        f"{path} holds no {POLICY_FILE}: its training has not ended; continue it with --resume, or name one of its "
+        ".zip files"
+    )
+
+
+def task_of_policy(path: str | Path, device: str = "cpu") -> Task:
+    """Returns the task of a policy, by the note inside its zip or the config of its run folder.
+
+    Raises:
+        UserError: neither names an environment, or this version cannot make it.
+    """
+    zipped = policy_zip(path)
+    if (zipped.parent / CONFIG_FILE).is_file():
+        return task_of(read_config(zipped.parent), device)
+    note = read_policy_note(zipped)
+    if note is None or not note.env_id:
+        policy_file.algorithm_of(zipped)  # has the message for what is no policy at all
+        raise UserError(f"{zipped} does not say which environment it drives; pass env=, or the run folder it is from")
+    return _task_of_note(note, device)
+
+
+def _task_of_note(note: PolicyNote, device: str) -> Task:
+    driven = {"device": device, "learners": note.learners, "driver": note.driver, "env_kwargs": note.env_kwargs}
+    pin = note.forecaster
+    if pin is None:
+        return Task(note.env_id, "none", **driven)  # type: ignore[arg-type]
+    constant = pin.checkpoint == CONSTANT_VELOCITY and pin.arm == "forecast"
+    return Task(
+        note.env_id,
+        CONSTANT_VELOCITY if constant else pin.arm,  # type: ignore[arg-type]
+        None if constant else pin.checkpoint,
+        num_samples=pin.num_samples,
+        horizon_steps=pin.horizon_steps,
+        perception_m=float("inf") if pin.perception_m is None else pin.perception_m,
+        what_if=bool(pin.num_plans),
+        **driven,  # type: ignore[arg-type]
+    )
+
+
+def _of_many_agents(path: str, model: BaseAlgorithm, env: ParallelEnv, note: PolicyNote) -> LoadedPolicy:
+    driven: Any = DrivenEnv(env, note.driver)
+    if note.forecaster is not None:
+        driven = ForecastParallelEnv(driven, **wrapper_options(path))
+    return LoadedPolicy(_TeamPolicy(path, model, driven, note.learners), driven)
+
+
+class _TeamPolicy(TrainedPolicy):
+    """Acts for all agents of one environment, observations padded as in training."""
+
+    def __init__(self, path: str, model: BaseAlgorithm, env: Any, names: tuple[str, ...]) -> None:
+        super().__init__(model, env)
+        learners = learners_named(env.possible_agents, names, f"policy {path}")
+        self._actions = {agent: env.action_space(agent) for agent in learners}
+        spaces = {agent: env.observation_space(agent) for agent in learners}
+        self._padded = PaddedObservation(spaces, roles_of(spaces, self._actions), None)
+        if self._padded.space != model.observation_space:
+            raise UserError(
+                f"policy {path} was trained on {_line(model.observation_space)}, but the env gives "
+                f"{_line(self._padded.space)}"
+            )
+
+    def __call__(self, observation: Any) -> Any:
+        seen = {agent: one for agent, one in observation.items() if agent in self._env.agents}
+        chosen = actions_of_others(self._env, own_observations(seen), self._actions)
+        for agent in (name for name in seen if name in self._actions):
+            chosen[agent] = own_action(self._action(agent, self._padded.one(agent, seen[agent])), self._actions[agent])
+        return chosen
+
+
+def _line(space: Any) -> str:
+    return " ".join(str(space).split())

@@ -1,0 +1,68 @@
+"""Checks a reader of one's own: `check_reader(env, reader)` raises one line for each thing that is wrong.
+
+It plays random episodes and looks at what no type shows: steps of another length, other units, mirrored or swapped
+axes, ids that are row numbers, change hands or come back, an ego that is not the first agent, reading that changes the
+environment. None of these raises an error by itself: a wrong id only makes forecasts worse, since memory follows ids.
+"""
+
+from typing import Any
+
+from envs.readers.base import MakeReader
+from envs.testing.ego import ego_problems, replay_problems
+from envs.testing.identity import identity_problems
+from envs.testing.motion import heading_problems, misfit_problems, motion_problems, scale_problems
+from envs.testing.playing import Episode, ReaderProblem, open_reader, play
+from predictor.support.errors import UserError
+
+__all__ = ["check_reader", "reader_problems"]
+
+
+def check_reader(
+    env: Any, reader: MakeReader | None = None, *, episodes: int = 5, max_steps: int = 100, seed: int = 0
+) -> None:
+    """Plays random episodes of an environment and checks what its reader reports.
+
+        >>> from envs import make_env
+        >>> check_reader(make_env("highway-fast-v0"), episodes=2)
+
+    Args:
+        env: a Gymnasium environment with one ego, or a PettingZoo parallel environment, without our wrappers.
+        reader: function or class that makes a reader for the env; None takes the one that is registered or built in.
+        episodes: number of episodes; what never happens in them cannot be found.
+        max_steps: largest number of steps of an episode.
+        seed: seed of the first episode and of the random actions.
+
+    Raises:
+        UserError: no reader knows the env, or something is wrong; one line for each thing.
+    """
+    problems = reader_problems(env, reader, episodes=episodes, max_steps=max_steps, seed=seed)
+    if problems:
+        raise UserError("\n".join(problems))
+
+
+def reader_problems(
+    env: Any, reader: MakeReader | None = None, *, episodes: int = 5, max_steps: int = 100, seed: int = 0
+) -> list[str]:
+    """Returns what is wrong with a reader, one line for each thing; empty if nothing was found.
+
+    The arguments are those of `check_reader`.
+
+    Raises:
+        UserError: no reader knows the env.
+    """
+    opened = open_reader(env, reader)
+    played: list[Episode] = []
+    try:
+        for number in range(episodes):
+            played.append(play(env, opened, seed + number, max_steps))
+    except ReaderProblem as error:
+        return [str(error)]
+    spec = opened.spec
+    problems = motion_problems(played, spec)
+    if not problems:  # what the next ones would find may follow from it
+        heading = heading_problems(played) if spec.has_ego else []
+        problems = (heading + identity_problems(played, spec)) or misfit_problems(played, spec)
+    problems += scale_problems(played, spec)
+    if spec.has_ego:
+        problems += ego_problems(env, opened, seed)
+    return problems + replay_problems(env, opened, seed)

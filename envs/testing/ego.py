@@ -1,0 +1,100 @@
+"""Checks by playing an episode twice: the first agent is the one that obeys actions, and reading changes nothing."""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from envs.testing.playing import Moment, OpenReader, begin, random_actions, step
+from predictor.scene import SceneSpec
+
+SEEDS, MAX_ACTIONS, REPLAYED_STEPS = 3, 5, 10
+ALIKE = 1e-9
+
+
+def ego_problems(env: Any, opened: OpenReader, seed: int) -> list[str]:
+    """Returns whether another agent than the first obeys the actions, in an environment that seeds determine."""
+    actions = _actions(env.action_space)
+    votes: list[int] = []
+    own = strongest = 0.0
+    for number in range(SEEDS):
+        effect = _effect(env, opened, seed + number, actions)
+        if effect is not None and effect.max() > ALIKE:
+            votes.append(int(effect.argmax()))
+            own, strongest = max(own, effect[0]), max(strongest, effect.max())
+    if len(votes) < 2 or len(set(votes)) > 1 or votes[0] == 0 or own > 0.5 * strongest:
+        return []
+    return [
+        f"agent {votes[0]} of the scene obeys the actions, agent 0 does not: the ego must be the first agent of every "
+        "scene"
+    ]
+
+
+def _actions(space: gym.Space) -> list[Any]:
+    """Returns actions that differ as much as they can."""
+    if isinstance(space, gym.spaces.Discrete):
+        return [int(space.start) + i for i in range(min(int(space.n), MAX_ACTIONS))]
+    if isinstance(space, gym.spaces.Box) and np.isfinite(space.low).all() and np.isfinite(space.high).all():
+        middle = ((space.low + space.high) / 2).astype(space.dtype)
+        return [space.low.copy(), middle, space.high.copy()]
+    space.seed(0)
+    return [space.sample() for _ in range(MAX_ACTIONS)]
+
+
+def _effect(env: Any, opened: OpenReader, seed: int, actions: Sequence[Any]) -> Any:
+    """Returns how far each agent's state depends on the first action, in units of its scale; None without a replay."""
+    ends, begins = [], []
+    for action in actions:
+        begin(env, opened, seed)
+        begins.append(opened.read(env))
+        step(env, opened, action)
+        ends.append(_by_first_row(begins[-1], opened.read(env)))
+    if any(not _same(begins[0], other) for other in begins[1:]):
+        return None
+    return _spread(ends, opened.spec, len(begins[0].ids))
+
+
+def _by_first_row(first: Moment, second: Moment) -> dict[int, Any]:
+    """Returns the later states by the agents' places in the first scene."""
+    rows = second.index_of
+    return {row: second.states[rows[number]] for row, number in enumerate(first.ids.tolist()) if number in rows}
+
+
+def _same(one: Moment, other: Moment) -> bool:
+    return one.states.shape == other.states.shape and bool(np.allclose(one.states, other.states, rtol=0, atol=ALIKE))
+
+
+def _spread(ends: Sequence[dict[int, Any]], spec: SceneSpec, agents: int) -> Any:
+    effect = np.zeros(agents)
+    used = 2 * spec.position_dim
+    for one, other in itertools.combinations(ends, 2):
+        for row in one.keys() & other.keys():
+            change = np.abs(one[row][:used] - other[row][:used]) / np.array(spec.feature_scales[:used])
+            effect[row] = max(effect[row], float(change.max()))
+    return effect
+
+
+def replay_problems(env: Any, opened: OpenReader, seed: int) -> list[str]:
+    """Returns whether an episode goes on differently when it is read; nothing where seeds do not determine it."""
+    unread = [_seen(env, None, seed) for _ in range(2)]
+    if unread[0] != unread[1]:
+        return []
+    if _seen(env, opened, seed) != unread[0]:
+        return [f"{opened.name}: reading changes what happens in the environment; a reader must not draw or step"]
+    return []
+
+
+def _seen(env: Any, opened: OpenReader | None, seed: int) -> list[Any]:
+    """Returns observations and rewards of the first steps of an episode."""
+    act, seen = random_actions(env, seed), []
+    begin(env, opened, seed)
+    for number in range(REPLAYED_STEPS):
+        if opened is not None:
+            opened.read(env)
+        shown, over = step(env, opened, act(number))
+        seen.append(shown)
+        if over:
+            break
+    return seen

@@ -1,0 +1,152 @@
+"""Checks of identity: an id stays with its agent, moves as its agent does, and never goes to another one."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from envs.testing.motion import Steps, step_length
+from envs.testing.playing import Episode, Moment
+from predictor.scene import SceneSpec
+
+FAR = 10.0
+"""Error of a predicted position, in typical errors, from which an agent is said to be elsewhere than it should."""
+
+
+@dataclass(frozen=True)
+class _Rule:
+    """How far from where its velocity leads an agent may be after a step."""
+
+    step_s: float
+    """Length of a step that motion shows."""
+    typical_m: float
+    """Median error of constant velocity."""
+    reach_m: float
+    """Distance that a fast agent moves in a step."""
+    axes: int
+
+    @classmethod
+    def of(cls, episodes: Sequence[Episode], spec: SceneSpec) -> "_Rule":
+        steps = Steps.of(episodes, spec.position_dim)
+        if not len(steps.moved):
+            return cls(spec.dt_s, 0.0, 0.0, spec.position_dim)
+        moving = steps.fast()
+        length = step_length(moving.moved, moving.velocity()) if len(moving.moved) else spec.dt_s
+        error = np.linalg.norm(steps.moved - steps.before * length, axis=1)
+        reach = np.quantile(np.linalg.norm(steps.before, axis=1), 0.9) * abs(length)
+        return cls(length, float(np.median(error)), float(reach), spec.position_dim)
+
+    def led_to(self, state: Float[np.ndarray, " state"], steps: int = 1) -> Float[np.ndarray, " axes"]:
+        return state[: self.axes] + state[self.axes : 2 * self.axes] * self.step_s * steps
+
+    def error(self, old: Float[np.ndarray, " state"], new: Float[np.ndarray, " state"], steps: int = 1) -> float:
+        return float(np.linalg.norm(new[: self.axes] - self.led_to(old, steps)))
+
+    @property
+    def handed_m(self) -> float:
+        """Least error of an id that is said to have another agent now."""
+        return FAR * self.typical_m + 0.05 * self.reach_m
+
+    @property
+    def jump_m(self) -> float:
+        """Least error of an agent that is said to have jumped: further than by braking and turning at once."""
+        return FAR * self.typical_m + 3 * self.reach_m
+
+
+def identity_problems(episodes: Sequence[Episode], spec: SceneSpec) -> list[str]:
+    """Returns what is wrong with the ids, one line for each kind of mistake."""
+    rule = _Rule.of(episodes, spec)
+    problems: list[str] = []
+    for check in (_handed, _jumped, _returned):
+        lines = [line for episode in episodes if (line := next(check(episode, rule), ""))]
+        problems += lines[:1]
+    if spec.has_ego:
+        problems += _ego_keeps_its_id(episodes)
+    if problems and _row_numbers(episodes):
+        problems[0] += "; the ids are the row numbers 0, 1, 2, … of every scene, but rows change hands"
+    return problems
+
+
+def _row_numbers(episodes: Sequence[Episode]) -> bool:
+    moments = [moment for episode in episodes for moment in episode.moments]
+    return all(np.array_equal(moment.ids, np.arange(len(moment.ids))) for moment in moments)
+
+
+def _handed(episode: Episode, rule: _Rule) -> Iterator[str]:
+    """Finds an id that is, after a step, where another id's agent should be, while that one's id is elsewhere."""
+    for number, (first, second) in enumerate(episode.pairs()):
+        rows = second.index_of
+        for row, agent in enumerate(first.ids.tolist()):
+            if agent not in rows:
+                continue
+            new = second.states[rows[agent]]
+            error = rule.error(first.states[row], new)
+            if error <= rule.handed_m:
+                continue
+            other = _better(first, second, row, new, error, rule)
+            if other is not None:
+                yield (
+                    f"ids change hands: in step {number + 1} id {agent} is {error:.3g} m off its course, "
+                    f"there where id {other} should be; an id must stay with its agent"
+                )
+
+
+def _better(
+    first: Moment, second: Moment, row: int, new: Float[np.ndarray, " state"], error: float, rule: _Rule
+) -> int | None:
+    """Returns the id whose agent should be there, if it is not there itself."""
+    rows = second.index_of
+    for other, number in enumerate(first.ids.tolist()):
+        if other == row or rule.error(first.states[other], new) > max(0.1 * error, 2 * rule.typical_m):
+            continue
+        elsewhere = number not in rows or rule.error(first.states[other], second.states[rows[number]]) > rule.handed_m
+        axes = slice(rule.axes, 2 * rule.axes)
+        turned = np.linalg.norm(new[axes] - first.states[other][axes]) > np.linalg.norm(
+            new[axes] - first.states[row][axes]
+        )
+        if elsewhere and not turned:
+            return number
+    return None
+
+
+def _jumped(episode: Episode, rule: _Rule) -> Iterator[str]:
+    for number, (first, second) in enumerate(episode.pairs()):
+        rows = second.index_of
+        for row, agent in enumerate(first.ids.tolist()):
+            if agent in rows:
+                old, new = first.states[row], second.states[rows[agent]]
+                error = rule.error(old, new)
+                if error > rule.jump_m and _better(first, second, row, new, error, rule) is None:
+                    yield (
+                        f"an id jumps: in step {number + 1} id {agent} is {error:.3g} m from where its velocity leads; "
+                        "an agent that appears elsewhere needs a new id"
+                    )
+
+
+def _returned(episode: Episode, rule: _Rule) -> Iterator[str]:
+    """Finds an id that was gone and comes back elsewhere than its motion would have led."""
+    last: dict[int, tuple[int, Float[np.ndarray, " state"]]] = {}
+    for time, moment in enumerate(episode.moments):
+        for row, agent in enumerate(moment.ids.tolist()):
+            seen, state = last.get(agent, (time, moment.states[row]))
+            gap = time - seen
+            error = rule.error(state, moment.states[row], gap) if gap > 1 else 0.0
+            if error > rule.jump_m + 0.5 * rule.reach_m * gap:
+                yield (
+                    f"an id returns: id {agent} was gone after step {seen} and came back in step {time}, {error:.3g} m "
+                    "from where its motion led; a new agent needs a new id"
+                )
+            last[agent] = (time, moment.states[row])
+
+
+def _ego_keeps_its_id(episodes: Sequence[Episode]) -> list[str]:
+    for episode in episodes:
+        first = [int(moment.ids[0]) for moment in episode.moments]
+        changed = next((time for time, number in enumerate(first) if number != first[0]), None)
+        if changed is not None:
+            return [
+                f"the first agent has id {first[0]} and, from step {changed} on, id {first[changed]}: the ego must be "
+                "the first agent of every scene, with one id"
+            ]
+    return []

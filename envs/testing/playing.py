@@ -1,0 +1,185 @@
+"""Plays episodes with random actions and keeps what the reader reports of them."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from pettingzoo import ParallelEnv
+
+from envs.multiagent_observation import check_multiagent_scene
+from envs.readers import FunctionReader, MakeReader, multiagent_reader_for, reader_for
+from envs.readers.base import build_multiagent_reader, build_reader, require_scene, show
+from predictor.scene import Scene, SceneSpec
+from predictor.support.errors import UserError
+
+MAX_LENGTH = 300
+"""Largest number of characters of a line that quotes what arrived."""
+
+
+class ReaderProblem(Exception):
+    """Raised when a reader breaks the contract so that nothing else can be checked; the message is one line."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """All agents at one instant, without padding."""
+
+    states: Float[np.ndarray, "agents state"]
+    """States in the world frame."""
+    ids: Int[np.ndarray, " agents"]
+    """Identities."""
+    heading_rad: float
+    """Heading of the ego."""
+
+    @property
+    def index_of(self) -> dict[int, int]:
+        """Row of each id."""
+        return {number: row for row, number in enumerate(self.ids.tolist())}
+
+
+@dataclass
+class Episode:
+    """Moments of an episode."""
+
+    moments: list[Moment] = field(default_factory=list)
+    """What the reader reported, from the reset on."""
+
+    def pairs(self) -> Iterator[tuple[Moment, Moment]]:
+        """Yields each moment with the one that follows it."""
+        yield from zip(self.moments, self.moments[1:], strict=False)
+
+
+@dataclass(frozen=True)
+class OpenReader:
+    """Reader of an environment, of either kind."""
+
+    reader: Any
+    """A `SceneReader` or a `MultiagentReader`."""
+    name: str
+    """Name for messages."""
+
+    @property
+    def spec(self) -> SceneSpec:
+        """Layout of the scenes."""
+        spec: SceneSpec = self.reader.spec
+        return spec
+
+    def read(self, env: Any) -> Moment:
+        """Reads all agents, twice, and checks what arrives.
+
+        Raises:
+            ReaderProblem: the contract is broken.
+        """
+        first, second = self._all(env), self._all(env)
+        if not (np.array_equal(first.states, second.states) and np.array_equal(first.ids, second.ids)):
+            raise ReaderProblem(f"{self.name}: reading twice within a step gives two scenes; it must give the same one")
+        return first
+
+    def _all(self, env: Any) -> Moment:
+        try:
+            if self.spec.has_ego:
+                self._check_view(self.reader.read(env))
+                scene = require_scene(self.reader.read_all(env), self.name)
+                scene.check(self.name, self.spec)
+            else:
+                scene = check_multiagent_scene(self.reader.read(env), self.spec, self.name).scene
+        except Exception as error:
+            kind = "" if isinstance(error, UserError) else f"{self.name}: reading failed with {type(error).__name__}: "
+            raise ReaderProblem(_line(f"{kind}{error}")) from error
+        there = scene.valid
+        return Moment(scene.states[there].copy(), scene.ids[there].copy(), float(scene.heading_rad))
+
+    def _check_view(self, view: Scene) -> None:
+        spec = self.spec
+        require_scene(view, self.name).check(self.name, spec, agents=spec.max_agents)
+        axes = spec.position_dim
+        distance_m = np.linalg.norm(view.states[view.valid, :axes] - view.states[0, :axes], axis=-1)
+        if distance_m.max() > spec.perception_m * (1 + 1e-6):
+            raise UserError(
+                f"{self.name}: read() gives an agent {distance_m.max():.4g} m away, but perception_m is "
+                f"{spec.perception_m:g}; return perceive(scene, spec) (envs.readers)"
+            )
+
+
+def _line(text: str) -> str:
+    line = " ".join(text.split())
+    return line if len(line) <= MAX_LENGTH else f"{line[:MAX_LENGTH]}…"
+
+
+def open_reader(env: Any, make_reader: MakeReader | None) -> OpenReader:
+    """Makes the reader of an environment.
+
+    Raises:
+        UserError: no reader knows the env, or `make_reader` makes none.
+    """
+    if isinstance(env, ParallelEnv):
+        reader = multiagent_reader_for(env) if make_reader is None else build_multiagent_reader(make_reader, env)
+    else:
+        reader = reader_for(env) if make_reader is None else build_reader(make_reader, env)
+        lacks = [part for part in ("read", "read_all") if not hasattr(reader, part)]
+        if lacks:
+            raise UserError(f"{type(reader).__name__} has no {', '.join(lacks)}; derive it from envs.readers.Reader")
+    given = make_reader if make_reader is not None else reader
+    given = given.read if isinstance(given, FunctionReader) else given
+    return OpenReader(reader, str(getattr(given, "__name__", type(given).__name__)))
+
+
+Act = Callable[[int], Any]
+"""Takes the number of the step and returns the action."""
+
+
+def begin(env: Any, opened: OpenReader | None, seed: int) -> None:
+    """Resets the environment, and the reader if there is one."""
+    observation, _ = env.reset(seed=seed)
+    if opened is not None:
+        opened.reader.reset()
+        show(opened.reader, observation)
+
+
+def step(env: Any, opened: OpenReader | None, action: Any) -> tuple[Any, bool]:
+    """Steps the environment; returns observation and reward, to be compared, and whether the episode is over."""
+    observation, reward, terminated, truncated, _ = env.step(action)
+    if opened is not None:
+        show(opened.reader, observation)
+    if isinstance(env, ParallelEnv):
+        return _frozen((observation, reward)), not env.agents
+    return _frozen((observation, reward)), bool(terminated or truncated)
+
+
+def _frozen(seen: Any) -> Any:
+    """Returns a value that is equal if what was seen is."""
+    if isinstance(seen, Mapping):
+        return tuple((key, _frozen(value)) for key, value in seen.items())
+    if isinstance(seen, tuple | list):
+        return tuple(map(_frozen, seen))
+    return np.asarray(seen).tobytes()
+
+
+def random_actions(env: Any, seed: int) -> Act:
+    """Returns random actions, equal for equal seeds."""
+    if not isinstance(env, ParallelEnv):
+        env.action_space.seed(seed)
+        return lambda _: env.action_space.sample()
+    spaces = {agent: env.action_space(agent) for agent in env.possible_agents}
+    for number, space in enumerate(spaces.values()):
+        space.seed(seed + number)
+    return lambda _: {agent: spaces[agent].sample() for agent in env.agents}
+
+
+def play(env: Any, opened: OpenReader, seed: int, max_steps: int) -> Episode:
+    """Plays an episode with random actions.
+
+    Raises:
+        ReaderProblem: the reader breaks its contract.
+    """
+    episode, act = Episode(), random_actions(env, seed)
+    begin(env, opened, seed)
+    episode.moments.append(opened.read(env))
+    for number in range(max_steps):
+        _, over = step(env, opened, act(number))
+        episode.moments.append(opened.read(env))
+        if over:
+            break
+    return episode

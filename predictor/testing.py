@@ -1,0 +1,386 @@
+"""Checks a forecaster of one's own: `check_forecaster(my_forecaster)` raises one line for each thing that is wrong.
+
+It runs the forecaster on made-up motion, as the wrappers would: shapes and ranges first; where these are right, what no
+shape shows: whether the past is in the memory alone, whether other scenes, the order of agents or absent agents change
+a forecast, whether noise comes from the given generators, whether the first step lasts `dt_s`.
+
+How good the forecasts are is not asked; `predictor.evaluate` and `envs.evaluate` measure that.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from predictor.forecaster import Belief, Forecaster, Futures, Memory, require_forecaster
+from predictor.noise import Noise
+from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
+
+SCENES, AGENTS, STEPS, SAMPLES = 3, 4, 6, 3
+TOLERANCE = 1e-3
+"""Largest difference of forecasts that are equal but for rounding, in units of `SceneSpec.feature_scales`."""
+SLOWEST, FASTEST = 0.4, 2.5
+"""Range of the first forecast step, as a multiple of velocity times `dt_s`; unit mistakes (3.6, 100) are outside."""
+
+
+def check_forecaster(forecaster: Any, *, device: str = "cpu", seed: int = 0) -> None:
+    """Checks that an object can be given to the wrappers in the place of a checkpoint.
+
+        >>> from predictor.baselines.constant_velocity import ConstantVelocity
+        >>> from predictor.scene import SceneSpec
+        >>> check_forecaster(ConstantVelocity(SceneSpec(dt_s=1.0)))
+
+    Args:
+        forecaster: what should be a `predictor.forecaster.Forecaster`, in evaluation mode.
+        device: device of the forecaster.
+        seed: random seed of the made-up motion and of the samples.
+
+    Raises:
+        UserError: something is wrong; one line for each thing.
+    """
+    problems = forecaster_problems(forecaster, device=device, seed=seed)
+    if problems:
+        raise UserError("\n".join(problems))
+
+
+def forecaster_problems(forecaster: Any, *, device: str = "cpu", seed: int = 0) -> list[str]:
+    """Returns what is wrong with a forecaster, one line for each thing; empty if nothing was found."""
+    try:
+        trial = _Trial(require_forecaster(forecaster), device, seed)
+    except UserError as error:
+        return [str(error)]
+    problems: list[str] = []
+    with torch.no_grad():
+        for check in (*_LAYOUT, *_MEANING):
+            found = _run(check, trial)
+            problems += found
+            if found and check is not _first_step:
+                break  # what the next ones would find may follow from it
+    return problems
+
+
+def _run(check: "Callable[[_Trial], Iterator[str]]", trial: "_Trial") -> list[str]:
+    """Returns what a check finds; an error of the forecaster's own is a finding."""
+    try:
+        return list(check(trial))
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200]
+        return [f"{check.__name__.strip('_').replace('_', ' ')}: failed with {type(error).__name__}: {reason}"]
+
+
+@dataclass
+class _Trial:
+    """A forecaster and the motion that it is shown."""
+
+    forecaster: Forecaster
+    device: str
+    seed: int
+    states: Float[Tensor, "scenes time agents state"] = field(init=False)
+    """Agents on straight lines, in the axes that the forecaster gets: relative to the ego where its frame says so."""
+    valid: Bool[Tensor, "scenes agents"] = field(init=False)
+    """Which agents are there; the last one of the second scene is not."""
+
+    def __post_init__(self) -> None:
+        spec, rng = self.spec, np.random.default_rng(self.seed)
+        axes, scales = spec.position_dim, np.array(spec.feature_scales)
+        states = np.zeros((SCENES, STEPS, AGENTS, spec.num_features))
+        start = rng.uniform(-0.4, 0.4, (SCENES, 1, AGENTS, axes)) * scales[:axes]
+        speed = rng.uniform(0.4, 0.8, (SCENES, 1, AGENTS, axes)) * rng.choice([-1, 1], (SCENES, 1, AGENTS, axes))
+        velocity = speed * scales[axes : 2 * axes]
+        time_s = spec.dt_s * np.arange(STEPS)[None, :, None, None]
+        states[..., :axes], states[..., axes : 2 * axes] = start + velocity * time_s, velocity
+        states[..., 2 * axes :] = rng.integers(0, 2, (SCENES, 1, AGENTS, spec.num_features - 2 * axes))
+        ego_axes = np.array([frame == "ego" for frame in spec.frame])
+        states[..., :axes] -= states[:, :, :1, :axes] * ego_axes
+        valid = np.ones((SCENES, AGENTS), dtype=np.bool_)
+        valid[1, -1] = False
+        states[1, :, -1] = 0.0
+        self.states = torch.from_numpy(states.astype(np.float32)).to(self.device)
+        self.valid = torch.from_numpy(valid).to(self.device)
+
+    @property
+    def spec(self) -> SceneSpec:
+        return self.forecaster.spec
+
+    @property
+    def horizon(self) -> int:
+        return min(5, self.forecaster.horizon_steps)
+
+    def observed(self, states: Tensor | None = None, valid: Tensor | None = None) -> tuple[Memory, Belief]:
+        """Shows the forecaster a history, step by step."""
+        states, valid = (self.states if states is None else states), (self.valid if valid is None else valid)
+        memory = self.forecaster.empty_memory(states.shape[0], states.shape[2])
+        for step in range(states.shape[1]):
+            memory, belief = self.forecaster.observe(memory, states[:, step].clone(), valid)
+        return memory, belief
+
+    def single(self, belief: Belief) -> Float[Tensor, "scenes agents horizon state"]:
+        """Returns the single forecast, zeros for absent agents."""
+        futures = self.forecaster.rollout(belief, self.horizon)
+        return futures.states[:, 0] * belief.valid[:, :, None, None]
+
+    def differ(self, one: Tensor, other: Tensor) -> bool:
+        """Returns whether two forecasts differ by more than rounding."""
+        scales = torch.tensor(self.spec.feature_scales, device=one.device)
+        return bool(((one - other).abs() / scales).max() > TOLERANCE)
+
+    def noise(self, scenes: int = SCENES, first: int = 0) -> Noise:
+        """Returns a generator for each scene; scene i has the same one whatever the others are."""
+        return [np.random.default_rng((self.seed, first + i)) for i in range(scenes)]
+
+
+# --- Layout -----------------------------------------------------------------------------------------------------------
+
+
+def _sizes(trial: _Trial) -> Iterator[str]:
+    for name, least in (("horizon_steps", 1), ("num_edge_types", 1), ("edge_feature_dim", 0)):
+        value = getattr(trial.forecaster, name)
+        if not isinstance(value, int | np.integer) or value < least:
+            yield f"{name} must be a whole number of at least {least}, got {value!r}"
+
+
+def _empty_memory(trial: _Trial) -> Iterator[str]:
+    memory: Any = trial.forecaster.empty_memory(SCENES, AGENTS)
+    if not isinstance(memory, Memory):
+        yield f"empty_memory must return a Memory, got {type(memory).__name__}"
+        return
+    for kind, tensors, axes in (("nodes", memory.nodes, 2), ("pairs", memory.pairs, 3)):
+        for tensor in tensors:
+            shape = tuple(tensor.shape)
+            if tensor.ndim != axes + 1 or shape[:2] != (SCENES, AGENTS):
+                wanted = "(scenes, agents, size)" if kind == "nodes" else "(scenes, agents, slots, size)"
+                yield f"empty_memory: {kind} must have the shape {wanted}, got {shape}; memory moves with agents"
+            elif bool((tensor != 0).any()):
+                yield f"empty_memory: {kind} must be zero, which stands for an agent that was never seen"
+
+
+def _observe(trial: _Trial) -> Iterator[str]:
+    before = trial.forecaster.empty_memory(SCENES, AGENTS)
+    result: Any = trial.forecaster.observe(before, trial.states[:, 0].clone(), trial.valid)
+    if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Belief)):
+        yield f"observe must return a Memory and a Belief, got {type(result).__name__}"
+        return
+    memory, belief = result
+    shapes = [[tuple(t.shape) for t in (*m.nodes, *m.pairs)] for m in (before, memory)]
+    if shapes[0] != shapes[1]:
+        yield f"observe: the memory must keep its shapes, got {shapes[1]} after {shapes[0]}"
+    if belief.states.shape != trial.states[:, 0].shape or trial.differ(belief.states, trial.states[:, 0]):
+        yield "observe: belief.states must be the observed states, which the wrappers compare with the forecast"
+    if not torch.equal(belief.valid, trial.valid):
+        yield "observe: belief.valid must be the given valid"
+    yield from _edges(trial, belief)
+
+
+def _edges(trial: _Trial, belief: Belief) -> Iterator[str]:
+    sizes = {"edge_probs": trial.forecaster.num_edge_types, "edge_features": trial.forecaster.edge_feature_dim}
+    slots = AGENTS if belief.senders is None else belief.senders.shape[-1]
+    for name, size in sizes.items():
+        tensor, wanted = getattr(belief, name), (SCENES, AGENTS, slots, size)
+        if tuple(tensor.shape) != wanted:
+            yield f"observe: belief.{name} must have the shape {wanted}, got {tuple(tensor.shape)}"
+        elif not bool(torch.isfinite(tensor).all()):
+            yield f"observe: belief.{name} must be finite"
+        elif name == "edge_probs" and bool(((tensor.sum(-1) - 1).abs() > 1e-3).any() or (tensor < 0).any()):
+            yield "observe: belief.edge_probs must be probabilities that sum to 1 over the types of each pair"
+
+
+def _rollout(trial: _Trial) -> Iterator[str]:
+    _, belief = trial.observed()
+    for samples, steps in ((1, trial.horizon), (SAMPLES, trial.horizon), (SAMPLES, 1)):
+        futures: Any = trial.forecaster.rollout(belief, steps, samples, trial.noise())
+        if not isinstance(futures, Futures):
+            yield f"rollout must return Futures, got {type(futures).__name__}"
+            return
+        wanted = (SCENES, samples, AGENTS, steps, trial.spec.num_features)
+        if tuple(futures.states.shape) != wanted:
+            yield (
+                f"rollout({steps} steps, {samples} samples): states must have the shape {wanted} (scenes, samples, "
+                f"agents, steps, features), got {tuple(futures.states.shape)}"
+            )
+            return
+        if not bool(torch.isfinite(futures.states[trial.valid[:, None].expand(-1, samples, -1)]).all()):
+            yield "rollout: states of agents that are there must be finite, got not-a-number or infinity"
+            return
+        found = list(_probabilities(futures, wanted, trial))
+        yield from found
+        if found:
+            return
+
+
+def _probabilities(futures: Futures, wanted: tuple[int, ...], trial: _Trial) -> Iterator[str]:
+    probs, scale = futures.mode_probs, futures.scale
+    if probs is not None and tuple(probs.shape) != wanted[:3]:
+        yield f"rollout: mode_probs must have the shape {wanted[:3]}, got {tuple(probs.shape)}"
+    elif probs is not None and bool(((probs.sum(1) - 1).abs() > 1e-3).any() or (probs < 0).any()):
+        yield "rollout: mode_probs must sum to 1 over the samples of each agent"
+    shape = (*wanted[:4], trial.spec.position_dim)
+    if scale is not None and tuple(scale.shape) != shape:
+        yield f"rollout: scale must have the shape {shape}, got {tuple(scale.shape)}"
+    elif scale is not None and not bool(((scale >= 0) & torch.isfinite(scale)).all()):
+        yield "rollout: scale is a standard deviation [m]; it must be finite and not negative"
+
+
+# --- Meaning ----------------------------------------------------------------------------------------------------------
+
+
+def _first_step(trial: _Trial) -> Iterator[str]:
+    """Straight motion goes on for a step, by and large: its sign and its size are those of velocity times dt_s."""
+    axes = trial.spec.position_dim
+    _, belief = trial.observed()
+    asked = trial.valid.clone()
+    asked[:, : int(trial.spec.has_ego)] = False  # the ego's future is the policy's choice
+    moved = (trial.single(belief)[:, :, 0, :axes] - trial.states[:, -1, :, :axes])[asked]
+    expected = (trial.states[:, -1, :, axes : 2 * axes] * trial.spec.dt_s)[asked]
+    for axis, letter in enumerate("xyz"[:axes]):
+        along = (moved[:, axis] * expected[:, axis]).sum() / expected[:, axis].square().sum()
+        if along < -SLOWEST:
+            yield f"rollout: the first step goes against the velocity along {letter}; is the axis mirrored?"
+        elif not (SLOWEST <= along <= FASTEST):
+            yield (
+                f"rollout: the first step is {along:.2g} times velocity × dt_s along {letter}; is a step "
+                f"{trial.spec.dt_s:g} s (spec.dt_s), and are positions in metres and velocities in m/s?"
+            )
+
+
+def _arguments_stay(trial: _Trial) -> Iterator[str]:
+    memory, _ = trial.observed(trial.states[:, :2])
+    states, valid = trial.states[:, 2].clone(), trial.valid.clone()
+    kept = [tensor.clone() for tensor in (*memory.nodes, *memory.pairs)]
+    _, belief = trial.forecaster.observe(memory, states, valid)
+    if not torch.equal(states, trial.states[:, 2]) or not torch.equal(valid, trial.valid):
+        yield "observe writes into its arguments; copy states and valid before changing them"
+    if not all(torch.equal(a, b) for a, b in zip(kept, (*memory.nodes, *memory.pairs), strict=True)):
+        yield "observe writes into the old memory; return a new one, since copies of an environment share it"
+    before = belief.states.clone()
+    trial.forecaster.rollout(belief, trial.horizon)
+    if not torch.equal(before, belief.states):
+        yield "rollout writes into the belief; copy belief.states before changing them"
+
+
+def _no_peeking(trial: _Trial) -> Iterator[str]:
+    """A forecast from a belief stays what it was, whatever is observed later or elsewhere."""
+    memory, belief = trial.observed(trial.states[:, :3])
+    before = trial.single(belief)
+    trial.forecaster.observe(memory, trial.states[:, 3].clone(), trial.valid)
+    if trial.differ(before, trial.single(belief)):
+        yield (
+            "rollout: a forecast changes when later states are observed: it reads something else than its belief (the "
+            "future, where a whole episode is encoded); keep everything in Memory and Belief"
+        )
+        return
+    trial.observed(trial.states.flip(0))  # something else in between
+    _, same = trial.forecaster.observe(memory, trial.states[:, 3].clone(), trial.valid)
+    _, alone = trial.observed(trial.states[:, :4])
+    if trial.differ(trial.single(same), trial.single(alone)):
+        yield (
+            "observe: what it returns depends on what else was observed before, not on the given memory alone; keep "
+            "the past in Memory, not in the object"
+        )
+
+
+def _window_does_not_peek(trial: _Trial) -> Iterator[str]:
+    window: Any = getattr(trial.forecaster, "window", None)
+    if window is None:
+        return
+    last = torch.full((SCENES,), 2, device=trial.device)
+    valid = trial.valid[:, None].expand(-1, STEPS, -1).clone()
+    other = trial.states.clone()
+    other[:, 3:] *= 0.5
+    one, two = (
+        window(states, valid, last, 2, torch.Generator(trial.device).manual_seed(trial.seed))
+        for states in (trial.states.clone(), other)
+    )
+    pairs = [(one.rollout, two.rollout, "rollout")]
+    if one.prior_logits is not None:
+        pairs.append((one.prior_logits[:, :3], two.prior_logits[:, :3], "prior_logits"))
+    for before, after, name in pairs:
+        if bool(((before - after).abs() > 1e-3 * (1 + before.abs())).any()):
+            yield f"window: {name} changes with the states after last_observed; only the posterior may see the future"
+
+
+def _scenes_are_independent(trial: _Trial) -> Iterator[str]:
+    together = trial.single(trial.observed()[1])
+    for scene in range(SCENES):
+        alone = trial.single(trial.observed(trial.states[[scene]], trial.valid[[scene]])[1])
+        if trial.differ(alone[0], together[scene]):
+            yield "rollout: the forecast of a scene changes with the other scenes of its batch"
+            return
+
+
+def _order_of_agents(trial: _Trial) -> Iterator[str]:
+    """Agents stand in another order from the middle of the history on, and their memory moves with them."""
+    first = 1 if trial.spec.has_ego else 0
+    order = torch.tensor([*range(first), *reversed(range(first, AGENTS))], device=trial.device)
+    expected = trial.single(trial.observed()[1])[:, order]
+    if trial.differ(trial.single(trial.observed(trial.states[:, :, order], trial.valid[:, order])[1]), expected):
+        yield "rollout: the forecast of an agent changes with the order of the agents"
+        return
+    memory, _ = trial.observed(trial.states[:, :3])
+    source: Int[Tensor, "scenes agents"] = order.expand(SCENES, -1)
+    memory = memory.reorder(source, torch.ones_like(source, dtype=torch.bool))
+    for step in range(3, STEPS):
+        memory, belief = trial.forecaster.observe(memory, trial.states[:, step, order], trial.valid[:, order])
+    if trial.differ(trial.single(belief), expected):
+        yield "memory: the past of an agent stays at its old place when agents are re-sorted (Memory.reorder)"
+
+
+def _absent_agents(trial: _Trial) -> Iterator[str]:
+    room = 2
+    states = torch.cat([trial.states, trial.states.new_zeros(SCENES, STEPS, room, trial.spec.num_features)], 2)
+    valid = torch.cat([trial.valid, trial.valid.new_zeros(SCENES, room)], 1)
+    if trial.differ(trial.single(trial.observed(states, valid)[1])[:, :AGENTS], trial.single(trial.observed()[1])):
+        yield "rollout: forecasts change with the number of absent (padded) agents; mask by valid"
+
+
+def _of_samples(valid: Bool[Tensor, "scenes agents"]) -> Bool[Tensor, "scenes samples agents"]:
+    """Returns the mask of present agents for each sample."""
+    return valid[:, None].expand(-1, SAMPLES, -1)
+
+
+def _noise(trial: _Trial) -> Iterator[str]:
+    _, belief = trial.observed()
+    before = torch.get_rng_state(), np.random.get_state()[1].copy()  # type: ignore[index]  # noqa: NPY002
+    one, two = (trial.forecaster.rollout(belief, trial.horizon, SAMPLES, trial.noise()).states for _ in range(2))
+    here = _of_samples(trial.valid)
+    after = np.random.get_state()[1]  # type: ignore[index]  # noqa: NPY002
+    if not torch.equal(before[0], torch.get_rng_state()) or not np.array_equal(before[1], after):
+        yield "rollout draws from torch's or NumPy's global generator; draw from the given one"
+    elif trial.differ(one[here], two[here]):
+        yield "rollout: equal generators must give equal samples"
+    other = trial.forecaster.rollout(belief, trial.horizon, SAMPLES, trial.noise(first=7)).states
+    if trial.differ(other[:, 0][trial.valid], one[:, 0][trial.valid]):
+        yield "rollout: sample 0 is the single forecast and must not depend on the generator"
+    for scene in range(SCENES):
+        _, alone = trial.observed(trial.states[[scene]], trial.valid[[scene]])
+        drawn = trial.forecaster.rollout(alone, trial.horizon, SAMPLES, trial.noise(1, scene)).states[0]
+        there = here[scene]
+        if trial.differ(drawn[there], one[scene][there]):
+            yield "rollout: the samples of a scene must come from its own generator, whatever the other scenes draw"
+            return
+
+
+def _place_does_not_matter(trial: _Trial) -> Iterator[str]:
+    """On "centroid" axes all agents may stand elsewhere."""
+    axes = torch.tensor([frame == "centroid" for frame in trial.spec.frame], device=trial.device)
+    if not bool(axes.any()):
+        return
+    count = trial.spec.position_dim
+    far = trial.states.clone()
+    shift = 3.0 * torch.tensor(trial.spec.feature_scales[:count], device=trial.device) * axes
+    far[..., :count] += shift * trial.valid[:, None, :, None]
+    moved = trial.single(trial.observed(far)[1])
+    moved[..., :count] -= shift * trial.valid[:, :, None, None]
+    if trial.differ(moved, trial.single(trial.observed()[1])):
+        yield "rollout: spec.frame says 'centroid', but the forecast changes when all agents stand elsewhere"
+
+
+_LAYOUT = (_sizes, _empty_memory, _observe, _rollout)
+_MEANING = (
+    _first_step, _arguments_stay, _no_peeking, _window_does_not_peek, _scenes_are_independent, _order_of_agents,
+    _absent_agents, _noise, _place_does_not_matter,
+)  # fmt: skip

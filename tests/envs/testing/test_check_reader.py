@@ -1,0 +1,227 @@
+"""`check_reader`: finds nothing in the readers of this project, and each of the planted mistakes."""
+
+import itertools
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from envs.readers.base import Reader
+from envs.readers.function import FunctionReader
+from envs.registry import make_env
+from envs.testing import check_reader, reader_problems
+from predictor.scene import Scene, SceneSpec
+from predictor.support.errors import UserError
+from tests.envs.semantics import DT_S, SUBJECTS, Crowd, Swarm, SwarmReader, named, read_crowd
+
+SPEC = SceneSpec(dt_s=DT_S, feature_scales=(10.0, 10.0, 1.0, 1.0), perception_m=1000.0)
+
+
+def changed(change: Callable[[Scene, Any], Scene]) -> FunctionReader:
+    """Returns a reader of the crowd, whose scenes are changed."""
+
+    def reads(env: Any) -> Any:
+        return change(read_crowd(env), env.unwrapped)
+
+    return FunctionReader(reads, SPEC)
+
+
+def with_states(change: Callable[[np.ndarray], np.ndarray]) -> FunctionReader:
+    return changed(lambda scene, _: replace(scene, states=change(scene.states)))
+
+
+def with_ids(change: Callable[[np.ndarray, Any], np.ndarray]) -> FunctionReader:
+    return changed(lambda scene, crowd: replace(scene, ids=change(scene.ids, crowd)))
+
+
+def with_rows(order: Callable[[Scene, Any], np.ndarray]) -> FunctionReader:
+    def reorder(scene: Scene, crowd: Any) -> Scene:
+        rows = order(scene, crowd)
+        return Scene(scene.states[rows], scene.ids[rows], scene.valid[rows], scene.heading_rad)
+
+    return changed(reorder)
+
+
+def columns(*order: int, factor: tuple[float, ...] = (1, 1, 1, 1)) -> FunctionReader:
+    return with_states(lambda states: states[:, list(order)] * np.array(factor))
+
+
+def by_distance(scene: Scene) -> np.ndarray:
+    away = np.linalg.norm(scene.states[:, :2] - scene.states[0, :2], axis=1)
+    return np.argsort(away)
+
+
+def numbered_by_row(scene: Scene, crowd: Any) -> Scene:
+    """Sorts by distance, as observations do, and takes the row numbers as ids."""
+    rows = by_distance(scene)
+    return Scene(scene.states[rows], np.arange(len(rows)), scene.valid[rows], scene.heading_rad)
+
+
+def swapped_once(ids: np.ndarray, crowd: Any) -> np.ndarray:
+    """Two agents change their ids in the middle of the episode."""
+    swapped = {3: 4, 4: 3} if crowd.time >= 5 else {}
+    return np.array([swapped.get(number, number) for number in ids.tolist()])
+
+
+class NewIds(Reader):
+    """Numbers the agents anew at each step."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(SPEC)
+        self._times = itertools.count()
+
+    def see(self, observation: Any) -> None:
+        self._base = 100 * next(self._times)
+
+    def read_all(self, env: Any) -> Scene:
+        scene = read_crowd(env)
+        return replace(scene, ids=scene.ids + self._base)
+
+
+class Stale(Reader):
+    """Keeps the first scene of an episode."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(SPEC)
+
+    def reset(self) -> None:
+        self._scene: Scene | None = None
+
+    def read_all(self, env: Any) -> Scene:
+        self._scene = self._scene or read_crowd(env)
+        return self._scene
+
+
+class Uncut(Reader):
+    """Gives the ego all agents, however far away."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(replace(SPEC, perception_m=5.0, max_agents=5))
+
+    def read_all(self, env: Any) -> Scene:
+        return read_crowd(env)
+
+    def read(self, env: Any) -> Scene:
+        scene = read_crowd(env)
+        return Scene(scene.states[:5], scene.ids[:5], scene.valid[:5])
+
+
+def draws(scene: Scene, crowd: Any) -> Scene:
+    """Uses up the environment's random numbers."""
+    crowd.np_random.random()
+    return scene
+
+
+def twice(scene: Scene, crowd: Any) -> Scene:
+    """Gives other states at each call."""
+    crowd.calls = getattr(crowd, "calls", 0) + 1
+    return replace(scene, states=scene.states + crowd.calls)
+
+
+class Pushed(Crowd):
+    """A crowd whose ego takes the action's push tenfold, so that actions show in the first step."""
+
+    def step(self, action: np.ndarray) -> Any:
+        return super().step(10 * np.asarray(action))
+
+
+MISTAKES: dict[str, tuple[Any, str]] = {
+    "dt_s": (
+        FunctionReader(read_crowd, replace(SPEC, dt_s=1.0)),
+        "positions change by 0.5 × velocity × dt_s: either a step lasts 0.5 s, not dt_s=1,",
+    ),
+    "units": (columns(0, 1, 2, 3, factor=(1, 1, 3.6, 3.6)), "in different units (velocities in km/h?)"),
+    "centimetres": (columns(0, 1, 2, 3, factor=(1e3, 1e3, 1e3, 1e3)), "feature_scales say 10: give SI units"),
+    "mirrored axis": (columns(0, 1, 2, 3, factor=(1, -1, 1, 1)), "positions along y change against their velocity"),
+    "swapped axes": (columns(0, 1, 3, 2), "velocities along x and y are swapped"),
+    "no velocities": (columns(0, 1, 2, 3, factor=(1, 1, 0, 0)), "all velocities are zero, although positions change"),
+    "relative": (
+        with_states(lambda s: s - s[:1] * np.array([1, 1, 0, 0])),
+        "the ego never changes its position, although it has a velocity: positions must be in the world frame",
+    ),
+    "old scene": (Stale, "no position ever changes while the environment steps; does the reader return an old scene?"),
+    "degrees": (
+        changed(lambda scene, crowd: replace(scene, heading_rad=float(np.rad2deg(crowd.heading_rad)))),
+        "heading_rad is in degrees; give radians",
+    ),
+    "mirrored heading": (
+        changed(lambda scene, crowd: replace(scene, heading_rad=-crowd.heading_rad)),
+        "heading_rad is mirrored: it must grow from x to y",
+    ),
+    "row numbers": (changed(numbered_by_row), "the ids are the row numbers 0, 1, 2, … of every scene, but rows change"),
+    "ids change hands": (with_ids(swapped_once), "ids change hands: in step 5 id "),
+    "id returns": (
+        with_ids(lambda ids, _: np.where(ids == 9, 1, ids)),
+        "an id returns: id 1 was gone after step 5 and came back in step 7",
+    ),
+    "id of the newcomer": (with_ids(lambda ids, _: np.where(ids == 7, 2, ids)), "an id jumps: in step 4 id 2 is "),
+    "new ids": (NewIds, "no agent is there in two scenes that follow each other: ids must stay with an agent"),
+    "ego not first": (with_rows(lambda scene, _: np.roll(np.arange(len(scene.ids)), 1)), "agent 1 of the scene obeys"),
+    "ego moves": (
+        with_rows(lambda scene, crowd: np.roll(np.arange(len(scene.ids)), crowd.time)),
+        "the first agent has id 0 and, from step 1 on, id ",
+    ),
+    "nan": (with_states(lambda s: np.where(s > 3, np.nan, s)), "reads: states must be finite"),
+    "columns": (with_states(lambda s: s[:, :2]), "reads: states need 4 features"),
+    "same ids": (with_ids(lambda ids, _: ids * 0), "reads: ids must be unique within a scene"),
+    "type": (changed(lambda scene, _: scene.states), "reads: reading must give a Scene (predictor.scene), got ndarray"),
+    "error": (changed(lambda scene, crowd: crowd.absent), "reads: reading failed with AttributeError: 'Pushed' object"),
+    "perception": (Uncut, "Uncut: read() gives an agent "),
+    "reading draws": (changed(draws), "reads: reading changes what happens in the environment"),
+    "reading twice": (changed(twice), "reads: reading twice within a step gives two scenes"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_each_mistake_is_found_and_said_in_a_line(mistake: str):
+    reader, sentence = MISTAKES[mistake]
+    with pytest.raises(UserError) as error:
+        check_reader(Pushed(shift_m=40.0), reader)
+    lines = str(error.value).splitlines()
+    assert any(sentence in line for line in lines), lines
+    assert len(lines) <= (3 if mistake == "ego moves" else 2), lines
+    assert all(len(line) < 400 for line in lines)
+
+
+@named()
+def test_nothing_is_found_in_the_readers_of_this_project(name: str):
+    subject = SUBJECTS[name]
+    reader = subject.reader and subject.reader(subject.spec)
+    assert reader_problems(subject.make(), reader, episodes=2, max_steps=20) == []
+
+
+@pytest.mark.parametrize("env_id", ["roundabout-v1", "merge-v1", "racetrack-v1", "parking-v0"])
+def test_nothing_is_found_on_other_roads(env_id: str):
+    """Those on which drivers brake, turn and steer; a parking lot, on which the ego drives backwards, too."""
+    reader = None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        env = make_env(env_id)
+        if env_id == "parking-v0":
+            env = gym.wrappers.FlattenObservation(env)
+        assert reader_problems(env, reader, episodes=2, max_steps=40) == []
+
+
+def test_it_finds_nothing_in_the_crowd():
+    check_reader(Pushed(shift_m=40.0), FunctionReader(read_crowd, SPEC))
+
+
+class SwarmMistaken(SwarmReader):
+    def read(self, env: Any) -> Any:
+        seen = super().read(env)
+        return replace(seen, scene=replace(seen.scene, states=seen.scene.states * np.array([1, 1, 3.6, 3.6])))
+
+
+def test_many_agents_are_checked_too():
+    assert "velocities in km/h?" in "\n".join(reader_problems(Swarm(), SwarmMistaken))
+    with pytest.raises(UserError, match="no scene reader knows swarm_v0; pass reader="):
+        check_reader(Swarm())
+
+
+def test_without_a_reader_there_is_nothing_to_check():
+    with pytest.raises(UserError, match="no scene reader"):
+        check_reader(gym.make("CartPole-v1"))

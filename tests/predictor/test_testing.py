@@ -1,0 +1,303 @@
+"""`check_forecaster`: finds nothing in a forecaster that keeps the rules, and each of the planted mistakes."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
+from predictor.checkpoint import load_checkpoint
+from predictor.forecaster import Belief, Futures, Memory, edgeless_belief, require_forecaster
+from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
+from predictor.testing import check_forecaster, forecaster_problems
+from tests.predictor.helpers import EVERY_MODEL, WORLD, any_model
+
+SPEC = SceneSpec(dt_s=0.5, frame=WORLD)
+
+
+class Smooth:
+    """Goes on with the mean of all velocities so far; samples scatter."""
+
+    spec = SPEC
+    horizon_steps, num_edge_types, edge_feature_dim = 4, 2, 3
+
+    def empty_memory(self, batch: int, agents: int) -> Memory:
+        return Memory(nodes=(torch.zeros(batch, agents, 3),))
+
+    def observe(self, memory: Memory, states: Tensor, valid: Tensor) -> tuple[Memory, Belief]:
+        (before,) = memory.nodes
+        now = torch.cat([states[..., 2:4], torch.ones_like(states[..., :1])], -1) * valid[..., None]
+        total = before + now
+        belief = edgeless_belief(states, valid, self.num_edge_types, self.edge_feature_dim)
+        mean = total[..., :2] / total[..., 2:].clamp(min=1)
+        return Memory((total,)), Belief(states, valid, belief.edge_probs, belief.edge_features, mean)
+
+    def rollout(self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Any = None) -> Futures:
+        velocity = belief.internal[:, None].repeat(1, num_samples, 1, 1)
+        for scene, own in enumerate(generator or [] if num_samples > 1 else []):
+            there = belief.valid[scene]
+            drawn = own.normal(size=(num_samples - 1, int(there.sum()), 2))
+            velocity[scene, 1:, there] += torch.from_numpy(drawn.astype(np.float32))
+        steps = torch.arange(1, horizon_steps + 1)[:, None] * self.spec.dt_s
+        states = belief.states[:, None, :, None].repeat(1, num_samples, 1, horizon_steps, 1)
+        states[..., :2] += velocity[..., None, :] * steps
+        return Futures(states)
+
+
+def changed_rollout(change: Callable[[Tensor], Tensor]) -> type[Smooth]:
+    """Returns a forecaster whose predicted states are changed."""
+
+    class Changed(Smooth):
+        def rollout(self, belief: Belief, *arguments: Any, **named: Any) -> Futures:
+            return Futures(change(super().rollout(belief, *arguments, **named).states))
+
+    return Changed
+
+
+class WrongStep(Smooth):
+    """Believes that a step lasts 2 s."""
+
+    def rollout(self, belief: Belief, *arguments: Any, **named: Any) -> Futures:
+        return super().rollout(Belief(*vars(belief).values()), *arguments, **named)
+
+    def observe(self, memory: Memory, states: Tensor, valid: Tensor) -> tuple[Memory, Belief]:
+        memory, belief = super().observe(memory, states, valid)
+        belief.internal.mul_(2.0 / self.spec.dt_s)
+        return memory, belief
+
+
+class KilometresPerHour(WrongStep):
+    def observe(self, memory: Memory, states: Tensor, valid: Tensor) -> tuple[Memory, Belief]:
+        memory, belief = Smooth.observe(self, memory, states, valid)
+        belief.internal.mul_(3.6)
+        return memory, belief
+
+
+class Mirrored(WrongStep):
+    def observe(self, memory: Memory, states: Tensor, valid: Tensor) -> tuple[Memory, Belief]:
+        memory, belief = Smooth.observe(self, memory, states, valid)
+        belief.internal[..., 1] *= -1
+        return memory, belief
+
+
+class Global(Smooth):
+    """Draws from torch's own generator."""
+
+    def rollout(self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Any = None) -> Futures:
+        states = super().rollout(belief, horizon_steps, num_samples).states
+        states[:, 1:] += torch.randn(states[:, 1:].shape)
+        return Futures(states)
+
+
+class FirstGenerator(Smooth):
+    """Draws for all scenes from the first one's generator."""
+
+    def rollout(self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Any = None) -> Futures:
+        return super().rollout(belief, horizon_steps, num_samples, generator and [generator[0]] * len(belief.states))
+
+
+class NoisySingle(Smooth):
+    """Scatters sample 0, too."""
+
+    def rollout(self, belief: Belief, horizon_steps: int, num_samples: int = 1, generator: Any = None) -> Futures:
+        states = super().rollout(belief, horizon_steps, num_samples, generator).states
+        for scene, own in enumerate(generator or []):
+            states[scene] += float(own.normal())
+        return Futures(states)
+
+
+class OwnMemory(Smooth):
+    """Keeps the past in itself: other environments get it."""
+
+    past: Tensor | None = None
+
+    def observe(self, memory: Memory, states: Tensor, valid: Tensor) -> tuple[Memory, Belief]:
+        last = self.past if self.past is not None and self.past.shape == states.shape else states
+        self.past = states
+        _, belief = super().observe(memory, (states + last) / 2, valid)
+        return memory, Belief(states, valid, belief.edge_probs, belief.edge_features, belief.internal)
+
+
+class Peeking(Smooth):
+    """Rolls out from the latest states that it saw, not from the belief."""
+
+    latest: Tensor
+
+    def observe(self, memory: Memory, states: Tensor, valid: Tensor) -> tuple[Memory, Belief]:
+        self.latest = states
+        return super().observe(memory, states, valid)
+
+    def rollout(self, belief: Belief, *arguments: Any, **named: Any) -> Futures:
+        there = self.latest if self.latest.shape == belief.states.shape else belief.states
+        edges = (belief.edge_probs, belief.edge_features)
+        return super().rollout(Belief(there, belief.valid, *edges, belief.internal), *arguments, **named)
+
+
+class Normalised(Smooth):
+    """Subtracts a mean over the whole batch, as batch normalisation in training mode does."""
+
+    def rollout(self, belief: Belief, *arguments: Any, **named: Any) -> Futures:
+        futures = super().rollout(belief, *arguments, **named)
+        return Futures(futures.states + 0.1 * belief.states.mean())
+
+
+class ByPlace(Smooth):
+    """Treats each place differently."""
+
+    def rollout(self, belief: Belief, *arguments: Any, **named: Any) -> Futures:
+        states = super().rollout(belief, *arguments, **named).states
+        return Futures(states + torch.arange(states.shape[2])[:, None, None])
+
+
+class MeanOfPlaces(Smooth):
+    """Counts padding."""
+
+    def rollout(self, belief: Belief, *arguments: Any, **named: Any) -> Futures:
+        states = super().rollout(belief, *arguments, **named).states
+        return Futures(states + belief.states.mean(dim=1)[:, None, None, None])
+
+
+class WritesMemory(Smooth):
+    def observe(self, memory: Memory, states: Tensor, valid: Tensor) -> tuple[Memory, Belief]:
+        new, belief = super().observe(memory, states, valid)
+        memory.nodes[0].copy_(new.nodes[0])
+        return memory, belief
+
+
+class WritesBelief(Smooth):
+    def rollout(self, belief: Belief, *arguments: Any, **named: Any) -> Futures:
+        belief.states[..., :2] += belief.internal * self.spec.dt_s
+        return super().rollout(belief, *arguments, **named)
+
+
+class NotEmpty(Smooth):
+    def empty_memory(self, batch: int, agents: int) -> Memory:
+        return Memory(nodes=(torch.ones(batch, agents, 3),))
+
+
+class TimeFirst(Smooth):
+    def empty_memory(self, batch: int, agents: int) -> Memory:
+        return Memory(nodes=(torch.zeros(3, batch, agents),))
+
+
+class Logits(Smooth):
+    """Forgets the softmax."""
+
+    def observe(self, memory: Memory, states: Tensor, valid: Tensor) -> tuple[Memory, Belief]:
+        memory, belief = super().observe(memory, states, valid)
+        belief.edge_probs.mul_(3.0)
+        return memory, belief
+
+
+class NormalisedStates(Smooth):
+    def observe(self, memory: Memory, states: Tensor, valid: Tensor) -> tuple[Memory, Belief]:
+        return super().observe(memory, states / torch.tensor(self.spec.feature_scales), valid)
+
+
+class Shares(Smooth):
+    """Probabilities of three modes for every agent, whatever number of samples is asked."""
+
+    def rollout(self, belief: Belief, *arguments: Any, **named: Any) -> Futures:
+        states = super().rollout(belief, *arguments, **named).states
+        return Futures(states, torch.full(states.shape[:3], 0.5))
+
+
+class Fails(Smooth):
+    def rollout(self, belief: Belief, *arguments: Any, **named: Any) -> Futures:
+        raise IndexError("list index\nout of range")
+
+
+class Windowed(Smooth):
+    """Its roll-out of training begins at the last state instead of the last observed one."""
+
+    def window(self, states: Tensor, valid: Tensor, last_observed: Tensor, rollout_steps: int, generator: Any) -> Any:
+        from predictor.forecaster import WindowOutput
+
+        return WindowOutput(states, states[:, -1:, :, :].transpose(1, 2).repeat(1, 1, rollout_steps, 1))
+
+
+MISTAKES: dict[str, tuple[Any, str]] = {
+    "dt_s": (WrongStep, "rollout: the first step is 4 times velocity × dt_s along x; is a step 0.5 s (spec.dt_s)"),
+    "units": (KilometresPerHour, "rollout: the first step is 3.6 times velocity × dt_s along x"),
+    "mirrored": (Mirrored, "rollout: the first step goes against the velocity along y; is the axis mirrored?"),
+    "nan": (changed_rollout(lambda s: s * float("nan")), "rollout: states of agents that are there must be finite"),
+    "axes": (changed_rollout(lambda s: s.transpose(1, 2)), "samples): states must have the shape (3, 1, 4, 4, 4)"),
+    "horizon": (changed_rollout(lambda s: s[..., :1, :]), "states must have the shape (3, 1, 4, 4, 4)"),
+    "global noise": (Global, "rollout draws from torch's or NumPy's global generator; draw from the given one"),
+    "shared noise": (FirstGenerator, "rollout: the samples of a scene must come from its own generator"),
+    "noisy single": (NoisySingle, "rollout: sample 0 is the single forecast and must not depend on the generator"),
+    "own memory": (OwnMemory, "observe: what it returns depends on what else was observed before"),
+    "peeking": (Peeking, "rollout: a forecast changes when later states are observed"),
+    "window peeks": (Windowed, "window: rollout changes with the states after last_observed"),
+    "batch": (Normalised, "rollout: the forecast of a scene changes with the other scenes of its batch"),
+    "order": (ByPlace, "rollout: the forecast of an agent changes with the order of the agents"),
+    "padding": (MeanOfPlaces, "rollout: forecasts change with the number of absent (padded) agents; mask by valid"),
+    "writes memory": (WritesMemory, "observe writes into the old memory; return a new one"),
+    "writes belief": (WritesBelief, "rollout writes into the belief; copy belief.states"),
+    "memory not zero": (NotEmpty, "empty_memory: nodes must be zero, which stands for an agent that was never seen"),
+    "memory by time": (TimeFirst, "empty_memory: nodes must have the shape (scenes, agents, size), got (3, 3, 4)"),
+    "logits": (Logits, "observe: belief.edge_probs must be probabilities that sum to 1 over the types of each pair"),
+    "normalised": (NormalisedStates, "observe: belief.states must be the observed states"),
+    "mode_probs": (Shares, "rollout: mode_probs must sum to 1 over the samples of each agent"),
+    "error": (Fails, "rollout: failed with IndexError: list index out of range"),
+    "class": (lambda: Smooth, "a forecaster is an object, got the class Smooth; call it first"),
+    "no forecaster": (dict, "but dict has no spec, horizon_steps"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_each_mistake_is_found_and_said_in_a_line(mistake: str):
+    make, sentence = MISTAKES[mistake]
+    with pytest.raises(UserError) as error:
+        check_forecaster(make())
+    lines = str(error.value).splitlines()
+    assert any(sentence in line for line in lines), lines
+    assert len(lines) <= 2, lines
+
+
+@pytest.mark.parametrize("frame", [("world", "world"), ("ego", "world"), ("centroid", "centroid")])
+def test_nothing_is_found_where_nothing_is_wrong(frame: Any):
+    class There(Smooth):
+        spec = SceneSpec(dt_s=0.1, frame=frame, has_ego="ego" in frame)
+
+    check_forecaster(There())
+    check_forecaster(There(), seed=5)
+    check_forecaster(ConstantVelocity(There.spec))
+    check_forecaster(NoisyConstantVelocity(There.spec, 1.0, 1.0))
+
+
+def test_a_frame_that_is_not_kept_is_found():
+    class Somewhere(Smooth):
+        spec = SceneSpec(dt_s=0.1, frame=("centroid", "centroid"), has_ego=False)
+
+        def rollout(self, belief: Belief, *arguments: Any, **named: Any) -> Futures:
+            states = super().rollout(belief, *arguments, **named).states
+            return Futures(states + 0.1 * states)
+
+    assert "spec.frame says 'centroid', but the forecast changes" in "".join(forecaster_problems(Somewhere()))
+
+
+@pytest.mark.parametrize("name", ["roundabout", "simple-tag", "racetrack"])
+def test_shipped_checkpoints_pass(name: str):
+    assert forecaster_problems(load_checkpoint(name)[0]) == []
+
+
+@pytest.mark.parametrize("name", EVERY_MODEL)
+def test_every_model_passes_untrained_but_for_its_first_step(name: str):
+    problems = [line for line in forecaster_problems(any_model(name)) if "first step" not in line]
+    by_place = ["rollout: the forecast of an agent changes with the order of the agents"]
+    assert problems == (by_place if name == "lstm-joint" else [])  # it has weights for each place, as in the paper
+
+
+def test_a_forecaster_needs_all_parts():
+    assert require_forecaster(Smooth()).horizon_steps == 4
+
+    class Half(Smooth):
+        spec: Any = {"dt_s": 1}
+
+    with pytest.raises(UserError, match="the spec of a forecaster must be a SceneSpec, got dict"):
+        require_forecaster(Half())
