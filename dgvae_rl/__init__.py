@@ -16,13 +16,18 @@ from dgvae_rl.own_packages import install_finder
 
 if TYPE_CHECKING:
     from agents import (
+        A2CPreset,
         AttentionConfig,
         DQNPreset,
         Evaluation,
         ForecastAttention,
         PolicySummary,
         PPOPreset,
+        QRDQNPreset,
+        RecurrentPPOPreset,
+        SACPreset,
         Task,
+        TQCPreset,
         TrainedPolicy,
         TrainingPlan,
         evaluate_policy_on_seeds,
@@ -87,9 +92,9 @@ PACKAGE_OF = {
     name: package
     for package, names in {
         "agents": (
-            "AttentionConfig", "DQNPreset", "Evaluation", "ForecastAttention", "PPOPreset", "PolicySummary", "Task",
-            "TrainedPolicy", "TrainingPlan", "evaluate_policy_on_seeds", "load_model", "load_policy", "preset_for",
-            "save_model", "train",
+            "A2CPreset", "AttentionConfig", "DQNPreset", "Evaluation", "ForecastAttention", "PPOPreset", "PolicySummary",
+            "QRDQNPreset", "RecurrentPPOPreset", "SACPreset", "TQCPreset", "Task", "TrainedPolicy", "TrainingPlan",
+            "evaluate_policy_on_seeds", "load_model", "load_policy", "preset_for", "save_model", "train",
         ),
         "envs": (
             "AgentMonitor", "EntityRowsReader", "EnvPoolVecEnv", "ForecastObservation", "ForecastParallelEnv",

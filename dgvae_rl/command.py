@@ -34,6 +34,7 @@ COMMANDS = {
     "train-policy": Command("train_policy", "train a policy that sees forecasts, evaluate and film it", "rl"),
     "evaluate-policy": Command("agents.evaluate", "measure a policy on held-out seeds, beside simple drivers", "rl"),
     "watch": Command("agents.watch", "film an episode of a policy, or play it in a window", "rl"),
+    "tune": Command("agents.tune", "search hyperparameters of a learning algorithm", "tune"),
     "study": Command("agents.study", "compare what policies are shown, over several seeds", "study"),
 }
 """Commands by name, in the order of use."""

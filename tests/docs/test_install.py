@@ -29,7 +29,7 @@ def test_every_extra_is_in_the_table():
     assert requirements("all") == set().union(
         *(requirements(name) for name in rows if name not in ("none", "extra", "all", "envpool"))
     )
-    for outer, inner in (("rl", "envs"), ("study", "rl"), ("envpool", "rl")):
+    for outer, inner in (("rl", "envs"), ("study", "rl"), ("contrib", "rl"), ("tune", "rl"), ("envpool", "rl")):
         assert f"`{inner}`" in rows[outer] and requirements(inner) < requirements(outer)
 
 
