@@ -89,7 +89,8 @@ def write_preset(path: Path, preset: Preset, comments: Sequence[str] = ()) -> No
         preset: values to write.
         comments: lines above them, without "#".
     """
-    lines = [f"# {line}" for line in comments] + [f"{name} = {_text(value)}" for name, value in asdict(preset).items()]
+    values = {name: value for name, value in asdict(preset).items() if value is not None}  # TOML has no None
+    lines = [f"# {line}" for line in comments] + [f"{name} = {_text(value)}" for name, value in values.items()]
     write_text(path, "\n".join(lines) + "\n")
 
 

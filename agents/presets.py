@@ -20,7 +20,7 @@ _COUNTS = (
     *("lstm_hidden_size", "n_lstm_layers", "n_quantiles", "n_critics"),
 )
 _AMOUNTS = ("learning_starts", "ent_coef", "top_quantiles_to_drop_per_net", "gamma", "gae_lambda", "vf_coef")
-_POSITIVE = ("learning_rate", "tau", "exploration_fraction")
+_POSITIVE = ("learning_rate", "tau", "exploration_fraction", "target_kl")
 _SHARES = ("gamma", "gae_lambda", "tau", "exploration_fraction", "exploration_final_eps")
 
 
@@ -83,6 +83,8 @@ class PPOPreset(OnPolicyPreset):
     """Number of samples per gradient step; few environments give smaller batches."""
     n_epochs: int = 10
     """Number of passes over each rollout."""
+    target_kl: float | None = None
+    """Passes end where the policy has moved 1.5 times this far (KL divergence); None sets no bound."""
 
     def __post_init__(self) -> None:
         """Checks ranges; advantages are normalised over a batch, which therefore needs two samples."""
@@ -231,8 +233,8 @@ _MULTIAGENT = PPOPreset(n_steps=100, batch_size=300, n_epochs=8, learning_rate=7
 # A rollout is one episode (25 steps of 0.1 s) of each copy. In simple_tag a touch pays 10 and most episodes have none;
 # at SB3's weight the critic's loss is a hundred times the actor's, and clipping its gradient slows the actor.
 _PARTICLES = PPOPreset(
-    n_steps=25, batch_size=480, n_epochs=5, learning_rate=1e-3, gamma=0.95, ent_coef=0.01, vf_coef=0.005,
-    net_arch=(64, 64),
+    n_steps=25, batch_size=480, n_epochs=5, target_kl=0.01, learning_rate=1e-3, gamma=0.95, ent_coef=0.01,
+    vf_coef=0.005, net_arch=(64, 64),
 )  # fmt: skip
 
 

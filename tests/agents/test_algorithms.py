@@ -179,6 +179,13 @@ def test_presets_of_new_algorithms_follow_the_environment():
     assert isinstance(preset_for("highway-fast-v0", "a2c", "envpool"), OnPolicyPreset)
 
 
+def test_bounds_and_weights_of_the_particle_worlds_reach_the_model():
+    venv = make_venv(Task("simple_tag_v3", "none", learners=("adversary",)), 1)
+    model: Any = make_model(TrainingPlan(Task("simple_tag_v3", "none"), "ppo", 1, 1, 0), venv)
+    venv.close()
+    assert (model.target_kl, model.vf_coef, model.batch_size, model.n_epochs) == (0.01, 0.005, 75, 5)
+
+
 def test_few_environments_get_small_batches_without_a_warning():
     settings = {"n_steps": 4, "batch_size": 512}
     task = replace(ROAD, observe="none")

@@ -51,9 +51,10 @@ def test_only_what_concerns_a_cell_is_in_its_name(cells: Callable[..., list[Cell
     """So that cells which are finished stay."""
     none, zeros = cells(env_id=HIGHWAY, seeds="1", arms='["none", "zeros"]', references="[]")
     assert "network" not in none.content and zeros.content["network"] == NETWORK
-    assert not {"shaping", "vf_coef"} & {*none.content["plan"], *none.content["preset"]}
+    assert not {"shaping", "vf_coef", "target_kl"} & {*none.content["plan"], *none.content["preset"]}
     (tag,) = cells(env_id="simple_tag_v3", seeds="1", arms='["none"]', references="[]")
     assert tag.content["plan"]["shaping"] is True and tag.content["preset"]["vf_coef"] == 0.005
+    assert tag.content["preset"]["target_kl"] == 0.01
 
 
 def test_settings_of_an_algorithm_are_those_of_its_trainings(cells: Callable[..., list[Cell]]):
