@@ -92,9 +92,9 @@ PACKAGE_OF = {
     name: package
     for package, names in {
         "agents": (
-            "A2CPreset", "AttentionConfig", "DQNPreset", "Evaluation", "ForecastAttention", "PPOPreset", "PolicySummary",
-            "QRDQNPreset", "RecurrentPPOPreset", "SACPreset", "TQCPreset", "Task", "TrainedPolicy", "TrainingPlan",
-            "evaluate_policy_on_seeds", "load_model", "load_policy", "preset_for", "save_model", "train",
+            "A2CPreset", "AttentionConfig", "DQNPreset", "Evaluation", "ForecastAttention", "PPOPreset",
+            "PolicySummary", "QRDQNPreset", "RecurrentPPOPreset", "SACPreset", "TQCPreset", "Task", "TrainedPolicy",
+            "TrainingPlan", "evaluate_policy_on_seeds", "load_model", "load_policy", "preset_for", "save_model", "train",
         ),
         "envs": (
             "AgentMonitor", "EntityRowsReader", "EnvPoolVecEnv", "ForecastObservation", "ForecastParallelEnv",
