@@ -94,7 +94,8 @@ PACKAGE_OF = {
         "agents": (
             "A2CPreset", "AttentionConfig", "DQNPreset", "Evaluation", "ForecastAttention", "PPOPreset",
             "PolicySummary", "QRDQNPreset", "RecurrentPPOPreset", "SACPreset", "TQCPreset", "Task", "TrainedPolicy",
-            "TrainingPlan", "evaluate_policy_on_seeds", "load_model", "load_policy", "preset_for", "save_model", "train",
+            "TrainingPlan", "evaluate_policy_on_seeds", "load_model", "load_policy", "preset_for", "save_model",
+            "train",
         ),
         "envs": (
             "AgentMonitor", "EntityRowsReader", "EnvPoolVecEnv", "ForecastObservation", "ForecastParallelEnv",
