@@ -413,7 +413,7 @@ def test_help_is_whole_phrases(command: str, capsys: pytest.CaptureFixture[str])
     for field in fields(config_of(command)):
         if not is_dataclass(get_type_hints(config_of(command))[field.name]):
             positional = field.default is MISSING and command == "agents.watch"
-            assert (field.name.upper() if positional else f"--{field.name.replace('_', '-')}") in out, field.name
+            assert ("PATH" if positional else f"--{field.name.replace('_', '-')}") in out, field.name
 
 
 # --- Configs made from Python -----------------------------------------------------------------------------------------

@@ -9,7 +9,9 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 THEIRS = {
     "envs/__init__.py": "from envs.wrappers import Mine\n",
-    "envs/wrappers.py": "class Mine: ...\n",  # as one of ours is called
+    "envs/wrappers.py": "class Mine: ...\n",  # these are called as some of ours, which import each other
+    "envs/registry.py": "class Mine: ...\n",
+    "envs/arms.py": "class Mine: ...\n",
     "agents/__init__.py": "MINE = 'theirs'\n",
 }
 OURS = """
