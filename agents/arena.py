@@ -127,7 +127,9 @@ class MultiagentArena:
     def __init__(self, task: Task, most_copies: int = 16) -> None:
         """Makes the environment of the drivers; copies for a policy are made when the first one plays."""
         self._task, self._most = task, most_copies
-        self._env: Any = MakeCopy(replace(task, observe="none"))()  # has what `DrivenEnv` has
+        self._env: Any = MakeCopy(
+            replace(task, observe="none", checkpoint=None, perception_m=None)
+        )()  # has what `DrivenEnv` has
         self._learners = learners_of(task, self._env)
         self._venv: ParallelVecEnv | None = None
         self.baselines = ("random", "heuristic" if has_heuristic(self._env) else "idle")

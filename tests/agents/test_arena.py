@@ -57,3 +57,12 @@ def test_random_and_idle_stand_beside_an_ego():
     assert random.episode_return != idle.episode_return
     assert arena.play("random", [2]) == [random]
     arena.close()
+
+
+def test_drivers_play_beside_every_option_of_forecasts():
+    """The arena plays drivers without forecasts, whatever the policy of the task is shown."""
+    task = Task("simple_tag_v3", checkpoint="constant-velocity", learners=("adversary",), perception_m=1.0)
+    arena = MultiagentArena(task)
+    (result,) = arena.play("random", [7])
+    assert result.length == 25
+    arena.close()
