@@ -34,6 +34,7 @@ from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_json, write_text
 from predictor.support.provenance import provenance
+from predictor.support.reading import read_object
 from predictor.support.runtime import resolve_device, tune
 from predictor.train import train
 from predictor.training.config import TrainConfig, TrainPrecision, check_precision
@@ -269,7 +270,7 @@ def run_suite(config: SuiteConfig) -> dict[str, Any]:
     results: dict[str, list[dict[str, Any]]] = {}
     for job in jobs:
         if job.result.exists():
-            results.setdefault(job.line.key, []).append(json.loads(job.result.read_text()))
+            results.setdefault(job.line.key, []).append(read_object(job.result))
     lines = [joined(found) for found in results.values()]
     content = {
         "table": config.table,

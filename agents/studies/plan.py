@@ -11,15 +11,21 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from agents.presets import Algorithm
-from agents.studies.toml_values import converted, from_table
 from agents.task import SELECTION_SEED, Observe, Task
 from envs.drivers.ego import CONSTANT_ACTIONS
 from envs.drivers.planner import PLANNER, PLANNER_ORACLE
-from predictor.support.config_checks import check_at_least, check_choices
+from predictor.support.config_checks import check_at_least, check_at_most, check_choices
 from predictor.support.errors import UserError
+from predictor.support.memory import ENV_BYTES, check_memory
+from predictor.support.reading import MIB, read_text
+from predictor.support.typed_values import converted, from_table
 
 SHIPPED = Path(__file__).resolve().parent
 """Folder of the studies that ship."""
+MOST_SEEDS = 10_000
+"""Largest number of training seeds."""
+MOST_BYTES = MIB
+"""Largest size of a study file."""
 REFERENCES = (PLANNER, CONSTANT_ACTIONS, "random", "idle")
 RIVALS = ("zeros", "constant-velocity")
 FLOOR, CEILING = "zeros", "oracle"
@@ -61,6 +67,7 @@ class Scenario:
     def __post_init__(self) -> None:
         """Checks ranges."""
         check_at_least(self, 1, "steps", "num_envs")
+        check_memory(self.num_envs * ENV_BYTES, f"num_envs={self.num_envs:,}", "take fewer")
 
 
 @dataclass(frozen=True)
@@ -106,6 +113,7 @@ class Study:
         check_at_least(self, 1, "steps", "num_envs", "episodes", "selections", "selection_episodes", "checkpoint_every")
         if isinstance(self.seeds, int):
             check_at_least(self, 1, "seeds")
+            check_at_most(self, MOST_SEEDS, "seeds")
         elif not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise UserError(f"seeds must be a number or different numbers, got {list(self.seeds)}")
         for seed in self.training_seeds:
@@ -181,9 +189,12 @@ def read_study(path: Path) -> Study:
     Raises:
         UserError: the file is no TOML, or a key or value of it does not fit; the message names file and key.
     """
+    text = read_text(path, MOST_BYTES)
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        content = tomllib.loads(text)
+    except RecursionError as error:
+        raise UserError(f"{path.name} is not valid TOML: it is nested too deeply") from error
+    except ValueError as error:  # a TOMLDecodeError, or an integer of thousands of digits
         raise UserError(f"{path.name} is not valid TOML: {error}") from error
     content = dict(content)
     where = path.name

@@ -157,7 +157,7 @@ def test_unknown_models_are_named(ask: Any):
 
 
 def test_unknown_fields_of_a_checkpoint_are_named():
-    with pytest.raises(ValueError, match="unknown field 'attention_heads' of IMMAConfig"):
+    with pytest.raises(UserError, match="unknown key 'attention_heads'; there are hidden_dim"):
         config_from_json("imma", {"hidden_dim": 4, "attention_heads": 2})
 
 
