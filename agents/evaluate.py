@@ -30,6 +30,7 @@ from envs.sb3.policy_file import read_policy_note
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
+from predictor.support.memory import check_count, check_processes
 from predictor.support.runtime import keep_freed_memory, resolve_device
 
 NO_DRIVERS = "none"
@@ -128,6 +129,8 @@ class EvaluateConfig:
             UserError: a value is out of range, or the device is not available.
         """
         check_at_least(self, 1, "episodes", "num_envs")
+        check_count(self.episodes, "episodes")
+        check_processes(min(self.num_envs, self.episodes), "num_envs")
         if (self.run_dir is None) == (self.policy is None):
             raise UserError("give either --run-dir (a training run) or --policy (a driver such as planner)")
         if self.policy is not None and self.env_id is None:
@@ -230,7 +233,7 @@ def checked_drivers(task: Task, names: Sequence[str]) -> tuple[str, ...]:
 
 def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str, str]]:
     """Evaluates the policy of a training run; returns what is noted beside the results, too."""
-    run = read_config(run_dir)
+    run = read_config(run_dir, "observe", "algorithm")
     task = task_of(run, config.device, config.env_id)
     if config.env_id not in (None, task.env_id):
         raise UserError(f"run {run_dir} was trained on {task.env_id}, got --env-id {config.env_id}; leave it out")

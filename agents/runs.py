@@ -62,14 +62,18 @@ def open_run(
     write_json(file, {"config": config, "provenance": [*starts, provenance]})
 
 
-def read_config(run_dir: Path) -> dict[str, Any]:
+def read_config(run_dir: Path, *required: str) -> dict[str, Any]:
     """Reads the config of a run.
 
+    Args:
+        run_dir: path of the folder.
+        required: keys that the config must have.
+
     Raises:
-        UserError: the folder holds no run of a policy.
+        UserError: the folder holds no run of a policy, or one without a required key.
     """
     config: dict[str, Any] = _read(run_dir / CONFIG_FILE)["config"]
-    for name in ("observe", "algorithm"):
+    for name in required:
         if name not in config:
             raise UserError(f"{run_dir / CONFIG_FILE}: key '{name}' is missing")
     return config

@@ -5,6 +5,8 @@ from pathlib import Path
 
 from predictor.support.errors import UserError
 
+ITEM_BYTES = 512
+"""Least memory of one episode, rollout or forecast that is kept with its results."""
 PROCESS_BYTES = 150 * 2**20
 """Least memory of a worker process: Python, NumPy and torch, measured on Linux."""
 ENV_BYTES = 2**20
@@ -58,4 +60,18 @@ def check_processes(count: int, name: str) -> None:
     Raises:
         UserError: they do not fit.
     """
-    check_memory(count * PROCESS_BYTES, f"{name}={count:,}", f"pass a smaller --{name.replace('_', '-')}")
+    check_count(count, name, PROCESS_BYTES)
+
+
+def check_count(count: int, name: str, each_bytes: int = ITEM_BYTES) -> None:
+    """Checks that this many things of at least `each_bytes` fit into the memory.
+
+    Args:
+        count: number of things; 0 always fits.
+        name: name of the option, for the message.
+        each_bytes: least size of each.
+
+    Raises:
+        UserError: they do not fit.
+    """
+    check_memory(count * each_bytes, f"{name}={count:,}", f"pass a smaller --{name.replace('_', '-')}")

@@ -200,7 +200,7 @@ class Trainer:
         self.stale = 0
         self.baseline_m = self._baseline()
         self.noise = torch.Generator(device=self.device)
-        source = open_batches(config, data.train, self.device)
+        source = open_batches(config, data.train, self.device, self.model.config)
         self.batches, self.notes, self._widths = source.batches, source.notes, source.widths
         self.read_every = LOG_EVERY if on_cuda else 1
         self._checks_each_loss = not on_cuda

@@ -161,7 +161,7 @@ KINDS: dict[str, Kind] = {
     "chunk": Kind("data/states/c/0/0/0", lambda f: _store(f), lambda f: read_store(f / "data")),
     "predictor run": Kind("run/config.json", _predictor_run, lambda f: _resume(f)),
     "training state": Kind("run/train_state.pt", _train_state, _restore),
-    "policy run": Kind("config.json", lambda f: _policy_run(f), lambda f: task_of(read_config(f))),
+    "policy run": Kind("config.json", lambda f: _policy_run(f), lambda f: task_of(read_config(f, "algorithm"))),
     "curve": Kind("curve.json", _json("curve.json", [POINT]), lambda f: read_curve(f / "curve.json")),
     "result": Kind("result.json", lambda f: _result(f), lambda f: read_result(f / "result.json")),
     "study": Kind("mine.toml", _written(mine__toml=texts.STUDY), lambda f: read_study(f / "mine.toml")),

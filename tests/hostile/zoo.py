@@ -7,6 +7,7 @@ import json
 import os
 import pickle
 import struct
+import tempfile
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from tests.hostile.samples import KINDS, PIN
 Spoil = Callable[[Path], None]
 """Damages a file."""
 DEEP, HUGE_NUMBER = 100_000, "9" * 5000
-EXECUTED = Path("/tmp/dgvae-rl-zoo-executed")
+EXECUTED = Path(tempfile.gettempdir()) / f"dgvae-rl-zoo-executed-{os.getpid()}"
 """File that code in a hostile file would write."""
 
 
