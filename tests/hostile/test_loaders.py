@@ -1,4 +1,4 @@
-"""Any content of a file loads, or is refused as a `UserError`: found by hypothesis, from good files and from nothing."""
+"""Any content of a file loads, or is refused as a `UserError`: found by hypothesis."""
 
 import json
 import struct
