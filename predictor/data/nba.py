@@ -13,7 +13,6 @@ training; the text files' own folders `train` and `test` share games.
 """
 
 import json
-import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -25,6 +24,8 @@ from jaxtyping import Float, Int
 
 from predictor.data.dataset_card import DatasetNotes, save_dataset, summary
 from predictor.data.loading import (
+    LARGEST,
+    LARGEST_WHOLE,
     NO_LIMIT_M,
     LoaderConfig,
     bad_line,
@@ -207,10 +208,12 @@ def _moment(path: Path, where: str, moment: Any) -> tuple[int, int, Entities]:
             f"{path}, {where}: expected [quarter, ms, clock, shot clock, null, [[team, player, x, y, z], …]], "
             f"got {json.dumps(moment)[:80]}; repair it or get the file anew"
         ) from error
-    if not all(math.isfinite(v) for xy in entities.values() for v in xy):
-        raise UserError(f"{path}, {where}: positions must be finite, got {json.dumps(moment)[:80]}; get the file anew")
-    if any(player <= BALL_ID for team, player in entities if team != -1):
-        raise UserError(f"{path}, {where}: ids of players must be positive; get the file anew")
+    if not all(abs(v) <= LARGEST for xy in entities.values() for v in xy):
+        raise UserError(
+            f"{path}, {where}: positions must be finite and at most {LARGEST:g}, got {json.dumps(moment)[:80]}; get the file anew"
+        )
+    if any(not BALL_ID < player <= LARGEST_WHOLE for team, player in entities if team != -1):
+        raise UserError(f"{path}, {where}: ids of players must be positive, of at most 15 digits; get the file anew")
     return time_ms, quarter, entities
 
 

@@ -177,9 +177,7 @@ def foreign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 def test_a_run_imports_only_what_the_command_line_names(foreign: str, observe: str):
     run = RUN | {"env_id": f"{foreign}:Road", "observe": observe}
     for trusted in (None, "highway-v0", f"{foreign}:Other"):
-        with pytest.raises(
-            UserError, match=f"imports code; if you trust it, .* --env-id {foreign}"
-        ):
+        with pytest.raises(UserError, match=f"imports code; if you trust it, .* --env-id {foreign}"):
             task_of(run, trusted=trusted)
     assert foreign not in sys.modules
     assert task_of(run | {"observe": "none"}, trusted=f"{foreign}:Road").env_id == f"{foreign}:Road"

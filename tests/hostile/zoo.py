@@ -349,6 +349,9 @@ VALUES: dict[str, list[tuple[str, Any, str]]] = {
         ("events.0.moments.0.5.0.2", NAN, "finite"),
         ("events.0.moments.0.5.0.2", "a", "moments[0]"),
         ("events.0.moments.0.5.1.1", -7, "ids"),
+        ("events.0.moments.0.5.1.1", 2**63, "ids"),
+        ("events.0.moments.0.5.1.1", 9.3e18, "ids"),
+        ("events.0.moments.0.5.1.2", 1e300, "positions"),
     ],
 }
 """Dotted place of a value in a file of JSON, the value, and a part of the message."""
