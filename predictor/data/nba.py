@@ -210,7 +210,8 @@ def _moment(path: Path, where: str, moment: Any) -> tuple[int, int, Entities]:
         ) from error
     if not all(abs(v) <= LARGEST for xy in entities.values() for v in xy):
         raise UserError(
-            f"{path}, {where}: positions must be finite and at most {LARGEST:g}, got {json.dumps(moment)[:80]}; get the file anew"
+            f"{path}, {where}: positions must be finite and at most {LARGEST:g}, got {json.dumps(moment)[:80]}; "
+            "get the file anew"
         )
     if any(not BALL_ID < player <= LARGEST_WHOLE for team, player in entities if team != -1):
         raise UserError(f"{path}, {where}: ids of players must be positive, of at most 15 digits; get the file anew")
