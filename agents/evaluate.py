@@ -134,7 +134,7 @@ class EvaluateConfig:
         if (self.run_dir is None) == (self.policy is None):
             raise UserError("give either --run-dir (a training run) or --policy (a driver such as planner)")
         if self.policy is not None and self.env_id is None:
-            raise UserError("--policy needs --env-id; a training run has its own environment")
+            raise UserError("--policy and --env-id go together; a training run has its own environment")
         if self.policy is not None and self.out is None:
             raise UserError("--policy has no run folder; say with --out where the results go")
         if self.policy == CONSTANT_ACTIONS:

@@ -15,13 +15,16 @@ from envs.collect import CollectConfig
 from envs.evaluate import EvaluateConfig as EvaluateEnvConfig
 from predictor.data.nri import NRIConfig
 from predictor.data.springs import SpringsConfig
+from predictor.data.store import read_store
+from predictor.data.windows import Windows
 from predictor.dgvae.config import DGVAEConfig
 from predictor.evaluate import EvaluateConfig
 from predictor.suite import SuiteConfig
 from predictor.support.errors import UserError
 from predictor.support.memory import check_memory, memory_bytes
-from predictor.training.batches import check_batch
+from predictor.training.batches import check_batch, open_batches
 from predictor.training.config import TrainConfig
+from tests.predictor.helpers import write_circles
 from train_policy import TrainPolicyConfig
 
 OUT = Path("never-made")
@@ -66,6 +69,17 @@ def test_the_limit_is_what_there_is():
     check_memory(2**30, "a store", "make it smaller", available_bytes=2**30)
     with pytest.raises(UserError, match=r"^a store needs at least 2.0 GiB, and there are 1.0 GiB; make it smaller$"):
         check_memory(2**31, "a store", "make it smaller", available_bytes=2**30)
+
+
+def test_a_batch_is_estimated_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """States of 10⁸ windows alone would fit into 16 GiB; with the agents and pairs of the data they do not."""
+    monkeypatch.setattr("predictor.support.memory.memory_bytes", lambda: 2**34)
+    store = read_store(write_circles(tmp_path / "data"))
+    config = TrainConfig((tmp_path / "data",), tmp_path / "run", batch_size=10**8)
+    windows = Windows(store.episodes, store.info.spec, config.history_steps, config.horizon_steps)
+    with pytest.raises(UserError, match=r"^a step with batch_size=100,000,000 needs at least .*pass a smaller --batch"):
+        open_batches(config, [windows], torch.device("cpu"), DGVAEConfig())
+    open_batches(dataclasses.replace(config, batch_size=64), [windows], torch.device("cpu"), DGVAEConfig())
 
 
 def test_a_batch_counts_states_and_pairs(monkeypatch: pytest.MonkeyPatch):
