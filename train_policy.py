@@ -29,6 +29,7 @@ from envs.simulators.envpool import ONE_START
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import run_entry_point
+from predictor.support.memory import ENV_BYTES, PROCESS_BYTES, check_count
 from predictor.support.provenance import provenance
 from predictor.support.runtime import keep_freed_memory
 
@@ -133,7 +134,12 @@ class TrainPolicyConfig:
         check_at_least(
             self, 1, "steps", "num_envs", "selections", "selection_episodes", "checkpoint_every", "eval_episodes"
         )
-        object.__setattr__(self, "device", self.plan.device)
+        for name in ("eval_episodes", "selection_episodes"):
+            check_count(getattr(self.sizes, name), name)
+        plan = self.plan
+        here = self.backend == "envpool" or plan.task.is_multiagent or plan.num_envs == 1
+        check_count(plan.num_envs, "num_envs", ENV_BYTES if here else PROCESS_BYTES)
+        object.__setattr__(self, "device", plan.device)
 
     @property
     def folder(self) -> Path:

@@ -30,6 +30,7 @@ from envs.sb3.policy_file import read_policy_note
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
+from predictor.support.memory import check_count, check_processes
 from predictor.support.runtime import keep_freed_memory, resolve_device
 
 NO_DRIVERS = "none"
@@ -100,7 +101,8 @@ class EvaluateConfig:
     """Driver of the ego instead of a trained policy: planner (docs/what_if.md), planner:CHECKPOINT, or another name of
     envs.drivers.ego; needs --env-id and --out."""
     env_id: str | None = None
-    """Environment of --policy; a training run has its own."""
+    """Environment of --policy; a training run has its own. Where a run's imports code ("module:Id"), name it here as
+    well, if you trust it: the run's config alone imports nothing."""
     drivers: tuple[str, ...] | None = None
     """Further drivers of the ego, each a line of the table: planner, planner:CHECKPOINT, one action in every step
     (slower, action-4), constant-actions for all of these, or another of envs.drivers.ego. None takes constant-actions
@@ -127,9 +129,11 @@ class EvaluateConfig:
             UserError: a value is out of range, or the device is not available.
         """
         check_at_least(self, 1, "episodes", "num_envs")
+        check_count(self.episodes, "episodes")
+        check_processes(min(self.num_envs, self.episodes), "num_envs")
         if (self.run_dir is None) == (self.policy is None):
             raise UserError("give either --run-dir (a training run) or --policy (a driver such as planner)")
-        if (self.policy is None) != (self.env_id is None):
+        if self.policy is not None and self.env_id is None:
             raise UserError("--policy and --env-id go together; a training run has its own environment")
         if self.policy is not None and self.out is None:
             raise UserError("--policy has no run folder; say with --out where the results go")
@@ -229,8 +233,10 @@ def checked_drivers(task: Task, names: Sequence[str]) -> tuple[str, ...]:
 
 def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str, str]]:
     """Evaluates the policy of a training run; returns what is noted beside the results, too."""
-    run = read_config(run_dir)
-    task = task_of(run, config.device)
+    run = read_config(run_dir, "observe", "algorithm")
+    task = task_of(run, config.device, config.env_id)
+    if config.env_id not in (None, task.env_id):
+        raise UserError(f"run {run_dir} was trained on {task.env_id}, got --env-id {config.env_id}; leave it out")
     task.check()
     drivers = compared_drivers(task, config.drivers)
     policy = run_dir / POLICY_FILE
@@ -252,7 +258,7 @@ def _film(config: EvaluateConfig, run_dir: Path, evaluation: Evaluation, out: Pa
 
     run, episodes = read_config(run_dir), next(iter(evaluation.results.values()))
     model = load_model(run_dir / POLICY_FILE, run["algorithm"])
-    films = film_extremes(task_of(run, config.device), model, episodes, out)
+    films = film_extremes(task_of(run, config.device, config.env_id), model, episodes, out)
     names = ", ".join(film["file"] for film in films.values())
     Console().print(f"films: {names or 'none, only highway-env and PettingZoo environments are drawn'}")
     return films

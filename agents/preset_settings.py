@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from agents.presets import PRESETS, Algorithm, Preset
-from agents.toml_values import converted
 from predictor.support.errors import UserError
 from predictor.support.files import write_text
+from predictor.support.reading import NoSuchFile, read_toml
+from predictor.support.typed_values import converted
 
 
 def settings_from_table(algorithm: Algorithm, table: Mapping[str, Any], where: str) -> dict[str, Any]:
@@ -42,11 +43,9 @@ def settings_from_file(algorithm: Algorithm, path: Path) -> dict[str, Any]:
         UserError: no such file, no TOML, or see `settings_from_table`.
     """
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
+        table = read_toml(path)
+    except NoSuchFile as error:
         raise UserError(f"no preset at {path}; give a TOML file with lines such as learning_rate = 3e-4") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} is not valid TOML: {error}") from error
     return settings_from_table(algorithm, table, str(path))
 
 
@@ -100,7 +99,7 @@ def _value(text: str, is_array: bool) -> Any:
         text = f"[{text}]"
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):  # no TOML, or an integer of thousands of digits
         return text
 
 

@@ -7,9 +7,10 @@ load only files you trust.
 
 import io
 import json
+import os
 import pickle
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +20,17 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.presets import Algorithm
 from envs.sb3.algorithms import algorithm_of_model
-from envs.sb3.policy_file import ForecasterPin, PolicyNote, algorithm_of, load_policy, write_note
+from envs.sb3.policy_file import FORECASTER, ForecasterPin, PolicyNote, algorithm_of, load_policy, write_note
 from predictor.support.errors import UserError
 from predictor.support.files import delete_leftovers, new_file, write_json
+from predictor.support.reading import NoSuchFile, read_json
+from predictor.support.typed_values import converted
 
 CONFIG_FILE = "config.json"
 CHECKPOINT_FILE = "checkpoint.zip"
 BEST_FILE = "best_model.zip"
 POLICY_FILE = "policy.zip"
 CURVE_FILE = "curve.json"
-FORECASTER = "forecaster"
-"""Key of a run's config under which the pin (name and hash) of its forecaster stands."""
 _BUFFER_ENTRY = "replay_buffer.pkl"
 
 
@@ -63,13 +64,55 @@ def open_run(
     write_json(file, {"config": config, "provenance": [*starts, provenance]})
 
 
-def read_config(run_dir: Path) -> dict[str, Any]:
+def read_config(run_dir: Path, *required: str) -> dict[str, Any]:
     """Reads the config of a run.
 
+    Args:
+        run_dir: path of the folder.
+        required: keys that the config must have.
+
     Raises:
-        UserError: the folder holds no run of a policy.
+        UserError: the folder holds no run of a policy, or one without a required key.
     """
-    return _read(run_dir / CONFIG_FILE)["config"]
+    config: dict[str, Any] = _read(run_dir / CONFIG_FILE)["config"]
+    for name in required:
+        if name not in config:
+            raise UserError(f"{run_dir / CONFIG_FILE}: key '{name}' is missing")
+    return config
+
+
+def read_curve(path: Path) -> list[dict[str, Any]]:
+    """Reads the measurements of a training, in the order of their steps; none if there is no such file.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    if not os.path.lexists(path):
+        return []
+    advice = f"{path} is damaged; remove it to go on without it"
+    try:
+        points = converted(read_json(path), tuple[dict[str, Any], ...], str(path))
+        for place, point in enumerate(points):
+            check_point(point, f"{path}: {place}")
+    except UserError as error:
+        raise UserError(f"{advice} ({error})") from error
+    return list(points)
+
+
+def check_point(point: Mapping[str, Any], where: str) -> None:
+    """Checks a measurement of a training's curve.
+
+    Raises:
+        UserError: it has no steps or no return, or one out of range.
+    """
+    for name, kind in (("steps", int), ("return", float)):
+        if name not in point:
+            raise UserError(f"{where}: key '{name}' is missing")
+        converted(point[name], kind, f"{where}: {name}")
+    for name, value in point.items():
+        converted(value, float | None, f"{where}: {name}")
+    if point["steps"] < 0:
+        raise UserError(f"{where}: steps must not be negative, got {point['steps']}")
 
 
 def save_model(
@@ -122,7 +165,7 @@ def check_forecaster(run_dir: Path, found: ForecasterPin | None) -> bool:
     Raises:
         UserError: the run was trained on another forecaster.
     """
-    if not (run_dir / CONFIG_FILE).exists():
+    if not os.path.lexists(run_dir / CONFIG_FILE):
         return True
     stored = _read(run_dir / CONFIG_FILE)["config"]
     if FORECASTER not in stored:
@@ -135,14 +178,18 @@ def check_forecaster(run_dir: Path, found: ForecasterPin | None) -> bool:
 
 def _read(file: Path) -> dict[str, Any]:
     try:
-        content = json.loads(file.read_text())
-    except FileNotFoundError as error:
+        content = read_json(file)
+    except NoSuchFile as error:
         raise UserError(f"{file.parent} holds no training run ({file.name} is missing)") from error
-    except (json.JSONDecodeError, UnicodeDecodeError, NotADirectoryError) as error:
+    except UserError as error:
         raise UserError(f"{file} is not a run's config: {error}") from error
     config = content.get("config") if isinstance(content, dict) else None
     if not isinstance(config, dict) or "env_id" not in config:  # a predictor's run has none
         raise UserError(f"{file} is not the config of a policy's run")
+    for name, kind in (("env_id", str), ("observe", str), ("algorithm", Algorithm)):
+        if name in config:
+            converted(config[name], kind, f"{file}: {name}")
+    converted(content.get("provenance", []), list, f"{file}: provenance")
     return content
 
 

@@ -25,6 +25,7 @@ from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, delete_leftovers, write_text
+from predictor.support.memory import check_processes
 from predictor.support.provenance import provenance
 
 CELLS = "cells"
@@ -52,6 +53,7 @@ class StudyConfig:
     def __post_init__(self) -> None:
         """Checks ranges."""
         check_at_least(self, 0, "workers")
+        check_processes(self.workers, "workers")
 
     @property
     def num_processes(self) -> int:

@@ -2,10 +2,10 @@
 
 import functools
 import importlib.util
-import json
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_type_hints
 
 import gymnasium as gym
 import numpy as np
@@ -29,9 +29,11 @@ from envs.wrappers import ForecastObservation
 from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint
 from predictor.forecaster import Forecaster
 from predictor.scene import SceneSpec
-from predictor.support.config_checks import check_at_least, check_choice, check_choices
-from predictor.support.errors import UserError
+from predictor.support.config_checks import check_at_least, check_at_most, check_choice, check_choices
+from predictor.support.errors import UserError, short
+from predictor.support.reading import as_object, parse_json
 from predictor.support.runtime import resolve_device
+from predictor.support.typed_values import converted
 
 EVALUATION_SEED = 2_000_000_000
 """First seed of the final evaluation; training seeds are below 1e9, those of model selection and tuning in between."""
@@ -41,6 +43,9 @@ SELECTION_SEED = 1_000_000_000
 
 TUNING_SEED = 1_500_000_000
 """First seed that measures hyperparameters (`agents.tune`); model selection takes those from 1e9 on."""
+
+MOST_FUTURES = 10_000
+"""Largest number of samples, and of forecast steps."""
 
 Observe = Literal[
     "forecast", "none", "constant-velocity", "zeros", "shuffled", "single", "no-edges", "modes", "what-if", "oracle",
@@ -96,6 +101,7 @@ class Task:
         if self.checkpoint is not None and self.observe in ("none", CONSTANT_VELOCITY):
             raise UserError(f"checkpoint '{self.checkpoint}' has no effect with observe={self.observe}; leave one out")
         check_at_least(self, 1, "num_samples", "horizon_steps")
+        check_at_most(self, MOST_FUTURES, "num_samples", "horizon_steps")
         if self.perception_m is not None and not self.perception_m > 0:
             raise UserError(f"perception_m must be positive, got {self.perception_m}")
         if self.perception_m is not None and self.observe == "none":
@@ -124,11 +130,11 @@ class Task:
             UserError: `env_kwargs` is no JSON object.
         """
         try:
-            kwargs = json.loads(self.env_kwargs or "{}")
-        except json.JSONDecodeError as error:
-            raise UserError(f"env_kwargs must be a JSON object, got {self.env_kwargs!r}: {error}") from error
-        if not isinstance(kwargs, dict):
-            raise UserError(f"env_kwargs must be a JSON object, got {self.env_kwargs!r}")
+            kwargs = as_object(parse_json(self.env_kwargs or "{}", "env_kwargs"), "env_kwargs")
+        except UserError as error:
+            raise UserError(f"env_kwargs must be a JSON object, got {short(repr(self.env_kwargs))}: {error}") from error
+        if "env_id" in kwargs or "id" in kwargs:
+            raise UserError("env_kwargs are arguments of the environment and cannot hold its env_id; leave it out")
         return kwargs
 
     @property
@@ -237,29 +243,55 @@ class Task:
         return space
 
 
-def task_of(run: Mapping[str, Any], device: str = "cpu") -> Task:
+_OF_RUN = ("env_id", "observe", "checkpoint", "learners", "num_samples", "horizon_steps", "perception_m", "what_if",
+           "env_kwargs")  # fmt: skip
+"""Fields of a run's config that have the name of a task's; the driver's is "partner"."""
+_OWN_PACKAGES = ("highway_env.", "envs.")
+"""Packages that the arguments of a run's environment may name: those that it imports anyway."""
+
+
+def task_of(run: Mapping[str, Any], device: str = "cpu", trusted: str | None = None) -> Task:
     """Returns the task of a training run.
 
     Args:
         run: the run's config (`agents.runs.read_config`).
         device: device that runs the forecaster.
+        trusted: id of an environment that may be imported ("module:Id"); a run's config alone imports nothing.
 
     Raises:
-        UserError: the config does not fit this version, or names what is missing.
+        UserError: the config does not fit this version, names what is missing, or would import code.
     """
-    return Task(
-        run["env_id"],
-        run["observe"],
-        run["checkpoint"],
-        device,
-        learners=tuple(run.get("learners", ())),
-        driver=run.get("partner", "heuristic"),
-        num_samples=run.get("num_samples", 1),
-        horizon_steps=run.get("horizon_steps"),
-        perception_m=run.get("perception_m"),
-        what_if=run.get("what_if", False),
-        env_kwargs=run.get("env_kwargs", ""),
-    )
+    hints, where = get_type_hints(Task), "the run's config"
+    for name in ("env_id", "observe", "checkpoint"):
+        if name not in run:
+            raise UserError(f"{where}: key '{name}' is missing")
+    values = {name: converted(run[name], hints[name], f"{where}: {name}") for name in _OF_RUN if name in run}
+    values["driver"] = converted(run.get("partner", "heuristic"), str, f"{where}: partner")
+    if ":" in values["env_id"] and values["env_id"] != trusted:
+        raise UserError(
+            f"the run's environment '{short(values['env_id'], 80)}' imports code; if you trust it, name it yourself "
+            f"with --env-id {short(values['env_id'], 80)}"
+        )
+    task = Task(device=device, **values)
+    for text in _texts_of(task.make_kwargs):
+        if re.fullmatch(r"\w+([.:]\w+)+", text) and not text.startswith(_OWN_PACKAGES):
+            raise UserError(
+                f"env_kwargs of the run name '{short(text, 80)}', which the environment could import; "
+                "play such a run from Python, with agents.task.Task, if you trust it"
+            )
+    return task
+
+
+def _texts_of(content: Any) -> Iterator[str]:
+    """Yields all texts in content of JSON."""
+    if isinstance(content, str):
+        yield content
+    elif isinstance(content, dict):
+        for value in content.values():
+            yield from _texts_of(value)
+    elif isinstance(content, list):
+        for value in content:
+            yield from _texts_of(value)
 
 
 @functools.lru_cache(maxsize=8)

@@ -4,7 +4,6 @@
 Those seeds are disjoint from training and from the final evaluation, so selection does not bias the final numbers.
 """
 
-import json
 import time
 import zipfile
 from collections import Counter
@@ -27,7 +26,7 @@ from agents.forecast_errors import ForecastErrors
 from agents.plan_scores import plan_actions
 from agents.preset_settings import changed
 from agents.presets import Algorithm, Preset, preset_for
-from agents.runs import BEST_FILE, CHECKPOINT_FILE, CURVE_FILE, POLICY_FILE, load_model, save_model
+from agents.runs import BEST_FILE, CHECKPOINT_FILE, CURVE_FILE, POLICY_FILE, load_model, read_curve, save_model
 from agents.step_count import STEP_UNIT, CountSteps, StepProgress, check_step_unit
 from agents.task import SELECTION_SEED, Task
 from agents.vec_envs import EpisodeResult, make_venv
@@ -363,18 +362,6 @@ def driving_scalars(results: Sequence[EpisodeResult]) -> dict[str, float]:
         scalars["speed_mps"] = float(np.mean(speeds_mps))
     actions = sum((Counter(r.action_counts) for r in results), Counter())
     return scalars | {f"share_{name}": count / actions.total() for name, count in sorted(actions.items())}
-
-
-def read_curve(path: Path) -> list[dict[str, Any]]:
-    """Reads the measurements of a training, in the order of their steps; none if there is no such file.
-
-    Raises:
-        UserError: the file is damaged.
-    """
-    try:
-        return json.loads(path.read_text()) if path.exists() else []
-    except ValueError as error:
-        raise UserError(f"{path} is damaged; remove it to go on without it") from error
 
 
 def significantly_worse(returns: Sequence[float], best: Sequence[float]) -> bool:

@@ -31,7 +31,9 @@ from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, delete_leftovers, write_json
+from predictor.support.memory import ENV_BYTES, PROCESS_BYTES, check_count
 from predictor.support.provenance import provenance
+from predictor.support.reading import as_object, read_object
 from predictor.support.runtime import keep_freed_memory
 
 if TYPE_CHECKING:
@@ -92,6 +94,9 @@ class TuneConfig:
             raise UserError(f"seed must lie in [0, {MAX_SEED}), got {self.seed}")
         if self.trainings > MAX_TRAININGS:
             raise UserError(f"trainings must be at most {MAX_TRAININGS}, got {self.trainings}")
+        for name in ("episodes", "selection_episodes"):
+            check_count(getattr(self, name), name)
+        check_count(self.num_envs, "num_envs", PROCESS_BYTES if self.num_envs > 1 else ENV_BYTES)
         self.plan({}, 0)
 
     @property
@@ -252,8 +257,8 @@ def _check_folder(folder: Path, config: TuneConfig) -> None:
             raise UserError(f"{folder} holds {found[0]} but no tuning ({CONFIG_FILE}); choose another --out")
         return
     try:
-        before = dict(json.loads(file.read_text())["config"])
-    except (ValueError, KeyError, TypeError) as error:
+        before = as_object(read_object(file)["config"], f"{file}: config")
+    except (UserError, KeyError) as error:
         raise UserError(f"{file} is damaged; remove {folder} or choose another --out") from error
     for name, now in _settings_of_tuning(config).items():
         if before.get(name) != now:
@@ -266,7 +271,7 @@ def _check_folder(folder: Path, config: TuneConfig) -> None:
 def _note(folder: Path, config: TuneConfig) -> None:
     """Writes the settings of the tuning, and a line on each of its starts."""
     file = folder / CONFIG_FILE
-    starts = json.loads(file.read_text())["provenance"] if file.exists() else []
+    starts = read_object(file).get("provenance", []) if file.exists() else []
     made = provenance((*PACKAGES, "optuna"))
     write_json(file, {"config": _settings_of_tuning(config), "provenance": [*starts, made]})
 

@@ -26,6 +26,7 @@ from predictor.data.store import Episode, StoreInfo
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_positive
 from predictor.support.errors import UserError, run_entry_point
+from predictor.support.memory import check_count, check_processes
 from predictor.support.provenance import provenance
 
 PACKAGES = ("highway-env", "mpe2", "pettingzoo", "envpool", "gymnasium", "numpy")
@@ -87,6 +88,8 @@ class CollectConfig:
         """
         check_at_least(self, 1, "episodes", "max_steps", "causal_senders", "workers", "branch_history_steps")
         check_at_least(self, 0, "seed", "causal_labels", "branches")
+        check_count(self.episodes, "episodes")
+        check_processes(min(self.workers, self.episodes), "workers")
         check_positive(self, "causal_horizon_s", "causal_threshold_m")
         if not 0 <= self.perturb <= 1:
             raise UserError(f"perturb must lie between 0 and 1, got {self.perturb:g}")
@@ -127,7 +130,8 @@ def recorded(config: CollectConfig, first: int = 0) -> Iterator[list[Episode]]:
     if config.workers == 1:
         yield from map(_record, tasks)
         return
-    with multiprocessing.get_context("spawn").Pool(config.workers, initializer=_limit_threads) as pool:
+    workers = max(1, min(config.workers, len(tasks)))
+    with multiprocessing.get_context("spawn").Pool(workers, initializer=_limit_threads) as pool:
         yield from pool.imap(_record, tasks, chunksize=1 if config.causal_labels or config.branches else 4)
 
 

@@ -42,6 +42,7 @@ from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_positive
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import finite, write_json, write_text
+from predictor.support.memory import check_count, check_processes
 from predictor.support.provenance import provenance
 from predictor.support.runtime import keep_freed_memory
 
@@ -116,6 +117,10 @@ class EvaluateConfig:
         check_at_least(self, 1, "episodes", "num_samples", "max_steps", "workers", "horizon_steps", "memory_steps")
         check_at_least(self, 1, "perturbations", "most_episodes")
         check_at_least(self, 0, "seed")
+        for name in ("episodes", "num_samples"):
+            check_count(getattr(self, name), name)
+        check_count(self.num_samples * (self.horizon_steps or 1), "horizon_steps times num_samples")
+        check_processes(min(self.workers, self.episodes), "workers")
         check_positive(self, "miss_m")
         names = [name_of_folder(checkpoint) for checkpoint in self.checkpoint]
         if len(set(names)) < len(names):

@@ -4,7 +4,6 @@ The card is made from files only (config, stores, measured accuracy). The measur
 beside the weights, from which `docs/write_tables.py` writes the tables of README.md and docs/in_env.md.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from predictor.reports.tables import MODEL_NAMES
 from predictor.support.command_line import parse
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_text
+from predictor.support.reading import read_object
 
 SPREAD = {
     True: "Where a driver's route is free, the single forecast lies between the routes, and the modes follow them.",
@@ -48,10 +48,10 @@ def write_card(config: CardConfig) -> Path:
     model, info = load_checkpoint(config.checkpoint)
     folder, name = resolve(config.checkpoint), name_of_folder(config.checkpoint)
     try:
-        accuracy = json.loads(config.accuracy.read_text())
+        accuracy = read_object(config.accuracy)
         found, first_seed = measurements_of(accuracy, name), int(accuracy["config"]["seed"])
         found = found or measurements_of(accuracy, folder.name)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
         raise UserError(f"{config.accuracy} is not an accuracy.json of envs.evaluate ({error})") from error
     if not found:
         raise UserError(f"{config.accuracy} has no result of checkpoint '{name}'; run envs.evaluate on it")

@@ -3,24 +3,26 @@
 A checkpoint holds everything needed to run it (spec, sizes, horizon, residual spread) and how it was made.
 """
 
-import dataclasses
-import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import safetensors
 import torch
-from safetensors.torch import load_file, save
+from safetensors.torch import save
 from torch import nn
 
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.forecaster import TrainableForecaster
-from predictor.models import build, config_from_json, name_of
+from predictor.models import KINDS, build, config_from_json, name_of, shapes_of
 from predictor.scene import SceneSpec
-from predictor.support.errors import UserError
+from predictor.support.config_checks import check_at_least, check_at_most, check_scale_values
+from predictor.support.errors import UserError, short
 from predictor.support.files import new_folder, write_json
+from predictor.support.reading import MIB, NoSuchFile, check_regular, read_json, version_of
 from predictor.support.runtime import resolve_device
+from predictor.support.typed_values import converted, from_table
 
 FORMAT = "dgvae-rl predictor"
 VERSION = 1
@@ -28,6 +30,10 @@ CONSTANT_VELOCITY = "constant-velocity"
 WEIGHTS = "model.safetensors"
 BEST_OF_RUN = "checkpoint"
 """Folder of the best checkpoint, in the run folder that `python -m predictor.train` writes."""
+MOST_CONFIG_BYTES, MOST_WEIGHT_BYTES = 4 * MIB, 4096 * MIB
+"""Largest sizes of the two files."""
+MOST_STEPS = 100_000
+"""Largest horizon."""
 PRETRAINED = Path(__file__).resolve().parent / "pretrained"
 
 
@@ -49,6 +55,18 @@ class CheckpointInfo:
     """Command, commit, versions, seeds, validation results."""
     model: str = "dgvae"
     """Name of the network in `predictor.models`."""
+
+    def __post_init__(self) -> None:
+        """Checks ranges.
+
+        Raises:
+            UserError: a value is out of range.
+        """
+        check_at_least(self, 1, "horizon_steps")
+        check_at_most(self, MOST_STEPS, "horizon_steps")
+        check_scale_values(self, "std_m")
+        if self.std_m and len(self.std_m) != self.horizon_steps:
+            raise UserError(f"std_m needs a number for each of {self.horizon_steps} steps, got {len(self.std_m)}")
 
 
 def save_checkpoint(path: Path, model: nn.Module, info: CheckpointInfo) -> None:
@@ -101,51 +119,64 @@ def load_checkpoint(name: str | Path, device: str = "cpu") -> tuple[Any, Checkpo
         raise UserError(f"'{name}' has no weights; pass a checkpoint")
     path = resolve(name)
     info = read_info(path)
+    tensors = read_weights(path / WEIGHTS, shapes_of(info.model, info.spec, info.config, info.horizon_steps))
     model = build(info.model, info.spec, info.config, info.horizon_steps)
-    try:
-        tensors = load_file(path / WEIGHTS)
-    except (safetensors.SafetensorError, OSError) as error:
-        raise UserError(f"{path / WEIGHTS} cannot be read ({error}); copy or train it again") from error
-    expected = {k: tuple(v.shape) for k, v in model.state_dict().items()}
-    found = {k: tuple(v.shape) for k, v in tensors.items()}
-    if expected != found:
-        name_ = next(k for k in sorted(expected.keys() | found.keys()) if expected.get(k) != found.get(k))
-        raise UserError(
-            f"{path}: tensor '{name_}' should be {expected.get(name_, 'absent')} by config.json but is "
-            f"{found.get(name_, 'absent')} in model.safetensors; the two files do not belong together"
-        )
-    if not all(bool(torch.isfinite(t).all()) for t in tensors.values()):
-        raise UserError(f"{path}: the weights are not finite; train it again")
     model.load_state_dict(tensors)
     return model.to(resolve_device(device)).eval(), info
 
 
+def read_weights(file: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, torch.Tensor]:
+    """Reads the weights of a network, after names, types and shapes of all of them have been compared with its own.
+
+    Raises:
+        UserError: the file cannot be read, holds other weights, or some that are not finite.
+    """
+    check_regular(file, MOST_WEIGHT_BYTES)
+    try:
+        with safetensors.safe_open(file, "pt") as stored:
+            slices = {key: stored.get_slice(key) for key in stored.keys()}  # noqa: SIM118 (no mapping)
+            found = {key: tuple(part.get_shape()) for key, part in slices.items()}
+            if found != shapes:
+                key = next(k for k in sorted(shapes.keys() | found.keys()) if shapes.get(k) != found.get(k))
+                raise UserError(
+                    f"{file}: tensor '{short(key)}' should be {shapes.get(key, 'absent')} by config.json but is "
+                    f"{found.get(key, 'absent')} in {file.name}; the two files do not belong together"
+                )
+            for key, part in slices.items():
+                if part.get_dtype() != "F32":
+                    raise UserError(f"{file}: tensor '{key}' must be float32 (F32), got {part.get_dtype()}")
+            tensors = {key: stored.get_tensor(key) for key in found}
+    except (safetensors.SafetensorError, OSError) as error:
+        raise UserError(f"{file} is no safetensors file ({error}); copy or train it again") from error
+    for key, tensor in tensors.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise UserError(f"{file}: tensor '{key}' is not finite; train it again")
+    return tensors
+
+
 def read_info(path: Path) -> CheckpointInfo:
-    """Reads and checks `config.json`."""
+    """Reads and checks `config.json`.
+
+    Raises:
+        UserError: it cannot be read, or does not describe a predictor; the message names the key.
+    """
     file = Path(path) / "config.json"
     try:
-        content = json.loads(file.read_text())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise UserError(f"{file} cannot be read ({error}); is {path} a predictor checkpoint?") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        content = read_json(file, MOST_CONFIG_BYTES)
+    except NoSuchFile as error:
+        raise UserError(f"{path} is not a predictor checkpoint (it has no {file.name})") from error
+    if not isinstance(content, dict) or content.pop("format", None) != FORMAT:
         raise UserError(f"{path} is not a predictor checkpoint (config.json has no format '{FORMAT}')")
-    if content.get("version") != VERSION:
-        raise UserError(f"{path} has checkpoint version {content.get('version')}, this release reads {VERSION}")
-    try:
-        if int(content["horizon_steps"]) < 1:
-            raise ValueError(f"horizon_steps must be at least 1, got {content['horizon_steps']}")
-        model = str(content.get("model", "dgvae"))  # before version 0.2 there was one model only
-        return CheckpointInfo(
-            spec=_build(SceneSpec, content["spec"]),
-            config=config_from_json(model, content["config"]),
-            horizon_steps=int(content["horizon_steps"]),
-            std_m=tuple(content["std_m"]),
-            sources=tuple(content["sources"]),
-            provenance=dict(content["provenance"]),
-            model=model,
-        )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise UserError(f"{file} does not describe a predictor: {error}") from error
+    version_of(content, VERSION, f"checkpoint {path}")
+    content.pop("version")
+    for key in ("std_m", "sources", "provenance"):
+        if key not in content:
+            raise UserError(f"{file}: key '{key}' is missing")
+    model = converted(content.get("model", "dgvae"), str, f"{file}: model")  # once there was one model only
+    if model not in KINDS:
+        raise UserError(f"{file}: model: no model '{short(model, 80)}'; there are {', '.join(KINDS)}")
+    config = config_from_json(model, content.pop("config", None), f"{file}: config")
+    return from_table(CheckpointInfo, content, str(file), {"config": config})
 
 
 def load_forecaster(
@@ -162,11 +193,3 @@ def load_forecaster(
     model, info = load_checkpoint(name, device)
     info.spec.check_compatible(scene_spec, f"checkpoint '{name}'", source)
     return model
-
-
-def _build(cls: type, values: dict[str, Any]) -> Any:
-    fields = {f.name for f in dataclasses.fields(cls)}
-    unknown = set(values) - fields
-    if unknown:
-        raise ValueError(f"unknown field '{sorted(unknown)[0]}' of {cls.__name__}")
-    return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})

@@ -32,6 +32,7 @@ from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, write_json, write_text
+from predictor.support.memory import check_count
 from predictor.support.provenance import provenance
 from predictor.support.runtime import resolve_device, tune
 
@@ -67,6 +68,8 @@ class EvaluateConfig:
         """
         check_at_least(self, 1, "num_samples", "history_steps", "horizon_steps", "max_windows")
         check_at_least(self, 0, "seed")
+        check_count(self.num_samples, "num_samples")
+        check_count(self.num_samples * (self.horizon_steps or 1), "horizon_steps times num_samples", 8)
         object.__setattr__(self, "device", resolve_device(self.device))
 
 

@@ -5,11 +5,13 @@ Checkpoints, training and the suite of tables build models here; a new model is 
 
 import dataclasses
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+import torch
 from torch import nn
+from torch.overrides import TorchFunctionMode
 
 from predictor.baselines.dnri import DNRI, DNRIConfig
 from predictor.baselines.imma import IMMA, IMMAConfig
@@ -18,7 +20,26 @@ from predictor.baselines.mlp import MLP, MLPConfig
 from predictor.dgvae import DGVAE
 from predictor.dgvae.config import PRESETS, DGVAEConfig
 from predictor.scene import SceneSpec
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, short
+from predictor.support.typed_values import from_table
+
+_ENTRYWISE = ("add", "sub", "mul", "div")
+
+
+class _Unfilled(TorchFunctionMode):
+    """Leaves out draws, products and what works in place: on the meta device, where nothing has a value.
+
+    torch would load its compiler for them, which takes seconds. The shapes stay as they are.
+    """
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Runs a function of torch, or returns its first argument where it would only change entries."""
+        name = getattr(func, "__name__", "")
+        if func is torch.randn:
+            func = torch.empty
+        in_place = name.endswith("_") and not name.endswith("__") and name != "requires_grad_"
+        return args[0] if args and (in_place or name in _ENTRYWISE) else func(*args, **(kwargs or {}))
+
 
 ModelName = Literal["dgvae", "dnri", "imma", "lstm", "mlp"]
 
@@ -60,18 +81,25 @@ def build(name: str, spec: SceneSpec, config: Any, horizon_steps: int) -> nn.Mod
     return network
 
 
-def config_from_json(name: str, values: Mapping[str, Any]) -> Any:
+def config_from_json(name: str, values: Any, where: str = "config") -> Any:
     """Returns the config of a checkpoint.
 
+    Args:
+        name: name of the model.
+        values: content of JSON.
+        where: file and key, for messages.
+
     Raises:
-        UserError: no model of this name, or a value out of range.
-        ValueError: an unknown field.
+        UserError: no model of this name, an unknown field, or a value of another type or out of range.
     """
-    cls = _kind(name).config
-    unknown = set(values) - {f.name for f in dataclasses.fields(cls)}
-    if unknown:
-        raise ValueError(f"unknown field '{sorted(unknown)[0]}' of {cls.__name__}")
-    return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    return from_table(_kind(name).config, values, where)
+
+
+def shapes_of(name: str, spec: SceneSpec, config: Any, horizon_steps: int) -> dict[str, tuple[int, ...]]:
+    """Returns the shapes of a network's weights by name, without memory for any of them."""
+    with torch.device("meta"), _Unfilled():
+        network = build(name, spec, config, horizon_steps)
+    return {key: tuple(tensor.shape) for key, tensor in network.state_dict().items()}
 
 
 def configure(name: str, preset: str, overrides: Sequence[str] = (), **fitted: Any) -> Any:
@@ -131,5 +159,5 @@ def _described(kind: Any) -> str:
 
 def _kind(name: str) -> _Kind:
     if name not in KINDS:
-        raise UserError(f"no model '{name}'; there are {', '.join(KINDS)}")
+        raise UserError(f"no model '{short(name, 80)}'; there are {', '.join(KINDS)}")
     return KINDS[name]

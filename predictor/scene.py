@@ -19,6 +19,10 @@ from predictor.support.errors import UserError
 KINEMATIC_FEATURES = ("x_m", "y_m", "vx_mps", "vy_mps")
 KINEMATIC_FEATURES_3D = ("x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps")
 PADDING_ID = -1
+MOST_AGENTS = 65_536
+"""Largest number of agents of a scene."""
+MOST_FEATURES = 1_024
+"""Largest number of features of an agent."""
 
 AxisFrame = Literal["ego", "world", "centroid"]
 
@@ -73,6 +77,11 @@ class SceneSpec:
         if self.max_agents < 1 or not self.perception_m > 0:
             raise UserError(
                 f"max_agents must be at least 1 and perception_m positive, got {self.max_agents}, {self.perception_m}"
+            )
+        if self.max_agents > MOST_AGENTS or self.num_features > MOST_FEATURES:
+            raise UserError(
+                f"max_agents must be at most {MOST_AGENTS:,} and the number of features at most {MOST_FEATURES:,}, "
+                f"got {self.max_agents} and {self.num_features}"
             )
         if "ego" in self.frame and not self.has_ego:
             raise UserError("an 'ego' frame needs has_ego=True; use 'world' or 'centroid'")

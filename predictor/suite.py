@@ -33,7 +33,9 @@ from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_json, write_text
+from predictor.support.memory import check_count, check_processes
 from predictor.support.provenance import provenance
+from predictor.support.reading import read_object
 from predictor.support.runtime import resolve_device, tune
 from predictor.train import train
 from predictor.training.config import TrainConfig, TrainPrecision, check_precision
@@ -92,6 +94,8 @@ class SuiteConfig:
         check_choices(self)
         check_at_least(self, 0, "steps", "workers", "seed")
         check_at_least(self, 1, "seeds")
+        check_count(self.seeds, "seeds")
+        check_processes(self.workers, "workers")
         keys = [line.key for line in TABLES[self.table].lines]
         for key in (*self.lines, *filter(None, [self.only_line])):
             if key not in keys:
@@ -269,7 +273,7 @@ def run_suite(config: SuiteConfig) -> dict[str, Any]:
     results: dict[str, list[dict[str, Any]]] = {}
     for job in jobs:
         if job.result.exists():
-            results.setdefault(job.line.key, []).append(json.loads(job.result.read_text()))
+            results.setdefault(job.line.key, []).append(read_object(job.result))
     lines = [joined(found) for found in results.values()]
     content = {
         "table": config.table,

@@ -4,7 +4,7 @@ The best checkpoint is chosen by the energy score of free-running samples on hel
 a spread like the truth's, whereas one-step errors reward neither.
 """
 
-import json
+import os
 import shlex
 import time
 from dataclasses import asdict, fields
@@ -17,9 +17,10 @@ from torch.utils.tensorboard import SummaryWriter
 
 from predictor.checkpoint import BEST_OF_RUN, CheckpointInfo, save_checkpoint
 from predictor.support.command_line import parse
-from predictor.support.errors import UserError, run_entry_point
+from predictor.support.errors import UserError, run_entry_point, short
 from predictor.support.files import check_out, delete_leftovers, write_json
 from predictor.support.provenance import provenance
+from predictor.support.reading import as_object, read_object
 from predictor.support.runtime import tune
 from predictor.training.config import BEFORE_THEY_EXISTED, TrainConfig
 from predictor.training.trainer import LOG_EVERY, Trainer, load_data
@@ -133,19 +134,21 @@ def _comparable(config: TrainConfig) -> dict[str, Any]:
 
 def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
     check_out(config.out)
-    if not config_file.exists():
+    if not os.path.lexists(config_file):
         if config.out.exists() and any(not p.name.startswith(".") for p in config.out.iterdir()):
             raise UserError(f"{config.out} is not empty and not a training run; choose another --out")
         return
     if not config.resume:
         raise UserError(f"{config.out} holds a run already; pass --resume to continue it or choose another --out")
-    try:
-        before, now = json.loads(config_file.read_text())["config"], _comparable(config)
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{config_file} cannot be read ({error}); train anew into another --out") from error
+    before = as_object(read_object(config_file).get("config"), f"{config_file}: config")
+    now = _comparable(config)
     # of fields that did not exist when the run began
     defaults = {f.name: f.default for f in fields(TrainConfig)} | BEFORE_THEY_EXISTED
     old = {name: before.get(name, defaults[name]) for name in now}
+    for name, value in old.items():
+        if not isinstance(value, float | int if isinstance(now[name], float) else type(now[name])):
+            kind = type(now[name]).__name__
+            raise UserError(f"{config_file}: config.{name} must be of type {kind}, got {short(repr(value), 80)}")
     changed = [name for name in now if old[name] != now[name] and name not in ("steps", *config.without_effect)]
     if changed:
         differences = ", ".join(f"{name} was {old[name]} and is now {now[name]}" for name in changed)

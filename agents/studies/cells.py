@@ -23,11 +23,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.arena import open_arena
 from agents.presets import Algorithm, Preset
-from agents.runs import CURVE_FILE, FORECASTER, load_model, open_run
+from agents.runs import CURVE_FILE, FORECASTER, load_model, open_run, read_curve
 from agents.studies.plan import Scenario, Study, StudyArm, task_for
 from agents.studies.results import RESULT_FILE, Result, write_result
 from agents.task import EVALUATION_SEED, Task
-from agents.training import TrainingPlan, read_curve, train
+from agents.training import TrainingPlan, train
 from envs.drivers.all_agents import make_driver
 from envs.drivers.ego import make_ego_driver, named_drivers
 from envs.drivers.planner import ORACLE, PLANNER, is_planner

@@ -4,7 +4,6 @@
 """
 
 import json
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -13,15 +12,21 @@ from typing import Any, get_args, get_type_hints
 from agents.preset_settings import settings_from_table
 from agents.presets import Algorithm
 from agents.task import SELECTION_SEED, Observe, Task
-from agents.toml_values import converted, from_table
 from envs.drivers.ego import CONSTANT_ACTIONS
 from envs.drivers.planner import PLANNER, PLANNER_ORACLE
 from envs.sb3.algorithms import algorithm_named
-from predictor.support.config_checks import check_at_least, check_choices
+from predictor.support.config_checks import check_at_least, check_at_most, check_choices
 from predictor.support.errors import UserError
+from predictor.support.memory import ENV_BYTES, check_memory
+from predictor.support.reading import MIB, read_toml
+from predictor.support.typed_values import converted, from_table
 
 SHIPPED = Path(__file__).resolve().parent
 """Folder of the studies that ship."""
+MOST_SEEDS = 10_000
+"""Largest number of training seeds."""
+MOST_BYTES = MIB
+"""Largest size of a study file."""
 REFERENCES = (PLANNER, CONSTANT_ACTIONS, "random", "idle")
 RIVALS = ("zeros", "constant-velocity")
 FLOOR, CEILING = "zeros", "oracle"
@@ -63,6 +68,7 @@ class Scenario:
     def __post_init__(self) -> None:
         """Checks ranges."""
         check_at_least(self, 1, "steps", "num_envs")
+        check_memory(self.num_envs * ENV_BYTES, f"num_envs={self.num_envs:,}", "take fewer")
 
 
 @dataclass(frozen=True)
@@ -113,6 +119,7 @@ class Study:
         check_at_least(self, 1, "steps", "num_envs", "episodes", "selections", "selection_episodes", "checkpoint_every")
         if isinstance(self.seeds, int):
             check_at_least(self, 1, "seeds")
+            check_at_most(self, MOST_SEEDS, "seeds")
         elif not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise UserError(f"seeds must be a number or different numbers, got {list(self.seeds)}")
         for seed in self.training_seeds:
@@ -188,11 +195,7 @@ def read_study(path: Path) -> Study:
     Raises:
         UserError: the file is no TOML, or a key or value of it does not fit; the message names file and key.
     """
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path.name} is not valid TOML: {error}") from error
-    content = dict(content)
+    content = read_toml(path, MOST_BYTES)
     where = path.name
     arms = _arms(content.pop("arms", None), where)
     tables = converted(content.pop("scenarios", None) or {}, dict, f"{where}: scenarios")

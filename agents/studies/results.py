@@ -4,15 +4,19 @@ import hashlib
 import importlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from predictor.support.errors import UserError
 from predictor.support.files import finite, new_file, write_json
+from predictor.support.reading import MIB, read_object
+from predictor.support.typed_values import from_table
 
 RESULT_FILE = "result.json"
 EPISODES_FILE, CURVES_FILE = "episodes.parquet", "curves.parquet"
+MOST_BYTES = 1024 * MIB
+"""Largest size of a result."""
 _DIGEST = "sha256"
 _RENAMED = {"seed": "episode_seed", "episode_return": "return"}
 """Field of an episode → its column, where the name alone would be misread."""
@@ -57,19 +61,15 @@ def read_result(path: Path) -> Result:
         UserError: the file is damaged; the message says what to do.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        digest = content.pop(_DIGEST)
-        if digest != _digest(content):
-            raise ValueError("its content does not have the hash that it was written with")
-        values = {field.name: content[field.name] for field in fields(Result)}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        reason = str(error) if isinstance(error, ValueError) else "fields are missing"
+        content = read_object(path, MOST_BYTES)
+        if content.pop(_DIGEST, None) != _digest(content):
+            raise UserError(f"its content does not have the hash ({_DIGEST}) that it was written with")
+        return from_table(Result, content, "its content")
+    except UserError as error:
         raise UserError(
-            f"{path} is damaged ({reason}); delete this file and run the same command again: all other cells are kept, "
+            f"{path} is damaged ({error}); delete this file and run the same command again: all other cells are kept, "
             "and this one is measured anew"
         ) from error
-    values["episodes"], values["curve"] = tuple(values["episodes"]), tuple(values["curve"])
-    return Result(**values)
 
 
 def require_tables() -> None:

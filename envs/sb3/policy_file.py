@@ -9,7 +9,9 @@ whose source you trust.
 import hashlib
 import json
 import math
+import os
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -19,15 +21,22 @@ import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from envs.arms import Arm, EntryLayout
+from envs.arms import ARMS, Arm, EntryLayout
 from envs.sb3.algorithms import Algorithm, algorithm_class, algorithm_named, algorithm_of_parameters
 from predictor.checkpoint import CONSTANT_VELOCITY, WEIGHTS, resolve
-from predictor.scene import SceneSpec
+from predictor.scene import MOST_AGENTS, SceneSpec
+from predictor.support.config_checks import check_at_least, check_at_most, check_choice, check_positive
 from predictor.support.errors import UserError
+from predictor.support.reading import MIB, MOST_JSON_BYTES, as_object, check_regular, parse_json
+from predictor.support.typed_values import from_table
 
 NOTE_ENTRY = "note.json"
 _POLICY_KEY = "policy"
 _ALGORITHM_KEY = "algorithm"
+FORECASTER = "forecaster"
+"""Key of the forecaster's pin, in a policy's note and in a run's config."""
+MOST_BYTES = 65_536 * MIB
+"""Largest size of a policy's zip, which may hold a replay buffer."""
 
 
 @dataclass(frozen=True)
@@ -53,16 +62,31 @@ class ForecasterPin:
     layout: EntryLayout | None = None
     """Sizes of the entries; None for the forecaster's own."""
 
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> "ForecasterPin":
-        """Returns the pin that `asdict` and JSON made; fields that older versions lacked get their defaults.
+    def __post_init__(self) -> None:
+        """Checks ranges.
 
         Raises:
-            TypeError: a field is missing or of another type.
+            UserError: a value is out of range.
         """
-        known = {field.name: content[field.name] for field in fields(cls) if field.name in content}
-        layout = known.get("layout")
-        return cls(**known | {"layout": None if layout is None else EntryLayout(**layout)})
+        check_at_least(self, 1, "horizon_steps", "num_samples", "max_agents")
+        check_at_least(self, 0, "num_plans")
+        check_at_most(self, MOST_AGENTS, "horizon_steps", "num_samples", "max_agents", "num_plans")
+        check_positive(self, "perception_m")
+        check_choice("arm", self.arm, tuple(ARMS))
+
+    @classmethod
+    def from_json(cls, content: Any, where: str = FORECASTER) -> "ForecasterPin":
+        """Returns the pin that `asdict` and JSON made; fields that older versions lacked get their defaults.
+
+        Args:
+            content: content of JSON.
+            where: file and key, for messages.
+
+        Raises:
+            UserError: a field is missing, of another type or out of range.
+        """
+        given = as_object(content, where)
+        return from_table(cls, {f.name: given[f.name] for f in fields(cls) if f.name in given}, where)
 
     def check(self, found: "ForecasterPin", policy: str) -> None:
         """Raises a `UserError` if `found` is another forecaster or has other options; its folder does not matter."""
@@ -159,20 +183,38 @@ def read_policy_note(path: Path) -> PolicyNote | None:
         return None  # `load_policy` has the message for it
     if content is None:
         return None
-    try:
-        pin = content["forecaster"]
-        forecaster = None if pin is None else ForecasterPin.from_json(pin)
-        place = {name: str(content[name]) for name in ("env_id", "env_kwargs") if name in content}
-        return PolicyNote(forecaster, tuple(content["learners"]), str(content["driver"]), **place)
-    except (KeyError, TypeError) as error:
-        raise UserError(f"the note inside {path} cannot be understood ({error!r}); save the policy again") from error
+    where = f"{path}: note"
+    content = as_object(content, where)
+    for key in (FORECASTER, "learners", "driver"):
+        if key not in content:
+            raise UserError(f"{where}: key '{key}' is missing; save the policy again")
+    pin = content[FORECASTER]
+    others = {key: value for key, value in content.items() if key not in (FORECASTER, _ALGORITHM_KEY)}
+    forecaster = None if pin is None else ForecasterPin.from_json(pin, f"{where}: {FORECASTER}")
+    return from_table(PolicyNote, others, where, {"forecaster": forecaster})
 
 
 def _note(path: Path) -> dict[str, Any]:
-    if not path.exists():
-        return {}
+    return as_object(_entry(path, NOTE_ENTRY, {}), f"{path}: {NOTE_ENTRY} (its note)") if os.path.lexists(path) else {}
+
+
+def _entry(path: Path, name: str, default: Any = None) -> Any:
+    """Returns an entry of JSON of a policy's zip.
+
+    Raises:
+        UserError: the file cannot be read, or the entry is too large or no JSON.
+        zipfile.BadZipFile: the file is no zip.
+    """
+    check_regular(path, MOST_BYTES)
     with zipfile.ZipFile(path) as archive:
-        return json.loads(archive.read(NOTE_ENTRY)) if NOTE_ENTRY in archive.namelist() else {}
+        if name not in archive.namelist():
+            return default
+        if archive.getinfo(name).file_size > MOST_JSON_BYTES:
+            raise UserError(f"{path}: {name} is too large, at most {MOST_JSON_BYTES // MIB} MiB; save the policy again")
+        try:
+            return parse_json(archive.read(name), f"{path}: {name}")
+        except (OSError, RuntimeError, NotImplementedError, zlib.error, EOFError) as error:  # damaged or encrypted
+            raise zipfile.BadZipFile(str(error)) from error
 
 
 def algorithm_of(path: Path) -> Algorithm:
@@ -181,13 +223,13 @@ def algorithm_of(path: Path) -> Algorithm:
     Raises:
         UserError: no such file, or a policy of no known algorithm.
     """
-    if not path.exists():
+    if not os.path.lexists(path):
         raise UserError(f"no policy at {path}; train one with python train_policy.py")
     try:
-        with zipfile.ZipFile(path) as archive:
-            parameters = json.loads(archive.read("data"))
-        found = algorithm_named(_note(path).get(_ALGORITHM_KEY)) or algorithm_of_parameters(parameters)
-    except (zipfile.BadZipFile, KeyError, ValueError, OSError):
+        parameters = _entry(path, "data")
+        known = parameters if isinstance(parameters, dict) else {}
+        found = algorithm_named(_note(path).get(_ALGORITHM_KEY)) or algorithm_of_parameters(known)
+    except zipfile.BadZipFile:
         found = None
     if found is None:
         raise UserError(f"{path} holds no policy of {', '.join(get_args(Algorithm))}")

@@ -18,7 +18,7 @@ from predictor.graph import pair_mask
 from predictor.layers.state_codec import Residual, StateCodec
 from predictor.noise import Noise
 from predictor.scene import SceneSpec
-from predictor.support.config_checks import check_at_least, check_choices
+from predictor.support.config_checks import MOST_WIDTH, check_at_least, check_at_most, check_choices, check_scale_values
 from predictor.what_if import with_ego
 
 Tensors = tuple[Tensor, ...]
@@ -266,3 +266,5 @@ def check_sizes(config: object, *names: str) -> None:
     """
     check_choices(config)
     check_at_least(config, 1, *names)
+    check_at_most(config, MOST_WIDTH, *names)
+    check_scale_values(config, "delta_scales")

@@ -11,6 +11,7 @@ history the edge weights are the prior's probabilities and not a draw, as in `pr
 the first forecast step on.
 """
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -34,6 +35,7 @@ from predictor.graph import pair_mask
 from predictor.layers.state_codec import Residual
 from predictor.noise import Noise, NoiseOfPairs, RepeatedNoise, noise_of_pairs, repeat_scenes
 from predictor.scene import SceneSpec
+from predictor.support.config_checks import MOST_PARTS, check_at_most
 from predictor.support.errors import UserError
 
 
@@ -65,9 +67,10 @@ class DNRIConfig:
     def __post_init__(self) -> None:
         """Checks ranges."""
         check_sizes(self, "hidden_dim", "rnn_dim", "head_dim", "decoder_dim", "message_dim")
+        check_at_most(self, MOST_PARTS, "num_edge_types")
         if self.num_edge_types < 2:
             raise UserError(f"num_edge_types must be at least 2 (the first is 'no edge'), got {self.num_edge_types}")
-        if not self.temperature > 0:
+        if not 0 < self.temperature < math.inf:
             raise UserError(f"temperature must be positive, got {self.temperature}")
 
 

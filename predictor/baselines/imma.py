@@ -22,6 +22,7 @@ from predictor.baselines.nri_blocks import FrameEncoder, HiddenDecoder, PairLSTM
 from predictor.graph import pair_mask
 from predictor.layers.state_codec import Residual
 from predictor.scene import SceneSpec
+from predictor.support.config_checks import MOST_PARTS, check_at_most
 from predictor.support.errors import UserError
 
 
@@ -49,6 +50,7 @@ class IMMAConfig:
     def __post_init__(self) -> None:
         """Checks ranges."""
         check_sizes(self, "hidden_dim", "rnn_dim", "decoder_dim", "message_dim", "num_layers")
+        check_at_most(self, MOST_PARTS, "num_layers")
 
 
 class AttentionLayer(nn.Module):

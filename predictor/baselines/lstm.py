@@ -14,7 +14,8 @@ from torch.nn import functional
 
 from predictor.baselines.base import Tensors, UnrolledForecaster, check_sizes
 from predictor.layers.state_codec import Residual
-from predictor.scene import SceneSpec
+from predictor.scene import MOST_AGENTS, SceneSpec
+from predictor.support.config_checks import check_at_most
 from predictor.support.errors import UserError
 
 
@@ -38,6 +39,7 @@ class LSTMConfig:
     def __post_init__(self) -> None:
         """Checks ranges."""
         check_sizes(self, "embed_dim", "rnn_dim")
+        check_at_most(self, MOST_AGENTS, "num_agents")
         if self.num_agents < 0:
             raise UserError(f"num_agents must be positive, or 0 for the spec's max_agents; got {self.num_agents}")
 

@@ -9,6 +9,7 @@ sign, and a vehicle heads along its road's direction.
 """
 
 import csv
+import os
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +18,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from predictor.data.loading import bad_line, finite, read_lines, whole
+from predictor.data.loading import LARGEST, bad_line, finite, read_lines, whole
 from predictor.data.track_points import TrackPoints
 from predictor.support.errors import UserError
+from predictor.support.reading import MOST_TEXT_BYTES, check_regular
 
 Layout = Literal["centre", "corner"]
 """Column layout of a recording: "centre" is that of inD, rounD and exiD, "corner" that of highD."""
@@ -89,7 +91,7 @@ def open_recording(tracks: Path) -> Recording:
     name = tracks.name.removesuffix("_tracks.csv")
     tracks_meta, meta = tracks.with_name(f"{name}_tracksMeta.csv"), tracks.with_name(f"{name}_recordingMeta.csv")
     for path in (tracks_meta, meta):
-        if not path.exists():
+        if not os.path.lexists(path):
             raise UserError(f"{tracks} needs {path.name} beside it, which is missing; copy all three files")
     lines = _read_meta(meta, ("frameRate", "locationId"))
     if len(lines) != 1:
@@ -185,6 +187,7 @@ def _read_tracks_meta(path: Path, layout: Layout) -> dict[int, TrackInfo]:
 
 
 def _header(path: Path) -> list[str]:
+    check_regular(path, MOST_TEXT_BYTES)
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         return [name.strip() for name in file.readline().split(",")]
 
@@ -202,10 +205,13 @@ def _read_meta(path: Path, names: tuple[str, ...]) -> list[tuple[int, dict[str, 
     _check_columns(path, _header(path), names)
     reader = csv.DictReader(read_lines(path), skipinitialspace=True)
     lines = []
-    for values in reader:
-        if any(values.get(name) is None for name in names):
-            raise bad_line(path, reader.line_num, "the line has too few columns")
-        lines.append((reader.line_num, values))
+    try:
+        for values in reader:
+            if any(values.get(name) is None for name in names):
+                raise bad_line(path, reader.line_num, "the line has too few columns")
+            lines.append((reader.line_num, values))
+    except csv.Error as error:
+        raise bad_line(path, reader.line_num, f"no line of a table ({error})") from error
     return lines
 
 
@@ -219,7 +225,7 @@ def _read_table(path: Path, names: tuple[str, ...]) -> Float[np.ndarray, "lines 
             table = np.loadtxt(
                 path, delimiter=",", skiprows=1, usecols=columns, ndmin=2, comments=None, encoding="utf-8"
             )
-        if np.isfinite(table).all() and len(table):
+        if (np.abs(table) <= LARGEST).all() and len(table):
             return table
     except ValueError:  # also text that is not UTF-8
         pass

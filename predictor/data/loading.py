@@ -14,11 +14,14 @@ from typing import Literal, TypeVar
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from predictor.support.config_checks import check_choices
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, short
+from predictor.support.reading import read_text
 
 Split = Literal["train", "val", "test", "all"]
 SPLIT_SHARES = {"test": 0.1, "val": 0.1}
 """Shares of the splits; the rest is for training."""
+LARGEST, LARGEST_WHOLE = 1e30, 10**15 - 1
+"""Largest numbers that are read: float32 holds differences of the former, and float64 is exact for the latter."""
 NO_LIMIT_M = 1e6
 """Perception range of scenes without an ego [m]."""
 
@@ -75,17 +78,11 @@ def read_lines(path: Path) -> list[str]:
     Raises:
         UserError: the file is not text or cannot be read.
     """
-    try:
-        return path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        line = path.read_bytes()[: error.start].count(b"\n") + 1
-        raise bad_line(path, line, "expected text in UTF-8, got other bytes") from error
-    except OSError as error:
-        raise UserError(f"{path} cannot be read ({error.strerror}); check the path") from error
+    return read_text(path).splitlines()
 
 
 def finite(text: str, name: str, path: Path, line: int) -> float:
-    """Returns a finite number from text.
+    """Returns a finite number from text, at most `LARGEST`, so that states keep it as float32.
 
     Raises:
         UserError: the text is anything else, NaN included.
@@ -95,7 +92,9 @@ def finite(text: str, name: str, path: Path, line: int) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise bad_line(path, line, f"{name} must be a finite number, got '{text}'")
+        raise bad_line(path, line, f"{name} must be a finite number, got '{short(text, 60)}'")
+    if abs(value) > LARGEST:
+        raise bad_line(path, line, f"{name} must be at most {LARGEST:g}, got '{short(text, 60)}'")
     return value
 
 
@@ -108,7 +107,9 @@ def whole(text: str, name: str, path: Path, line: int, least: int | None = None)
     try:
         number = int(text)
     except ValueError:
-        raise bad_line(path, line, f"{name} must be a whole number, got '{text}'") from None
+        raise bad_line(path, line, f"{name} must be a whole number, got '{short(text, 60)}'") from None
+    if abs(number) > LARGEST_WHOLE:
+        raise bad_line(path, line, f"{name} must have at most 15 digits, got '{short(text, 60)}'")
     if least is not None and number < least:
         raise bad_line(path, line, f"{name} must be at least {least}, got {number}")
     return number

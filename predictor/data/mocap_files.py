@@ -13,6 +13,8 @@ from jaxtyping import Float
 from predictor.data.loading import bad_line, finite, read_lines, whole
 from predictor.support.errors import UserError
 
+LEAST_UNIT = 1e-6
+"""Smallest unit of length that is read."""
 METRES_PER_INCH = 0.0254
 _ROOT_CHANNELS = ("TX", "TY", "TZ", "RX", "RY", "RZ")
 
@@ -107,8 +109,9 @@ def _read_unit(path: Path, lines: list[Line]) -> float:
     for number, words in lines[1:]:
         if words[0] == "length":
             unit = _numbers(path, number, words, 1)[0]
-            if unit <= 0:
-                raise bad_line(path, number, f"the unit of length must be positive, got {unit:g}")
+            if unit < LEAST_UNIT:
+                least = f"at least {LEAST_UNIT:g}" if unit > 0 else "positive"
+                raise bad_line(path, number, f"the unit of length must be {least}, got {unit:g}")
             return METRES_PER_INCH / unit
     raise bad_line(path, lines[0][0], ":units gives no length")
 

@@ -13,8 +13,6 @@ training; the text files' own folders `train` and `test` share games.
 """
 
 import json
-import math
-import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -26,6 +24,8 @@ from jaxtyping import Float, Int
 
 from predictor.data.dataset_card import DatasetNotes, save_dataset, summary
 from predictor.data.loading import (
+    LARGEST,
+    LARGEST_WHOLE,
     NO_LIMIT_M,
     LoaderConfig,
     bad_line,
@@ -41,6 +41,7 @@ from predictor.scene import KINEMATIC_FEATURES, SceneSpec
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
+from predictor.support.reading import MOST_TEXT_BYTES, read_json
 
 METRES_PER_FOOT = 0.3048
 
@@ -185,7 +186,7 @@ def read_sportvu(path: Path) -> tuple[list[Passage], Counter[str]]:
 
 def _moments(path: Path) -> Iterator[tuple[str, Any]]:
     """Yields all moments of a file, each with its path in the JSON."""
-    content = _read_json(path)
+    content = read_json(path, MOST_TEXT_BYTES, finite=True)
     events = content.get("events") if isinstance(content, dict) else None
     if not isinstance(events, list):
         raise bad_line(path, 1, "expected an object with a list 'events'", "pass raw SportVU JSON")
@@ -197,34 +198,23 @@ def _moments(path: Path) -> Iterator[tuple[str, Any]]:
             yield f"events[{e}].moments[{m}]", moment
 
 
-def _read_json(path: Path) -> Any:
-    text = "\n".join(read_lines(path))
-
-    def refuse(constant: str) -> None:
-        found = re.search(rf"(?<![\w\"]){re.escape(constant)}", text)
-        line = text.count("\n", 0, found.start() if found else 0) + 1
-        raise bad_line(path, line, f"numbers must be finite, got {constant}")
-
-    try:
-        return json.loads(text, parse_constant=refuse)
-    except json.JSONDecodeError as error:
-        raise bad_line(path, error.lineno, f"not JSON ({error.msg})") from error
-
-
 def _moment(path: Path, where: str, moment: Any) -> tuple[int, int, Entities]:
     """Returns time [ms], quarter, and positions [ft] by team and player."""
     try:
         quarter, time_ms, points = int(moment[0]), int(moment[1]), moment[5]
         entities = {(int(point[0]), int(point[1])): (float(point[2]), float(point[3])) for point in points}
-    except (TypeError, ValueError, IndexError, KeyError) as error:
+    except (TypeError, ValueError, IndexError, KeyError, OverflowError) as error:
         raise UserError(
             f"{path}, {where}: expected [quarter, ms, clock, shot clock, null, [[team, player, x, y, z], …]], "
             f"got {json.dumps(moment)[:80]}; repair it or get the file anew"
         ) from error
-    if not all(math.isfinite(v) for xy in entities.values() for v in xy):
-        raise UserError(f"{path}, {where}: positions must be finite, got {json.dumps(moment)[:80]}; get the file anew")
-    if any(player <= BALL_ID for team, player in entities if team != -1):
-        raise UserError(f"{path}, {where}: ids of players must be positive; get the file anew")
+    if not all(abs(v) <= LARGEST for xy in entities.values() for v in xy):
+        raise UserError(
+            f"{path}, {where}: positions must be finite and at most {LARGEST:g}, got {json.dumps(moment)[:80]}; "
+            "get the file anew"
+        )
+    if any(not BALL_ID < player <= LARGEST_WHOLE for team, player in entities if team != -1):
+        raise UserError(f"{path}, {where}: ids of players must be positive, of at most 15 digits; get the file anew")
     return time_ms, quarter, entities
 
 

@@ -31,6 +31,7 @@ from predictor.data.store import Episode, StoreInfo
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import run_entry_point
+from predictor.support.memory import check_count
 
 Law = Literal["springs", "charged"]
 
@@ -81,6 +82,8 @@ class NRIConfig:
         check_choices(self)
         check_at_least(self, 0, "train", "val", "test", "seed")
         check_at_least(self, 2, "num_agents", "frames", "test_frames")
+        for name in ("train", "val", "test"):
+            check_count(getattr(self, name) * self.num_agents * max(self.frames, self.test_frames), name, 16)
 
 
 def nri_physics(law: Law, num_agents: int = 5, frames: int = FRAMES) -> Physics:

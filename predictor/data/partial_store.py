@@ -16,6 +16,7 @@ from typing import Any
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.support.errors import UserError
 from predictor.support.files import delete_leftovers, write_json
+from predictor.support.reading import read_object
 
 PART_S = 30.0
 """Time after which the episodes that have been recorded since the last part are written [s]."""
@@ -84,8 +85,8 @@ class PartialStore:
     def _take_over(self, discard: bool) -> None:
         delete_leftovers(self._folder)
         try:
-            found = json.loads((self._folder / SETTINGS).read_text(encoding="utf-8"))
-        except (OSError, json.JSONDecodeError):
+            found = read_object(self._folder / SETTINGS)
+        except UserError:
             found = {}
         if found == self._settings:
             return

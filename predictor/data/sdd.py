@@ -38,6 +38,8 @@ from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 
+LARGEST_SCALE = 1e6
+"""Largest scale [m/pixel]."""
 FRAMES_PER_S = 30.0
 """Frame rate of the videos [Hz]."""
 SPLIT_SEED = 405
@@ -116,8 +118,9 @@ def read_scales(path: Path) -> dict[str, float]:
             raise bad_line(path, number, f"'{name}' belongs to no video")
         elif name == "scale":
             scale = finite(value, "scale", path, number)
-            if scale <= 0:
-                raise bad_line(path, number, f"scale must be positive, got {scale:g}")
+            if not 0 < scale <= LARGEST_SCALE:
+                least = f"at most {LARGEST_SCALE:g}" if scale > 0 else "positive"
+                raise bad_line(path, number, f"scale must be {least}, got {scale:g}")
             scales[f"{scene}/{video}"] = scale
     return scales
 

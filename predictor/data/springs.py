@@ -24,6 +24,7 @@ from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices, check_positive
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out
+from predictor.support.memory import check_count
 from predictor.support.provenance import provenance
 
 DT_S = 1 / 6
@@ -113,6 +114,8 @@ class SpringsConfig:
         if not 0 <= self.kicks <= 1:
             raise UserError(f"kicks must lie between 0 and 1, got {self.kicks}")
         check_positive(self, "kick_mps")
+        for name in ("train", "val", "test", "ood"):
+            check_count(getattr(self, name), name)
 
 
 def draw_springs(

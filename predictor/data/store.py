@@ -8,6 +8,7 @@ Within an episode an agent keeps its column from its first step to its last, so 
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial as partial_of
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,22 @@ import numpy as np
 import zarr
 from jaxtyping import Bool, Float, Int
 
+from predictor.data.store_files import (
+    COMPRESSORS,
+    DIGEST,
+    StoreHeader,
+    attributes_of,
+    check_digest,
+    digest_of,
+    read_arrays,
+    read_header,
+)
 from predictor.scene import PADDING_ID, Scene, SceneSpec
+from predictor.support.config_checks import check_positive
 from predictor.support.errors import UserError
 from predictor.support.files import new_folder
+from predictor.support.reading import version_of
+from predictor.support.typed_values import converted, from_table
 
 FORMAT = "dgvae-rl episodes"
 VERSION = 1
@@ -85,6 +99,14 @@ class StoreInfo:
     causal_threshold_m: float | None = None
     """Shift above which an edge counts as causal [m]; None without causal labels."""
 
+    def __post_init__(self) -> None:
+        """Checks ranges.
+
+        Raises:
+            UserError: a value is out of range.
+        """
+        check_positive(self, "causal_threshold_m")
+
 
 @dataclass(frozen=True)
 class EpisodeStore:
@@ -110,8 +132,8 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
     path = Path(path)
     if path.exists() and not overwrite:
         raise UserError(f"{path} exists; choose another path or pass --overwrite")
-    if path.exists() and not (path / "zarr.json").exists():
-        raise UserError(f"{path} is not an episode store and will not be replaced; choose another path")
+    if path.exists():
+        _check_own(path)
     episodes = list(episodes)
     if not episodes:
         raise UserError("a store needs at least one episode, got none")
@@ -137,28 +159,37 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
     with new_folder(path) as partial:
         group = zarr.open_group(partial, mode="w")
         chunk = max(1, min(len(states), 4096))
-        every_chunk: Any = {"write_empty_chunks": True}  # so that a missing chunk is damage, not zeros
-        group.create_array("states", data=states, chunks=(chunk, columns, states.shape[-1]), config=every_chunk)
-        group.create_array("valid", data=valid, chunks=(chunk, columns), config=every_chunk)
+        # every chunk is written, so that a missing one is damage, not zeros
+        create = partial_of(group.create_array, compressors=COMPRESSORS, config={"write_empty_chunks": True})
+        create("states", data=states, chunks=(chunk, columns, states.shape[-1]))
+        create("valid", data=valid, chunks=(chunk, columns))
         if any(marked):
-            group.create_array("perturbed", data=perturbed, chunks=(chunk, columns), config=every_chunk)
-        group.create_array("ids", data=ids)
-        group.create_array("starts", data=starts)
-        group.create_array("seeds", data=np.array([e.seed for e in episodes], dtype=np.int64))
+            create("perturbed", data=perturbed, chunks=(chunk, columns))
+        create("ids", data=ids)
+        create("starts", data=starts)
+        create("seeds", data=np.array([e.seed for e in episodes], dtype=np.int64))
         for name, labels in _padded_labels(episodes, columns, str(path)).items():
-            group.create_array(name, data=labels, config=every_chunk)
-        group.attrs.update(
-            {
-                "format": FORMAT,
-                "version": VERSION,
-                "spec": asdict(info.spec),
-                "source": info.source,
-                "provenance": json.loads(json.dumps(info.provenance, default=str)),
-                "labels": [e.label for e in episodes],
-                "edge_attribute_names": list(info.edge_attribute_names),
-                "causal_threshold_m": info.causal_threshold_m,
-            }
-        )
+            create(name, data=labels)
+        attributes = {
+            "format": FORMAT,
+            "version": VERSION,
+            "spec": asdict(info.spec),
+            "source": info.source,
+            "provenance": info.provenance,
+            "labels": [e.label for e in episodes],
+            "edge_attribute_names": list(info.edge_attribute_names),
+            "causal_threshold_m": info.causal_threshold_m,
+        }
+        plain = json.loads(json.dumps(attributes, default=str))
+        group.attrs.update(plain | {DIGEST: digest_of(plain)})
+
+
+def _check_own(path: Path) -> None:
+    """Checks that a path that may be replaced holds a store: another Zarr group is never overwritten."""
+    try:
+        attributes_of(path, FORMAT)
+    except UserError as error:
+        raise UserError(f"{path} is not an episode store and will not be replaced; choose another path") from error
 
 
 def read_store(path: Path) -> EpisodeStore:
@@ -170,29 +201,13 @@ def read_store(path: Path) -> EpisodeStore:
     path = Path(path)
     if not path.exists():
         raise UserError(f"no episode store at {path}; make one with python -m envs.collect")
-    try:
-        group = zarr.open_group(path, mode="r")
-        attrs: dict[str, Any] = dict(group.attrs)
-        if attrs.get("format") != FORMAT:
-            raise UserError(f"{path} is not an episode store; make one with python -m envs.collect")
-        if attrs["version"] != VERSION:
-            raise UserError(
-                f"{path} has store version {attrs['version']}, this release reads {VERSION}; collect it anew"
-            )
-        arrays = {name: np.asarray(group[name]) for name in ("states", "valid", "ids", "starts", "seeds")}
-        labelled = [name for name in _FILL if name in group]
-        marks = ["perturbed"] if "perturbed" in group else []
-        for name in ("states", "valid", *labelled, *marks):
-            stored: Any = group[name]
-            if stored.nchunks_initialized != stored.nchunks:  # Zarr reads what is missing as zeros
-                raise UserError(f"{path}: chunks of '{name}' are missing; copy or collect it anew")
-        info = _info(attrs, len(arrays["states"]))
-        labels = list(attrs["labels"])
-        perturbed = np.asarray(group["perturbed"]) if marks else None
-        edge_labels = {name: np.asarray(group[name]) for name in labelled}
-        label_starts = np.asarray(group["label_starts"]) if edge_labels else None
-    except (KeyError, TypeError, OSError, RuntimeError, json.JSONDecodeError, zarr.errors.BaseZarrError) as error:
-        raise UserError(f"{path} is not a readable episode store ({error}); collect it anew") from error
+    header = read_header(path, FORMAT)
+    info = _info(path, header)
+    labels = _checked_labels(path, header, info)
+    check_digest(path, header.attributes)
+    arrays = read_arrays(path, header)
+    _check_arrays(path, arrays)
+    edge_labels = {name: arrays[name] for name in _FILL if name in arrays}
     episodes = []
     for i, (start, stop) in enumerate(zip(arrays["starts"][:-1], arrays["starts"][1:], strict=True)):
         present = arrays["ids"][i] != PADDING_ID
@@ -200,10 +215,10 @@ def read_store(path: Path) -> EpisodeStore:
             arrays["states"][start:stop][:, present],
             arrays["valid"][start:stop][:, present],
             arrays["ids"][i][present],
-            str(labels[i]),
+            labels[i],
             int(arrays["seeds"][i]),
-            perturbed=None if perturbed is None else perturbed[start:stop][:, present],
-            **_labels_of(edge_labels, label_starts, i, present),
+            perturbed=arrays["perturbed"][start:stop][:, present] if "perturbed" in arrays else None,
+            **_labels_of(edge_labels, arrays.get("label_starts"), i, present),
         )
         _check_finite(episode, str(path))
         episodes.append(episode)
@@ -216,19 +231,69 @@ def read_info_of(path: Path) -> StoreInfo:
     Raises:
         UserError: the path holds no store.
     """
-    try:
-        group = zarr.open_group(path, mode="r")
-        states: Any = group["states"]
-        return _info(dict(group.attrs), int(states.shape[0]))
-    except (KeyError, TypeError, OSError, RuntimeError, json.JSONDecodeError, zarr.errors.BaseZarrError) as error:
-        raise UserError(f"{path} is not a readable episode store ({error}); make it anew") from error
+    header = read_header(Path(path), FORMAT)
+    info = _info(Path(path), header)
+    check_digest(Path(path), header.attributes)
+    return info
 
 
-def _info(attrs: dict[str, Any], num_steps: int) -> StoreInfo:
-    names = tuple(str(name) for name in attrs.get("edge_attribute_names", ()))
-    spec = _spec_from_json(attrs["spec"])
-    threshold_m = attrs.get("causal_threshold_m")
-    return StoreInfo(spec, str(attrs["source"]), dict(attrs["provenance"]), names, num_steps, threshold_m)
+def _info(path: Path, header: StoreHeader) -> StoreInfo:
+    """Returns what the attributes say, after a check of their types and ranges."""
+    attributes, where = header.attributes, f"{path}: attributes"
+    version_of(attributes, VERSION, f"store {path}")
+    for key in ("spec", "source", "provenance"):
+        if key not in attributes:
+            raise UserError(f"{where}: key '{key}' is missing; collect the store anew")
+    known = ("spec", "source", "provenance", "edge_attribute_names", "causal_threshold_m")
+    given = {key: attributes[key] for key in known if key in attributes}
+    return from_table(StoreInfo, given, where, {"num_steps": header.shapes["states"][0]})
+
+
+def _checked_labels(path: Path, header: StoreHeader, info: StoreInfo) -> tuple[str, ...]:
+    """Returns the tags of the episodes, after a check that the shapes of all arrays fit together."""
+    shapes = header.shapes
+    steps, agents, _ = shapes["states"]
+    episodes = shapes["seeds"][0]
+    edges = ("edge_types", "edge_attributes", "causal_shift_m")
+    wanted: dict[str, tuple[int, ...]] = {
+        "states": (steps, agents, info.spec.num_features),
+        "valid": (steps, agents),
+        "perturbed": (steps, agents),
+        "ids": (episodes, agents),
+        "starts": (episodes + 1,),
+        "label_starts": (episodes + 1,),
+    }
+    label_steps = next((shapes[name][0] for name in edges if name in shapes), 0)
+    wanted |= dict.fromkeys(edges, (label_steps, agents, agents))
+    if "edge_attributes" in shapes:
+        wanted["edge_attributes"] += (len(info.edge_attribute_names) or shapes["edge_attributes"][-1],)
+    for name, shape in shapes.items():
+        if shape != wanted.get(name, shape):
+            hint = " (edge_attribute_names)" if name == "edge_attributes" else ""
+            raise UserError(f"{path}: '{name}' must have the shape {wanted[name]}{hint}, got {shape}; collect it anew")
+    if any(name in shapes for name in edges) != ("label_starts" in shapes):
+        raise UserError(f"{path}: labels of edges and label_starts belong together; collect it anew")
+    labels: tuple[str, ...] = converted(header.attributes.get("labels"), tuple[str, ...], f"{path}: labels")
+    if len(labels) != episodes:
+        raise UserError(f"{path}: labels must be as many as episodes ({episodes}), got {len(labels)}")
+    return labels
+
+
+def _check_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Checks the values of the arrays that say where episodes begin and who is in them."""
+    last = {"starts": len(arrays["states"]), "label_starts": 0}
+    last["label_starts"] = next((len(arrays[name]) for name in _FILL if name in arrays), 0)
+    for name in ("starts", "label_starts"):
+        places = arrays.get(name)
+        if places is not None and (places[0] != 0 or places[-1] != last[name] or (np.diff(places) < 1).any()):
+            raise UserError(f"{path}: '{name}' must rise from 0 to {last[name]}; copy or collect it anew")
+    for i, ids in enumerate(arrays["ids"]):
+        live = ids[ids != PADDING_ID]
+        if (live < 0).any() or len(np.unique(live)) < len(live):
+            raise UserError(f"{path}: ids of episode {i} must differ and not be negative; copy or collect it anew")
+    marks = arrays.get("perturbed")
+    if marks is not None and ((marks < 0) | (marks >= len(PERTURBATIONS))).any():
+        raise UserError(f"{path}: 'perturbed' must lie between 0 and {len(PERTURBATIONS) - 1}; collect it anew")
 
 
 def _padded_labels(episodes: Sequence[Episode], columns: int, where: str) -> dict[str, np.ndarray]:
@@ -305,8 +370,3 @@ def _check_finite(episode: Episode, where: str) -> None:
             f"{where}: states must be finite, got {episode.states[t, agent].tolist()} "
             f"(episode seed {episode.seed}, step {t}, agent {episode.ids[agent]}); remove the episode"
         )
-
-
-def _spec_from_json(values: dict[str, Any]) -> SceneSpec:
-    arguments: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
-    return SceneSpec(**arguments)

@@ -7,6 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from predictor.data.store import Episode
+from predictor.support.errors import UserError
+
+MOST_STEPS = 5_000_000
+"""Largest number of steps from the first point of a recording to its last."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +59,14 @@ def cut_episodes(points: TrackPoints, episode_steps: int, label: str, counts: Co
 
     Within an episode each track has a column; steps without any agent are kept, all invalid. The last episode may be
     shorter. Episodes without any agent and those of one step are left out and counted.
+
+    Raises:
+        UserError: the recording spans more than `MOST_STEPS` steps.
     """
     episodes = []
     first, last = (int(points.steps.min()), int(points.steps.max())) if len(points) else (0, -1)
+    if last - first >= MOST_STEPS:
+        raise UserError(f"{label}: frames span {last - first + 1:,} steps, at most {MOST_STEPS:,}; a frame is wrong")
     for begin in range(first, last + 1, episode_steps):
         length = min(episode_steps, last + 1 - begin)
         inside = points.where((points.steps >= begin) & (points.steps < begin + length))

@@ -25,6 +25,7 @@ from jaxtyping import Float, Int
 
 from predictor.data.dataset_card import DatasetNotes, check_not_empty, most_present, save_dataset, summary
 from predictor.data.loading import (
+    LARGEST_WHOLE,
     NO_LIMIT_M,
     LoaderConfig,
     Split,
@@ -52,8 +53,6 @@ MAX_AGENTS = 128
 RIGHTS = "Those of the source, which the files do not name: a store made from it falls under the same terms."
 
 _COMMENT = re.compile("[#%]")
-_LARGEST = 10**15 - 1
-"""Largest whole number that is read; larger ones are not exact as floating point."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +176,7 @@ def _is_number(text: str) -> bool:
 def _whole(text: str, name: str, path: Path, number: int) -> int:
     """Returns a whole number from text such as 780, 780.0 or 7.8e+02."""
     value = finite(text, name, path, number)
-    if value != round(value) or abs(value) > _LARGEST:
+    if value != round(value) or abs(value) > LARGEST_WHOLE:
         raise bad_line(path, number, f"{name} must be a whole number of at most 15 digits, got '{text}'")
     return round(value)
 

@@ -1,10 +1,18 @@
 """Sizes and variants of the dG-VAE, and named sets of them."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from predictor.layers.state_codec import Residual
-from predictor.support.config_checks import check_at_least, check_choices
+from predictor.support.config_checks import (
+    MOST_PARTS,
+    MOST_WIDTH,
+    check_at_least,
+    check_at_most,
+    check_choices,
+    check_scale_values,
+)
 from predictor.support.errors import UserError
 
 
@@ -88,6 +96,14 @@ class DGVAEConfig:
             )
         check_at_least(self, 1, "hidden_dim", "rnn_dim", "head_dim", "message_dim", "decoder_dim", "innovation_dim")
         check_at_least(self, 0, "edge_feature_dim", "innovation_rounds", "static_dim", "substeps", "num_neighbours")
+        check_at_most(
+            self, MOST_WIDTH, "hidden_dim", "rnn_dim", "head_dim", "message_dim", "decoder_dim", "innovation_dim",
+            "edge_feature_dim", "num_neighbours",
+        )  # fmt: skip
+        check_at_most(self, MOST_PARTS, "num_modes", "num_edge_types", "innovation_rounds", "substeps")
+        check_scale_values(self, "delta_scales", "input_scales", "change_scales")
+        if not math.isfinite(self.forget_bias):
+            raise UserError(f"forget_bias must be finite, got {self.forget_bias}")
         if self.num_neighbours and self.needs_reverse_pairs:
             needy = "innovation_rounds" if self.innovation_rounds else "symmetric_types"
             raise UserError(f"{needy} needs every pair and its reverse; set num_neighbours to 0")

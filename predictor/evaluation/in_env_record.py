@@ -4,7 +4,7 @@
 the record. The cards and the tables of README.md and docs/in_env.md are written from the records alone.
 """
 
-import json
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,6 +12,8 @@ from typing import Any
 
 from predictor.support.errors import UserError
 from predictor.support.files import write_json
+from predictor.support.reading import read_object
+from predictor.support.typed_values import from_table
 
 FILE_NAME = "in_env.json"
 
@@ -89,6 +91,14 @@ class Measurement:
         return self.env_id, self.driver, self.samples
 
 
+@dataclass(frozen=True)
+class _Record:
+    """Content of the file."""
+
+    measurements: tuple[Measurement, ...]
+    """Measurements, in the order of the tables."""
+
+
 def measurements_of(accuracy: dict[str, Any], checkpoint: str) -> list[Measurement]:
     """Returns the measurements of a checkpoint in the content of an accuracy.json of `envs.evaluate`.
 
@@ -106,15 +116,15 @@ def read_record(folder: Path) -> list[Measurement]:
         UserError: the file is not a record.
     """
     path = folder / FILE_NAME
-    if not path.exists():
+    if not os.path.lexists(path):
         return []
     try:
-        entries = json.loads(path.read_text())["measurements"]
-        return [Measurement(**{name: _frozen(value) for name, value in entry.items()}) for entry in entries]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        content = from_table(_Record, read_object(path), str(path))
+    except UserError as error:
         raise UserError(
             f"{path} is not a record of measurements ({error}); write it with python -m predictor.card"
         ) from error
+    return list(content.measurements)
 
 
 def update_record(folder: Path, found: Sequence[Measurement]) -> list[Measurement]:

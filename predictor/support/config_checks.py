@@ -34,6 +34,24 @@ def check_choice(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
         raise UserError(f"{name} must be one of {listed}, got '{value}'")
 
 
+MOST_WIDTH = 65_536
+"""Largest width of a layer; what a network of this size takes is estimated before it is built."""
+MOST_PARTS = 1_024
+"""Largest number of parts of a network that are alike, such as layers, types and modes."""
+
+
+def check_scale_values(config: Any, *names: str) -> None:
+    """Checks that all entries of tuples are finite and above zero.
+
+    Raises:
+        UserError: one is not.
+    """
+    for name in names:
+        scales = getattr(config, name)
+        if not all(0 < scale < math.inf for scale in scales):
+            raise UserError(f"{name} must be positive, finite numbers, got {scales}")
+
+
 def check_at_least(config: Any, least: int, *names: str) -> None:
     """Checks that numbers, or all entries of tuples, are finite and at least `least`; None passes.
 
@@ -51,6 +69,19 @@ def check_at_least(config: Any, least: int, *names: str) -> None:
             if number < least:
                 bound = f"be at least {least}" if least else "not be negative"
                 raise UserError(f"{name} must {bound}, got {value}")
+
+
+def check_at_most(config: Any, most: int, *names: str) -> None:
+    """Checks that numbers, or all entries of tuples, are at most `most`; None passes.
+
+    Raises:
+        UserError: one is not.
+    """
+    for name in names:
+        value = getattr(config, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is not None and number > most:
+                raise UserError(f"{name} must be at most {most:,}, got {value}")
 
 
 def check_positive(config: Any, *names: str) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -17,7 +17,8 @@ from jaxtyping import Int
 
 from predictor.data.device_windows import ResidentWindows, bytes_needed, window_sizes
 from predictor.data.windows import WindowBatch, Windows, concatenate, padded
-from predictor.training.config import TrainConfig
+from predictor.support.memory import check_memory
+from predictor.training.config import SMALLER, TrainConfig
 
 MOST_PADDING = 3.0
 """Largest factor by which padding to a fixed size may increase the pairs of a batch; more costs more than it saves."""
@@ -261,20 +262,48 @@ class Source:
     """Number of agents of each window, by which batches are put together; None if shapes are fixed or all are equal."""
 
 
-def open_batches(config: TrainConfig, windows: Sequence[Windows], device: torch.device) -> Source:
-    """Decides where the data is kept and whether its shapes are fixed.
+def check_batch(config: TrainConfig, agents: Int[np.ndarray, " windows"], network: Any, device: torch.device) -> None:
+    """Checks, before any batch is made, that the least that a training step keeps fits into the memory.
+
+    These are the states at each forecast step, and one memory of each pair where the network has a memory of pairs.
+
+    Args:
+        config: options of the training.
+        agents: number of agents of each window.
+        network: config of the network.
+        device: device that trains.
 
     Raises:
-        UserError: the data is to be kept on the device and does not fit, or an ego is missing.
+        UserError: it does not fit.
     """
+    width = getattr(network, "rnn_dim", 0) if config.model in ("dgvae", "dnri", "imma") else 0
+    senders = np.minimum(agents, getattr(network, "num_neighbours", 0) or agents)
+    each = float(np.mean(16 * (1 + config.horizon_steps) * agents + 4 * width * agents * senders))
+    available = torch.cuda.mem_get_info()[1] if device.type == "cuda" else None
+    check_memory(int(config.batch_size * each), f"a step with batch_size={config.batch_size:,}", SMALLER, available)
+
+
+def open_batches(config: TrainConfig, windows: Sequence[Windows], device: torch.device, network: Any = None) -> Source:
+    """Decides where the data is kept and whether its shapes are fixed.
+
+    Args:
+        config: options of the training.
+        windows: windows of each store.
+        device: device that trains.
+        network: config of the network; None checks the memory for states alone.
+
+    Raises:
+        UserError: the data is to be kept on the device and does not fit, a batch cannot fit, or an ego is missing.
+    """
+    widths = tuple(window_sizes(w) for w in windows)
+    agents = np.concatenate(widths)
+    check_batch(config, agents, network, device)
     if device.type != "cuda":
         resident = config.data_device == "device"
         batches: Batches = (
             DeviceBatches(ResidentWindows(windows, device), device) if resident else HostBatches(windows, device)
         )
-        widths = tuple(window_sizes(w) for w in windows)
-        return Source(batches, widths=widths if len(np.unique(np.concatenate(widths))) > 1 else None)
-    agents = np.concatenate([window_sizes(w) for w in windows])
+        return Source(batches, widths=widths if len(np.unique(agents)) > 1 else None)
     shapes: Shapes | None = Shapes(int(agents.max()), config.history_steps, config.horizon_steps)
     waste = padding_factor(agents, config.batch_size)
     notes = []

@@ -9,6 +9,7 @@ import torch
 from predictor.models import ModelName
 from predictor.support.config_checks import check_at_least, check_choices, check_positive
 from predictor.support.errors import UserError
+from predictor.support.memory import check_memory
 from predictor.support.runtime import resolve_device
 
 Likelihood = Literal["gaussian", "laplace"]
@@ -19,6 +20,7 @@ OF_THE_DGVAE = ("input_changes", "fit_inputs", "edge_geometry")
 """Options of the dG-VAE's inputs, without effect on other models."""
 OF_THE_NETWORK = ("preset", "set", *OF_THE_DGVAE)
 """Options that make the network; a checkpoint to start from has them already."""
+SMALLER = "pass a smaller --batch-size, or a shorter --horizon-steps"
 BEFORE_THEY_EXISTED = dict.fromkeys(OF_THE_DGVAE, False)
 """Values of options in runs that began before the option existed, where today's default is another one."""
 
@@ -140,6 +142,8 @@ class TrainConfig:
         check_at_least(
             self, 1, "steps", "batch_size", "history_steps", "horizon_steps", "eval_every", "patience", "val_windows"
         )
+        # each step of each window has a state; what the network needs is estimated when the data is there
+        check_memory(16 * self.batch_size * (1 + self.horizon_steps), f"batch_size={self.batch_size:,}", SMALLER)
         check_positive(self, "lr", "variance", "clip_norm")
         check_at_least(
             self, 0, "one_step_weight", "rollout_weight", "kl_weight", "seed", "threads", "curriculum_steps",

@@ -5,7 +5,6 @@ that was not.
 """
 
 import math
-import pickle
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -40,6 +39,7 @@ from predictor.training.cuda_graph import (
 )
 from predictor.training.fitted_scales import typical_change, typical_neighbour, typical_spread
 from predictor.training.objective import window_loss
+from predictor.training.saved_state import read_state
 
 VALIDATION_DRAWS = 5
 """Number of samples for model selection, of models without modes."""
@@ -200,7 +200,7 @@ class Trainer:
         self.stale = 0
         self.baseline_m = self._baseline()
         self.noise = torch.Generator(device=self.device)
-        source = open_batches(config, data.train, self.device)
+        source = open_batches(config, data.train, self.device, self.model.config)
         self.batches, self.notes, self._widths = source.batches, source.notes, source.widths
         self.read_every = LOG_EVERY if on_cuda else 1
         self._checks_each_loss = not on_cuda
@@ -353,15 +353,17 @@ class Trainer:
         """Continues from a saved training state, of this kind of device or another."""
         self._forget()  # recordings refer to tensors that are replaced here
         try:
-            state = torch.load(path, weights_only=True, map_location=self.device)
+            state = read_state(path, self.model, self.device)
             self.model.load_state_dict(state["model"])
             # Adam's settings are this run's, its moments are the saved ones
             groups = zip(self.optimizer.state_dict()["param_groups"], state["optimizer"]["param_groups"], strict=True)
             state["optimizer"]["param_groups"] = [ours | {"params": theirs["params"]} for ours, theirs in groups]
             self.optimizer.load_state_dict(state["optimizer"])
-            self.step, self.best, self.stale = int(state["step"]), float(state["best"]), int(state["stale"])
+            self.step, self.best, self.stale = state["step"], state["best"], state["stale"]
             self._finite_until = self.step
-        except (RuntimeError, KeyError, TypeError, ValueError, EOFError, pickle.UnpicklingError) as error:
+        except UserError:
+            raise
+        except (RuntimeError, KeyError, TypeError, ValueError) as error:
             reason = " ".join(str(error).split())[:200]
             raise UserError(f"{path} cannot be read ({reason}); train anew into another --out") from error
 

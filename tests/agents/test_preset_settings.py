@@ -52,5 +52,7 @@ def test_bad_files_are_one_clear_line(text: str, message: str, tmp_path: Path):
     with pytest.raises(UserError) as error:
         settings_from_file("ppo", file)
     assert str(error.value).startswith(str(file)) and message in str(error.value) and "\n" not in str(error.value)
-    with pytest.raises(UserError, match=f"^no preset at {tmp_path}; give a TOML file"):
+    with pytest.raises(UserError, match=f"^no preset at {file}x; give a TOML file"):
+        settings_from_file("ppo", Path(f"{file}x"))
+    with pytest.raises(UserError, match=f"^{tmp_path} cannot be read: it is a folder"):
         settings_from_file("ppo", tmp_path)

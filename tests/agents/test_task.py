@@ -1,3 +1,6 @@
+import json
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +35,7 @@ def without_envpool(monkeypatch: pytest.MonkeyPatch) -> None:
         (TAG, {"driver": "fast"}, "driver must be one of random, idle, varied, heuristic, mixed, got 'fast'"),
         (TAG, {"observe": "none", "checkpoint": "highway"}, "has no effect with observe=none"),
         (TAG, {"what_if": True}, f"what_if needs an environment with one ego, {TAG} has several learners"),
-        ("merge-v1", {"env_kwargs": "{"}, "env_kwargs must be a JSON object, got '{': Expecting"),
+        ("merge-v1", {"env_kwargs": "{"}, "env_kwargs must be a JSON object, got '{': .*Expecting"),
         ("merge-v1", {"env_kwargs": "[1]"}, r"env_kwargs must be a JSON object, got '\[1\]'"),
         (
             "highway-fast-v0",
@@ -154,3 +157,38 @@ def test_perception_must_be_positive_and_have_an_effect():
         Task("merge-v1", perception_m=-1.0)
     with pytest.raises(UserError, match="perception_m has no effect with observe=none; leave one out"):
         Task("merge-v1", "none", perception_m=20.0)
+
+
+# --- A run's config imports nothing -----------------------------------------------------------------------------------
+
+RUN = {"env_id": "merge-v1", "observe": "forecast", "checkpoint": None}
+
+
+@pytest.fixture
+def foreign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A module that can be imported and says so."""
+    (tmp_path / "foreign_envs.py").write_text("import gymnasium\n\nclass Road(gymnasium.Env):\n    pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    yield "foreign_envs"
+    sys.modules.pop("foreign_envs", None)
+
+
+@pytest.mark.parametrize("observe", ["none", "forecast"])
+def test_a_run_imports_only_what_the_command_line_names(foreign: str, observe: str):
+    run = RUN | {"env_id": f"{foreign}:Road", "observe": observe}
+    for trusted in (None, "highway-v0", f"{foreign}:Other"):
+        with pytest.raises(UserError, match=f"imports code; if you trust it, .* --env-id {foreign}"):
+            task_of(run, trusted=trusted)
+    assert foreign not in sys.modules
+    assert task_of(run | {"observe": "none"}, trusted=f"{foreign}:Road").env_id == f"{foreign}:Road"
+    assert foreign in sys.modules
+
+
+def test_arguments_of_a_run_name_no_foreign_class(foreign: str):
+    """highway-env imports the class of other_vehicles_type, so a run's config must not choose it freely."""
+    kwargs = {"config": {"other_vehicles_type": f"{foreign}.Road"}}
+    with pytest.raises(UserError, match=rf"name '{foreign}.Road', which the environment could import"):
+        task_of(RUN | {"env_kwargs": json.dumps(kwargs)})
+    assert foreign not in sys.modules
+    own = {"config": {"other_vehicles_type": "highway_env.vehicle.behavior.IDMVehicle", "note": "0.5 of all. Done"}}
+    assert task_of(RUN | {"env_kwargs": json.dumps(own)}).make_kwargs == own

@@ -235,27 +235,30 @@ def impossible_dt(path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (truncated_weights, r"toy/model\.safetensors cannot be read \(.*\); copy or train it again"),
+        (truncated_weights, r"toy/model\.safetensors is no safetensors file \(.*\); copy or train it again"),
         (no_weights, r"toy/model\.safetensors cannot be read"),
-        (weights_are_text, r"toy/model\.safetensors cannot be read"),
-        (foreign_weights, r"toy: tensor '\S+' should be \(.*\) by config\.json but is absent in model\.safetensors"),
+        (weights_are_text, r"toy/model\.safetensors is no safetensors file"),
+        (
+            foreign_weights,
+            r"toy/model\.safetensors: tensor '\S+' should be \(.*\) by config\.json but is absent",
+        ),
         (
             weights_of_another_size,
             r"tensor 'encoder\.\S+' should be \((5|20).*\) by config\.json but is \((6|24).*do not belong together",
         ),
         (one_weight_missing, r"tensor 'decoder\.readout\.bias' should be \(4,\) by config\.json but is absent"),
-        (weights_not_finite, "toy: the weights are not finite; train it again"),
-        (truncated_config, r"toy/config\.json cannot be read \(.*\); is .*toy a predictor checkpoint\?"),
-        (no_config, r"toy/config\.json cannot be read"),
-        (config_is_binary, r"toy/config\.json cannot be read"),
+        (weights_not_finite, r"toy/model\.safetensors: tensor 'decoder\.readout\.bias' is not finite; train it again"),
+        (truncated_config, r"toy/config\.json, line \d+: no JSON \(.*\); get it anew"),
+        (no_config, r"toy is not a predictor checkpoint \(it has no config\.json\)"),
+        (config_is_binary, r"toy/config\.json, line 1: expected text in UTF-8"),
         (foreign_json, r"toy is not a predictor checkpoint \(config\.json has no format 'dgvae-rl predictor'\)"),
         (json_list, "toy is not a predictor checkpoint"),
-        (newer_version, "toy has checkpoint version 2, this release reads 1"),
-        (unknown_size, r"config\.json does not describe a predictor: unknown field 'attention_heads' of DGVAEConfig"),
-        (unknown_spec_field, "unknown field 'lidar' of SceneSpec"),
-        (no_spec, r"does not describe a predictor: 'spec'"),
-        (impossible_size, "does not describe a predictor: rnn_dim must be at least 1, got 0"),
-        (impossible_dt, "does not describe a predictor: dt_s must be positive, got -1.0"),
+        (newer_version, "checkpoint .*toy has version 2, this release reads 1"),
+        (unknown_size, r"config\.json: config: unknown key 'attention_heads'"),
+        (unknown_spec_field, "spec: unknown key 'lidar'; there are dt_s, frame"),
+        (no_spec, r"config\.json: key 'spec' is missing"),
+        (impossible_size, "config: rnn_dim must be at least 1, got 0"),
+        (impossible_dt, "spec: dt_s must be positive, got -1.0"),
     ],
 )
 def test_bad_files_are_refused(path: Path, damage: Callable[[Path], None], message: str):
@@ -336,7 +339,14 @@ def test_constant_velocity_takes_every_spec():
 
 def save_any(path: Path, kind: str) -> CheckpointInfo:
     forecaster = any_model(kind)
-    info = replace(INFO, spec=forecaster.spec, config=forecaster.config, horizon_steps=3, model=EVERY_MODEL[kind][0])
+    info = replace(
+        INFO,
+        spec=forecaster.spec,
+        config=forecaster.config,
+        horizon_steps=3,
+        std_m=INFO.std_m[:3],
+        model=EVERY_MODEL[kind][0],
+    )
     save_checkpoint(path, forecaster, info)
     return info
 
@@ -388,10 +398,10 @@ def test_a_model_is_not_saved_under_another_ones_name(tmp_path: Path):
     [
         (
             {"model": "transformer"},
-            "does not describe a predictor: no model 'transformer'; there are dgvae, dnri, imma",
+            "config.json: model: no model 'transformer'; there are dgvae, dnri, imma",
         ),
-        ({"model": "mlp"}, "does not describe a predictor: unknown field 'change_scales' of MLPConfig"),
-        ({"horizon_steps": 0}, "does not describe a predictor: horizon_steps must be at least 1, got 0"),
+        ({"model": "mlp"}, "config: unknown key '.*'; there are hidden_dim, residual, delta_scales"),
+        ({"horizon_steps": 0}, "config.json: horizon_steps must be at least 1, got 0"),
     ],
 )
 def test_impossible_models_are_refused(path: Path, change: dict[str, Any], message: str):
@@ -433,7 +443,7 @@ def test_a_folder_with_weights_of_its_own_stands_for_itself(path: Path):
 def test_a_run_without_a_checkpoint_stands_for_itself(tmp_path: Path):
     (tmp_path / "checkpoint").mkdir()
     assert resolve(tmp_path) == tmp_path
-    with pytest.raises(UserError, match="is .* a predictor checkpoint"):
+    with pytest.raises(UserError, match="is not a predictor checkpoint"):
         load_checkpoint(tmp_path)
 
 

@@ -2,6 +2,9 @@
 
 import dataclasses
 import json
+import math
+import subprocess
+import sys
 from typing import Any, get_args
 
 import pytest
@@ -11,7 +14,7 @@ from predictor.baselines.lstm import LSTMConfig
 from predictor.baselines.mlp import MLPConfig
 from predictor.dgvae.config import PRESETS, DGVAEConfig
 from predictor.forecaster import TrainableForecaster
-from predictor.models import KINDS, ModelName, build, config_from_json, configure, name_of
+from predictor.models import KINDS, ModelName, build, config_from_json, configure, name_of, shapes_of
 from predictor.support.errors import UserError
 from tests.predictor.helpers import EVERY_MODEL, spec
 
@@ -157,7 +160,7 @@ def test_unknown_models_are_named(ask: Any):
 
 
 def test_unknown_fields_of_a_checkpoint_are_named():
-    with pytest.raises(ValueError, match="unknown field 'attention_heads' of IMMAConfig"):
+    with pytest.raises(UserError, match="unknown key 'attention_heads'; there are hidden_dim"):
         config_from_json("imma", {"hidden_dim": 4, "attention_heads": 2})
 
 
@@ -169,3 +172,27 @@ def test_values_of_a_checkpoint_are_checked():
 def test_a_network_that_cannot_be_trained_has_no_name():
     with pytest.raises(UserError, match="Linear is not a trainable model; there are dgvae, dnri, imma, lstm, mlp"):
         name_of(torch.nn.Linear(1, 1))
+
+
+@pytest.mark.parametrize("kind", EVERY_MODEL)
+def test_shapes_are_known_without_memory(kind: str):
+    name, config = EVERY_MODEL[kind]
+    built = build(name, spec(), config, 3).state_dict()
+    assert shapes_of(name, spec(), config, 3) == {key: tuple(tensor.shape) for key, tensor in built.items()}
+
+
+def test_shapes_of_a_network_that_fits_nowhere_are_known_at_once():
+    """A hidden layer of 65,536 by 65,536 would take 16 GiB."""
+    shapes = shapes_of("dgvae", spec(), DGVAEConfig(hidden_dim=65_536, head_dim=65_536, decoder_dim=65_536), 3)
+    assert max(math.prod(shape) for shape in shapes.values()) >= 2**32
+
+
+def test_shapes_need_no_compiler():
+    """torch loads its compiler, which takes seconds, for arithmetic on the meta device: none is done there."""
+    code = (
+        "import sys; from predictor.checkpoint import load_checkpoint, shipped\n"
+        "for name in shipped(): load_checkpoint(name)\n"
+        "print('sympy' in sys.modules)"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "False"

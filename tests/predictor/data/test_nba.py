@@ -250,12 +250,12 @@ def set_to(point: int, column: int, value: Any) -> Any:
 
 
 SPORTVU_ERRORS = {
-    "text": ("not json", ", line 1: not JSON (Expecting value)"),
-    "cut off": (game([moment(0)])[:-5].replace('"moments"', '\n"moments"'), ", line 2: not JSON"),
+    "text": ("not json", ", line 1: no JSON (Expecting value)"),
+    "cut off": (game([moment(0)])[:-5].replace('"moments"', '\n"moments"'), ", line 2: no JSON"),
     "a list": ("[]", ", line 1: expected an object with a list 'events'"),
     "no moments": (json.dumps({"events": [{}]}), ", events[0]: expected a list 'moments'"),
-    "nan": (broken_moment(set_to(2, 2, float("nan"))), ", line 35: numbers must be finite, got NaN"),
-    "too large": (game([moment(0)]).replace("47.0", "1e999"), ", events[0].moments[0]: positions must be finite"),
+    "nan": (broken_moment(set_to(2, 2, float("nan"))), ": numbers must be finite, got nan"),
+    "too large": (game([moment(0)]).replace("47.0", "1e999"), ": numbers must be finite, got inf"),
     "word": (broken_moment(set_to(2, 2, "x")), ", events[0].moments[1]: expected [quarter, ms, clock,"),
     "null": (broken_moment(set_to(2, 2, None)), ", events[0].moments[1]: expected [quarter, ms, clock,"),
     "short point": (broken_moment(lambda m: m[5][3].__delitem__(slice(2, 5))), ", events[0].moments[1]: expected ["),
@@ -269,8 +269,6 @@ def test_broken_games_are_one_line(case: str, games: Path, loader: Loader):
     text, message = SPORTVU_ERRORS[case]
     path = games / "7.json"
     path.write_text(text)
-    if case == "nan":
-        message = f", line {1 + text[: text.index('NaN')].count(chr(10))}: numbers must be finite, got NaN"
     loader.refuses(games, f"{path}{message}", "--format", "sportvu")
 
 

@@ -198,7 +198,7 @@ def test_info_is_read_without_the_arrays(tmp_path: Path):
     for name in ("states", "valid"):
         shutil.rmtree(tmp_path / "store" / name / "c")
     assert read_info_of(tmp_path / "store") == replace(INFO, num_steps=7)
-    with pytest.raises(UserError, match=r"nowhere is not a readable episode store \(.*\); make it anew"):
+    with pytest.raises(UserError, match=r"nowhere is not an episode store"):
         read_info_of(tmp_path / "nowhere")
 
 
@@ -285,12 +285,12 @@ def with_broken_metadata(path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (foreign_folder, "store is not a readable episode store"),
-        (foreign_file, "store is not a readable episode store"),
+        (foreign_folder, r"store is not an episode store \(it has no zarr.json\)"),
+        (foreign_file, "store/zarr.json cannot be read: a part of the path is a file"),
         (foreign_group, "store is not an episode store; make one with python -m envs.collect"),
-        (newer_version, "store has store version 99, this release reads 1; collect it anew"),
-        (without_an_array, "store is not a readable episode store .*ids.*; collect it anew"),
-        (with_broken_metadata, "store is not a readable episode store"),
+        (newer_version, "store has version 99, this release reads 1; make it anew"),
+        (without_an_array, "ids/zarr.json cannot be read: there is no such file"),
+        (with_broken_metadata, "store/zarr.json, line 3: no JSON"),
     ],
 )
 def test_what_is_no_store_is_refused(tmp_path: Path, make: Any, message: str):
@@ -386,3 +386,56 @@ def test_marks_are_for_all_episodes_or_for_none(tmp_path: Path):
         marked = replace(shifted_episode(0, 3), causal_shift_m=None)
         write_store(tmp_path / "s", StoreInfo(spec(), "circle"), [marked, circling_episode(0, steps=4)])
     assert not (tmp_path / "s").exists()
+
+
+# --- Checksums and foreign groups -------------------------------------------------------------------------------------
+
+
+def test_every_flipped_bit_is_found(tmp_path: Path):
+    """One bit at each place of each chunk, and of the attributes' values."""
+    write_store(tmp_path / "store", INFO, [episode(1, steps=3)])
+    chunks = [f for f in (tmp_path / "store").rglob("c/**/*") if f.is_file()]
+    assert len(chunks) == 5
+    for chunk in chunks:
+        whole = chunk.read_bytes()
+        for place in range(0, len(whole), 7):
+            chunk.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+            name = chunk.relative_to(tmp_path / "store").parts[0]
+            with pytest.raises(UserError, match=rf"store: chunk c/0\S* of '{name}' is damaged \(.*\); copy or collect"):
+                read_store(tmp_path / "store")
+        chunk.write_bytes(whole)
+    metadata = tmp_path / "store" / "zarr.json"
+    metadata.write_text(metadata.read_text().replace(INFO.source, f"{INFO.source}!"))
+    for read in (read_store, read_info_of):
+        with pytest.raises(UserError, match="zarr.json is damaged"):
+            read(tmp_path / "store")
+
+
+def test_the_damaged_chunk_of_many_is_named(tmp_path: Path):
+    write_store(tmp_path / "store", INFO, [episode(1, steps=9000)])
+    chunk = tmp_path / "store" / "states" / "c" / "1" / "0" / "0"
+    chunk.write_bytes(chunk.read_bytes()[:-1] + b"\0")
+    with pytest.raises(UserError, match="chunk c/1/0/0 of 'states' is damaged"):
+        read_store(tmp_path / "store")
+
+
+def test_a_store_without_checksums_still_loads(tmp_path: Path):
+    """As versions before wrote it: no crc32c, no hash, and no chunks of arrays that are all zero."""
+    write_store(tmp_path / "store", INFO, [episode(1), episode(2)])
+    old = zarr.open_group(tmp_path / "old", mode="w")
+    new = zarr.open_group(tmp_path / "store", mode="r")
+    for name in ("states", "valid", "ids", "starts", "seeds"):
+        values = np.asarray(new[name])
+        old.create_array(name, data=values * (name != "seeds"))
+    old.attrs.update({key: value for key, value in new.attrs.items() if key not in ("sha256", "causal_threshold_m")})
+    assert not (tmp_path / "old" / "seeds" / "c").exists()
+    assert_equal(read_store(tmp_path / "old").episodes[1], replace(episode(2), seed=0))
+
+
+@pytest.mark.parametrize("make", [foreign_folder, foreign_file, foreign_group])
+def test_what_is_no_store_is_never_replaced(tmp_path: Path, make: Any):
+    make(tmp_path / "store")
+    before = {path: path.read_bytes() for path in (tmp_path / "store", *tmp_path.rglob("*")) if path.is_file()}
+    with pytest.raises(UserError, match="store is not an episode store and will not be replaced; choose another path"):
+        write_store(tmp_path / "store", INFO, [episode(1)], overwrite=True)
+    assert {path: path.read_bytes() for path in before} == before

@@ -259,8 +259,8 @@ def test_checkpoints_from_before_there_were_neighbours_load(tmp_path: Path):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"num_neighbours": -2}, "does not describe a predictor: num_neighbours must not be negative, got -2"),
-        ({"rollout_graph": "forzen"}, "(?s)does not describe a predictor: .*rollout_graph.*'forzen'"),
+        ({"num_neighbours": -2}, "config: num_neighbours must not be negative, got -2"),
+        ({"rollout_graph": "forzen"}, "(?s)config: .*rollout_graph.*'forzen'"),
     ],
 )
 def test_impossible_values_are_refused(tmp_path: Path, fields: dict[str, Any], message: str):

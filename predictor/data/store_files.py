@@ -1,0 +1,206 @@
+"""Checks of a store's files before Zarr opens them, and reading of its arrays with the damaged chunk named.
+
+Zarr reads whatever a group declares: other formats, whose arrays may be pickles, sizes of any height, pipes. So a store
+is Zarr's format 3, has only arrays that a store has, of their types and a few codecs, and fits into memory. New stores
+carry a CRC-32C of every chunk (Zarr's codec crc32c) and a SHA-256 of their attributes; older ones have neither.
+"""
+
+import hashlib
+import itertools
+import json
+import math
+import os
+import stat
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from zarr.codecs import Crc32cCodec, ZstdCodec
+
+from predictor.support.errors import UserError, short
+from predictor.support.memory import check_memory
+from predictor.support.reading import MIB, NoSuchFile, as_object, check_regular, read_object, unreadable
+
+METADATA = "zarr.json"
+DIGEST = "sha256"
+COMPRESSORS = (ZstdCodec(level=0), Crc32cCodec())
+"""Codecs of a new array: compression, and a checksum of each chunk."""
+MOST_METADATA_BYTES, MOST_CHUNK_BYTES = 256 * MIB, 16_384 * MIB
+_CODECS = ("bytes", "zstd", "crc32c", "blosc", "gzip", "transpose")
+_FLOAT, _INT = ("float32", "float64"), ("int8", "int16", "int32", "int64")
+_ARRAYS: dict[str, tuple[tuple[str, ...], int]] = {
+    "states": (_FLOAT, 3),
+    "valid": (("bool",), 2),
+    "ids": (_INT, 2),
+    "starts": (_INT, 1),
+    "seeds": (_INT, 1),
+    "perturbed": (_INT, 2),
+    "label_starts": (_INT, 1),
+    "edge_types": (_INT, 3),
+    "edge_attributes": (_FLOAT, 4),
+    "causal_shift_m": (_FLOAT, 3),
+}
+"""Types and number of axes of each array that a store may have."""
+_ALWAYS = ("states", "valid", "ids", "starts", "seeds")
+_BAD = (KeyError, TypeError, ValueError, OSError, RuntimeError, MemoryError, AttributeError, zarr.errors.BaseZarrError)
+"""What Zarr and its codecs raise for what they cannot read."""
+
+
+@dataclass(frozen=True)
+class StoreHeader:
+    """What a store declares."""
+
+    attributes: dict[str, Any]
+    """Attributes of the group."""
+    shapes: dict[str, tuple[int, ...]]
+    """Shapes of its arrays."""
+
+
+def digest_of(attributes: Mapping[str, Any]) -> str:
+    """Returns the SHA-256 of attributes, in hexadecimal digits; that of an older digest does not count."""
+    kept = {key: value for key, value in attributes.items() if key != DIGEST}
+    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
+
+
+def attributes_of(path: Path, format: str) -> dict[str, Any]:
+    """Reads the attributes of a group, which must have the given value of "format".
+
+    Raises:
+        UserError: there is no such group.
+    """
+    try:
+        content = read_object(path / METADATA, MOST_METADATA_BYTES)
+    except NoSuchFile as error:
+        raise UserError(f"{short(path)} is not an episode store (it has no {METADATA}); see docs/datasets") from error
+    if content.get("zarr_format") != 3 or content.get("node_type") != "group":
+        raise UserError(
+            f"{short(path)} is not an episode store (zarr_format must be 3 and node_type group, got "
+            f"{short(repr(content.get('zarr_format')), 40)} and {short(repr(content.get('node_type')), 40)})"
+        )
+    attributes = as_object(content.get("attributes"), f"{path / METADATA}: attributes")
+    if attributes.get("format") != format:
+        raise UserError(f"{short(path)} is not an episode store; make one with python -m envs.collect")
+    return attributes
+
+
+def read_header(path: Path, format: str) -> StoreHeader:
+    """Checks all files of a store but the content of its arrays.
+
+    Raises:
+        UserError: an entry is neither file nor folder, a store cannot have such an array, or it is too large.
+    """
+    attributes = attributes_of(path, format)
+    _check_files(path)
+    shapes, total = dict[str, tuple[int, ...]](), 0
+    for name in _ARRAYS:
+        if name in _ALWAYS or (path / name).exists():
+            shapes[name], size = _array(path / name, name)
+            total += size
+    check_memory(2 * total, f"store {short(path)}", "copy it anew, or read it on a larger machine")
+    return StoreHeader(attributes, shapes)
+
+
+def check_digest(path: Path, attributes: Mapping[str, Any]) -> None:
+    """Checks the checksum of a store's attributes; older stores have none.
+
+    Raises:
+        UserError: the attributes are not those that were written.
+    """
+    if attributes.get(DIGEST, digest_of(attributes)) != digest_of(attributes):
+        raise UserError(f"{path / METADATA} is damaged (its checksum does not fit); copy or collect it anew")
+
+
+def read_arrays(path: Path, header: StoreHeader) -> dict[str, np.ndarray]:
+    """Reads all arrays of a store whose files have been checked.
+
+    Raises:
+        UserError: chunks are missing or damaged; the message names one.
+    """
+    try:
+        group = zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
+        return {name: _read(path, name, group[name], DIGEST in header.attributes) for name in header.shapes}
+    except UserError:
+        raise
+    except _BAD as error:
+        reason = short(" ".join(str(error).split()), 200)
+        raise UserError(f"{short(path)} is not a readable episode store ({reason}); collect it anew") from error
+
+
+def _read(path: Path, name: str, stored: Any, has_checksums: bool) -> np.ndarray:
+    """Reads one array; of small ones, older stores leave out chunks of zeros."""
+    if has_checksums or name not in ("ids", "starts", "seeds", "label_starts"):
+        if stored.nchunks_initialized != stored.nchunks:  # Zarr reads what is missing as zeros
+            raise UserError(f"{path}: chunks of '{name}' are missing; copy or collect it anew")
+    try:
+        return np.asarray(stored)
+    except _BAD as error:
+        reason = short(" ".join(str(error).split()), 120)
+        raise UserError(
+            f"{path}: chunk {_damaged(stored)} of '{name}' is damaged ({reason}); copy or collect it anew"
+        ) from error
+
+
+def _damaged(stored: Any) -> str:
+    """Returns the name of the first chunk that cannot be read."""
+    counts = [math.ceil(length / chunk) for length, chunk in zip(stored.shape, stored.chunks, strict=True)]
+    for place in itertools.product(*map(range, counts)):
+        try:
+            stored[tuple(slice(i * chunk, (i + 1) * chunk) for i, chunk in zip(place, stored.chunks, strict=True))]
+        except _BAD:
+            return "/".join(["c", *map(str, place)])
+    return "c"
+
+
+def _check_files(path: Path) -> None:
+    """Checks that everything below a folder is a regular file of a possible size, or a folder."""
+    for entry in _entries(path):
+        try:
+            is_folder = stat.S_ISDIR(os.stat(entry).st_mode)
+        except OSError as error:
+            raise unreadable(entry, error) from error
+        if not is_folder:
+            check_regular(entry, MOST_METADATA_BYTES if entry.name == METADATA else MOST_CHUNK_BYTES)
+
+
+def _entries(path: Path) -> Iterator[Path]:
+    for folder, folders, files in os.walk(path):
+        yield from (Path(folder) / name for name in (*folders, *files))
+
+
+def _array(path: Path, name: str) -> tuple[tuple[int, ...], int]:
+    """Returns shape and size in bytes of an array, after a check of all that its metadata declares."""
+    where = str(path / METADATA)
+    content = read_object(path / METADATA, MIB)
+    if content.get("zarr_format") != 3 or content.get("node_type") != "array":
+        raise UserError(f"{where}: '{name}' must be an array of zarr_format 3; collect the store anew")
+    kinds, axes = _ARRAYS[name]
+    kind = content.get("data_type")
+    if kind not in kinds:
+        raise UserError(f"{where}: data_type must be {' or '.join(kinds)}, got {short(repr(kind), 60)}")
+    shape = _sizes(content.get("shape"), axes, 0, f"{where}: shape")
+    grid = as_object(content.get("chunk_grid"), f"{where}: chunk_grid")
+    inner = as_object(grid.get("configuration"), f"{where}: chunk_grid.configuration")
+    chunks = _sizes(inner.get("chunk_shape"), axes, 1, f"{where}: chunk_shape")
+    item = np.dtype(kind).itemsize
+    size, chunk = math.prod(shape) * item, math.prod(chunks) * item
+    if grid.get("name") != "regular" or chunk > max(2 * size, MIB):
+        raise UserError(f"{where}: a chunk must not be larger than the array, got {list(chunks)} in {list(shape)}")
+    codecs = content.get("codecs")
+    if not isinstance(codecs, list) or not codecs:
+        raise UserError(f"{where}: codecs must be an array of codecs, got {short(repr(codecs), 60)}")
+    for codec in codecs:
+        if not isinstance(codec, dict) or codec.get("name") not in _CODECS:
+            raise UserError(f"{where}: a codec must be one of {', '.join(_CODECS)}, got {short(repr(codec), 60)}")
+    if content.get("storage_transformers"):
+        raise UserError(f"{where}: storage_transformers must be empty")
+    return shape, size
+
+
+def _sizes(values: Any, axes: int, least: int, where: str) -> tuple[int, ...]:
+    given: Sequence[Any] = values if isinstance(values, list) else ()
+    if len(given) != axes or not all(type(value) is int and least <= value < 2**48 for value in given):
+        raise UserError(f"{where} must be {axes} whole numbers from {least} up, got {short(repr(values), 60)}")
+    return tuple(given)
