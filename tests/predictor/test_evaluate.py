@@ -271,7 +271,7 @@ def no_agent_stays(data: Path, checkpoint: Path) -> list[Any]:
         (other_features, "'heading_rad')"),
         (no_such_store, "no episode store at "),
         (no_such_checkpoint, "no checkpoint 'highwy': neither a folder nor a shipped name"),
-        (truncated_checkpoint, "model.safetensors cannot be read"),
+        (truncated_checkpoint, "model.safetensors is no safetensors file"),
         (negative_samples, "samples must be at least 1, got -1"),
         (no_horizon, "horizon_steps must be at least 1, got 0"),
         (horizon_beyond_every_episode, "episodes have at most 6 steps, a horizon of 6 needs 7; lower --horizon-steps"),

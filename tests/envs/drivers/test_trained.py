@@ -93,7 +93,7 @@ def test_a_damaged_note_is_one_clear_line(tmp_path: Path):
     path, _ = save_run(tmp_path, Task(SPREAD, "none"), noted=False)
     with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
         archive.writestr("note.json", '{"policy": {"learners": []}}')
-    with pytest.raises(UserError, match=r"note inside .*policy.zip cannot be understood \(KeyError\('forecaster'\)\)"):
+    with pytest.raises(UserError, match="policy.zip: note: key 'forecaster' is missing; save the policy again"):
         trained_driver(path, forecast_env(), np.random.default_rng(0))
 
 

@@ -325,9 +325,13 @@ def test_encoder_sees_what_changed_since_the_last_step():
         torch.testing.assert_close(shown.pop(), inputs[:, [t]])
 
 
-@pytest.mark.parametrize("scales", [(1.0, 2.0), (1.0, 0.0, 1.0, 1.0)], ids=["too_few", "zero"])
-def test_change_scales_must_fit_the_features(scales: tuple[float, ...]):
-    with pytest.raises(UserError, match=rf"change_scales needs 4 positive numbers, got {re.escape(str(scales))}"):
+@pytest.mark.parametrize(
+    ("scales", "must"),
+    [((1.0, 2.0), "needs 4 positive numbers"), ((1.0, 0.0, 1.0, 1.0), "must be positive, finite numbers")],
+    ids=["too_few", "zero"],
+)
+def test_change_scales_must_fit_the_features(scales: tuple[float, ...], must: str):
+    with pytest.raises(UserError, match=rf"change_scales {must}, got {re.escape(str(scales))}"):
         DGVAE(spec(), replace(FAST_LIKE, change_scales=scales))
 
 
