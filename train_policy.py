@@ -25,7 +25,7 @@ from agents.training import TrainingPlan, train
 from agents.video import film
 from envs.readers.mpe import MPE_IDS
 from envs.registry import entry_for, envpool_task_of
-from envs.simulators.envpool import ONE_START
+from envs.simulators.envpool import begins_alike
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import run_entry_point
@@ -210,7 +210,7 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
     free = ("checkpoint_every", "eval_episodes", "video", "device", "set", "preset_file", FORECASTER)
     # the forecaster is compared above, what --set and --preset say as part of the preset
     open_run(config.folder, settings, provenance(PACKAGES) | {"seed": config.seed}, config.resume, free)
-    if config.backend == "envpool" and (copy := envpool_task_of(config.env_id)) in ONE_START:
+    if config.backend == "envpool" and begins_alike(copy := envpool_task_of(config.env_id)):
         console.print(f"note: EnvPool's {copy} begins every episode in the same state; the original does not")
     policy = train(plan, config.folder)
     model = load_model(policy, config.algorithm)

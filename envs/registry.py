@@ -13,7 +13,7 @@ import gymnasium as gym
 
 from envs.readers.mpe import MPE_IDS
 from envs.simulators.envpool import ENV_IDS as ENVPOOL_IDS
-from envs.simulators.envpool import HIGHWAY_ENV_OF, register_envpool_ids
+from envs.simulators.envpool import HIGHWAY_ENV_OF, known_tasks, register_envpool_ids
 from predictor.support.errors import UserError
 
 if TYPE_CHECKING:
@@ -83,7 +83,11 @@ def _intersection(env_id: str, checkpoint: str | None = None) -> EnvEntry:
 
 ENVS: dict[str, EnvEntry] = {
     **_HIGHWAY,
-    **{env_id: EnvEntry(checkpoint=_original_of(env_id).checkpoint) for env_id in ENVPOOL_IDS},
+    **{
+        env_id: EnvEntry(checkpoint=_original_of(env_id).checkpoint)
+        for env_id, task in ENVPOOL_IDS.items()
+        if task in known_tasks()
+    },
     **{env_id: _mpe(env_id) for env_id in MPE_IDS},
     "simple_tag_v3": _mpe("simple_tag_v3", "simple-tag", learners=("adversary",)),
     "simple_spread_v3": _mpe("simple_spread_v3", "simple-spread"),
@@ -198,12 +202,12 @@ def envpool_task_of(env_id: str) -> str:
     Raises:
         UserError: EnvPool has none.
     """
-    exact = [task for task, copied in HIGHWAY_ENV_OF.items() if copied == env_id]
-    near = [task for task, copied in HIGHWAY_ENV_OF.items() if copied.rpartition("-v")[0] == env_id.rpartition("-v")[0]]
+    copies = {task: HIGHWAY_ENV_OF[task] for task in known_tasks()}
+    exact = [task for task, copied in copies.items() if copied == env_id]
+    near = [task for task, copied in copies.items() if copied.rpartition("-v")[0] == env_id.rpartition("-v")[0]]
     if not exact + near:
         raise UserError(
-            f"EnvPool has no copy of '{env_id}'; it has {', '.join(HIGHWAY_ENV_OF.values())}: train without "
-            "--backend envpool"
+            f"EnvPool has no copy of '{env_id}'; it has {', '.join(copies.values())}: train without --backend envpool"
         )
     return (exact + near)[0]
 

@@ -29,7 +29,7 @@ class EnvPoolVecEnv(VecEnv):
     SB3's VecEnvs: `infos[i]["terminal_observation"]` closes the old one, scene included.
 
     Args:
-        task_id: a key of `HIGHWAY_ENV_OF`.
+        task_id: one of `envs.simulators.envpool.known_tasks()`.
         num_envs: number of environments.
         seed: random seed: env i gets seed + i; None draws one.
         num_threads: number of threads of the simulation; 0 leaves it to EnvPool.

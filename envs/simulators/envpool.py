@@ -5,6 +5,8 @@ the first environment is made. This module only adapts: the simulation itself is
 """
 
 import functools
+import importlib.metadata
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,20 +21,37 @@ HIGHWAY_ENV_OF: dict[str, str] = {
     "Highway-v0": "highway-v0",
     "HighwayFast-v0": "highway-fast-v0",
     "Exit-v0": "exit-v0",
+    "Exit-v1": "exit-v1",
     "Intersection-v0": "intersection-v0",
     "Intersection-v1": "intersection-v1",
+    "Intersection-v2": "intersection-v2",
     "Merge-v0": "merge-v0",
+    "Merge-v1": "merge-v1",
+    "MergeGeneric-v0": "merge-generic-v0",
+    "MergeGeneric-v1": "merge-generic-v1",
     "Racetrack-v0": "racetrack-v0",
+    "Racetrack-v1": "racetrack-v1",
     "RacetrackLarge-v0": "racetrack-large-v0",
+    "RacetrackLarge-v1": "racetrack-large-v1",
     "RacetrackOval-v0": "racetrack-oval-v0",
+    "RacetrackOval-v1": "racetrack-oval-v1",
     "Roundabout-v0": "roundabout-v0",
+    "Roundabout-v1": "roundabout-v1",
+    "RoundaboutGeneric-v0": "roundabout-generic-v0",
+    "RoundaboutGeneric-v1": "roundabout-generic-v1",
     "TwoWay-v0": "two-way-v0",
     "UTurn-v0": "u-turn-v0",
+    "UTurn-v1": "u-turn-v1",
 }
 """EnvPool task → the highway-env id that it re-implements; docs/envpool.md says where the two differ."""
 
-ONE_START = frozenset(HIGHWAY_ENV_OF) - {"Highway-v0", "HighwayFast-v0", "Merge-v0"}
-"""Tasks that begin in the same state whatever the seed (EnvPool 1.2.5): all their variety comes from the ego."""
+VARIED_SINCE = (1, 2, 7)
+"""First release with the tasks of `ADDED`, and in which every task begins anew with each seed (Python ≥ 3.12)."""
+ADDED = frozenset(task for task, copied in HIGHWAY_ENV_OF.items() if "generic" in copied or task.endswith("-v1")) - {
+    "Intersection-v1"
+} | {"Intersection-v2"}
+"""Tasks that earlier releases do not have."""
+_ONE_START = frozenset(HIGHWAY_ENV_OF) - ADDED - {"Highway-v0", "HighwayFast-v0", "Merge-v0"}
 
 ENV_IDS: dict[str, str] = {f"envpool/{task_id}": task_id for task_id in HIGHWAY_ENV_OF if task_id != "Intersection-v1"}
 """Gymnasium id → EnvPool task."""
@@ -56,10 +75,31 @@ _META = MetaActions({"LANE_LEFT": 0, "IDLE": 1, "LANE_RIGHT": 2, "FASTER": 3, "S
 _META_LONGITUDINAL = MetaActions({"SLOWER": 0, "IDLE": 1, "FASTER": 2})
 
 
+@functools.cache
+def envpool_release() -> tuple[int, ...]:
+    """Returns the release of the installed EnvPool, such as (1, 2, 7); that of `VARIED_SINCE` where there is none."""
+    try:
+        version = importlib.metadata.version("envpool")
+    except importlib.metadata.PackageNotFoundError:
+        return VARIED_SINCE
+    return tuple(int(part) for part in re.findall(r"\d+", version)[:3])
+
+
+def known_tasks() -> tuple[str, ...]:
+    """Returns the tasks of `HIGHWAY_ENV_OF` that the installed release of EnvPool has."""
+    return tuple(t for t in HIGHWAY_ENV_OF if t not in ADDED or envpool_release() >= VARIED_SINCE)
+
+
+def begins_alike(task_id: str) -> bool:
+    """Returns whether a task begins in the same state whatever the seed: all its variety comes from the ego."""
+    return task_id in _ONE_START and envpool_release() < VARIED_SINCE
+
+
 def register_envpool_ids() -> None:
-    """Registers `ENV_IDS` with gymnasium; may be called again, and does not import EnvPool."""
+    """Registers the `ENV_IDS` of `known_tasks()` with gymnasium; may be called again, and does not import EnvPool."""
+    tasks = known_tasks()
     for env_id, task_id in ENV_IDS.items():
-        if env_id not in gym.registry:
+        if env_id not in gym.registry and task_id in tasks:
             gym.register(env_id, entry_point=f"{__name__}:EnvPoolEnv", kwargs={"task_id": task_id})
 
 
@@ -67,7 +107,7 @@ def make_pool(task_id: str, seeds: Sequence[int], num_threads: int = 0, **settin
     """Makes an EnvPool pool of one task, one environment per seed.
 
     Args:
-        task_id: a key of `HIGHWAY_ENV_OF`.
+        task_id: one of `known_tasks()`.
         seeds: seed of each environment; the first `reset` draws from it, later ones carry on.
         num_threads: number of threads of the simulation; 0 leaves it to EnvPool.
         settings: settings of the task (`duration`, `policy_frequency`, … ; docs/envpool.md), or `render_mode`.
@@ -76,13 +116,17 @@ def make_pool(task_id: str, seeds: Sequence[int], num_threads: int = 0, **settin
         UserError: no EnvPool, an unknown task or setting.
     """
     if task_id not in HIGHWAY_ENV_OF:
-        raise UserError(f"no EnvPool task '{task_id}' is known here; known: {', '.join(HIGHWAY_ENV_OF)}")
+        raise UserError(f"no EnvPool task '{task_id}' is known here; known: {', '.join(known_tasks())}")
     try:
         import envpool
     except ImportError as error:
         raise UserError(
             f"EnvPool's environments need the envpool package ({error}); pip install 'dgvae-rl[envpool]'"
         ) from error
+    if task_id not in known_tasks():
+        raise UserError(
+            f"EnvPool {envpool.__version__} has no {task_id}; install 1.2.7 or later (Python 3.12 or later)"
+        )
     known = [k for k in envpool.make_spec(task_id).config._fields if k not in _OWN_SETTINGS]
     if unknown := set(settings) - {*known, "render_mode"}:
         raise UserError(f"EnvPool's {task_id} has no setting {sorted(unknown)}; it has {', '.join(known)}")

@@ -18,10 +18,11 @@ from envs.drivers.ego import idle_action  # noqa: E402
 from envs.observation import SCENE_KEYS  # noqa: E402
 from envs.sb3.envpool import EnvPoolVecEnv  # noqa: E402
 from envs.sb3.forecast import VecForecast  # noqa: E402
-from envs.simulators.envpool import (
+from envs.simulators.envpool import (  # noqa: E402
     ENV_IDS,
-    HIGHWAY_ENV_OF,  # noqa: E402
+    HIGHWAY_ENV_OF,
     EnvPoolEnv,
+    known_tasks,
     make_pool,
     register_envpool_ids,
 )
@@ -45,6 +46,10 @@ CHECKER_WARNINGS = (
     r"ignore:The minimal resolution for an image:UserWarning",
     r"ignore:Your observation .*has an unconventional shape:UserWarning",
 )
+
+
+OUTDATED = "ignore:.*is out of date"
+"""EnvPool has newer versions of some tasks from 1.2.7 on, and gymnasium recommends them."""
 
 
 def ignore_checker_warnings(test: Any) -> Any:
@@ -72,13 +77,15 @@ def one_of(observations: Any, index: int) -> Any:
 
 
 @ignore_checker_warnings
-@pytest.mark.parametrize("env_id", ENV_IDS)
+@pytest.mark.filterwarnings(OUTDATED)
+@pytest.mark.parametrize("env_id", [env_id for env_id, task in ENV_IDS.items() if task in known_tasks()])
 def test_gymnasium_accepts(env_id: str):
     register_envpool_ids()
     check_env(gym.make(env_id), skip_render_check=True)
 
 
 @ignore_checker_warnings
+@pytest.mark.filterwarnings(OUTDATED)
 @pytest.mark.parametrize("env_id", ["envpool/HighwayFast-v0", "envpool/Intersection-v0", "envpool/Racetrack-v0"])
 def test_sb3_accepts(env_id: str):
     register_envpool_ids()
@@ -98,7 +105,7 @@ from envs.simulators.envpool import ENV_IDS, register_envpool_ids
 register_envpool_ids()
 register_envpool_ids()
 import gymnasium as gym
-assert set(ENV_IDS) <= set(gym.registry)
+assert "envpool/HighwayFast-v0" in gym.registry
 try:
     gym.make("envpool/HighwayFast-v0")
 except ValueError as error:
@@ -109,6 +116,7 @@ except ValueError as error:
     assert "need the envpool package" in done.stdout and "pip install 'dgvae-rl[envpool]'" in done.stdout
 
 
+@pytest.mark.filterwarnings(OUTDATED)
 @pytest.mark.parametrize("env_id", ["envpool/HighwayFast-v0", "envpool/Merge-v0"])
 def test_a_seed_is_an_episode(env_id: str):
     register_envpool_ids()
@@ -223,7 +231,7 @@ def test_envs_of_a_pool_are_single_environments(scenes: bool):
     assert len(ended) > ENVS and len({t for t, _ in ended}) > 2  # environments end at different steps, more than once
 
 
-@pytest.mark.parametrize("task_id", HIGHWAY_ENV_OF)
+@pytest.mark.parametrize("task_id", known_tasks())
 def test_observations_lie_in_the_space(task_id: str):
     pool = EnvPoolVecEnv(task_id, 2, seed=0, num_threads=1)
     pool.action_space.seed(0)
