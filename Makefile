@@ -1,10 +1,11 @@
 PYTHON ?= python3
 TEST_JOBS ?= 2
+DOCS_JOBS ?= 16
 EXTRAS ?= core scores envs rl study contrib tune envpool
 RUN_DIR ?= runs/highway-fast-ppo
 
 .DEFAULT_GOAL := help
-.PHONY: help .venv train test check docs-check install-check bench bench-check clean
+.PHONY: help .venv train test check docs docs-check install-check bench bench-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[.a-z-]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -34,6 +35,15 @@ check: .venv/.tools ## lint, formatting, types, who may import whom, the shape o
 	.venv/bin/python -m docs.write_tables --check
 	.venv/bin/python -m pytest -q -o addopts=--import-mode=importlib --doctest-modules \
 		predictor envs agents dgvae_rl benchmarks train_policy.py tests/test_structure.py
+
+.venv/.site: .venv/.package
+	.venv/bin/python -m pip install -c constraints.txt -e '.[all,docs]'
+	touch $@
+
+docs: .venv/.site ## build the site into build/site: runs the tutorials, fails on a warning or a dead link
+	rm -rf build/site
+	.venv/bin/python -m sphinx -W --keep-going -E -q -j $(DOCS_JOBS) -c docs -d build/site-cache . build/site
+	.venv/bin/python -m docs.check_links build/site
 
 docs-check: .venv/.tools ## run every command and every block of README.md and docs/ as written, in a copy of the tree
 	.venv/bin/python .ci/docs_check.py

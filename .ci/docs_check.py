@@ -38,7 +38,7 @@ OTHER_LANGUAGES = ("text", "json", "toml", "yaml", "bibtex", "mermaid", "markdow
 
 _BLOCK = re.compile(
     r"(?:^[ \t]*<!--\s*docs-check:(?P<note>(?:(?!-->).)*)-->[ \t]*\n)?"
-    r"^(?P<indent>[ \t]*)```(?P<language>\S*)[ \t]*\n(?P<code>.*?)^[ \t]*```[ \t]*$",
+    r"^(?P<indent>[ \t]*)```(?P<language>\{[^\n]*|\S*)[ \t]*\n(?P<code>.*?)^[ \t]*```[ \t]*$",
     flags=re.MULTILINE | re.DOTALL,
 )
 _COMMAND = re.compile(r"^\s*(?:\$ |>>> |python3? |pip |make |git |export |tensorboard )", flags=re.MULTILINE)
@@ -163,6 +163,8 @@ def blocks_of(page: Path, root: Path = ROOT) -> list[Block]:
         if language in ("bash", "python"):
             dedented = re.sub(f"^{indent}", "", code, flags=re.MULTILINE)
             found.append(Block(name, fence, language, dedented, (match["note"] or "").strip()))
+        elif language.startswith("{"):
+            continue  # a directive of the site; `make docs` builds it, and runs what is in a code cell
         elif language and language not in OTHER_LANGUAGES:
             raise DocsError(f"{name}:{fence}: blocks of '{language}' are not known; write bash, python or text")
         elif not language and _COMMAND.search(code):

@@ -1,14 +1,16 @@
-"""Writes the tables of README.md, docs/in_env.md and the checkpoints' cards: `python -m docs.write_tables [--check]`.
+"""Writes the tables of README.md, docs/ and the checkpoints' cards: `python -m docs.write_tables [--check]`.
 
-Every number comes from a record, predictor/pretrained/NAME/in_env.json, which `python -m predictor.card` fills. Tables
-stand between `<!-- table: NAME -->` and `<!-- end -->`. With `--check` nothing is written: the exit status is 1 if a
-page differs from its records.
+Numbers come from records, predictor/pretrained/NAME/in_env.json, which `python -m predictor.card` fills; sizes from the
+checkpoints themselves. Tables stand between `<!-- table: NAME -->` and `<!-- end -->`. With `--check` nothing is
+written: the exit status is 1 if a page differs from its records.
 """
 
 import sys
 from pathlib import Path
 
 from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS
+from predictor.checkpoint import PRETRAINED as CHECKPOINT_FOLDER
+from predictor.checkpoint import WEIGHTS, load_checkpoint
 from predictor.evaluation.in_env_record import FILE_NAME, Measurement, read_record
 from predictor.reports.in_env_tables import (
     COLUMNS,
@@ -24,16 +26,19 @@ from predictor.support.markdown import table
 
 ROOT = Path(__file__).resolve().parents[1]
 PRETRAINED = Path("predictor/pretrained")
-PAGES = (Path("README.md"), Path("docs/in_env.md"))
+PAGES = (Path("README.md"), Path("docs/checkpoints.md"), Path("docs/in_env.md"))
 SERVED_BY = CHECKPOINTS | MULTIAGENT_CHECKPOINTS
 """Id → checkpoint that ships for it, in the order of the tables."""
 SAMPLES = 20
 """Number of samples K of the tables by environment; the transfer matrix has K = 1, the most likely forecast alone."""
 
+FIRST = ("highway-fast-v0", "merge-v1", "roundabout-v1", "intersection-v2", "racetrack-v1", "simple_tag_v3")
+"""Ids of the table of README.md: one of each kind."""
 SHORT = (
     "env", "driver", "episodes", "horizon", "minADE₁ / minFDE₁ [m]", "nearest neighbours ADE [m]",
     "constant velocity ADE / FDE [m]", "ADE below constant velocity (95 %)", "forecasts",
 )  # fmt: skip
+SIZES = ("checkpoint", "serves", "parameters", "size [kB]", "modes", "horizon", "agents", "range [m]")
 LONG = (
     "env", "driver", "episodes", "K", "horizon", "minADE₁ (95 %) / minFDE₁ [m]", "best of K [m]",
     "one step of history (95 %) [m]", "nearest neighbours ADE [m]", "constant velocity ADE / FDE [m]",
@@ -49,10 +54,12 @@ Records = dict[str, list[Measurement]]
 
 
 def tables(records: Records) -> dict[str, str]:
-    """Returns the tables of README.md and docs/in_env.md by name."""
+    """Returns the tables of README.md and docs/ by name."""
     at_k = {name: [m for m in found if m.samples == SAMPLES] for name, found in records.items()}
     own = [m for env_id, name in SERVED_BY.items() for m in at_k.get(name, []) if m.env_id == env_id]
     return {
+        "first": measurement_table([m for m in own if m.env_id in FIRST], SHORT),
+        "checkpoints": _sizes(),
         "forecasts": measurement_table(own, SHORT),
         "forecasts-long": measurement_table(own, LONG),
         "samples": samples_table(own),
@@ -80,6 +87,27 @@ def pages(root: Path) -> dict[Path, tuple[str, str]]:
         shown = [m for m in measurements if m.samples == SAMPLES]
         found[path] = page, replace_tables(page, {"accuracy": card_section(shown)})
     return found
+
+
+def _sizes() -> str:
+    """Returns the table of what ships: a checkpoint's card, the ids it serves, its size, and what it forecasts."""
+    lines = []
+    for name in sorted(set(SERVED_BY.values())):
+        model, info = load_checkpoint(name)
+        modes, card = getattr(info.config, "num_modes", 0), f"../{PRETRAINED}/{name}/README.md"
+        lines.append(
+            [
+                f"[{name}]({card})",
+                ", ".join(env_id for env_id, serving in SERVED_BY.items() if serving == name),
+                f"{sum(weights.numel() for weights in model.parameters()):,}",
+                f"{(CHECKPOINT_FOLDER / name / WEIGHTS).stat().st_size / 1000:.0f}",
+                str(modes) if modes else "–",
+                f"{info.horizon_steps} × {info.spec.dt_s:g} s",
+                str(info.spec.max_agents),
+                f"{info.spec.perception_m:g}",
+            ]
+        )
+    return table(SIZES, lines, "--r")
 
 
 def _lent(records: Records) -> str:

@@ -75,6 +75,24 @@ def test_a_broken_block_fails_with_its_place_and_its_output(tmp_path: Path, bloc
     assert after.error == "" and str(after).endswith("s  ok")
 
 
+def test_directives_of_the_site_are_left_to_it(tmp_path: Path):
+    """Their closing fence must not open a block: the one after them would be lost."""
+    text = """
+~~~{include} ../README.md
+:start-after: "## Citation"
+~~~
+~~~{code-cell}
+%%bash
+python -m no_such_module
+~~~
+~~~bash
+false
+~~~
+"""
+    (done,) = results(tmp_path, text)
+    assert done.block.line == 9 and "exit status 1" in done.error
+
+
 def test_a_block_that_takes_too_long_is_stopped(tmp_path: Path):
     done = results(
         tmp_path, "~~~bash\nsleep 2 && touch late\n~~~\n~~~python\nimport time\ntime.sleep(30)\n~~~\n", limit_s=0.5

@@ -20,6 +20,9 @@ from predictor.training.config import OF_THE_DGVAE, TrainConfig
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 README = (ROOT / "README.md").read_text()
+LIMITS, OBSERVATIONS, PREDICTORS = (
+    (ROOT / "docs" / f"{name}.md").read_text() for name in ("limits", "observations", "predictors")
+)
 RESULTS = (ROOT / "docs" / "results.md").read_text()
 TRAINING = (ROOT / "docs" / "training.md").read_text()
 CONTROL = "constant velocity + noise"
@@ -64,7 +67,7 @@ def test_every_table_of_results_has_the_stochastic_control():
     found = lines_with_k(RESULTS)
     assert len(found) == 12  # two views and the graph, of four datasets
     assert all(CONTROL in {line[""] for line in lines} for lines in found)
-    assert any(CONTROL in {line[""] for line in lines} for lines in lines_with_k(README))
+    assert any(CONTROL in {line[""] for line in lines} for lines in lines_with_k(PREDICTORS))
 
 
 @pytest.mark.parametrize("title", ["NBA", "Stanford Drone Dataset", "5-Spring", "Motion capture"])
@@ -81,7 +84,8 @@ def test_the_text_names_the_leader_at_equal_k(title: str):
 
 def test_what_wraps_with_one_argument_is_what_has_a_checkpoint():
     lines = {
-        cells[0].strip(): cells[1].strip() for cells in next(t for t in tables(README) if "environments" in t[0][0])
+        cells[0].strip(): cells[1].strip()
+        for cells in next(t for t in tables(OBSERVATIONS) if "environments" in t[0][0])
     }
     one_argument = " ".join(name for name, code in lines.items() if re.search(r"\(env\)`", code))
     for env_id in ("simple_tag_v3", "simple_spread_v3", "highway-mixed-v0"):
@@ -103,11 +107,11 @@ def test_what_the_shipped_checkpoints_use_of_the_newer_parts_is_what_their_confi
     sees_changes = {name for name, config in configs.items() if config.get("change_scales")}
     fitted = {name for name, config in configs.items() if config.get("input_scales")}
     words = {3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine", 10: "ten"}
-    assert f"Of {len(configs)}, {words[len(sees_changes)]} see changes" in README
-    assert f"{words[len(fitted)]} of these have fitted input scales" in README and fitted <= sees_changes
-    assert all(f"`{name}`" in README.split("fitted input scales")[1].split("\n* ")[0] for name in fitted)
+    assert f"Of {len(configs)}, {words[len(sees_changes)]} see changes" in LIMITS
+    assert f"{words[len(fitted)]} of these have fitted input scales" in LIMITS and fitted <= sees_changes
+    assert all(f"`{name}`" in LIMITS.split("fitted input scales")[1].split("\n* ")[0] for name in fitted)
     plural = {name for name, config in configs.items() if config.get("num_modes")}
-    named = README.split("Plural are ")[1].split(". ")[0]
+    named = LIMITS.split("Plural are ")[1].split(". ")[0]
     assert {name for name in configs if f"`{name}`" in named} == plural
     for config in configs.values():
         assert not config.get("innovation_rounds") and not config.get("gated_messages")

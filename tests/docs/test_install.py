@@ -24,7 +24,7 @@ def requirements(extra: str) -> set[str]:
 
 def test_every_extra_is_in_the_table():
     rows = dict(re.findall(r"^\| `?(\w+)`? \| (.*) \|$", INSTALL, re.MULTILINE))
-    assert set(rows) - {"none", "extra"} == set(PROJECT["optional-dependencies"]) - {"dev", "training"}
+    assert set(rows) - {"none", "extra"} == set(PROJECT["optional-dependencies"]) - {"dev", "docs", "training"}
     assert "0.7 GB" in rows["envpool"] and "but EnvPool" in rows["all"]
     assert requirements("all") == set().union(
         *(requirements(name) for name in rows if name not in ("none", "extra", "all", "envpool"))
@@ -41,6 +41,7 @@ def test_training_installs_no_envpool():
         return done.stdout
 
     assert "envpool" not in planned("train") and "-e '.[all]'" in planned("train")
+    assert "envpool" not in planned("docs") and "-e '.[all,docs]'" in planned("docs")
     assert "envpool" in planned("test")
 
 

@@ -1,4 +1,4 @@
-"""The tables of README.md, docs/in_env.md and the cards are what the checkpoints' records say."""
+"""The tables of README.md, docs/ and the cards are what the checkpoints' records say."""
 
 import shutil
 from pathlib import Path
@@ -43,7 +43,11 @@ def test_every_page_has_its_tables():
     named = {
         path.name: [name for _, name, _ in MARKED.findall((ROOT / path).read_text())] for path in write_tables.PAGES
     }
-    assert named == {"README.md": ["forecasts"], "in_env.md": ["forecasts-long", "samples", "lent", "transfer"]}
+    assert named == {
+        "README.md": ["first"],
+        "checkpoints.md": ["checkpoints", "forecasts"],
+        "in_env.md": ["forecasts-long", "samples", "lent", "transfer"],
+    }
     cards = list((ROOT / write_tables.PRETRAINED).glob("*/README.md"))
     assert len(cards) == len(RECORDS) == len(set(write_tables.SERVED_BY.values()))
     assert all([name for _, name, _ in MARKED.findall(card.read_text())] == ["accuracy"] for card in cards)
