@@ -5,7 +5,7 @@ EXTRAS ?= core scores envs rl study contrib tune envpool
 RUN_DIR ?= runs/highway-fast-ppo
 
 .DEFAULT_GOAL := help
-.PHONY: help .venv train test check docs docs-check install-check bench bench-check clean
+.PHONY: help .venv train test test-shapes check docs docs-check install-check bench bench-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[.a-z-]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -24,8 +24,14 @@ help: ## list the targets
 train: .venv/.package ## train a policy on highway-fast-v0 into RUN_DIR (continues a run that was stopped), evaluate and film it
 	.venv/bin/python train_policy.py --resume --out $(RUN_DIR)
 
-test: .venv/.tools ## run the tests, TEST_JOBS at a time
-	.venv/bin/python -m pytest -n $(TEST_JOBS)
+# Checks shapes and types of every call; without the checker at the end nothing is checked.
+SHAPES = --jaxtyping-packages=envs,predictor,agents,beartype.beartype
+
+test: .venv/.tools ## run the tests, TEST_JOBS at a time; TEST_ARGS are pytest's
+	.venv/bin/python -m pytest -n $(TEST_JOBS) $(TEST_ARGS)
+
+test-shapes: .venv/.tools ## run the tests with shapes and types of every call checked: takes twice as long
+	$(MAKE) test TEST_ARGS="$(SHAPES)"
 
 check: .venv/.tools ## lint, formatting, types, who may import whom, the shape of the tree, the examples in docstrings
 	.venv/bin/ruff check .

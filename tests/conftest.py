@@ -24,6 +24,14 @@ torch.set_num_threads(1)
 AS_SHIPPED = {name: getattr(IDMVehicle, name) for name in ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN")}
 
 
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leaves the tests of the shape checks out where shapes are not checked; `make test-shapes` has them."""
+    if not config.getoption("--jaxtyping-packages"):
+        for item in items:
+            if item.get_closest_marker("shapes"):
+                item.add_marker(pytest.mark.skip(reason="shapes are not checked; make test-shapes does"))
+
+
 @pytest.fixture(autouse=True)
 def pristine_drivers() -> Iterator[None]:
     """highway-env's intersection changes every IDM driver of the process; no test may depend on who ran before it.

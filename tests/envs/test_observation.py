@@ -170,6 +170,7 @@ def test_ego_axes_closed_form():
     np.testing.assert_allclose(north.T @ north, np.eye(2), atol=1e-12)
 
 
+@pytest.mark.shapes
 def test_shapes_execute():
     rng = np.random.default_rng(0)
     scenes = random_scenes(rng, 2, 4)

@@ -10,6 +10,8 @@ from predictor.graph import pair_mask
 from predictor.scene import Scene
 from tests.predictor.helpers import model, random_presence, random_states
 
+pytestmark = pytest.mark.shapes
+
 
 def test_swapped_axes_raise():
     forecast, future, valid = torch.zeros(2, 3, 4, 5, 2), torch.zeros(2, 4, 5, 2), torch.ones(2, 4, 5).bool()

@@ -91,6 +91,7 @@ def test_the_same_seed_builds_the_same_model_and_another_does_not(kind: str):
     assert not all(torch.equal(one[name], other[name]) for name in one)
 
 
+@pytest.mark.shapes
 @every_kind
 def test_axes_in_the_wrong_order_raise(kind: str):
     forecaster, valid = tiny(kind), torch.ones(BATCH, AGENTS).bool()

@@ -108,6 +108,7 @@ def test_is_a_forecaster_without_edges():
     assert torch.equal(belief.edge_features, torch.zeros(2, 3, 3, 4))
 
 
+@pytest.mark.shapes
 def test_axes_in_the_wrong_order_raise(fitted: NearestNeighbour):
     with pytest.raises(TypeCheckError):
         fitted.observe(Memory(), random_states(0, 2, 3, 4), torch.ones(3, 2).bool())
