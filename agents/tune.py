@@ -23,7 +23,6 @@ from agents.presets import Algorithm, Preset
 from agents.results import PACKAGES
 from agents.runs import load_model
 from agents.search_space import search_space, settings_of
-from agents.studies.pool import locked
 from agents.task import SELECTION_SEED, TUNING_SEED, Observe, Task
 from agents.training import TrainingPlan, train
 from envs.registry import entry_for
@@ -31,10 +30,12 @@ from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, delete_leftovers, write_json
+from predictor.support.locks import locked
 from predictor.support.memory import ENV_BYTES, PROCESS_BYTES, check_count
 from predictor.support.provenance import provenance
 from predictor.support.reading import as_object, read_object
 from predictor.support.runtime import keep_freed_memory
+from predictor.support.stopping import resumable
 
 if TYPE_CHECKING:
     from optuna import Study
@@ -281,7 +282,9 @@ def main() -> None:
     keep_freed_memory()
     torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
     config = parse(TuneConfig, __doc__)
-    print(f"written to {tune(config)}")
+    with resumable("the same command goes on: ended trials are kept, the one that ran continues"):
+        best = tune(config)
+    print(f"written to {best}")
 
 
 if __name__ == "__main__":

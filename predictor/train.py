@@ -19,9 +19,11 @@ from predictor.checkpoint import BEST_OF_RUN, CheckpointInfo, save_checkpoint
 from predictor.support.command_line import parse
 from predictor.support.errors import UserError, run_entry_point, short
 from predictor.support.files import check_out, delete_leftovers, write_json
+from predictor.support.locks import locked
 from predictor.support.provenance import provenance
 from predictor.support.reading import as_object, read_object
 from predictor.support.runtime import tune
+from predictor.support.stopping import deferred_stops, resumable
 from predictor.training.config import BEFORE_THEY_EXISTED, TrainConfig
 from predictor.training.trainer import LOG_EVERY, Trainer, load_data
 
@@ -35,16 +37,17 @@ def train(config: TrainConfig) -> Path:
         torch.set_num_threads(config.threads)
     data = load_data(config)
     trainer = Trainer(config, data)
-    config.out.mkdir(parents=True, exist_ok=True)
-    delete_leftovers(config.out)  # of a run that was killed while it saved
-    if config.resume and state_file.exists():
-        trainer.restore(state_file)
-    made = provenance(("torch", "numpy", "zarr", "safetensors"))
-    write_json(config_file, {"config": _comparable(config), "provenance": made})
-    try:
-        _run(trainer, state_file, made)
-    finally:
-        trainer.close()
+    with locked(config.out, "training"), resumable(lambda: _kept(config, state_file)):
+        _check_run_folder(config, config_file)  # another training may have come and gone
+        delete_leftovers(config.out)  # of a run that was killed while it saved
+        if config.resume and state_file.exists():
+            trainer.restore(state_file)
+        made = provenance(("torch", "numpy", "zarr", "safetensors"))
+        write_json(config_file, {"config": _comparable(config), "provenance": made})
+        try:
+            _run(trainer, state_file, made)
+        finally:
+            trainer.close()
     if not (config.out / BEST_OF_RUN).exists():
         raise UserError(
             f"no validation episode has {config.horizon_steps} steps of future, so no checkpoint was chosen; "
@@ -53,13 +56,21 @@ def train(config: TrainConfig) -> Path:
     return config.out / BEST_OF_RUN
 
 
+def _kept(config: TrainConfig, state_file: Path) -> str:
+    """Returns what a run that is stopped keeps."""
+    if not state_file.exists():
+        return "nothing is saved yet; the same command with --resume begins anew"
+    return f"its state is saved in {config.out}; the same command with --resume goes on"
+
+
 def _run(trainer: Trainer, state_file: Path, made: dict[str, Any]) -> None:
-    """Trains, logs, validates and saves until the run is finished."""
+    """Trains, logs, validates and saves until the run is finished; a signal waits for the step's end and saves, too."""
     config, columns = trainer.config, (TextColumn("train"), BarColumn(20), MofNCompleteColumn(), TimeRemainingColumn())
     note, printed = "", 0
     with (
         SummaryWriter(str(config.out / "tb"), purge_step=trainer.step) as writer,
         Progress(*columns, TextColumn("{task.fields[note]}")) as progress,
+        deferred_stops() as stops,
     ):
         task = progress.add_task("", total=config.steps, completed=trainer.step, note="")
         if config.init and not trainer.step:
@@ -70,6 +81,10 @@ def _run(trainer: Trainer, state_file: Path, made: dict[str, Any]) -> None:
             for line in trainer.notes[printed:]:
                 progress.console.print(line, highlight=False)
             printed = len(trainer.notes)
+            if stops.asked is not None:
+                trainer.read(terms)  # a state that is not finite is never saved
+                trainer.save(state_file)
+                stops.stop()
             due = trainer.step % config.eval_every == 0 or trainer.step == config.steps
             if not due and trainer.step % trainer.read_every:
                 continue
