@@ -1,10 +1,12 @@
 PYTHON ?= python3
 TEST_JOBS ?= 2
+KILLS ?= 10
+POINTS ?= 10
 EXTRAS ?= core scores envs rl study contrib tune envpool
 RUN_DIR ?= runs/highway-fast-ppo
 
 .DEFAULT_GOAL := help
-.PHONY: help .venv train test check docs-check install-check bench bench-check clean
+.PHONY: help .venv train test storm check docs-check install-check bench bench-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[.a-z-]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -25,6 +27,10 @@ train: .venv/.package ## train a policy on highway-fast-v0 into RUN_DIR (continu
 
 test: .venv/.tools ## run the tests, TEST_JOBS at a time
 	.venv/bin/python -m pytest -n $(TEST_JOBS)
+
+storm: .venv/.tools ## kill the commands at random moments, and let them run out of disk: KILLS and POINTS times
+	.venv/bin/python -m tests.storm.kills --kills $(KILLS)
+	.venv/bin/python -m tests.storm.full_disk --points $(POINTS)
 
 check: .venv/.tools ## lint, formatting, types, who may import whom, the shape of the tree, the examples in docstrings
 	.venv/bin/ruff check .

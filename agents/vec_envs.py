@@ -8,7 +8,7 @@ policy sees, so that training, evaluation and video agree.
 
 import multiprocessing
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -195,7 +195,7 @@ def make_venv(
     else:
         make = _MakeEnv(task, spec, seeded)
         here = in_process or num_envs == 1
-        makers = [make] * num_envs
+        makers: list[Callable[[], gym.Env]] = [make] * num_envs
         venv = DummyVecEnv(makers) if here else WorkerVecEnv(makers, task.env_id, task.timeout_s)
     if task.observe != "none":
         venv = VecForecast(venv, **task.options)

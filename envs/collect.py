@@ -6,6 +6,7 @@ recording that is stopped goes on where it stopped when its command is repeated.
 
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -130,8 +131,15 @@ def collect(config: CollectConfig) -> Iterator[Episode]:
     return (episode for found in recorded(config) if not isinstance(found, Failed) for episode in found)
 
 
-def recorded(config: CollectConfig, first: int = 0) -> Iterator[list[Episode] | Failed]:
+def recorded(
+    config: CollectConfig, first: int = 0, pool: "EpisodePool[Any] | None" = None
+) -> Iterator[list[Episode] | Failed]:
     """Records the episodes of each seed, from that with number `first` on: one, all its branches, or a failure.
+
+    Args:
+        config: settings of the recording.
+        first: number of the first episode.
+        pool: processes that play; None takes this process, or makes them.
 
     Raises:
         UserError: the environment cannot be perturbed or copied, where that is asked for; or it failed.
@@ -141,11 +149,21 @@ def recorded(config: CollectConfig, first: int = 0) -> Iterator[list[Episode] | 
         _Task(config.env_id, drivers[i % len(drivers)], config.seed + i, settings)
         for i in range(first, config.episodes)
     ]
-    if config.workers == 1 and config.on_error == "stop":
-        yield from map(_record, tasks)
-        return
-    with EpisodePool(_record, config.workers, config.timeout_s, config.on_error) as pool:
+    if pool is not None:
         yield from pool.play(tasks)
+        return
+    with open_pool(config) as own:
+        yield from map(_record, tasks) if own is None else own.play(tasks)
+
+
+@contextmanager
+def open_pool(config: CollectConfig) -> Iterator["EpisodePool[Any] | None"]:
+    """Yields the processes of a recording, and ends them; None if this process plays itself."""
+    if config.workers == 1 and config.on_error == "stop":
+        yield None
+        return
+    with EpisodePool(_played, config.workers, config.timeout_s, config.on_error) as pool:
+        yield pool
 
 
 def recording_of(config: CollectConfig) -> Recording:
@@ -193,14 +211,44 @@ def _record(task: _Task) -> list[Episode]:
     return record_all(_world(task.env_id, task.driver), task.seed, task.driver, task.recording)
 
 
-def _info(config: CollectConfig) -> StoreInfo:
+class _InfoTask(NamedTuple):
+    """Asks for content and provenance of the store."""
+
+    env_id: str
+    seed: int
+    config: CollectConfig
+
+
+def _played(task: _Task | _InfoTask) -> Any:
+    return _record(task) if isinstance(task, _Task) else _info(task.config, task.seed)
+
+
+def _info_from(config: CollectConfig, pool: "EpisodePool[Any] | None") -> StoreInfo:
+    """Returns content and provenance of the store, by the first seed whose environment does not fail.
+
+    Raises:
+        UserError: a driver, an environment or settings that do not go together, or the first environments all fail.
+    """
+    if pool is None:
+        return _info(config, config.seed)
+    failed = []
+    for number in range(min(config.episodes, MOST_REASONS)):
+        task = _InfoTask(config.env_id, config.seed + number, config)
+        for found in pool.play([task]):
+            if isinstance(found, StoreInfo):
+                return found
+            failed.append(found)
+    raise UserError(f"none of the first {len(failed)} seeds can be played: {failed[0].reason}")
+
+
+def _info(config: CollectConfig, seed: int) -> StoreInfo:
     """Returns content and provenance of the store; makes each driver once, so that a wrong one ends here.
 
     Raises:
         UserError: a driver, an environment or settings that do not go together.
     """
     worlds = [open_world(config.env_id, name) for name in config.drivers]
-    worlds[0].reset(config.seed)
+    worlds[0].reset(seed)
     labelled = config.labels and not config.branches and worlds[0].labels() is not None
     recording = recording_of(config)
     made = provenance(PACKAGES) | {"seed": config.seed}
@@ -240,21 +288,22 @@ def main() -> None:
     config = parse(CollectConfig, __doc__)
     if config.out.exists() and not config.overwrite:
         raise UserError(f"{config.out} exists; choose another path or pass --overwrite")
-    info = _info(config)
     columns = (TextColumn(f"collect {config.env_id}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with locked_path(config.out):
-        partial = PartialStore(config.out, _settings(config, info), discard=config.overwrite)
-        done = partial.num_done
-        with resumable(lambda: _kept(config, partial)), partial, Progress(*columns) as progress:
-            task = progress.add_task("", total=config.episodes, completed=done)
-            for found in recorded(config, done):
-                if isinstance(found, Failed):
-                    partial.skip(found.seed, found.reason)
-                else:
-                    partial.add(info, *found)
-                progress.advance(task)
-            progress.stop()
-            episodes = partial.finish(info, config.overwrite)
+    with open_pool(config) as pool:
+        info = _info_from(config, pool)
+        with locked_path(config.out):
+            partial = PartialStore(config.out, _settings(config, info), discard=config.overwrite)
+            done = partial.num_done
+            with resumable(lambda: _kept(config, partial)), partial, Progress(*columns) as progress:
+                task = progress.add_task("", total=config.episodes, completed=done)
+                for found in recorded(config, done, pool):
+                    if isinstance(found, Failed):
+                        partial.skip(found.seed, found.reason)
+                    else:
+                        partial.add(info, *found)
+                    progress.advance(task)
+                progress.stop()
+                episodes = partial.finish(info, config.overwrite)
     steps = sum(len(e.states) for e in episodes)
     taken = f" ({done} of them from an unfinished recording)" if done else ""
     print(

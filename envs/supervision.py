@@ -41,6 +41,10 @@ class Place:
         shared = _shared if numbers is None else numbers
         self._numbers: Any = [_UNKNOWN, 0, _UNKNOWN, 0] if shared is None else shared
 
+    def __reduce__(self) -> tuple[type["Place"], tuple[list[int]]]:
+        """Makes copies and pickles (of an environment with its place) begin here and count for themselves."""
+        return Place, (list(self._numbers),)
+
     def begin(self, seed: int | None) -> None:
         """Notes that an episode begins; without a seed it is a later one of the seed before."""
         if seed is not None:

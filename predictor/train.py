@@ -27,17 +27,30 @@ from predictor.support.stopping import deferred_stops, resumable
 from predictor.training.config import BEFORE_THEY_EXISTED, TrainConfig
 from predictor.training.trainer import LOG_EVERY, Trainer, load_data
 
+STATE_FILE = "train_state.pt"
+
 
 def train(config: TrainConfig) -> Path:
-    """Trains until all steps are done or validation stops improving; returns the folder of the best checkpoint."""
-    state_file, config_file = config.out / "train_state.pt", config.out / "config.json"
+    """Trains until all steps are done or validation stops improving; returns the folder of the best checkpoint.
+
+    Ctrl-C and SIGTERM wait for the end of a step and save the state; a second one does not wait.
+
+    Raises:
+        UserError: the folder holds another run, another process trains in it, data do not fit, or the disk is full.
+    """
+    state_file, config_file = config.out / STATE_FILE, config.out / "config.json"
+    with resumable(lambda: _kept(config, state_file)):
+        return _train(config, state_file, config_file)
+
+
+def _train(config: TrainConfig, state_file: Path, config_file: Path) -> Path:
     _check_run_folder(config, config_file)
     tune(config.device)
     if config.threads:
         torch.set_num_threads(config.threads)
     data = load_data(config)
     trainer = Trainer(config, data)
-    with locked(config.out, "training"), resumable(lambda: _kept(config, state_file)):
+    with locked(config.out, "training"):
         _check_run_folder(config, config_file)  # another training may have come and gone
         delete_leftovers(config.out)  # of a run that was killed while it saved
         if config.resume and state_file.exists():
@@ -64,7 +77,7 @@ def _kept(config: TrainConfig, state_file: Path) -> str:
 
 
 def _run(trainer: Trainer, state_file: Path, made: dict[str, Any]) -> None:
-    """Trains, logs, validates and saves until the run is finished; a signal waits for the step's end and saves, too."""
+    """Trains, logs, validates and saves until the run is finished, or a signal asks it to stop."""
     config, columns = trainer.config, (TextColumn("train"), BarColumn(20), MofNCompleteColumn(), TimeRemainingColumn())
     note, printed = "", 0
     with (

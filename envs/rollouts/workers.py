@@ -238,6 +238,7 @@ def _play_all(play: Callable[[Any], Any], pipe: Connection, place: Place) -> Non
         except UserError as error:
             result = Failed(task.seed, str(error), UserError)
         except Exception as error:  # of this project's own code
-            reason = failure(task.env_id, f"seed {task.seed}, {place}", reason_of(error))
+            where = str(place) if place.has_begun else f"seed {task.seed}, {place}"
+            reason = failure(task.env_id, where, reason_of(error))
             result = Failed(task.seed, f"{reason}\n{traceback.format_exc()}", RuntimeError)
         pipe.send_bytes(pickle.dumps((result,), protocol=pickle.HIGHEST_PROTOCOL))

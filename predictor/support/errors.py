@@ -85,7 +85,7 @@ def _leave(word: str, message: str, error: BaseException, status: int) -> None:
     """Prints one line, with what was said on how to go on, and exits."""
     advice = _advice(error)
     if word == "stopped" and advice is None:
-        advice = "nothing of it is kept; the same command begins anew"
+        advice = "what was not written yet is lost; the same command begins anew"
     text = "; ".join(filter(None, (message, advice)))
     print(f"{word}: {text}", file=sys.stderr)
     sys.exit(status)

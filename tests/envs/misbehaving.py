@@ -18,8 +18,8 @@ from predictor.scene import Scene, SceneSpec
 
 AT_STEP, NUM_STEPS = 2, 5
 KINDS = (
-    "Fine", "Raise", "RaiseReset", "Hang", "HangReset", "Exit", "Kill", "NanState", "NanObservation", "NanReward",
-    "Slow",
+    "Fine", "Raise", "RaiseReset", "Hang", "HangReset", "Exit", "ExitReset", "Kill", "NanState", "NanObservation",
+    "NanReward", "Slow",
 )  # fmt: skip
 HERE = f"{__name__}:"
 

@@ -24,8 +24,8 @@ def raises(error: BaseException):
         (NotADirectoryError("a file"), 2, "error: a file\n"),
         (IsADirectoryError("a folder"), 2, "error: a folder\n"),
         (PermissionError("not yours"), 2, "error: not yours\n"),
-        (KeyboardInterrupt(), 130, "stopped: nothing of it is kept; the same command begins anew\n"),
-        (Terminated(), 143, "stopped: nothing of it is kept; the same command begins anew\n"),
+        (KeyboardInterrupt(), 130, "stopped: what was not written yet is lost; the same command begins anew\n"),
+        (Terminated(), 143, "stopped: what was not written yet is lost; the same command begins anew\n"),
         (
             OSError(errno.ENOSPC, "full", "/disk/a"),
             2,
