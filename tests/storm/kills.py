@@ -72,9 +72,10 @@ def storm(name: str, subject: Subject, kills: int, folder: Path, rng: random.Ran
                 counts.failures += 1
             shutil.rmtree(out, ignore_errors=True)  # it came to its end: anew
         except subprocess.TimeoutExpired:
+            counts.kills += 1
+        finally:
             run.process.kill()
             run.process.wait()
-            counts.kills += 1
         counts.orphans += len(orphans(run))
         print(f"{name}: kill {counts.kills} of {kills} after {wait_s:.1f} of {whole_s:.1f} s", flush=True)
     counts.failures += finish(start(words, log)) != 0

@@ -46,8 +46,11 @@ def start(words: Sequence[str], log: Path, errors: Path | None = None) -> Run:
 
 
 def finish(run: Run) -> int:
-    """Waits for a command; returns its exit status."""
-    return run.process.wait()
+    """Waits for a command; returns its exit status. A storm that is stopped meanwhile takes it along."""
+    try:
+        return run.process.wait()
+    finally:
+        run.process.kill()
 
 
 def orphans(run: Run, patience_s: float = ORPHAN_S) -> list[int]:
