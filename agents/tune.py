@@ -29,7 +29,7 @@ from envs.registry import entry_for
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import check_out, delete_leftovers, write_json
+from predictor.support.files import check_out, delete_leftovers, disk_errors_of, write_json
 from predictor.support.locks import locked
 from predictor.support.memory import ENV_BYTES, PROCESS_BYTES, check_count
 from predictor.support.provenance import provenance
@@ -144,7 +144,7 @@ def tune(config: TuneConfig) -> Path:
     plan.check_action_space(plan.task.check())
     _check_folder(folder, config)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    with locked(folder, "tuning"):
+    with locked(folder, "tuning"), disk_errors_of(folder / STUDY_FILE):
         _note(folder, config)
         study = optuna.create_study(
             storage=f"sqlite:///{folder / STUDY_FILE}", study_name="tuning", direction="maximize", load_if_exists=True

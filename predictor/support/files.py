@@ -30,11 +30,11 @@ def new_file(path: Path) -> Iterator[Path]:
     The content is flushed to disk before it is renamed, so that even a power cut leaves the old file or the new one.
     The temporary name has the suffix of `path`, by which encoders choose their format. A missing parent folder is made.
     """
-    with _disk_errors_of(path):
+    with disk_errors_of(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = _beside(path, path.suffix)
         try:
-            with _disk_errors_of(path):  # while the part still fills the disk
+            with disk_errors_of(path):  # while the part still fills the disk
                 yield partial
                 _flush(partial)
             os.replace(partial, path)
@@ -47,7 +47,7 @@ def new_file(path: Path) -> Iterator[Path]:
 def new_folder(path: Path) -> Iterator[Path]:
     """Yields an empty temporary folder to fill; replaces `path` by it at the end, or deletes it on an error."""
     with scratch_folder(path) as partial:
-        with _disk_errors_of(path):
+        with disk_errors_of(path):
             yield partial
             _replace_folder(partial, path)
 
@@ -55,7 +55,7 @@ def new_folder(path: Path) -> Iterator[Path]:
 @contextmanager
 def scratch_folder(path: Path) -> Iterator[Path]:
     """Yields an empty temporary folder beside `path`, on the same disk; deletes it at the end."""
-    with _disk_errors_of(path):
+    with disk_errors_of(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = _beside(path)
         partial.mkdir()
@@ -123,8 +123,8 @@ def _flush(path: Path) -> None:
 
 
 @contextmanager
-def _disk_errors_of(path: Path) -> Iterator[None]:
-    """Turns the errors of a full or read-only disk into one sentence that names the path.
+def disk_errors_of(path: Path) -> Iterator[None]:
+    """Turns the errors of a full or read-only disk into one sentence that names a path that is written inside.
 
     Raises:
         CannotWriteError: the disk took no more.

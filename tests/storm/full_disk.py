@@ -64,9 +64,10 @@ def storm(name: str, subject: Subject, points: int, folder: Path, rng: random.Ra
         counts.tracebacks += sum(text.count("Traceback (most recent call last)") for text in _logs(disk))
         last = (said.strip().splitlines() or [""])[-1]
         print(f"{name}: full disk {counts.kills + 1} of {points}: status {status}: {last}", flush=True)
-        if status:
-            counts.kills += 1
-            counts.failures += not ("No space left" in said or "disk is full" in said)
+        if not status:
+            continue
+        counts.kills += 1
+        counts.failures += not ("No space left" in said or "disk is full" in said)
         subprocess.run(["mount", "-o", f"remount,size={ROOM}", str(disk)], check=True)
         counts.failures += finish(start(words, log)) != 0
         counts.unequal += not counts.failures and subject.results(disk) != expected

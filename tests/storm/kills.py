@@ -77,6 +77,9 @@ def storm(name: str, subject: Subject, kills: int, folder: Path, rng: random.Ran
             run.process.kill()
             run.process.wait()
         counts.orphans += len(orphans(run))
+        if subject.is_over(out):  # killed after its last write
+            counts.unequal += subject.results(out) != expected
+            shutil.rmtree(out)
         print(f"{name}: kill {counts.kills} of {kills} after {wait_s:.1f} of {whole_s:.1f} s", flush=True)
     counts.failures += finish(start(words, log)) != 0
     counts.tracebacks += log.read_text(errors="replace").count("Traceback (most recent call last)")

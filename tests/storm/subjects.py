@@ -29,8 +29,8 @@ class Subject:
     """Function from a folder of inputs and one of outputs to the words of the command."""
     results: Callable[[Path], Results]
     """Function from the folder of outputs to what must be equal, however often the command was stopped."""
-    seconds: float
-    """Time in which kills are spread: that of the whole command, about [s]."""
+    is_over: Callable[[Path], bool] = lambda out: False
+    """Function from the folder of outputs to whether the command refuses to run again, since all is there."""
 
 
 def make_inputs(folder: Path) -> Path:
@@ -130,10 +130,10 @@ def _module(name: str) -> list[str]:
 
 
 SUBJECTS = {
-    "train": Subject(_train, _trained, 30.0),
-    "policy": Subject(_policy, _learned, 60.0),
-    "collect": Subject(_collect, _collected, 30.0),
-    "suite": Subject(_suite, _measured, 60.0),
-    "study": Subject(_study, _studied, 60.0),
+    "train": Subject(_train, _trained),
+    "policy": Subject(_policy, _learned),
+    "collect": Subject(_collect, _collected, lambda out: (out / "store").exists()),
+    "suite": Subject(_suite, _measured),
+    "study": Subject(_study, _studied),
 }
 """Commands by name."""
