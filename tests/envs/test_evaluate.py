@@ -377,8 +377,8 @@ ERRORS = {
     "unfit-ego": (["--driver", "keep-lane"], "keep-lane needs continuous steering"),
     "unknown-ego": (["--driver", "reckless"], "driver must be one of random"),
     "unfit-driver": (["--env-ids", TAG, "--driver", "keep-lane"], "driver must be one of random"),
-    "no-neighbours": (["--data", "nowhere"], "nowhere is not a readable episode store"),
-    "no-store": (["--data", "."], ". is not a readable episode store"),
+    "no-neighbours": (["--data", "nowhere"], "nowhere is not an episode store"),
+    "no-store": (["--data", "."], ". is not an episode store"),
     "too-short": (["--max-steps", "1", "--episodes", "1"], f"{ROAD}: no forecast has 5 steps of truth"),
 }
 
@@ -424,4 +424,4 @@ def test_missing_neighbours_are_no_misfit_of_a_checkpoint(
     arguments = ["--env-ids", ROAD, "--checkpoint", STILL, highway_checkpoint, "--data", "nowhere"]
     code, errors, _ = run_command(evaluate.main, arguments, monkeypatch, capsys)
     assert (code, len(errors)) == (2, 1)
-    assert errors[0].startswith("error: nowhere is not a readable episode store")
+    assert errors[0].startswith("error: nowhere is not an episode store")
