@@ -1,11 +1,13 @@
 PYTHON ?= python3
 TEST_JOBS ?= 2
 DOCS_JOBS ?= 16
+KILLS ?= 10
+POINTS ?= 10
 EXTRAS ?= core scores envs rl study contrib tune envpool
 RUN_DIR ?= runs/highway-fast-ppo
 
 .DEFAULT_GOAL := help
-.PHONY: help .venv train test test-shapes check docs docs-check install-check bench bench-check clean
+.PHONY: help .venv train test test-shapes storm check docs docs-check install-check bench bench-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[.a-z-]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -32,6 +34,10 @@ test: .venv/.tools ## run the tests, TEST_JOBS at a time; TEST_ARGS are pytest's
 
 test-shapes: .venv/.tools ## run the tests with shapes and types of every call checked: takes twice as long
 	$(MAKE) test TEST_ARGS="$(SHAPES)"
+
+storm: .venv/.tools ## kill the commands at random moments, and let them run out of disk: KILLS and POINTS times
+	.venv/bin/python -m tests.storm.kills --kills $(KILLS)
+	.venv/bin/python -m tests.storm.full_disk --points $(POINTS)
 
 check: .venv/.tools ## lint, formatting, types, who may import whom, the shape of the tree, the examples in docstrings
 	.venv/bin/ruff check .

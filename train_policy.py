@@ -18,7 +18,7 @@ from agents.evaluate import constant_drivers, evaluate_with_progress, show
 from agents.preset_settings import settings_from_file, settings_from_words
 from agents.presets import Algorithm
 from agents.results import PACKAGES
-from agents.runs import CHECKPOINT_FILE, FORECASTER, check_forecaster, load_model, open_run
+from agents.runs import CHECKPOINT_FILE, FORECASTER, POLICY_FILE, check_forecaster, load_model, open_run
 from agents.step_count import check_step_unit
 from agents.task import Backend, Observe, Task
 from agents.training import TrainingPlan, train
@@ -26,12 +26,16 @@ from agents.video import film
 from envs.readers.mpe import MPE_IDS
 from envs.registry import entry_for, envpool_task_of
 from envs.simulators.envpool import begins_alike
+from envs.supervision import TIMEOUT_S
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import run_entry_point
+from predictor.support.files import check_out
+from predictor.support.locks import locked
 from predictor.support.memory import ENV_BYTES, PROCESS_BYTES, check_count
 from predictor.support.provenance import provenance
 from predictor.support.runtime import keep_freed_memory
+from predictor.support.stopping import resumable
 
 
 @dataclass(frozen=True)
@@ -123,6 +127,9 @@ class TrainPolicyConfig:
     """Film one episode at the end."""
     device: str = "cpu"
     """Device that runs forecaster and policy: cpu, cuda or auto (cuda where there is one)."""
+    timeout_s: float = TIMEOUT_S
+    """Largest time that one step of an environment may take in a process of its own [s]; one that takes longer hangs,
+    which ends the command."""
 
     def __post_init__(self) -> None:
         """Checks choices and ranges; `plan` checks that the values fit together.
@@ -152,7 +159,7 @@ class TrainPolicyConfig:
         learners = entry_for(self.env_id).learners if self.learners is None else self.learners
         task = Task(
             self.env_id, self.observe, self.checkpoint, self.device, self.backend, tuple(learners), self.driver,
-            self.num_samples, self.horizon_steps, self.perception_m, self.what_if, self.env_kwargs,
+            self.num_samples, self.horizon_steps, self.perception_m, self.what_if, self.env_kwargs, self.timeout_s,
         )  # fmt: skip
         return TrainingPlan(
             task,
@@ -189,6 +196,22 @@ class TrainPolicyConfig:
 
 
 def run(config: TrainPolicyConfig, console: Console) -> None:
+    """Trains, evaluates and films, in a folder that no other training uses meanwhile."""
+    check_out(config.folder)
+    with resumable(lambda: _kept(config)), locked(config.folder, "training"):
+        _run(config, console)
+
+
+def _kept(config: TrainPolicyConfig) -> str:
+    """Returns what a run that is stopped keeps."""
+    if (config.folder / POLICY_FILE).exists():
+        return f"the policy is in {config.folder}; the same command with --resume measures it"
+    if (config.folder / CHECKPOINT_FILE).exists():
+        return f"the latest checkpoint is in {config.folder}; the same command with --resume goes on"
+    return "no checkpoint is saved yet; the same command with --resume begins anew"
+
+
+def _run(config: TrainPolicyConfig, console: Console) -> None:
     """Trains, evaluates and films; nothing is written before the input has been checked."""
     plan = config.plan
     plan.check_action_space(plan.task.check())
@@ -199,7 +222,7 @@ def run(config: TrainPolicyConfig, console: Console) -> None:
     pin = plan.task.note.forecaster
     settings[FORECASTER] = None if pin is None else asdict(pin)
     settings["preset_file"] = config.preset
-    for name in ("out", "resume", "num_envs", "driver"):
+    for name in ("out", "resume", "num_envs", "driver", "timeout_s"):
         settings.pop(name)
     if config.resume:
         check_step_unit(config.folder / CHECKPOINT_FILE, plan.task.is_multiagent)

@@ -8,7 +8,7 @@ training and of model selection (`agents.task`). docs/protocol.md defines each m
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,6 +27,7 @@ from agents.summaries import EXTREMES
 from agents.task import EVALUATION_SEED, Task, task_of
 from envs.drivers.ego import CONSTANT_ACTIONS, constant_actions, make_ego_driver, named_drivers
 from envs.sb3.policy_file import read_policy_note
+from envs.supervision import TIMEOUT_S
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
@@ -121,6 +122,9 @@ class EvaluateConfig:
     """Number of parallel environments; the results do not depend on it."""
     device: str = "cpu"
     """Device that runs forecaster and policy: cpu, cuda or auto (cuda where there is one)."""
+    timeout_s: float = TIMEOUT_S
+    """Largest time that one step of an environment may take in a process of its own [s]; one that takes longer hangs,
+    which ends the command."""
 
     def __post_init__(self) -> None:
         """Checks ranges; replaces `device="auto"` by the device that is taken.
@@ -176,7 +180,7 @@ def show(evaluation: Evaluation, console: Console) -> None:
 def _of_driver(config: EvaluateConfig) -> tuple[Evaluation, dict[str, str]]:
     """Evaluates a driver; returns what is noted beside the results, too."""
     assert config.policy is not None and config.env_id is not None
-    task = Task(config.env_id, "none", device=config.device)
+    task = Task(config.env_id, "none", device=config.device, timeout_s=config.timeout_s)
     task.check()
     checked_drivers(task, (config.policy,))
     drivers = compared_drivers(task, config.drivers)
@@ -234,7 +238,7 @@ def checked_drivers(task: Task, names: Sequence[str]) -> tuple[str, ...]:
 def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str, str]]:
     """Evaluates the policy of a training run; returns what is noted beside the results, too."""
     run = read_config(run_dir, "observe", "algorithm")
-    task = task_of(run, config.device, config.env_id)
+    task = replace(task_of(run, config.device, config.env_id), timeout_s=config.timeout_s)
     if config.env_id not in (None, task.env_id):
         raise UserError(f"run {run_dir} was trained on {task.env_id}, got --env-id {config.env_id}; leave it out")
     task.check()

@@ -6,18 +6,15 @@ never runs a finished cell again. The folder then holds report.html, report.md, 
 """
 
 import os
-import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
 from agents.studies.cells import LOG_FILE, PACKAGES, Cell, cells_of
 from agents.studies.findings import Findings
 from agents.studies.plan import Study, read_study, shipped_studies, study_file
-from agents.studies.pool import last_line, locked, run_cells
+from agents.studies.pool import last_line, run_cells
 from agents.studies.progress import Progress
 from agents.studies.report import HEADROOM, PAGE, REPORT, write_headroom, write_report
 from agents.studies.results import RESULT_FILE, Result, read_result, require_tables, write_tables
@@ -25,13 +22,15 @@ from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, delete_leftovers, write_text
+from predictor.support.locks import locked
 from predictor.support.memory import check_processes
 from predictor.support.provenance import provenance
+from predictor.support.stopping import resumable
 
 CELLS = "cells"
 STUDY_FILE = "study.toml"
-FAILED, STOPPED = 1, 128
-"""Exit status if a cell failed; if a signal stopped the study, its number is added."""
+FAILED = 1
+"""Exit status if a cell failed."""
 
 
 @dataclass(frozen=True)
@@ -61,15 +60,6 @@ class StudyConfig:
         return self.workers or os.cpu_count() or 1
 
 
-class Stopped(BaseException):
-    """Raised in the main thread when a signal asks the study to stop."""
-
-    def __init__(self, number: int) -> None:
-        """Keeps the number of the signal."""
-        super().__init__(number)
-        self.number = number
-
-
 def run_study(config: StudyConfig) -> int:
     """Runs the cells without a result, writes tables and report; returns the exit status.
 
@@ -85,7 +75,7 @@ def run_study(config: StudyConfig) -> int:
     check_out(folder)
     _check_folder(folder)
     cells = cells_of(study, file.name)
-    with locked(folder):
+    with locked(folder, "study"):
         delete_leftovers(folder)
         results = _results_of(folder, cells)
         write_text(folder / STUDY_FILE, file.read_text(encoding="utf-8"))
@@ -160,10 +150,6 @@ def _write(
     print(f"written to {folder}: {REPORT}, {PAGE}, episodes.parquet, curves.parquet")
 
 
-def _stop(number: int, frame: FrameType | None) -> Any:
-    raise Stopped(number)
-
-
 def main() -> None:
     """Runs the command."""
     config = parse(StudyConfig, __doc__)
@@ -172,15 +158,8 @@ def main() -> None:
         return
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[name] = "1"  # of the cells' processes: each fills one core
-    before = {number: signal.signal(number, _stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with resumable("the same command goes on: finished cells are kept, others continue"):
         status = run_study(config)
-    except Stopped as stopped:
-        print("stopped; the same command goes on: finished cells are kept, others continue", file=sys.stderr)
-        status = STOPPED + stopped.number
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
     if status:
         sys.exit(status)
 

@@ -25,11 +25,12 @@ from envs.registry import (
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.sb3.padded_spaces import learners_named
 from envs.sb3.policy_file import PolicyNote, pin_forecaster
+from envs.supervision import TIMEOUT_S
 from envs.wrappers import ForecastObservation
 from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint
 from predictor.forecaster import Forecaster
 from predictor.scene import SceneSpec
-from predictor.support.config_checks import check_at_least, check_at_most, check_choice, check_choices
+from predictor.support.config_checks import check_at_least, check_at_most, check_choice, check_choices, check_positive
 from predictor.support.errors import UserError, short
 from predictor.support.reading import as_object, parse_json
 from predictor.support.runtime import resolve_device
@@ -85,6 +86,8 @@ class Task:
     """Whether the observation has room for what the others do in each candidate plan of the ego."""
     env_kwargs: str = ""
     """Arguments of the environment, as the text of a JSON object."""
+    timeout_s: float = TIMEOUT_S
+    """Largest time that one step of an environment may take in a process of its own [s]."""
 
     def __post_init__(self) -> None:
         """Checks choices, and that the fields fit together; replaces `device="auto"` by the device that is taken."""
@@ -106,6 +109,7 @@ class Task:
             raise UserError(f"perception_m must be positive, got {self.perception_m}")
         if self.perception_m is not None and self.observe == "none":
             raise UserError("perception_m has no effect with observe=none; leave one out")
+        check_positive(self, "timeout_s")
         if self.what_if and self.is_multiagent:
             raise UserError(f"what_if needs an environment with one ego, {self.env_id} has several learners")
         if self.make_kwargs and self.backend == "envpool":

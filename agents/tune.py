@@ -23,18 +23,19 @@ from agents.presets import Algorithm, Preset
 from agents.results import PACKAGES
 from agents.runs import load_model
 from agents.search_space import search_space, settings_of
-from agents.studies.pool import locked
 from agents.task import SELECTION_SEED, TUNING_SEED, Observe, Task
 from agents.training import TrainingPlan, train
 from envs.registry import entry_for
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import check_out, delete_leftovers, write_json
+from predictor.support.files import check_out, delete_leftovers, disk_errors_of, write_json
+from predictor.support.locks import locked
 from predictor.support.memory import ENV_BYTES, PROCESS_BYTES, check_count
 from predictor.support.provenance import provenance
 from predictor.support.reading import as_object, read_object
 from predictor.support.runtime import keep_freed_memory
+from predictor.support.stopping import resumable
 
 if TYPE_CHECKING:
     from optuna import Study
@@ -143,7 +144,7 @@ def tune(config: TuneConfig) -> Path:
     plan.check_action_space(plan.task.check())
     _check_folder(folder, config)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    with locked(folder, "tuning"):
+    with locked(folder, "tuning"), disk_errors_of(folder / STUDY_FILE):
         _note(folder, config)
         study = optuna.create_study(
             storage=f"sqlite:///{folder / STUDY_FILE}", study_name="tuning", direction="maximize", load_if_exists=True
@@ -281,7 +282,9 @@ def main() -> None:
     keep_freed_memory()
     torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
     config = parse(TuneConfig, __doc__)
-    print(f"written to {tune(config)}")
+    with resumable("the same command goes on: ended trials are kept, the one that ran continues"):
+        best = tune(config)
+    print(f"written to {best}")
 
 
 if __name__ == "__main__":

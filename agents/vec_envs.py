@@ -8,7 +8,7 @@ policy sees, so that training, evaluation and video agree.
 
 import multiprocessing
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,20 +17,23 @@ import numpy as np
 import torch
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 from agents.shaping import shaped
 from agents.task import Task
 from envs.drivers.all_agents import Driver, make_driver
 from envs.drivers.ego import constant_actions, make_ego_driver
 from envs.drivers.trained import EgoDriver
+from envs.readers import multiagent_env_id
 from envs.registry import envpool_task_of
 from envs.rollouts.driving_measures import DrivingMeasures, recorder_for
 from envs.sb3.agents_as_rows import AgentMonitor, ParallelVecEnv
 from envs.sb3.envpool import EnvPoolVecEnv
 from envs.sb3.forecast import VecForecast
 from envs.sb3.padded_spaces import learners_named
+from envs.sb3.workers import WorkerVecEnv
 from envs.seeding import driver_rng
+from envs.supervision import Place, SupervisedEnv, check_numbers, named
 from envs.wrappers import SceneObservation
 from predictor.scene import SceneSpec
 
@@ -77,7 +80,7 @@ class DrivenEnv(BaseParallelWrapper):
     def __init__(self, env: ParallelEnv, driver: str) -> None:
         """Wraps the environment; the first driver is made after the first reset."""
         super().__init__(env)
-        self._name = driver
+        self._name, self._id, self._place = driver, multiagent_env_id(env), Place()
         self._rng = driver_rng(0)
         self._driver: Driver | None = None
         self.episodes = 0
@@ -95,12 +98,26 @@ class DrivenEnv(BaseParallelWrapper):
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], Any]:
         """Resets the environment; a seed also fixes the drivers of this and the following episodes."""
-        observations, infos = self.env.reset(seed=seed, options=options)
+        self._place.begin(seed)
+        with named(self._id, self._place):
+            observations, infos = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._rng = driver_rng(seed)
         self._driver = None
         self.episodes += 1
         return observations, infos
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
+        """Steps the environment.
+
+        Raises:
+            EnvironmentFailedError: it raised, or returned NaN.
+        """
+        self._place.move()
+        with named(self._id, self._place):
+            observations, rewards, *ends = self.env.step(actions)
+            check_numbers(observations, sum(rewards.values()))
+        return observations, rewards, *ends
 
 
 def drive(env: Any, observations: Mapping[str, Any], generator: np.random.Generator) -> dict[str, Any]:
@@ -178,7 +195,8 @@ def make_venv(
     else:
         make = _MakeEnv(task, spec, seeded)
         here = in_process or num_envs == 1
-        venv = DummyVecEnv([make] * num_envs) if here else SubprocVecEnv([make] * num_envs, start_method="spawn")
+        makers: list[Callable[[], gym.Env]] = [make] * num_envs
+        venv = DummyVecEnv(makers) if here else WorkerVecEnv(makers, task.env_id, task.timeout_s)
     if task.observe != "none":
         venv = VecForecast(venv, **task.options)
     return VecMonitor(venv)
@@ -198,6 +216,7 @@ class _MakeEnv:
         env = self.task.make(disable_env_checker=True)
         if self.scene_spec is not None:
             env = SceneObservation(env, self.scene_spec.perception_m, self.scene_spec.max_agents)
+        env = SupervisedEnv(env, self.task.env_id)
         return SeededEpisodes(env) if self.seeded else env
 
 

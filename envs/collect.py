@@ -4,9 +4,9 @@ Each episode is a function of its seed and the options alone, so the store is th
 recording that is stopped goes on where it stopped when its command is repeated.
 """
 
-import multiprocessing
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -19,16 +19,24 @@ from envs.rollouts.causal_labels import TRIED, settings_for
 from envs.rollouts.interventions import kinds_of
 from envs.rollouts.perturbations import check_kinds, mix_for
 from envs.rollouts.recording import Recording, record_all
+from envs.rollouts.workers import EpisodePool, Failed, OnError
 from envs.rollouts.world import World, default_drivers, open_world
 from envs.simulators.interventions import Kind
+from envs.supervision import TIMEOUT_S
 from predictor.data.partial_store import PartialStore
 from predictor.data.store import Episode, StoreInfo
 from predictor.support.command_line import Renamed, parse
-from predictor.support.config_checks import check_at_least, check_positive
-from predictor.support.errors import UserError, run_entry_point
+from predictor.support.config_checks import check_at_least, check_choices, check_positive
+from predictor.support.errors import UserError, run_entry_point, short
+from predictor.support.locks import locked_path
 from predictor.support.memory import check_count, check_processes
 from predictor.support.provenance import provenance
+from predictor.support.stopping import resumable
 
+FREE = ("out", "workers", "overwrite", "on_error", "timeout_s")
+"""Options that episodes do not depend on."""
+MOST_REASONS = 10
+"""Largest number of skipped episodes whose reasons are printed; the store has them all."""
 PACKAGES = ("highway-env", "mpe2", "pettingzoo", "envpool", "gymnasium", "numpy")
 
 
@@ -56,7 +64,13 @@ class CollectConfig:
     never part of an observation. Recorded states do not depend on it; docs/datasets/env.md has its cost in time and
     bytes."""
     workers: int = os.cpu_count() or 1
-    """Number of parallel processes; the store does not depend on it."""
+    """Number of parallel processes; the store does not depend on it. One plays in the command's own process, which
+    an environment that hangs or dies takes along, unless --on-error skip."""
+    on_error: OnError = "stop"
+    """What an environment that raises, hangs, dies or reports NaN does: it stops the recording (stop), or the episode
+    is left out, counted and named in the store (skip)."""
+    timeout_s: float = TIMEOUT_S
+    """Largest time that one step of an episode may take in a worker [s]; an environment that takes longer hangs."""
     overwrite: bool = False
     """Whether to replace an existing store."""
     perturb: float = 0.0
@@ -86,11 +100,12 @@ class CollectConfig:
         Raises:
             UserError: a value out of range.
         """
+        check_choices(self)
         check_at_least(self, 1, "episodes", "max_steps", "causal_senders", "workers", "branch_history_steps")
         check_at_least(self, 0, "seed", "causal_labels", "branches")
         check_count(self.episodes, "episodes")
         check_processes(min(self.workers, self.episodes), "workers")
-        check_positive(self, "causal_horizon_s", "causal_threshold_m")
+        check_positive(self, "causal_horizon_s", "causal_threshold_m", "timeout_s")
         if not 0 <= self.perturb <= 1:
             raise UserError(f"perturb must lie between 0 and 1, got {self.perturb:g}")
         if self.perturb_kinds and not self.perturb:
@@ -108,31 +123,47 @@ class CollectConfig:
 
 
 def collect(config: CollectConfig) -> Iterator[Episode]:
-    """Records the episodes of a config, in the order of their seeds.
+    """Records the episodes of a config, in the order of their seeds, without those that are skipped.
 
     Raises:
-        UserError: the environment cannot be perturbed or copied, where that is asked for.
+        UserError: the environment cannot be perturbed or copied, where that is asked for; or it failed.
     """
-    return (episode for episodes in recorded(config) for episode in episodes)
+    return (episode for found in recorded(config) if not isinstance(found, Failed) for episode in found)
 
 
-def recorded(config: CollectConfig, first: int = 0) -> Iterator[list[Episode]]:
-    """Records the episodes of each seed, from that with number `first` on: one, or all its branches.
+def recorded(
+    config: CollectConfig, first: int = 0, pool: "EpisodePool[Any] | None" = None
+) -> Iterator[list[Episode] | Failed]:
+    """Records the episodes of each seed, from that with number `first` on: one, all its branches, or a failure.
+
+    Args:
+        config: settings of the recording.
+        first: number of the first episode.
+        pool: processes that play; None takes this process, or makes them.
 
     Raises:
-        UserError: the environment cannot be perturbed or copied, where that is asked for.
+        UserError: the environment cannot be perturbed or copied, where that is asked for; or it failed.
     """
     drivers, settings = config.drivers, recording_of(config)
     tasks = [
         _Task(config.env_id, drivers[i % len(drivers)], config.seed + i, settings)
         for i in range(first, config.episodes)
     ]
-    if config.workers == 1:
-        yield from map(_record, tasks)
+    if pool is not None:
+        yield from pool.play(tasks)
         return
-    workers = max(1, min(config.workers, len(tasks)))
-    with multiprocessing.get_context("spawn").Pool(workers, initializer=_limit_threads) as pool:
-        yield from pool.imap(_record, tasks, chunksize=1 if config.causal_labels or config.branches else 4)
+    with open_pool(config) as own:
+        yield from map(_record, tasks) if own is None else own.play(tasks)
+
+
+@contextmanager
+def open_pool(config: CollectConfig) -> Iterator["EpisodePool[Any] | None"]:
+    """Yields the processes of a recording, and ends them; None if this process plays itself."""
+    if config.workers == 1 and config.on_error == "stop":
+        yield None
+        return
+    with EpisodePool(_played, config.workers, config.timeout_s, config.on_error) as pool:
+        yield pool
 
 
 def recording_of(config: CollectConfig) -> Recording:
@@ -170,12 +201,6 @@ class _Task(NamedTuple):
 _worlds: dict[tuple[str, str], World] = {}
 
 
-def _limit_threads() -> None:
-    import torch
-
-    torch.set_num_threads(1)  # workers already fill the cores
-
-
 def _world(env_id: str, driver: str) -> World:
     if (env_id, driver) not in _worlds:
         _worlds[env_id, driver] = open_world(env_id, driver)
@@ -186,14 +211,44 @@ def _record(task: _Task) -> list[Episode]:
     return record_all(_world(task.env_id, task.driver), task.seed, task.driver, task.recording)
 
 
-def _info(config: CollectConfig) -> StoreInfo:
+class _InfoTask(NamedTuple):
+    """Asks for content and provenance of the store."""
+
+    env_id: str
+    seed: int
+    config: CollectConfig
+
+
+def _played(task: _Task | _InfoTask) -> Any:
+    return _record(task) if isinstance(task, _Task) else _info(task.config, task.seed)
+
+
+def _info_from(config: CollectConfig, pool: "EpisodePool[Any] | None") -> StoreInfo:
+    """Returns content and provenance of the store, by the first seed whose environment does not fail.
+
+    Raises:
+        UserError: a driver, an environment or settings that do not go together, or the first environments all fail.
+    """
+    if pool is None:
+        return _info(config, config.seed)
+    failed = []
+    for number in range(min(config.episodes, MOST_REASONS)):
+        task = _InfoTask(config.env_id, config.seed + number, config)
+        for found in pool.play([task]):
+            if isinstance(found, StoreInfo):
+                return found
+            failed.append(found)
+    raise UserError(f"none of the first {len(failed)} seeds can be played: {failed[0].reason}")
+
+
+def _info(config: CollectConfig, seed: int) -> StoreInfo:
     """Returns content and provenance of the store; makes each driver once, so that a wrong one ends here.
 
     Raises:
         UserError: a driver, an environment or settings that do not go together.
     """
     worlds = [open_world(config.env_id, name) for name in config.drivers]
-    worlds[0].reset(config.seed)
+    worlds[0].reset(seed)
     labelled = config.labels and not config.branches and worlds[0].labels() is not None
     recording = recording_of(config)
     made = provenance(PACKAGES) | {"seed": config.seed}
@@ -217,8 +272,15 @@ def _info(config: CollectConfig) -> StoreInfo:
 
 def _settings(config: CollectConfig, info: StoreInfo) -> dict[str, Any]:
     """Returns all that an episode depends on, for recordings that are taken up again."""
-    given = {name: value for name, value in asdict(config).items() if name not in ("out", "workers", "overwrite")}
+    given = {name: value for name, value in asdict(config).items() if name not in FREE}
     return given | {name: info.provenance[name] for name in ("commit", "versions")} | {"drivers": config.drivers}
+
+
+def _kept(config: CollectConfig, partial: PartialStore) -> str:
+    """Returns what a recording that is stopped keeps."""
+    if not partial.num_done:
+        return "no episode is kept yet; the same command begins anew"
+    return f"{partial.num_done} of {config.episodes} episodes are kept beside {config.out}; the same command goes on"
 
 
 def main() -> None:
@@ -226,22 +288,33 @@ def main() -> None:
     config = parse(CollectConfig, __doc__)
     if config.out.exists() and not config.overwrite:
         raise UserError(f"{config.out} exists; choose another path or pass --overwrite")
-    info = _info(config)
     columns = (TextColumn(f"collect {config.env_id}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with PartialStore(config.out, _settings(config, info), discard=config.overwrite) as partial:
-        done = partial.num_done
-        with Progress(*columns) as progress:
-            task = progress.add_task("", total=config.episodes, completed=done)
-            for found in recorded(config, done):
-                partial.add(info, *found)
-                progress.advance(task)
-        episodes = partial.finish(info, config.overwrite)
+    with open_pool(config) as pool:
+        info = _info_from(config, pool)
+        with locked_path(config.out):
+            partial = PartialStore(config.out, _settings(config, info), discard=config.overwrite)
+            done = partial.num_done
+            with resumable(lambda: _kept(config, partial)), partial, Progress(*columns) as progress:
+                task = progress.add_task("", total=config.episodes, completed=done)
+                for found in recorded(config, done, pool):
+                    if isinstance(found, Failed):
+                        partial.skip(found.seed, found.reason)
+                    else:
+                        partial.add(info, *found)
+                    progress.advance(task)
+                progress.stop()
+                episodes = partial.finish(info, config.overwrite)
     steps = sum(len(e.states) for e in episodes)
     taken = f" ({done} of them from an unfinished recording)" if done else ""
     print(
         f"{config.out}: {len(episodes)} episodes{taken}, {steps} scenes, "
         f"seeds {config.seed}–{config.seed + config.episodes - 1}"
     )
+    reasons = list(partial.skipped.values())
+    if reasons:
+        print(f"skipped: {len(reasons)} of {config.episodes} seeds, whose environment failed")
+        for reason in reasons[:MOST_REASONS]:
+            print(f"  {short(reason)}")
 
 
 if __name__ == "__main__":

@@ -9,14 +9,12 @@ the policy's choice, and landmarks. Several checkpoints make a transfer matrix: 
 against causal labels (docs/reactions.md), `--plans` what-if forecasts for plans of the ego (docs/what_if.md).
 """
 
-import multiprocessing
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
 from rich.console import Console
 from rich.progress import track
 
@@ -34,7 +32,9 @@ from envs.rollouts.plan_run import PlanRun, check_has_plans, measure_plans
 from envs.rollouts.reaction_run import ReactionRun, measure_reactions
 from envs.rollouts.report import EnvAccuracy
 from envs.rollouts.summary import summarise_episodes
+from envs.rollouts.workers import EpisodePool
 from envs.rollouts.world import default_drivers, open_world
+from envs.supervision import TIMEOUT_S
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, name_of_folder, resolve
 from predictor.data.store import read_info_of
 from predictor.reports.tables import accuracy_table
@@ -89,6 +89,8 @@ class EvaluateConfig:
     """Largest length of an episode; longer ones are cut there [policy steps]."""
     workers: int = os.cpu_count() or 1
     """Number of parallel processes; the results do not depend on it."""
+    timeout_s: float = TIMEOUT_S
+    """Largest time that one step of an episode may take [s]; an environment that hangs for longer ends the command."""
     out: Path | None = None
     """Folder for accuracy.json, accuracy.md, and per environment a figure by horizon and a gallery of worst cases."""
     reactions: bool = False
@@ -121,7 +123,7 @@ class EvaluateConfig:
             check_count(getattr(self, name), name)
         check_count(self.num_samples * (self.horizon_steps or 1), "horizon_steps times num_samples")
         check_processes(min(self.workers, self.episodes), "workers")
-        check_positive(self, "miss_m")
+        check_positive(self, "miss_m", "timeout_s")
         names = [name_of_folder(checkpoint) for checkpoint in self.checkpoint]
         if len(set(names)) < len(names):
             raise UserError(f"each checkpoint needs a name of its own, got {', '.join(names)}; rename a folder")
@@ -166,9 +168,8 @@ def _play_all(config: EvaluateConfig, env_id: str, checkpoint: str, driver: str,
         )
         for i in range(config.episodes)
     ]  # fmt: skip
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(min(config.workers, len(tasks)), initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        return list(track(pool.imap(play, tasks, chunksize=2), f"evaluate {env_id}", total=len(tasks)))
+    with EpisodePool(play, config.workers, config.timeout_s) as pool:
+        return list(track(pool.results(tasks), f"evaluate {env_id}", total=len(tasks)))
 
 
 def _stores_of(roots: Sequence[Path], env_id: str) -> tuple[str, ...]:
@@ -241,18 +242,21 @@ def _reaction_run(config: EvaluateConfig, env_id: str, driver: str) -> ReactionR
     return ReactionRun(
         env_id, driver, config.checkpoint or (checkpoint_for(env_id),), config.perturbations, config.most_episodes,
         config.seed, config.max_steps, config.workers, config.horizon_steps, _stores_of(config.data, env_id),
+        config.timeout_s,
     )  # fmt: skip
 
 
 def _graph_run(config: EvaluateConfig, env_id: str, driver: str) -> GraphRun:
     checkpoints = config.checkpoint or (checkpoint_for(env_id),)
-    return GraphRun(env_id, driver, checkpoints, config.episodes, config.seed, config.max_steps, config.workers)
+    return GraphRun(
+        env_id, driver, checkpoints, config.episodes, config.seed, config.max_steps, config.workers, config.timeout_s
+    )
 
 
 def _plan_run(config: EvaluateConfig, env_id: str, driver: str) -> PlanRun:
     return PlanRun(
         env_id, driver, config.checkpoint or (checkpoint_for(env_id),), config.episodes, config.seed, config.max_steps,
-        config.workers, config.horizon_steps,
+        config.workers, config.horizon_steps, config.timeout_s,
     )  # fmt: skip
 
 

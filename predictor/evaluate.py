@@ -25,7 +25,7 @@ from predictor.data.windows import Windows
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import Outcome, run_window_batch, run_windows
 from predictor.forecaster import Forecaster
-from predictor.reports.plots import plot_error_by_horizon, plot_scene
+from predictor.reports.plots import plot_error_by_horizon, plot_scene, save_figure
 from predictor.reports.tables import MODEL_NAMES, accuracy_table, markdown_table
 from predictor.scene import SceneSpec
 from predictor.support.command_line import Renamed, parse
@@ -166,8 +166,7 @@ def _plot(
     matplotlib.use("Agg")
     figure, ax = plt.subplots(figsize=(6, 4), layout="constrained")
     plot_error_by_horizon(ax, accuracies, windows.spec.dt_s)
-    figure.savefig(config.out / "error_by_horizon.png", dpi=130)
-    plt.close(figure)
+    save_figure(figure, config.out / "error_by_horizon.png", 130)
     batch = windows.batch(chosen[:200])
     device = torch.device("cpu" if isinstance(model, ConstantVelocity) else config.device)
     outcome: Outcome = run_window_batch(
@@ -186,8 +185,7 @@ def _plot(
             outcome.valid[window].cpu().numpy(),
         )
     figure.suptitle("history solid, forecast dashed, truth thin black")
-    figure.savefig(config.out / "scenes.png", dpi=110)
-    plt.close(figure)
+    save_figure(figure, config.out / "scenes.png", 110)
 
 
 def main() -> None:

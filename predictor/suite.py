@@ -6,17 +6,16 @@ in both views of docs/protocol.md, and prints the table as Markdown, with JSON a
 
 import hashlib
 import json
+import multiprocessing
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import matplotlib
-from matplotlib import pyplot as plt
 from rich.progress import Progress
 
 from predictor.data.store import read_info_of
@@ -27,16 +26,19 @@ from predictor.evaluation.nri_tables import NRI_TABLES
 from predictor.evaluation.paper_tables import NUM_SAMPLES, Budget, Line, Sizes
 from predictor.evaluation.paper_tables import TABLES as PAPER_TABLES
 from predictor.evaluation.training_seeds import joined
-from predictor.reports.plots import plot_results_by_step
+from predictor.reports.plots import figure_by_step, save_figure
 from predictor.reports.suite_tables import latex_table, markdown_report
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_json, write_text
+from predictor.support.locks import locked
 from predictor.support.memory import check_count, check_processes
+from predictor.support.processes import end, follow_parent, print_into, start
 from predictor.support.provenance import provenance
 from predictor.support.reading import read_object
 from predictor.support.runtime import resolve_device, tune
+from predictor.support.stopping import resumable
 from predictor.train import train
 from predictor.training.config import TrainConfig, TrainPrecision, check_precision
 
@@ -50,6 +52,9 @@ MIN_HISTORY_STEPS = 8
 """Smallest number of observed steps of a training window, where the table's burn-in is not shorter."""
 ADDED = {"precision": "float32", "causal_edges": False, "reaction_weight": 0.0, "init": ""}
 """Options that came after the first lines were trained, with the values that change nothing."""
+KEPT = "the same command goes on: finished lines are kept, others continue"
+SAVING_S = 60.0
+"""Time that a line's process gets to save its training when the suite is stopped [s]."""
 MEASURING = 2
 """Number of the way of measuring: results of another one are not taken for finished."""
 
@@ -83,7 +88,7 @@ class SuiteConfig:
     seeds: int = 1
     """Number of training seeds of each line, from `seed` on; cells then show mean and range."""
     only_line: Annotated[str, Renamed("only_row")] = ""
-    """Key of a line to run in this process; the suite starts its processes with it."""
+    """Key of a line to run in this process, without a table."""
 
     def __post_init__(self) -> None:
         """Checks choices and ranges; `device="auto"` becomes the device that is taken.
@@ -269,7 +274,11 @@ def run_suite(config: SuiteConfig) -> dict[str, Any]:
     config.check_stores()
     table, jobs = TABLES[config.table], jobs_of(config)
     began = time.perf_counter()
-    failed = _run_in_processes(config, [job for job in jobs if not job.result.exists()])
+    with (
+        locked(config.folder, "suite"),
+        resumable("the same command goes on: finished lines are kept, others continue"),
+    ):
+        failed = _run_in_processes(config, [job for job in jobs if not job.result.exists()])
     results: dict[str, list[dict[str, Any]]] = {}
     for job in jobs:
         if job.result.exists():
@@ -305,26 +314,15 @@ def _plot(config: SuiteConfig, results: Sequence[dict[str, Any]], title: str) ->
     matplotlib.use("Agg")
     kinds = list(results[0]["tests"])
     dt_s = read_info_of(config.data / TABLES[config.table].tests[kinds[0]]).spec.dt_s
-    figure, axes = plt.subplots(
-        1, len(kinds), figsize=(1 + 5 * len(kinds), 5.2), sharey=True, squeeze=False, layout="constrained"
-    )
-    for ax, kind in zip(axes[0], kinds, strict=True):
-        plot_results_by_step(ax, results, kind, dt_s).set_title(kind)
-    axes[0, 0].set_ylabel("displacement of the best sample [m]")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2 * len(kinds), fontsize=7.5, frameon=False)
-    figure.suptitle(
-        f"{title}, budget {config.budget}, mean over seeds: {config.seeds}; bars: standard error over 20 subsets",
-        fontsize=9,
-    )
-    figure.savefig(config.folder / "by_step.png", dpi=110)
-    plt.close(figure)
+    headline = f"{title}, budget {config.budget}, mean over seeds: {config.seeds}"
+    figure = figure_by_step(results, kinds, dt_s, f"{headline}; bars: standard error over 20 subsets")
+    save_figure(figure, config.folder / "by_step.png", 110)
 
 
 def _run_in_processes(config: SuiteConfig, pending: Sequence[Job]) -> dict[str, str]:
     """Runs jobs in parallel; returns the last line of output of those that failed, by name."""
     waiting, failed = list(pending), {}
-    running: list[tuple[Job, subprocess.Popen[bytes], Path]] = []
+    running: list[tuple[Job, BaseProcess, Path]] = []
     with Progress() as progress:
         task = progress.add_task(f"{config.table}: {len(pending)} lines to run", total=len(pending))
         try:
@@ -335,9 +333,9 @@ def _run_in_processes(config: SuiteConfig, pending: Sequence[Job]) -> dict[str, 
                     waiting.remove(job)
                     running.append((job, *_start(job)))
                 time.sleep(0.5)
-                ended = [one for one in running if one[1].poll() is not None]
+                ended = [one for one in running if one[1].exitcode is not None]
                 for job, process, log in ended:
-                    if process.returncode:
+                    if process.exitcode:
                         failed[job.name] = (log.read_text(errors="replace").strip().splitlines() or ["no output"])[-1]
                     progress.advance(task)
                 running = [one for one in running if one not in ended]
@@ -345,23 +343,25 @@ def _run_in_processes(config: SuiteConfig, pending: Sequence[Job]) -> dict[str, 
                     named = ", ".join(job.name for job, *_ in running) or "done"
                     progress.update(task, description=f"{config.table}: {named}")
         finally:
-            for _, process, _ in running:
-                process.terminate()
+            end([process for _, process, _ in running], SAVING_S)
     return failed
 
 
-def _start(job: Job) -> "tuple[subprocess.Popen[bytes], Path]":
-    config = job.config
+def _start(job: Job) -> tuple[BaseProcess, Path]:
     job.folder.mkdir(parents=True, exist_ok=True)
     log = job.folder / "log.txt"
-    command = [
-        sys.executable, "-m", "predictor.suite", "--table", config.table, "--data", str(config.data),
-        "--out", str(config.out), "--budget", config.budget, "--steps", str(config.steps), "--workers",
-        str(config.num_processes), "--seed", str(config.seed), "--device", config.device,
-        "--precision", config.precision, "--only-line", job.line.key,
-    ]  # fmt: skip
-    with log.open("wb") as stream:
-        return subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT), log
+    process = multiprocessing.get_context("spawn").Process(target=_work, args=(job, log))
+    start(process)
+    return process, log
+
+
+def _work(job: Job, log: Path) -> None:
+    """Runs a job in a process of its own, which ends with the suite; SIGTERM saves what it trains."""
+    follow_parent()
+    with log.open("w", buffering=1) as file:
+        print_into(file)
+        tune(job.config.device)
+        run_entry_point(lambda: print(f"measured {run_line(job.config, job.line)['name']}"))
 
 
 def _fingerprint(path: Path) -> str:

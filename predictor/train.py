@@ -19,32 +19,48 @@ from predictor.checkpoint import BEST_OF_RUN, CheckpointInfo, save_checkpoint
 from predictor.support.command_line import parse
 from predictor.support.errors import UserError, run_entry_point, short
 from predictor.support.files import check_out, delete_leftovers, write_json
+from predictor.support.locks import locked
 from predictor.support.provenance import provenance
 from predictor.support.reading import as_object, read_object
 from predictor.support.runtime import tune
+from predictor.support.stopping import deferred_stops, resumable
 from predictor.training.config import BEFORE_THEY_EXISTED, TrainConfig
 from predictor.training.trainer import LOG_EVERY, Trainer, load_data
 
+STATE_FILE = "train_state.pt"
+
 
 def train(config: TrainConfig) -> Path:
-    """Trains until all steps are done or validation stops improving; returns the folder of the best checkpoint."""
-    state_file, config_file = config.out / "train_state.pt", config.out / "config.json"
+    """Trains until all steps are done or validation stops improving; returns the folder of the best checkpoint.
+
+    Ctrl-C and SIGTERM wait for the end of a step and save the state; a second one does not wait.
+
+    Raises:
+        UserError: the folder holds another run, another process trains in it, data do not fit, or the disk is full.
+    """
+    state_file, config_file = config.out / STATE_FILE, config.out / "config.json"
+    with resumable(lambda: _kept(config, state_file)):
+        return _train(config, state_file, config_file)
+
+
+def _train(config: TrainConfig, state_file: Path, config_file: Path) -> Path:
     _check_run_folder(config, config_file)
     tune(config.device)
     if config.threads:
         torch.set_num_threads(config.threads)
     data = load_data(config)
     trainer = Trainer(config, data)
-    config.out.mkdir(parents=True, exist_ok=True)
-    delete_leftovers(config.out)  # of a run that was killed while it saved
-    if config.resume and state_file.exists():
-        trainer.restore(state_file)
-    made = provenance(("torch", "numpy", "zarr", "safetensors"))
-    write_json(config_file, {"config": _comparable(config), "provenance": made})
-    try:
-        _run(trainer, state_file, made)
-    finally:
-        trainer.close()
+    with locked(config.out, "training"):
+        _check_run_folder(config, config_file)  # another training may have come and gone
+        delete_leftovers(config.out)  # of a run that was killed while it saved
+        if config.resume and state_file.exists():
+            trainer.restore(state_file)
+        made = provenance(("torch", "numpy", "zarr", "safetensors"))
+        write_json(config_file, {"config": _comparable(config), "provenance": made})
+        try:
+            _run(trainer, state_file, made)
+        finally:
+            trainer.close()
     if not (config.out / BEST_OF_RUN).exists():
         raise UserError(
             f"no validation episode has {config.horizon_steps} steps of future, so no checkpoint was chosen; "
@@ -53,13 +69,21 @@ def train(config: TrainConfig) -> Path:
     return config.out / BEST_OF_RUN
 
 
+def _kept(config: TrainConfig, state_file: Path) -> str:
+    """Returns what a run that is stopped keeps."""
+    if not state_file.exists():
+        return "nothing is saved yet; the same command with --resume begins anew"
+    return f"its state is saved in {config.out}; the same command with --resume goes on"
+
+
 def _run(trainer: Trainer, state_file: Path, made: dict[str, Any]) -> None:
-    """Trains, logs, validates and saves until the run is finished."""
+    """Trains, logs, validates and saves until the run is finished, or a signal asks it to stop."""
     config, columns = trainer.config, (TextColumn("train"), BarColumn(20), MofNCompleteColumn(), TimeRemainingColumn())
     note, printed = "", 0
     with (
         SummaryWriter(str(config.out / "tb"), purge_step=trainer.step) as writer,
         Progress(*columns, TextColumn("{task.fields[note]}")) as progress,
+        deferred_stops() as stops,
     ):
         task = progress.add_task("", total=config.steps, completed=trainer.step, note="")
         if config.init and not trainer.step:
@@ -70,6 +94,10 @@ def _run(trainer: Trainer, state_file: Path, made: dict[str, Any]) -> None:
             for line in trainer.notes[printed:]:
                 progress.console.print(line, highlight=False)
             printed = len(trainer.notes)
+            if stops.asked is not None:
+                trainer.read(terms)  # a state that is not finite is never saved
+                trainer.save(state_file)
+                stops.stop()
             due = trainer.step % config.eval_every == 0 or trainer.step == config.steps
             if not due and trainer.step % trainer.read_every:
                 continue

@@ -31,7 +31,8 @@ def texts() -> list[Path]:
     """Returns all texts of a clone; runs, data and caches are not part of it."""
     inside = [path for room in ROOMS for path in (ROOT / room).rglob("*") if "__pycache__" not in path.parts]
     top = [path for path in ROOT.iterdir() if not path.name.startswith(".")]
-    return sorted(path for path in [*inside, *top] if path.is_file() and path.suffix in TEXT_SUFFIXES)
+    found = [path for path in [*inside, *top] if path.is_file() and path.suffix in TEXT_SUFFIXES]
+    return sorted(path for path in found if path.suffix or "golden" not in path.parts)  # chunks of stores are no texts
 
 
 def imported_modules(path: Path) -> Iterator[tuple[int, str]]:

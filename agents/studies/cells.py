@@ -96,7 +96,9 @@ class Cell:
     @property
     def content(self) -> dict[str, Any]:
         """Everything that determines the result, as JSON content."""
-        task = {key: value for key, value in _named(self.task).items() if key not in ("device", "checkpoint")}
+        task = {
+            key: value for key, value in _named(self.task).items() if key not in ("device", "checkpoint", "timeout_s")
+        }
         content: dict[str, Any] = {
             "measuring": MEASURING,
             "task": task,
@@ -242,7 +244,8 @@ def _run_config(cell: Cell) -> dict[str, Any]:
     assert cell.plan is not None
     plan = {key: value for key, value in asdict(cell.plan).items() if key not in ("task", "in_process")}
     pin = None if cell.forecaster is None else dict(cell.forecaster)
-    return {**asdict(cell.task), **plan, "partner": cell.task.driver, FORECASTER: pin}
+    task = {key: value for key, value in asdict(cell.task).items() if key != "timeout_s"}
+    return {**task, **plan, "partner": cell.task.driver, FORECASTER: pin}
 
 
 def _command() -> str:

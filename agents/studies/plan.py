@@ -32,8 +32,9 @@ RIVALS = ("zeros", "constant-velocity")
 FLOOR, CEILING = "zeros", "oracle"
 _PLACES = ("scenario", "env_id")
 """Names that a text of an arm may hold in braces."""
-_OWN = ("env_id", "observe")
-"""Fields of `Task` that are no options: a scenario and an arm say them in keys of their own."""
+_OWN = ("env_id", "observe", "timeout_s")
+"""Fields of `Task` that are no options: a scenario and an arm say the first two in keys of their own, and a cell runs
+its environments in its own process."""
 
 
 @dataclass(frozen=True)

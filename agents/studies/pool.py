@@ -14,46 +14,22 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from agents.studies.cells import LOG_FILE, Cell, run_cell
 from agents.studies.results import RESULT_FILE
 from predictor.support.errors import UserError
+from predictor.support.locks import LOCK_FILE
+from predictor.support.processes import ctrl_c_ignored, end, print_into
 from predictor.support.runtime import keep_freed_memory
 
-LOCK_FILE = ".lock"
 START_METHOD = "forkserver" if sys.platform == "linux" else "spawn"
-_PATIENCE_S = 5.0
-"""Time that a process gets to end when it is asked to, before it is killed [s]."""
-
-
-@contextlib.contextmanager
-def locked(folder: Path, what: str = "study") -> Iterator[None]:
-    """Holds the lock of the folder of a study, or of `what`, which the operating system takes back at the process' end.
-
-    Raises:
-        UserError: another process holds it.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / LOCK_FILE).open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            file.seek(0)
-            raise UserError(
-                f"another {what} runs in {folder} (process {file.read().strip() or 'unknown'}); wait for its end or "
-                "choose another --out"
-            ) from error
-        file.truncate(0)
-        file.write(str(os.getpid()))
-        file.flush()
-        yield
 
 
 @dataclass(frozen=True)
@@ -105,19 +81,15 @@ def _start(cell: Cell, folder: Path) -> Running:
         context.set_forkserver_preload([__name__])
     theirs, ours = context.Pipe(duplex=False)
     process = context.Process(target=_work, args=(cell, folder / cell.name, theirs), name=cell.name)
-    process.start()
+    with ctrl_c_ignored():
+        process.start()
     theirs.close()
     return Running(cell, process, ours)
 
 
 def _stop(running: Sequence[Running]) -> None:
+    end([one.process for one in running])
     for one in running:
-        one.process.terminate()
-    for one in running:
-        one.process.join(_PATIENCE_S)
-        if one.process.is_alive():
-            one.process.kill()
-            one.process.join()
         one.lifeline.close()
 
 
@@ -127,7 +99,7 @@ def _work(cell: Cell, folder: Path, lifeline: Connection) -> None:
     threading.Thread(target=_end_with, args=(lifeline,), daemon=True).start()
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / LOG_FILE).open("a", buffering=1) as log, (folder / LOCK_FILE).open("a") as lock:
-        _print_into(log)
+        print_into(log)
         fcntl.flock(lock, fcntl.LOCK_EX)  # the last process of a killed study may still be here, for a moment
         if (folder / RESULT_FILE).exists():
             return
@@ -148,9 +120,3 @@ def _end_with(lifeline: Connection) -> None:
     with contextlib.suppress(EOFError, OSError):
         lifeline.recv()
     os._exit(1)
-
-
-def _print_into(log: IO[str]) -> None:
-    sys.stdout.flush(), sys.stderr.flush()
-    for number in (1, 2):
-        os.dup2(log.fileno(), number)

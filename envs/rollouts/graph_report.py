@@ -13,6 +13,7 @@ from rich.table import Table
 from envs.rollouts.graph_run import DISTANCE, LEADERS, MAJORITY, EnvGraph
 from predictor.evaluation.causal_graph import CausalScores
 from predictor.evaluation.standard_errors import Estimate
+from predictor.reports.plots import save_figure
 from predictor.support.markdown import table
 
 HEADS = (
@@ -101,8 +102,7 @@ def write_picture(out: Path, result: EnvGraph) -> None:
         ax.grid(alpha=0.3)
     left.legend(frameon=False, fontsize=8)
     figure.suptitle(title(result), fontsize=11)
-    figure.savefig(out / f"{result.env_id.replace('/', '-')}.graph.png", dpi=130)
-    plt.close(figure)
+    save_figure(figure, out / f"{result.env_id.replace('/', '-')}.graph.png", 130)
 
 
 def plot_curve(ax: Axes, name: str, found: CausalScores) -> Axes:

@@ -1,17 +1,17 @@
 """Measures inferred edges against causal labels in one environment, beside rules that need no network."""
 
-import multiprocessing
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from rich.progress import track
 
 from envs.rollouts.causal_labels import CausalSettings, settings_for
 from envs.rollouts.causal_scenes import EdgeScene, GraphTask, play_graph
 from envs.rollouts.side_forecasts import fitting_checkpoints
+from envs.rollouts.workers import EpisodePool
 from envs.rollouts.world import open_world
+from envs.supervision import TIMEOUT_S
 from predictor.evaluation.causal_graph import CausalPairs, CausalScores, halves, score_rule
 from predictor.support.errors import UserError
 
@@ -39,6 +39,8 @@ class GraphRun:
     """Largest length of an episode [policy steps]."""
     workers: int
     """Number of parallel processes."""
+    timeout_s: float = TIMEOUT_S
+    """Largest time between two steps of an episode [s]."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +75,8 @@ def measure_graph(run: GraphRun) -> EnvGraph:
     tasks = [
         GraphTask(run.env_id, run.driver, fitting, run.seed + i, run.max_steps, settings) for i in range(run.episodes)
     ]
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(min(run.workers, len(tasks)), initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        played = pool.imap(play_graph, tasks, chunksize=1)
-        episodes = list(track(played, f"graph {run.env_id}", total=len(tasks)))
+    with EpisodePool(play_graph, run.workers, run.timeout_s) as pool:
+        episodes = list(track(pool.results(tasks), f"graph {run.env_id}", total=len(tasks)))
     scores = scores_of(episodes, settings.threshold_m)
     if not next(iter(scores.values())).pairs:
         raise UserError(f"{run.env_id}: no causal label is known in {run.episodes} episodes; add --episodes")

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from envs.rollouts.plan_run import EnvPlans, PlanScores
 from predictor.evaluation.standard_errors import Estimate
+from predictor.reports.plots import save_figure
 from predictor.support.markdown import table
 
 HEADS = (
@@ -101,8 +102,7 @@ def write_picture(out: Path, result: EnvPlans) -> None:
     plot_errors(left, result)
     plot_choices(right, result)
     figure.suptitle(title(result), fontsize=11)
-    figure.savefig(out / f"{result.env_id.replace('/', '-')}.plans.png", dpi=130)
-    plt.close(figure)
+    save_figure(figure, out / f"{result.env_id.replace('/', '-')}.plans.png", 130)
 
 
 def plot_errors(ax: Axes, result: EnvPlans) -> Axes:

@@ -1,18 +1,18 @@
 """Measures what-if forecasts in one environment: errors with and without the ego's plan, and choices between plans."""
 
-import multiprocessing
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 from rich.progress import track
 
 from envs.plans import plan_model_for
 from envs.rollouts.plan_moments import PlanMoment, PlanTask, play_plans
 from envs.rollouts.side_forecasts import fitting_checkpoints
+from envs.rollouts.workers import EpisodePool
 from envs.rollouts.world import open_world
+from envs.supervision import TIMEOUT_S
 from predictor.checkpoint import load_forecaster
 from predictor.evaluation.standard_errors import Estimate, bootstrap_interval
 from predictor.support.errors import UserError
@@ -38,6 +38,8 @@ class PlanRun:
     """Number of parallel processes."""
     horizon_steps: int | None = None
     """Number of steps forecast and played; None takes the first checkpoint's."""
+    timeout_s: float = TIMEOUT_S
+    """Largest time between two steps of an episode [s]."""
 
 
 @dataclass(frozen=True)
@@ -129,9 +131,8 @@ def measure_plans(run: PlanRun) -> EnvPlans:
     tasks = [
         PlanTask(run.env_id, run.driver, fitting, run.seed + i, run.max_steps, horizon) for i in range(run.episodes)
     ]
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(min(run.workers, len(tasks)), initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        played = pool.imap(play_plans, tasks, chunksize=1)
+    with EpisodePool(play_plans, run.workers, run.timeout_s) as pool:
+        played = pool.results(tasks)
         episodes = [found for found in track(played, f"plans {run.env_id}", total=len(tasks)) if found]
     if not episodes:
         raise UserError(f"{run.env_id}: none of {run.episodes} episodes has a step to measure; add --episodes")

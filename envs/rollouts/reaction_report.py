@@ -15,6 +15,7 @@ from envs.rollouts.reaction_cells import FALSE_BESIDE
 from envs.rollouts.reaction_run import CellReactions, EnvReactions
 from envs.rollouts.reactions import NEIGHBOURS, STRAIGHT
 from predictor.evaluation.standard_errors import Estimate
+from predictor.reports.plots import save_figure
 from predictor.support.markdown import table
 
 HEADS = (
@@ -125,8 +126,7 @@ def write_picture(out: Path, result: EnvReactions) -> None:
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
     figure.suptitle(f"{result.env_id}: mean shift of the receiver [m]", fontsize=11)
-    figure.savefig(out / f"{result.env_id.replace('/', '-')}.reactions.png", dpi=130)
-    plt.close(figure)
+    save_figure(figure, out / f"{result.env_id.replace('/', '-')}.reactions.png", 130)
 
 
 def plot_cell(ax: Axes, cell: CellReactions, dt_s: float) -> Axes:

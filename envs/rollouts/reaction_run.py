@@ -1,18 +1,18 @@
 """Measures reactions in one environment: plays episodes in parallel until each cell has enough perturbations."""
 
-import multiprocessing
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from envs.rollouts.interventions import kinds_of
 from envs.rollouts.reaction_cells import FALSE_BESIDE, cells_of
 from envs.rollouts.reactions import Perturbation, ReactionTask, play_reactions
 from envs.rollouts.side_forecasts import fitting_checkpoints
+from envs.rollouts.workers import EpisodePool
 from envs.rollouts.world import open_world
+from envs.supervision import TIMEOUT_S
 from predictor.checkpoint import load_forecaster
 from predictor.evaluation.reactions import Reaction, Shifts, false_reaction, reaction
 from predictor.evaluation.standard_errors import Estimate
@@ -42,6 +42,8 @@ class ReactionRun:
     """Number of steps forecast and played; None takes the first checkpoint's."""
     stores: tuple[str, ...] = ()
     """Stores to fit nearest neighbours to; empty leaves them out."""
+    timeout_s: float = TIMEOUT_S
+    """Largest time between two steps of an episode [s]."""
 
 
 @dataclass(frozen=True)
@@ -120,9 +122,9 @@ def _play_until_enough(
     """Returns the first perturbations of each cell, and the number of episodes that they took."""
     found: dict[str, list[Perturbation]] = {name: [] for name in names}
     columns = TextColumn(f"reactions {run.env_id}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    context, played, needed = multiprocessing.get_context("spawn"), 0, 0
+    played, needed = 0, 0
     with (
-        context.Pool(run.workers, initializer=torch.set_num_threads, initargs=(1,)) as pool,
+        EpisodePool(play_reactions, run.workers, run.timeout_s) as pool,
         Progress(*columns) as progress,
     ):
         bar = progress.add_task("", total=len(names) * run.perturbations)
@@ -137,7 +139,7 @@ def _play_until_enough(
                 )
                 for i in wave
             ]
-            for episode, ones in zip(wave, pool.imap(play_reactions, tasks, chunksize=1), strict=True):
+            for episode, ones in zip(wave, pool.results(tasks), strict=True):
                 for one in ones:
                     if _count(found[one.cell]) < run.perturbations:
                         found[one.cell].append(one)

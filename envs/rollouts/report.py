@@ -13,6 +13,7 @@ from rich.table import Table
 from envs.rollouts.episode import MODEL, NEIGHBOURS, RESIDUAL, STRAIGHT, Case
 from predictor.evaluation.accuracy import Accuracy
 from predictor.evaluation.graph_accuracy import GraphAccuracy
+from predictor.reports.plots import save_figure
 from predictor.reports.tables import markdown_table
 from predictor.support.markdown import table
 
@@ -199,8 +200,7 @@ def write_pictures(out: Path, result: "EnvAccuracy", cases: Sequence[Case]) -> N
     ):
         plot_by_horizon(ax, [a for a in result.lines if getattr(a, quantity)], result.dt_s, quantity, label)
     figure.suptitle(f"{title(result)}; bands are 95 % intervals over episodes")
-    figure.savefig(out / f"{stem}.by_horizon.png", dpi=130)
-    plt.close(figure)
+    save_figure(figure, out / f"{stem}.by_horizon.png", 130)
     if cases:
         figure, grid = plt.subplots(2, 3, figsize=(13, 8), layout="constrained")
         for ax, case in zip(grid.flat, cases, strict=False):
@@ -210,8 +210,7 @@ def write_pictures(out: Path, result: "EnvAccuracy", cases: Sequence[Case]) -> N
         handles, labels = grid.flat[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
         figure.suptitle(f"{title(result)}: the worst forecast of the {len(cases)} worst episodes")
-        figure.savefig(out / f"{stem}.worst.png", dpi=110)
-        plt.close(figure)
+        save_figure(figure, out / f"{stem}.worst.png", 110)
 
 
 def plot_by_horizon(ax: Axes, accuracies: Sequence[Accuracy], dt_s: float, quantity: str, label: str) -> Axes:

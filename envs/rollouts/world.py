@@ -21,6 +21,7 @@ from envs.drivers.trained import (
     wrapper_options,
 )
 from envs.parallel import ForecastParallelEnv
+from envs.readers import multiagent_env_id
 from envs.readers.base import SceneReader
 from envs.readers.highway import is_highway_env
 from envs.readers.highway_labels import SceneLabels, read_labels
@@ -35,6 +36,7 @@ from envs.registry import (
 )
 from envs.seeding import driver_rng
 from envs.simulators.interventions import drop_all, generator_of
+from envs.supervision import Place, named
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.scene import Forecast, Scene, SceneSpec
@@ -85,14 +87,16 @@ class EgoWorld:
     Args:
         env: environment in `SceneObservation` or `ForecastObservation`.
         driver: name of a driver from `envs.drivers.ego`, or the path of a policy .zip.
+        env_id: id in messages; None takes the environment's.
 
     Attributes:
         crashed: whether the environment has reported a crash of the ego in this episode.
     """
 
-    def __init__(self, env: SceneObservation | ForecastObservation, driver: str) -> None:
+    def __init__(self, env: SceneObservation | ForecastObservation, driver: str, env_id: str | None = None) -> None:
         """Keeps environment and driver; resets nothing."""
         self.env = env
+        self._place, self._id = Place(), env_id or (env.spec.id if env.spec else type(env.unwrapped).__name__)
         self._name = driver
         self._reader: SceneReader = env.get_wrapper_attr("reader")
         self._whole = driver.endswith(".zip") and sees_forecasts(driver)
@@ -105,8 +109,14 @@ class EgoWorld:
         return self._reader.spec
 
     def reset(self, seed: int) -> None:
-        """Begins the episode of a seed."""
-        self.observation, _ = self.env.reset(seed=seed)
+        """Begins the episode of a seed.
+
+        Raises:
+            EnvironmentFailedError: the environment raised.
+        """
+        self._place.begin(seed)
+        with named(self._id, self._place):
+            self.observation, _ = self.env.reset(seed=seed)
         self.crashed = False
         self._rng = driver_rng(seed)
         self._ego = make_ego_driver(self._name, self.env, self._rng)
@@ -116,8 +126,14 @@ class EgoWorld:
         self._ego = driver
 
     def step(self) -> bool:
-        """Lets the ego act."""
-        self.observation, _, terminated, truncated, info = self.env.step(self._ego(self._seen()))
+        """Lets the ego act.
+
+        Raises:
+            EnvironmentFailedError: the environment raised, or its driver.
+        """
+        self._place.move()
+        with named(self._id, self._place):
+            self.observation, _, terminated, truncated, info = self.env.step(self._ego(self._seen()))
         self.crashed = self.crashed or bool(info.get("crashed", False))
         return bool(terminated or truncated)
 
@@ -137,7 +153,8 @@ class EgoWorld:
 
     def full_scene(self) -> Scene:
         """Returns all agents, ego first."""
-        return self._reader.read_all(self.env)
+        with named(self._id, self._place):
+            return self._reader.read_all(self.env)
 
     def forecast(self, num_samples: int) -> Forecast:
         """Returns the forecast of the perceived scene, from the wrapper's own stream."""
@@ -163,11 +180,13 @@ class MultiagentWorld:
     Args:
         env: environment in `ForecastParallelEnv`.
         driver: name of a driver from `envs.drivers.all_agents`, or the path of a policy .zip.
+        env_id: id in messages; None takes the environment's.
     """
 
-    def __init__(self, env: ForecastParallelEnv, driver: str) -> None:
+    def __init__(self, env: ForecastParallelEnv, driver: str, env_id: str | None = None) -> None:
         """Keeps the environment and checks that the driver fits; resets nothing."""
         self.env = env
+        self._place, self._id = Place(), env_id or multiagent_env_id(env)
         self._name = driver
         self._observations: dict[str, Any] = {}
         self._make_driver(np.random.default_rng(0))
@@ -178,18 +197,30 @@ class MultiagentWorld:
         return self.env.scene_spec
 
     def reset(self, seed: int) -> None:
-        """Begins the episode of a seed."""
+        """Begins the episode of a seed.
+
+        Raises:
+            EnvironmentFailedError: the environment raised.
+        """
         drop_all(self.env)
-        self._observations, _ = self.env.reset(seed=seed)
+        self._place.begin(seed)
+        with named(self._id, self._place):
+            self._observations, _ = self.env.reset(seed=seed)
         self._rng = driver_rng(seed)
         self._driver = self._make_driver(self._rng)
 
     def step(self) -> bool:
-        """Lets all agents act."""
+        """Lets all agents act.
+
+        Raises:
+            EnvironmentFailedError: the environment raised, or a driver.
+        """
         seen = self._observations
         if not self._name.endswith(".zip"):
             seen = {name: entries["observation"] for name, entries in seen.items()}
-        self._observations, *_ = self.env.step(self._driver(seen))
+        self._place.move()
+        with named(self._id, self._place):
+            self._observations, *_ = self.env.step(self._driver(seen))
         return not self.env.agents
 
     def generators(self) -> list[np.random.Generator]:
@@ -257,7 +288,7 @@ def open_world(
             options = {"checkpoint": checkpoint}
         options |= {} if horizon_steps is None else {"horizon_steps": horizon_steps}
         wrapped = ForecastParallelEnv(make_multiagent_env(env_id), **options)
-        multiagent = MultiagentWorld(wrapped, driver)
+        multiagent = MultiagentWorld(wrapped, driver, env_id)
         if sees_forecasts(driver):
             space: Any = wrapped.observation_space(wrapped.possible_agents[0])
             require_forecaster(driver, checkpoint, space, wrapped.scene_spec, options.get("arm"))
@@ -268,7 +299,7 @@ def open_world(
         if not isinstance(seen, ForecastObservation):
             bounds = () if perceived_as is None else (perceived_as.perception_m, perceived_as.max_agents)
             seen = SceneObservation(seen, *bounds)
-        world = EgoWorld(seen, driver)
+        world = EgoWorld(seen, driver, env_id)
     else:
         if sees_forecasts(driver):
             seen = ForecastObservation(env, checkpoint, horizon_steps=horizon_steps)
@@ -277,7 +308,7 @@ def open_world(
             require_forecaster(driver, checkpoint, space, seen.get_wrapper_attr("scene_spec"))
         else:
             require_view(env, driver)
-        world = EgoWorld(ForecastObservation(env, checkpoint, horizon_steps=horizon_steps), driver)
+        world = EgoWorld(ForecastObservation(env, checkpoint, horizon_steps=horizon_steps), driver, env_id)
     make_ego_driver(driver, world.env, np.random.default_rng(0))
     return world
 

@@ -9,6 +9,7 @@ import json
 import shutil
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -21,6 +22,7 @@ from predictor.support.reading import read_object
 PART_S = 30.0
 """Time after which the episodes that have been recorded since the last part are written [s]."""
 SETTINGS = "settings.json"
+SKIPPED = "skipped.json"
 
 
 class PartialStore:
@@ -31,6 +33,10 @@ class PartialStore:
         settings: everything that the episodes depend on, as JSON; parts with the same settings are taken over.
         discard: whether parts with other settings are deleted.
         part_s: time between two parts [s].
+
+    Attributes:
+        num_done: number of steps of the recording that are on disk.
+        skipped: why seeds have no episode, by seed.
 
     Raises:
         UserError: there are parts with other settings, and `discard` is not set.
@@ -44,10 +50,14 @@ class PartialStore:
         self._info: StoreInfo | None = None
         self._new: list[Episode] = []
         self._added = 0
+        self.skipped: dict[int, str] = {}
         self._written_at = time.monotonic()
         if self._folder.exists():
             self._take_over(discard)
         self.num_done = sum(int(part.name.partition("+")[2]) for part in self._parts())
+        if (self._folder / SKIPPED).exists():
+            found = read_object(self._folder / SKIPPED)
+            self.skipped = {int(seed): str(reason) for seed, reason in found.items()}
 
     def __enter__(self) -> "PartialStore":
         """Returns itself."""
@@ -67,13 +77,24 @@ class PartialStore:
         if time.monotonic() - self._written_at >= self._part_s:
             self._write_part()
 
+    def skip(self, seed: int, reason: str) -> None:
+        """Takes what the next step of the recording brought: no episode, and why."""
+        self.skipped[seed] = reason
+        self._added += 1
+
     def finish(self, info: StoreInfo, overwrite: bool = False) -> list[Episode]:
-        """Writes the store, deletes the parts, and returns all episodes.
+        """Writes the store, deletes the parts, and returns all episodes; its provenance names the seeds without one.
 
         Raises:
-            UserError: as `predictor.data.store.write_store`.
+            UserError: all seeds were skipped; or as `predictor.data.store.write_store`.
         """
         episodes = [episode for part in self._parts() for episode in read_store(part).episodes] + self._new
+        if self.skipped:
+            if not episodes:
+                first = next(iter(self.skipped.values()))
+                raise UserError(f"all {len(self.skipped)} episodes failed, the first so: {first}")
+            named = {str(seed): reason for seed, reason in sorted(self.skipped.items())}
+            info = replace(info, provenance=info.provenance | {"skipped": {"episodes": len(named), "reasons": named}})
         write_store(self._path, info, episodes, overwrite)
         self._new = []
         shutil.rmtree(self._folder, ignore_errors=True)
@@ -104,6 +125,8 @@ class PartialStore:
             return
         self._folder.mkdir(parents=True, exist_ok=True)
         write_json(self._folder / SETTINGS, self._settings)
+        if self.skipped:
+            write_json(self._folder / SKIPPED, self.skipped)
         write_store(self._folder / f"{self.num_done:08d}+{self._added}", self._info, self._new)
         self.num_done += self._added
         self._new, self._added = [], 0

@@ -30,6 +30,7 @@ from predictor.scene import PADDING_ID, Scene, SceneSpec
 from predictor.support.config_checks import check_positive
 from predictor.support.errors import UserError
 from predictor.support.files import new_folder
+from predictor.support.locks import locked_path
 from predictor.support.reading import version_of
 from predictor.support.typed_values import converted, from_table
 
@@ -127,14 +128,20 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
     """Writes a store; nothing appears under `path` until it is complete.
 
     Raises:
-        UserError: no episodes, non-finite states, or `path` exists and `overwrite` is not set.
+        UserError: no episodes, non-finite states, `path` exists and `overwrite` is not set, or another process writes
+            it.
     """
     path = Path(path)
     if path.exists() and not overwrite:
         raise UserError(f"{path} exists; choose another path or pass --overwrite")
     if path.exists():
         _check_own(path)
-    episodes = list(episodes)
+    with locked_path(path):
+        _write(path, info, list(episodes))
+
+
+def _write(path: Path, info: StoreInfo, episodes: Sequence[Episode]) -> None:
+    """Writes a store in place of what is there."""
     if not episodes:
         raise UserError("a store needs at least one episode, got none")
     marked = [e.perturbed is not None for e in episodes]

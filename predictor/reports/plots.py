@@ -1,14 +1,25 @@
 """Plots forecasts and their accuracy; functions take arrays and an axis and return the axis."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from predictor.evaluation.accuracy import Accuracy
+from predictor.support.files import new_file
+
+
+def save_figure(figure: Figure, path: Path, dpi: int) -> None:
+    """Writes a figure, as a whole file or not at all, and closes it."""
+    with new_file(path) as partial:
+        figure.savefig(partial, dpi=dpi)
+    plt.close(figure)
 
 
 def plot_error_by_horizon(ax: Axes, accuracies: Sequence[Accuracy], dt_s: float) -> Axes:
@@ -53,6 +64,27 @@ def plot_results_by_step(ax: Axes, results: Sequence[dict[str, Any]], kind: str,
     ax.set_xlabel("time ahead [s]")
     ax.grid(alpha=0.3, which="both")
     return ax
+
+
+def figure_by_step(results: Sequence[dict[str, Any]], kinds: Sequence[str], dt_s: float, headline: str) -> Figure:
+    """Draws `plot_results_by_step` for several test stores side by side, under one headline.
+
+    Args:
+        results: results of a suite's table.json, one per line of the table.
+        kinds: test stores.
+        dt_s: length of a step [s].
+        headline: text above.
+    """
+    figure, axes = plt.subplots(
+        1, len(kinds), figsize=(1 + 5 * len(kinds), 5.2), sharey=True, squeeze=False, layout="constrained"
+    )
+    for ax, kind in zip(axes[0], kinds, strict=True):
+        plot_results_by_step(ax, results, kind, dt_s).set_title(kind)
+    axes[0, 0].set_ylabel("displacement of the best sample [m]")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2 * len(kinds), fontsize=7.5, frameon=False)
+    figure.suptitle(headline, fontsize=9)
+    return figure
 
 
 def plot_scene(

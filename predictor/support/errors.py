@@ -1,14 +1,35 @@
-"""Errors that a user can cause, printed by an entry point in one line, with exit status 2 and no traceback."""
+"""Errors that a user can cause, printed by an entry point in one line, with exit status 2 and no traceback.
 
+Signals end a command in one line, too: Ctrl-C with status 130, SIGTERM with status 143. What was saved and how to go on
+is told by `predictor.support.stopping.resumable`.
+"""
+
+import errno
+import os
+import signal
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
 
 _WRONG_PATH = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 """Errors of the operating system when a user gives a path that does not fit."""
 
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO)
+"""Errors of the operating system when a disk is full, over its quota, read-only or broken."""
+
 
 class UserError(ValueError):
     """Raised for bad input; the message names what was required, what was given and what to do."""
+
+
+class CannotWriteError(UserError):
+    """Raised when a disk takes no more; what was there before is whole."""
+
+
+class Terminated(BaseException):
+    """Raised in the main thread when SIGTERM asks the process to end."""
 
 
 class ProtocolError(RuntimeError):
@@ -35,12 +56,62 @@ def one_line(error: BaseException) -> str:
 
 
 def run_entry_point(main: Callable[[], None]) -> None:
-    """Runs `main`; turns user errors into one line on stderr and exit status 2, Ctrl-C into status 130."""
+    """Runs `main`; prints user errors, full disks, Ctrl-C and SIGTERM in one line on stderr and exits.
+
+    Exit status: 2 after an error, 130 after Ctrl-C, 143 after SIGTERM.
+    """
     try:
-        main()
+        with _terminable():
+            main()
     except (UserError, *_WRONG_PATH) as error:
-        print(f"error: {one_line(error)}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted; continue with --resume where the command has it", file=sys.stderr)
-        sys.exit(130)
+        _leave("error", one_line(error), error, 2)
+    except OSError as error:
+        if error.errno not in DISK_ERRORS:
+            raise
+        _leave("error", cannot_write(error.filename or "the output", error), error, 2)
+    except KeyboardInterrupt as stop:
+        _leave("stopped", "", stop, 128 + signal.SIGINT)
+    except Terminated as stop:
+        _leave("stopped", "", stop, 128 + signal.SIGTERM)
+
+
+def cannot_write(path: object, error: OSError) -> str:
+    """Returns the message for a path that a disk does not take."""
+    reason = os.strerror(error.errno or errno.EIO)
+    return f"cannot write {path}: {reason}; what was there before is whole; make room or choose another disk"
+
+
+def _leave(word: str, message: str, error: BaseException, status: int) -> None:
+    """Prints one line, with what was said on how to go on, and exits."""
+    advice = _advice(error)
+    if word == "stopped" and advice is None:
+        advice = "what was not written yet is lost; the same command begins anew"
+    text = "; ".join(filter(None, (message, advice)))
+    print(f"{word}: {text}", file=sys.stderr)
+    sys.exit(status)
+
+
+def _advice(error: BaseException | None) -> str | None:
+    """Returns the first note of an error, or of one during whose handling it came (a second Ctrl-C)."""
+    while error is not None:
+        if notes := getattr(error, "__notes__", None):
+            return one_line(Exception(notes[0]))
+        error = error.__context__
+    return None
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Raises `Terminated` at SIGTERM inside the block; elsewhere than in the main thread it changes nothing."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    raise Terminated

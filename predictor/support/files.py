@@ -1,9 +1,11 @@
 """Writing of files and folders so that a reader finds the old version or the whole new one, never a part.
 
-Unfinished files are beside their targets, under hidden names that end in ``.partial``. A folder that is replaced is
-absent for a moment; after a crash the old one may be beside it, as ``.NAME.old``.
+Unfinished files are beside their targets, under hidden names that end in ``.partial``. On Linux a folder is exchanged
+with the new one at once; elsewhere it is absent for a moment, and after a crash the old one may be beside it, as
+``.NAME.old``. A disk that is full or read-only ends in one sentence (`CannotWriteError`), with the old version whole.
 """
 
+import ctypes
 import json
 import math
 import os
@@ -14,7 +16,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from predictor.support.errors import UserError
+from predictor.support.errors import DISK_ERRORS, CannotWriteError, UserError, cannot_write
+
+_FULL_BYTES = 65_536
+"""Free space below which a disk counts as full when a library fails to write without saying why."""
+_HERE, _EXCHANGE = -100, 2  # AT_FDCWD of <fcntl.h>, RENAME_EXCHANGE of <linux/fs.h>
 
 
 @contextmanager
@@ -24,31 +30,35 @@ def new_file(path: Path) -> Iterator[Path]:
     The content is flushed to disk before it is renamed, so that even a power cut leaves the old file or the new one.
     The temporary name has the suffix of `path`, by which encoders choose their format. A missing parent folder is made.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = _beside(path, path.suffix)
-    try:
-        yield partial
-        _flush(partial)
-        os.replace(partial, path)
-        _flush(path.parent)
-    finally:
-        partial.unlink(missing_ok=True)
+    with disk_errors_of(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = _beside(path, path.suffix)
+        try:
+            with disk_errors_of(path):  # while the part still fills the disk
+                yield partial
+                _flush(partial)
+            os.replace(partial, path)
+            _flush(path.parent)
+        finally:
+            partial.unlink(missing_ok=True)
 
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
     """Yields an empty temporary folder to fill; replaces `path` by it at the end, or deletes it on an error."""
     with scratch_folder(path) as partial:
-        yield partial
-        _replace_folder(partial, path)
+        with disk_errors_of(path):
+            yield partial
+            _replace_folder(partial, path)
 
 
 @contextmanager
 def scratch_folder(path: Path) -> Iterator[Path]:
     """Yields an empty temporary folder beside `path`, on the same disk; deletes it at the end."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = _beside(path)
-    partial.mkdir()
+    with disk_errors_of(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = _beside(path)
+        partial.mkdir()
     try:
         yield partial
     finally:
@@ -112,13 +122,55 @@ def _flush(path: Path) -> None:
         os.close(descriptor)
 
 
+@contextmanager
+def disk_errors_of(path: Path) -> Iterator[None]:
+    """Turns the errors of a full or read-only disk into one sentence that names a path that is written inside.
+
+    Raises:
+        CannotWriteError: the disk took no more.
+    """
+    try:
+        yield
+    except CannotWriteError:
+        raise
+    except Exception as error:
+        cause = _disk_error_in(error, path)
+        if cause is None:
+            raise
+        raise CannotWriteError(cannot_write(path, cause)) from error
+
+
+def _disk_error_in(error: BaseException, path: Path) -> OSError | None:
+    """Returns the disk's error behind one of a library, which may hide it (torch, ffmpeg); None if there is none."""
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, OSError) and seen.errno in DISK_ERRORS:
+            return seen
+        seen = seen.__cause__ or seen.__context__
+    if isinstance(error, UserError):
+        return None
+    try:
+        free = os.statvfs(path.parent)
+    except OSError:
+        return None
+    return OSError(DISK_ERRORS[0], "") if free.f_bavail * free.f_frsize < _FULL_BYTES else None
+
+
 def _replace_folder(new: Path, target: Path) -> None:
     """Replaces `target` by `new`; a crash leaves one of them whole, under the target's name or beside it."""
     if not target.exists():
         new.rename(target)
         return
+    if _exchange(new, target):
+        return  # what is now the old folder is deleted with the temporary one
     old = target.with_name(f".{target.name}.old")
     shutil.rmtree(old, ignore_errors=True)
     target.rename(old)
     os.replace(new, target)
     shutil.rmtree(old, ignore_errors=True)
+
+
+def _exchange(first: Path, second: Path) -> bool:
+    """Exchanges two paths of one disk at once; returns whether the system can."""
+    rename = getattr(ctypes.CDLL(None), "renameat2", None) if os.name == "posix" else None
+    return rename is not None and rename(_HERE, os.fsencode(first), _HERE, os.fsencode(second), _EXCHANGE) == 0

@@ -10,6 +10,7 @@ from agents.vec_envs import DrivenEnv, EpisodeResult, MakeCopy, drive, make_mult
 from envs.drivers.all_agents import make_driver
 from envs.registry import make_multiagent_env
 from envs.seeding import driver_rng
+from envs.supervision import EnvironmentFailedError
 from predictor.online import OnlineForecaster
 from predictor.support.errors import UserError
 from tests.agents.helpers import LIVES, TOY, policy_for
@@ -55,6 +56,31 @@ def test_learners_observe_what_the_task_says():
     assert isinstance(seeing.observation_space, gym.spaces.Dict)
     assert seeing.observation_space["observation"] == own.observation_space
     assert {"agents", "forecast", "valid"} <= set(seeing.observation_space)
+
+
+def test_a_copy_that_raises_or_returns_nan_is_named(monkeypatch: pytest.MonkeyPatch):
+    venv = make_multiagent_venv(Task(TAG, "none"), 2)
+    venv.seed(5)
+    venv.reset()
+    simulator: Any = venv.venv.envs[0].env  # type: ignore[attr-defined]
+    step = simulator.step
+
+    def no_number(actions: Any) -> Any:
+        observations, rewards, *more = step(actions)
+        return observations, dict.fromkeys(rewards, float("nan")), *more
+
+    def broken(actions: Any) -> Any:
+        raise ZeroDivisionError("no mass")
+
+    found = []
+    for misbehaving in (no_number, broken):
+        monkeypatch.setattr(simulator, "step", misbehaving)
+        with pytest.raises(EnvironmentFailedError) as caught:
+            venv.step(np.zeros(venv.num_envs, dtype=np.int64))
+        found.append(str(caught.value))
+    assert found[0] == f"{TAG}, seed 5, step 1: the reward must be a number, got NaN"
+    assert found[1].startswith(f"{TAG}, seed 5, step 2: ZeroDivisionError: no mass (")
+    venv.close()
 
 
 @pytest.mark.parametrize("observe", ["forecast", "zeros", "constant-velocity"])

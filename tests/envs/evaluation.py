@@ -1,11 +1,8 @@
 """What the tests of the evaluation in live environments share: a small checkpoint for mpe2, and a clean slate."""
 
 import json
-import multiprocessing
-from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,6 +13,7 @@ from envs.registry import make_multiagent_env
 from envs.rollouts import episode as live
 from envs.rollouts import reactions
 from envs.rollouts.side_forecasts import kept_forecaster, kept_world
+from envs.rollouts.workers import EpisodePool
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE
 from predictor.scene import SceneSpec
@@ -57,24 +55,9 @@ def forget() -> None:
         kept.cache_clear()
 
 
-class InProcessPool:
-    """Runs a pool's tasks here: a process of its own takes seconds to start."""
-
-    def __init__(self, processes: int, initializer: Any = None, initargs: Any = ()) -> None:
-        assert processes >= 1
-
-    def __enter__(self) -> "InProcessPool":
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        pass
-
-    def imap(self, function: Callable[[Any], Any], tasks: Iterable[Any], chunksize: int = 1) -> Iterator[Any]:
-        return map(function, tasks)
-
-
 def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(multiprocessing, "get_context", lambda method: SimpleNamespace(Pool=InProcessPool))
+    """Lets pools play their episodes here: a process of its own takes seconds to start."""
+    monkeypatch.setattr(EpisodePool, "play", lambda pool, tasks: map(pool._play, tasks))
 
 
 def read_json(path: Path) -> Any:

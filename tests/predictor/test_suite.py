@@ -310,10 +310,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     started: list[str] = []
 
     class Done:
-        returncode = 0
-
-        def poll(self) -> int:
-            return 0
+        exitcode = 0
 
     def start(job: Any) -> tuple[Any, Path]:
         started.append(job.name)

@@ -352,7 +352,8 @@ def test_resumed_run_remembers_its_best(tiny: None, circles: Path, tmp_path: Pat
 KILLED = """
 import os, signal, sys
 from predictor import train
-replace, step = os.replace, train.Trainer.train_step
+from predictor.support import files
+replace, exchange, step = os.replace, files._exchange, train.Trainer.train_step
 seen = {}
 
 def kill():
@@ -368,7 +369,12 @@ def killing_replace(source, target):
     kill() if (name, seen[name]) == (WHERE, WHEN) else None
     return replace(source, target)
 
-os.replace, train.Trainer.train_step = killing_replace, killing_step
+def killing_exchange(source, target):
+    if WHERE == "exchange":
+        kill()
+    return WHERE != "checkpoint" and exchange(source, target)  # as where folders cannot be exchanged
+
+os.replace, files._exchange, train.Trainer.train_step = killing_replace, killing_exchange, killing_step
 sys.argv = ["train", *sys.argv[1:]]
 train.main()
 """
@@ -386,8 +392,8 @@ def never_killed(circles: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 @pytest.mark.parametrize(
     ("where", "when"),
     # checkpoint: the old one is already moved away, the new one not yet in its place
-    [("step", 1), ("step", 5), ("train_state.pt", 1), ("checkpoint", 1)],
-    ids=["before_the_first_save", "between_saves", "in_the_first_save", "replacing_the_checkpoint"],
+    [("step", 1), ("step", 5), ("train_state.pt", 1), ("exchange", 1), ("checkpoint", 1)],
+    ids=["before_the_first_save", "between_saves", "in_the_first_save", "exchanging", "replacing_the_checkpoint"],
 )
 def test_killed_process_is_resumed_to_the_same_weights(
     circles: Path, never_killed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str, when: int

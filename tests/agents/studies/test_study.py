@@ -25,7 +25,7 @@ LEFT_OUT = re.compile(r"(## Time\n|<h2>Time</h2>).*", re.DOTALL)
 """What differs between two runs of one study."""
 
 
-STOPPED = "stopped; the same command goes on: finished cells are kept, others continue\n"
+STOPPED = "stopped: the same command goes on: finished cells are kept, others continue\n"
 PATIENCE_S = 600.0
 """Longest time that is waited for something on a busy machine [s]."""
 
@@ -158,9 +158,11 @@ def test_a_signal_ends_in_one_line(
 
 
 def test_two_studies_in_one_folder_are_refused(whole: Path):
-    with (whole / "out" / ".lock").open("a") as lock:
+    with (whole / "out" / ".lock").open("w") as lock:
+        lock.write("123")
+        lock.flush()
         fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(UserError, match=r"another study runs in .*out \(process \d+\); wait for its end or choose"):
+        with pytest.raises(UserError, match=r"another study runs in .*out \(process 123\); wait for its end or choose"):
             run_study(config(whole, study_text(SLOW_TOY)))
     assert run_study(config(whole, study_text(SLOW_TOY))) == 0, "the lock ends with the process that holds it"
 

@@ -1,6 +1,11 @@
+import errno
+import os
+import signal
+
 import pytest
 
-from predictor.support.errors import ProtocolError, UserError, run_entry_point
+from predictor.support.errors import CannotWriteError, ProtocolError, Terminated, UserError, run_entry_point
+from predictor.support.stopping import deferred_stops, resumable
 
 
 def raises(error: BaseException):
@@ -19,9 +24,16 @@ def raises(error: BaseException):
         (NotADirectoryError("a file"), 2, "error: a file\n"),
         (IsADirectoryError("a folder"), 2, "error: a folder\n"),
         (PermissionError("not yours"), 2, "error: not yours\n"),
-        (KeyboardInterrupt(), 130, "interrupted; continue with --resume where the command has it\n"),
+        (KeyboardInterrupt(), 130, "stopped: what was not written yet is lost; the same command begins anew\n"),
+        (Terminated(), 143, "stopped: what was not written yet is lost; the same command begins anew\n"),
+        (
+            OSError(errno.ENOSPC, "full", "/disk/a"),
+            2,
+            "error: cannot write /disk/a: No space left on device; what was there before is whole; make room or choose "
+            "another disk\n",
+        ),
     ],
-    ids=["user", "missing", "exists", "file", "folder", "forbidden", "interrupted"],
+    ids=["user", "missing", "exists", "file", "folder", "forbidden", "interrupted", "terminated", "full"],
 )
 def test_what_a_user_can_cause_is_one_line(
     capsys: pytest.CaptureFixture[str], error: BaseException, status: int, line: str
@@ -40,3 +52,86 @@ def test_bugs_keep_their_traceback(error: Exception):
 
 def test_good_runs_end_as_they_are():
     run_entry_point(lambda: None)
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_a_command_in_one_line_that_says_how_to_go_on(
+    capsys: pytest.CaptureFixture[str], number: signal.Signals, status: int
+):
+    def main() -> None:
+        with resumable("outside"), resumable(lambda: "step 3 is saved; --resume goes on"):
+            os.kill(os.getpid(), number)
+
+    before = signal.getsignal(number)
+    with pytest.raises(SystemExit) as stop:
+        run_entry_point(main)
+    assert stop.value.code == status
+    assert capsys.readouterr() == ("", "stopped: step 3 is saved; --resume goes on\n")
+    assert signal.getsignal(number) is before
+
+
+def test_a_second_signal_during_the_end_keeps_the_line(capsys: pytest.CaptureFixture[str]):
+    def main() -> None:
+        try:
+            with resumable("step 3 is saved"):
+                raise KeyboardInterrupt
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(SystemExit):
+        run_entry_point(main)
+    assert capsys.readouterr().err == "stopped: step 3 is saved\n"
+
+
+def test_a_full_disk_says_how_to_go_on_and_a_users_error_does_not(capsys: pytest.CaptureFixture[str]):
+    def full() -> None:
+        with resumable("--resume goes on"):
+            raise CannotWriteError("cannot write a")
+
+    def wrong() -> None:
+        with resumable("--resume goes on"):
+            raise UserError("steps must be positive")
+
+    for main, line in ((full, "error: cannot write a; --resume goes on\n"), (wrong, "error: steps must be positive\n")):
+        with pytest.raises(SystemExit):
+            run_entry_point(main)
+        assert capsys.readouterr().err == line
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_wait_for_the_end_of_a_step(capsys: pytest.CaptureFixture[str], number: signal.Signals):
+    done: list[str] = []
+
+    def main() -> None:
+        with deferred_stops() as stops:
+            os.kill(os.getpid(), number)
+            done.append("step")
+            assert stops.asked == number
+            done.append("saved")
+            stops.stop()
+            done.append("never")
+
+    with pytest.raises(SystemExit) as stop:
+        run_entry_point(main)
+    assert done == ["step", "saved"] and stop.value.code == 128 + number
+
+
+def test_a_second_signal_does_not_wait(capsys: pytest.CaptureFixture[str]):
+    def main() -> None:
+        with deferred_stops():
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGINT)
+            pytest.fail("it went on")
+
+    with pytest.raises(SystemExit):
+        run_entry_point(main)
+
+
+def test_signals_that_are_ignored_stay_ignored():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with deferred_stops() as stops:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert stops.asked is None
+    finally:
+        signal.signal(signal.SIGINT, before)

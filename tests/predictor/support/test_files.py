@@ -1,13 +1,19 @@
 """Files and folders are replaced whole or not at all."""
 
+import errno
 import json
 import math
 import os
 import stat
+import sys
+import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from predictor.support import files
+from predictor.support.errors import CannotWriteError
 from predictor.support.files import (
     copy_file,
     delete_leftovers,
@@ -106,3 +112,63 @@ def test_others_may_read_what_the_umask_lets_them_read(tmp_path: Path):
 def test_what_json_does_not_have_becomes_none_at_any_depth():
     nested = {"a": float("nan"), "b": {"c": (1.0, float("inf"))}, "d": [{"e": -float("inf")}], "f": "nan", "g": None}
     assert finite(nested) == {"a": None, "b": {"c": [1.0, None]}, "d": [{"e": None}], "f": "nan", "g": None}
+
+
+# --- Full and read-only disks -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EDQUOT])
+def test_a_disk_that_takes_no_more_is_named_and_the_old_version_is_whole(tmp_path: Path, number: int):
+    write_text(tmp_path / "a", "old")
+    with new_folder(tmp_path / "x") as partial:
+        (partial / "old").touch()
+    message = rf"^cannot write .*/[ax]: {os.strerror(number)}; what was there before is whole; make room or choose"
+    with pytest.raises(CannotWriteError, match=message), new_file(tmp_path / "a") as partial:
+        partial.write_text("half")
+        raise OSError(number, "full")
+    with pytest.raises(CannotWriteError, match=message), new_folder(tmp_path / "x") as partial:
+        (partial / "new").touch()
+        raise OSError(number, "full")
+    assert names(tmp_path) == ["a", "x"] and names(tmp_path / "x") == ["old"]
+    assert (tmp_path / "a").read_text() == "old"
+
+
+@pytest.mark.parametrize(("free", "kind"), [(0, CannotWriteError), (10**9, RuntimeError)])
+def test_a_full_disk_is_found_behind_what_a_library_raises(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free: int, kind: type[Exception]
+):
+    monkeypatch.setattr(files.os, "statvfs", lambda _: SimpleNamespace(f_bavail=free, f_frsize=1))
+    with pytest.raises(kind), new_file(tmp_path / "a"):
+        raise RuntimeError("unexpected pos 768 vs 662")
+
+
+# --- Exchange -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a folder is absent for a moment")
+def test_a_folder_that_is_replaced_is_never_absent(tmp_path: Path):
+    missing, over = [], threading.Event()
+    with new_folder(tmp_path / "x") as partial:
+        (partial / "a").touch()
+
+    def watch() -> None:
+        while not over.is_set():
+            if not os.path.exists(tmp_path / "x"):
+                missing.append(1)
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    for _ in range(300):
+        with new_folder(tmp_path / "x") as partial:
+            (partial / "a").touch()
+    over.set()
+    watcher.join()
+    assert missing == [] and names(tmp_path) == ["x"]
+
+
+def test_where_folders_cannot_be_exchanged_they_are_renamed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(files, "_exchange", lambda first, second: False)
+    for content in ("old", "new"):
+        with new_folder(tmp_path / "x") as partial:
+            (partial / content).touch()
+    assert names(tmp_path) == ["x"] and names(tmp_path / "x") == ["new"]

@@ -1,0 +1,99 @@
+"""Locks, so that one process at a time writes a folder or a store.
+
+A lock is one of the operating system (flock) on a hidden file, which it takes back when the process ends, however that
+ends: what is left of a killed process never blocks. Within one process a lock may be taken again.
+"""
+
+import contextlib
+import errno
+import fcntl
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from predictor.support.errors import UserError
+
+LOCK_FILE = ".lock"
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+"""Errors of file systems without locks; there, nothing is locked."""
+_held: dict[str, int] = {}
+
+
+@contextlib.contextmanager
+def locked(folder: Path, what: str) -> Iterator[None]:
+    """Holds the lock of a folder in which `what` runs; makes the folder, and removes it if it stays empty.
+
+    Raises:
+        UserError: another process holds it.
+    """
+    made = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with _held_file(folder / LOCK_FILE, f"another {what} runs in {folder}", "--out"):
+            yield
+    finally:
+        if made:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+
+@contextlib.contextmanager
+def locked_path(path: Path) -> Iterator[None]:
+    """Holds the lock of a store that is written as a whole, by a file beside it.
+
+    Raises:
+        UserError: another process writes it.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with _held_file(path.with_name(f".{path.name}.lock"), f"another process writes {path}", "path"):
+        yield
+
+
+@contextlib.contextmanager
+def _held_file(file: Path, problem: str, other: str) -> Iterator[None]:
+    key = os.path.abspath(file)
+    if key in _held:
+        _held[key] += 1
+        try:
+            yield
+        finally:
+            _held[key] -= 1
+        return
+    descriptor = _taken(file, problem, other)
+    _held[key] = 1
+    try:
+        yield
+    finally:
+        del _held[key]
+        with contextlib.suppress(OSError):
+            file.unlink()
+        os.close(descriptor)
+
+
+def _taken(file: Path, problem: str, other: str) -> int:
+    """Returns the descriptor of a file that is locked and still there: another process may have removed it."""
+    while True:
+        descriptor = os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            found = os.read(descriptor, 20).decode(errors="replace").strip() or "unknown"
+            os.close(descriptor)
+            raise UserError(f"{problem} (process {found}); wait for its end or choose another {other}") from error
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                os.close(descriptor)
+                raise
+        if _is_there(file, descriptor):
+            with contextlib.suppress(OSError):  # a full disk takes no number
+                os.truncate(descriptor, 0)
+                os.write(descriptor, str(os.getpid()).encode())
+            return descriptor
+        os.close(descriptor)
+
+
+def _is_there(file: Path, descriptor: int) -> bool:
+    try:
+        return os.path.samestat(os.stat(file), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False

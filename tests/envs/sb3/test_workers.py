@@ -1,0 +1,71 @@
+"""SB3's environments in processes that raise, hang or die."""
+
+import multiprocessing
+import time
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from envs.sb3.workers import WorkerVecEnv
+from envs.supervision import EnvironmentFailedError, SupervisedEnv
+from tests.envs.misbehaving import NUM_STEPS, env_id
+
+
+class Make:
+    """Makes a supervised environment of a kind; can be pickled."""
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+
+    def __call__(self) -> gym.Env:
+        return SupervisedEnv(gym.make(env_id(self.kind), disable_env_checker=True), "toy-v0")
+
+
+MESSAGES = {
+    "Raise": r"^toy-v0, seed 3, step 2: RuntimeError: the simulator broke \(.*misbehaving.py, line \d+\)$",
+    "Exit": r"^toy-v0, environment 1, seed 3, step 2: its process ended with status 3$",
+    "Kill": r"^toy-v0, environment 1, seed 3, step 2: its process was killed by SIGKILL",
+    "Hang": r"^toy-v0, environment 1, seed 3, step 2: no answer for 2 s; it hangs, or --timeout-s is too short$",
+}
+
+
+@pytest.mark.parametrize("kind", MESSAGES)
+def test_an_environment_that_misbehaves_is_named_and_the_others_end(kind: str, capfd: pytest.CaptureFixture[str]):
+    venv = WorkerVecEnv([Make("Fine"), Make(kind)], "toy-v0", timeout_s=2.0)
+    try:
+        venv.seed(2)  # the second gets 3
+        venv.reset()
+        venv.step(np.zeros(2, dtype=np.int64))
+        with pytest.raises(EnvironmentFailedError, match=MESSAGES[kind]):
+            venv.step(np.zeros(2, dtype=np.int64))
+    finally:
+        began = time.monotonic()
+        venv.close()
+    assert time.monotonic() - began < 10.0
+    assert not multiprocessing.active_children()
+    assert capfd.readouterr().err == ""
+
+
+def test_an_environment_that_cannot_be_made_is_named():
+    with pytest.raises(EnvironmentFailedError, match=r"^toy-v0, before its first reset: NameNotFound: "):
+        WorkerVecEnv([Make("Unknown")], "toy-v0")
+    assert not multiprocessing.active_children()
+
+
+def test_episodes_are_those_of_one_process():
+    """A second episode of a seed and its reset by SB3, too."""
+    makers = [Make("Fine"), Make("Raise")]
+    actions = np.array([0, 1])
+    seen = []
+    for venv in (WorkerVecEnv(makers, "toy-v0"), DummyVecEnv(makers)):
+        venv.seed(1)  # neither 1 nor 2 misbehaves
+        found = [venv.reset(), *(venv.step(actions) for _ in range(NUM_STEPS + 2))]
+        seen.append(found)
+        venv.close()
+        venv.close()
+    np.testing.assert_array_equal(seen[0][0], seen[1][0])
+    for worker, own in zip(seen[0][1:], seen[1][1:], strict=True):
+        for first, second in zip(worker[:3], own[:3], strict=True):
+            np.testing.assert_array_equal(first, second)

@@ -1,0 +1,54 @@
+"""Locks: one process at a time."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from predictor.support.errors import UserError
+from predictor.support.locks import LOCK_FILE, locked, locked_path
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from predictor.support.locks import locked, locked_path
+with locked(Path(sys.argv[1]), "training"), locked_path(Path(sys.argv[2])):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_a_folder_and_a_store_are_held_by_one_process_until_it_ends_however_it_ends(tmp_path: Path):
+    folder, store = tmp_path / "run", tmp_path / "store"
+    holder = subprocess.Popen([sys.executable, "-c", HOLD, str(folder), str(store)], stdout=subprocess.PIPE)
+    assert holder.stdout is not None
+    try:
+        assert holder.stdout.readline() == b"held\n"
+        with pytest.raises(UserError, match=rf"^another training runs in .*run \(process {holder.pid}\); wait for"):
+            locked(folder, "training").__enter__()
+        with pytest.raises(UserError, match=rf"^another process writes .*store \(process {holder.pid}\); wait for"):
+            locked_path(store).__enter__()
+    finally:
+        holder.kill()
+        holder.wait()
+        holder.stdout.close()
+    assert (folder / LOCK_FILE).exists(), "what is left of a killed process"
+    with locked(folder, "training"), locked_path(store):
+        assert (folder / LOCK_FILE).read_text() == str(os.getpid())
+    assert list(folder.iterdir()) == [] and [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_a_lock_may_be_taken_again_within_a_process_and_leaves_nothing(tmp_path: Path):
+    with locked(tmp_path / "run", "training"):
+        with locked(tmp_path / "run", "training"):
+            pass
+        assert (tmp_path / "run" / LOCK_FILE).exists()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_with_content_stays(tmp_path: Path):
+    with locked(tmp_path / "run", "training"):
+        (tmp_path / "run" / "a").touch()
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["a"]
