@@ -6,7 +6,7 @@ recording that is stopped goes on where it stopped when its command is repeated.
 
 import multiprocessing
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -21,6 +21,7 @@ from envs.rollouts.perturbations import check_kinds, mix_for
 from envs.rollouts.recording import Recording, record_all
 from envs.rollouts.world import World, default_drivers, open_world
 from envs.simulators.interventions import Kind
+from envs.testing import store_problems
 from predictor.data.partial_store import PartialStore
 from predictor.data.store import Episode, StoreInfo
 from predictor.support.command_line import Renamed, parse
@@ -242,6 +243,20 @@ def main() -> None:
         f"{config.out}: {len(episodes)} episodes{taken}, {steps} scenes, "
         f"seeds {config.seed}–{config.seed + config.episodes - 1}"
     )
+    for line in warnings_of(config, info, episodes):
+        print(f"warning: {line}")
+
+
+def warnings_of(config: CollectConfig, info: StoreInfo, episodes: Sequence[Episode]) -> list[str]:
+    """Returns what looks wrong in recorded episodes, one line for each thing; nothing of disturbed ones.
+
+    Interventions change speeds at once, as wrong ids seem to do.
+    """
+    if config.perturb or config.branches:
+        return []
+    found = store_problems(episodes, info.spec)
+    advice = f"to find the cause: dgvae check-env {config.env_id}"
+    return [*found, advice] if found else []
 
 
 if __name__ == "__main__":
