@@ -8,7 +8,7 @@ training and of model selection (`agents.task`). docs/protocol.md defines each m
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -112,6 +112,11 @@ class EvaluateConfig:
     """Number of episodes per policy."""
     seed: int = EVALUATION_SEED
     """Random seed: episode i is reset with seed + i; the default is disjoint from all training seeds."""
+    crash_key: str | None = None
+    """Key of the infos that says whether the ego has crashed (outcome.collided leads into a nested dict); None takes
+    the run's, or the one that is registered with the reader or known; without one, tables say "not reported"."""
+    success_key: str | None = None
+    """Key of the infos that says whether the ego has succeeded; None likewise, or is_success."""
     out: Path | None = None
     """Folder for summary.json, summary.md and, where pyarrow is installed, episodes.parquet; None takes
     RUN_DIR/evaluation."""
@@ -176,7 +181,7 @@ def show(evaluation: Evaluation, console: Console) -> None:
 def _of_driver(config: EvaluateConfig) -> tuple[Evaluation, dict[str, str]]:
     """Evaluates a driver; returns what is noted beside the results, too."""
     assert config.policy is not None and config.env_id is not None
-    task = Task(config.env_id, "none", device=config.device)
+    task = Task(config.env_id, "none", device=config.device, crash_key=config.crash_key, success_key=config.success_key)
     task.check()
     checked_drivers(task, (config.policy,))
     drivers = compared_drivers(task, config.drivers)
@@ -235,6 +240,8 @@ def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str
     """Evaluates the policy of a training run; returns what is noted beside the results, too."""
     run = read_config(run_dir, "observe", "algorithm")
     task = task_of(run, config.device, config.env_id)
+    named: dict[str, Any] = {"crash_key": config.crash_key, "success_key": config.success_key}
+    task = replace(task, **{name: key for name, key in named.items() if key is not None})
     if config.env_id not in (None, task.env_id):
         raise UserError(f"run {run_dir} was trained on {task.env_id}, got --env-id {config.env_id}; leave it out")
     task.check()

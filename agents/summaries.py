@@ -107,8 +107,11 @@ def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
 
 
 def _rate(events: Sequence[bool | None]) -> tuple[float | None, float | None, float | None]:
-    """Returns the share of episodes with an event and its Wilson interval; None if no episode reports it."""
-    known = [event for event in events if event is not None]
+    """Returns the share of episodes with an event and its Wilson interval; None if no episode reports it.
+
+    Where some do, an episode that does not has had none: some environments report an event only when it happens.
+    """
+    known = [bool(event) for event in events] if any(event is not None for event in events) else []
     return (sum(known) / len(known), *wilson_interval(sum(known), len(known))) if known else (None, None, None)
 
 

@@ -85,6 +85,10 @@ class Task:
     """Whether the observation has room for what the others do in each candidate plan of the ego."""
     env_kwargs: str = ""
     """Arguments of the environment, as the text of a JSON object."""
+    crash_key: str | None = None
+    """Key of the infos that says whether the ego has crashed; None takes the env's (`envs.readers.register_reader`)."""
+    success_key: str | None = None
+    """Key of the infos that says whether the ego has succeeded; None takes the env's."""
 
     def __post_init__(self) -> None:
         """Checks choices, and that the fields fit together; replaces `device="auto"` by the device that is taken."""
@@ -108,6 +112,9 @@ class Task:
             raise UserError("perception_m has no effect with observe=none; leave one out")
         if self.what_if and self.is_multiagent:
             raise UserError(f"what_if needs an environment with one ego, {self.env_id} has several learners")
+        for name in ("crash_key", "success_key"):
+            if getattr(self, name) == "" or (getattr(self, name) is not None and self.is_multiagent):
+                raise UserError(f"{name} is a key of the infos of an environment with one ego; leave it out")
         if self.make_kwargs and self.backend == "envpool":
             raise UserError("env_kwargs are for the gymnasium backend; leave them or backend envpool out")
         object.__setattr__(self, "device", resolve_device(self.device))
@@ -244,7 +251,7 @@ class Task:
 
 
 _OF_RUN = ("env_id", "observe", "checkpoint", "learners", "num_samples", "horizon_steps", "perception_m", "what_if",
-           "env_kwargs")  # fmt: skip
+           "env_kwargs", "crash_key", "success_key")  # fmt: skip
 """Fields of a run's config that have the name of a task's; the driver's is "partner"."""
 _OWN_PACKAGES = ("highway_env.", "envs.")
 """Packages that the arguments of a run's environment may name: those that it imports anyway."""

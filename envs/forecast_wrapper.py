@@ -68,7 +68,7 @@ class ObservationLayout:
     """Layout of a policy's observation: the environment's own and the forecast entries, as a Dict or as one Box.
 
     Args:
-        own: space of the environment's own observation.
+        own: spaces of the entries that hold the environment's own observation (`envs.own_observation`).
         entries: spaces of the forecast entries.
         flatten: whether the observation is one Box, in the Dict's key order.
 
@@ -77,23 +77,27 @@ class ObservationLayout:
         dict_space: space of one observation before it is flattened.
     """
 
-    def __init__(self, own: gym.Space, entries: Mapping[str, gym.Space], flatten: bool) -> None:
+    def __init__(self, own: Mapping[str, gym.Space], entries: Mapping[str, gym.Space], flatten: bool) -> None:
         """Builds the space."""
-        self.dict_space = gym.spaces.Dict({"observation": own, **entries})
+        self._own = tuple(own)
+        self.dict_space = gym.spaces.Dict({**own, **entries})
         self._flatten = flatten
         self.space: gym.Space = gym.spaces.flatten_space(self.dict_space) if flatten else self.dict_space
 
-    def one(self, own: Any, entries: Mapping[str, NDArray[Any]]) -> Any:
-        """Returns one environment's observation."""
-        full = {"observation": own, **entries}
+    def one(self, observation: Mapping[str, Any], entries: Mapping[str, NDArray[Any]]) -> Any:
+        """Returns one environment's observation: its own entries, out of `observation`, and the forecast entries."""
+        full = self._full(observation, entries)
         return gym.spaces.flatten(self.dict_space, full) if self._flatten else full
 
-    def batch(self, own: Any, entries: Mapping[str, NDArray[Any]]) -> Any:
+    def batch(self, observations: Mapping[str, Any], entries: Mapping[str, NDArray[Any]]) -> Any:
         """Returns the observations of many environments, stacked."""
-        full = {"observation": own, **entries}
+        full = self._full(observations, entries)
         if not self._flatten:
             return full
         return np.concatenate([_flattened(space, full[key]) for key, space in self.dict_space.spaces.items()], axis=1)
+
+    def _full(self, observation: Mapping[str, Any], entries: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+        return {**{key: observation[key] for key in self._own}, **entries}
 
 
 def _flattened(space: gym.Space, stacked: Any) -> NDArray[Any]:

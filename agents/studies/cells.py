@@ -45,7 +45,7 @@ MEASURING = 2
 NETWORK = 2
 """Number of the network that reads forecasts (`agents.features`); a cell of a policy with another one is another
 cell."""
-YOUNGER = {"perception_m": None, "vf_coef": 0.5, "target_kl": None}
+YOUNGER = {"perception_m": None, "vf_coef": 0.5, "target_kl": None, "crash_key": None, "success_key": None}
 """Fields of `Task` and of presets that came after the first cells, with the value that those had: it does not change
 their names."""
 RUN_FOLDER = "run"

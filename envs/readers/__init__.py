@@ -25,6 +25,7 @@ from envs.readers.envpool import EnvPoolReader, is_envpool_env
 from envs.readers.function import FunctionReader
 from envs.readers.highway import HighwayReader, is_highway_env
 from envs.readers.mpe import MPE_IDS, MpeReader, is_mpe_env, mpe_scenario
+from envs.readers.outcomes import OutcomeKeys, outcome_keys, register_outcomes
 from envs.readers.pursuit import PursuitReader, is_pursuit_env
 from envs.simulators import mixed_traffic  # noqa: F401  (registers its ids, as the import of highway-env does)
 from predictor.support.errors import UserError
@@ -37,10 +38,12 @@ __all__ = [
     "MakeReader",
     "MultiagentReader",
     "MultiagentScene",
+    "OutcomeKeys",
     "Reader",
     "SceneReader",
     "multiagent_env_id",
     "multiagent_reader_for",
+    "outcome_keys",
     "pad_multiagent_scene",
     "perceive",
     "reader_for",
@@ -50,14 +53,23 @@ __all__ = [
 _REGISTERED: dict[type, MakeReader] = {}
 
 
-def register_reader(env_class: type, make_reader: MakeReader) -> None:
+def register_reader(
+    env_class: type, make_reader: MakeReader, *, crash_key: str | None = None, success_key: str | None = None
+) -> None:
     """Registers a reader for an environment class and what derives from it, for every wrapper and command.
 
     Args:
         env_class: class of the unwrapped environment; of the AEC environment where PettingZoo converts one.
         make_reader: takes an environment (not reset yet, wrapped or not) and returns its reader: a `SceneReader` for
             Gymnasium environments, a `MultiagentReader` for PettingZoo's.
+        crash_key: key of the infos that says whether the ego has crashed; a point leads into a nested dict
+            ("outcome.collided"). None: tables say "not reported", since no key is guessed.
+        success_key: key that says, in an episode's last step, whether the ego has succeeded; None takes "is_success".
+
+    Raises:
+        UserError: a key is empty.
     """
+    register_outcomes(env_class, crash_key, success_key)
     _REGISTERED[env_class] = make_reader
 
 
