@@ -146,6 +146,16 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         """
         return self._layout(agent).space
 
+    def unflatten(self, observation: Any, agent: str | None = None) -> dict[str, Any]:
+        """Returns the entries of an agent's observation with `flatten=True`.
+
+        Raises:
+            UserError: no agent is named, observations are not flattened, or this one has another size.
+        """
+        if agent is None:
+            raise UserError(f"unflatten needs the name of the agent, one of {', '.join(self.env.possible_agents)}")
+        return self._layout(agent).unflatten(observation)
+
     def _layout(self, agent: str) -> ObservationLayout:
         if agent not in self._layouts:
             own = own_spaces(self.env.observation_space(agent), f"'{agent}' of {self._source}")

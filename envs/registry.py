@@ -112,6 +112,16 @@ def entry_for(env_id: str) -> EnvEntry:
     return ENVS.get(env_id, EnvEntry())
 
 
+def is_foreign_id(env_id: str) -> bool:
+    """Returns whether an id is neither listed here nor of highway-env; imports no module that the id names."""
+    import highway_env  # noqa: F401  (registers its ids)
+
+    if env_id in ENVS:
+        return False
+    spec = gym.registry.get(env_id.rpartition(":")[2])
+    return spec is None or not str(spec.entry_point).startswith("highway_env.")
+
+
 def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     """Makes a Gymnasium environment.
 

@@ -22,7 +22,7 @@ from envs.plans import PlanModel, Plans, checked_plans, plan_model_for
 from envs.plans.batch import PlanBatch, plans_info
 from envs.plans.playing import with_true_futures
 from envs.readers import MakeReader, reader_for
-from envs.readers.base import build_reader, require_scene, show
+from envs.readers.base import Reader, bounded, build_reader, require_scene, show
 from envs.scene_stream import ForecastConfig
 from envs.simulators.copies import RunningCopy
 from predictor.forecaster import Forecaster
@@ -37,7 +37,9 @@ def scene_source(env: gym.Env) -> str:
 
 
 def _reader_of(env: gym.Env, make_reader: MakeReader | None, perception_m: float | None, max_agents: int | None) -> Any:
-    return reader_for(env, perception_m, max_agents) if make_reader is None else build_reader(make_reader, env)
+    if make_reader is None:
+        return reader_for(env, perception_m, max_agents)
+    return bounded(build_reader(make_reader, env), perception_m, max_agents)
 
 
 class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstructorArgs):
@@ -235,10 +237,11 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
                     f"({spec.perception_m:g}, {spec.max_agents}); give them to that wrapper"
                 )
         else:
-            spec = _reader_of(env, reader, perception_m, max_agents).spec
+            made = _reader_of(env, reader, perception_m, max_agents)
+            spec = made.spec
         forecaster = open_forecaster(checkpoint, spec, source, device, forecaster)
         if not ready:
-            trained = forecaster.spec
+            trained = forecaster.spec if isinstance(made, Reader) else spec  # others cannot be bounded
             env = SceneObservation(env, perception_m or trained.perception_m, max_agents or trained.max_agents, reader)
             spec = env.scene_spec
         gym.Wrapper.__init__(self, env)
