@@ -28,6 +28,7 @@ from envs.sb3.policy_file import PolicyNote, pin_forecaster
 from envs.wrappers import ForecastObservation
 from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint
 from predictor.forecaster import Forecaster
+from predictor.own_forecasters import is_own
 from predictor.scene import SceneSpec
 from predictor.support.config_checks import check_at_least, check_at_most, check_choice, check_choices
 from predictor.support.errors import UserError, short
@@ -65,8 +66,8 @@ class Task:
     """What the policy sees beside the env's own observation: an arm of `envs.arms`, or constant-velocity forecasts;
     "none" shows no forecasts."""
     checkpoint: str | None = None
-    """Forecaster behind every arm but none and constant-velocity: shipped name or path; None takes the one that ships
-    for the id."""
+    """Forecaster behind every arm but none and constant-velocity: shipped name, path, or own:module:function
+    (docs/own_forecaster.md); None takes the one that ships for the id."""
     device: str = "cpu"
     """Device that runs the forecaster: cpu, cuda or auto."""
     backend: Backend = "gymnasium"
@@ -257,13 +258,16 @@ _OWN_PACKAGES = ("highway_env.", "envs.")
 """Packages that the arguments of a run's environment may name: those that it imports anyway."""
 
 
-def task_of(run: Mapping[str, Any], device: str = "cpu", trusted: str | None = None) -> Task:
+def task_of(
+    run: Mapping[str, Any], device: str = "cpu", trusted: str | None = None, trusted_forecaster: str | None = None
+) -> Task:
     """Returns the task of a training run.
 
     Args:
         run: the run's config (`agents.runs.read_config`).
         device: device that runs the forecaster.
         trusted: id of an environment that may be imported ("module:Id"); a run's config alone imports nothing.
+        trusted_forecaster: forecaster of a user's own that may be imported ("own:module:function").
 
     Raises:
         UserError: the config does not fit this version, names what is missing, or would import code.
@@ -278,6 +282,11 @@ def task_of(run: Mapping[str, Any], device: str = "cpu", trusted: str | None = N
         raise UserError(
             f"the run's environment '{short(values['env_id'], 80)}' imports code; if you trust it, name it yourself "
             f"with --env-id {short(values['env_id'], 80)}"
+        )
+    if is_own(values["checkpoint"]) and values["checkpoint"] != trusted_forecaster:
+        raise UserError(
+            f"the run's forecaster '{short(values['checkpoint'], 80)}' imports code; if you trust it, name it yourself "
+            f"with --checkpoint {short(values['checkpoint'], 80)}"
         )
     task = Task(device=device, **values)
     for text in _texts_of(task.make_kwargs):
