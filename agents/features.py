@@ -101,7 +101,7 @@ class ForecastAttention(BaseFeaturesExtractor):
         """
         config = config or AttentionConfig()
         own = own_part(observation_space) if isinstance(observation_space, gym.spaces.Dict) else {}
-        if not own:
+        if not own or not isinstance(observation_space, gym.spaces.Dict):
             raise UserError(
                 f"ForecastAttention needs a Dict with the key '{OWN_KEY}', or the environment's own keys, got "
                 f"{observation_space}"

@@ -7,7 +7,7 @@ import numpy as np
 from pettingzoo.utils import BaseParallelWrapper
 
 from envs.readers import FunctionReader, register_reader
-from tests.envs.semantics import Crowd, Swarm, SwarmReader, read_crowd
+from tests.envs.semantics import Crowd, Swarm, read_crowd
 from tests.envs.testing.test_check_reader import SPEC
 
 
@@ -57,10 +57,5 @@ def dict_swarm() -> Any:
     return MaskedSwarm(Swarm())
 
 
-class PlainSwarm(Swarm):
-    """Swarm of the tests, for a reader that is registered for it alone."""
-
-
 register_reader(DictCrowd, FunctionReader(read_crowd, SPEC))
-register_reader(Swarm, SwarmReader)
 gym.register("DictCrowd-v0", DictCrowd)

@@ -28,7 +28,7 @@ def test_it_is_measured_beside_constant_velocity():
     result = summarise_episodes(ENV_ID, OWN, "random", SPEC, episodes, (), None)
     assert result.checkpoint == "tests.predictor.test_own_forecasters:Mine"
     assert result.model.agents > 0
-    assert result.model.min_ade_m == pytest.approx(result.straight.min_ade_m)  # it goes on with its velocity, too
+    assert result.model.min_ade_m == pytest.approx(result.constant_velocity.min_ade_m)  # it is one
 
 
 def test_one_that_does_not_fit_is_named_before_anything_is_played(tmp_path: Path):
