@@ -75,7 +75,8 @@ def with_option(words: Sequence[str]) -> list[str]:
 
 def main() -> None:
     """Runs the command."""
-    config = parse(CheckConfig, __doc__, with_option(sys.argv[1:]))
+    sys.argv[1:] = with_option(sys.argv[1:])
+    config = parse(CheckConfig, __doc__)
     found = findings(config)
     for line in found:
         print(line)
