@@ -97,7 +97,7 @@ def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
         return_se,
         length_mean,
         length_se,
-        *_rate([e.crashed for e in episodes]),
+        *_rate(_counted([e.crashed for e in episodes])),
         float(np.mean([e.mean_speed_mps for e in episodes])),
         {role: mean_and_standard_error([e.returns_by_role[role] for e in episodes]) for role in roles},
         {action: count / actions.total() for action, count in actions.most_common()},
@@ -106,12 +106,14 @@ def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
     )
 
 
-def _rate(events: Sequence[bool | None]) -> tuple[float | None, float | None, float | None]:
-    """Returns the share of episodes with an event and its Wilson interval; None if no episode reports it.
+def _counted(crashed: Sequence[bool | None]) -> list[bool | None]:
+    """Returns crashes without gaps where some episodes report them: some environments do so only when they happen."""
+    return list(crashed) if all(event is None for event in crashed) else [bool(event) for event in crashed]
 
-    Where some do, an episode that does not has had none: some environments report an event only when it happens.
-    """
-    known = [bool(event) for event in events] if any(event is not None for event in events) else []
+
+def _rate(events: Sequence[bool | None]) -> tuple[float | None, float | None, float | None]:
+    """Returns the share of episodes with an event and its Wilson interval; None if no episode reports it."""
+    known = [event for event in events if event is not None]
     return (sum(known) / len(known), *wilson_interval(sum(known), len(known))) if known else (None, None, None)
 
 
