@@ -93,6 +93,11 @@ class TrainPolicyConfig:
     """Show also what the others do in each candidate plan of the ego."""
     env_kwargs: str = ""
     """Arguments of the environment as a JSON object, for example '{"config": {"vehicles_density": 2}}'."""
+    crash_key: str | None = None
+    """Key of the infos that says whether the ego has crashed (outcome.collided leads into a nested dict); None takes
+    the one that is registered with the reader or known; without one, tables say "not reported"."""
+    success_key: str | None = None
+    """Key of the infos that says whether the ego has succeeded; None takes the registered one or is_success."""
     steps: int | None = None
     """Number of environment steps to train for, over all environments; one step of a PettingZoo copy is one, however
     many agents learn. None takes 20,000, in mpe2's particle worlds (simple_tag_v3) 60,000."""
@@ -160,6 +165,7 @@ class TrainPolicyConfig:
         task = Task(
             self.env_id, self.observe, self.checkpoint, self.device, self.backend, tuple(learners), self.driver,
             self.num_samples, self.horizon_steps, self.perception_m, self.what_if, self.env_kwargs, self.timeout_s,
+            self.crash_key, self.success_key,
         )  # fmt: skip
         return TrainingPlan(
             task,

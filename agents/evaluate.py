@@ -104,6 +104,9 @@ class EvaluateConfig:
     env_id: str | None = None
     """Environment of --policy; a training run has its own. Where a run's imports code ("module:Id"), name it here as
     well, if you trust it: the run's config alone imports nothing."""
+    checkpoint: str | None = None
+    """Forecaster of a training run that imports code (own:module:function): name it here, if you trust it; other runs
+    have their own."""
     drivers: tuple[str, ...] | None = None
     """Further drivers of the ego, each a line of the table: planner, planner:CHECKPOINT, one action in every step
     (slower, action-4), constant-actions for all of these, or another of envs.drivers.ego. None takes constant-actions
@@ -113,6 +116,11 @@ class EvaluateConfig:
     """Number of episodes per policy."""
     seed: int = EVALUATION_SEED
     """Random seed: episode i is reset with seed + i; the default is disjoint from all training seeds."""
+    crash_key: str | None = None
+    """Key of the infos that says whether the ego has crashed (outcome.collided leads into a nested dict); None takes
+    the run's, or the one that is registered with the reader or known; without one, tables say "not reported"."""
+    success_key: str | None = None
+    """Key of the infos that says whether the ego has succeeded; None likewise, or is_success."""
     out: Path | None = None
     """Folder for summary.json, summary.md and, where pyarrow is installed, episodes.parquet; None takes
     RUN_DIR/evaluation."""
@@ -141,6 +149,8 @@ class EvaluateConfig:
             raise UserError("--policy and --env-id go together; a training run has its own environment")
         if self.policy is not None and self.out is None:
             raise UserError("--policy has no run folder; say with --out where the results go")
+        if self.policy is not None and self.checkpoint is not None:
+            raise UserError("--checkpoint is of a training run; the planner's is part of its name, planner:CHECKPOINT")
         if self.policy == CONSTANT_ACTIONS:
             raise UserError(f"{CONSTANT_ACTIONS} stands for several drivers; give it to --drivers, and one to --policy")
         if self.films and self.policy is not None:
@@ -180,7 +190,10 @@ def show(evaluation: Evaluation, console: Console) -> None:
 def _of_driver(config: EvaluateConfig) -> tuple[Evaluation, dict[str, str]]:
     """Evaluates a driver; returns what is noted beside the results, too."""
     assert config.policy is not None and config.env_id is not None
-    task = Task(config.env_id, "none", device=config.device, timeout_s=config.timeout_s)
+    task = Task(
+        config.env_id, "none", device=config.device, timeout_s=config.timeout_s, crash_key=config.crash_key,
+        success_key=config.success_key,
+    )  # fmt: skip
     task.check()
     checked_drivers(task, (config.policy,))
     drivers = compared_drivers(task, config.drivers)
@@ -238,7 +251,15 @@ def checked_drivers(task: Task, names: Sequence[str]) -> tuple[str, ...]:
 def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str, str]]:
     """Evaluates the policy of a training run; returns what is noted beside the results, too."""
     run = read_config(run_dir, "observe", "algorithm")
-    task = replace(task_of(run, config.device, config.env_id), timeout_s=config.timeout_s)
+    task = task_of(run, config.device, config.env_id, config.checkpoint)
+    if config.checkpoint not in (None, task.checkpoint):
+        raise UserError(
+            f"run {run_dir} was trained on forecaster {task.checkpoint}, got --checkpoint {config.checkpoint}; leave "
+            "it out"
+        )
+    task = replace(task, timeout_s=config.timeout_s)
+    named: dict[str, Any] = {"crash_key": config.crash_key, "success_key": config.success_key}
+    task = replace(task, **{name: key for name, key in named.items() if key is not None})
     if config.env_id not in (None, task.env_id):
         raise UserError(f"run {run_dir} was trained on {task.env_id}, got --env-id {config.env_id}; leave it out")
     task.check()
@@ -262,7 +283,8 @@ def _film(config: EvaluateConfig, run_dir: Path, evaluation: Evaluation, out: Pa
 
     run, episodes = read_config(run_dir), next(iter(evaluation.results.values()))
     model = load_model(run_dir / POLICY_FILE, run["algorithm"])
-    films = film_extremes(task_of(run, config.device, config.env_id), model, episodes, out)
+    task = task_of(run, config.device, config.env_id, config.checkpoint)
+    films = film_extremes(task, model, episodes, out)
     names = ", ".join(film["file"] for film in films.values())
     Console().print(f"films: {names or 'none, only highway-env and PettingZoo environments are drawn'}")
     return films

@@ -1,8 +1,9 @@
 """Features extractor of the policy's network: the ego attends over the agents around it.
 
-Reads the Dict observation of `ForecastObservation` / `VecForecast`: the env's own observation becomes the ego's
-embedding (the query); each agent's state, futures with their probabilities and standard deviations, edge probabilities,
-edge features and what happens in each candidate plan of the ego become a token (key, value).
+Reads the Dict observation of `ForecastObservation` / `VecForecast`: the env's own observation (of a Dict, its entries,
+flattened) becomes the ego's embedding (the query); each agent's state, futures with their probabilities and standard
+deviations, edge probabilities, edge features and what happens in each candidate plan of the ego become a token (key,
+value).
 The features are the env's own observation, as a policy without forecasts gets it, and what the ego attends to, each
 value times a learned gain that begins at 0. So learning begins as it does without forecasts, and forecasts add to that:
 an untrained embedding in front of actor and critic is noise, which halved what simple_tag's predators learned.
@@ -21,10 +22,10 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 from torch.nn import functional
 
+from envs.own_observation import OWN_KEY, own_part
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
-EGO_KEY = "observation"
 VALID_KEY = "valid"
 WHAT_IF_GAP = "what_if_gap"
 EGO_PATH = "ego_path"
@@ -33,7 +34,8 @@ TOKEN_KEYS = (
     *("agents", "forecast", CLOSEST, "mode_probs", "xy_scale", "edge_probs", "edge_features"),
     *(WHAT_IF_GAP, "what_if_contact", "what_if_risk"),
 )
-"""Entries of an observation that become tokens; others are not read. Those without a scale here are of order one."""
+"""Entries of an observation that become tokens; of the other added ones only `EGO_PATH` and `VALID_KEY` are read. Those
+without a scale here are of order one."""
 
 NEAR, FAR, SPEED = 0.1, 0.5, 1.0
 """Scales for near positions, far positions and velocities, as fractions of a scene's `feature_scales`."""
@@ -85,7 +87,8 @@ class ForecastAttention(BaseFeaturesExtractor):
         >>> model = PPO("MultiInputPolicy", env, policy_kwargs={"features_extractor_class": ForecastAttention})
 
     Args:
-        observation_space: Dict space with the keys `observation` and some of `agents`, `forecast`, `mode_probs`,
+        observation_space: Dict space with the environment's own keys (`observation`, or those of its Dict, which are
+            flattened) and some of `agents`, `forecast`, `mode_probs`,
             `xy_scale`, `edge_probs`, `edge_features`, `what_if_gap`, `what_if_contact`, `what_if_risk`, `valid`.
         config: sizes and scales.
     """
@@ -94,15 +97,20 @@ class ForecastAttention(BaseFeaturesExtractor):
         """Makes the layers in the sizes of the space.
 
         Raises:
-            UserError: the space is not a Dict with the key `observation`.
+            UserError: the space is not a Dict, or has no key of the environment's own.
         """
         config = config or AttentionConfig()
-        if not isinstance(observation_space, gym.spaces.Dict) or EGO_KEY not in observation_space.spaces:
-            raise UserError(f"ForecastAttention needs a Dict with the key '{EGO_KEY}', got {observation_space}")
-        ego_dim = get_flattened_obs_dim(observation_space[EGO_KEY])
+        own = own_part(observation_space) if isinstance(observation_space, gym.spaces.Dict) else {}
+        if not own or not isinstance(observation_space, gym.spaces.Dict):
+            raise UserError(
+                f"ForecastAttention needs a Dict with the key '{OWN_KEY}', or the environment's own keys, got "
+                f"{observation_space}"
+            )
+        ego_dim = sum(get_flattened_obs_dim(space) for space in own.values())
         super().__init__(observation_space, features_dim=ego_dim + config.width)
         self.config = config
         shapes = {k: space.shape or () for k, space in observation_space.items()}
+        self._own = tuple(own)
         self._keys = tuple(k for k in TOKEN_KEYS if k in shapes)
         self.ego = nn.Sequential(
             nn.Linear(ego_dim, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.width), nn.ReLU()
@@ -121,7 +129,7 @@ class ForecastAttention(BaseFeaturesExtractor):
 
     def forward(self, observations: dict[str, Tensor]) -> Float[Tensor, "batch features"]:
         """Returns the env's own observation, concatenated with the weighted mean of what the ego attends to."""
-        own = observations[EGO_KEY].flatten(1)
+        own = torch.cat([observations[key].flatten(1) for key in self._own], dim=-1)
         ego = self.ego(own)
         tokens, slots = self._tokens(ego, observations)
         return torch.cat([own, self.gain * self.attended(self._attend(ego, tokens, slots))], dim=-1)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from agents.task import Backend
 from envs.readers.mpe import MPE_IDS
-from envs.registry import is_multiagent_id
+from envs.registry import is_foreign_id, is_multiagent_id
 from envs.sb3.algorithms import Algorithm
 from predictor.support.config_checks import check_at_least, check_choices, check_positive
 from predictor.support.errors import UserError
@@ -31,7 +31,8 @@ class Preset:
     learning_rate: float = 5e-4
     """Step size of the optimiser."""
     gamma: float = 0.8
-    """Discount per policy step; on a highway, what counts happens within a few seconds."""
+    """Discount per policy step; on a highway, what counts happens within a few seconds. Environments that are neither
+    highway-env's nor listed here get 0.99, SB3's default."""
     net_arch: tuple[int, ...] = (256, 256)
     """Sizes of the hidden layers, equal for actor and critic."""
 
@@ -223,6 +224,8 @@ PRESETS: dict[Algorithm, Preset] = {
 """Algorithm → its preset where `preset_for` has no other."""
 # Racetracks step five times as often, so the same foresight needs a longer discount (their script: 0.9).
 _FIVE_HZ_GAMMA = 0.9
+# How long a step of another environment lasts is not known: 0.8 would be half a second at ten steps a second.
+_UNKNOWN_GAMMA = 0.99
 
 
 # Many EnvPool environments give large rollouts: larger batches keep the gradient steps per sample near a tenth of
@@ -246,4 +249,6 @@ def preset_for(env_id: str, algorithm: Algorithm, backend: Backend = "gymnasium"
             return replace(preset, **asdict(_PARTICLES if env_id in MPE_IDS else _MULTIAGENT))
         if backend == "envpool":
             preset = replace(preset, **asdict(_ENVPOOL_PPO))
+    if is_foreign_id(env_id):
+        return replace(preset, gamma=_UNKNOWN_GAMMA)
     return replace(preset, gamma=_FIVE_HZ_GAMMA) if env_id.startswith("racetrack") else preset

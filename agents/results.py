@@ -27,6 +27,8 @@ PACKAGES = (
     *("torch", "numpy"),
 )
 """Packages whose versions the provenance names."""
+NOT_REPORTED = "not reported"
+"""Cell of a rate of which an environment says nothing."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Evaluation:
     results: dict[str, list[EpisodeResult]]
     """Results of the episodes, by policy."""
     has_ego: bool = True
-    """Whether one agent is driven: the table then has its crash rate and speed, "–" if the env does not report them."""
+    """Whether one agent is driven: the table then has its crash rate and speed, if the env reports them."""
 
     @property
     def summaries(self) -> list[PolicySummary]:
@@ -119,7 +121,7 @@ class Evaluation:
         if not self.has_ego:
             return f"{caption}; return: mean over the learners."
         if all(summary.crash_rate is None for summary in self.summaries):
-            return f"{caption}; the environment reports no crashes."
+            return f"{caption}; crashes are not reported: name their key with --crash-key or in register_reader."
         return f"{caption}, crash rate with its 95 % Wilson interval." if intervals else f"{caption}."
 
     def _driving(self, summaries: Sequence[PolicySummary]) -> list[str]:
@@ -212,7 +214,7 @@ def _cells_of(summary: PolicySummary, roles: Sequence[str]) -> list[str]:
 
 def _rate(rate: float | None, low: float | None, high: float | None, interval: bool) -> str:
     if rate is None or low is None or high is None:
-        return "–"
+        return NOT_REPORTED
     return f"{100 * rate:.0f} %" + (f" ({100 * low:.0f}–{100 * high:.0f} %)" if interval else "")
 
 

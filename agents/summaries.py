@@ -97,13 +97,18 @@ def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
         return_se,
         length_mean,
         length_se,
-        *_rate([e.crashed for e in episodes]),
+        *_rate(_counted([e.crashed for e in episodes])),
         float(np.mean([e.mean_speed_mps for e in episodes])),
         {role: mean_and_standard_error([e.returns_by_role[role] for e in episodes]) for role in roles},
         {action: count / actions.total() for action, count in actions.most_common()},
         *_rate([e.success for e in episodes]),
         _mean_driving([e.driving for e in episodes if e.driving is not None]),
     )
+
+
+def _counted(crashed: Sequence[bool | None]) -> list[bool | None]:
+    """Returns crashes without gaps where some episodes report them: some environments do so only when they happen."""
+    return list(crashed) if all(event is None for event in crashed) else [bool(event) for event in crashed]
 
 
 def _rate(events: Sequence[bool | None]) -> tuple[float | None, float | None, float | None]:

@@ -29,6 +29,7 @@ from envs.supervision import TIMEOUT_S
 from envs.wrappers import ForecastObservation
 from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint
 from predictor.forecaster import Forecaster
+from predictor.own_forecasters import is_own
 from predictor.scene import SceneSpec
 from predictor.support.config_checks import check_at_least, check_at_most, check_choice, check_choices, check_positive
 from predictor.support.errors import UserError, short
@@ -66,8 +67,8 @@ class Task:
     """What the policy sees beside the env's own observation: an arm of `envs.arms`, or constant-velocity forecasts;
     "none" shows no forecasts."""
     checkpoint: str | None = None
-    """Forecaster behind every arm but none and constant-velocity: shipped name or path; None takes the one that ships
-    for the id."""
+    """Forecaster behind every arm but none and constant-velocity: shipped name, path, or own:module:function
+    (docs/own_forecaster.md); None takes the one that ships for the id."""
     device: str = "cpu"
     """Device that runs the forecaster: cpu, cuda or auto."""
     backend: Backend = "gymnasium"
@@ -88,6 +89,10 @@ class Task:
     """Arguments of the environment, as the text of a JSON object."""
     timeout_s: float = TIMEOUT_S
     """Largest time that one step of an environment may take in a process of its own [s]."""
+    crash_key: str | None = None
+    """Key of the infos that says whether the ego has crashed; None takes the env's (`envs.readers.register_reader`)."""
+    success_key: str | None = None
+    """Key of the infos that says whether the ego has succeeded; None takes the env's."""
 
     def __post_init__(self) -> None:
         """Checks choices, and that the fields fit together; replaces `device="auto"` by the device that is taken."""
@@ -112,6 +117,9 @@ class Task:
         check_positive(self, "timeout_s")
         if self.what_if and self.is_multiagent:
             raise UserError(f"what_if needs an environment with one ego, {self.env_id} has several learners")
+        for name in ("crash_key", "success_key"):
+            if getattr(self, name) == "" or (getattr(self, name) is not None and self.is_multiagent):
+                raise UserError(f"{name} is a key of the infos of an environment with one ego; leave it out")
         if self.make_kwargs and self.backend == "envpool":
             raise UserError("env_kwargs are for the gymnasium backend; leave them or backend envpool out")
         object.__setattr__(self, "device", resolve_device(self.device))
@@ -248,19 +256,22 @@ class Task:
 
 
 _OF_RUN = ("env_id", "observe", "checkpoint", "learners", "num_samples", "horizon_steps", "perception_m", "what_if",
-           "env_kwargs")  # fmt: skip
+           "env_kwargs", "crash_key", "success_key")  # fmt: skip
 """Fields of a run's config that have the name of a task's; the driver's is "partner"."""
 _OWN_PACKAGES = ("highway_env.", "envs.")
 """Packages that the arguments of a run's environment may name: those that it imports anyway."""
 
 
-def task_of(run: Mapping[str, Any], device: str = "cpu", trusted: str | None = None) -> Task:
+def task_of(
+    run: Mapping[str, Any], device: str = "cpu", trusted: str | None = None, trusted_forecaster: str | None = None
+) -> Task:
     """Returns the task of a training run.
 
     Args:
         run: the run's config (`agents.runs.read_config`).
         device: device that runs the forecaster.
         trusted: id of an environment that may be imported ("module:Id"); a run's config alone imports nothing.
+        trusted_forecaster: forecaster of a user's own that may be imported ("own:module:function").
 
     Raises:
         UserError: the config does not fit this version, names what is missing, or would import code.
@@ -275,6 +286,11 @@ def task_of(run: Mapping[str, Any], device: str = "cpu", trusted: str | None = N
         raise UserError(
             f"the run's environment '{short(values['env_id'], 80)}' imports code; if you trust it, name it yourself "
             f"with --env-id {short(values['env_id'], 80)}"
+        )
+    if is_own(values["checkpoint"]) and values["checkpoint"] != trusted_forecaster:
+        raise UserError(
+            f"the run's forecaster '{short(values['checkpoint'], 80)}' imports code; if you trust it, name it yourself "
+            f"with --checkpoint {short(values['checkpoint'], 80)}"
         )
     task = Task(device=device, **values)
     for text in _texts_of(task.make_kwargs):

@@ -24,7 +24,8 @@ from agents.task import Task
 from envs.drivers.all_agents import Driver, make_driver
 from envs.drivers.ego import constant_actions, make_ego_driver
 from envs.drivers.trained import EgoDriver
-from envs.readers import multiagent_env_id
+from envs.own_observation import without_added
+from envs.readers import multiagent_env_id, outcome_keys
 from envs.registry import envpool_task_of
 from envs.rollouts.driving_measures import DrivingMeasures, recorder_for
 from envs.sb3.agents_as_rows import AgentMonitor, ParallelVecEnv
@@ -127,7 +128,7 @@ def drive(env: Any, observations: Mapping[str, Any], generator: np.random.Genera
 
 def own_observations(observations: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the environment's own observation of each agent, without forecasts."""
-    return {name: seen["observation"] if isinstance(seen, dict) else seen for name, seen in observations.items()}
+    return {name: without_added(seen) for name, seen in observations.items()}
 
 
 @dataclass(frozen=True)
@@ -217,7 +218,7 @@ class _MakeEnv:
         if self.scene_spec is not None:
             env = SceneObservation(env, self.scene_spec.perception_m, self.scene_spec.max_agents)
         env = SupervisedEnv(env, self.task.env_id)
-        return SeededEpisodes(env) if self.seeded else env
+        return SeededEpisodes(env, self.task.crash_key, self.task.success_key) if self.seeded else env
 
 
 class SeededEpisodes(gym.Wrapper):
@@ -228,11 +229,14 @@ class SeededEpisodes(gym.Wrapper):
 
     Args:
         env: one environment.
+        crash_key: key of the infos that says whether the ego has crashed; None takes the env's (`register_reader`).
+        success_key: key that says whether it has succeeded; None takes the env's.
     """
 
-    def __init__(self, env: gym.Env) -> None:
+    def __init__(self, env: gym.Env, crash_key: str | None = None, success_key: str | None = None) -> None:
         """Wraps the environment with an empty queue."""
         super().__init__(env)
+        self._keys = outcome_keys(env, crash_key, success_key)
         self._action_names = {number: name for name, number in constant_actions(env).items()}
         self._recorder = recorder_for(env)
         self._seeds: list[int] = []
@@ -270,8 +274,9 @@ class SeededEpisodes(gym.Wrapper):
         self._speeds_mps.append(float(info.get("speed", np.nan)))
         if self._action_names:
             self._actions[self._action_names[int(action)]] += 1
-        if "crashed" in info:
-            self._crashed = bool(self._crashed) or bool(info["crashed"])
+        crashed = self._keys.crashed(info)
+        if crashed is not None:
+            self._crashed = bool(self._crashed) or crashed
         if self._recorder is not None:
             self._recorder.note()
         if (terminated or truncated) and self._seed is not None:
@@ -279,7 +284,7 @@ class SeededEpisodes(gym.Wrapper):
         return obs, reward, terminated, truncated, info
 
     def _result(self, seed: int, last_info: Mapping[str, Any]) -> EpisodeResult:
-        success = reported_success(last_info)
+        success = self._keys.succeeded(last_info)
         return EpisodeResult(
             seed,
             float(np.sum(self._rewards)),
@@ -290,17 +295,3 @@ class SeededEpisodes(gym.Wrapper):
             success=None if success is None else success and not self._crashed,
             driving=None if self._recorder is None else self._recorder.measures(),
         )
-
-
-def reported_success(info: Mapping[str, Any]) -> bool | None:
-    """Returns whether an info reports success; None if it says nothing of it.
-
-    Many environments have the key "is_success", highway-env's exit and parking among them; its intersections report the
-    arrival among the parts of the reward.
-    """
-    if "is_success" in info:
-        return bool(np.all(info["is_success"]))
-    parts = info.get("rewards")
-    if isinstance(parts, Mapping) and "arrived_reward" in parts:
-        return bool(parts["arrived_reward"])
-    return None

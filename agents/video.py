@@ -8,10 +8,10 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.arena import actions_of_others
-from agents.features import EGO_KEY
 from agents.summaries import EXTREMES
 from agents.task import EVALUATION_SEED, Task
 from agents.vec_envs import EpisodeResult, MakeCopy, learners_of, make_multiagent_venv, own_observations
+from envs.own_observation import without_added
 from envs.parallel import ForecastParallelEnv
 from envs.readers import multiagent_reader_for
 from envs.readers.highway import is_highway_env
@@ -155,6 +155,6 @@ def _act(task: Task, model: BaseAlgorithm) -> Callable[[Any], Any]:
     acting = ActingPolicy(model)
 
     def act(obs: dict[str, Any]) -> Any:
-        return acting(obs[EGO_KEY] if task.observe == "none" else obs)
+        return acting(without_added(obs) if task.observe == "none" else obs)
 
     return act

@@ -51,10 +51,12 @@ if TYPE_CHECKING:
         SceneReader,
         VecForecast,
         VectorForecast,
+        agent_ids,
         make_env,
         make_multiagent_env,
         reader_for,
         register_reader,
+        unflatten,
     )
     from predictor import (
         DGVAE,
@@ -100,7 +102,8 @@ PACKAGE_OF = {
         "envs": (
             "AgentMonitor", "EntityRowsReader", "EnvPoolVecEnv", "ForecastObservation", "ForecastParallelEnv",
             "FunctionReader", "HighwayParallelEnv", "ParallelVecEnv", "Reader", "SceneObservation", "SceneReader",
-            "VecForecast", "VectorForecast", "make_env", "make_multiagent_env", "reader_for", "register_reader",
+            "VecForecast", "VectorForecast", "agent_ids", "make_env", "make_multiagent_env", "reader_for",
+            "register_reader", "unflatten",
         ),
         "predictor": (
             "Belief", "CheckpointInfo", "ConstantVelocity", "DGVAE", "DGVAEConfig", "Episode", "Forecast", "Forecaster",

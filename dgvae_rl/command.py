@@ -28,6 +28,7 @@ class Command:
 
 
 COMMANDS = {
+    "check-env": Command("envs.check", "say what is wrong with an environment or its reader", "envs"),
     "collect": Command("envs.collect", "record episodes of an environment", "envs"),
     "train-predictor": Command("predictor.train", "train a predictor on recorded episodes", ""),
     "evaluate": Command("envs.evaluate", "measure forecasts in running environments", "envs"),

@@ -5,7 +5,7 @@ recording that is stopped goes on where it stopped when its command is repeated.
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -23,6 +23,7 @@ from envs.rollouts.workers import EpisodePool, Failed, OnError
 from envs.rollouts.world import World, default_drivers, open_world
 from envs.simulators.interventions import Kind
 from envs.supervision import TIMEOUT_S
+from envs.testing import store_problems
 from predictor.data.partial_store import PartialStore
 from predictor.data.store import Episode, StoreInfo
 from predictor.support.command_line import Renamed, parse
@@ -315,6 +316,20 @@ def main() -> None:
         print(f"skipped: {len(reasons)} of {config.episodes} seeds, whose environment failed")
         for reason in reasons[:MOST_REASONS]:
             print(f"  {short(reason)}")
+    for line in warnings_of(config, info, episodes):
+        print(f"warning: {line}")
+
+
+def warnings_of(config: CollectConfig, info: StoreInfo, episodes: Sequence[Episode]) -> list[str]:
+    """Returns what looks wrong in recorded episodes, one line for each thing; nothing of disturbed ones.
+
+    Interventions change speeds at once, as wrong ids seem to do.
+    """
+    if config.perturb or config.branches:
+        return []
+    found = store_problems(episodes, info.spec)
+    advice = f"to find the cause: dgvae check-env {config.env_id}"
+    return [*found, advice] if found else []
 
 
 if __name__ == "__main__":

@@ -16,6 +16,8 @@ from envs.scene_stream import ForecastConfig
 from predictor.forecaster import Forecaster
 from predictor.scene import Forecast, SceneBatch, SceneSpec
 
+SCENE_KEYS = ("scene_states", "scene_ids", "scene_valid", "scene_heading_rad")
+"""Entries of every observation that carries a scene, from `envs.observation.scene_entries`."""
 FORECAST_KEYS = ("agents", "forecast", "edge_probs", "edge_features", "valid")
 """Entries of every observation with forecasts, from `ego_entries`."""
 PATH_KEYS = ("ego_path", "closest")

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.arms import Arm, EntryBank
+from envs.own_observation import ADDED_KEYS
 from envs.parallel import ForecastParallelEnv
 from envs.seeding import driver_rng
 from envs.wrappers import ForecastObservation
@@ -47,7 +48,7 @@ def record_bank(env: Wrapper, source: str, episodes: int = EPISODES) -> EntryBan
     env.close()
     if not found:
         raise UserError(f"the arm 'shuffled' needs scenes with another agent, {source} had none in {episodes} episodes")
-    return EntryBank(source, {key: np.stack([one[key] for one in found]) for key in found[0] if key != "observation"})
+    return EntryBank(source, {key: np.stack([one[key] for one in found]) for key in found[0] if key in ADDED_KEYS})
 
 
 def _random_step(env: Wrapper, rng: np.random.Generator) -> tuple[Any, bool]:

@@ -35,8 +35,9 @@ from envs.rollouts.summary import summarise_episodes
 from envs.rollouts.workers import EpisodePool
 from envs.rollouts.world import default_drivers, open_world
 from envs.supervision import TIMEOUT_S
-from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, name_of_folder, resolve
+from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, name_of_folder, require_known, resolve
 from predictor.data.store import read_info_of
+from predictor.own_forecasters import is_own
 from predictor.reports.tables import accuracy_table
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_positive
@@ -59,8 +60,9 @@ class EvaluateConfig:
     env_ids: tuple[str, ...] = (*CHECKPOINTS, *MULTIAGENT_CHECKPOINTS)
     """Environments to measure in, gymnasium or PettingZoo parallel; by default all ids with a shipped checkpoint."""
     checkpoint: tuple[str, ...] = ()
-    """Checkpoints to measure: shipped names, folders or run folders; none given, the one that ships for each id.
-    Several make a transfer matrix."""
+    """Checkpoints to measure: shipped names, folders or run folders, or forecasters of your own, as
+    own:module:function (docs/own_forecaster.md); none given, the one that ships for each id. Several make a transfer
+    matrix."""
     episodes: int = 50
     """Number of episodes in each environment."""
     driver: Annotated[str | None, Renamed("ego")] = None
@@ -144,7 +146,7 @@ def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = N
         UserError: unknown env or checkpoint, or episodes shorter than the horizon.
     """
     checkpoint = checkpoint if checkpoint is not None else checkpoint_for(env_id)
-    if checkpoint != CONSTANT_VELOCITY:
+    if checkpoint != CONSTANT_VELOCITY and not is_own(checkpoint):
         checkpoint = str(resolve(checkpoint))
     driver = config.driver or default_drivers(env_id)[0]
     world = open_world(env_id, driver, checkpoint, horizon_steps=config.horizon_steps)
@@ -299,8 +301,7 @@ def main() -> None:
         policy = config.driver is not None and config.driver.endswith(".zip")
         open_world(env_id, "idle" if policy else config.driver or default_drivers(env_id)[0]).close()
     for checkpoint in config.checkpoint:
-        if checkpoint != CONSTANT_VELOCITY:
-            resolve(checkpoint)
+        require_known(checkpoint)
     if causes:
         evaluate_causes(config, console)
         return

@@ -57,6 +57,15 @@ class ForecastWrapper:
         restore = getattr(super(), "__setstate__", self.__dict__.update)
         restore(state)
 
+    def unflatten(self, observation: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """Returns the entries of an observation with `flatten=True`, of one environment or, with two axes, of many.
+
+        Raises:
+            UserError: observations are not flattened, or this one has another size.
+        """
+        layout: ObservationLayout = self._layout  # type: ignore[attr-defined]
+        return layout.unflatten(observation)
+
     def _scenes(self) -> SceneBatch:
         """Returns the scenes of all environments of the latest observation."""
         if self.stream.scenes is None:
@@ -68,7 +77,7 @@ class ObservationLayout:
     """Layout of a policy's observation: the environment's own and the forecast entries, as a Dict or as one Box.
 
     Args:
-        own: space of the environment's own observation.
+        own: spaces of the entries that hold the environment's own observation (`envs.own_observation`).
         entries: spaces of the forecast entries.
         flatten: whether the observation is one Box, in the Dict's key order.
 
@@ -77,29 +86,79 @@ class ObservationLayout:
         dict_space: space of one observation before it is flattened.
     """
 
-    def __init__(self, own: gym.Space, entries: Mapping[str, gym.Space], flatten: bool) -> None:
+    def __init__(self, own: Mapping[str, gym.Space], entries: Mapping[str, gym.Space], flatten: bool) -> None:
         """Builds the space."""
-        self.dict_space = gym.spaces.Dict({"observation": own, **entries})
+        self._own = tuple(own)
+        self.dict_space = gym.spaces.Dict({**own, **entries})
         self._flatten = flatten
         self.space: gym.Space = gym.spaces.flatten_space(self.dict_space) if flatten else self.dict_space
 
-    def one(self, own: Any, entries: Mapping[str, NDArray[Any]]) -> Any:
-        """Returns one environment's observation."""
-        full = {"observation": own, **entries}
+    def one(self, observation: Mapping[str, Any], entries: Mapping[str, NDArray[Any]]) -> Any:
+        """Returns one environment's observation: its own entries, out of `observation`, and the forecast entries."""
+        full = self._full(observation, entries)
         return gym.spaces.flatten(self.dict_space, full) if self._flatten else full
 
-    def batch(self, own: Any, entries: Mapping[str, NDArray[Any]]) -> Any:
+    def batch(self, observations: Mapping[str, Any], entries: Mapping[str, NDArray[Any]]) -> Any:
         """Returns the observations of many environments, stacked."""
-        full = {"observation": own, **entries}
+        full = self._full(observations, entries)
         if not self._flatten:
             return full
         return np.concatenate([_flattened(space, full[key]) for key, space in self.dict_space.spaces.items()], axis=1)
+
+    def unflatten(self, observation: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """Returns the entries of a flattened observation, or of many, stacked.
+
+        Raises:
+            UserError: observations are not flattened, or this one has another size.
+        """
+        if not self._flatten:
+            raise UserError("observations are a Dict already; unflatten is for wrappers with flatten=True")
+        sizes = [gym.spaces.flatdim(space) for space in self.dict_space.spaces.values()]
+        flat = np.asarray(observation)
+        if flat.ndim not in (1, 2) or flat.shape[-1] != sum(sizes):
+            raise UserError(f"a flattened observation has {sum(sizes)} numbers, got an array of shape {flat.shape}")
+        parts = np.split(np.atleast_2d(flat), np.cumsum(sizes)[:-1], axis=1)
+        entries = {
+            key: np.stack([np.asarray(gym.spaces.unflatten(space, row)) for row in part])
+            for (key, space), part in zip(self.dict_space.spaces.items(), parts, strict=True)
+        }
+        return entries if flat.ndim == 2 else {key: value[0] for key, value in entries.items()}
+
+    def _full(self, observation: Mapping[str, Any], entries: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+        return {**{key: observation[key] for key in self._own}, **entries}
 
 
 def _flattened(space: gym.Space, stacked: Any) -> NDArray[Any]:
     if isinstance(space, gym.spaces.Box):
         return np.asarray(stacked, space.dtype).reshape(len(stacked), -1)
     return np.stack([np.asarray(gym.spaces.flatten(space, one)) for one in stacked])
+
+
+def unflatten(env: Any, observation: NDArray[Any], agent: str | None = None) -> dict[str, NDArray[Any]]:
+    """Returns the entries of an observation that a wrapper with `flatten=True` has made; the inverse of flattening.
+
+        >>> from envs import ForecastObservation, make_env
+        >>> env = ForecastObservation(make_env("highway-fast-v0"), "constant-velocity", flatten=True)
+        >>> observation, info = env.reset(seed=0)
+        >>> unflatten(env, observation)["forecast"].shape
+        (11, 5, 2)
+
+    Args:
+        env: environment in `ForecastObservation`, `VecForecast`, `VectorForecast` or `ForecastParallelEnv`, possibly in
+            further wrappers that leave observations as they are.
+        observation: one observation, or with two axes those of many environments.
+        agent: name of the agent, in a PettingZoo environment.
+
+    Raises:
+        UserError: observations are not flattened, or this one has another size; no such wrapper.
+    """
+    try:
+        get: Any = getattr(env, "get_wrapper_attr", None)
+        found: Any = env.unflatten if get is None else get("unflatten")
+    except AttributeError as error:
+        raise UserError(f"unflatten needs an environment with forecasts, got {type(env).__name__}") from error
+    entries: dict[str, NDArray[Any]] = found(observation) if agent is None else found(observation, agent)
+    return entries
 
 
 def refuse_reader(reader: Any, wrapper: str) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy.typing import NDArray
 
-from envs.entries import ego_entries, entry_spaces, path_entries, what_if_entries
+from envs.entries import SCENE_KEYS, ego_entries, entry_spaces, path_entries, what_if_entries
 from envs.plans.batch import PlanBatch
 from envs.plans.playing import as_forecast
 from envs.registry import checkpoint_for
@@ -21,9 +21,6 @@ from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 from predictor.support.errors import UserError
 
 Observations = dict[str, NDArray[Any]]
-
-
-SCENE_KEYS = ("scene_states", "scene_ids", "scene_valid", "scene_heading_rad")
 
 
 def scene_spaces(spec: SceneSpec) -> dict[str, gym.Space]:

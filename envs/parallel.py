@@ -24,6 +24,7 @@ from envs.batched_forward import BatchedForward, can_share
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout
 from envs.multiagent_observation import MultiagentStream, check_multiagent_scene
 from envs.observation import open_forecaster
+from envs.own_observation import own_entries, own_spaces
 from envs.readers import MakeReader, multiagent_env_id, multiagent_reader_for
 from envs.readers.base import MultiagentReader, MultiagentScene, build_multiagent_reader
 from envs.scene_stream import ForecastConfig
@@ -32,15 +33,14 @@ from predictor.forecaster import Forecaster
 from predictor.scene import Forecast, SceneSpec
 from predictor.support.errors import ProtocolError, UserError
 
-_COMPOSED = (gym.spaces.Dict, gym.spaces.Tuple, gym.spaces.Graph, gym.spaces.Sequence, gym.spaces.OneOf)
-
 
 class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     """Adds forecasts of the other agents to each agent's observation.
 
-    Observation of an agent: Dict with `observation` (its own, untouched) and, for the other agents sorted by distance
-    from it, `agents` (relative current states), `forecast` (future positions in its frame [m]; a samples axis when
-    num_samples > 1), `edge_probs` and `edge_features` (other → agent, then agent → other), `valid`.
+    Observation of an agent: Dict with `observation` (its own, untouched; of a Dict, its entries under their own names)
+    and, for the other agents sorted by distance from it, `agents` (relative current states), `forecast` (future
+    positions in its frame [m]; a samples axis when num_samples > 1), `edge_probs` and `edge_features` (other → agent,
+    then agent → other), `valid`.
     `envs.entries.ego_entries` gives the shapes. Agents may differ in their own spaces, die and join at any step. An
     agent's last observation has forecasts too; if the reader no longer reports the agent, all its entries are zero,
     `valid` too. With `flatten=True` an observation is one Box, in the Dict's key order.
@@ -65,7 +65,8 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
 
     Raises:
         UserError: not a parallel env, no reader, no checkpoint, a forecaster of another spec (features, dt) or relative
-            to an ego, or an agent whose own observation is a Dict or Tuple.
+            to an ego, or an agent whose own observation is a Tuple, a Dict of Dicts, or has an entry of an added one's
+            name.
     """
 
     def __init__(
@@ -141,18 +142,23 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         """Returns the space of the agent's own observation and the forecast entries, the same object at each call.
 
         Raises:
-            UserError: the agent's own observation is a Dict or Tuple.
+            UserError: the agent's own observation is a Tuple, a Dict of Dicts, or has an entry of an added one's name.
         """
         return self._layout(agent).space
 
+    def unflatten(self, observation: Any, agent: str | None = None) -> dict[str, Any]:
+        """Returns the entries of an agent's observation with `flatten=True`.
+
+        Raises:
+            UserError: no agent is named, observations are not flattened, or this one has another size.
+        """
+        if agent is None:
+            raise UserError(f"unflatten needs the name of the agent, one of {', '.join(self.env.possible_agents)}")
+        return self._layout(agent).unflatten(observation)
+
     def _layout(self, agent: str) -> ObservationLayout:
         if agent not in self._layouts:
-            own = self.env.observation_space(agent)
-            if isinstance(own, _COMPOSED):
-                raise UserError(
-                    f"an agent's own observation must be one array, but '{agent}' of {self._source} gives a "
-                    f"{type(own).__name__}; pass on the array alone, and an action mask in the agent's info"
-                )
+            own = own_spaces(self.env.observation_space(agent), f"'{agent}' of {self._source}")
             self._layouts[agent] = ObservationLayout(own, self.stream.spaces(), self.stream.config.flatten)
         return self._layouts[agent]
 
@@ -189,12 +195,12 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         return self._scene
 
     def _own(self, observations: Mapping[str, Any]) -> dict[str, Any]:
-        return {agent: {"observation": own} for agent, own in observations.items()}
+        return {agent: own_entries(own) for agent, own in observations.items()}
 
     def _with_views(self, scene: MultiagentScene, shown: dict[str, Any]) -> dict[str, Any]:
         entries = self.stream.observe(scene)
         return {
-            agent: self._layout(agent).one(seen["observation"], entries.get(agent) or self.stream.nothing_seen())
+            agent: self._layout(agent).one(seen, entries.get(agent) or self.stream.nothing_seen())
             for agent, seen in shown.items()
         }
 

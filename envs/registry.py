@@ -116,6 +116,16 @@ def entry_for(env_id: str) -> EnvEntry:
     return ENVS.get(env_id, EnvEntry())
 
 
+def is_foreign_id(env_id: str) -> bool:
+    """Returns whether an id is neither listed here nor of highway-env; imports no module that the id names."""
+    import highway_env  # noqa: F401  (registers its ids)
+
+    if env_id in ENVS:
+        return False
+    spec = gym.registry.get(env_id.rpartition(":")[2])
+    return spec is None or not str(spec.entry_point).startswith("highway_env.")
+
+
 def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     """Makes a Gymnasium environment.
 
@@ -163,6 +173,40 @@ def make_multiagent_env(env_id: str, **kwargs: Any) -> "ParallelEnv":
     return env
 
 
+def make_any_env(env_id: str, **kwargs: Any) -> Any:
+    """Makes an environment of either kind: of an id, or of "module:function" (or a class), whichever it returns.
+
+    Args:
+        env_id: as `make_env` and `make_multiagent_env` take it; a function may return a Gymnasium environment, too.
+        kwargs: for the environment.
+
+    Raises:
+        UserError: unknown id, a missing package, or arguments that the environment refuses.
+    """
+    make = _function_named(env_id)
+    if make is None:
+        return make_multiagent_env(env_id, **kwargs) if is_multiagent_id(env_id) else make_env(env_id, **kwargs)
+    from pettingzoo import ParallelEnv
+
+    try:
+        env = make(**kwargs)
+    except (TypeError, ValueError, AssertionError, ImportError) as error:
+        raise UserError(f"cannot make env '{env_id}': {type(error).__name__}: {error}") from error
+    if not isinstance(env, gym.Env | ParallelEnv):
+        raise UserError(f"'{env_id}' must give a gymnasium Env or a pettingzoo ParallelEnv, got {type(env).__name__}")
+    return env
+
+
+def _function_named(env_id: str) -> Callable[..., Any] | None:
+    """Returns the function that "module:function" names; None if it is an id, "module:Id" included."""
+    if ":" not in env_id:
+        return None
+    try:
+        return load_named(env_id)
+    except UserError:
+        return None
+
+
 def is_multiagent_id(env_id: str) -> bool:
     """Returns whether `make_multiagent_env` knows the id: listed here, "module:function", or PettingZoo's.
 
@@ -175,7 +219,7 @@ def is_multiagent_id(env_id: str) -> bool:
     from pettingzoo import ParallelEnv
 
     try:
-        factory = _load(env_id)
+        factory = load_named(env_id)
     except UserError:
         return False
     return not isinstance(factory, type) or issubclass(factory, ParallelEnv)
@@ -215,9 +259,9 @@ def envpool_task_of(env_id: str) -> str:
 def _maker(env_id: str) -> Callable[..., Any]:
     entry = entry_for(env_id)
     if entry.factory is not None:
-        return functools.partial(_load(entry.factory), **entry.kwargs)
+        return functools.partial(load_named(entry.factory), **entry.kwargs)
     if ":" in env_id:
-        return _load(env_id)
+        return load_named(env_id)
     if _in_pettingzoo(env_id):
         import pettingzoo
 
@@ -228,15 +272,19 @@ def _maker(env_id: str) -> Callable[..., Any]:
     )
 
 
-def _load(path: str) -> Callable[..., Any]:
-    """Returns the function that "module:function" names."""
+def load_named(path: str) -> Callable[..., Any]:
+    """Imports what "module:function" names.
+
+    Raises:
+        UserError: there is no such module, or it has no such function or class.
+    """
     module, _, name = path.partition(":")
     try:
         factory: Callable[..., Any] | None = getattr(importlib.import_module(module), name, None)
     except (ImportError, ValueError) as error:
         raise UserError(f"cannot import '{module}' for '{path}': {error}; is its package installed?") from error
     if not callable(factory):
-        raise UserError(f"module '{module}' has no function '{name}' that could make an environment")
+        raise UserError(f"module '{module}' has no function or class '{name}'")
     return factory
 
 

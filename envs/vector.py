@@ -25,6 +25,7 @@ from envs.observation import (
     require_scenes,
     scenes_from,
 )
+from envs.own_observation import own_part
 from envs.plans import PlanModel
 from envs.plans.batch import PLANS_INFO, PlanBatch, ask_for_plans
 from envs.readers import MakeReader
@@ -104,7 +105,7 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         num_plans = len(self.plan_names) if what_if else 0
         config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, num_plans=num_plans, arm=arm)
         self.stream: ForecastStream = ForecastStream(forecaster, spec, env.num_envs, config)
-        self._layout = ObservationLayout(space["observation"], self.stream.spaces(), flatten)
+        self._layout = ObservationLayout(own_part(space), self.stream.spaces(), flatten)
         self.single_observation_space = self._layout.space
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
@@ -134,7 +135,7 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         for key, value in entries.items():
             self._entries.setdefault(key, np.zeros((self.num_envs, *value.shape[1:]), value.dtype))[envs] = value
         shown = {key: value.copy() for key, value in self._entries.items()}
-        return self._layout.batch(observations["observation"], shown), infos
+        return self._layout.batch(observations, shown), infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Steps all environments and forecasts them in one batch."""
@@ -150,14 +151,14 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
                 plans = plans.replaced(over, last_plans[over]).followed_by(plans[over])
             entries, closing_entries = observe_ended(self.stream, observations, over, closing, plans)
             for i, last, extra in zip(over, closing, closing_entries, strict=True):
-                infos["final_obs"][i] = self._layout.one(last["observation"], extra)
+                infos["final_obs"][i] = self._layout.one(last, extra)
         else:
             if self._mode is AutoresetMode.NEXT_STEP:
                 self.stream.reset(np.flatnonzero(self._ended))
             entries = self.stream.observe(scenes_from(observations), plans=self._plans(infos))
         # copies: a later reset writes into the entries of the environments that it opens
         self._ended, self._entries = ended, {key: value.copy() for key, value in entries.items()}
-        shown = self._layout.batch(observations["observation"], entries)
+        shown = self._layout.batch(observations, entries)
         return shown, rewards, terminations, truncations, infos
 
     def _plans(self, infos: dict[str, Any]) -> PlanBatch | None:

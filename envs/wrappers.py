@@ -17,11 +17,12 @@ from gymnasium.utils import RecordConstructorArgs
 from envs.arms import Arm
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
 from envs.observation import ForecastStream, carries_scenes, open_forecaster, scene_entries, scene_spaces
+from envs.own_observation import own_entries, own_part, own_spaces
 from envs.plans import PlanModel, Plans, checked_plans, plan_model_for
 from envs.plans.batch import PlanBatch, plans_info
 from envs.plans.playing import with_true_futures
 from envs.readers import MakeReader, reader_for
-from envs.readers.base import build_reader, require_scene, show
+from envs.readers.base import Reader, bounded, build_reader, require_scene, show
 from envs.scene_stream import ForecastConfig
 from envs.simulators.copies import RunningCopy
 from predictor.forecaster import Forecaster
@@ -36,15 +37,17 @@ def scene_source(env: gym.Env) -> str:
 
 
 def _reader_of(env: gym.Env, make_reader: MakeReader | None, perception_m: float | None, max_agents: int | None) -> Any:
-    return reader_for(env, perception_m, max_agents) if make_reader is None else build_reader(make_reader, env)
+    if make_reader is None:
+        return reader_for(env, perception_m, max_agents)
+    return bounded(build_reader(make_reader, env), perception_m, max_agents)
 
 
 class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], RecordConstructorArgs):
     """Adds the scene around the ego to the observation.
 
-    Observation: Dict with `observation` (the env's own, untouched), `scene_states` (max_agents, F) in the world frame,
-    `scene_ids`, `scene_valid`, `scene_heading_rad` (the ego's). The ego has index 0. `VecForecast` needs these entries
-    from each environment; for a policy use `ForecastObservation`.
+    Observation: Dict with `observation` (the env's own, untouched; of a Dict, its entries under their own names),
+    `scene_states` (max_agents, F) in the world frame, `scene_ids`, `scene_valid`, `scene_heading_rad` (the ego's). The
+    ego has index 0. `VecForecast` needs these entries from each environment; for a policy use `ForecastObservation`.
 
     Args:
         env: any environment that a scene reader knows.
@@ -53,7 +56,8 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         reader: function or class that makes a reader for the env; None picks one by env family.
 
     Raises:
-        UserError: no reader knows the env, or its observation is a Dict or Tuple.
+        UserError: no reader knows the env; or its observation is a Tuple, a Dict of Dicts, or has an entry of an added
+            one's name.
     """
 
     def __init__(
@@ -66,18 +70,13 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         """Picks the reader and extends the observation space."""
         RecordConstructorArgs.__init__(self, perception_m=perception_m, max_agents=max_agents, reader=reader)
         gym.Wrapper.__init__(self, env)
-        own = env.observation_space
-        if isinstance(own, gym.spaces.Dict | gym.spaces.Tuple | gym.spaces.Graph | gym.spaces.Sequence):
-            raise UserError(
-                f"the env's own observation must be one array, got {type(own).__name__}; "
-                "apply gymnasium.wrappers.FlattenObservation first"
-            )
+        own = own_spaces(env.observation_space, f"env '{scene_source(env)}'")
         self.reader = _reader_of(env, reader, perception_m, max_agents)
         self._scene: Scene | None = None
         self._plan_model: PlanModel | None = None
         self._plan_steps = 0
         self._played: int | None = 0
-        self.observation_space = gym.spaces.Dict({"observation": own, **scene_spaces(self.reader.spec)})
+        self.observation_space = gym.spaces.Dict({**own, **scene_spaces(self.reader.spec)})
 
     @property
     def scene_spec(self) -> SceneSpec:
@@ -153,15 +152,16 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         scene = require_scene(self.reader.read(self.env), name)
         scene.check(name, spec, agents=spec.max_agents)
         self._scene = scene
-        return {"observation": obs, **scene_entries(scene)}
+        return {**own_entries(obs), **scene_entries(scene)}
 
 
 class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Adds forecasts of the other agents to the observation.
 
-    Observation: Dict with `observation` (the env's own, untouched) and, for the other agents sorted by distance,
-    `agents` (relative current states), `forecast` (future positions in the ego's frame [m]; a samples axis when
-    num_samples > 1), `edge_probs` and `edge_features` (agent → ego, then ego → agent), `valid`.
+    Observation: Dict with `observation` (the env's own, untouched; of a Dict, its entries under their own names)
+    and, for the other agents sorted by distance, `agents` (relative current states), `forecast` (future positions in
+    the ego's frame [m]; a samples axis when num_samples > 1), `edge_probs` and `edge_features` (agent → ego, then
+    ego → agent), `valid`.
     `envs.entries.ego_entries` gives the shapes. With `flatten=True` it is one Box, in the Dict's key order.
 
     The history is cleared at reset. After each step, `scene` and `forecast` hold the observed scene and its forecast in
@@ -237,10 +237,11 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
                     f"({spec.perception_m:g}, {spec.max_agents}); give them to that wrapper"
                 )
         else:
-            spec = _reader_of(env, reader, perception_m, max_agents).spec
+            made = _reader_of(env, reader, perception_m, max_agents)
+            spec = made.spec
         forecaster = open_forecaster(checkpoint, spec, source, device, forecaster)
         if not ready:
-            trained = forecaster.spec
+            trained = forecaster.spec if isinstance(made, Reader) else spec  # others cannot be bounded
             env = SceneObservation(env, perception_m or trained.perception_m, max_agents or trained.max_agents, reader)
             spec = env.scene_spec
         gym.Wrapper.__init__(self, env)
@@ -248,8 +249,8 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         self.plan_model = plan_model
         self.plans: Plans | None = None
         self.what_if: Forecast | None = None
-        own = env.observation_space["observation"]  # type: ignore[index]
-        self._layout = ObservationLayout(own, self.stream.spaces(), flatten)
+        extended: Any = env.observation_space
+        self._layout = ObservationLayout(own_part(extended), self.stream.spaces(), flatten)
         self.observation_space = self._layout.space
 
     @property
@@ -279,4 +280,4 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
             plans = PlanBatch.stack([self.plans])
         entries = self.stream.observe(SceneBatch.stack([self.scene]), plans=plans)
         self.what_if = self.stream.planned
-        return self._layout.one(obs["observation"], {key: value[0] for key, value in entries.items()})
+        return self._layout.one(obs, {key: value[0] for key, value in entries.items()})

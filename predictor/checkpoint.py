@@ -14,8 +14,9 @@ from safetensors.torch import save
 from torch import nn
 
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.forecaster import TrainableForecaster
+from predictor.forecaster import Forecaster, TrainableForecaster
 from predictor.models import KINDS, build, config_from_json, name_of, shapes_of
+from predictor.own_forecasters import PREFIX, find_own, is_own, make_own
 from predictor.scene import SceneSpec
 from predictor.support.config_checks import check_at_least, check_at_most, check_scale_values
 from predictor.support.errors import UserError, short
@@ -91,6 +92,8 @@ def resolve(name: str | Path) -> Path:
         return best if (best / WEIGHTS).is_file() and not (path / WEIGHTS).is_file() else path
     if str(name) in shipped():
         return PRETRAINED / str(name)
+    if is_own(name):
+        raise UserError(f"'{name}' is a forecaster of your own and no checkpoint; pass one with weights")
     raise UserError(
         f"no checkpoint '{name}': neither a folder nor a shipped name ({', '.join([*shipped(), CONSTANT_VELOCITY])})"
     )
@@ -98,6 +101,8 @@ def resolve(name: str | Path) -> Path:
 
 def name_of_folder(path: str | Path) -> str:
     """Returns the name of a checkpoint in tables: its folder's, or the run folder's for its best checkpoint."""
+    if is_own(path):
+        return str(path).removeprefix(PREFIX)
     path = Path(path)
     named = path.resolve() if path.name in ("", ".", "..") else path
     return named.resolve().parent.name if named.name == BEST_OF_RUN else named.name
@@ -179,14 +184,33 @@ def read_info(path: Path) -> CheckpointInfo:
     return from_table(CheckpointInfo, content, str(file), {"config": config})
 
 
-def load_forecaster(
-    name: str | Path, scene_spec: SceneSpec, source: str, device: str = "cpu"
-) -> TrainableForecaster | ConstantVelocity:
-    """Loads a forecaster for scenes of `scene_spec`, by a shipped name, a folder, or "constant-velocity".
+def require_known(name: str | Path) -> None:
+    """Checks that there is a forecaster of this name; imports one of a user's own, and loads no weights.
 
     Raises:
-        UserError: when `load_checkpoint` raises, or the checkpoint has another spec (features, dt).
+        UserError: there is none.
     """
+    if is_own(name):
+        find_own(str(name))
+    elif str(name) != CONSTANT_VELOCITY:
+        resolve(name)
+
+
+def load_forecaster(name: str | Path, scene_spec: SceneSpec, source: str, device: str = "cpu") -> Forecaster:
+    """Loads a forecaster for scenes of `scene_spec`.
+
+    Args:
+        name: shipped name, folder, "constant-velocity", or the name of a user's own (`predictor.own_forecasters`),
+            which imports code.
+        scene_spec: layout of the scenes.
+        source: origin of the scenes, for messages.
+        device: device of a checkpoint.
+
+    Raises:
+        UserError: when `load_checkpoint` or `make_own` raises, or the checkpoint has another spec (features, dt).
+    """
+    if is_own(name):
+        return make_own(str(name), scene_spec, source)
     if str(name) == CONSTANT_VELOCITY:
         return ConstantVelocity(scene_spec)
     model: TrainableForecaster

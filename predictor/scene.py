@@ -177,7 +177,10 @@ class Scene:
         ):
             if not isinstance(array, np.ndarray) or array.dtype.kind not in kind or array.ndim != axes:
                 got = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
-                raise UserError(f"{source}: {name} must be a NumPy array of {wanted} with {axes} axes, got {got}")
+                named = "; agent_ids(names) (dgvae_rl) makes numbers of names" if name == "ids" else ""
+                raise UserError(
+                    f"{source}: {name} must be a NumPy array of {wanted} with {axes} axes, got {got}{named}"
+                )
         if not len(self.states) == len(self.ids) == len(self.valid):
             raise UserError(
                 f"{source}: states, ids and valid need one entry per agent, got {len(self.states)}, "

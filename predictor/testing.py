@@ -234,8 +234,15 @@ def _first_step(trial: _Trial) -> Iterator[str]:
     _, belief = trial.observed()
     asked = trial.valid.clone()
     asked[:, : int(trial.spec.has_ego)] = False  # the ego's future is the policy's choice
-    moved = (trial.single(belief)[:, :, 0, :axes] - trial.states[:, -1, :, :axes])[asked]
+    forecast = trial.single(belief)[..., :axes]
+    moved = (forecast[:, :, 0] - trial.states[:, -1, :, :axes])[asked]
     expected = (trial.states[:, -1, :, axes : 2 * axes] * trial.spec.dt_s)[asked]
+    if trial.horizon > 1 and torch.equal(forecast[asked][:, 1:], forecast[asked][:, :-1]) and bool(moved.any()):
+        yield "rollout: all steps of a forecast are the same; step i is where an agent is i times dt_s later"
+        return
+    if (forecast[:, :, 0][asked] - expected).square().sum() < 0.2 * expected.square().sum():
+        yield "rollout: states hold displacements from where each agent is now; give positions, as in belief.states"
+        return
     for axis, letter in enumerate("xyz"[:axes]):
         along = (moved[:, axis] * expected[:, axis]).sum() / expected[:, axis].square().sum()
         if along < -SLOWEST:
@@ -245,6 +252,12 @@ def _first_step(trial: _Trial) -> Iterator[str]:
                 f"rollout: the first step is {along:.2g} times velocity × dt_s along {letter}; is a step "
                 f"{trial.spec.dt_s:g} s (spec.dt_s), and are positions in metres and velocities in m/s?"
             )
+
+
+def _repeats(trial: _Trial) -> Iterator[str]:
+    _, belief = trial.observed()
+    if trial.differ(trial.single(belief), trial.single(belief)):
+        yield "rollout: the single forecast differs from call to call; is the network in training mode (call eval())?"
 
 
 def _arguments_stay(trial: _Trial) -> Iterator[str]:
@@ -381,6 +394,6 @@ def _place_does_not_matter(trial: _Trial) -> Iterator[str]:
 
 _LAYOUT = (_sizes, _empty_memory, _observe, _rollout)
 _MEANING = (
-    _first_step, _arguments_stay, _no_peeking, _window_does_not_peek, _scenes_are_independent, _order_of_agents,
-    _absent_agents, _noise, _place_does_not_matter,
+    _first_step, _arguments_stay, _repeats, _no_peeking, _window_does_not_peek, _scenes_are_independent,
+    _order_of_agents, _absent_agents, _noise, _place_does_not_matter,
 )  # fmt: skip

@@ -119,6 +119,12 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--env-id merge-v1 --out new --episodes 0", "episodes must be at least 1, got 0"),
         ("--env-id merge-v1 --out file", "file exists; choose another path or pass --overwrite"),
     ],
+    "envs.check": [
+        ("--env-id nope-v0", "cannot make env 'nope-v0'"),
+        ("--env-id merge-v1 --episodes 0", "episodes must be at least 1, got 0"),
+        ("--env-id merge-v1 --reader absent:read", "cannot import 'absent' for 'absent:read'"),
+        ("--env-id merge-v1 --env-kwargs 3", "--env-kwargs"),
+    ],
     "envs.evaluate": [
         ("--checkpoint absent --env-ids merge-v1", "no checkpoint 'absent'"),
         ("--workers 0", "workers must be at least 1, got 0"),
@@ -291,6 +297,7 @@ REQUIRED: dict[str, list[str]] = {
         f"predictor.data.{name}": ["--source", "files", "--out", "new"]
         for name in ("nba", "levelx", "mocap", "sdd", "tracks")
     },
+    "envs.check": ["--env-id", "merge-v1"],
     "envs.collect": ["--env-id", "merge-v1", "--out", "new"],
     "envs.export_levelx": ["--env-id", "merge-v1", "--out", "new"],
     "agents.evaluate": ["--run-dir", "run"],

@@ -34,6 +34,7 @@ from envs.drivers.planner import ORACLE, PLANNER, is_planner
 from envs.registry import checkpoint_for
 from envs.sb3.algorithms import CONTRIB
 from predictor.checkpoint import CONSTANT_VELOCITY, WEIGHTS, resolve
+from predictor.own_forecasters import is_own
 from predictor.support.errors import UserError
 from predictor.support.provenance import provenance
 
@@ -45,7 +46,7 @@ MEASURING = 2
 NETWORK = 2
 """Number of the network that reads forecasts (`agents.features`); a cell of a policy with another one is another
 cell."""
-YOUNGER = {"perception_m": None, "vf_coef": 0.5, "target_kl": None}
+YOUNGER = {"perception_m": None, "vf_coef": 0.5, "target_kl": None, "crash_key": None, "success_key": None}
 """Fields of `Task` and of presets that came after the first cells, with the value that those had: it does not change
 their names."""
 RUN_FOLDER = "run"
@@ -102,7 +103,7 @@ class Cell:
         content: dict[str, Any] = {
             "measuring": MEASURING,
             "task": task,
-            "forecaster": None if self.forecaster is None else {**self.forecaster, "checkpoint": None},
+            "forecaster": _content_of(self.forecaster),
             "test": [EVALUATION_SEED, self.episodes],
             "versions": {name: _version(name) for name in RULES},
         }
@@ -117,6 +118,13 @@ class Cell:
             unrelated.add("shaping")
         values = {key: value for key, value in asdict(self.plan).items() if key not in unrelated}
         return content | {"plan": values, "preset": _named(self.plan.preset)}
+
+
+def _content_of(forecaster: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """Returns what names a forecaster: the hash of its weights, or its name where code makes it."""
+    if forecaster is None:
+        return None
+    return {**forecaster, "checkpoint": forecaster["checkpoint"] if is_own(forecaster.get("checkpoint")) else None}
 
 
 def _named(settings: Task | Preset) -> dict[str, Any]:
@@ -233,7 +241,7 @@ def _planner_pin(name: str, task: Task) -> dict[str, Any] | None:
     if not is_planner(name):
         return None
     checkpoint = name.removeprefix(PLANNER).removeprefix(":") or checkpoint_for(task.env_id)
-    if checkpoint in (CONSTANT_VELOCITY, ORACLE):
+    if checkpoint in (CONSTANT_VELOCITY, ORACLE) or is_own(checkpoint):
         return {"sha256": checkpoint}
     with (resolve(checkpoint) / WEIGHTS).open("rb") as file:
         return {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}

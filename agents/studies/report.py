@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from agents.forecast_errors import CONSTANT_ERROR, FORECAST_ERROR
+from agents.results import NOT_REPORTED
 from agents.studies.document import PICTURES, Block, Code, Heading, Paragraph, Picture, Table, as_html, as_markdown
 from agents.studies.estimators import Estimate, interquartile_mean
 from agents.studies.findings import NEARLY_CONSTANT, Findings, Line
@@ -109,7 +110,7 @@ def _scenario(findings: Findings, scenario: str) -> list[Block]:
                 str(len(runs)) if trained else NOTHING,
                 interval(findings.mean_return(scenario, line)),
                 interval(findings.middle_return(scenario, line)) if trained else NOTHING,
-                NOTHING if crashes is None else interval(crashes, 0, 100.0, " %"),
+                NOT_REPORTED if crashes is None else interval(crashes, 0, 100.0, " %"),
                 _number(findings.mean_of(scenario, line, "length")),
                 _number(findings.mean_of(scenario, line, "mean_speed_mps")),
             ]

@@ -47,7 +47,7 @@ class CrossingEnv(gym.Env):
         touched = bool((np.linalg.norm(self.walkers[:, :2] - self.robot[:2], axis=1) < 0.5).any())
         arrived = bool(self.robot[1] >= WIDTH_M / 2)
         reward = float(self.robot[3] * DT_S) - 10.0 * touched
-        return self._observe(), reward, touched or arrived, False, {}
+        return self._observe(), reward, touched or arrived, False, {"touched": touched, "arrived": arrived}
 
     def _enter(self, x: float) -> None:
         side = np.sign(x) if abs(x) == LENGTH_M / 2 else self.np_random.choice([-1.0, 1.0])

@@ -17,4 +17,4 @@ def read_crossing(env: gym.Env) -> Scene:
 
 
 SPEC = SceneSpec(dt_s=DT_S, feature_scales=(10.0, 10.0, 1.0, 1.0), perception_m=10.0)
-register_reader(CrossingEnv, FunctionReader(read_crossing, SPEC))
+register_reader(CrossingEnv, FunctionReader(read_crossing, SPEC), crash_key="touched", success_key="arrived")

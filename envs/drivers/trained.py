@@ -16,6 +16,7 @@ import numpy as np
 
 from envs.arms import Arm
 from envs.drivers.all_agents import Driver, make_driver
+from envs.own_observation import carries_forecasts, space_without_added, without_added
 from envs.sb3.padded_spaces import PaddedObservation, learners_named, own_action, roles_of
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
@@ -43,8 +44,8 @@ def trained_driver(path: str, env: Any, rng: np.random.Generator) -> Driver:
     """
     policy, note = kept_policy(path), note_of(path)
     learners = learners_named(env.possible_agents, () if note is None else note.learners, path)
-    sees_forecasts = isinstance(policy.observation_space, gym.spaces.Dict)
-    spaces = {agent: _seen_space(env.observation_space(agent), sees_forecasts) for agent in learners}
+    whole = carries_forecasts(policy.observation_space)
+    spaces = {agent: _seen_space(env.observation_space(agent), whole) for agent in learners}
     actions = {agent: env.action_space(agent) for agent in learners}
     padded = PaddedObservation(spaces, roles_of(spaces, actions), None)
     if padded.space != policy.observation_space:
@@ -80,7 +81,7 @@ def _drive(
     from envs.sb3.acting import ActingPolicy  # most drivers need no SB3
 
     policy = kept_policy(path)
-    whole = isinstance(policy.observation_space, gym.spaces.Dict)
+    whole = carries_forecasts(policy.observation_space)
     for gone in acting.keys() - observations.keys():
         del acting[gone]  # an agent that comes back remembers nothing
     chosen = {} if others is None else others({a: s for a, s in observations.items() if a not in actions})
@@ -97,13 +98,12 @@ def _line(space: gym.Space) -> str:
 
 def _seen_space(space: gym.Space, sees_forecasts: bool) -> gym.Space:
     """Returns an agent's observation space with forecasts, or without any."""
-    assert isinstance(space, gym.spaces.Dict)
-    return space if sees_forecasts else space["observation"]
+    return space if sees_forecasts else space_without_added(space)
 
 
 def _seen(observation: Mapping[str, Any], sees_forecasts: bool) -> Any:
     """Returns the observation in the space of `_seen_space`."""
-    return observation if sees_forecasts else observation["observation"]
+    return observation if sees_forecasts else without_added(observation)
 
 
 def env_for_driver(env: gym.Env, name: str) -> gym.Env:
@@ -162,7 +162,7 @@ def require_view(env: gym.Env, name: str) -> None:
 
 def sees_forecasts(name: str) -> bool:
     """Returns whether the driver is a policy that was trained on forecasts."""
-    return name.endswith(".zip") and isinstance(kept_policy(name).observation_space, gym.spaces.Dict)
+    return name.endswith(".zip") and carries_forecasts(kept_policy(name).observation_space)
 
 
 @functools.cache

@@ -4,6 +4,8 @@ A `SceneReader` serves a Gymnasium environment with one ego, a `MultiagentReader
 are registered with `register_reader`, and checked alike when they are made.
 """
 
+from importlib.metadata import EntryPoint, entry_points
+from types import ModuleType
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +16,7 @@ from envs.readers.base import (
     MultiagentScene,
     Reader,
     SceneReader,
+    bounded,
     build_multiagent_reader,
     build_reader,
     comes_from,
@@ -25,6 +28,7 @@ from envs.readers.envpool import EnvPoolReader, is_envpool_env
 from envs.readers.function import FunctionReader
 from envs.readers.highway import HighwayReader, is_highway_env
 from envs.readers.mpe import MPE_IDS, MpeReader, is_mpe_env, mpe_scenario
+from envs.readers.outcomes import OutcomeKeys, outcome_keys, register_outcomes
 from envs.readers.pursuit import PursuitReader, is_pursuit_env
 from envs.simulators import mixed_traffic  # noqa: F401  (registers its ids, as the import of highway-env does)
 from predictor.support.errors import UserError
@@ -37,10 +41,12 @@ __all__ = [
     "MakeReader",
     "MultiagentReader",
     "MultiagentScene",
+    "OutcomeKeys",
     "Reader",
     "SceneReader",
     "multiagent_env_id",
     "multiagent_reader_for",
+    "outcome_keys",
     "pad_multiagent_scene",
     "perceive",
     "reader_for",
@@ -48,16 +54,27 @@ __all__ = [
 ]
 
 _REGISTERED: dict[type, MakeReader] = {}
+GROUP = "dgvae_rl.readers"
+"""Group of entry points under which installed packages register readers."""
 
 
-def register_reader(env_class: type, make_reader: MakeReader) -> None:
+def register_reader(
+    env_class: type, make_reader: MakeReader, *, crash_key: str | None = None, success_key: str | None = None
+) -> None:
     """Registers a reader for an environment class and what derives from it, for every wrapper and command.
 
     Args:
         env_class: class of the unwrapped environment; of the AEC environment where PettingZoo converts one.
         make_reader: takes an environment (not reset yet, wrapped or not) and returns its reader: a `SceneReader` for
             Gymnasium environments, a `MultiagentReader` for PettingZoo's.
+        crash_key: key of the infos that says whether the ego has crashed; a point leads into a nested dict
+            ("outcome.collided"). None: tables say "not reported", since no key is guessed.
+        success_key: key that says, in an episode's last step, whether the ego has succeeded; None takes "is_success".
+
+    Raises:
+        UserError: a key is empty.
     """
+    register_outcomes(env_class, crash_key, success_key)
     _REGISTERED[env_class] = make_reader
 
 
@@ -66,21 +83,23 @@ def reader_for(env: gym.Env, perception_m: float | None = None, max_agents: int 
 
     Args:
         env: any Gymnasium environment, wrapped or not.
-        perception_m: range of the ego's perception [m]; None takes the family's default. A registered reader sets its
-            own.
-        max_agents: size of a scene, the ego included; None takes the family's default.
+        perception_m: range of the ego's perception [m]; None takes the family's or the registered reader's.
+        max_agents: size of a scene, the ego included; None takes the family's or the registered reader's.
 
     Raises:
-        UserError: no reader knows the environment, or the registered one is a `MultiagentReader`.
+        UserError: no reader knows the environment, the registered one is a `MultiagentReader`, or it is no `Reader` and
+            has other bounds.
     """
     make_reader = _registered(env)
     if make_reader is not None:
-        reader: SceneReader = build_reader(make_reader, env)
+        reader: SceneReader = bounded(build_reader(make_reader, env), perception_m, max_agents)
         return reader
     if is_highway_env(env):
         return HighwayReader(env, perception_m=perception_m, max_agents=max_agents)
     if is_envpool_env(env):
         return EnvPoolReader(env, perception_m=perception_m, max_agents=max_agents)
+    if _find_plugged(env):
+        return reader_for(env, perception_m, max_agents)
     raise UserError(
         f"no scene reader knows {type(env.unwrapped).__name__}; pass reader= (FunctionReader for a function "
         "read(env) -> Scene, EntityRowsReader for observations whose rows are entities, or an own Reader), or call "
@@ -122,6 +141,8 @@ def multiagent_reader_for(
         return MpeReader(env, max_agents=max_agents, perception_m=perception_m)
     if is_pursuit_env(env):
         return PursuitReader(env, max_agents=max_agents, perception_m=perception_m)
+    if _find_plugged(env):
+        return multiagent_reader_for(env, perception_m, max_agents)
     raise UserError(
         f"no scene reader knows {multiagent_env_id(env)}; pass reader= (any MultiagentReader), give the environment a "
         "make_scene_reader() method, or call register_reader for its class; see docs/wrap_your_env.md"
@@ -136,6 +157,39 @@ def multiagent_env_id(env: Any) -> str:
             return env_id
     metadata = getattr(env, "metadata", None) or {}
     return str(metadata.get("name", type(env.unwrapped).__name__))
+
+
+def _find_plugged(env: Any) -> bool:
+    """Registers the reader that an installed package has for the environment's class; returns whether there is one.
+
+    The name of the entry point is the class or a module or package above it ("crossing_env", "crossing_env.Crossing"),
+    so that no package is imported but for its environments. It leads to what `register_reader` takes, or to a module
+    that registers its readers.
+
+    Raises:
+        UserError: it cannot be imported.
+    """
+    known = {point.name: point for point in entry_points(group=GROUP)}
+    for kind in type(env.unwrapped).__mro__:
+        path = f"{kind.__module__}.{kind.__qualname__}"
+        while path:
+            if path in known:
+                _load_plugged(known[path], kind)
+                return _registered(env) is not None
+            path = path.rpartition(".")[0]
+    return False
+
+
+def _load_plugged(point: EntryPoint, kind: type) -> None:
+    try:
+        found = point.load()
+    except (ImportError, AttributeError) as error:
+        raise UserError(
+            f"the reader for {kind.__name__} cannot be imported from {point.value} (entry point '{point.name}' of the "
+            f"group {GROUP}): {error}"
+        ) from error
+    if not isinstance(found, ModuleType):
+        register_reader(kind, found)
 
 
 def _registered(env: Any) -> MakeReader | None:

@@ -8,7 +8,7 @@ A reader reports all agents (`read_all`): their ids, positions and velocities. W
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -142,6 +142,26 @@ def build_multiagent_reader(make_reader: Any, env: Any) -> Any:
     return reader
 
 
+def bounded(reader: Any, perception_m: float | None, max_agents: int | None) -> Any:
+    """Returns a reader of one's own after setting what its ego perceives; None leaves the reader's value.
+
+    Raises:
+        UserError: a value out of range, or a reader that is no `Reader` and has another value.
+    """
+    given = {"perception_m": perception_m, "max_agents": max_agents}
+    given = {name: value for name, value in given.items() if value is not None and value != getattr(reader.spec, name)}
+    if not given:
+        return reader
+    if not isinstance(reader, Reader):
+        asked = ", ".join(f"{name}={value:g}" for name, value in given.items())
+        raise UserError(
+            f"{type(reader).__name__} sets what the ego perceives itself, so {asked} has no effect: derive it from "
+            "envs.readers.Reader, or make it with these values"
+        )
+    reader._spec = replace(reader.spec, **given)  # type: ignore[arg-type]
+    return reader
+
+
 def _name_of(make_reader: Any) -> str:
     return str(getattr(make_reader, "__name__", type(make_reader).__name__))
 
@@ -174,6 +194,11 @@ def _build(make_reader: Any, env: Any, advice: str) -> Any:
         raise UserError(
             f"{name}: the spec of a reader must be a SceneSpec, got {type(reader.spec).__name__}; a class of one's own "
             "is called with the env and gives a spec to Reader.__init__"
+        )
+    if reader.spec.position_dim != 2:
+        raise UserError(
+            f"{name}: environments need positions in a plane, got {reader.spec.position_dim} axes; give x_m, y_m, "
+            "vx_mps and vy_mps alone, or the height as a further feature (feature_names of SceneSpec)"
         )
     return reader
 

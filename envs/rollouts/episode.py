@@ -111,7 +111,7 @@ class Episode:
     edge_types: list[Int[np.ndarray, "agents agents"]] = field(default_factory=list)
     """True edge types, -1 where unknown; empty where the simulator has none."""
     crashed: bool = False
-    """Whether the ego crashed; the episode then ends with the crash."""
+    """Whether the ego is reported to have crashed; the episode then ends with the crash."""
     worst: Case | None = None
     """Worst forecast of the model among those with a whole future."""
 
@@ -142,7 +142,7 @@ def play(task: EpisodeTask) -> Episode:
             break
     future, valid = futures(scenes, truths, task.horizon_steps, world.spec)
     episode.outcomes = {key: _outcome(found, future, valid) for key, found in forecasts.items()}
-    episode.crashed = isinstance(world, EgoWorld) and world.crashed
+    episode.crashed = isinstance(world, EgoWorld) and bool(world.crashed)
     episode.worst = _worst(episode.outcomes, scenes, task.seed, world.spec.has_ego)
     return episode
 

@@ -14,6 +14,7 @@ from envs.rollouts.world import World, open_world
 from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint, load_forecaster, name_of_folder
 from predictor.forecaster import Forecaster
 from predictor.online import OnlineForecaster
+from predictor.own_forecasters import is_own
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
 from predictor.support.errors import UserError
 
@@ -123,5 +124,5 @@ def kept_world(env_id: str, driver: str, checkpoints: tuple[str, ...]) -> World:
     """Returns a world whose ego perceives what the first learned checkpoint was trained on, kept in a process."""
     if sees_forecasts(driver):
         return open_world(env_id, driver, checkpoints[0])
-    learned = [name for name in checkpoints if name != CONSTANT_VELOCITY]
+    learned = [name for name in checkpoints if name != CONSTANT_VELOCITY and not is_own(name)]
     return open_world(env_id, driver, perceived_as=load_checkpoint(learned[0])[1].spec if learned else None)

@@ -15,6 +15,7 @@ from predictor.evaluation.displacement import MISS_THRESHOLD_M, min_ade
 from predictor.evaluation.graph_accuracy import GraphAccuracy, GraphTally
 from predictor.evaluation.outcomes import Outcome
 from predictor.graph import pair_mask
+from predictor.own_forecasters import is_own
 from predictor.reports.tables import MODEL_NAMES
 from predictor.scene import SceneSpec
 
@@ -47,8 +48,7 @@ def summarise_episodes(
     outcomes = {key: [e.outcomes[key] for e in episodes] for key in episodes[0].outcomes}
     first = [outcome.single() for outcome in outcomes[MODEL]]
     learned = checkpoint != CONSTANT_VELOCITY
-    std_m = read_info(Path(checkpoint)).std_m if learned else fitted_std_m(first)
-    name = MODEL_NAMES.get(read_info(Path(checkpoint)).model, "model") if learned else "constant velocity (deployed)"
+    std_m, name = _spread_and_name(checkpoint, first)
 
     def line(title: str, found: Sequence[Outcome], spread: Sequence[float], partial: bool = False) -> Accuracy:
         tally = Tally(spread, miss_m, partial)
@@ -88,6 +88,16 @@ def summarise_episodes(
         to_the_end,
         before_crash,
     )
+
+
+def _spread_and_name(checkpoint: str, forecasts: Sequence[Outcome]) -> tuple[Sequence[float], str]:
+    """Returns the spread of the model's errors [m], fitted here where a checkpoint does not say it, and its name."""
+    if is_own(checkpoint):
+        return fitted_std_m(forecasts), name_of_folder(checkpoint)
+    if checkpoint == CONSTANT_VELOCITY:
+        return fitted_std_m(forecasts), "constant velocity (deployed)"
+    info = read_info(Path(checkpoint))
+    return info.std_m, MODEL_NAMES.get(info.model, "model")
 
 
 def _graph(episodes: Sequence[Episode]) -> GraphAccuracy | None:

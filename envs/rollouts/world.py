@@ -20,8 +20,9 @@ from envs.drivers.trained import (
     trained_driver,
     wrapper_options,
 )
+from envs.own_observation import without_added
 from envs.parallel import ForecastParallelEnv
-from envs.readers import multiagent_env_id
+from envs.readers import multiagent_env_id, outcome_keys
 from envs.readers.base import SceneReader
 from envs.readers.highway import is_highway_env
 from envs.readers.highway_labels import SceneLabels, read_labels
@@ -90,7 +91,7 @@ class EgoWorld:
         env_id: id in messages; None takes the environment's.
 
     Attributes:
-        crashed: whether the environment has reported a crash of the ego in this episode.
+        crashed: whether the environment has reported a crash of the ego in this episode; None if it reports none.
     """
 
     def __init__(self, env: SceneObservation | ForecastObservation, driver: str, env_id: str | None = None) -> None:
@@ -101,7 +102,8 @@ class EgoWorld:
         self._reader: SceneReader = env.get_wrapper_attr("reader")
         self._whole = driver.endswith(".zip") and sees_forecasts(driver)
         self.observation: dict[str, Any] = {}
-        self.crashed = False
+        self._keys = outcome_keys(env)
+        self.crashed: bool | None = None
 
     @property
     def spec(self) -> SceneSpec:
@@ -117,7 +119,7 @@ class EgoWorld:
         self._place.begin(seed)
         with named(self._id, self._place):
             self.observation, _ = self.env.reset(seed=seed)
-        self.crashed = False
+        self.crashed = None
         self._rng = driver_rng(seed)
         self._ego = make_ego_driver(self._name, self.env, self._rng)
 
@@ -134,7 +136,9 @@ class EgoWorld:
         self._place.move()
         with named(self._id, self._place):
             self.observation, _, terminated, truncated, info = self.env.step(self._ego(self._seen()))
-        self.crashed = self.crashed or bool(info.get("crashed", False))
+        crashed = self._keys.crashed(info)
+        if crashed is not None:
+            self.crashed = bool(self.crashed) or crashed
         return bool(terminated or truncated)
 
     def generators(self) -> list[np.random.Generator]:
@@ -171,7 +175,7 @@ class EgoWorld:
 
     def _seen(self) -> Any:
         """Returns the driver's observation: the env's own, or with forecasts."""
-        return self.observation if self._whole else self.observation["observation"]
+        return self.observation if self._whole else without_added(self.observation)
 
 
 class MultiagentWorld:
@@ -217,7 +221,7 @@ class MultiagentWorld:
         """
         seen = self._observations
         if not self._name.endswith(".zip"):
-            seen = {name: entries["observation"] for name, entries in seen.items()}
+            seen = {name: without_added(entries) for name, entries in seen.items()}
         self._place.move()
         with named(self._id, self._place):
             self._observations, *_ = self.env.step(self._driver(seen))

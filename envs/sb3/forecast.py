@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from envs.arms import Arm
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
 from envs.observation import ForecastStream, common_value, observe_ended, open_forecaster, require_scenes, scenes_from
+from envs.own_observation import own_part
 from envs.plans import PlanModel
 from envs.plans.batch import PLANS_INFO, PlanBatch, ask_for_plans
 from envs.readers import MakeReader
@@ -91,7 +92,7 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         num_plans = len(self.plan_names) if what_if else 0
         config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, num_plans=num_plans, arm=arm)
         self.stream: ForecastStream = ForecastStream(forecaster, spec, venv.num_envs, config)
-        self._layout = ObservationLayout(space["observation"], self.stream.spaces(), flatten)
+        self._layout = ObservationLayout(own_part(space), self.stream.spaces(), flatten)
         VecEnvWrapper.__init__(self, venv, observation_space=self._layout.space)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -113,7 +114,7 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         self.stream.reset()
         plans = PlanBatch.from_infos(self.venv.unwrapped.reset_infos) if self.plan_names else None
         entries = self.stream.observe(scenes_from(observations), plans=plans)
-        return self._layout.batch(observations["observation"], entries)
+        return self._layout.batch(observations, entries)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Steps; one batched forward serves running episodes, terminal observations and new episodes."""
@@ -125,8 +126,8 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         plans = self._plans(infos, ended) if self.plan_names else None
         entries, closing_entries = observe_ended(self.stream, observations, ended, closing, plans)
         for i, last, extra in zip(ended, closing, closing_entries, strict=True):
-            infos[i]["terminal_observation"] = self._layout.one(last["observation"], extra)
-        return self._layout.batch(observations["observation"], entries), rewards, dones, infos
+            infos[i]["terminal_observation"] = self._layout.one(last, extra)
+        return self._layout.batch(observations, entries), rewards, dones, infos
 
     def _plans(self, infos: list[dict[str, Any]], ended: NDArray[np.int64]) -> PlanBatch:
         """Returns the plans of a step, those of closing observations in their places; takes them out of the infos."""

@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from envs.arms import ARMS, Arm, EntryLayout
 from envs.sb3.algorithms import Algorithm, algorithm_class, algorithm_named, algorithm_of_parameters
 from predictor.checkpoint import CONSTANT_VELOCITY, WEIGHTS, resolve
+from predictor.own_forecasters import is_own
 from predictor.scene import MOST_AGENTS, SceneSpec
 from predictor.support.config_checks import check_at_least, check_at_most, check_choice, check_positive
 from predictor.support.errors import UserError
@@ -44,9 +45,9 @@ class ForecasterPin:
     """Forecaster that a policy was trained on, and the wrapper's options."""
 
     checkpoint: str
-    """Shipped name, folder, or "constant-velocity"."""
+    """Shipped name, folder, "constant-velocity", or the name of a user's own (`predictor.own_forecasters`)."""
     sha256: str | None
-    """SHA-256 of the weights (model.safetensors); None for constant velocity, which has none."""
+    """SHA-256 of the weights (model.safetensors); None for constant velocity and forecasters of a user's own."""
     horizon_steps: int
     """Number of steps forecast."""
     num_samples: int
@@ -127,7 +128,7 @@ def pin_forecaster(checkpoint: str, space: gym.spaces.Dict, spec: SceneSpec, arm
     """Returns the pin of a forecaster with the options of an observation space.
 
     Args:
-        checkpoint: shipped name, folder, or "constant-velocity".
+        checkpoint: shipped name, folder, "constant-velocity", or the name of a user's own.
         space: space of an observation with forecasts.
         spec: layout of the scenes that are forecast.
         arm: arm of the wrapper; None shows everything.
@@ -137,7 +138,7 @@ def pin_forecaster(checkpoint: str, space: gym.spaces.Dict, spec: SceneSpec, arm
     """
     shape = space["forecast"].shape or ()
     digest = None
-    if checkpoint != CONSTANT_VELOCITY:
+    if checkpoint != CONSTANT_VELOCITY and not is_own(checkpoint):
         with (resolve(checkpoint) / WEIGHTS).open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
     samples = shape[1] if len(shape) == 4 else 1

@@ -2,19 +2,19 @@
 
 It plays random episodes and looks at what no type shows: steps of another length, other units, mirrored or swapped
 axes, ids that are row numbers, change hands or come back, an ego that is not the first agent, reading that changes the
-environment. None of these raises an error by itself: a wrong id only makes forecasts worse, since memory follows ids.
+environment, observations that never change. None of these raises an error by itself: a wrong id only makes forecasts
+worse, since memory follows ids. `recorded_problems` is the part that needs scenes alone.
 """
 
 from typing import Any
 
 from envs.readers.base import MakeReader
 from envs.testing.ego import ego_problems, replay_problems
-from envs.testing.identity import identity_problems
-from envs.testing.motion import heading_problems, misfit_problems, motion_problems, scale_problems
 from envs.testing.playing import Episode, ReaderProblem, open_reader, play
+from envs.testing.recorded import observation_problems, recorded_problems, store_problems
 from predictor.support.errors import UserError
 
-__all__ = ["check_reader", "reader_problems"]
+__all__ = ["check_reader", "reader_problems", "recorded_problems", "store_problems"]
 
 
 def check_reader(
@@ -57,12 +57,7 @@ def reader_problems(
             played.append(play(env, opened, seed + number, max_steps))
     except ReaderProblem as error:
         return [str(error)]
-    spec = opened.spec
-    problems = motion_problems(played, spec)
-    if not problems:  # what the next ones would find may follow from it
-        heading = heading_problems(played) if spec.has_ego else []
-        problems = (heading + identity_problems(played, spec)) or misfit_problems(played, spec)
-    problems += scale_problems(played, spec)
-    if spec.has_ego:
+    problems = recorded_problems(played, opened.spec) + observation_problems(played)
+    if opened.spec.has_ego:
         problems += ego_problems(env, opened, seed)
     return problems + replay_problems(env, opened, seed)

@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from envs.testing.playing import Moment, OpenReader, begin, random_actions, step
+from envs.testing.playing import Moment, OpenReader, begin, frozen, random_actions, step
 from predictor.scene import SceneSpec
 
 SEEDS, MAX_ACTIONS, REPLAYED_STEPS = 3, 5, 10
@@ -93,8 +93,8 @@ def _seen(env: Any, opened: OpenReader | None, seed: int) -> list[Any]:
     for number in range(REPLAYED_STEPS):
         if opened is not None:
             opened.read(env)
-        shown, over = step(env, opened, act(number))
-        seen.append(shown)
+        *shown, over = step(env, opened, act(number))
+        seen.append(frozen(shown))
         if over:
             break
     return seen

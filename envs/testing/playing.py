@@ -1,6 +1,7 @@
 """Plays episodes with random actions and keeps what the reader reports of them."""
 
 from collections.abc import Callable, Iterator, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -45,6 +46,10 @@ class Episode:
 
     moments: list[Moment] = field(default_factory=list)
     """What the reader reported, from the reset on."""
+    shown: list[Mapping[str, Any]] = field(default_factory=list)
+    """Observations of each agent, by its name, from the reset on; of an ego, whose name is empty."""
+    rewards: list[Mapping[str, Any]] = field(default_factory=list)
+    """Rewards of each step, likewise."""
 
     def pairs(self) -> Iterator[tuple[Moment, Moment]]:
         """Yields each moment with the one that follows it."""
@@ -130,30 +135,29 @@ Act = Callable[[int], Any]
 """Takes the number of the step and returns the action."""
 
 
-def begin(env: Any, opened: OpenReader | None, seed: int) -> None:
-    """Resets the environment, and the reader if there is one."""
+def begin(env: Any, opened: OpenReader | None, seed: int) -> Any:
+    """Resets the environment, and the reader if there is one; returns the observation."""
     observation, _ = env.reset(seed=seed)
     if opened is not None:
         opened.reader.reset()
         show(opened.reader, observation)
+    return observation
 
 
-def step(env: Any, opened: OpenReader | None, action: Any) -> tuple[Any, bool]:
-    """Steps the environment; returns observation and reward, to be compared, and whether the episode is over."""
+def step(env: Any, opened: OpenReader | None, action: Any) -> tuple[Any, Any, bool]:
+    """Steps the environment; returns observation, reward, and whether the episode is over."""
     observation, reward, terminated, truncated, _ = env.step(action)
     if opened is not None:
         show(opened.reader, observation)
-    if isinstance(env, ParallelEnv):
-        return _frozen((observation, reward)), not env.agents
-    return _frozen((observation, reward)), bool(terminated or truncated)
+    return observation, reward, not env.agents if isinstance(env, ParallelEnv) else bool(terminated or truncated)
 
 
-def _frozen(seen: Any) -> Any:
+def frozen(seen: Any) -> Any:
     """Returns a value that is equal if what was seen is."""
     if isinstance(seen, Mapping):
-        return tuple((key, _frozen(value)) for key, value in seen.items())
+        return tuple((key, frozen(value)) for key, value in seen.items())
     if isinstance(seen, tuple | list):
-        return tuple(map(_frozen, seen))
+        return tuple(map(frozen, seen))
     return np.asarray(seen).tobytes()
 
 
@@ -175,10 +179,16 @@ def play(env: Any, opened: OpenReader, seed: int, max_steps: int) -> Episode:
         ReaderProblem: the reader breaks its contract.
     """
     episode, act = Episode(), random_actions(env, seed)
-    begin(env, opened, seed)
+
+    def by_agent(seen: Any) -> Mapping[str, Any]:
+        return deepcopy(dict(seen) if isinstance(env, ParallelEnv) else {"": seen})  # some write into old observations
+
+    episode.shown.append(by_agent(begin(env, opened, seed)))
     episode.moments.append(opened.read(env))
     for number in range(max_steps):
-        _, over = step(env, opened, act(number))
+        observation, reward, over = step(env, opened, act(number))
+        episode.shown.append(by_agent(observation))
+        episode.rewards.append(by_agent(reward))
         episode.moments.append(opened.read(env))
         if over:
             break

@@ -249,8 +249,17 @@ def test_how_likely_and_how_uncertain_a_future_is_are_read(key: str):
 
 
 def test_missing_observation_is_named():
-    with pytest.raises(UserError, match="needs a Dict with the key 'observation', got Dict\\('agents'"):
+    with pytest.raises(UserError, match="needs a Dict with the key 'observation', or .* got Dict\\('agents'"):
         ForecastAttention(make_space({"agents": (AGENTS, 4)}))
+
+
+def test_the_own_entries_of_a_dict_are_read_flattened():
+    shapes = {key: shape for key, shape in SHAPES.items() if key != "observation"} | {"goal": (2,), "table": (3, 4)}
+    extractor, observations = ForecastAttention(make_space(shapes)), make_observations({**shapes, "observation": (1,)})
+    features = extractor(observations)
+    own = torch.cat([observations["goal"], observations["table"].flatten(1)], dim=1)
+    torch.testing.assert_close(features[:, :14], own, rtol=0, atol=0)
+    assert features.shape[1] == extractor.features_dim == 14 + 64
 
 
 def test_scales_on_roads_are_those_of_the_default():

@@ -57,10 +57,10 @@ def test_crashes_that_are_never_reported_are_unknown_not_zero():
     mixed = Evaluation("toy-v0", 10, {"ppo": EPISODES, "silent": [silent]})
     lines = mixed.markdown().splitlines()
     assert lines[2].endswith("% (6–79 %) | 25.0 |")
-    assert lines[3] == "| silent | 2.00 | 5.0 | – | 20.0 |"
+    assert lines[3] == "| silent | 2.00 | 5.0 | not reported | 20.0 |"
     alone = Evaluation("toy-v0", 10, {"silent": [silent]}).markdown()
     assert "0 %" not in alone
-    assert "the environment reports no crashes" in alone
+    assert "crashes are not reported: name their key with --crash-key" in alone
 
 
 def test_the_caption_of_an_ego_explains_its_interval():
@@ -136,7 +136,7 @@ def test_success_is_a_column_where_it_is_reported():
     lines = evaluation.markdown().splitlines()
     assert lines[0] == "| policy | return | length | crash rate (95 %) | success rate (95 %) | speed [m/s] |"
     assert lines[2].endswith("| 33 % (6–79 %) | 33 % (6–79 %) | 25.0 |")
-    assert lines[3].endswith("| 33 % (6–79 %) | – | 25.0 |")
+    assert lines[3].endswith("| 33 % (6–79 %) | not reported | 25.0 |")
 
 
 @pytest.mark.parametrize("success", [None, True])

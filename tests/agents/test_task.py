@@ -184,6 +184,16 @@ def test_a_run_imports_only_what_the_command_line_names(foreign: str, observe: s
     assert foreign in sys.modules
 
 
+def test_a_run_imports_no_forecaster_that_the_command_line_does_not_name(foreign: str):
+    own = f"own:{foreign}:Road"
+    run = RUN | {"env_id": "merge-v1", "observe": "forecast", "checkpoint": own}
+    for trusted in (None, "highway", f"own:{foreign}:Other"):
+        with pytest.raises(UserError, match=f"forecaster '{own}' imports code; .* with --checkpoint {own}"):
+            task_of(run, trusted_forecaster=trusted)
+    assert foreign not in sys.modules
+    assert task_of(run, trusted_forecaster=own).checkpoint == own
+
+
 def test_arguments_of_a_run_name_no_foreign_class(foreign: str):
     """highway-env imports the class of other_vehicles_type, so a run's config must not choose it freely."""
     kwargs = {"config": {"other_vehicles_type": f"{foreign}.Road"}}

@@ -229,6 +229,8 @@ def test_models_follow_their_preset():
 def test_presets():
     assert preset_for("highway-fast-v0", "ppo") == PPOPreset()
     assert preset_for("merge-v1", "dqn") == DQNPreset()
+    assert preset_for("crossing_reader:Crossing-v0", "ppo").gamma == preset_for("Pendulum-v1", "sac").gamma == 0.99
+    assert preset_for("lane-keeping-v0", "ppo").gamma == preset_for("highway_env:parking-v0", "sac").gamma == 0.8
     assert preset_for("racetrack-oval-v1", "ppo").gamma == 0.9
     particles = preset_for("simple_tag_v3", "ppo")
     assert (particles.gamma, particles.n_steps) == (0.95, 25)  # type: ignore[union-attr]

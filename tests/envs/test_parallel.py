@@ -536,9 +536,10 @@ class Masked(BaseParallelWrapper):
         return gym.spaces.Dict({"observation": own, "action_mask": gym.spaces.MultiBinary(2)})
 
 
-def test_an_observation_with_an_action_mask_is_refused():
-    with pytest.raises(UserError, match=r"must be one array, but 'dies' of env 'toy_v0' gives a Dict; .*action mask"):
-        wrap(Masked(Toy()))
+def test_an_action_mask_stays_beside_the_forecasts():
+    env = wrap(Masked(Toy()))
+    assert {"observation", "action_mask", "forecast"} <= set(env.observation_space("dies").spaces)
+    assert "action_mask" not in env.observation_space("stays").spaces
 
 
 def test_an_aec_env_is_told_how_to_convert(monkeypatch: pytest.MonkeyPatch):

@@ -351,7 +351,7 @@ def test_id_without_a_checkpoint_is_named():
 def test_several_controlled_vehicles_are_named():
     env = make_env("intersection-multi-agent-v2")
     for wrapper, arguments in ((SceneObservation, ()), (ForecastObservation, ("constant-velocity",))):
-        with pytest.raises(UserError, match="own observation must be one array, got Tuple; apply .*FlattenObservation"):
+        with pytest.raises(UserError, match="must be one array or a Dict of arrays, got Tuple; .*FlattenObservation"):
             wrapper(env, *arguments)
 
 

@@ -206,6 +206,23 @@ class Shares(Smooth):
         return Futures(states, torch.full(states.shape[:3], 0.5))
 
 
+class TrainingMode(Smooth):
+    """Drops out inputs at random."""
+
+    def rollout(self, belief: Belief, *arguments: Any, **named: Any) -> Futures:
+        states = super().rollout(belief, *arguments, **named).states
+        return Futures(torch.nn.functional.dropout(states, 0.1, training=True))
+
+
+class Displacements(Smooth):
+    """Gives displacements from where each agent is."""
+
+    def rollout(self, belief: Belief, *arguments: Any, **named: Any) -> Futures:
+        states = super().rollout(belief, *arguments, **named).states
+        states[..., :2] -= belief.states[:, None, :, None, :2]
+        return Futures(states)
+
+
 class Fails(Smooth):
     def rollout(self, belief: Belief, *arguments: Any, **named: Any) -> Futures:
         raise IndexError("list index\nout of range")
@@ -243,6 +260,15 @@ MISTAKES: dict[str, tuple[Any, str]] = {
     "logits": (Logits, "observe: belief.edge_probs must be probabilities that sum to 1 over the types of each pair"),
     "normalised": (NormalisedStates, "observe: belief.states must be the observed states"),
     "mode_probs": (Shares, "rollout: mode_probs must sum to 1 over the samples of each agent"),
+    "training mode": (
+        TrainingMode,
+        "the single forecast differs from call to call; is the network in training",
+    ),
+    "displacements": (Displacements, "rollout: states hold displacements from where each agent is now; give positions"),
+    "one step": (
+        changed_rollout(lambda s: s[..., :1, :].expand(-1, -1, -1, s.shape[3], -1).clone()),
+        "rollout: all steps of a forecast are the same; step i is where an agent is i times dt_s later",
+    ),
     "error": (Fails, "rollout: failed with IndexError: list index out of range"),
     "class": (lambda: Smooth, "a forecaster is an object, got the class Smooth; call it first"),
     "no forecaster": (dict, "but dict has no spec, horizon_steps"),

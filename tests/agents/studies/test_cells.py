@@ -39,7 +39,7 @@ def test_what_determines_a_result_is_in_the_name(cells: Callable[..., list[Cell]
         ({"checkpoint_every": "99"}, trained),
         ({"episodes": "5"}, trained | drivers),
         ({"algorithms": "{ppo = {gamma = 0.7}}"}, trained),
-        ({"algorithms": "{ppo = {gamma = 0.8}}"}, set()),
+        ({"algorithms": "{ppo = {gamma = 0.99}}"}, set()),
     ):
         after = {cell.title: cell.name for cell in cells(**changes)}
         assert {title for title in before if after[title] != before[title]} == other, changes
@@ -60,7 +60,7 @@ def test_only_what_concerns_a_cell_is_in_its_name(cells: Callable[..., list[Cell
 def test_settings_of_an_algorithm_are_those_of_its_trainings(cells: Callable[..., list[Cell]]):
     found = cells(algorithms="{ppo = {gamma = 0.7, net_arch = [64]}, qrdqn = {}}", seeds="1")
     presets = {cell.algorithm: cell.plan.preset for cell in found if cell.plan is not None}
-    assert presets == {"ppo": PPOPreset(gamma=0.7, net_arch=(64,)), "qrdqn": QRDQNPreset()}
+    assert presets == {"ppo": PPOPreset(gamma=0.7, net_arch=(64,)), "qrdqn": QRDQNPreset(gamma=0.99)}
     versions = {cell.algorithm: set(cell.content["versions"]) for cell in found}
     assert versions["qrdqn"] - versions["ppo"] == {"sb3-contrib"}, "cells of other algorithms do not depend on it"
 

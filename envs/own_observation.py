@@ -1,0 +1,81 @@
+"""An environment's own observation among the entries that wrappers add: a Dict's own entries, or one for an array.
+
+An array (or a number) becomes the entry "observation". A Dict's entries stay as they are, beside those that are added;
+none may have the name of an added one.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+
+from envs.entries import FORECAST_KEYS, PATH_KEYS, SCENE_KEYS, UNCERTAINTY_KEYS, WHAT_IF_KEYS
+from predictor.support.errors import UserError
+
+OWN_KEY = "observation"
+"""Name of the entry that holds an environment's own observation where that is no Dict."""
+ADDED_KEYS = frozenset((*SCENE_KEYS, *FORECAST_KEYS, *PATH_KEYS, *UNCERTAINTY_KEYS, *WHAT_IF_KEYS))
+"""Names of all entries that wrappers can add."""
+_COMPOSED = (gym.spaces.Dict, gym.spaces.Tuple, gym.spaces.Graph, gym.spaces.Sequence, gym.spaces.OneOf)
+
+
+def own_spaces(space: gym.Space, source: str) -> dict[str, gym.Space]:
+    """Returns the entries that hold an environment's own observation, by name.
+
+    Args:
+        space: its own observation space.
+        source: name of the environment, for messages.
+
+    Raises:
+        UserError: the space is composed otherwise than as a flat Dict, or has an entry with the name of an added one.
+    """
+    if not isinstance(space, gym.spaces.Dict):
+        if isinstance(space, _COMPOSED):
+            raise UserError(
+                f"the own observation of {source} must be one array or a Dict of arrays, got {type(space).__name__}; "
+                "flatten it first, in gymnasium with FlattenObservation (gymnasium.wrappers)"
+            )
+        return {OWN_KEY: space}
+    for key, entry in space.spaces.items():
+        if isinstance(entry, _COMPOSED):
+            raise UserError(
+                f"the own observation of {source} must be a flat Dict, but its entry '{key}' is a "
+                f"{type(entry).__name__}; flatten it first, in gymnasium with FlattenObservation (gymnasium.wrappers)"
+            )
+        if key in ADDED_KEYS:
+            raise UserError(
+                f"the own observation of {source} has an entry '{key}', as forecasts have; rename it with a wrapper "
+                "around the environment, in gymnasium with TransformObservation"
+            )
+    return dict(space.spaces)
+
+
+def own_entries(observation: Any) -> dict[str, Any]:
+    """Returns an environment's own observation as entries, in a new dict."""
+    return dict(observation) if isinstance(observation, Mapping) else {OWN_KEY: observation}
+
+
+def own_part(space: gym.spaces.Dict) -> dict[str, gym.Space]:
+    """Returns the spaces of an environment's own entries, out of a space with added ones."""
+    return {key: entry for key, entry in space.spaces.items() if key not in ADDED_KEYS}
+
+
+def without_added(observation: Any) -> Any:
+    """Returns an environment's own observation, out of one with added entries; others as they are."""
+    if not isinstance(observation, Mapping):
+        return observation
+    own = {key: value for key, value in observation.items() if key not in ADDED_KEYS}
+    return own[OWN_KEY] if own.keys() == {OWN_KEY} else own
+
+
+def space_without_added(space: gym.Space) -> gym.Space:
+    """Returns the space of `without_added`."""
+    if not isinstance(space, gym.spaces.Dict):
+        return space
+    own = own_part(space)
+    return own[OWN_KEY] if own.keys() == {OWN_KEY} else gym.spaces.Dict(own)
+
+
+def carries_forecasts(space: gym.Space) -> bool:
+    """Returns whether observations of this space hold forecasts; flattened ones do not show it."""
+    return isinstance(space, gym.spaces.Dict) and all(key in space.spaces for key in FORECAST_KEYS)

@@ -1,0 +1,69 @@
+"""Environments and readers with planted mistakes, by name: `tests.envs.planted:units`."""
+
+from typing import Any
+
+import numpy as np
+
+from envs.readers import FunctionReader, register_reader
+from tests.envs.semantics import Swarm, read_crowd
+from tests.envs.testing.test_check_reader import MISTAKES, SPEC, Pushed, SwarmMistaken
+
+READERS = {name.replace(" ", "_"): reader for name, (reader, _) in MISTAKES.items()}
+"""Name of a reader, as it is written on a command line → reader."""
+
+
+def __getattr__(name: str) -> Any:
+    """Returns a reader by its name."""
+    if name not in READERS:
+        raise AttributeError(name)
+    return READERS[name]
+
+
+class Walk(Pushed):
+    """Crowd whose reader is right."""
+
+    def __init__(self) -> None:
+        super().__init__(shift_m=40.0)
+
+
+class Forgetful(Walk):
+    """Shows the first observation of an episode in every step."""
+
+    def reset(self, **options: Any) -> Any:
+        self.first, info = super().reset(**options)
+        return self.first, info
+
+    def step(self, action: Any) -> Any:
+        _, *others = super().step(action)
+        return self.first, *others
+
+
+class Broken(Walk):
+    """Shows infinity from the third step on."""
+
+    def step(self, action: Any) -> Any:
+        observation, *others = super().step(action)
+        return observation + (np.inf if self.time > 2 else 0.0), *others
+
+
+class Priceless(Walk):
+    """Gives a reward that is not a number."""
+
+    def step(self, action: Any) -> Any:
+        observation, _, *others = super().step(action)
+        return observation, float("nan"), *others
+
+
+class FastSwarm(Swarm):
+    """PettingZoo environment whose reader gives km/h."""
+
+    make_scene_reader = None
+
+
+register_reader(Walk, FunctionReader(read_crowd, SPEC))
+register_reader(FastSwarm, SwarmMistaken)
+
+
+def a_number() -> int:
+    """Returns no environment."""
+    return 3

@@ -1,0 +1,129 @@
+"""`dgvae check-env`: finds planted mistakes, one line each, and nothing where nothing is wrong."""
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envs import check
+from envs.check import CheckConfig, findings, with_option
+from envs.collect import CollectConfig, warnings_of
+from envs.testing import store_problems
+from predictor.data.store import Episode, StoreInfo
+from predictor.scene import Scene
+from predictor.support.errors import UserError, run_entry_point
+from tests.envs.semantics import read_crowd
+from tests.envs.testing.test_check_reader import MISTAKES, SPEC, Pushed, by_distance
+
+PLANTED = (
+    *("dt_s", "units", "centimetres", "mirrored axis", "swapped axes", "row numbers", "ids change hands"),
+    *("id returns", "id of the newcomer", "ego not first", "ego moves", "nan", "degrees", "old scene"),
+)
+
+
+@pytest.mark.parametrize("mistake", PLANTED)
+def test_each_planted_mistake_is_named_in_a_line(mistake: str):
+    config = CheckConfig("tests.envs.planted:Walk", f"tests.envs.planted:{mistake.replace(' ', '_')}")
+    found = findings(config)
+    assert any(MISTAKES[mistake][1] in line for line in found), found
+    assert all("\n" not in line for line in found)
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("Forgetful", "the environment's own observation never changes within an episode, although agents move"),
+        ("Broken", "the environment's own observation is not finite in step 3"),
+        ("Priceless", "the environment's own reward is not finite in step 1"),
+        ("FastSwarm", "velocities in km/h?"),
+    ],
+)
+def test_mistakes_of_the_environment_are_named_too(name: str, sentence: str):
+    found = findings(CheckConfig(f"tests.envs.planted:{name}"))
+    assert any(sentence in line for line in found), found
+
+
+@pytest.mark.parametrize("env_id", ["highway-fast-v0", "intersection-v2", "simple_tag_v3", "tests.envs.planted:Walk"])
+def test_nothing_is_found_where_nothing_is_wrong(env_id: str):
+    assert findings(CheckConfig(env_id, episodes=2, max_steps=15)) == []
+
+
+def test_the_command_ends_with_status_1_if_something_is_wrong(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    monkeypatch.setattr(sys, "argv", ["check", "tests.envs.planted:Broken", "--episodes", "1"])
+    with pytest.raises(SystemExit) as leaving:
+        run_entry_point(check.main)
+    assert leaving.value.code == 1
+    (line,) = capsys.readouterr().out.splitlines()
+    assert "not finite" in line
+    monkeypatch.setattr(sys, "argv", ["check", "--env-id", "tests.envs.planted:Walk", "--episodes", "2"])
+    run_entry_point(check.main)
+    assert capsys.readouterr().out == "nothing found in 2 episodes\n"
+
+
+@pytest.mark.parametrize(
+    ("config", "sentence"),
+    [
+        ({"env_id": "CartPole-v1"}, "no scene reader knows CartPoleEnv"),
+        ({"env_id": "nowhere:Env-v0"}, "cannot make env 'nowhere:Env-v0'"),
+        ({"env_id": "tests.envs.planted:a_number"}, "must give a gymnasium Env or a pettingzoo ParallelEnv, got int"),
+        ({"env_id": "tests.envs.planted:Walk", "env_kwargs": '{"size": 3}'}, "unexpected keyword argument 'size'"),
+        ({"env_id": "tests.envs.planted:Walk", "env_kwargs": "size=3"}, "--env-kwargs"),
+        ({"env_id": "tests.envs.planted:Walk", "reader": "tests.envs.planted:absent"}, "has no function or class"),
+    ],
+)
+def test_bad_values_end_in_one_line(config: dict[str, Any], sentence: str):
+    with pytest.raises(UserError, match=sentence):
+        findings(CheckConfig(**config))
+
+
+def test_the_environment_may_come_first():
+    assert with_option(["highway-v0", "--seed", "1"]) == ["--env-id", "highway-v0", "--seed", "1"]
+    assert with_option(["--env-id", "highway-v0"]) == ["--env-id", "highway-v0"]
+    assert with_option([]) == []
+
+
+def recorded(change: Callable[[Scene], Scene] = lambda scene: scene, episodes: int = 3) -> list[Episode]:
+    """Episodes of the crowd, as a collection stores them."""
+    found = []
+    for seed in range(episodes):
+        env = Pushed(shift_m=40.0)
+        env.reset(seed=seed)
+        scenes = [change(read_crowd(env))]
+        over = False
+        while not over:
+            *_, over, _ = env.step(env.np_random.uniform(-1, 1, 2))
+            scenes.append(change(read_crowd(env)))
+        found.append(Episode.from_scenes(scenes))
+    return found
+
+
+def row_numbers(scene: Scene) -> Scene:
+    rows = by_distance(scene)
+    return Scene(scene.states[rows], np.arange(len(rows)), scene.valid)
+
+
+def test_recordings_have_the_same_findings(monkeypatch: pytest.MonkeyPatch):
+    assert store_problems(recorded(), SPEC) == []
+    fast = recorded(lambda scene: replace(scene, states=scene.states * np.array([1, 1, 3.6, 3.6])))
+    assert "velocities in km/h?" in store_problems(fast, SPEC)[0]
+    assert "the ids are the row numbers" in store_problems(recorded(row_numbers), SPEC)[0]
+    lost = recorded(lambda scene: replace(scene, states=np.where(scene.states > 10, np.nan, scene.states)))
+    assert "states are not finite: id " in store_problems(lost, SPEC)[0]
+    assert store_problems([], SPEC) == []
+    monkeypatch.setattr("envs.testing.recorded.MOST_STATES", 1)
+    assert "velocities in km/h?" in store_problems([fast[0], lost[0]], SPEC)[0]  # the first episode alone
+
+
+def test_a_collection_warns_and_refuses_nothing(tmp_path: Path):
+    config = CollectConfig("Mine-v0", tmp_path / "store")
+    info = StoreInfo(replace(SPEC, dt_s=1.0), "Mine-v0")
+    first, *_, last = warnings_of(config, info, recorded())
+    assert "either a step lasts 0.5 s, not dt_s=1" in first and last.endswith("dgvae check-env Mine-v0")
+    assert warnings_of(config, StoreInfo(SPEC, "Mine-v0"), recorded()) == []
+    assert warnings_of(replace(config, perturb=0.5), info, recorded()) == []
