@@ -172,7 +172,10 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("absent --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
     ],
     "agents.study": [
-        ("--study absent", "no study 'absent': neither a file nor one that ships (foresight, quick)"),
+        (
+            "--study absent",
+            "no study 'absent': neither a file nor one that ships (foresight, foresight-fast, ",
+        ),
         ("--study file", "file is not valid TOML: "),
         ("--workers -1", "workers must not be negative, got -1"),
         ("--out file", "file is a file; choose another --out"),

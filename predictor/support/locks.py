@@ -26,15 +26,8 @@ def locked(folder: Path, what: str) -> Iterator[None]:
     Raises:
         UserError: another process holds it.
     """
-    made = not folder.exists()
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with _held_file(folder / LOCK_FILE, f"another {what} runs in {folder}", "--out"):
-            yield
-    finally:
-        if made:
-            with contextlib.suppress(OSError):
-                folder.rmdir()
+    with _made(folder), _held_file(folder / LOCK_FILE, f"another {what} runs in {folder}", "--out"):
+        yield
 
 
 @contextlib.contextmanager
@@ -44,9 +37,22 @@ def locked_path(path: Path) -> Iterator[None]:
     Raises:
         UserError: another process writes it.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with _held_file(path.with_name(f".{path.name}.lock"), f"another process writes {path}", "path"):
+    lock = path.with_name(f".{path.name}.lock")
+    with _made(path.parent), _held_file(lock, f"another process writes {path}", "path"):
         yield
+
+
+@contextlib.contextmanager
+def _made(folder: Path) -> Iterator[None]:
+    """Makes a folder and those above it; removes those that it made and that stay empty."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            for path in missing:  # the innermost first; one that is not empty ends it
+                path.rmdir()
 
 
 @contextlib.contextmanager
