@@ -1,9 +1,14 @@
 """Settings for every test; nothing of this project is imported here, so that the shape checks see each module first."""
 
 import os
+import signal
 from collections.abc import Iterator
 
 import pytest
+
+# A shell starts what runs in its background with Ctrl-C ignored, and every process of the tests would inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Processes that tests start have one thread too; read when torch and numpy are imported, in this process as well.
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
