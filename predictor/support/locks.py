@@ -66,11 +66,11 @@ def _held_file(file: Path, problem: str, other: str) -> Iterator[None]:
             _held[key] -= 1
         return
     descriptor = _taken(file, problem, other)
-    _held[key] = 1
     try:
+        _held[key] = 1
         yield
     finally:
-        del _held[key]
+        _held.pop(key, None)
         with contextlib.suppress(OSError):
             file.unlink()
         os.close(descriptor)
@@ -81,21 +81,27 @@ def _taken(file: Path, problem: str, other: str) -> int:
     while True:
         descriptor = os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            found = os.read(descriptor, 20).decode(errors="replace").strip() or "unknown"
+            _lock(descriptor, problem, other)
+            if _is_there(file, descriptor):
+                with contextlib.suppress(OSError):  # a full disk takes no number
+                    os.truncate(descriptor, 0)
+                    os.write(descriptor, str(os.getpid()).encode())
+                return descriptor
+        except BaseException:  # Ctrl-C, too: a lock that is left behind would refuse this process itself
             os.close(descriptor)
-            raise UserError(f"{problem} (process {found}); wait for its end or choose another {other}") from error
-        except OSError as error:
-            if error.errno not in _NO_LOCKS:
-                os.close(descriptor)
-                raise
-        if _is_there(file, descriptor):
-            with contextlib.suppress(OSError):  # a full disk takes no number
-                os.truncate(descriptor, 0)
-                os.write(descriptor, str(os.getpid()).encode())
-            return descriptor
+            raise
         os.close(descriptor)
+
+
+def _lock(descriptor: int, problem: str, other: str) -> None:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        found = os.read(descriptor, 20).decode(errors="replace").strip() or "unknown"
+        raise UserError(f"{problem} (process {found}); wait for its end or choose another {other}") from error
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
 
 
 def _is_there(file: Path, descriptor: int) -> bool:

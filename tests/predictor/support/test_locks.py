@@ -52,3 +52,17 @@ def test_a_folder_with_content_stays(tmp_path: Path):
     with locked(tmp_path / "run", "training"):
         (tmp_path / "run" / "a").touch()
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["a"]
+
+
+def test_ctrl_c_while_a_lock_is_taken_leaves_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Else what is written on the way out would wait for this very process."""
+
+    def interrupt(*_: object) -> int:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("predictor.support.locks.os.write", interrupt)
+        with pytest.raises(KeyboardInterrupt), locked_path(tmp_path / "store"):
+            raise AssertionError
+    with locked_path(tmp_path / "store"):
+        pass
