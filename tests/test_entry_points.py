@@ -185,6 +185,8 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--env-id nope-v0", "cannot make env 'nope-v0'"),
         ("--algorithm sac", "sac needs a continuous action space, highway-fast-v0 has Discrete(5); use ppo"),
         ("--algorithm sarsa", "invalid choice 'sarsa' for argument '--algorithm'"),
+        ("--num-envs 100000000000", "num_envs=100,000,000,000 needs at least "),
+        ("--episodes 1000000000000", "episodes=1,000,000,000,000 needs at least "),
         ("--trials 0", "trials must be at least 1, got 0"),
         ("--seed -1", "seed must lie in [0, 1000000), got -1"),
         ("--trainings 101", "trainings must be at most 100, got 101"),

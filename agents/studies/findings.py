@@ -138,13 +138,15 @@ class Findings:
     def pairs(self, scenarios: Sequence[str]) -> list[Pair]:
         """Compares every arm with every rival, under each algorithm, over scenarios in which both have results.
 
-        Over several scenarios scores are rescaled (`scaled_runs`); over one they are returns.
+        Two rivals are compared once, with the one that comes first. Over several scenarios scores are rescaled
+        (`scaled_runs`); over one they are returns.
         """
-        found = []
-        for rival in self.study.compared_with:
+        found: list[Pair] = []
+        for place, rival in enumerate(self.study.compared_with):
             for ours in self.lines(trained=True):
                 other = Line(rival, ours.algorithm)
-                if ours != other and all((s, x) in self.results for s in scenarios for x in (ours, other)):
+                done = ours.arm in self.study.compared_with[: place + 1]
+                if not done and all((s, x) in self.results for s in scenarios for x in (ours, other)):
                     found.append(self._pair(ours, other, scenarios))
         return found
 

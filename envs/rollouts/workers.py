@@ -224,6 +224,7 @@ def _work(play: Callable[[Any], Any], pipe: Connection, numbers: Any) -> None:
 
 
 def _play_all(play: Callable[[Any], Any], pipe: Connection, place: Place) -> None:
+    """Plays tasks; results are pickled here, since torch's way through a pipe leaves tensors in this process."""
     pipe.send_bytes(pickle.dumps(_Ready()))
     while True:
         try:

@@ -10,16 +10,15 @@ import random
 import shutil
 import subprocess
 import sys
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
-from tests.storm.kills import Counts, Name
+from tests.storm.all_commands import LOG, NAMES, Counts, Name, try_all
 from tests.storm.running import finish, orphans, start
-from tests.storm.subjects import SUBJECTS, Subject, make_inputs
+from tests.storm.subjects import Subject
 
 INSIDE = "STORM_INSIDE"
 ROOM = "512m"
@@ -34,7 +33,7 @@ class FullDiskConfig:
 
     points: int = 10
     """Number of times that a disk is full, spread over the commands in turn."""
-    only: tuple[Name, ...] = ("train", "policy", "collect", "suite", "study")
+    only: tuple[Name, ...] = NAMES
     """Commands to try."""
     seed: int = 0
     """Random seed of the places."""
@@ -46,9 +45,17 @@ class FullDiskConfig:
 
 def storm(name: str, subject: Subject, points: int, folder: Path, rng: random.Random) -> Counts:
     """Fills the disk of one command several times; returns what was counted (kills are full disks)."""
-    counts, disk, log = Counts(), folder / "disk", folder / "full.log"
-    words = subject.words(folder / "inputs", disk)
+    disk = folder / "disk"
     _mount(disk, ROOM)
+    try:
+        return _fill(name, subject, points, folder, rng)
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+def _fill(name: str, subject: Subject, points: int, folder: Path, rng: random.Random) -> Counts:
+    counts, disk, log = Counts(), folder / "disk", folder / LOG
+    words = subject.words(folder / "inputs", disk)
     if finish(start(words, folder / "peace.log")):
         raise UserError(f"{name} fails in peace: {(folder / 'peace.log').read_text()[-2000:]}")
     expected, used = subject.results(disk), _used(disk)
@@ -97,22 +104,7 @@ def main() -> None:
     if INSIDE not in os.environ:
         words = ["unshare", "--map-root-user", "--mount", sys.executable, "-m", "tests.storm.full_disk", *sys.argv[1:]]
         os.execvpe("unshare", words, os.environ | {INSIDE: "1"})
-    rng, all_good = random.Random(config.seed), True
-    for place, name in enumerate(config.only):
-        points = config.points // len(config.only) + (place < config.points % len(config.only))
-        if not points:
-            continue
-        with tempfile.TemporaryDirectory(prefix="storm-", ignore_cleanup_errors=True) as folder:
-            make_inputs(Path(folder) / "inputs")
-            counts = storm(name, SUBJECTS[name], points, Path(folder), rng)
-            log = (Path(folder) / "full.log").read_text(errors="replace")
-            subprocess.run(["umount", f"{folder}/disk"], check=True)
-        print(f"{name}: {counts}", flush=True)
-        if not counts.is_good:
-            print(log[-6000:], file=sys.stderr)
-        all_good = all_good and counts.is_good
-    if not all_good:
-        raise UserError("the storm found damage; see above")
+    try_all(storm, config.only, config.points, config.seed)
 
 
 if __name__ == "__main__":

@@ -65,6 +65,8 @@ def test_pairs_are_those_with_the_rivals():
     assert (seen.ours, seen.rival, oracle.ours) == (SEEN, ZEROS, ORACLE)
     assert seen.probability == (1.0, 1.0, 1.0) and seen.gain.value == 3.0
     assert found_in(study(rivals=()), results()).pairs(["one"]) == []
+    two = found_in(study(rivals=("zeros", "forecast")), results()).pairs(["one"])
+    assert [(pair.ours, pair.rival) for pair in two] == [(SEEN, ZEROS), (ORACLE, ZEROS), (ORACLE, SEEN)]
 
 
 def test_references_are_told_apart():

@@ -22,6 +22,7 @@ from envs.simulators.envpool import (  # noqa: E402
     ENV_IDS,
     HIGHWAY_ENV_OF,
     EnvPoolEnv,
+    begins_alike,
     known_tasks,
     make_pool,
     register_envpool_ids,
@@ -94,6 +95,17 @@ def test_sb3_accepts(env_id: str):
 
 def test_every_task_has_one_id():
     assert sorted(ENV_IDS.values()) == sorted(HIGHWAY_ENV_OF)
+
+
+def test_what_only_a_later_release_has_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("envs.simulators.envpool.envpool_release", lambda: (1, 2, 5))
+    with pytest.raises(UserError, match=r"EnvPool 1\.2\.\d+ has no Merge-v1; install 1\.2\.7 or later"):
+        make_pool("Merge-v1", [0])
+    with pytest.raises(UserError, match="no EnvPool task 'Merge-v9' is known here; known: Highway-v0, HighwayFast"):
+        make_pool("Merge-v9", [0])
+    assert begins_alike("Exit-v0") and not begins_alike("HighwayFast-v0")
+    monkeypatch.setattr("envs.simulators.envpool.envpool_release", lambda: (1, 2, 7))
+    assert not begins_alike("Exit-v0")
 
 
 def test_ids_are_declared_without_envpool():
