@@ -3,11 +3,13 @@ TEST_JOBS ?= 2
 DOCS_JOBS ?= 16
 KILLS ?= 10
 POINTS ?= 10
-EXTRAS ?= core scores envs rl study contrib tune envpool
+SOAK_STEPS ?= 1000000
+FUZZ_SECONDS ?= 300
+EXTRAS ?= core scores envs rl study contrib tune hub ray envpool
 RUN_DIR ?= runs/highway-fast-ppo
 
 .DEFAULT_GOAL := help
-.PHONY: help .venv train test test-shapes storm check docs docs-check install-check bench bench-check clean
+.PHONY: help .venv train test test-shapes test-cluster storm soak sbom fuzz check docs docs-check install-check bench bench-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[.a-z-]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -30,14 +32,30 @@ train: .venv/.package ## train a policy on highway-fast-v0 into RUN_DIR (continu
 SHAPES = --jaxtyping-packages=envs,predictor,agents,beartype.beartype
 
 test: .venv/.tools ## run the tests, TEST_JOBS at a time; TEST_ARGS are pytest's
-	.venv/bin/python -m pytest -n $(TEST_JOBS) $(TEST_ARGS)
+	.venv/bin/python -m pytest -n $(TEST_JOBS) --dist worksteal $(TEST_ARGS)
+
+test-cluster: .venv/.tools ## run the tests on a Ray cluster of three nodes on this machine: two minutes
+	.venv/bin/python -m pip install -q -c constraints.txt -e '.[all,ray]'
+	.venv/bin/python -m pytest -m cluster tests/test_cluster.py
 
 test-shapes: .venv/.tools ## run the tests with shapes and types of every call checked: takes twice as long
 	$(MAKE) test TEST_ARGS="$(SHAPES)"
 
-storm: .venv/.tools ## kill the commands at random moments, and let them run out of disk: KILLS and POINTS times
+storm: .venv/.tools ## kill the commands at random moments, fill their disks (KILLS and POINTS times), try all bad inputs
 	.venv/bin/python -m tests.storm.kills --kills $(KILLS)
 	.venv/bin/python -m tests.storm.full_disk --points $(POINTS)
+	.venv/bin/python -W ignore -m tests.hostile.all
+
+fuzz: .venv/.tools ## fuzz what is read from files, each kind for FUZZ_SECONDS (Linux)
+	.venv/bin/python -m pip install -q -c constraints.txt -e '.[all,fuzz]'
+	for entry in json toml csv amc tracks texts safetensors store zip; do \
+		.venv/bin/python -m tests.fuzz $$entry --seconds $(FUZZ_SECONDS) || exit 1; done
+
+sbom: .venv/.tools ## write the bill of materials of the pinned packages, build/sbom.json; fails if a known weakness is among them
+	.venv/bin/python .ci/sbom.py
+
+soak: .venv/.tools ## step vector environments with forecasts SOAK_STEPS times each, and check that nothing grows: about an hour
+	.venv/bin/python -m tests.storm.soak --steps $(SOAK_STEPS)
 
 check: .venv/.tools ## lint, formatting, types, who may import whom, the shape of the tree, the examples in docstrings
 	.venv/bin/ruff check .
@@ -45,6 +63,7 @@ check: .venv/.tools ## lint, formatting, types, who may import whom, the shape o
 	.venv/bin/mypy
 	.venv/bin/lint-imports
 	.venv/bin/python -m docs.write_tables --check
+	.venv/bin/python .ci/sbom.py --only-check
 	.venv/bin/python -m pytest -q -o addopts=--import-mode=importlib --doctest-modules \
 		predictor envs agents dgvae_rl benchmarks train_policy.py tests/test_structure.py
 

@@ -303,9 +303,11 @@ def main() -> int:
     except DocsError as error:
         print(error)
         return 1
-    failed, skipped = sum(bool(r.error) for r in results), sum(bool(r.block.skipped) for r in results)
-    ran, seconds = len(results) - failed - skipped, sum(result.seconds for result in results)
-    print(f"{len(results)} blocks in {seconds:.0f} s: {ran} ran, {skipped} skipped, {failed} failed")
+    failed, skipped = [r for r in results if r.error], sum(bool(r.block.skipped) for r in results)
+    ran, seconds = len(results) - len(failed) - skipped, sum(result.seconds for result in results)
+    print(f"{len(results)} blocks in {seconds:.0f} s: {ran} ran, {skipped} skipped, {len(failed)} failed")
+    for result in failed:  # again, where the end of a log is read
+        print(result)
     return 1 if failed or not results else 0
 
 

@@ -62,6 +62,14 @@ except UserError as error:
 else:
     raise SystemExit("planned a training with sb3-contrib, which is not installed")
 """
+ON_A_CLUSTER = """
+import ray
+from predictor.support.cluster import connected
+ray.init(num_cpus=1, include_dashboard=False, object_store_memory=80_000_000)
+with connected("auto", ("numpy", "torch")) as cluster:
+    found = sorted(cluster.results(bool, [0, 1, 2]))
+assert found == [(0, False), (1, True), (2, True)], found
+"""
 
 
 @dataclass(frozen=True)
@@ -132,6 +140,15 @@ EXTRAS: dict[str, Extra] = {
         ),
         absent=("envpool", "sb3_contrib"),
     ),
+    "hub": Extra(
+        (
+            "\nimport os\n\nos.environ['HF_ENDPOINT'] = 'http://127.0.0.1:9'\n"
+            "from predictor import UserError, from_hub\n"
+            "try:\n    from_hub('owner/name')\nexcept UserError as error:\n    assert 'cannot reach' in str(error)\n",
+        ),
+        absent=("gymnasium", "stable_baselines3"),
+    ),
+    "ray": Extra((ON_A_CLUSTER,), absent=("gymnasium",)),
     "envpool": Extra((WRAPPED.format(env_id="envpool/HighwayFast-v0"), "\nfrom envs import EnvPoolVecEnv\n")),
 }
 """Extras by name; "core" is the package alone."""

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.arena import EgoArena, open_arena
@@ -26,12 +25,15 @@ from agents.runs import POLICY_FILE, load_model, read_config
 from agents.summaries import EXTREMES
 from agents.task import EVALUATION_SEED, Task, task_of
 from envs.drivers.ego import CONSTANT_ACTIONS, constant_actions, make_ego_driver, named_drivers
+from envs.registry import arguments_of
 from envs.sb3.policy_file import read_policy_note
 from envs.supervision import TIMEOUT_S
 from predictor.support.command_line import Renamed, parse
-from predictor.support.config_checks import check_at_least
+from predictor.support.config_checks import check_at_least, check_positive
 from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import check_out
 from predictor.support.memory import check_count, check_processes
+from predictor.support.progress import WorkShown
 from predictor.support.runtime import keep_freed_memory, resolve_device
 
 NO_DRIVERS = "none"
@@ -70,7 +72,7 @@ def evaluate_policy_on_seeds(
                 results[baseline] = arena.play(baseline, seeds, on_episode)
     finally:
         arena.close()
-    return Evaluation(task.env_id, first_seed, results, has_ego=not task.is_multiagent)
+    return Evaluation(task.env_id, first_seed, results, not task.is_multiagent, task.env_kwargs)
 
 
 def evaluate_with_progress(
@@ -83,13 +85,9 @@ def evaluate_with_progress(
     drivers: Sequence[str] = (),
 ) -> Evaluation:
     """Runs `evaluate_policy_on_seeds` with a progress bar."""
-    columns = (TextColumn(f"evaluate {task.env_id}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns) as progress:
-        policies = {name, *drivers, *EgoArena.baselines}  # an arena without an ego has as many baselines
-        bar = progress.add_task("", total=num_episodes * len(policies))
-        return evaluate_policy_on_seeds(
-            task, model, name, num_episodes, num_envs, first_seed, lambda: progress.advance(bar), drivers
-        )
+    policies = {name, *drivers, *EgoArena.baselines}  # an arena without an ego has as many baselines
+    with WorkShown(f"evaluate {task.env_id}", num_episodes * len(policies)) as shown:
+        return evaluate_policy_on_seeds(task, model, name, num_episodes, num_envs, first_seed, shown.advance, drivers)
 
 
 @dataclass(frozen=True)
@@ -104,6 +102,9 @@ class EvaluateConfig:
     env_id: str | None = None
     """Environment of --policy; a training run has its own. Where a run's imports code ("module:Id"), name it here as
     well, if you trust it: the run's config alone imports nothing."""
+    env_kwargs: str | None = None
+    """Arguments of the environment as a JSON object, for example '{"config": {"vehicles_density": 2}}'. None takes
+    those of the training run; others measure its policy in a changed environment."""
     checkpoint: str | None = None
     """Forecaster of a training run that imports code (own:module:function): name it here, if you trust it; other runs
     have their own."""
@@ -141,6 +142,7 @@ class EvaluateConfig:
             UserError: a value is out of range, or the device is not available.
         """
         check_at_least(self, 1, "episodes", "num_envs")
+        check_positive(self, "timeout_s")
         check_count(self.episodes, "episodes")
         check_processes(min(self.num_envs, self.episodes), "num_envs")
         if (self.run_dir is None) == (self.policy is None):
@@ -158,6 +160,7 @@ class EvaluateConfig:
         if self.films and self.episodes < len(EXTREMES):
             raise UserError(f"--films needs at least {len(EXTREMES)} --episodes, got {self.episodes}")
         check_at_least(self, 0, "seed")
+        arguments_of(self.env_kwargs or "")
         object.__setattr__(self, "device", resolve_device(self.device))
 
 
@@ -167,8 +170,7 @@ def main() -> None:
     torch.set_num_threads(1)  # small networks; the environments' processes fill the cores
     config = parse(EvaluateConfig, __doc__)
     out = config.out or (config.run_dir or Path()) / "evaluation"
-    if out.is_file():
-        raise UserError(f"{out} is a file; choose another --out")
+    check_out(out)
     evaluation, noted = _of_driver(config) if config.run_dir is None else _of_run(config, config.run_dir)
     out.mkdir(parents=True, exist_ok=True)
     evaluation.write(out, **noted)
@@ -192,7 +194,7 @@ def _of_driver(config: EvaluateConfig) -> tuple[Evaluation, dict[str, str]]:
     assert config.policy is not None and config.env_id is not None
     task = Task(
         config.env_id, "none", device=config.device, timeout_s=config.timeout_s, crash_key=config.crash_key,
-        success_key=config.success_key,
+        success_key=config.success_key, env_kwargs=config.env_kwargs or "",
     )  # fmt: skip
     task.check()
     checked_drivers(task, (config.policy,))
@@ -258,8 +260,7 @@ def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str
             "it out"
         )
     task = replace(task, timeout_s=config.timeout_s)
-    named: dict[str, Any] = {"crash_key": config.crash_key, "success_key": config.success_key}
-    task = replace(task, **{name: key for name, key in named.items() if key is not None})
+    task = _changed(task, config)
     if config.env_id not in (None, task.env_id):
         raise UserError(f"run {run_dir} was trained on {task.env_id}, got --env-id {config.env_id}; leave it out")
     task.check()
@@ -277,13 +278,19 @@ def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str
     return evaluation, {"algorithm": run["algorithm"], "observe": run["observe"]}
 
 
+def _changed(task: Task, config: EvaluateConfig) -> Task:
+    """Returns the task of a run with what the command says otherwise."""
+    given: dict[str, Any] = {name: getattr(config, name) for name in ("crash_key", "success_key", "env_kwargs")}
+    return replace(task, **{name: value for name, value in given.items() if value is not None})
+
+
 def _film(config: EvaluateConfig, run_dir: Path, evaluation: Evaluation, out: Path) -> dict[str, dict[str, Any]]:
     """Films episodes of the trained policy, which is the first of the evaluation; returns what the films show."""
     from agents.video import film_extremes  # films alone need a video encoder
 
     run, episodes = read_config(run_dir), next(iter(evaluation.results.values()))
     model = load_model(run_dir / POLICY_FILE, run["algorithm"])
-    task = task_of(run, config.device, config.env_id, config.checkpoint)
+    task = _changed(task_of(run, config.device, config.env_id, config.checkpoint), config)
     films = film_extremes(task, model, episodes, out)
     names = ", ".join(film["file"] for film in films.values())
     Console().print(f"films: {names or 'none, only highway-env and PettingZoo environments are drawn'}")

@@ -14,7 +14,8 @@ from pettingzoo import ParallelEnv
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.arena import actions_of_others
-from agents.runs import CONFIG_FILE, POLICY_FILE, read_config
+from agents.hub import local_policy
+from agents.runs import CONFIG_FILE, policy_zip, read_config
 from agents.task import Task, task_of
 from agents.vec_envs import DrivenEnv, own_observations
 from envs.drivers.trained import env_for_driver, wrapper_options
@@ -98,7 +99,12 @@ class LoadedPolicy(NamedTuple):
 
 
 def load_policy(
-    path: str | Path, env: Any = None, *, device: str = "cpu", render_mode: str | None = None
+    path: str | Path,
+    env: Any = None,
+    *,
+    device: str = "cpu",
+    render_mode: str | None = None,
+    trust_pickle: bool = False,
 ) -> LoadedPolicy:
     """Loads a policy and makes its environment.
 
@@ -110,15 +116,18 @@ def load_policy(
     The zip holds pickled Python objects, and loading it runs their code: load only policies whose source you trust.
 
     Args:
-        path: run folder of train_policy.py, or a policy's ``.zip``.
+        path: run folder of train_policy.py, a policy's ``.zip``, or "hub:owner/name" (`agents.hub`).
         env: environment without forecasts, to take instead of a new one; for zips that do not name theirs.
         device: device of the policy's network.
         render_mode: render mode of the new environment ("human", "rgb_array").
+        trust_pickle: whether you trust everyone who can write to a repository on a hub; without it nothing is
+            downloaded from there.
 
     Raises:
-        UserError: no policy there, a policy that does not name its environment, or one that was trained on other
-            observations or another forecaster.
+        UserError: no policy there, one on a hub without `trust_pickle`, a policy that does not name its environment,
+            or one that was trained on other observations or another forecaster.
     """
+    path = local_policy(path, trust_pickle)
     zipped = policy_zip(path)
     note = read_policy_note(zipped)
     model = policy_file.load_policy(zipped, device=device)
@@ -133,36 +142,21 @@ def load_policy(
     return LoadedPolicy(TrainedPolicy(model, env), env)
 
 
-def policy_zip(path: str | Path) -> Path:
-    """Returns the zip of a policy: the file itself, or the final policy of a run folder.
-
-    Raises:
-        UserError: there is none; the message says what is there instead.
-    """
-    path = Path(path)
-    if path.is_file():
-        return path
-    if not path.is_dir():
-        raise UserError(f"no policy at {path}: neither a run folder nor a .zip; train one with train_policy.py")
-    if (path / POLICY_FILE).is_file():
-        return path / POLICY_FILE
-    read_config(path)
-    raise UserError(
-        f"{path} holds no {POLICY_FILE}: its training has not ended; continue it with --resume, or name one of its "
-        ".zip files"
-    )
-
-
 def task_of_policy(path: str | Path, device: str = "cpu") -> Task:
     """Returns the task of a policy, by the note inside its zip or the config of its run folder.
+
+    Code of a user's own (an environment "module:Id", a forecaster "own:module:name") is imported if the zip names it,
+    which is as trusted as code; the config alone imports nothing.
 
     Raises:
         UserError: neither names an environment, or this version cannot make it.
     """
     zipped = policy_zip(path)
-    if (zipped.parent / CONFIG_FILE).is_file():
-        return task_of(read_config(zipped.parent), device)
     note = read_policy_note(zipped)
+    if (zipped.parent / CONFIG_FILE).is_file():
+        pin = None if note is None else note.forecaster
+        named = (None if note is None else note.env_id, None if pin is None else pin.checkpoint)
+        return task_of(read_config(zipped.parent), device, *named)
     if note is None or not note.env_id:
         policy_file.algorithm_of(zipped)  # has the message for what is no policy at all
         raise UserError(f"{zipped} does not say which environment it drives; pass env=, or the run folder it is from")

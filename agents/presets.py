@@ -12,8 +12,9 @@ from agents.task import Backend
 from envs.readers.mpe import MPE_IDS
 from envs.registry import is_foreign_id, is_multiagent_id
 from envs.sb3.algorithms import Algorithm
-from predictor.support.config_checks import check_at_least, check_choices, check_positive
+from predictor.support.config_checks import MOST_WIDTH, check_at_least, check_at_most, check_choices, check_positive
 from predictor.support.errors import UserError
+from predictor.support.memory import check_memory
 
 _COUNTS = (
     *("n_steps", "batch_size", "n_epochs", "buffer_size", "train_freq", "target_update_interval", "net_arch"),
@@ -21,6 +22,10 @@ _COUNTS = (
 )
 _AMOUNTS = ("learning_starts", "ent_coef", "top_quantiles_to_drop_per_net", "gamma", "gae_lambda", "vf_coef")
 _POSITIVE = ("learning_rate", "tau", "exploration_fraction", "target_kl")
+_WIDTHS = ("net_arch", "lstm_hidden_size", "n_quantiles")
+_KEPT = ("n_steps", "buffer_size", "batch_size")
+STEP_BYTES = 32
+"""Least memory of a step that is kept: an observation of one number, action, reward, value and end."""
 _SHARES = ("gamma", "gae_lambda", "tau", "exploration_fraction", "exploration_final_eps")
 
 
@@ -47,6 +52,10 @@ class Preset:
         check_at_least(self, 1, *(name for name in _COUNTS if name in names))
         check_at_least(self, 0, *(name for name in _AMOUNTS if name in names and not isinstance(names[name], str)))
         check_positive(self, *(name for name in _POSITIVE if name in names))
+        check_at_most(self, MOST_WIDTH, *(name for name in _WIDTHS if name in names))
+        for name in _KEPT:
+            kept = names.get(name, 0)
+            check_memory(kept * STEP_BYTES, f"{name}={kept:,}", f"choose a smaller {name}")
         for name in _SHARES:
             if name in names and not 0 <= names[name] <= 1:
                 raise UserError(f"{name} must lie in [0, 1], got {names[name]}")

@@ -5,20 +5,25 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.markup import escape
 from rich.table import Table
 
 from agents.differences import DRAWS, reference_policy, return_differences
 from agents.episode_file import write_episodes
+from agents.runs import SUMMARY_FILE
 from agents.summaries import PolicySummary, summarize
 from agents.vec_envs import EpisodeResult
+from envs.registry import name_with
 from envs.rollouts.driving_measures import HARD_BRAKING_MPS2, LONGEST_S
 from predictor.evaluation.standard_errors import Estimate
 from predictor.support import markdown
+from predictor.support.errors import UserError, short
 from predictor.support.files import finite, write_json, write_text
 from predictor.support.provenance import provenance
+from predictor.support.reading import read_object
+from predictor.support.typed_values import converted, from_table
 
 NEARLY_CONSTANT = 0.95
 """Least share of one action from which on a policy is called nearly constant."""
@@ -27,6 +32,8 @@ PACKAGES = (
     *("torch", "numpy"),
 )
 """Packages whose versions the provenance names."""
+MOST_EPISODES = 10_000
+"""Largest number of episodes of a policy in a summary.json that is read."""
 NOT_REPORTED = "not reported"
 """Cell of a rate of which an environment says nothing."""
 
@@ -43,6 +50,13 @@ class Evaluation:
     """Results of the episodes, by policy."""
     has_ego: bool = True
     """Whether one agent is driven: the table then has its crash rate and speed, if the env reports them."""
+    env_kwargs: str = ""
+    """Arguments of the environment, as the text of a JSON object; empty if it had none."""
+
+    @property
+    def env(self) -> str:
+        """Id of the environment, with its arguments where it had some."""
+        return name_with(self.env_id, self.env_kwargs)
 
     @property
     def summaries(self) -> list[PolicySummary]:
@@ -73,7 +87,9 @@ class Evaluation:
         """Writes ``summary.json`` (with every episode and the provenance), ``summary.md`` and ``episodes.parquet``."""
         content = {
             "env_id": self.env_id,
+            "env_kwargs": self.env_kwargs,
             "first_seed": self.first_seed,
+            "has_ego": self.has_ego,
             **extra,
             "policies": [asdict(summary) for summary in self.summaries],
             "differences": {
@@ -83,28 +99,29 @@ class Evaluation:
             "episodes": {name: [asdict(e) for e in found] for name, found in self.results.items()},
             "provenance": provenance(PACKAGES),
         }
-        write_json(folder / "summary.json", finite(content))
+        write_json(folder / SUMMARY_FILE, finite(content))
         write_text(folder / "summary.md", self.markdown())
         write_episodes(folder, self.results)
 
+    @property
+    def parts(self) -> list["TablePart"]:
+        """All tables: returns, driving, and paired differences."""
+        summaries = self.summaries
+        returns = _returns(summaries, self.has_ego, intervals=True)
+        parts = [TablePart(*returns, f"{self.env}: {self._caption()}"), *self._driving(summaries), *self._compared()]
+        return [*parts, TablePart([], [], self.constant_policies)] if self.constant_policies else parts
+
     def markdown(self) -> str:
         """Returns all tables as Markdown: returns, driving, and paired differences."""
-        summaries = self.summaries
-        paragraphs = [
-            markdown.table(*_returns(summaries, self.has_ego, intervals=True)),
-            f"{self.env_id}: {self._caption()}",
-            *self._driving(summaries),
-            *self._compared(),
-            self.constant_policies,
-        ]
-        return "\n\n".join(filter(None, paragraphs)) + "\n"
+        paragraphs = [p for part in self.parts for p in (part.headings and markdown.table(*part[:2]), part.told) if p]
+        return "\n\n".join(paragraphs) + "\n"
 
     def table(self) -> Table:
         """Returns the table of returns for a terminal; with a column of success, rates have no intervals there."""
         summaries = self.summaries
         intervals = not _has_success(summaries)
         header, lines = _returns(summaries, self.has_ego, intervals)
-        table = Table(title=self.env_id, caption=self._caption(intervals))
+        table = Table(title=escape(self.env), caption=self._caption(intervals))
         for i, name in enumerate(header):
             broken = escape(name.replace(" [", "\n[").replace(" (", "\n("))
             table.add_column(broken, justify="right" if i else "left", overflow="fold")
@@ -124,28 +141,67 @@ class Evaluation:
             return f"{caption}; crashes are not reported: name their key with --crash-key or in register_reader."
         return f"{caption}, crash rate with its 95 % Wilson interval." if intervals else f"{caption}."
 
-    def _driving(self, summaries: Sequence[PolicySummary]) -> list[str]:
+    def _driving(self, summaries: Sequence[PolicySummary]) -> list["TablePart"]:
         """Returns the table of driving measures and what it shows; a line where an ego's driving is not measured."""
         if not self.has_ego:
             return []
         if not any(summary.driving for summary in summaries):
-            return ["Driving measures: not reported."]
+            return [TablePart([], [], "Driving measures: not reported.")]
         lines = [[s.policy, *(column.cell(s.driving) for column in DRIVING)] for s in summaries]
-        return [
-            markdown.table(["policy", *(column.heading for column in DRIVING)], lines),
+        told = (
             f"Driving: mean over episodes ± standard error; times to contact are at most {LONGEST_S:g} s, hard braking "
-            f"is above {HARD_BRAKING_MPS2:g} m/s².",
-        ]
+            f"is above {HARD_BRAKING_MPS2:g} m/s²."
+        )
+        return [TablePart(["policy", *(column.heading for column in DRIVING)], lines, told)]
 
-    def _compared(self) -> list[str]:
+    def _compared(self) -> list["TablePart"]:
         """Returns the table of paired differences and what it shows; nothing if there is nothing to compare."""
         lines = [[name, _difference(found)] for name, found in self.differences.items()]
         if not lines:
             return []
-        return [
-            markdown.table(["policy", f"return − return of {self.reference} (95 %)"], lines),
-            f"Differences: mean over the same seeds, 95 % bootstrap over episodes ({DRAWS:,} draws).",
-        ]
+        told = f"Differences: mean over the same seeds, 95 % bootstrap over episodes ({DRAWS:,} draws)."
+        return [TablePart(["policy", f"return − return of {self.reference} (95 %)"], lines, told)]
+
+
+class TablePart(NamedTuple):
+    """Table of an evaluation, with what it shows."""
+
+    headings: list[str]
+    """Headings of the columns; empty if there is no table."""
+    lines: list[list[str]]
+    """Cells of each line."""
+    told: str
+    """Sentence below the table."""
+
+
+def read_evaluation(file: Path) -> Evaluation:
+    """Reads the summary.json that `Evaluation.write` wrote.
+
+    Raises:
+        UserError: there is no such file, or it is damaged.
+    """
+    content = read_object(file)
+    for key in ("env_id", "first_seed", "episodes"):
+        if key not in content:
+            raise UserError(f"{file}: key '{key}' is missing; evaluate the policy again")
+    episodes = converted(content["episodes"], dict[str, tuple[dict[str, Any], ...]], f"{file}: episodes")
+    results = {}
+    for name, found in episodes.items():
+        if not found:
+            raise UserError(f"{file}: episodes.{short(name, 40)} has no episode; evaluate the policy again")
+        if len(found) > MOST_EPISODES:
+            raise UserError(f"{file}: a policy may have at most {MOST_EPISODES:,} episodes, got {len(found):,}")
+        # JSON has no NaN, which stands for a speed that is not reported
+        known = [{"mean_speed_mps": None} | one for one in found]
+        cleaned = [one | {"mean_speed_mps": math.nan} if one["mean_speed_mps"] is None else one for one in known]
+        results[name] = [from_table(EpisodeResult, one, f"{file}: episodes.{short(name, 40)}") for one in cleaned]
+    if not results:
+        raise UserError(f"{file} has no episodes; evaluate the policy again")
+    first = next(iter(results.values()))
+    has_ego = content.get("has_ego", any(e.action_counts or not math.isnan(e.mean_speed_mps) for e in first))
+    values: dict[str, Any] = {name: content[name] for name in ("env_id", "first_seed", "env_kwargs") if name in content}
+    values["has_ego"] = has_ego
+    return from_table(Evaluation, values, str(file), {"results": results})
 
 
 @dataclass(frozen=True)

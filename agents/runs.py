@@ -22,7 +22,7 @@ from agents.presets import Algorithm
 from envs.sb3.algorithms import algorithm_of_model
 from envs.sb3.policy_file import FORECASTER, ForecasterPin, PolicyNote, algorithm_of, load_policy, write_note
 from predictor.support.errors import UserError
-from predictor.support.files import delete_leftovers, new_file, write_json
+from predictor.support.files import check_out, check_place, delete_leftovers, new_file, write_json
 from predictor.support.reading import NoSuchFile, read_json
 from predictor.support.typed_values import converted
 
@@ -31,6 +31,7 @@ CHECKPOINT_FILE = "checkpoint.zip"
 BEST_FILE = "best_model.zip"
 POLICY_FILE = "policy.zip"
 CURVE_FILE = "curve.json"
+SUMMARY_FILE = "summary.json"
 _BUFFER_ENTRY = "replay_buffer.pkl"
 
 
@@ -49,8 +50,7 @@ def open_run(
     Raises:
         UserError: the folder is in use, or holds a run with another config.
     """
-    if run_dir.exists() and not run_dir.is_dir():
-        raise UserError(f"{run_dir} is a file; choose another --out")
+    check_out(run_dir)
     config = json.loads(json.dumps(config, default=str))
     file = run_dir / CONFIG_FILE
     started = run_dir.exists() and any(not entry.name.startswith(".") for entry in run_dir.iterdir())
@@ -79,6 +79,34 @@ def read_config(run_dir: Path, *required: str) -> dict[str, Any]:
         if name not in config:
             raise UserError(f"{run_dir / CONFIG_FILE}: key '{name}' is missing")
     return config
+
+
+def policy_zip(path: str | Path) -> Path:
+    """Returns the zip of a policy: the file itself, or the final policy of a run folder.
+
+    Raises:
+        UserError: there is none; the message says what is there instead.
+    """
+    path = Path(path)
+    check_place(path)
+    if path.is_file():
+        return path
+    if not path.is_dir():
+        raise UserError(f"no policy at {path}: neither a run folder nor a .zip; train one with train_policy.py")
+    if (path / POLICY_FILE).is_file():
+        return path / POLICY_FILE
+    read_config(path)
+    raise UserError(
+        f"{path} holds no {POLICY_FILE}: its training has not ended; continue it with --resume, or name one of its "
+        ".zip files"
+    )
+
+
+def is_policy(path: Path) -> bool:
+    """Returns whether a path is a policy's zip or a run folder of train_policy.py."""
+    if path.is_dir():
+        return any((path / name).is_file() for name in (POLICY_FILE, CHECKPOINT_FILE))
+    return path.suffix == ".zip"
 
 
 def read_curve(path: Path) -> list[dict[str, Any]]:

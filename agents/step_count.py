@@ -8,10 +8,11 @@ in budgets, measurements, checkpoints, the progress bar, TensorBoard and schedul
 import zipfile
 from pathlib import Path
 
-from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
+from stable_baselines3.common.callbacks import BaseCallback
 
 from envs.sb3.policy_file import read_note
 from predictor.support.errors import UserError
+from predictor.support.progress import WorkShown
 
 _UNIT = "step_unit"
 STEP_UNIT = {_UNIT: "environment"}
@@ -36,26 +37,38 @@ class CountSteps(BaseCallback):
         return True
 
 
-class StepProgress(ProgressBarCallback):
-    """Shows SB3's progress bar over environment steps.
+class StepProgress(BaseCallback):
+    """Shows how many environment steps are done: a bar on a terminal, plain lines in a file.
 
     Args:
-        num_envs: number of parallel environments or copies.
+        steps: number of environment steps of the whole training.
     """
 
-    def __init__(self, num_envs: int) -> None:
+    def __init__(self, steps: int) -> None:
         """Stores the number."""
         super().__init__()
-        self._num_envs = num_envs
+        self._steps = steps
+        self._shown: WorkShown | None = None
+
+    def _on_training_start(self) -> None:
+        self._shown = WorkShown("train", self._steps, self.model.num_timesteps)
+        self._shown.__enter__()
 
     def _on_step(self) -> bool:
-        self.pbar.update(self._num_envs)
+        assert self._shown is not None
+        self._shown.to(self.num_timesteps)
         return True
+
+    def say(self, line: str) -> None:
+        """Prints a line that stays."""
+        if self._shown is not None:
+            self._shown.say(line)
 
     def close(self) -> None:
         """Gives the terminal back, also after an interrupt."""
-        if hasattr(self, "pbar"):
-            self.pbar.close()
+        if self._shown is not None:
+            self._shown.__exit__(None, None, None)
+            self._shown = None
 
 
 def check_step_unit(checkpoint: Path, is_multiagent: bool) -> None:

@@ -7,21 +7,23 @@ never runs a finished cell again. The folder then holds report.html, report.md, 
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from agents.studies.cells import LOG_FILE, PACKAGES, Cell, cells_of
 from agents.studies.findings import Findings
 from agents.studies.plan import Study, read_study, shipped_studies, study_file
-from agents.studies.pool import last_line, run_cells
+from agents.studies.pool import run_cells, run_cells_on
 from agents.studies.progress import Progress
 from agents.studies.report import HEADROOM, PAGE, REPORT, write_headroom, write_report
 from agents.studies.results import RESULT_FILE, Result, read_result, require_tables, write_tables
+from predictor.support.cluster import check_address, connected
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, delete_leftovers, write_text
+from predictor.support.jobs import last_line
 from predictor.support.locks import locked
 from predictor.support.memory import check_processes
 from predictor.support.provenance import provenance
@@ -43,6 +45,9 @@ class StudyConfig:
     """Folder of the study; None takes runs/study-NAME. The same command continues what is in it."""
     workers: int = 0
     """Number of cells that run side by side, each in a process with one thread; 0 is one per core."""
+    cluster: str | None = None
+    """Ray cluster that runs the cells, in place of --workers: auto (the one that runs on this machine) or HOST:PORT of
+    its head; --out has to be on a file system that all machines share (docs/scale.md). None runs them here."""
     headroom: bool = False
     """Run the arms of no and of perfect foresight alone, beside constant actions and planner: is there anything to
     gain? Writes headroom.md."""
@@ -53,6 +58,7 @@ class StudyConfig:
         """Checks ranges."""
         check_at_least(self, 0, "workers")
         check_processes(self.workers, "workers")
+        check_address(self.cluster)
 
     @property
     def num_processes(self) -> int:
@@ -120,7 +126,20 @@ def _results_of(folder: Path, cells: Sequence[Cell]) -> dict[str, Result]:
 def _run_missing(config: StudyConfig, folder: Path, cells: Sequence[Cell], results: dict[str, Result]) -> list[Cell]:
     """Runs the cells without a result and adds theirs; returns those that failed."""
     missing, failed = [cell for cell in cells if cell.name not in results], list[Cell]()
-    progress = Progress(folder, len(cells), missing, config.num_processes)
+    with connected(config.cluster if missing else None, PACKAGES) as cluster:
+        side_by_side = config.num_processes if cluster is None else cluster.size
+        note = _notes(folder, results, failed, Progress(folder, len(cells), missing, side_by_side))
+        if cluster is None:
+            run_cells(missing, folder / CELLS, config.num_processes, note)
+        else:
+            run_cells_on(cluster, missing, folder / CELLS, note)
+    return failed
+
+
+def _notes(
+    folder: Path, results: dict[str, Result], failed: list[Cell], progress: Progress
+) -> Callable[[Cell, bool], None]:
+    """Returns what notes a cell that ended, among the results or those that failed."""
 
     def note(cell: Cell, has_result: bool) -> None:
         if has_result:
@@ -130,8 +149,7 @@ def _run_missing(config: StudyConfig, folder: Path, cells: Sequence[Cell], resul
             failed.append(cell)
             progress.failed(cell)
 
-    run_cells(missing, folder / CELLS, config.num_processes, note)
-    return failed
+    return note
 
 
 def _write(

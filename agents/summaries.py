@@ -99,8 +99,11 @@ def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
         length_se,
         *_rate(_counted([e.crashed for e in episodes])),
         float(np.mean([e.mean_speed_mps for e in episodes])),
-        {role: mean_and_standard_error([e.returns_by_role[role] for e in episodes]) for role in roles},
-        {action: count / actions.total() for action, count in actions.most_common()},
+        {
+            role: mean_and_standard_error([e.returns_by_role[role] for e in episodes if role in e.returns_by_role])
+            for role in roles
+        },
+        {action: count / max(1, actions.total()) for action, count in actions.most_common()},
         *_rate([e.success for e in episodes]),
         _mean_driving([e.driving for e in episodes if e.driving is not None]),
     )

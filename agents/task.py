@@ -15,6 +15,7 @@ from envs.drivers.all_agents import DRIVER_NAMES, make_driver
 from envs.entry_bank import record_bank
 from envs.parallel import ForecastParallelEnv
 from envs.registry import (
+    arguments_of,
     checkpoint_for,
     entry_for,
     envpool_task_of,
@@ -33,7 +34,7 @@ from predictor.own_forecasters import is_own
 from predictor.scene import SceneSpec
 from predictor.support.config_checks import check_at_least, check_at_most, check_choice, check_choices, check_positive
 from predictor.support.errors import UserError, short
-from predictor.support.reading import as_object, parse_json
+from predictor.support.remote import is_remote
 from predictor.support.runtime import resolve_device
 from predictor.support.typed_values import converted
 
@@ -110,11 +111,12 @@ class Task:
             raise UserError(f"checkpoint '{self.checkpoint}' has no effect with observe={self.observe}; leave one out")
         check_at_least(self, 1, "num_samples", "horizon_steps")
         check_at_most(self, MOST_FUTURES, "num_samples", "horizon_steps")
-        if self.perception_m is not None and not self.perception_m > 0:
-            raise UserError(f"perception_m must be positive, got {self.perception_m}")
+        check_positive(self, "perception_m")
         if self.perception_m is not None and self.observe == "none":
             raise UserError("perception_m has no effect with observe=none; leave one out")
         check_positive(self, "timeout_s")
+        if self.what_if and self.observe == "none":
+            raise UserError("what_if has no effect with observe=none; leave one out")
         if self.what_if and self.is_multiagent:
             raise UserError(f"what_if needs an environment with one ego, {self.env_id} has several learners")
         for name in ("crash_key", "success_key"):
@@ -141,13 +143,7 @@ class Task:
         Raises:
             UserError: `env_kwargs` is no JSON object.
         """
-        try:
-            kwargs = as_object(parse_json(self.env_kwargs or "{}", "env_kwargs"), "env_kwargs")
-        except UserError as error:
-            raise UserError(f"env_kwargs must be a JSON object, got {short(repr(self.env_kwargs))}: {error}") from error
-        if "env_id" in kwargs or "id" in kwargs:
-            raise UserError("env_kwargs are arguments of the environment and cannot hold its env_id; leave it out")
-        return kwargs
+        return arguments_of(self.env_kwargs)
 
     @property
     def options(self) -> dict[str, Any]:
@@ -291,6 +287,15 @@ def task_of(
         raise UserError(
             f"the run's forecaster '{short(values['checkpoint'], 80)}' imports code; if you trust it, name it yourself "
             f"with --checkpoint {short(values['checkpoint'], 80)}"
+        )
+    if (
+        values["checkpoint"] is not None
+        and is_remote(values["checkpoint"])
+        and values["checkpoint"] != trusted_forecaster
+    ):
+        raise UserError(
+            f"the run's checkpoint would be fetched from '{short(values['checkpoint'], 80)}'; if you trust it, name it "
+            f"yourself with --checkpoint {short(values['checkpoint'], 80)}"
         )
     task = Task(device=device, **values)
     for text in _texts_of(task.make_kwargs):

@@ -113,7 +113,7 @@ def train(plan: TrainingPlan, run_dir: Path, progress_bar: bool = True) -> Path:
     Args:
         plan: settings of the training.
         run_dir: folder of the run, which exists.
-        progress_bar: whether to show SB3's progress bar.
+        progress_bar: whether to show how far it is, and each measurement.
 
     Returns:
         Path of the final policy, `run_dir/policy.zip`.
@@ -139,7 +139,7 @@ def _learn(
     """Trains for the remaining steps."""
     every = max(plan.steps // plan.selections, 1)
     checkpoint = run_dir / CHECKPOINT_FILE
-    errors, progress = ForecastErrors(), StepProgress(plan.num_envs)
+    errors, progress = ForecastErrors(), StepProgress(plan.steps)
     restart = partial(_restart_streams, plan, model, errors) if plan.repeatable else None
     select = SelectBest(
         selection,
@@ -151,6 +151,7 @@ def _learn(
         at_multiples=plan.repeatable,
         seconds=read_note(checkpoint).get("seconds", 0.0),
         scalars=errors.scalars,
+        say=progress.say,
     )
     save = SaveCheckpoint(
         checkpoint, plan.checkpoint_every, note, lambda: STEP_UNIT | {"seconds": select.seconds}, restart
@@ -258,6 +259,7 @@ class SelectBest(BaseCallback):
         at_multiples: whether to measure at the multiples of `every_steps`, wherever the training was resumed.
         seconds: time that was learned before this start [s].
         scalars: called at each measurement; what it returns stands in TensorBoard and in the curve.
+        say: called with a line on each measurement.
 
     Attributes:
         seconds: time that was learned, without measurements [s].
@@ -275,13 +277,14 @@ class SelectBest(BaseCallback):
         at_multiples: bool = False,
         seconds: float = 0.0,
         scalars: Callable[[], dict[str, float]] = dict,
+        say: Callable[[str], None] = lambda line: None,
     ) -> None:
         """Prepares the measurements; none is made yet."""
         super().__init__()
         self._note = note
         self._arena, self._path, self._every = arena, path, every_steps
         self._curve, self._at_multiples, self._learned_s = curve, at_multiples, seconds
-        self._scalars = scalars
+        self._scalars, self._say = scalars, say
         self._seeds = range(SELECTION_SEED, SELECTION_SEED + num_episodes)
         self._measured_at = 0
         self._highest: list[float] = []
@@ -325,6 +328,8 @@ class SelectBest(BaseCallback):
         for name, value in scalars.items():
             self.logger.record(f"loop/{name}", value)
         self._keep(results, mean)
+        best = float(np.mean(self._highest))
+        self._say(f"step {self.num_timesteps:,}: return {mean:.2f} over {len(results)} episodes (best {best:.2f})")
         if self._curve is not None:
             point = {"steps": self.num_timesteps, "return": mean, "episodes": len(results), "seconds": self._learned_s}
             self._points.append(point | scalars)

@@ -28,14 +28,15 @@ from agents.training import TrainingPlan, train
 from envs.registry import entry_for
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices
-from predictor.support.errors import UserError, run_entry_point
+from predictor.support.errors import UserError, one_line, run_entry_point, short
 from predictor.support.files import check_out, delete_leftovers, disk_errors_of, write_json
 from predictor.support.locks import locked
 from predictor.support.memory import ENV_BYTES, PROCESS_BYTES, check_count
 from predictor.support.provenance import provenance
-from predictor.support.reading import as_object, read_object
+from predictor.support.reading import MIB, as_object, check_regular, read_bytes, read_object
 from predictor.support.runtime import keep_freed_memory
 from predictor.support.stopping import resumable
+from predictor.support.typed_values import converted
 
 if TYPE_CHECKING:
     from optuna import Study
@@ -48,6 +49,8 @@ MAX_TRAININGS = 100
 MAX_SEED = (SELECTION_SEED - TRAINING_SEED) // MAX_TRAININGS
 DIVERGED = "Expected parameter"
 """Beginning of the error by which torch refuses the distribution of actions of a network that diverged."""
+MOST_STUDY_BYTES = 1024 * MIB
+"""Largest size of Optuna's study."""
 CONFIG_FILE, STUDY_FILE, BEST_FILE, PRESET_FILE = "tuning.json", "tuning.db", "best.toml", "preset.toml"
 
 
@@ -146,9 +149,7 @@ def tune(config: TuneConfig) -> Path:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     with locked(folder, "tuning"), disk_errors_of(folder / STUDY_FILE):
         _note(folder, config)
-        study = optuna.create_study(
-            storage=f"sqlite:///{folder / STUDY_FILE}", study_name="tuning", direction="maximize", load_if_exists=True
-        )
+        study = open_study(folder / STUDY_FILE)
         for trial in study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,)):
             study.tell(trial.number, state=optuna.trial.TrialState.FAIL)  # of a start that was killed: drawn again
         for index in range(len(_ended(study)), config.trials):
@@ -157,6 +158,28 @@ def tune(config: TuneConfig) -> Path:
     if not (folder / BEST_FILE).exists():
         raise UserError(f"the networks of all {config.trials} trials diverged; give more --trials")
     return folder / BEST_FILE
+
+
+def open_study(file: Path) -> "Study":
+    """Opens Optuna's study in a file, or begins one.
+
+    Raises:
+        UserError: the file is no regular one, or holds no study.
+    """
+    import optuna
+    from sqlalchemy.exc import DatabaseError
+
+    if os.path.lexists(file):
+        check_regular(file, MOST_STUDY_BYTES)
+    try:
+        return optuna.create_study(
+            storage=f"sqlite:///{file}", study_name="tuning", direction="maximize", load_if_exists=True
+        )
+    except (DatabaseError, optuna.exceptions.OptunaError, RuntimeError, ValueError) as error:
+        if isinstance(error.__cause__, OSError) or "disk is full" in str(error) or "disk I/O" in str(error):
+            raise  # a full disk, which is told elsewhere
+        reason = short(one_line(error), 120)
+        raise UserError(f"{file} holds no study of Optuna ({reason}); remove it to begin anew") from error
 
 
 def _run_trial(config: TuneConfig, study: "Study", index: int, preset: Preset) -> None:
@@ -195,7 +218,7 @@ def _measure(config: TuneConfig, settings: Mapping[str, Any], folder: Path) -> f
     plans = [config.plan(settings, number) for number in range(config.trainings)]
     preset_file, begun = folder / PRESET_FILE, folder / f".{PRESET_FILE}"
     write_preset(begun, plans[0].preset)
-    if preset_file.exists() and preset_file.read_text() != begun.read_text():
+    if os.path.lexists(preset_file) and read_bytes(preset_file, MIB) != begun.read_bytes():
         shutil.rmtree(folder)  # another version of Optuna draws other values
         write_preset(begun, plans[0].preset)
     begun.rename(preset_file)
@@ -258,9 +281,11 @@ def _check_folder(folder: Path, config: TuneConfig) -> None:
             raise UserError(f"{folder} holds {found[0]} but no tuning ({CONFIG_FILE}); choose another --out")
         return
     try:
-        before = as_object(read_object(file)["config"], f"{file}: config")
+        content = read_object(file)
+        before = as_object(content["config"], f"{file}: config")
+        converted(content.get("provenance", []), tuple[dict[str, Any], ...], f"{file}: provenance")
     except (UserError, KeyError) as error:
-        raise UserError(f"{file} is damaged; remove {folder} or choose another --out") from error
+        raise UserError(f"{file} is damaged ({error}); remove {folder} or choose another --out") from error
     for name, now in _settings_of_tuning(config).items():
         if before.get(name) != now:
             raise UserError(

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -18,6 +18,8 @@ from envs.readers.highway import is_highway_env
 from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, make_multiagent_env
 from envs.sb3.acting import ActingPolicy
 from envs.sb3.agents_as_rows import ParallelVecEnv
+from envs.simulators.envpool import ENV_IDS, HIGHWAY_ENV_OF
+from envs.video.film_forecasts import FilmForecasts, record_pictures, view_of
 from envs.video.highway import record_episode
 from envs.video.multiagent import MultiagentRecording, record_multiagent_episode
 from predictor.checkpoint import CONSTANT_VELOCITY
@@ -84,7 +86,26 @@ def _has_reader(env_id: str) -> bool:
     return True
 
 
-def film(task: Task, model: BaseAlgorithm, path: Path, seed: int = EVALUATION_SEED) -> Path | None:
+@runtime_checkable
+class Recorded(Protocol):
+    """Played episode, which can be drawn."""
+
+    fps: int
+    """Number of pictures per second."""
+
+    def __len__(self) -> int:
+        """Returns the number of pictures."""
+
+    def draw(self, index: int, /) -> Any:
+        """Returns a picture as an array of uint8 (height, width, 3)."""
+
+    def write_video(self, path: str | Path, /) -> None:
+        """Writes all pictures as a video."""
+
+
+def film(
+    task: Task, model: BaseAlgorithm, path: Path, seed: int = EVALUATION_SEED, max_steps: int | None = None
+) -> Path | None:
     """Films an evaluation episode with the forecasts drawn in, also for a policy that sees none.
 
     Args:
@@ -92,38 +113,56 @@ def film(task: Task, model: BaseAlgorithm, path: Path, seed: int = EVALUATION_SE
         model: the policy.
         path: path of the video to write.
         seed: seed of the episode; the default is the first one's.
+        max_steps: largest number of policy steps; None takes `MAX_VIDEO_STEPS`.
 
     Returns:
         `path`; None if the environment cannot be drawn.
     """
+    recording = recorded(task, model, seed, max_steps)
+    if recording is None:
+        return None
+    recording.write_video(path)
+    return path
+
+
+def recorded(
+    task: Task, model: BaseAlgorithm, seed: int = EVALUATION_SEED, max_steps: int | None = None
+) -> Recorded | None:
+    """Plays an episode of `film` and returns it; None if the environment cannot be drawn.
+
+    An id of EnvPool is played in the environment of highway-env that it is a copy of.
+    """
+    max_steps = MAX_VIDEO_STEPS if max_steps is None else max_steps
     if task.is_multiagent:
-        recording = record_task(task, model, seed, MAX_VIDEO_STEPS)
-        if recording is None:
-            return None
-        recording.write_video(path)
-        return path
+        return record_task(task, model, seed, max_steps)
+    if task.env_id in ENV_IDS and not task.make_kwargs:
+        task = replace(task, env_id=HIGHWAY_ENV_OF[ENV_IDS[task.env_id]])
     plain = task.make()
-    drawn = is_highway_env(plain)
+    highway, drawn = is_highway_env(plain), view_of(plain) is not None
     plain.close()
-    if not drawn:
+    if not highway and not drawn:
         return None
     shown = task
     if task.observe == "none":
         seen = None if task.env_id in CHECKPOINTS else CONSTANT_VELOCITY
         shown = replace(task, observe="forecast", checkpoint=seen)
-    env = shown.wrapped(task.make(render_mode="rgb_array"))
+    env = shown.wrapped(_with_pictures(task))
+    act, samples = _act(task, model), _num_drawn(env.forecaster)
     try:
-        played = record_episode(
-            env,
-            _act(task, model),
-            seed=seed,
-            max_steps=MAX_VIDEO_STEPS,
-            num_samples=_num_drawn(env.forecaster),
-        )
-        played.write_video(path)
+        if drawn:
+            return record_pictures(FilmForecasts(env, num_samples=samples), act, seed=seed, max_steps=max_steps)
+        return record_episode(env, act, seed=seed, max_steps=max_steps, num_samples=samples)
     finally:
         env.close()
-    return path
+
+
+def _with_pictures(task: Task) -> Any:
+    """Makes the environment with pictures, where it has such a render mode."""
+    env = task.make()
+    if "rgb_array" not in (env.metadata or {}).get("render_modes", []):
+        return env
+    env.close()
+    return task.make(render_mode="rgb_array")
 
 
 def film_extremes(

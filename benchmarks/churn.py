@@ -14,7 +14,6 @@ from typing import Annotated, Any
 import gymnasium as gym
 import numpy as np
 import torch
-from rich.progress import track
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from envs.readers.function import FunctionReader
@@ -26,6 +25,7 @@ from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_json
+from predictor.support.progress import track
 from predictor.support.provenance import provenance
 
 

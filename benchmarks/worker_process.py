@@ -138,7 +138,15 @@ def forecast(preset: str, agents: int, neighbours: int, horizon: int) -> dict[st
     return {"peak_bytes": peak_rise(lambda: look(agents))}
 
 
-TASKS: dict[str, Callable[..., dict[str, Any]]] = {"training": training, "forecast": forecast}
+def rows(**arguments: Any) -> dict[str, Any]:
+    """Measures forecasts for many environments at once (`benchmarks.rows`)."""
+    from benchmarks.row_costs import RowCosts
+
+    costs = RowCosts(**arguments)
+    return costs.found(peak_rise(costs.run))
+
+
+TASKS: dict[str, Callable[..., dict[str, Any]]] = {"training": training, "forecast": forecast, "rows": rows}
 """Tasks of a worker, by name."""
 
 

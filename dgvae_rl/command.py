@@ -35,6 +35,8 @@ COMMANDS = {
     "train-policy": Command("train_policy", "train a policy that sees forecasts, evaluate and film it", "rl"),
     "evaluate-policy": Command("agents.evaluate", "measure a policy on held-out seeds, beside simple drivers", "rl"),
     "watch": Command("agents.watch", "film an episode of a policy, or play it in a window", "rl"),
+    "report": Command("agents.report", "write the report of a run: config, curves, tables, films", "rl"),
+    "push": Command("agents.push", "share a checkpoint or a policy on a hub", "hub"),
     "tune": Command("agents.tune", "search hyperparameters of a learning algorithm", "tune"),
     "study": Command("agents.study", "compare what policies are shown, over several seeds", "study"),
 }

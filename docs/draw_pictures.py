@@ -6,6 +6,7 @@ Each picture is a moment of an episode of a fixed seed with a shipped checkpoint
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import matplotlib
@@ -33,6 +34,8 @@ DOCS = Path(__file__).resolve().parent
 ROAD = "highway-fast-v0"
 FUTURES = 6
 """Number of futures that are drawn of each agent."""
+MANY_FUTURES = 20
+"""The same, where the picture is about how they spread."""
 LANES_M = (-2.0, 2.0, 6.0, 10.0)
 """Borders of the three lanes."""
 CAR_M = (5.0, 2.0)
@@ -52,6 +55,7 @@ FILMED = Moment(900_021, 6)
 PLANNED = Moment(900_004, 5)
 BRAKING = Moment(900_014, 6)
 GRAPH = Moment(900_010, 5)
+FORKS = {"roundabout-v1": Moment(900_000, 3), "intersection-v2": Moment(900_002, 5)}
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,8 @@ class DrawConfig:
     """Draws the pictures of live traffic in README.md and docs/."""
 
     only: tuple[str, ...] = ()
-    """Names of pictures (highway, what_if, braking_leader, causal_graph); none given draws all."""
+    """Names of pictures (highway, what_if, braking_leader, causal_graph, fans_roundabout, fans_intersection); none
+    given draws all."""
 
     def __post_init__(self) -> None:
         """Checks the names.
@@ -72,13 +77,13 @@ class DrawConfig:
             raise UserError(f"only must be among {', '.join(PICTURES)}, got {', '.join(unknown)}")
 
 
-def draw_highway(path: Path) -> None:
+def draw_film(env_id: str, moment: Moment, futures: int, path: Path) -> None:
     """Draws a frame of the film of an episode that the planner drives."""
-    env = ForecastObservation(make_env(ROAD, render_mode="rgb_array"))
+    env = ForecastObservation(make_env(env_id, render_mode="rgb_array"))
     played = record_episode(
-        env, Planner(env, env.forecaster), seed=FILMED.seed, max_steps=FILMED.step + 6, num_samples=FUTURES
+        env, Planner(env, env.forecaster), seed=moment.seed, max_steps=moment.step + 6, num_samples=futures
     )
-    played.write_frame(path, played.frame_of_step(FILMED.step))
+    played.write_frame(path, played.frame_of_step(moment.step))
     env.close()
 
 
@@ -221,10 +226,14 @@ def _plot_edges(ax: Axes, scene: Scene, edges: Sequence[tuple[int, int, float]])
 
 
 PICTURES: dict[str, Callable[[Path], None]] = {
-    "highway": draw_highway,
+    "highway": partial(draw_film, ROAD, FILMED, FUTURES),
     "what_if": draw_what_if,
     "braking_leader": draw_braking_leader,
     "causal_graph": draw_causal_graph,
+    **{
+        f"fans_{env_id.partition('-')[0]}": partial(draw_film, env_id, moment, MANY_FUTURES)
+        for env_id, moment in FORKS.items()
+    },
 }
 
 

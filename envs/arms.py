@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from predictor.forecaster import Forecaster, has_scale
 from predictor.support.config_checks import check_choice
+from predictor.support.errors import UserError
 
 PRESENT_KEYS = ("agents", "valid", "ego_path")
 """Entries on the present and on the ego itself, which every arm shows."""
@@ -108,6 +109,17 @@ class EntryBank:
                 values = recorded[chosen[:, None], slots]
                 drawn[key] = values * valid.reshape(*valid.shape, *(1,) * (values.ndim - 2))
         return drawn
+
+
+def arm_of(arm: "Arm | None") -> "Arm":
+    """Returns an arm; for None, the one that shows all of a forecast.
+
+    Raises:
+        UserError: it is something else.
+    """
+    if arm is not None and not isinstance(arm, Arm):
+        raise UserError(f"arm must be an Arm, for example Arm('zeros') of envs.arms, got {arm!r}")
+    return Arm() if arm is None else arm
 
 
 @dataclass(frozen=True)

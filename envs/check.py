@@ -9,16 +9,15 @@ wrong.
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from envs.readers import MakeReader
-from envs.registry import load_named, make_any_env
+from envs.registry import arguments_of, make_any_env
 from envs.testing import reader_problems
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, one_line, run_entry_point
+from predictor.support.importing import load_named
 from predictor.support.memory import check_count
-from predictor.support.reading import as_object, parse_json
 
 
 @dataclass(frozen=True)
@@ -56,8 +55,7 @@ def findings(config: CheckConfig) -> list[str]:
     Raises:
         UserError: no such environment, or no reader knows it.
     """
-    kwargs: dict[str, Any] = as_object(parse_json(config.env_kwargs or "{}", "--env-kwargs"), "--env-kwargs")
-    env = make_any_env(config.env_id, **kwargs)
+    env = make_any_env(config.env_id, **arguments_of(config.env_kwargs))
     make_reader: MakeReader | None = None if config.reader is None else load_named(config.reader)
     try:
         found = reader_problems(

@@ -11,11 +11,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from envs.readers.highway_labels import ATTRIBUTE_NAMES
+from envs.registry import arguments_of
 from envs.rollouts.branch_recording import branch_mix_for
 from envs.rollouts.causal_labels import TRIED, settings_for
+from envs.rollouts.cluster_pool import episode_pool
 from envs.rollouts.interventions import kinds_of
 from envs.rollouts.perturbations import check_kinds, mix_for
 from envs.rollouts.recording import Recording, record_all
@@ -26,15 +26,20 @@ from envs.supervision import TIMEOUT_S
 from envs.testing import store_problems
 from predictor.data.partial_store import PartialStore
 from predictor.data.store import Episode, StoreInfo
+from predictor.data.store_files import check_replaceable
+from predictor.support.cluster import check_address
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_choices, check_positive
 from predictor.support.errors import UserError, run_entry_point, short
+from predictor.support.files import check_place
 from predictor.support.locks import locked_path
 from predictor.support.memory import check_count, check_processes
+from predictor.support.progress import WorkShown
 from predictor.support.provenance import provenance
+from predictor.support.remote import address, exists, is_remote
 from predictor.support.stopping import resumable
 
-FREE = ("out", "workers", "overwrite", "on_error", "timeout_s")
+FREE = ("out", "workers", "cluster", "overwrite", "on_error", "timeout_s")
 """Options that episodes do not depend on."""
 MOST_REASONS = 10
 """Largest number of skipped episodes whose reasons are printed; the store has them all."""
@@ -55,7 +60,7 @@ class CollectConfig:
     driver: Annotated[tuple[str, ...], Renamed("ego")] = ()
     """Driver; several take turns, one per episode. One ego: random, idle, varied, keep-lane, planner, one action in
     every step (slower, action-4), or the path of a policy .zip. Many learners: random, idle, varied, heuristic, mixed.
-    None given: varied random idle, or heuristic mixed varied."""
+    Both: own:module:function (docs/wrap_your_env.md). None given: varied random idle, or heuristic mixed varied."""
     seed: int = 0
     """Random seed: episode i is reset with seed + i; keep test seeds apart from training seeds."""
     max_steps: int = 200
@@ -67,6 +72,12 @@ class CollectConfig:
     workers: int = os.cpu_count() or 1
     """Number of parallel processes; the store does not depend on it. One plays in the command's own process, which
     an environment that hangs or dies takes along, unless --on-error skip."""
+    env_kwargs: str = ""
+    """Arguments of the environment as a JSON object, for example '{"config": {"vehicles_density": 2}}'; the store notes
+    them."""
+    cluster: str | None = None
+    """Ray cluster that plays the episodes, in place of --workers: auto (the one that runs on this machine) or HOST:PORT
+    of its head (docs/scale.md); the store is the same. None plays them here."""
     on_error: OnError = "stop"
     """What an environment that raises, hangs, dies or reports NaN does: it stops the recording (stop), or the episode
     is left out, counted and named in the store (skip)."""
@@ -102,10 +113,12 @@ class CollectConfig:
             UserError: a value out of range.
         """
         check_choices(self)
+        arguments_of(self.env_kwargs)
         check_at_least(self, 1, "episodes", "max_steps", "causal_senders", "workers", "branch_history_steps")
         check_at_least(self, 0, "seed", "causal_labels", "branches")
         check_count(self.episodes, "episodes")
         check_processes(min(self.workers, self.episodes), "workers")
+        check_address(self.cluster)
         check_positive(self, "causal_horizon_s", "causal_threshold_m", "timeout_s")
         if not 0 <= self.perturb <= 1:
             raise UserError(f"perturb must lie between 0 and 1, got {self.perturb:g}")
@@ -120,7 +133,7 @@ class CollectConfig:
     @property
     def drivers(self) -> tuple[str, ...]:
         """Drivers that take turns, one per episode."""
-        return self.driver or default_drivers(self.env_id)
+        return self.driver or default_drivers(self.env_id, self.env_kwargs)
 
 
 def collect(config: CollectConfig) -> Iterator[Episode]:
@@ -147,7 +160,7 @@ def recorded(
     """
     drivers, settings = config.drivers, recording_of(config)
     tasks = [
-        _Task(config.env_id, drivers[i % len(drivers)], config.seed + i, settings)
+        _Task(config.env_id, drivers[i % len(drivers)], config.seed + i, settings, config.env_kwargs)
         for i in range(first, config.episodes)
     ]
     if pool is not None:
@@ -160,10 +173,10 @@ def recorded(
 @contextmanager
 def open_pool(config: CollectConfig) -> Iterator["EpisodePool[Any] | None"]:
     """Yields the processes of a recording, and ends them; None if this process plays itself."""
-    if config.workers == 1 and config.on_error == "stop":
+    if config.workers == 1 and config.on_error == "stop" and config.cluster is None:
         yield None
         return
-    with EpisodePool(_played, config.workers, config.timeout_s, config.on_error) as pool:
+    with episode_pool(_played, config.workers, config.timeout_s, config.on_error, config.cluster) as pool:
         yield pool
 
 
@@ -176,7 +189,7 @@ def recording_of(config: CollectConfig) -> Recording:
     plain = Recording(config.max_steps, config.labels)
     if not (config.perturb or config.causal_labels or config.branches):
         return plain
-    world = _world(config.env_id, config.drivers[0])
+    world = _world(config.env_id, config.drivers[0], config.env_kwargs)
     check_kinds(world, config.perturb_kinds)
     given = {"horizon_s": config.causal_horizon_s, "threshold_m": config.causal_threshold_m}
     changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
@@ -197,19 +210,33 @@ class _Task(NamedTuple):
     driver: str
     seed: int
     recording: Recording
+    env_kwargs: str
 
 
-_worlds: dict[tuple[str, str], World] = {}
+_worlds: dict[tuple[str, str, str], World] = {}
+"""World of this process, by id, arguments and policy; at most one, since some simulators allow no second."""
 
 
-def _world(env_id: str, driver: str) -> World:
-    if (env_id, driver) not in _worlds:
-        _worlds[env_id, driver] = open_world(env_id, driver)
-    return _worlds[env_id, driver]
+def _world(env_id: str, driver: str, env_kwargs: str) -> World:
+    """Returns the world of this process, with a driver; a new one for another environment or policy."""
+    policy = driver if driver.endswith(".zip") else ""
+    wanted = (env_id, env_kwargs, policy)
+    if wanted not in _worlds:
+        close_world()
+        _worlds[wanted] = open_world(env_id, driver, env_kwargs=env_kwargs)
+    elif not policy:
+        _worlds[wanted].drive(driver)
+    return _worlds[wanted]
+
+
+def close_world() -> None:
+    """Closes the world of this process."""
+    while _worlds:
+        _worlds.popitem()[1].close()
 
 
 def _record(task: _Task) -> list[Episode]:
-    return record_all(_world(task.env_id, task.driver), task.seed, task.driver, task.recording)
+    return record_all(_world(task.env_id, task.driver, task.env_kwargs), task.seed, task.driver, task.recording)
 
 
 class _InfoTask(NamedTuple):
@@ -248,22 +275,23 @@ def _info(config: CollectConfig, seed: int) -> StoreInfo:
     Raises:
         UserError: a driver, an environment or settings that do not go together.
     """
-    worlds = [open_world(config.env_id, name) for name in config.drivers]
-    worlds[0].reset(seed)
-    labelled = config.labels and not config.branches and worlds[0].labels() is not None
+    for name in reversed(config.drivers):
+        world = _world(config.env_id, name, config.env_kwargs)
+    world.reset(seed)
+    labelled = config.labels and not config.branches and world.labels() is not None
     recording = recording_of(config)
     made = provenance(PACKAGES) | {"seed": config.seed}
+    if arguments_of(config.env_kwargs):
+        made["env_kwargs"] = config.env_kwargs
     if config.perturb:
-        kinds = check_kinds(worlds[0], config.perturb_kinds)
-        made["perturbations"] = {"share": config.perturb, "kinds": kinds, "mix": asdict(mix_for(kinds_of(worlds[0])))}
+        kinds = check_kinds(world, config.perturb_kinds)
+        made["perturbations"] = {"share": config.perturb, "kinds": kinds, "mix": asdict(mix_for(kinds_of(world)))}
     if recording.causal is not None:
         made["causal_labels"] = {"every": config.causal_labels, "tried": TRIED} | asdict(recording.causal)
     if config.branches:
-        made["branches"] = {"of_each": config.branches} | asdict(branch_mix_for(worlds[0]))
-    for world in worlds:
-        world.close()
+        made["branches"] = {"of_each": config.branches} | asdict(branch_mix_for(world))
     return StoreInfo(
-        worlds[0].spec,
+        world.spec,
         config.env_id,
         made,
         ATTRIBUTE_NAMES if labelled else (),
@@ -281,34 +309,36 @@ def _kept(config: CollectConfig, partial: PartialStore) -> str:
     """Returns what a recording that is stopped keeps."""
     if not partial.num_done:
         return "no episode is kept yet; the same command begins anew"
-    return f"{partial.num_done} of {config.episodes} episodes are kept beside {config.out}; the same command goes on"
+    where = f"in {partial.folder}" if is_remote(config.out) else f"beside {config.out}"
+    return f"{partial.num_done} of {config.episodes} episodes are kept {where}; the same command goes on"
 
 
 def main() -> None:
     """Entry point."""
     config = parse(CollectConfig, __doc__)
-    if config.out.exists() and not config.overwrite:
-        raise UserError(f"{config.out} exists; choose another path or pass --overwrite")
-    columns = (TextColumn(f"collect {config.env_id}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    check_place(config.out)
+    if exists(config.out):
+        if not config.overwrite:
+            raise UserError(f"{address(config.out)} exists; choose another path or pass --overwrite")
+        check_replaceable(config.out)
     with open_pool(config) as pool:
         info = _info_from(config, pool)
         with locked_path(config.out):
             partial = PartialStore(config.out, _settings(config, info), discard=config.overwrite)
             done = partial.num_done
-            with resumable(lambda: _kept(config, partial)), partial, Progress(*columns) as progress:
-                task = progress.add_task("", total=config.episodes, completed=done)
-                for found in recorded(config, done, pool):
-                    if isinstance(found, Failed):
-                        partial.skip(found.seed, found.reason)
-                    else:
-                        partial.add(info, *found)
-                    progress.advance(task)
-                progress.stop()
+            with resumable(lambda: _kept(config, partial)), partial:
+                with WorkShown(f"collect {config.env_id}", config.episodes, done) as shown:
+                    for found in recorded(config, done, pool):
+                        if isinstance(found, Failed):
+                            partial.skip(found.seed, found.reason)
+                        else:
+                            partial.add(info, *found)
+                        shown.advance()
                 episodes = partial.finish(info, config.overwrite)
     steps = sum(len(e.states) for e in episodes)
     taken = f" ({done} of them from an unfinished recording)" if done else ""
     print(
-        f"{config.out}: {len(episodes)} episodes{taken}, {steps} scenes, "
+        f"{address(config.out)}: {len(episodes)} episodes{taken}, {steps} scenes, "
         f"seeds {config.seed}–{config.seed + config.episodes - 1}"
     )
     reasons = list(partial.skipped.values())

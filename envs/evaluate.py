@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from rich.console import Console
-from rich.progress import track
 
-from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, checkpoint_for
+from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, arguments_of, checkpoint_for, name_with
 from envs.rollouts import graph_report, plan_report, reaction_report, report
 from envs.rollouts.branches import check_can_branch
+from envs.rollouts.cluster_pool import episode_pool
 from envs.rollouts.episode import (
     Case,
     Episode,
@@ -32,18 +32,19 @@ from envs.rollouts.plan_run import PlanRun, check_has_plans, measure_plans
 from envs.rollouts.reaction_run import ReactionRun, measure_reactions
 from envs.rollouts.report import EnvAccuracy
 from envs.rollouts.summary import summarise_episodes
-from envs.rollouts.workers import EpisodePool
 from envs.rollouts.world import default_drivers, open_world
 from envs.supervision import TIMEOUT_S
-from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, name_of_folder, require_known, resolve
+from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, names_of, require_known, resolve
 from predictor.data.store import read_info_of
 from predictor.own_forecasters import is_own
 from predictor.reports.tables import accuracy_table
+from predictor.support.cluster import check_address
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_positive
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import finite, write_json, write_text
+from predictor.support.files import check_out, finite, write_json, write_text
 from predictor.support.memory import check_count, check_processes
+from predictor.support.progress import track
 from predictor.support.provenance import provenance
 from predictor.support.runtime import keep_freed_memory
 
@@ -59,6 +60,9 @@ class EvaluateConfig:
 
     env_ids: tuple[str, ...] = (*CHECKPOINTS, *MULTIAGENT_CHECKPOINTS)
     """Environments to measure in, gymnasium or PettingZoo parallel; by default all ids with a shipped checkpoint."""
+    env_kwargs: str = ""
+    """Arguments of the environment as a JSON object, for example '{"config": {"vehicles_density": 2}}'; with one of
+    --env-ids alone."""
     checkpoint: tuple[str, ...] = ()
     """Checkpoints to measure: shipped names, folders or run folders, or forecasters of your own, as
     own:module:function (docs/own_forecaster.md); none given, the one that ships for each id. Several make a transfer
@@ -68,7 +72,7 @@ class EvaluateConfig:
     driver: Annotated[str | None, Renamed("ego")] = None
     """Driver. One ego: random, idle, varied (default), keep-lane, one action in every step (slower, action-4), or the
     path of a policy .zip (which gets the measured forecasts). Many learners: random, idle, varied, heuristic (default),
-    mixed."""
+    mixed. Both: own:module:function (docs/wrap_your_env.md)."""
     seed: int = 900_000
     """Random seed: episode i is reset with seed + i; the shipped checkpoints were trained on seeds from 100,000
     on."""
@@ -91,6 +95,9 @@ class EvaluateConfig:
     """Largest length of an episode; longer ones are cut there [policy steps]."""
     workers: int = os.cpu_count() or 1
     """Number of parallel processes; the results do not depend on it."""
+    cluster: str | None = None
+    """Ray cluster that plays the episodes, in place of --workers: auto (the one that runs on this machine) or HOST:PORT
+    of its head (docs/scale.md); the results are the same. None plays them here."""
     timeout_s: float = TIMEOUT_S
     """Largest time that one step of an episode may take [s]; an environment that hangs for longer ends the command."""
     out: Path | None = None
@@ -125,10 +132,13 @@ class EvaluateConfig:
             check_count(getattr(self, name), name)
         check_count(self.num_samples * (self.horizon_steps or 1), "horizon_steps times num_samples")
         check_processes(min(self.workers, self.episodes), "workers")
+        check_address(self.cluster)
         check_positive(self, "miss_m", "timeout_s")
-        names = [name_of_folder(checkpoint) for checkpoint in self.checkpoint]
-        if len(set(names)) < len(names):
-            raise UserError(f"each checkpoint needs a name of its own, got {', '.join(names)}; rename a folder")
+        if arguments_of(self.env_kwargs) and len(self.env_ids) != 1:
+            raise UserError(f"env_kwargs are of one environment; give one of --env-ids, got {len(self.env_ids)}")
+        if arguments_of(self.env_kwargs) and (self.reactions or self.graph or self.plans):
+            raise UserError("env_kwargs go with accuracy, not with --reactions, --graph or --plans; leave one out")
+        names_of(self.checkpoint)
 
 
 def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = None) -> tuple[EnvAccuracy, list[Case]]:
@@ -145,16 +155,20 @@ def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = N
     Raises:
         UserError: unknown env or checkpoint, or episodes shorter than the horizon.
     """
+    given, names = checkpoint, names_of(config.checkpoint)
     checkpoint = checkpoint if checkpoint is not None else checkpoint_for(env_id)
     if checkpoint != CONSTANT_VELOCITY and not is_own(checkpoint):
         checkpoint = str(resolve(checkpoint))
-    driver = config.driver or default_drivers(env_id)[0]
-    world = open_world(env_id, driver, checkpoint, horizon_steps=config.horizon_steps)
+    driver = config.driver or default_drivers(env_id, config.env_kwargs)[0]
+    world = open_world(env_id, driver, checkpoint, horizon_steps=config.horizon_steps, env_kwargs=config.env_kwargs)
     spec = world.spec
     world.close()
     horizon = config.horizon_steps or load_forecaster(checkpoint, spec, f"env '{env_id}'").horizon_steps
     episodes = _play_all(config, env_id, checkpoint, driver, horizon)
-    result = summarise_episodes(env_id, checkpoint, driver, spec, episodes, config.memory_steps, config.miss_m)
+    result = summarise_episodes(
+        env_id, checkpoint, driver, spec, episodes, config.memory_steps, config.miss_m,
+        None if given is None else names.get(given), config.env_kwargs,
+    )  # fmt: skip
     if not result.model.agents:
         raise UserError(f"{env_id}: no forecast has {horizon} steps of truth; lower --horizon-steps or add episodes")
     cases = sorted((e.worst for e in episodes if e.worst is not None), key=lambda case: -case.error_m)
@@ -162,30 +176,33 @@ def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = N
 
 
 def _play_all(config: EvaluateConfig, env_id: str, checkpoint: str, driver: str, horizon: int) -> list[Episode]:
-    stores = _stores_of(config.data, env_id)
+    stores = _stores_of(config.data, env_id, config.env_kwargs)
     tasks = [
         EpisodeTask(
             env_id, checkpoint, driver, config.seed + i, config.num_samples, horizon, config.max_steps,
-            stores, config.memory_steps, config.edge_ablations,
+            stores, config.memory_steps, config.edge_ablations, config.env_kwargs,
         )
         for i in range(config.episodes)
     ]  # fmt: skip
-    with EpisodePool(play, config.workers, config.timeout_s) as pool:
+    with episode_pool(play, config.workers, config.timeout_s, cluster=config.cluster) as pool:
         return list(track(pool.results(tasks), f"evaluate {env_id}", total=len(tasks)))
 
 
-def _stores_of(roots: Sequence[Path], env_id: str) -> tuple[str, ...]:
-    """Returns the stores that were recorded in this environment."""
+def _stores_of(roots: Sequence[Path], env_id: str, env_kwargs: str = "") -> tuple[str, ...]:
+    """Returns the stores that were recorded in this environment, with these arguments."""
     found = []
     for root in roots:
         store = root / env_id if (root / env_id).is_dir() else root
         if store == root and not (root / "zarr.json").exists() and any(root.glob("*/zarr.json")):
             continue  # a folder of other environments' stores
-        if read_info_of(store).source == env_id:
+        info = read_info_of(store)
+        recorded = info.provenance.get("env_kwargs", "")
+        if info.source == env_id and arguments_of(str(recorded)) == arguments_of(env_kwargs):
             found.append(str(store))
     if roots and not found:
         raise UserError(
-            f"data: no store of {env_id} in {', '.join(map(str, roots))}; record one with python -m envs.collect"
+            f"data: no store of {name_with(env_id, env_kwargs)} in {', '.join(map(str, roots))}; record one with "
+            "python -m envs.collect"
         )
     return tuple(found)
 
@@ -199,18 +216,18 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
     results: list[EnvAccuracy] = []
     misfits: dict[tuple[str, str], str] = {}
     for env_id in config.env_ids:
-        _stores_of(config.data, env_id)  # an error for all checkpoints is no misfit of one
+        _stores_of(config.data, env_id, config.env_kwargs)  # an error for all checkpoints is no misfit of one
         for checkpoint in config.checkpoint or (None,):
             try:
                 result, cases = evaluate_env(config, env_id, checkpoint)
             except UserError as error:
                 if len(config.checkpoint) < 2 or checkpoint is None:
                     raise
-                misfits[env_id, name_of_folder(checkpoint)] = str(error)
+                misfits[env_id, names_of(config.checkpoint)[checkpoint]] = str(error)
                 continue
             results.append(result)
             console.print(accuracy_table(result.lines, result.dt_s, report.title(result)))
-            console.print(report.remarks(result))
+            console.print(report.remarks(result), markup=False)
             if config.out is not None:
                 report.write_pictures(config.out, result, cases)
     return results, misfits
@@ -244,21 +261,22 @@ def _reaction_run(config: EvaluateConfig, env_id: str, driver: str) -> ReactionR
     return ReactionRun(
         env_id, driver, config.checkpoint or (checkpoint_for(env_id),), config.perturbations, config.most_episodes,
         config.seed, config.max_steps, config.workers, config.horizon_steps, _stores_of(config.data, env_id),
-        config.timeout_s,
+        config.timeout_s, config.cluster,
     )  # fmt: skip
 
 
 def _graph_run(config: EvaluateConfig, env_id: str, driver: str) -> GraphRun:
     checkpoints = config.checkpoint or (checkpoint_for(env_id),)
     return GraphRun(
-        env_id, driver, checkpoints, config.episodes, config.seed, config.max_steps, config.workers, config.timeout_s
-    )
+        env_id, driver, checkpoints, config.episodes, config.seed, config.max_steps, config.workers, config.timeout_s,
+        config.cluster,
+    )  # fmt: skip
 
 
 def _plan_run(config: EvaluateConfig, env_id: str, driver: str) -> PlanRun:
     return PlanRun(
         env_id, driver, config.checkpoint or (checkpoint_for(env_id),), config.episodes, config.seed, config.max_steps,
-        config.workers, config.horizon_steps, config.timeout_s,
+        config.workers, config.horizon_steps, config.timeout_s, config.cluster,
     )  # fmt: skip
 
 
@@ -294,12 +312,13 @@ def main() -> None:
     keep_freed_memory()
     config = parse(EvaluateConfig, __doc__)
     causes = config.reactions or config.graph or config.plans
-    console = Console(width=200 if causes else 170)
-    if config.out is not None and config.out.is_file():
-        raise UserError(f"{config.out} is a file; choose another --out")
+    console = Console(width=200 if causes else None)
+    if config.out is not None:
+        check_out(config.out)
     for env_id in config.env_ids:  # unknown ids and drivers raise before hours of work
         policy = config.driver is not None and config.driver.endswith(".zip")
-        open_world(env_id, "idle" if policy else config.driver or default_drivers(env_id)[0]).close()
+        driver = config.driver or default_drivers(env_id, config.env_kwargs)[0]
+        open_world(env_id, "idle" if policy else driver, env_kwargs=config.env_kwargs).close()
     for checkpoint in config.checkpoint:
         require_known(checkpoint)
     if causes:

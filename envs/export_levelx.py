@@ -15,7 +15,6 @@ from typing import Annotated, Any
 import gymnasium as gym
 import numpy as np
 from jaxtyping import Float
-from rich.progress import track
 
 from envs.drivers.ego import EGO_DRIVER_NAMES, make_ego_driver
 from envs.drivers.planner import PLANNER
@@ -26,7 +25,8 @@ from predictor.data.store import Episode
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_choice
 from predictor.support.errors import UserError, run_entry_point
-from predictor.support.files import new_folder, write_json
+from predictor.support.files import check_out, new_folder, write_json
+from predictor.support.progress import track
 from predictor.support.provenance import provenance
 
 FRAMES_PER_S = 25
@@ -78,8 +78,7 @@ class ExportConfig:
         Raises:
             UserError: it is neither.
         """
-        if self.out.is_file():
-            raise UserError(f"{self.out} is a file; choose another --out")
+        check_out(self.out)
         if self.out.exists() and not self.overwrite:
             raise UserError(f"{self.out} exists; choose another path or pass --overwrite")
         if self.out.exists() and not (self.out / "export.json").exists():

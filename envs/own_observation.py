@@ -19,6 +19,24 @@ ADDED_KEYS = frozenset((*SCENE_KEYS, *FORECAST_KEYS, *PATH_KEYS, *UNCERTAINTY_KE
 _COMPOSED = (gym.spaces.Dict, gym.spaces.Tuple, gym.spaces.Graph, gym.spaces.Sequence, gym.spaces.OneOf)
 
 
+def require_space(space: Any, what: str) -> gym.Space:
+    """Returns a space, which must be one of gymnasium.
+
+    Args:
+        space: what an environment gives as a space.
+        what: name of the space, for messages.
+
+    Raises:
+        UserError: it is something else, as a space of the package gym, which came before gymnasium.
+    """
+    if isinstance(space, gym.Space):
+        return space
+    raise UserError(
+        f"{what} must be a space of gymnasium, got {type(space).__module__}.{type(space).__name__}; make it anew, for "
+        "example gymnasium.spaces.Box(space.low, space.high, dtype=space.dtype)"
+    )
+
+
 def own_spaces(space: gym.Space, source: str) -> dict[str, gym.Space]:
     """Returns the entries that hold an environment's own observation, by name.
 
@@ -27,8 +45,10 @@ def own_spaces(space: gym.Space, source: str) -> dict[str, gym.Space]:
         source: name of the environment, for messages.
 
     Raises:
-        UserError: the space is composed otherwise than as a flat Dict, or has an entry with the name of an added one.
+        UserError: the space is no gymnasium space, is composed otherwise than as a flat Dict, or has an entry with the
+            name of an added one.
     """
+    require_space(space, f"the own observation space of {source}")
     if not isinstance(space, gym.spaces.Dict):
         if isinstance(space, _COMPOSED):
             raise UserError(

@@ -19,14 +19,14 @@ import gymnasium as gym
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
-from envs.arms import Arm
+from envs.arms import Arm, arm_of
 from envs.batched_forward import BatchedForward, can_share
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout
 from envs.multiagent_observation import MultiagentStream, check_multiagent_scene
 from envs.observation import open_forecaster
 from envs.own_observation import own_entries, own_spaces
 from envs.readers import MakeReader, multiagent_env_id, multiagent_reader_for
-from envs.readers.base import MultiagentReader, MultiagentScene, build_multiagent_reader
+from envs.readers.base import MultiagentReader, MultiagentScene, build_multiagent_reader, check_bounds
 from envs.scene_stream import ForecastConfig
 from envs.simulators.copies import RunningCopy
 from predictor.forecaster import Forecaster
@@ -92,6 +92,7 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
                 "parallel_env(), or convert an AEC env with pettingzoo.utils.conversions.aec_to_parallel"
             )
         BaseParallelWrapper.__init__(self, env)
+        check_bounds(perception_m, max_agents)
         self._source = f"env '{multiagent_env_id(env)}'"
         self._reader: MultiagentReader = (
             build_multiagent_reader(reader, env) if reader is not None else multiagent_reader_for(env, perception_m)
@@ -100,9 +101,10 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         env_id = multiagent_env_id(env)
         forecaster = open_forecaster(checkpoint, spec, env_id, device, forecaster)
         perception_m = forecaster.spec.perception_m if perception_m is None else perception_m
-        if arm is not None and arm.shown.true_futures:
+        arm = arm_of(arm)
+        if arm.shown.true_futures:
             raise UserError(f"arm '{arm.name}' needs an environment with one ego, {self._source} has several learners")
-        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, arm=arm or Arm())
+        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, arm=arm)
         self.stream: MultiagentStream = MultiagentStream(forecaster, spec, config, perception_m, max_agents)
         self._layouts: dict[str, ObservationLayout] = {}
         self._forward: BatchedForward | None = None

@@ -4,7 +4,6 @@ Other ids that Gymnasium or PettingZoo has registered can be used too; no checkp
 """
 
 import functools
-import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -14,13 +13,17 @@ import gymnasium as gym
 from envs.readers.mpe import MPE_IDS
 from envs.simulators.envpool import ENV_IDS as ENVPOOL_IDS
 from envs.simulators.envpool import HIGHWAY_ENV_OF, known_tasks, register_envpool_ids
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, short
+from predictor.support.importing import load_named
+from predictor.support.reading import as_object, parse_json
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
 HEURISTIC_DRIVERS = ("heuristic", "mixed", "varied")
 """Drivers of the multiagent environments that `envs.drivers.all_agents` has a heuristic for."""
+_OF_GYMNASIUM = ("disable_env_checker", "render_mode")
+"""Arguments of `make_env` that are not a user's."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +129,29 @@ def is_foreign_id(env_id: str) -> bool:
     return spec is None or not str(spec.entry_point).startswith("highway_env.")
 
 
+def arguments_of(text: str) -> dict[str, Any]:
+    """Returns the arguments of an environment that `--env-kwargs` holds.
+
+    Args:
+        text: text of a JSON object; empty for none.
+
+    Raises:
+        UserError: it is no JSON object, or holds the id.
+    """
+    try:
+        kwargs = as_object(parse_json(text or "{}", "env_kwargs"), "env_kwargs")
+    except UserError as error:
+        raise UserError(f"env_kwargs must be a JSON object, got {short(repr(text))}: {error}") from error
+    if "env_id" in kwargs or "id" in kwargs:
+        raise UserError("env_kwargs are arguments of the environment and cannot hold its env_id; leave it out")
+    return kwargs
+
+
+def name_with(env_id: str, env_kwargs: str) -> str:
+    """Returns an id with the arguments of its environment, for tables and messages: `merge-v1 {"size": 3}`."""
+    return f"{env_id} {env_kwargs}" if arguments_of(env_kwargs) else env_id
+
+
 def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     """Makes a Gymnasium environment.
 
@@ -135,17 +161,27 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
         kwargs: for `gymnasium.make`.
 
     Raises:
-        UserError: unknown id, or a missing package.
+        UserError: unknown id, a missing package, or arguments that the environment refuses.
     """
     import highway_env  # noqa: F401  (registers its ids)
 
     from envs.simulators import mixed_traffic  # noqa: F401  (registers its ids)
 
     register_envpool_ids()
+    module, colon, _ = env_id.partition(":")
+    if colon and not all(part.isidentifier() for part in module.split(".")):
+        raise UserError(f"cannot make env '{short(env_id)}': '{short(module)}' before the colon is no name of a module")
     try:
         return gym.make(env_id, **kwargs)
-    except (gym.error.Error, ModuleNotFoundError) as error:
+    except UserError:
+        raise
+    except (gym.error.Error, ImportError) as error:
         raise UserError(f"cannot make env '{env_id}': {error}; known here: {', '.join(_HIGHWAY)}") from error
+    except Exception as error:
+        given = {name: value for name, value in kwargs.items() if name not in _OF_GYMNASIUM}
+        if not given:
+            raise
+        raise UserError(f"cannot make env '{env_id}' with {short(given)}: {type(error).__name__}: {error}") from error
 
 
 def make_multiagent_env(env_id: str, **kwargs: Any) -> "ParallelEnv":
@@ -270,22 +306,6 @@ def _maker(env_id: str) -> Callable[..., Any]:
         f"unknown multiagent env '{env_id}'; known: {', '.join(MULTIAGENT_IDS)}; others as 'module:function' or "
         "registered with pettingzoo.register('parallel', id, ...)"
     )
-
-
-def load_named(path: str) -> Callable[..., Any]:
-    """Imports what "module:function" names.
-
-    Raises:
-        UserError: there is no such module, or it has no such function or class.
-    """
-    module, _, name = path.partition(":")
-    try:
-        factory: Callable[..., Any] | None = getattr(importlib.import_module(module), name, None)
-    except (ImportError, ValueError) as error:
-        raise UserError(f"cannot import '{module}' for '{path}': {error}; is its package installed?") from error
-    if not callable(factory):
-        raise UserError(f"module '{module}' has no function or class '{name}'")
-    return factory
 
 
 def _in_pettingzoo(env_id: str) -> bool:

@@ -12,9 +12,11 @@ from torch import Tensor
 
 from envs.arms import Arm
 from predictor.forecaster import Forecaster
-from predictor.online import OnlineForecaster
+from predictor.online import MAX_ROWS, OnlineForecaster
 from predictor.scene import Forecast, SceneBatch
-from predictor.support.config_checks import check_at_least
+from predictor.scene_checks import MOST_STEPS
+from predictor.support.config_checks import check_at_least, check_at_most, check_types
+from predictor.support.memory import check_count
 from predictor.support.runtime import resolve_device
 
 NOISE_STREAM = 0x6E6F697365
@@ -43,6 +45,8 @@ class ForecastConfig:
     """Number of candidate plans of the ego whose what-if forecasts are in the observation."""
     arm: Arm = Arm()
     """Part of the forecast that the observation shows."""
+    max_rows: int = MAX_ROWS
+    """Largest number of environments in one call of the forecaster: bounds the memory that a step needs."""
 
     @property
     def shows_uncertainty(self) -> bool:
@@ -51,7 +55,11 @@ class ForecastConfig:
 
     def __post_init__(self) -> None:
         """Checks ranges, and replaces `device="auto"` by the device that it stands for."""
-        check_at_least(self, 1, "num_samples", "horizon_steps")
+        check_types(self)
+        check_at_least(self, 1, "num_samples", "horizon_steps", "max_rows")
+        check_at_most(self, MOST_STEPS, "horizon_steps")
+        each_bytes = 8 * (self.horizon_steps or 1)
+        check_count(self.num_samples, "num_samples", each_bytes)
         check_at_least(self, 0, "seed", "num_plans")
         object.__setattr__(self, "device", resolve_device(self.device))
 
@@ -83,9 +91,9 @@ class SceneStream:
         self.scenes: SceneBatch | None = None
         self.forecast: Forecast | None = None
         self.seen: SceneBatch | None = None
-        self._online = OnlineForecaster(forecaster, envs, agents, config.device)
-        self._noise: list[np.random.Generator] = [_noise(config.seed + env) for env in range(envs)]
-        self._before: list[np.random.Generator] = self._noise
+        self._online = OnlineForecaster(forecaster, envs, agents, config.device, config.max_rows)
+        self._noise = EnvNoise([config.seed + env for env in range(envs)])
+        self._before: Sequence[np.random.Generator] = self._noise
 
     @property
     def forecaster(self) -> Forecaster:
@@ -119,14 +127,16 @@ class SceneStream:
 
     def continue_noise(self, streams: "Sequence[SceneStream]") -> None:
         """Takes over the noise generators of one stream per environment, in their current state."""
-        self._noise = [stream._noise[0] for stream in streams]
+        self._noise = EnvNoise([0] * len(streams))
+        for env, stream in enumerate(streams):
+            self._noise.put(env, stream._noise[0])
 
     def seed(self, seed: int | Sequence[int | None]) -> None:
         """Restarts the samples' noise: environment i from seed + i, or from entry i unless that is None."""
         seeds = [seed + env for env in range(len(self._noise))] if isinstance(seed, int | np.integer) else seed
         for env, own in enumerate(seeds):
             if own is not None:
-                self._noise[env] = _noise(own)
+                self._noise.restart(env, own)
 
     def reset(self, envs: Int[np.ndarray, " some"] | None = None) -> None:
         """Forgets the history of some environments (all, if None)."""
@@ -158,7 +168,7 @@ class SceneStream:
 
     def _forecast_for(self, envs: Int[np.ndarray, " entries"]) -> Forecast:
         """Returns the forecasts of the latest scenes; an ended episode draws its noise before its successor does."""
-        noise = [self._noise[env] for env in envs]
+        noise = self._noise.of(envs)
         self._before = deepcopy(noise) if self.config.num_plans else noise
         return self._shown(self._online.forecast(self.horizon_steps, self.config.num_samples, noise))
 
@@ -183,7 +193,69 @@ class SceneStream:
         self.scenes = SceneBatch(*arrays)
 
 
-def _noise(seed: int) -> np.random.Generator:
+class EnvNoise(Sequence[np.random.Generator]):
+    """Noise generator of each environment, made when something is drawn from it: most forecasters never draw.
+
+    Args:
+        seeds: random seed of each environment.
+    """
+
+    def __init__(self, seeds: list[int]) -> None:
+        """Makes no generator yet."""
+        self._seeds = seeds
+        self._made: dict[int, np.random.Generator] = {}
+
+    def __len__(self) -> int:
+        """Number of environments."""
+        return len(self._seeds)
+
+    def __getitem__(self, env: Any) -> Any:
+        """Returns the generator of an environment, or those of a slice."""
+        if isinstance(env, slice):
+            return self.of(np.arange(len(self))[env])
+        env = range(len(self))[env]
+        if env not in self._made:
+            self.put(env, _generator(self._seeds[env]))
+        return self._made[env]
+
+    def put(self, env: int, generator: np.random.Generator) -> None:
+        """Sets the generator of an environment."""
+        self._made[env] = generator
+
+    def restart(self, env: int, seed: int) -> None:
+        """Starts the noise of an environment anew."""
+        self._seeds[env] = seed
+        self._made.pop(env, None)
+
+    def of(self, envs: Int[np.ndarray, " some"]) -> "SomeNoise":
+        """Returns the generators of some environments, in this order."""
+        return SomeNoise(self, envs)
+
+
+class SomeNoise(Sequence[np.random.Generator]):
+    """Noise generators of some environments, one of which may be listed twice.
+
+    Args:
+        every: generators of all environments.
+        envs: index of each environment.
+    """
+
+    def __init__(self, every: EnvNoise, envs: Int[np.ndarray, " some"]) -> None:
+        """Stores both; makes no generator."""
+        self._every, self._envs = every, np.asarray(envs)
+
+    def __len__(self) -> int:
+        """Number of generators."""
+        return len(self._envs)
+
+    def __getitem__(self, place: Any) -> Any:
+        """Returns a generator, or those of a slice."""
+        if isinstance(place, slice):
+            return SomeNoise(self._every, self._envs[place])
+        return self._every[int(self._envs[place])]
+
+
+def _generator(seed: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(NOISE_STREAM,)))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from envs.arms import Arm
+from envs.arms import Arm, arm_of
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
 from envs.observation import (
     ForecastStream,
@@ -98,7 +98,7 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         forecaster = open_forecaster(checkpoint, spec, source, device, forecaster)
         steps = horizon_steps or forecaster.horizon_steps
         base: Any = env.unwrapped  # vector wrappers do not pass calls on
-        arm = arm or Arm()
+        arm = arm_of(arm)
         self.plan_names = ask_for_plans(
             lambda *a: base.call(*a), what_if, steps, "VectorForecast", base, arm.plays(bool(what_if))
         )

@@ -14,11 +14,11 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 
-from envs.arms import Arm
+from envs.arms import Arm, arm_of
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
 from envs.observation import ForecastStream, carries_scenes, open_forecaster, scene_entries, scene_spaces
 from envs.own_observation import own_entries, own_part, own_spaces
-from envs.plans import PlanModel, Plans, checked_plans, plan_model_for
+from envs.plans import PlanModel, Plans, checked_model, checked_plans, plan_model_for
 from envs.plans.batch import PlanBatch, plans_info
 from envs.plans.playing import with_true_futures
 from envs.readers import MakeReader, reader_for
@@ -220,10 +220,12 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
             perception_m=perception_m, max_agents=max_agents, device=device, forecaster=forecaster, seed=seed,
             what_if=what_if, arm=arm, _disable_deepcopy=True,
         )  # the reader is recorded by the SceneObservation below  # fmt: skip
-        arm = arm or Arm()
+        arm = arm_of(arm)
         self._played = arm.plays(bool(what_if))
         needs_plans = bool(what_if) or self._played != 0
-        plan_model = (plan_model_for(env) if needs_plans else None) if isinstance(what_if, bool) else what_if
+        plan_model = (
+            (plan_model_for(env) if needs_plans else None) if isinstance(what_if, bool) else checked_model(what_if)
+        )
         num_plans = len(plan_model.names) if plan_model is not None and what_if else 0
         config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, num_plans=num_plans, arm=arm)
         ready = carries_scenes(env.observation_space)

@@ -4,8 +4,10 @@ The card is made from files only (config, stores, measured accuracy). The measur
 beside the weights, from which `docs/write_tables.py` writes the tables of README.md and docs/in_env.md.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from predictor.checkpoint import WEIGHTS, CheckpointInfo, load_checkpoint, name_of_folder, resolve
 from predictor.data.store import EpisodeStore, read_store
@@ -17,6 +19,7 @@ from predictor.support.command_line import parse
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_text
 from predictor.support.reading import read_object
+from predictor.support.remote import require_local
 
 SPREAD = {
     True: "Where a driver's route is free, the single forecast lies between the routes, and the modes follow them.",
@@ -45,6 +48,7 @@ def write_card(config: CardConfig) -> Path:
         UserError: an input is unreadable, the accuracy has no result for this checkpoint, or the checkpoint does not
             say how it was trained. Nothing is written then.
     """
+    require_local(config.checkpoint, "checkpoint")
     model, info = load_checkpoint(config.checkpoint)
     folder, name = resolve(config.checkpoint), name_of_folder(config.checkpoint)
     try:
@@ -95,11 +99,15 @@ def _store_line(path: Path, store: EpisodeStore) -> str:
 
 
 def _training(name: str, info: CheckpointInfo) -> str:
-    made = info.provenance
-    if "result" not in made:
+    try:
+        return _trained(info.provenance)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise UserError(
             f"checkpoint '{name}' does not say how it was trained; write cards of checkpoints of predictor.train"
-        )
+        ) from error
+
+
+def _trained(made: Mapping[str, Any]) -> str:
     result = made["result"]
     reached = f"minADE {result['val_min_ade_m']:.3f} m"
     if "val_energy_m" in result:

@@ -1,9 +1,11 @@
 """Predictor checkpoints: a folder with `config.json` and `model.safetensors`; no pickle, so safe to load from others.
 
-A checkpoint holds everything needed to run it (spec, sizes, horizon, residual spread) and how it was made.
+A checkpoint holds everything needed to run it (spec, sizes, horizon, residual spread) and how it was made. The name
+"hub:owner/name" stands for one on a hub (`predictor.support.hub`), wherever a checkpoint's name is taken.
 """
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,23 +20,25 @@ from predictor.forecaster import Forecaster, TrainableForecaster
 from predictor.models import KINDS, build, config_from_json, name_of, shapes_of
 from predictor.own_forecasters import PREFIX, find_own, is_own, make_own
 from predictor.scene import SceneSpec
+from predictor.scene_checks import MOST_STEPS
 from predictor.support.config_checks import check_at_least, check_at_most, check_scale_values
 from predictor.support.errors import UserError, short
-from predictor.support.files import new_folder, write_json
+from predictor.support.files import check_place, new_folder, write_json
+from predictor.support.hub import fetch, hub_name, is_hub
 from predictor.support.reading import MIB, NoSuchFile, check_regular, read_json, version_of
+from predictor.support.remote import address, is_remote, kept_copy, named
 from predictor.support.runtime import resolve_device
 from predictor.support.typed_values import converted, from_table
 
 FORMAT = "dgvae-rl predictor"
 VERSION = 1
 CONSTANT_VELOCITY = "constant-velocity"
-WEIGHTS = "model.safetensors"
+CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
 BEST_OF_RUN = "checkpoint"
 """Folder of the best checkpoint, in the run folder that `python -m predictor.train` writes."""
-MOST_CONFIG_BYTES, MOST_WEIGHT_BYTES = 4 * MIB, 4096 * MIB
-"""Largest sizes of the two files."""
-MOST_STEPS = 100_000
-"""Largest horizon."""
+MOST_CONFIG_BYTES, MOST_WEIGHT_BYTES, MOST_CARD_BYTES = 4 * MIB, 4096 * MIB, MIB
+"""Largest sizes of the two files, and of the card beside them."""
+MOST_BYTES = {CONFIG: MOST_CONFIG_BYTES, WEIGHTS: MOST_WEIGHT_BYTES}
 PRETRAINED = Path(__file__).resolve().parent / "pretrained"
 
 
@@ -77,16 +81,29 @@ def save_checkpoint(path: Path, model: nn.Module, info: CheckpointInfo) -> None:
     with new_folder(Path(path)) as partial:
         tensors = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
         (partial / WEIGHTS).write_bytes(save(tensors))  # `save_file` would not follow the umask
-        write_json(partial / "config.json", {"format": FORMAT, "version": VERSION, **asdict(info)})
+        write_json(partial / CONFIG, {"format": FORMAT, "version": VERSION, **asdict(info)})
 
 
 def resolve(name: str | Path) -> Path:
     """Returns the folder of a checkpoint: a shipped one by its name, a folder itself, or the best one of a run folder.
 
+    Of a folder on another file system (`s3://…`) it returns a copy, which is kept until the process ends. One on a hub
+    is downloaded, once in a process.
+
     Raises:
-        UserError: none of them exists.
+        UserError: none of them exists, or the hub does not give it.
     """
+    if not isinstance(name, str | Path) or not str(name).strip() or "\0" in str(name):
+        raise UserError(f"a checkpoint is a folder or a shipped name, got {short(repr(name), 60)}")
+    if is_hub(name):
+        return _fetched(str(name))
     path = Path(name)
+    if is_remote(path):
+        found = kept_copy(path, MOST_BYTES) or kept_copy(path / BEST_OF_RUN, MOST_BYTES)
+        if found is None:
+            raise UserError(f"{address(path)} is not a predictor checkpoint (it has no {' and '.join(MOST_BYTES)})")
+        return found
+    check_place(path)
     if path.is_dir():
         best = path / BEST_OF_RUN
         return best if (best / WEIGHTS).is_file() and not (path / WEIGHTS).is_file() else path
@@ -99,13 +116,51 @@ def resolve(name: str | Path) -> Path:
     )
 
 
+@functools.lru_cache(maxsize=64)
+def _fetched(name: str) -> Path:
+    return fetch(name, {CONFIG: MOST_CONFIG_BYTES, WEIGHTS: MOST_WEIGHT_BYTES}, {CARD: MOST_CARD_BYTES})
+
+
 def name_of_folder(path: str | Path) -> str:
     """Returns the name of a checkpoint in tables: its folder's, or the run folder's for its best checkpoint."""
     if is_own(path):
         return str(path).removeprefix(PREFIX)
+    if is_hub(path):
+        return hub_name(path).repository.rpartition("/")[2]
     path = Path(path)
+    if path.parent.name == "snapshots":  # a download in the cache: models--OWNER--NAME/snapshots/COMMIT
+        return path.parent.parent.name.rpartition("--")[2]
     named = path.resolve() if path.name in ("", ".", "..") else path
     return named.resolve().parent.name if named.name == BEST_OF_RUN else named.name
+
+
+def names_of(checkpoints: Sequence[str]) -> dict[str, str]:
+    """Returns a name in tables for each checkpoint: its folder's, and folders above it where two are called alike.
+
+    >>> names_of(["new/crossing/checkpoint", "old/crossing", "highway"])
+    {'new/crossing/checkpoint': 'new/crossing', 'old/crossing': 'old/crossing', 'highway': 'highway'}
+
+    Raises:
+        UserError: one of them is given twice.
+    """
+    names = {checkpoint: name_of_folder(checkpoint) for checkpoint in checkpoints}
+    parts = {checkpoint: _folders_of(checkpoint) for checkpoint in checkpoints}
+    if len(set(parts.values())) < len(checkpoints):
+        raise UserError(f"each checkpoint is given once, got {', '.join(checkpoints)}; leave one out")
+    for length in range(2, max(map(len, parts.values()), default=0) + 1):
+        found = list(names.values())
+        alike = [checkpoint for checkpoint, name in names.items() if found.count(name) > 1]
+        names |= {checkpoint: "/".join(parts[checkpoint][-length:]) for checkpoint in alike}
+    return names
+
+
+def _folders_of(checkpoint: str) -> tuple[str, ...]:
+    """Returns the folders on the way to a checkpoint, without that of the best one in a run's."""
+    known = not Path(checkpoint).is_dir() and checkpoint in (*shipped(), CONSTANT_VELOCITY)
+    if is_own(checkpoint) or known:
+        return (checkpoint,)
+    path = Path(checkpoint).resolve()
+    return (path.parent if path.name == BEST_OF_RUN else path).parts
 
 
 def shipped() -> list[str]:
@@ -123,8 +178,9 @@ def load_checkpoint(name: str | Path, device: str = "cpu") -> tuple[Any, Checkpo
     if str(name) == CONSTANT_VELOCITY:
         raise UserError(f"'{name}' has no weights; pass a checkpoint")
     path = resolve(name)
-    info = read_info(path)
-    tensors = read_weights(path / WEIGHTS, shapes_of(info.model, info.spec, info.config, info.horizon_steps))
+    with named(path, name):
+        info = read_info(path)
+        tensors = read_weights(path / WEIGHTS, shapes_of(info.model, info.spec, info.config, info.horizon_steps))
     model = build(info.model, info.spec, info.config, info.horizon_steps)
     model.load_state_dict(tensors)
     return model.to(resolve_device(device)).eval(), info
@@ -165,11 +221,14 @@ def read_info(path: Path) -> CheckpointInfo:
     Raises:
         UserError: it cannot be read, or does not describe a predictor; the message names the key.
     """
-    file = Path(path) / "config.json"
+    file = Path(path) / CONFIG
     try:
         content = read_json(file, MOST_CONFIG_BYTES)
     except NoSuchFile as error:
         raise UserError(f"{path} is not a predictor checkpoint (it has no {file.name})") from error
+    run = content.get("config") if isinstance(content, dict) else None
+    if isinstance(run, dict) and "eval_every" in run:
+        raise UserError(f"{path} is a training run without a checkpoint yet; train on, with --resume, to the first one")
     if not isinstance(content, dict) or content.pop("format", None) != FORMAT:
         raise UserError(f"{path} is not a predictor checkpoint (config.json has no format '{FORMAT}')")
     version_of(content, VERSION, f"checkpoint {path}")
@@ -200,8 +259,8 @@ def load_forecaster(name: str | Path, scene_spec: SceneSpec, source: str, device
     """Loads a forecaster for scenes of `scene_spec`.
 
     Args:
-        name: shipped name, folder, "constant-velocity", or the name of a user's own (`predictor.own_forecasters`),
-            which imports code.
+        name: shipped name, folder, "hub:owner/name", "constant-velocity", or the name of a user's own
+            (`predictor.own_forecasters`), which imports code.
         scene_spec: layout of the scenes.
         source: origin of the scenes, for messages.
         device: device of a checkpoint.

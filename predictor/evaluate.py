@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from matplotlib import pyplot as plt
 from rich.console import Console
-from rich.progress import track
 
 from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
 from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint
@@ -33,6 +32,7 @@ from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, write_json, write_text
 from predictor.support.memory import check_count
+from predictor.support.progress import track
 from predictor.support.provenance import provenance
 from predictor.support.runtime import resolve_device, tune
 
@@ -195,7 +195,7 @@ def main() -> None:
     subject = _load(config)
     accuracies = _evaluate(config, subject)
     title = f"{config.checkpoint} on {config.data}"
-    Console(width=160).print(accuracy_table(accuracies, subject.spec.dt_s, title))
+    Console().print(accuracy_table(accuracies, subject.spec.dt_s, title))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from predictor.graph import NO_AGENT
-from predictor.noise import Noise
+from predictor.noise import Noise, TrainingNoise
 from predictor.scene import SceneSpec, dense_edges
 from predictor.support.errors import UserError
 
@@ -94,10 +94,14 @@ class Memory:
         """Returns a copy in which the memory of `envs` is that of `other`."""
         return self._map(lambda m, o: m.index_copy(0, envs, o), other)
 
+    def part(self, envs: slice) -> "Memory":
+        """Returns the memory of consecutive environments, without copying it."""
+        return self._map(lambda m: m[envs])
+
     @staticmethod
-    def concatenate(first: "Memory", second: "Memory") -> "Memory":
-        """Returns the memory of the environments of `first`, then of those of `second`."""
-        return first._map(lambda m, o: torch.cat([m, o]), second)
+    def concatenate(first: "Memory", *others: "Memory") -> "Memory":
+        """Returns the memory of the environments of `first`, then of those of the others."""
+        return first._map(lambda *m: torch.cat(m), *others) if others else first
 
     def _map(self, change: Callable[..., Tensor], *others: "Memory") -> "Memory":
         """Applies `change` to every tensor, together with the corresponding tensors of other memories."""
@@ -271,7 +275,7 @@ class TrainableForecaster(Forecaster, Protocol):
         valid: Bool[Tensor, "batch time agents"],
         last_observed: Int[Tensor, " batch"],
         rollout_steps: int,
-        generator: torch.Generator | None = None,
+        generator: TrainingNoise | None = None,
     ) -> WindowOutput:
         """Runs a teacher-forced pass over all steps and a free roll-out of `rollout_steps` after each `last_observed`.
 

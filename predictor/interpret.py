@@ -20,7 +20,6 @@ import torch
 from jaxtyping import Float, Int
 from rich.console import Console
 from rich.markdown import Markdown
-from rich.progress import track
 
 from predictor.checkpoint import CONSTANT_VELOCITY, CheckpointInfo, load_checkpoint
 from predictor.data.store import StoreInfo, read_store
@@ -35,6 +34,7 @@ from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, scratch_folder, write_json, write_text
+from predictor.support.progress import track
 from predictor.support.provenance import provenance
 from predictor.support.runtime import resolve_device
 
@@ -111,7 +111,7 @@ def interpret(config: InterpretConfig) -> Findings:
     findings, accuracies = measure(
         model,
         windows,
-        track(parts, description="infer edges"),
+        track(parts, "infer edges"),
         store.info.edge_attribute_names,
         config.seed,
         config.device,

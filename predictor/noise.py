@@ -86,13 +86,34 @@ class RepeatedNoise:
         return self._repeat(uniform_like(self._unrepeated(logits), self._noise))
 
 
-NoiseOfPairs = torch.Generator | PairNoise | RepeatedNoise
+class NoiseOfRows:
+    """Uniform numbers for some rows of a batch: those that they get where one generator draws for the whole batch.
+
+    Args:
+        generator: source of the numbers, at the same place in every process that draws for the batch.
+        rows: rows of the batch.
+        total: number of rows of the whole batch.
+    """
+
+    def __init__(self, generator: torch.Generator, rows: slice, total: int) -> None:
+        """Stores the arguments; draws nothing."""
+        self._generator, self._rows, self._total = generator, rows, total
+
+    def like(self, logits: Float[Tensor, "rows *pairs types"]) -> Float[Tensor, "rows *pairs types"]:
+        """Returns the next numbers of the rows."""
+        shape = (self._total, *logits.shape[1:])
+        return torch.rand(shape, generator=self._generator, device=logits.device, dtype=logits.dtype)[self._rows]
+
+
+TrainingNoise = torch.Generator | NoiseOfRows
+"""Source of the noise of a training step."""
+NoiseOfPairs = TrainingNoise | PairNoise | RepeatedNoise
 """Source of the noise of one roll-out."""
 
 
 def uniform_like(logits: Float[Tensor, "*batch types"], noise: NoiseOfPairs | None) -> Float[Tensor, "*batch types"]:
     """Draws uniform numbers in [0, 1), one for each logit."""
-    if isinstance(noise, PairNoise | RepeatedNoise):
+    if isinstance(noise, PairNoise | RepeatedNoise | NoiseOfRows):
         return noise.like(logits)
     return torch.rand(logits.shape, generator=noise, device=logits.device, dtype=logits.dtype)
 

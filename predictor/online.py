@@ -2,12 +2,15 @@
 
 Between two observations agents may be re-sorted and may come and go: memory moves with an agent's id,
 new agents start from zero, and the memory of agents that left is dropped. The cost of a step does not depend on the
-length of the history.
+length of the history. Nothing loops over scenes in Python; many scenes are taken in parts of `max_rows`, so that what a
+forecaster needs for a moment does not grow with their number.
 """
 
 import copy
 import os
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -19,9 +22,13 @@ from predictor.forecaster import Belief, Forecaster, Memory
 from predictor.graph import NO_AGENT
 from predictor.noise import Noise
 from predictor.scene import PADDING_ID, Forecast, SceneBatch
-from predictor.support.errors import ProtocolError
+from predictor.scene_checks import check_batch, check_ids, check_request, check_states
+from predictor.support.errors import ProtocolError, UserError
 from predictor.support.runtime import resolve_device
 from predictor.what_if import check_plans, rollout_plans
+
+MAX_ROWS = 1024
+"""Largest number of scenes in one call of a forecaster."""
 
 _process = os.getpid()
 
@@ -49,18 +56,21 @@ class OnlineForecaster:
         envs: number of parallel scenes, one for each environment.
         agents: number of agents of each scene, padding included.
         device: device of the forecaster: cpu, cuda or auto.
+        max_rows: largest number of scenes in one call of the forecaster.
     """
 
-    def __init__(self, forecaster: Forecaster, envs: int, agents: int, device: str = "cpu") -> None:
+    def __init__(
+        self, forecaster: Forecaster, envs: int, agents: int, device: str = "cpu", max_rows: int = MAX_ROWS
+    ) -> None:
         """Starts with empty memory for every environment."""
         use_one_thread_after_fork()
-        self.forecaster = forecaster
+        self.forecaster, self._max_rows = forecaster, max_rows
         self.device = torch.device(resolve_device(device))
         self._memory = forecaster.empty_memory(envs, agents)
         self._fresh = forecaster.empty_memory(1, agents)
         self._ids: Int[np.ndarray, "envs agents"] = np.full((envs, agents), PADDING_ID, dtype=np.int64)
         self._ego_axes = np.array([f == "ego" for f in forecaster.spec.frame], dtype=np.float64)
-        self._belief: Belief | None = None
+        self._beliefs: list[Belief] = []  # one for each part of the latest scenes
         self._origins: Float[np.ndarray, "scenes axes"] = np.zeros((0, len(self._ego_axes)))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "OnlineForecaster":
@@ -76,7 +86,7 @@ class OnlineForecaster:
         chosen = np.arange(len(self._ids)) if envs is None else np.asarray(envs, dtype=np.int64)
         if not len(chosen):
             return
-        self._belief = None  # a forecast of what is forgotten would have no meaning
+        self._beliefs = []  # a forecast of what is forgotten would have no meaning
         self._ids[chosen] = PADDING_ID
         index = torch.from_numpy(chosen).to(self.device)
         fresh = self._fresh.select(torch.zeros(len(chosen), dtype=torch.long, device=self.device))
@@ -84,8 +94,13 @@ class OnlineForecaster:
 
     @torch.inference_mode()
     def observe(self, scenes: SceneBatch, envs: Int[np.ndarray, " some"] | None = None) -> None:
-        """Observes one scene per environment, or one for each of `envs`; the next `forecast` has as many entries."""
+        """Observes one scene per environment, or one for each of `envs`; the next `forecast` has as many entries.
+
+        Raises:
+            UserError: the batch has another shape or type, states that are not finite, or an id twice in a scene.
+        """
         use_one_thread_after_fork()
+        self._check(scenes, len(self._ids) if envs is None else len(envs))
         if envs is None:
             self._memory, self._ids = self._take(scenes, self._ids, self._memory)
             return
@@ -104,6 +119,8 @@ class OnlineForecaster:
         use_one_thread_after_fork()
         ended = np.asarray(ended, dtype=np.int64)
         envs = len(self._ids)
+        self._check(scenes, envs)
+        self._check(successors, len(ended))
         fresh = self._fresh.select(torch.zeros(len(ended), dtype=torch.long, device=self.device))
         no_ids = np.full((len(ended), self._ids.shape[1]), PADDING_ID, dtype=np.int64)
         memory, ids = self._take(
@@ -135,23 +152,54 @@ class OnlineForecaster:
 
         Raises:
             ProtocolError: nothing was observed yet.
-            UserError: the spec has no ego, the ego is absent, or the plans are of another shape or not finite.
+            UserError: steps or samples are no whole numbers from 1 on; the spec has no ego, the ego is absent, or the
+                plans are of another shape or not finite.
         """
         use_one_thread_after_fork()
-        if self._belief is None:
+        if not self._beliefs:
             raise ProtocolError("forecast() needs an observation; call observe() first")
-        belief = self._belief
-        steps = horizon_steps or self.forecaster.horizon_steps
-        if ego_plan is None:
+        steps = self.forecaster.horizon_steps if horizon_steps is None else horizon_steps
+        agents = sum(belief.valid.shape[0] * belief.valid.shape[1] for belief in self._beliefs)
+        check_request(steps, num_samples, agents * len(self._ego_axes))
+        plans = None if ego_plan is None else self._local_plans(ego_plan, steps)
+        if len(self._beliefs) == 1:
+            return self._forecast_part(self._beliefs[0], steps, num_samples, generator, plans)
+        scenes = sum(len(belief.valid) for belief in self._beliefs)
+        if isinstance(generator, Sequence) and len(generator) != scenes:
+            raise UserError(
+                f"samples need one generator per scene, got {len(generator)} generators for {scenes} scenes"
+            )
+        return _joined(
+            [
+                self._forecast_part(
+                    belief,
+                    steps,
+                    num_samples,
+                    generator[part] if isinstance(generator, Sequence) else generator,
+                    None if plans is None else plans[part],
+                )
+                for belief, part in zip(self._beliefs, self._parts(scenes), strict=True)
+            ]
+        )
+
+    def _forecast_part(
+        self,
+        belief: Belief,
+        steps: int,
+        num_samples: int,
+        generator: Noise | None,
+        plans: Float[Tensor, "batch plans horizon state"] | None,
+    ) -> Forecast:
+        """Forecasts one part of the latest scenes."""
+        if plans is None:
             futures = self.forecaster.rollout(belief, steps, num_samples, generator)
         else:
-            plans = self._local_plans(ego_plan, belief, steps)
             futures = rollout_plans(self.forecaster, belief, plans, num_samples, generator)
         # float32 relative to the ego: the origin that observe() removed is the ego's own position on "ego" axes
         axes = self.forecaster.spec.position_dim
         ego_now = belief.states[:, None, :1, None, :axes] * float(self.forecaster.spec.has_ego)
         absent = ~belief.valid[:, None, :, None, None]
-        if ego_plan is not None:  # the axis of plans
+        if plans is not None:  # the axis of plans
             ego_now, absent = ego_now[:, None], absent[:, None]
         xy = (futures.states[..., :axes] - ego_now).masked_fill(absent, 0.0)
         missing = self._ids.shape[1] - belief.valid.shape[1]
@@ -173,34 +221,78 @@ class OnlineForecaster:
         )
 
     def _local_plans(
-        self, ego_plan: Float[np.ndarray, "..."], belief: Belief, horizon_steps: int
+        self, ego_plan: Float[np.ndarray, "..."], horizon_steps: int
     ) -> Float[Tensor, "batch plans horizon state"]:
-        """Returns plans in the axes of the belief's states; raises a `UserError` if they do not fit the scenes."""
-        plans = np.array(ego_plan, dtype=np.float64)
+        """Returns plans in the axes of the beliefs' states; raises a `UserError` if they do not fit the scenes."""
+        try:
+            plans = np.array(ego_plan, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise UserError(f"ego_plan must be numbers: {error}") from error
         finite = bool(np.isfinite(plans).all())
-        check_plans(self.forecaster.spec, belief.valid[:, 0], plans.shape, finite, horizon_steps)
+        there = torch.cat([belief.valid[:, 0] for belief in self._beliefs])
+        check_plans(self.forecaster.spec, there, plans.shape, finite, horizon_steps)
         plans[..., : self._origins.shape[-1]] -= self._origins[:, None, None]
         return torch.from_numpy(plans.astype(np.float32)).to(self.device)
+
+    def _check(self, scenes: SceneBatch, envs: int) -> None:
+        """Raises a `UserError` if a batch does not have the shape of what is observed."""
+        check_batch(scenes, envs, self._ids.shape[1], self.forecaster.spec.num_features)
+
+    def _parts(self, scenes: int) -> Iterator[slice]:
+        """Yields the parts of a batch of scenes, each of at most `max_rows`; one even if there is no scene."""
+        for start in range(0, max(1, scenes), self._max_rows):
+            yield slice(start, min(start + self._max_rows, scenes))
 
     def _take(
         self, scenes: SceneBatch, old_ids: Int[np.ndarray, "envs agents"], memory: Memory
     ) -> tuple[Memory, Int[np.ndarray, "envs agents"]]:
         # Columns beyond the last agent of any scene cost nothing: pairs grow with the square of the columns.
         agents = 1 + int(np.flatnonzero(scenes.valid.any(axis=0)).max(initial=0))
+        taken = [
+            self._take_part(scenes[part], old_ids[part], memory.part(part), agents) for part in self._parts(len(scenes))
+        ]
+        self._beliefs = [part.belief for part in taken]
+        self._origins = np.concatenate([part.origins for part in taken])
+        return Memory.concatenate(*(part.memory for part in taken)), np.concatenate([part.ids for part in taken])
+
+    def _take_part(
+        self, scenes: SceneBatch, old_ids: Int[np.ndarray, "envs agents"], memory: Memory, agents: int
+    ) -> "_Taken":
+        """Observes scenes whose agents stand in the first `agents` columns."""
         valid = scenes.valid[:, :agents]
         ids = np.where(scenes.valid, scenes.ids, PADDING_ID)
         if agents < ids.shape[1] or not np.array_equal(old_ids, ids):
+            check_ids(ids, scenes.valid)
             source, known = _match(old_ids, ids[:, :agents])
             memory = memory.reorder(torch.from_numpy(source).to(self.device), torch.from_numpy(known).to(self.device))
         # float64 until the ego's position is subtracted: a scene 10 km down the road loses no precision
         # values in padding, not-a-number for example, must not reach any agent
         local = np.where(valid[..., None], scenes.states[:, :agents], 0.0)
+        check_states(local)
         axes = len(self._ego_axes)
-        self._origins = local[:, 0, :axes] * self._ego_axes
-        local[..., :axes] -= self._origins[:, None]
+        origins = local[:, 0, :axes] * self._ego_axes
+        local[..., :axes] -= origins[:, None]
         states = torch.from_numpy(np.where(valid[..., None], local, 0.0).astype(np.float32)).to(self.device)
-        memory, self._belief = self.forecaster.observe(memory, states, torch.from_numpy(valid).to(self.device))
-        return memory.padded(ids.shape[1]), ids
+        memory, belief = self.forecaster.observe(memory, states, torch.from_numpy(valid).to(self.device))
+        return _Taken(memory.padded(ids.shape[1]), ids, belief, origins)
+
+
+class _Taken(NamedTuple):
+    """Outcome of observing one part of the scenes."""
+
+    memory: Memory
+    ids: Int[np.ndarray, "envs agents"]
+    belief: Belief
+    origins: Float[np.ndarray, "envs axes"]
+
+
+def _joined(forecasts: list[Forecast]) -> Forecast:
+    """Returns the forecasts of all parts as one."""
+    parts: dict[str, list[Tensor | None]] = {
+        f.name: [getattr(one, f.name) for one in forecasts] for f in fields(Forecast)
+    }
+    joined: Any = {name: None if of[0] is None else torch.cat(of) for name, of in parts.items()}  # type: ignore[arg-type]
+    return Forecast(**joined)
 
 
 def _match(

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from predictor.graph import to_dense
+from predictor.support.config_checks import check_types
 from predictor.support.errors import UserError
 
 KINEMATIC_FEATURES = ("x_m", "y_m", "vx_mps", "vy_mps")
@@ -52,6 +53,7 @@ class SceneSpec:
 
     def __post_init__(self) -> None:
         """Checks that the fields fit together."""
+        check_types(self)
         if not 0 < self.dt_s < float("inf"):
             raise UserError(f"dt_s must be positive, got {self.dt_s}")
         if self.feature_names[:4] != KINEMATIC_FEATURES and self.feature_names[:6] != KINEMATIC_FEATURES_3D:
@@ -223,8 +225,8 @@ class SceneBatch:
         """Number of scenes in the batch."""
         return len(self.states)
 
-    def __getitem__(self, envs: Int[np.ndarray, " envs"]) -> "SceneBatch":
-        """Returns the scenes of the given environments, as a batch."""
+    def __getitem__(self, envs: Int[np.ndarray, " envs"] | slice) -> "SceneBatch":
+        """Returns the scenes of the given environments, as a batch; of a slice without copying them."""
         return SceneBatch(self.states[envs], self.ids[envs], self.valid[envs], self.heading_rad[envs])
 
     @staticmethod

@@ -6,17 +6,14 @@ in both views of docs/protocol.md, and prints the table as Markdown, with JSON a
 
 import hashlib
 import json
-import multiprocessing
 import os
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import matplotlib
-from rich.progress import Progress
 
 from predictor.data.store import read_info_of
 from predictor.evaluation.ablations import ABLATIONS
@@ -28,15 +25,17 @@ from predictor.evaluation.paper_tables import TABLES as PAPER_TABLES
 from predictor.evaluation.training_seeds import joined
 from predictor.reports.plots import figure_by_step, save_figure
 from predictor.reports.suite_tables import latex_table, markdown_report
+from predictor.support.cluster import check_address, connected
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_json, write_text
+from predictor.support.jobs import run_jobs, run_jobs_on
 from predictor.support.locks import locked
 from predictor.support.memory import check_count, check_processes
-from predictor.support.processes import end, follow_parent, print_into, start
 from predictor.support.provenance import provenance
 from predictor.support.reading import read_object
+from predictor.support.remote import exists
 from predictor.support.runtime import resolve_device, tune
 from predictor.support.stopping import resumable
 from predictor.train import train
@@ -53,8 +52,7 @@ MIN_HISTORY_STEPS = 8
 ADDED = {"precision": "float32", "causal_edges": False, "reaction_weight": 0.0, "init": ""}
 """Options that came after the first lines were trained, with the values that change nothing."""
 KEPT = "the same command goes on: finished lines are kept, others continue"
-SAVING_S = 60.0
-"""Time that a line's process gets to save its training when the suite is stopped [s]."""
+PACKAGES = ("torch", "numpy", "zarr")
 MEASURING = 2
 """Number of the way of measuring: results of another one are not taken for finished."""
 
@@ -87,6 +85,10 @@ class SuiteConfig:
     """Precision of matrix products in training (see `python -m predictor.train --help`); measuring is in float32."""
     seeds: int = 1
     """Number of training seeds of each line, from `seed` on; cells then show mean and range."""
+    cluster: str | None = None
+    """Ray cluster that runs the lines, each on one CPU (and one GPU with --device cuda): auto (the one that runs on
+    this machine) or HOST:PORT of its head; --data and --out have to be on a file system that all machines share
+    (docs/scale.md). None runs them here."""
     only_line: Annotated[str, Renamed("only_row")] = ""
     """Key of a line to run in this process, without a table."""
 
@@ -101,6 +103,7 @@ class SuiteConfig:
         check_at_least(self, 1, "seeds")
         check_count(self.seeds, "seeds")
         check_processes(self.workers, "workers")
+        check_address(self.cluster)
         keys = [line.key for line in TABLES[self.table].lines]
         for key in (*self.lines, *filter(None, [self.only_line])):
             if key not in keys:
@@ -115,7 +118,7 @@ class SuiteConfig:
             UserError: a store is missing; the message has the commands that make it.
         """
         table = TABLES[self.table]
-        missing = [s for s in (table.train, table.val, *table.tests.values()) if s and not (self.data / s).exists()]
+        missing = [s for s in (table.train, table.val, *table.tests.values()) if s and not exists(self.data / s)]
         if missing:
             commands = "; ".join(c.format(data=self.data) for c in table.commands)
             raise UserError(f"no store at {self.data / missing[0]}; make the stores of this table with: {commands}")
@@ -133,7 +136,9 @@ class SuiteConfig:
 
     @property
     def num_processes(self) -> int:
-        """Number of parallel processes, a line in each."""
+        """Number of parallel processes, a line in each, between which the cores are divided."""
+        if self.cluster is not None and self.device == "cpu":
+            return os.cpu_count() or 1  # a line has one CPU
         return self.workers or (1 if self.device.startswith("cuda") else os.cpu_count() or 1)
 
 
@@ -221,7 +226,7 @@ def run_line(config: SuiteConfig, line: Line) -> dict[str, Any]:
         "train_seconds": trained - began,
         **measure_line(TABLES[config.table], line, config.data, config.sizes, checkpoint, config.seed, config.device),
         "measure_seconds": time.perf_counter() - trained,
-        "provenance": provenance(("torch", "numpy", "zarr")),
+        "provenance": provenance(PACKAGES),
     }
     write_json(folder / "result.json", result)
     return result
@@ -249,6 +254,16 @@ class Job(NamedTuple):
     def result(self) -> Path:
         """File of the result."""
         return self.folder / "result.json"
+
+    @property
+    def locked_folder(self) -> Path:
+        """Folder of the table."""
+        return self.config.folder
+
+    def run(self) -> None:
+        """Trains and measures in this process, which is its own."""
+        tune(self.config.device)
+        print(f"measured {run_line(self.config, self.line)['name']}")
 
     def waits_for(self, other: "Job") -> bool:
         """Returns whether the other job trains the model that this one measures."""
@@ -278,7 +293,7 @@ def run_suite(config: SuiteConfig) -> dict[str, Any]:
         locked(config.folder, "suite"),
         resumable("the same command goes on: finished lines are kept, others continue"),
     ):
-        failed = _run_in_processes(config, [job for job in jobs if not job.result.exists()])
+        failed = _run_missing(config, [job for job in jobs if not job.result.exists()])
     results: dict[str, list[dict[str, Any]]] = {}
     for job in jobs:
         if job.result.exists():
@@ -299,7 +314,7 @@ def run_suite(config: SuiteConfig) -> dict[str, Any]:
         "published": table.published,
         "protocol": asdict(table.protocol),
         "failed": failed,
-        "provenance": provenance(("torch", "numpy", "zarr")),
+        "provenance": provenance(PACKAGES),
     }
     config.folder.mkdir(parents=True, exist_ok=True)
     write_json(config.folder / "table.json", content)
@@ -310,6 +325,14 @@ def run_suite(config: SuiteConfig) -> dict[str, Any]:
     return content
 
 
+def _run_missing(config: SuiteConfig, pending: Sequence[Job]) -> dict[str, str]:
+    """Runs jobs here or on a cluster; returns the last line of output of those that failed, by name."""
+    with connected(config.cluster if pending else None, PACKAGES) as cluster:
+        if cluster is None:
+            return run_jobs(config.table, pending, config.num_processes)
+        return run_jobs_on(cluster, config.table, pending, gpus=int(config.device.startswith("cuda")))
+
+
 def _plot(config: SuiteConfig, results: Sequence[dict[str, Any]], title: str) -> None:
     matplotlib.use("Agg")
     kinds = list(results[0]["tests"])
@@ -317,51 +340,6 @@ def _plot(config: SuiteConfig, results: Sequence[dict[str, Any]], title: str) ->
     headline = f"{title}, budget {config.budget}, mean over seeds: {config.seeds}"
     figure = figure_by_step(results, kinds, dt_s, f"{headline}; bars: standard error over 20 subsets")
     save_figure(figure, config.folder / "by_step.png", 110)
-
-
-def _run_in_processes(config: SuiteConfig, pending: Sequence[Job]) -> dict[str, str]:
-    """Runs jobs in parallel; returns the last line of output of those that failed, by name."""
-    waiting, failed = list(pending), {}
-    running: list[tuple[Job, BaseProcess, Path]] = []
-    with Progress() as progress:
-        task = progress.add_task(f"{config.table}: {len(pending)} lines to run", total=len(pending))
-        try:
-            while waiting or running:
-                busy = [*waiting, *(job for job, *_ in running)]
-                ready = [job for job in waiting if not any(job.waits_for(other) for other in busy)]
-                for job in ready[: config.num_processes - len(running)]:
-                    waiting.remove(job)
-                    running.append((job, *_start(job)))
-                time.sleep(0.5)
-                ended = [one for one in running if one[1].exitcode is not None]
-                for job, process, log in ended:
-                    if process.exitcode:
-                        failed[job.name] = (log.read_text(errors="replace").strip().splitlines() or ["no output"])[-1]
-                    progress.advance(task)
-                running = [one for one in running if one not in ended]
-                if ended or ready:
-                    named = ", ".join(job.name for job, *_ in running) or "done"
-                    progress.update(task, description=f"{config.table}: {named}")
-        finally:
-            end([process for _, process, _ in running], SAVING_S)
-    return failed
-
-
-def _start(job: Job) -> tuple[BaseProcess, Path]:
-    job.folder.mkdir(parents=True, exist_ok=True)
-    log = job.folder / "log.txt"
-    process = multiprocessing.get_context("spawn").Process(target=_work, args=(job, log))
-    start(process)
-    return process, log
-
-
-def _work(job: Job, log: Path) -> None:
-    """Runs a job in a process of its own, which ends with the suite; SIGTERM saves what it trains."""
-    follow_parent()
-    with log.open("w", buffering=1) as file:
-        print_into(file)
-        tune(job.config.device)
-        run_entry_point(lambda: print(f"measured {run_line(job.config, job.line)['name']}"))
 
 
 def _fingerprint(path: Path) -> str:

@@ -2,17 +2,22 @@
 
 The best checkpoint is chosen by the energy score of free-running samples on held-out episodes: it rewards accuracy and
 a spread like the truth's, whereas one-step errors reward neither.
+
+`torchrun --nproc-per-node 2 -m predictor.train …` trains with two processes (`predictor.training.processes`).
 """
 
+import io
 import os
 import shlex
+import signal
+import sys
 import time
+from contextlib import ExitStack, nullcontext, redirect_stderr
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 import torch
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch.utils.tensorboard import SummaryWriter
 
 from predictor.checkpoint import BEST_OF_RUN, CheckpointInfo, save_checkpoint
@@ -20,53 +25,96 @@ from predictor.support.command_line import parse
 from predictor.support.errors import UserError, run_entry_point, short
 from predictor.support.files import check_out, delete_leftovers, write_json
 from predictor.support.locks import locked
+from predictor.support.progress import WorkShown
 from predictor.support.provenance import provenance
 from predictor.support.reading import as_object, read_object
+from predictor.support.remote import address
 from predictor.support.runtime import tune
 from predictor.support.stopping import deferred_stops, resumable
 from predictor.training.config import BEFORE_THEY_EXISTED, TrainConfig
+from predictor.training.curve import CURVE_FILE, KEYS, add_point
+from predictor.training.processes import ALONE, Group, LostProcessError, joined
 from predictor.training.trainer import LOG_EVERY, Trainer, load_data
 
 STATE_FILE = "train_state.pt"
 
 
-def train(config: TrainConfig) -> Path:
+def train(config: TrainConfig, group: Group = ALONE) -> Path:
     """Trains until all steps are done or validation stops improving; returns the folder of the best checkpoint.
 
     Ctrl-C and SIGTERM wait for the end of a step and save the state; a second one does not wait.
 
+    Args:
+        config: options of the run.
+        group: processes that train together; the first of them alone touches the run folder.
+
     Raises:
-        UserError: the folder holds another run, another process trains in it, data do not fit, or the disk is full.
+        UserError: the folder holds another run, another process trains in it, data do not fit, the disk is full, or
+            a process of the group is lost.
     """
     state_file, config_file = config.out / STATE_FILE, config.out / "config.json"
     with resumable(lambda: _kept(config, state_file)):
-        return _train(config, state_file, config_file)
+        return _train(config, group, state_file, config_file)
 
 
-def _train(config: TrainConfig, state_file: Path, config_file: Path) -> Path:
-    _check_run_folder(config, config_file)
-    tune(config.device)
-    if config.threads:
-        torch.set_num_threads(config.threads)
-    data = load_data(config)
-    trainer = Trainer(config, data)
-    with locked(config.out, "training"):
-        _check_run_folder(config, config_file)  # another training may have come and gone
-        delete_leftovers(config.out)  # of a run that was killed while it saved
-        if config.resume and state_file.exists():
+def _train(config: TrainConfig, group: Group, state_file: Path, config_file: Path) -> Path:
+    trainer = group.together(lambda: _prepared(config, group, config_file))
+    group.check_same((_comparable(config), [len(w) for w in trainer.data.train]), "options or data")
+    group.align(trainer.model)
+    made = provenance(("torch", "numpy", "zarr", "safetensors"))
+    with ExitStack() as stack:
+        stack.callback(trainer.close)
+        group.from_leader(lambda: _take_folder(stack, config, config_file))
+        if config.resume and group.from_leader(state_file.exists):
             trainer.restore(state_file)
-        made = provenance(("torch", "numpy", "zarr", "safetensors"))
+        if not group.leads:
+            _follow(trainer)
+            return config.out / BEST_OF_RUN
         write_json(config_file, {"config": _comparable(config), "provenance": made})
-        try:
-            _run(trainer, state_file, made)
-        finally:
-            trainer.close()
+        _run(trainer, state_file, made)
     if not (config.out / BEST_OF_RUN).exists():
         raise UserError(
             f"no validation episode has {config.horizon_steps} steps of future, so no checkpoint was chosen; "
             "lower --horizon-steps or collect longer episodes"
         )
     return config.out / BEST_OF_RUN
+
+
+def _prepared(config: TrainConfig, group: Group, config_file: Path) -> Trainer:
+    if group.leads:
+        _check_run_folder(config, config_file)
+    tune(config.device)
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    return Trainer(config, load_data(config), group)
+
+
+def _take_folder(stack: ExitStack, config: TrainConfig, config_file: Path) -> None:
+    """Locks the run folder until the stack ends."""
+    stack.enter_context(locked(config.out, "training"))
+    _check_run_folder(config, config_file)  # another training may have come and gone
+    delete_leftovers(config.out)  # of a run that was killed while it saved
+
+
+def _follow(trainer: Trainer) -> None:
+    """Takes part in a training that another process leads, to its end; errors that it shares are told by that one."""
+    config, group = trainer.config, trainer.group
+    with deferred_stops() as stops:
+        try:
+            if config.init and not trainer.step:
+                trainer.share_progress()
+            while not trainer.finished:
+                terms = trainer.train_step()
+                if group.any(stops.asked is not None):
+                    sys.exit(128 + (stops.asked or signal.SIGTERM))
+                if trainer.due or trainer.step % trainer.read_every == 0:
+                    trainer.read(terms)
+                if trainer.due:
+                    trainer.share_progress()
+        except LostProcessError:
+            raise
+        except UserError:
+            sys.exit(2)
 
 
 def _kept(config: TrainConfig, state_file: Path) -> str:
@@ -78,47 +126,50 @@ def _kept(config: TrainConfig, state_file: Path) -> str:
 
 def _run(trainer: Trainer, state_file: Path, made: dict[str, Any]) -> None:
     """Trains, logs, validates and saves until the run is finished, or a signal asks it to stop."""
-    config, columns = trainer.config, (TextColumn("train"), BarColumn(20), MofNCompleteColumn(), TimeRemainingColumn())
-    note, printed = "", 0
+    config, printed = trainer.config, 0
     with (
         SummaryWriter(str(config.out / "tb"), purge_step=trainer.step) as writer,
-        Progress(*columns, TextColumn("{task.fields[note]}")) as progress,
+        WorkShown("train", config.steps, trainer.step) as progress,
         deferred_stops() as stops,
     ):
-        task = progress.add_task("", total=config.steps, completed=trainer.step, note="")
         if config.init and not trainer.step:
             note = _validate_and_save(trainer, writer, made)  # so that the result is no worse than where it began
+            progress.say(note)
+            trainer.share_progress()
         began, since = time.perf_counter(), trainer.step
         while not trainer.finished:
             terms = trainer.train_step()
             for line in trainer.notes[printed:]:
-                progress.console.print(line, highlight=False)
+                progress.say(line)
             printed = len(trainer.notes)
-            if stops.asked is not None:
+            if trainer.group.any(stops.asked is not None):
                 trainer.read(terms)  # a state that is not finite is never saved
                 trainer.save(state_file)
+                stops.asked = stops.asked or signal.SIGTERM  # another process was asked
                 stops.stop()
-            due = trainer.step % config.eval_every == 0 or trainer.step == config.steps
-            if not due and trainer.step % trainer.read_every:
+            if not trainer.due and trainer.step % trainer.read_every:
                 continue
             seen = trainer.read(terms)
             seen["steps_per_s"] = (trainer.step - since) / (time.perf_counter() - began)
-            if due:
-                note = _validate_and_save(trainer, writer, made)
+            if trainer.due:
+                progress.say(_validate_and_save(trainer, writer, made))
                 trainer.save(state_file)
+                trainer.share_progress()
             if trainer.step % LOG_EVERY == 0:
                 for name, value in seen.items():
                     writer.add_scalar(f"train/{name}", value, trainer.step)
-            shown = " ".join(f"{k} {seen[k]:.3g}" for k in ("nll_rollout", "nll_one_step", "kl") if k in seen)
-            progress.update(task, completed=trainer.step, note=f"{shown} {note}")
+            shown = next((f"{k} {seen[k]:.3g}" for k in ("nll_rollout", "nll_one_step") if k in seen), "")
+            progress.to(trainer.step, shown)
             began, since = time.perf_counter(), trainer.step
 
 
 def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, Any]) -> str:
     accuracy, std_m = trainer.validate()
-    for name in ("energy_m", "ade_m", "fde_m", "min_ade_m", "min_joint_ade_m"):
+    for name in KEYS[:-1]:
         writer.add_scalar(f"val/{name}", getattr(accuracy, name), trainer.step)
     writer.add_scalar("val/constant_velocity_ade_m", trainer.baseline_m, trainer.step)
+    errors = {name: getattr(accuracy, name) for name in KEYS[:-1]} | {KEYS[-1]: trainer.baseline_m}
+    add_point(trainer.config.out / CURVE_FILE, {"step": trainer.step} | errors)
     if accuracy.energy_m < trainer.best:
         trainer.best, trainer.stale = accuracy.energy_m, 0
         result = {
@@ -144,8 +195,8 @@ def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, 
     else:
         trainer.stale += 1
     return (
-        f"| val energy {accuracy.energy_m:.3f} m (best {trainer.best:.3f}), ADE {accuracy.ade_m:.3f} "
-        f"(constant velocity {trainer.baseline_m:.3f})"
+        f"step {trainer.step:,}: energy score {accuracy.energy_m:.3f} m (best {trainer.best:.3f}), "
+        f"ADE {accuracy.ade_m:.3f} m (constant velocity {trainer.baseline_m:.3f})"
     )
 
 
@@ -153,8 +204,8 @@ def _comparable(config: TrainConfig) -> dict[str, Any]:
     values = asdict(config)
     for name in ("resume", "threads", "device", "data_device", "capture"):
         del values[name]
-    values["data"] = [str(p) for p in config.data]
-    values["val_data"] = [str(p) for p in config.val_data]
+    values["data"] = [address(p) for p in config.data]
+    values["val_data"] = [address(p) for p in config.val_data]
     values["set"] = list(config.set)
     values["out"] = str(config.out)
     return values
@@ -194,9 +245,12 @@ def _option(name: str, value: Any) -> str:
 
 def main() -> None:
     """Entry point."""
-    config = parse(TrainConfig, __doc__)
-    checkpoint = train(config)
-    print(f"best checkpoint: {checkpoint}")
+    with joined() as group:
+        with nullcontext() if group.leads else redirect_stderr(io.StringIO()):  # usage is printed once
+            config = group.together(lambda: parse(TrainConfig, __doc__))
+        checkpoint = train(config, group)
+        if group.leads:
+            print(f"best checkpoint: {checkpoint}")
 
 
 if __name__ == "__main__":

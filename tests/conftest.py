@@ -4,6 +4,7 @@ import os
 import signal
 from collections.abc import Iterator
 
+import jaxtyping
 import pytest
 
 # A shell starts what runs in its background with Ctrl-C ignored, and every process of the tests would inherit that.
@@ -35,6 +36,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         for item in items:
             if item.get_closest_marker("shapes"):
                 item.add_marker(pytest.mark.skip(reason="shapes are not checked; make test-shapes does"))
+
+
+@pytest.fixture(autouse=True)
+def unchecked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Switches the shape checks off in tests that pass what has a wrong shape or type: they would complain first."""
+    if request.node.get_closest_marker("unchecked"):
+        monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.fixture(autouse=True)

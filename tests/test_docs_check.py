@@ -190,7 +190,10 @@ def test_the_command_fails_with_the_block(tmp_path: Path):
     assert not (tmp_path / "left").exists()  # it ran in a copy
     (tmp_path / "README.md").write_text("```bash\ntest -f NO_SUCH_FILE\n```\n")
     bad = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert bad.returncode == 1 and "README.md:1" in bad.stdout and "1 failed" in bad.stdout
+    assert bad.returncode == 1 and "1 failed" in bad.stdout
+    assert bad.stdout.count("README.md:1 ") == 2 and bad.stdout.endswith("exit status 1\n"), (
+        "the end of a log tells why"
+    )
 
 
 def test_a_page_of_another_folder_is_one_clear_line(

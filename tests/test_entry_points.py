@@ -50,6 +50,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--table springs --data absent --only-line mlp", "no store at absent/springs/train"),
         ("--table spring", "invalid choice 'spring' for argument '--table'"),
         ("--table springs --workers -1", "workers must not be negative, got -1"),
+        ("--table springs --cluster head", "cluster must be auto or HOST:PORT (as in 10.0.0.1:6379), got 'head'"),
         ("--table springs --seeds 0", "seeds must be at least 1, got 0"),
         ("--table springs --precision tf32", "precision 'tf32' needs a CUDA device"),
         ("--table springs --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
@@ -68,7 +69,11 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--data absent --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
     ],
     "docs.draw_pictures": [
-        ("--only film", "only must be among highway, what_if, braking_leader, causal_graph, got film")
+        (
+            "--only film",
+            "only must be among highway, what_if, braking_leader, causal_graph, fans_roundabout, fans_intersection, "
+            "got film",
+        )
     ],
     "predictor.card": [("--checkpoint absent --data absent --accuracy absent", "no checkpoint 'absent'")],
     "predictor.data.springs": [
@@ -117,20 +122,21 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     "envs.collect": [
         ("--env-id nope-v0 --out new", "cannot make env 'nope-v0'"),
         ("--env-id merge-v1 --out new --episodes 0", "episodes must be at least 1, got 0"),
+        ("--env-id merge-v1 --out new --cluster 10.0.0.1", "cluster must be auto or HOST:PORT (as in 10.0.0.1:6379)"),
         ("--env-id merge-v1 --out file", "file exists; choose another path or pass --overwrite"),
     ],
     "envs.check": [
         ("--env-id nope-v0", "cannot make env 'nope-v0'"),
         ("--env-id merge-v1 --episodes 0", "episodes must be at least 1, got 0"),
         ("--env-id merge-v1 --reader absent:read", "cannot import 'absent' for 'absent:read'"),
-        ("--env-id merge-v1 --env-kwargs 3", "--env-kwargs"),
+        ("--env-id merge-v1 --env-kwargs 3", "env_kwargs must be a JSON object, got '3'"),
     ],
     "envs.evaluate": [
         ("--checkpoint absent --env-ids merge-v1", "no checkpoint 'absent'"),
         ("--workers 0", "workers must be at least 1, got 0"),
         ("--memory-steps 3 0", "memory_steps must be at least 1, got (3, 0)"),
         ("--env-ids merge-v1 --out file", "file is a file; choose another --out"),
-        ("--checkpoint runs/a/checkpoint runs/a", "each checkpoint needs a name of its own, got a, a"),
+        ("--checkpoint runs/a/checkpoint runs/a", "each checkpoint is given once, got runs/a/checkpoint, runs/a"),
         ("--reactions --perturbations 0", "perturbations must be at least 1, got 0"),
         ("--graph --env-ids pursuit_v5", "raw_env cannot be perturbed; use an environment of highway-env"),
         ("--reactions --env-ids pursuit_v5", "raw_env cannot be perturbed; use an environment of highway-env"),
@@ -181,6 +187,16 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--out file", "file is a file; choose another --out"),
         ("--out .", ". holds file but no study (study.toml); choose another --out"),
     ],
+    "agents.push": [
+        ("absent me/name", "no checkpoint 'absent'"),
+        ("absent.zip me/name", "no policy at absent.zip: neither a run folder nor a .zip"),
+        ("merge name", "'hub:name' names nothing on a hub; write hub:owner/name"),
+    ],
+    "agents.report": [
+        ("absent", "no run folder at absent; give the --out of train_policy.py or of predictor.train"),
+        (".", ". holds no training run (config.json is missing)"),
+        (". --accuracy absent", "no folder at absent; --accuracy takes the --out of envs.evaluate"),
+    ],
     "agents.tune": [
         ("--env-id nope-v0", "cannot make env 'nope-v0'"),
         ("--algorithm sac", "sac needs a continuous action space, highway-fast-v0 has Discrete(5); use ppo"),
@@ -228,6 +244,14 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--copies 1", "copies must be at least 2, got 1"),
         ("--env-id highway-fast-v0", "unknown multiagent env 'highway-fast-v0'; known: "),
     ],
+    "benchmarks.rows": [
+        ("--num-envs 0", "num_envs needs numbers of at least 1, got (0,)"),
+        ("--max-rows 0", "max_rows must be at least 1, got 0"),
+        ("--seconds 0", "seconds must be positive, got 0.0"),
+        ("--checkpoint absent", "no checkpoint 'absent'"),
+        ("--device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
+    ],
+    "benchmarks.cluster": [("--episodes 1", "episodes must be at least 2, got 1")],
     "benchmarks.time_shares": [("--calls 0", "calls must be at least 1, got 0")],
     "benchmarks.graph_accuracy": [
         ("--checkpoint absent --data absent", "no episode store at absent"),
@@ -307,6 +331,8 @@ REQUIRED: dict[str, list[str]] = {
     "envs.export_levelx": ["--env-id", "merge-v1", "--out", "new"],
     "agents.evaluate": ["--run-dir", "run"],
     "agents.watch": ["run"],
+    "agents.report": ["run"],
+    "agents.push": ["what", "owner/name"],
     "benchmarks.graph_accuracy": ["--checkpoint", "highway", "--data", "store"],
     "benchmarks.gpu_springs": ["--device", "cpu"],
 }
@@ -424,8 +450,9 @@ def test_help_is_whole_phrases(command: str, capsys: pytest.CaptureFixture[str])
         assert string.endswith("."), string
     for field in fields(config_of(command)):
         if not is_dataclass(get_type_hints(config_of(command))[field.name]):
-            positional = field.default is MISSING and command == "agents.watch"
-            assert ("PATH" if positional else f"--{field.name.replace('_', '-')}") in out, field.name
+            positional = field.default is MISSING and command in ("agents.watch", "agents.report", "agents.push")
+            kind = "STR" if command == "agents.push" else "PATH"
+            assert (kind if positional else f"--{field.name.replace('_', '-')}") in out, field.name
 
 
 # --- Configs made from Python -----------------------------------------------------------------------------------------
@@ -463,6 +490,7 @@ def test_commands_that_run_a_model_take_a_device():
         "agents.evaluate",
         "agents.watch",
         "train_policy",
+        "benchmarks.rows",
         "benchmarks.gpu_springs",
     ]
 

@@ -1,10 +1,12 @@
 """The guide and its examples run: every Python block, every command, the environment and its reader."""
 
+import ast
 import importlib
 import re
 import shlex
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
+import dgvae_rl
 import envs.readers
 from envs.check import CheckConfig
 from envs.collect import CollectConfig, collect
@@ -22,11 +25,14 @@ from envs.evaluate import EvaluateConfig
 from envs.plans import checked_plans
 from envs.readers import reader_for
 from envs.readers.entities import EntityRowsReader
+from envs.rollouts.world import EgoWorld, open_world
+from envs.testing import check_reader
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.data.store import StoreInfo, write_store
 from predictor.scene import SceneSpec
 from predictor.support.command_line import parse
+from predictor.support.errors import UserError
 from predictor.train import train
 from predictor.training.config import TrainConfig
 from train_policy import TrainPolicyConfig
@@ -35,6 +41,7 @@ ROOT = Path(__file__).resolve().parents[1]
 GUIDE = ROOT / "docs" / "wrap_your_env.md"
 EXAMPLES = ROOT / "docs" / "examples"
 CROSSING = "crossing_reader:Crossing-v0"
+CIRCLE = "circle_reader:Circle-v0"
 COMMANDS = {
     "-m envs.collect": CollectConfig,
     "-m predictor.train": TrainConfig,
@@ -50,9 +57,10 @@ def examples_on_the_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.syspath_prepend(EXAMPLES)
     monkeypatch.setattr(envs.readers, "_REGISTERED", {})
     yield
-    gym.registry.pop("Crossing-v0", None)
-    for name in ("crossing_env", "crossing_plans", "crossing_reader", "field_env", "field_reader"):
-        sys.modules.pop(name, None)
+    for env_id in ("Crossing-v0", "Circle-v0"):
+        gym.registry.pop(env_id, None)
+    for path in EXAMPLES.glob("*.py"):
+        sys.modules.pop(path.stem, None)
 
 
 def sections() -> dict[str, str]:
@@ -95,7 +103,8 @@ def test_the_guides_links_lead_somewhere():
     text = GUIDE.read_text()
     anchors = {title.lower().replace(" ", "-").replace(",", "") for title in sections()}
     for target in re.findall(r"\]\(([^)]+)\)", text):
-        assert target[1:] in anchors if target.startswith("#") else (GUIDE.parent / target).exists(), target
+        path, _, anchor = target.partition("#")
+        assert (GUIDE.parent / path).exists() if path else anchor in anchors, target
 
 
 def commands() -> list[str]:
@@ -104,6 +113,20 @@ def commands() -> list[str]:
 
 @pytest.mark.parametrize("line", commands())
 def test_the_guides_commands_are_understood(line: str):
+    (name,) = [name for name in COMMANDS if line.startswith(f"python {name} ")]
+    parse(COMMANDS[name], args=shlex.split(line.removeprefix(f"python {name} ")))
+
+
+WORKED = [
+    line
+    for block in blocks((ROOT / "docs" / "worked_examples.md").read_text(), "bash")
+    for line in block.splitlines()
+    if line.startswith("python ") and ("circle" in line or "train_policy" not in line)  # others import their packages
+]
+
+
+@pytest.mark.parametrize("line", WORKED)
+def test_the_commands_of_the_worked_examples_are_understood(line: str):
     (name,) = [name for name in COMMANDS if line.startswith(f"python {name} ")]
     parse(COMMANDS[name], args=shlex.split(line.removeprefix(f"python {name} ")))
 
@@ -207,6 +230,73 @@ def test_collect_train_wrap(tmp_path: Path):
         assert obs in env.observation_space
         assert obs["forecast"].shape == (11, 3, 2)
         obs, *_ = env.step(env.action_space.sample())
+
+
+# --- The worked example of a crowd ------------------------------------------------------------------------------------
+
+
+def test_the_circle_is_an_environment_with_a_reader_that_is_right():
+    check_env(gym.make(CIRCLE).unwrapped, skip_render_check=True)
+    check_reader(gym.make(CIRCLE))
+    source = (EXAMPLES / "circle_env.py").read_text()
+    assert set(re.findall(r"^(?:from|import) (\w+)", source, flags=re.MULTILINE)) == {"typing", "gymnasium", "numpy"}
+
+
+def crossed(seed: int, action: int = 8, steps: int = 40, **kwargs: Any) -> np.ndarray:
+    """The places of robot and people over the steps of an episode in which the robot takes one action."""
+    env = gym.make(CIRCLE, **kwargs).unwrapped
+    env.reset(seed=seed)
+    found = []
+    for _ in range(steps):
+        env.step(action)
+        found.append(np.vstack([env.robot, env.walkers])[:, :2].copy())  # type: ignore[attr-defined]
+    return np.array(found)
+
+
+def test_people_cross_and_keep_apart():
+    for seed in range(3):
+        places = crossed(seed, steps=60)[:, 1:]
+        assert (np.linalg.norm(places[-1] - places[0], axis=-1) > 6.0).all()  # the circle is 10 m wide
+        gaps = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1) + 9.0 * np.eye(6)
+        assert gaps.min() > 0.4  # they brush past each other, and do not walk through
+
+
+def test_people_make_way_for_the_robot_unless_they_do_not_see_it():
+    """The only thing in the example that makes forecasts depend on the ego."""
+    for seed in range(3):
+        shift_m = np.abs(crossed(seed, action=2) - crossed(seed, action=8))[:, 1:].max()
+        blind_m = np.abs(crossed(seed, action=2, courtesy=0.0) - crossed(seed, action=8, courtesy=0.0))[:, 1:].max()
+        assert shift_m > 0.1
+        assert blind_m == 0.0
+
+
+def test_the_driver_of_the_circle_reaches_its_goal_or_touches_someone():
+    env = open_world(CIRCLE, "own:circle_reader:straight_on")
+    crashed = []
+    for seed in range(20):
+        env.reset(seed)
+        while not env.step():
+            pass
+        assert isinstance(env, EgoWorld)
+        crashed.append(bool(env.crashed))
+    assert 0 < sum(crashed) < 20
+
+
+def test_arguments_reach_the_circle():
+    config = CollectConfig(CIRCLE, Path("unused"), env_kwargs='{"people": 3}', episodes=1, max_steps=5, workers=1)
+    (episode,) = collect(config)
+    assert len(episode.ids) == 4
+    with pytest.raises(UserError, match="cannot make env .* with {'people': 0}: ValueError: people must be at least 1"):
+        list(collect(replace(config, env_kwargs='{"people": 0}')))
+
+
+def test_the_examples_of_other_packages_are_python():
+    """They run where their packages are; here, what they import of this project is there."""
+    for name in ("metadrive_reader", "vmas_reader", "magent_reader"):
+        tree = ast.parse((EXAMPLES / f"{name}.py").read_text())
+        ours = [n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module == "dgvae_rl"]
+        names = {alias.name for node in ours for alias in node.names}
+        assert names and names <= set(dgvae_rl.__all__)
 
 
 # --- Plans of one's own -----------------------------------------------------------------------------------------------

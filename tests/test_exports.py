@@ -34,12 +34,11 @@ def test_every_export_is_what_its_module_defines(package: str):
 def test_type_checkers_see_the_exports(package: str):
     tree = ast.parse((ROOT / package / "__init__.py").read_text())
     (guarded,) = [node for node in tree.body if isinstance(node, ast.If)]
-    pairs = [
-        (node.module, alias.name)
-        for node in ast.walk(guarded)
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
+    imports = [
+        (node.module, name) for node in ast.walk(guarded) if isinstance(node, ast.ImportFrom) for name in node.names
     ]
+    assert all(name.asname == name.name for _, name in imports)  # without it, mypy --strict has no export
+    pairs = [(module, name.name) for module, name in imports]
     listed = next(node for node in ast.walk(tree) if isinstance(node, ast.Dict))
     assert sorted(pairs) == sorted(
         (module, name) for module, names in ast.literal_eval(listed).items() for name in names

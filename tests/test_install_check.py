@@ -14,8 +14,8 @@ assert SPEC is not None and SPEC.loader is not None
 install_check: Any = importlib.util.module_from_spec(SPEC)
 sys.modules["install_check"] = install_check
 SPEC.loader.exec_module(install_check)
-SITE = "docs"
-"""Builds the site from a checkout, not from a wheel."""
+OF_A_CHECKOUT = {"docs", "fuzz"}
+"""Serve a checkout, not a wheel: the site, the fuzzer."""
 EVERYTHING, TOOLS, EMPTY = "all", "dev", "training"
 
 
@@ -38,7 +38,10 @@ def this_python(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 def test_every_extra_is_tried():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert set(install_check.EXTRAS) == {"core", *project["optional-dependencies"]} - {EVERYTHING, TOOLS, EMPTY, SITE}
+    assert (
+        set(install_check.EXTRAS)
+        == {"core", *project["optional-dependencies"]} - {EVERYTHING, TOOLS, EMPTY} - OF_A_CHECKOUT
+    )
     assert project["optional-dependencies"][EMPTY] == []
     assert all(extra.commands for extra in install_check.EXTRAS.values())
 

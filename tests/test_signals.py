@@ -38,8 +38,6 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         ("train", signal.SIGINT),
         ("policy", signal.SIGINT),
-        ("policy", signal.SIGTERM),
-        ("collect", signal.SIGINT),
         ("collect", signal.SIGTERM),
         ("study", signal.SIGINT),
     ],

@@ -3,31 +3,25 @@
 Files are SVG, and equal from run to run.
 """
 
-import io
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
-import matplotlib
 import numpy as np
 from jaxtyping import Float
-from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from scipy import stats
 
 from agents.studies.estimators import CONFIDENCE, performance_profile, profile_band
 from agents.studies.findings import Findings, Line, generator_of
+from predictor.reports.figures import COLORS, panels, svg_of
 
-_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f7f7f", "#8c564b", "#9467bd")
 _GREYS = (("#777777", "--"), ("#777777", ":"), ("#aaaaaa", "-."))
 _THRESHOLDS = 201
-_WIDTH_IN, _HEIGHT_IN = 5.4, 4.0
 
 
 def style_of(index: int) -> dict[str, Any]:
     """Returns colour and dashes of the arm with this number; the same arm looks the same in all pictures."""
-    return {"color": _COLORS[index % len(_COLORS)], "ls": ("-", "--", "-.")[index // len(_COLORS) % 3]}
+    return {"color": COLORS[index % len(COLORS)], "ls": ("-", "--", "-.")[index // len(COLORS) % 3]}
 
 
 def plot_curve(
@@ -77,7 +71,7 @@ def plot_profile(
 
 def learning_curves(findings: Findings) -> str:
     """Returns the picture of all learning curves, a panel per scenario, as SVG."""
-    figure, axes = _panels(len(findings.scenarios))
+    figure, axes = panels(len(findings.scenarios))
     for ax, scenario in zip(axes, findings.scenarios, strict=True):
         for line in findings.lines(scenario, trained=True):
             steps, returns = curve_of(findings, scenario, line)
@@ -87,7 +81,7 @@ def learning_curves(findings: Findings) -> str:
         ax.set_xlabel("environment steps")
         ax.set_xlim(left=0)
     axes[0].set_ylabel("return on the selection seeds")
-    return _svg(figure, axes)
+    return svg_of(figure, axes)
 
 
 def profiles(findings: Findings) -> str:
@@ -96,7 +90,7 @@ def profiles(findings: Findings) -> str:
     The panel over all has the arms with runs in every scenario, by rescaled scores.
     """
     several = len(findings.scenarios) > 1
-    figure, axes = _panels(len(findings.scenarios) + several)
+    figure, axes = panels(len(findings.scenarios) + several)
     for ax, scenario in zip(axes, findings.scenarios, strict=False):
         lines = findings.lines(scenario, trained=True)
         _profile_panel(ax, findings, {line: findings.raw_runs(line, [scenario]) for line in lines}, scenario)
@@ -108,7 +102,7 @@ def profiles(findings: Findings) -> str:
         _profile_panel(axes[-1], findings, scaled, "all scenarios")
         axes[-1].set_xlabel("rescaled score τ")
     axes[0].set_ylabel("share of runs above τ")
-    return _svg(figure, axes)
+    return svg_of(figure, axes)
 
 
 def curve_of(
@@ -145,33 +139,3 @@ def _references(findings: Findings, scenario: str) -> dict[str, float]:
 
 def _index(findings: Findings, line: Line) -> int:
     return findings.lines(trained=True).index(line)
-
-
-def _panels(count: int) -> tuple[Figure, list[Axes]]:
-    matplotlib.use("Agg")
-    columns = min(count, 2)
-    lines = -(-count // columns)
-    figure, grid = plt.subplots(
-        lines, columns, figsize=(_WIDTH_IN * columns, _HEIGHT_IN * lines + 0.6), squeeze=False, layout="constrained"
-    )
-    axes = list(grid.flat)
-    for spare in axes[count:]:
-        spare.set_axis_off()
-    return figure, axes[:count]
-
-
-def _svg(figure: Figure, axes: Sequence[Axes]) -> str:
-    """Returns a figure as SVG without XML header, with one legend below the panels."""
-    entries: dict[str, Any] = {}
-    for ax in axes:
-        ax.grid(alpha=0.3)
-        ax.spines[["top", "right"]].set_visible(False)
-        handles, labels = ax.get_legend_handles_labels()
-        entries |= {label: entries.get(label, handle) for handle, label in zip(handles, labels, strict=True)}
-    if entries:
-        figure.legend(entries.values(), entries, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    written = io.StringIO()
-    with matplotlib.rc_context({"svg.hashsalt": "dgvae-rl"}):
-        figure.savefig(written, format="svg", metadata={"Date": None, "Creator": None})
-    plt.close(figure)
-    return re.sub(r"^.*?(?=<svg)", "", written.getvalue(), flags=re.DOTALL).strip()

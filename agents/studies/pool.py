@@ -24,7 +24,10 @@ from tqdm import tqdm  # type: ignore[import-untyped]
 
 from agents.studies.cells import LOG_FILE, Cell, run_cell
 from agents.studies.results import RESULT_FILE
+from predictor.support.cluster import Cluster
 from predictor.support.errors import UserError
+from predictor.support.files import write_text
+from predictor.support.jobs import ended_on
 from predictor.support.locks import LOCK_FILE
 from predictor.support.processes import ctrl_c_ignored, end, print_into
 from predictor.support.runtime import keep_freed_memory
@@ -68,10 +71,62 @@ def run_cells(cells: Sequence[Cell], folder: Path, workers: int, on_end: Callabl
         _stop(running)
 
 
-def last_line(log: Path) -> str:
-    """Returns the last line of a log; a few words if there is none."""
-    lines = log.read_text(errors="replace").strip().splitlines() if log.exists() else []
-    return lines[-1] if lines else "it ended without a message"
+def run_cells_on(cluster: Cluster, cells: Sequence[Cell], folder: Path, on_end: Callable[[Cell, bool], None]) -> None:
+    """Runs cells on the machines of a cluster, which share the folder; returns when all have ended.
+
+    Args:
+        cluster: cluster.
+        cells: cells without a result.
+        folder: folder of the cells' folders, inside that of the study, which is locked.
+        on_end: called with each cell that ended, and whether it has a result.
+
+    Raises:
+        UserError: a machine does not see the folder, or has other versions.
+    """
+    tasks = [_Task(cell, folder.absolute()) for cell in cells]
+    with contextlib.closing(ended_on(cluster, tasks)) as ended:
+        for number, reason in ended:
+            if reason is not None and not tasks[number].log.exists():
+                write_text(tasks[number].log, reason)
+            on_end(cells[number], reason is None and tasks[number].result.exists())
+
+
+@dataclass(frozen=True)
+class _Task:
+    """Cell that is run on a machine of a cluster."""
+
+    cell: Cell
+    cells: Path
+
+    @property
+    def name(self) -> str:
+        """Name in messages."""
+        return self.cell.title
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the cell."""
+        return self.cells / self.cell.name
+
+    @property
+    def log(self) -> Path:
+        """File of what it prints."""
+        return self.folder / LOG_FILE
+
+    @property
+    def result(self) -> Path:
+        """File of its result."""
+        return self.folder / RESULT_FILE
+
+    @property
+    def locked_folder(self) -> Path:
+        """Folder of the study."""
+        return self.cells.parent
+
+    def run(self) -> None:
+        """Runs the cell."""
+        _prepare()
+        run_cell(self.cell, self.folder)
 
 
 def _start(cell: Cell, folder: Path) -> Running:
@@ -103,8 +158,7 @@ def _work(cell: Cell, folder: Path, lifeline: Connection) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX)  # the last process of a killed study may still be here, for a moment
         if (folder / RESULT_FILE).exists():
             return
-        keep_freed_memory()
-        tqdm.set_lock(threading.RLock())  # a progress bar's own lock is a semaphore, which a stopped process would leak
+        _prepare()
         try:
             run_cell(cell, folder)
         except UserError as error:
@@ -113,6 +167,12 @@ def _work(cell: Cell, folder: Path, lifeline: Connection) -> None:
         except Exception:
             traceback.print_exc(file=log)
             sys.exit(1)
+
+
+def _prepare() -> None:
+    """Sets this process up for a cell."""
+    keep_freed_memory()
+    tqdm.set_lock(threading.RLock())  # a progress bar's own lock is a semaphore, which a stopped process would leak
 
 
 def _end_with(lifeline: Connection) -> None:

@@ -8,10 +8,10 @@ import numpy as np
 
 from agents.forecast_errors import CONSTANT_ERROR, FORECAST_ERROR
 from agents.results import NOT_REPORTED
-from agents.studies.document import PICTURES, Block, Code, Heading, Paragraph, Picture, Table, as_html, as_markdown
 from agents.studies.estimators import Estimate, interquartile_mean
 from agents.studies.findings import NEARLY_CONSTANT, Findings, Line
 from agents.studies.pictures import learning_curves, profiles
+from predictor.reports.document import PICTURES, Block, Code, Heading, Paragraph, Picture, Table, as_html, as_markdown
 from predictor.support.files import write_text
 
 REPORT, PAGE, HEADROOM = Path("report.md"), Path("report.html"), Path("headroom.md")

@@ -15,10 +15,12 @@ import gymnasium as gym
 import numpy as np
 from jaxtyping import Float
 
+from envs.drivers.own import OwnDriver
 from envs.drivers.sampled_actions import uniform_action, varied_actions
 from envs.readers import multiagent_env_id
 from envs.readers.mpe import mpe_scenario
 from envs.readers.pursuit import is_pursuit_env
+from predictor.own_forecasters import is_own
 from predictor.support.errors import UserError
 
 Driver = Callable[[Mapping[str, Any]], dict[str, Any]]
@@ -47,8 +49,8 @@ def make_driver(name: str, env: Any, rng: np.random.Generator) -> Driver:
     Args:
         name: "random" (uniform actions), "idle" (no action), "varied" (each agent draws its preferences and how long
             a choice is kept), "heuristic" (each agent pursues what its scenario rewards, with its own `Habits`;
-            mpe2 and pursuit only), or "mixed" (each agent is one of random, varied and, where there is one,
-            heuristic).
+            mpe2 and pursuit only), "mixed" (each agent is one of random, varied and, where there is one,
+            heuristic), or one of a user's own ("own:module:function", `envs.drivers.own`).
         env: the parallel environment that will be driven, wrapped or not; need not be reset yet.
         rng: source of all randomness of this episode.
 
@@ -56,6 +58,8 @@ def make_driver(name: str, env: Any, rng: np.random.Generator) -> Driver:
         UserError: unknown name, no heuristic for this environment, or an action space that is neither Discrete nor a
             bounded Box.
     """
+    if is_own(name):
+        return OwnDriver(name, env, rng)
     for agent in getattr(env, "possible_agents", ()):
         uniform_action(env.action_space(agent), np.random.default_rng(0), WHO)
     return partial(_drive, env, rng, _agent_drivers(name, env, rng), {})
@@ -84,7 +88,7 @@ def _agent_drivers(name: str, env: Any, rng: np.random.Generator) -> DrawAgentDr
     if name == "mixed":
         kinds = ("random", "varied", "heuristic") if has_heuristic(env) else ("random", "varied")
         return partial(_draw_any, [_agent_drivers(kind, env, rng) for kind in kinds])
-    raise UserError(f"driver must be one of {', '.join(DRIVER_NAMES)}, got '{name}'")
+    raise UserError(f"driver must be one of {', '.join(DRIVER_NAMES)} or own:module:function, got '{name}'")
 
 
 def _draw(name: str, env: Any, agent: str, own: np.random.Generator) -> AgentDriver:

@@ -12,9 +12,11 @@ import gymnasium as gym
 import numpy as np
 from highway_env.vehicle.controller import ControlledVehicle
 
+from envs.drivers.own import OwnDriver
 from envs.drivers.planner import PLANNER, is_planner, planner_driver
 from envs.drivers.sampled_actions import uniform_action, varied_actions
 from envs.drivers.trained import EgoDriver, trained_ego
+from predictor.own_forecasters import is_own
 from predictor.support.errors import UserError
 
 WHO = "random egos"
@@ -30,8 +32,8 @@ def make_ego_driver(name: str, env: gym.Env, rng: np.random.Generator) -> EgoDri
         name: "random" (uniform actions), "idle" (no action), "varied" (each episode draws its own preferences and how
             long a choice is kept), "keep-lane" (steers along its lane; continuous steering only), "planner" (the best
             of its plans by what-if forecasts, `envs.drivers.planner`; "planner:CHECKPOINT" names the forecaster), an
-            action that is taken in every step, by its name in `constant_actions` ("slower", "action-4"), or the path of
-            a Stable-Baselines3 ``.zip``.
+            action that is taken in every step, by its name in `constant_actions` ("slower", "action-4"), one of a
+            user's own ("own:module:function", `envs.drivers.own`), or the path of a Stable-Baselines3 ``.zip``.
         env: the environment that will be driven.
         rng: source of all randomness of this episode.
 
@@ -48,13 +50,15 @@ def make_ego_driver(name: str, env: gym.Env, rng: np.random.Generator) -> EgoDri
         return _keep_lane(env, rng)
     if is_planner(name):
         return planner_driver(name, env, rng)
+    if is_own(name):
+        return OwnDriver(name, env, rng)
     if name.endswith(".zip"):
         return trained_ego(name)
     constants = constant_actions(env)
     if name in constants:
         return partial(_constant, constants[name])
     names = ", ".join(dict.fromkeys((*EGO_DRIVER_NAMES, *constants)))
-    raise UserError(f"driver must be one of {names} or the path of a policy .zip, got '{name}'")
+    raise UserError(f"driver must be one of {names}, own:module:function or the path of a policy .zip, got '{name}'")
 
 
 def constant_actions(env: gym.Env) -> dict[str, int]:

@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from envs.own_observation import require_space
 from predictor.support.errors import UserError
 
 
@@ -25,6 +26,7 @@ def uniform_action(space: gym.Space, rng: np.random.Generator, who: str) -> Any:
         return int(space.start + rng.integers(space.n))
     if isinstance(space, gym.spaces.Box) and space.is_bounded():
         return rng.uniform(space.low, space.high).astype(space.dtype)
+    require_space(space, "the action space")
     raise UserError(f"{who} need a Discrete or a bounded Box action space, got {space}")
 
 

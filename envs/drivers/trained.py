@@ -18,6 +18,7 @@ from envs.arms import Arm
 from envs.drivers.all_agents import Driver, make_driver
 from envs.own_observation import carries_forecasts, space_without_added, without_added
 from envs.sb3.padded_spaces import PaddedObservation, learners_named, own_action, roles_of
+from predictor.own_forecasters import is_own
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
@@ -52,6 +53,8 @@ def trained_driver(path: str, env: Any, rng: np.random.Generator) -> Driver:
         raise UserError(
             f"policy {path} was trained on {_line(policy.observation_space)}, but the env gives {_line(padded.space)}"
         )
+    if note is not None and is_own(note.driver):
+        raise UserError(f"policy {path}: the note names driver '{note.driver}', which imports code; train it anew")
     others = (
         make_driver(note.driver, env, rng) if note is not None and set(learners) < set(env.possible_agents) else None
     )

@@ -8,12 +8,21 @@ from collections.abc import Callable
 
 import gymnasium as gym
 
-from envs.plans.base import PlanModel, Plans, checked_plans
+from envs.plans.base import PlanModel, Plans, checked_model, checked_plans
 from envs.plans.highway import HighwayPlans
+from envs.readers.base import check_registration
 from envs.readers.highway import is_highway_env
 from predictor.support.errors import UserError
 
-__all__ = ["HighwayPlans", "PlanModel", "Plans", "checked_plans", "plan_model_for", "register_plan_model"]
+__all__ = [
+    "HighwayPlans",
+    "PlanModel",
+    "Plans",
+    "checked_model",
+    "checked_plans",
+    "plan_model_for",
+    "register_plan_model",
+]
 
 MakePlanModel = Callable[[gym.Env], PlanModel]
 """Takes an environment (not reset yet, wrapped or not) and returns its plan model."""
@@ -27,7 +36,11 @@ def register_plan_model(env_class: type, make_plan_model: MakePlanModel) -> None
     Args:
         env_class: class of the unwrapped environment.
         make_plan_model: takes an environment (not reset yet, wrapped or not) and returns its plan model.
+
+    Raises:
+        UserError: the class is none, or the other cannot be called.
     """
+    check_registration(env_class, make_plan_model, "plan model")
     _REGISTERED[env_class] = make_plan_model
 
 
@@ -39,7 +52,7 @@ def plan_model_for(env: gym.Env) -> PlanModel:
     """
     for kind in type(env.unwrapped).__mro__:
         if kind in _REGISTERED:
-            return _REGISTERED[kind](env)
+            return checked_model(_REGISTERED[kind](env))
     if is_highway_env(env):
         return HighwayPlans(env)
     raise UserError(

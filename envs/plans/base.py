@@ -1,7 +1,7 @@
 """Interface of plan models, and what they return."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
@@ -46,6 +46,25 @@ class PlanModel(Protocol):
         """Returns the plans from the environment's present state, which it must not change."""
 
 
+def checked_model(model: Any) -> PlanModel:
+    """Returns what was given as a plan model.
+
+    Raises:
+        UserError: it is none, or its plans have no names, or the same ones.
+    """
+    if not callable(getattr(model, "plans", None)) or not hasattr(model, "names"):
+        raise UserError(
+            f"what_if must be True, False, or an object with names and plans(env, horizon_steps), got {model!r}; "
+            "see docs/what_if.md"
+        )
+    names = model.names
+    if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names) or not names:
+        raise UserError(f"names of plan model {type(model).__name__} must be texts, one or more, got {names!r}")
+    if len(set(names)) != len(names):
+        raise UserError(f"names of plan model {type(model).__name__} must be different, got {names!r}")
+    return cast(PlanModel, model)
+
+
 def checked_plans(model: PlanModel, env: gym.Env, horizon_steps: int, num_features: int) -> Plans:
     """Returns the plans of a model, after checking them.
 
@@ -60,6 +79,8 @@ def checked_plans(model: PlanModel, env: gym.Env, horizon_steps: int, num_featur
     """
     plans, count = model.plans(env, horizon_steps), len(model.names)
     source = f"plan model {type(model).__name__}"
+    if not hasattr(plans, "states") or not hasattr(plans, "actions"):
+        raise UserError(f"{source}: plans must give Plans (envs.plans), got {type(plans).__name__}")
     wanted = {
         "states": (count, horizon_steps, num_features),
         "rewards": (count, horizon_steps),
@@ -72,6 +93,8 @@ def checked_plans(model: PlanModel, env: gym.Env, horizon_steps: int, num_featur
             continue
         if np.shape(values) != shape:
             raise UserError(f"{source}: {name} need the shape {shape}, got {np.shape(values)}")
+        if np.asarray(values).dtype.kind not in "fiub":
+            raise UserError(f"{source}: {name} must be numbers, got {np.asarray(values).dtype}")
         if not np.isfinite(values).all():
             raise UserError(f"{source}: {name} must be finite, got NaN or infinity")
     if count < 1 or len(plans.actions) != count:

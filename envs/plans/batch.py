@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from envs.plans.base import PlanModel, Plans
+from envs.plans.base import PlanModel, Plans, checked_model
 from predictor.support.errors import UserError
 
 PLANS_INFO = "ego_plans"
@@ -121,6 +121,8 @@ def ask_for_plans(
     """
     if what_if is False and played == 0:
         return ()
+    if not isinstance(what_if, bool):
+        checked_model(what_if)
     try:
         answers = list(call("propose_plans", what_if or True, horizon_steps, played))
     except AttributeError as error:

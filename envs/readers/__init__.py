@@ -19,6 +19,8 @@ from envs.readers.base import (
     bounded,
     build_multiagent_reader,
     build_reader,
+    check_bounds,
+    check_registration,
     comes_from,
     pad_multiagent_scene,
     perceive,
@@ -72,8 +74,9 @@ def register_reader(
         success_key: key that says, in an episode's last step, whether the ego has succeeded; None takes "is_success".
 
     Raises:
-        UserError: a key is empty.
+        UserError: the class is none, the reader's maker cannot be called, or a key is empty.
     """
+    check_registration(env_class, make_reader, "reader")
     register_outcomes(env_class, crash_key, success_key)
     _REGISTERED[env_class] = make_reader
 
@@ -90,6 +93,7 @@ def reader_for(env: gym.Env, perception_m: float | None = None, max_agents: int 
         UserError: no reader knows the environment, the registered one is a `MultiagentReader`, or it is no `Reader` and
             has other bounds.
     """
+    check_bounds(perception_m, max_agents)
     make_reader = _registered(env)
     if make_reader is not None:
         reader: SceneReader = bounded(build_reader(make_reader, env), perception_m, max_agents)
@@ -121,6 +125,7 @@ def multiagent_reader_for(
     Raises:
         UserError: no reader knows the environment, or the registered one is for an environment with one ego.
     """
+    check_bounds(perception_m, max_agents)
     make_reader = _registered(env)
     if make_reader is not None:
         reader: MultiagentReader = build_multiagent_reader(make_reader, env)

@@ -14,8 +14,9 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from predictor.scene import PADDING_ID, Scene, SceneBatch, SceneSpec, perceived_agents
+from predictor.scene import MOST_AGENTS, PADDING_ID, Scene, SceneBatch, SceneSpec, perceived_agents
 from predictor.support.errors import UserError
+from predictor.support.importing import load_named
 
 
 @runtime_checkable
@@ -64,8 +65,9 @@ class MultiagentReader(Protocol):
         """Returns all agents that are present now."""
 
 
-MakeReader = Callable[[Any], Any]
-"""Takes an environment and returns its reader, a `SceneReader` or a `MultiagentReader`."""
+MakeReader = Callable[[Any], Any] | str
+"""Takes an environment and returns its reader, a `SceneReader` or a `MultiagentReader`; or the name of what does so, as
+"module:name", which alone can stand in the JSON of an environment's spec."""
 
 
 class Reader(ABC):
@@ -142,12 +144,42 @@ def build_multiagent_reader(make_reader: Any, env: Any) -> Any:
     return reader
 
 
+def check_bounds(perception_m: Any, max_agents: Any) -> None:
+    """Checks what an ego perceives; None leaves the reader's value.
+
+    Raises:
+        UserError: a value is no positive number, or no whole one.
+    """
+    is_number = isinstance(perception_m, int | float | np.integer | np.floating)
+    if perception_m is not None and not (is_number and perception_m > 0):
+        raise UserError(f"perception_m must be a positive number, got {perception_m!r}")
+    if max_agents is not None and not (isinstance(max_agents, int | np.integer) and 1 <= max_agents <= MOST_AGENTS):
+        raise UserError(f"max_agents must be a whole number from 1 to {MOST_AGENTS:,}, got {max_agents!r}")
+
+
+def check_registration(env_class: Any, make: Any, what: str) -> None:
+    """Checks what is registered for a class of environments.
+
+    Raises:
+        UserError: the class is none, or what makes the thing cannot be called.
+    """
+    if not isinstance(env_class, type):
+        raise UserError(
+            f"a {what} is registered for a class of environments, got {env_class!r}; pass type(env.unwrapped)"
+        )
+    if not callable(make):
+        raise UserError(
+            f"a {what} is registered as a function or class that is called with an environment, got {make!r}"
+        )
+
+
 def bounded(reader: Any, perception_m: float | None, max_agents: int | None) -> Any:
     """Returns a reader of one's own after setting what its ego perceives; None leaves the reader's value.
 
     Raises:
         UserError: a value out of range, or a reader that is no `Reader` and has another value.
     """
+    check_bounds(perception_m, max_agents)
     given = {"perception_m": perception_m, "max_agents": max_agents}
     given = {name: value for name, value in given.items() if value is not None and value != getattr(reader.spec, name)}
     if not given:
@@ -168,6 +200,8 @@ def _name_of(make_reader: Any) -> str:
 
 def _build(make_reader: Any, env: Any, advice: str) -> Any:
     """Calls `make_reader` and checks what both kinds of reader have in common."""
+    if isinstance(make_reader, str):
+        make_reader = load_named(make_reader)
     name = _name_of(make_reader)
     if not callable(make_reader):
         raise UserError(f"reader= takes what makes a reader, a Reader class for example, got an object of {name}")
@@ -269,6 +303,8 @@ def pad_multiagent_scene(
     count = len(full.ids)
     if count > spec.max_agents:
         raise UserError(f"{source}: {count} agents do not fit max_agents={spec.max_agents}; raise max_agents")
+    if count == spec.max_agents:
+        return MultiagentScene(full, dict(index_of), np.array(heading_rad, dtype=np.float64))
     headings = np.zeros(spec.max_agents)
     headings[:count] = heading_rad
     return MultiagentScene(padded(full, np.arange(count), spec.max_agents), dict(index_of), headings)

@@ -133,7 +133,7 @@ class MpeReader:
         names = set(agents_in_sight(env))
         world = env.unwrapped.world
         entities = [entity for entity in self._listed(world) if getattr(entity, "alive", True)]
-        still = {id(landmark) for landmark in world.landmarks}
+        still = set(map(id, world.landmarks))
         states = np.array([_state(entity, id(entity) in still) for entity in entities], dtype=np.float64)
         ids = np.array([self._identify(entity) for entity in entities], dtype=np.int64)
         indices = {entity.name: i for i, entity in enumerate(entities) if entity.name in names}
@@ -158,5 +158,6 @@ class MpeReader:
 
 
 def _state(entity: Any, landmark: bool) -> tuple[float, ...]:
+    state = entity.state
     adversary = bool(getattr(entity, "adversary", False))
-    return (*entity.state.p_pos, *entity.state.p_vel, float(adversary), float(landmark), entity.size)
+    return (*state.p_pos.tolist(), *state.p_vel.tolist(), float(adversary), float(landmark), entity.size)

@@ -71,7 +71,7 @@ def outcome_keys(env: Any, crash_key: str | None = None, success_key: str | None
 
 def _keys(known: OutcomeKeys, crash_key: str | None, success_key: str | None) -> OutcomeKeys:
     for name, key in (("crash_key", crash_key), ("success_key", success_key)):
-        if key == "":
+        if key is not None and (not isinstance(key, str) or not all(key.split("."))):
             raise UserError(f"{name} must be the name of a key of the infos, got {key!r}")
     return OutcomeKeys(
         known.crash if crash_key is None else (crash_key,), known.success if success_key is None else (success_key,)

@@ -74,6 +74,8 @@ class EpisodeTask:
     """Numbers of steps to which the model's memory is limited in ablations."""
     edge_ablations: bool = False
     """Whether the model forecasts with changed edges, too."""
+    env_kwargs: str = ""
+    """Arguments of the environment, as the text of a JSON object."""
 
 
 @dataclass(frozen=True)
@@ -148,12 +150,12 @@ def play(task: EpisodeTask) -> Episode:
 
 
 @functools.lru_cache(maxsize=4)
-def _kept_world(env_id: str, driver: str, checkpoint: str, horizon_steps: int) -> World:
-    return open_world(env_id, driver, checkpoint, horizon_steps=horizon_steps)
+def _kept_world(env_id: str, driver: str, checkpoint: str, horizon_steps: int, env_kwargs: str) -> World:
+    return open_world(env_id, driver, checkpoint, horizon_steps=horizon_steps, env_kwargs=env_kwargs)
 
 
 def _world(task: EpisodeTask) -> World:
-    return _kept_world(task.env_id, task.driver, task.checkpoint, task.horizon_steps)
+    return _kept_world(task.env_id, task.driver, task.checkpoint, task.horizon_steps, task.env_kwargs)
 
 
 @functools.lru_cache(maxsize=2)

@@ -4,16 +4,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from rich.progress import track
 
 from envs.rollouts.causal_labels import CausalSettings, settings_for
 from envs.rollouts.causal_scenes import EdgeScene, GraphTask, play_graph
+from envs.rollouts.cluster_pool import episode_pool
 from envs.rollouts.side_forecasts import fitting_checkpoints
-from envs.rollouts.workers import EpisodePool
 from envs.rollouts.world import open_world
 from envs.supervision import TIMEOUT_S
 from predictor.evaluation.causal_graph import CausalPairs, CausalScores, halves, score_rule
 from predictor.support.errors import UserError
+from predictor.support.progress import track
 
 MAJORITY, DISTANCE, LEADERS = "the commoner answer", "distance", "the leader"
 """Names of the rules that need no network."""
@@ -41,6 +41,8 @@ class GraphRun:
     """Number of parallel processes."""
     timeout_s: float = TIMEOUT_S
     """Largest time between two steps of an episode [s]."""
+    cluster: str | None = None
+    """Address of a Ray cluster that plays in place of this machine."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ def measure_graph(run: GraphRun) -> EnvGraph:
     tasks = [
         GraphTask(run.env_id, run.driver, fitting, run.seed + i, run.max_steps, settings) for i in range(run.episodes)
     ]
-    with EpisodePool(play_graph, run.workers, run.timeout_s) as pool:
+    with episode_pool(play_graph, run.workers, run.timeout_s, cluster=run.cluster) as pool:
         episodes = list(track(pool.results(tasks), f"graph {run.env_id}", total=len(tasks)))
     scores = scores_of(episodes, settings.threshold_m)
     if not next(iter(scores.values())).pairs:

@@ -5,17 +5,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from rich.progress import track
 
 from envs.plans import plan_model_for
+from envs.rollouts.cluster_pool import episode_pool
 from envs.rollouts.plan_moments import PlanMoment, PlanTask, play_plans
 from envs.rollouts.side_forecasts import fitting_checkpoints
-from envs.rollouts.workers import EpisodePool
 from envs.rollouts.world import open_world
 from envs.supervision import TIMEOUT_S
 from predictor.checkpoint import load_forecaster
 from predictor.evaluation.standard_errors import Estimate, bootstrap_interval
 from predictor.support.errors import UserError
+from predictor.support.progress import track
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,8 @@ class PlanRun:
     """Number of steps forecast and played; None takes the first checkpoint's."""
     timeout_s: float = TIMEOUT_S
     """Largest time between two steps of an episode [s]."""
+    cluster: str | None = None
+    """Address of a Ray cluster that plays in place of this machine."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,7 @@ def measure_plans(run: PlanRun) -> EnvPlans:
     tasks = [
         PlanTask(run.env_id, run.driver, fitting, run.seed + i, run.max_steps, horizon) for i in range(run.episodes)
     ]
-    with EpisodePool(play_plans, run.workers, run.timeout_s) as pool:
+    with episode_pool(play_plans, run.workers, run.timeout_s, cluster=run.cluster) as pool:
         played = pool.results(tasks)
         episodes = [found for found in track(played, f"plans {run.env_id}", total=len(tasks)) if found]
     if not episodes:

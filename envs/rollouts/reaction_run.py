@@ -4,18 +4,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from envs.rollouts.cluster_pool import episode_pool
 from envs.rollouts.interventions import kinds_of
 from envs.rollouts.reaction_cells import FALSE_BESIDE, cells_of
 from envs.rollouts.reactions import Perturbation, ReactionTask, play_reactions
 from envs.rollouts.side_forecasts import fitting_checkpoints
-from envs.rollouts.workers import EpisodePool
 from envs.rollouts.world import open_world
 from envs.supervision import TIMEOUT_S
 from predictor.checkpoint import load_forecaster
 from predictor.evaluation.reactions import Reaction, Shifts, false_reaction, reaction
 from predictor.evaluation.standard_errors import Estimate
+from predictor.support.progress import WorkShown
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,8 @@ class ReactionRun:
     """Stores to fit nearest neighbours to; empty leaves them out."""
     timeout_s: float = TIMEOUT_S
     """Largest time between two steps of an episode [s]."""
+    cluster: str | None = None
+    """Address of a Ray cluster that plays in place of this machine."""
 
 
 @dataclass(frozen=True)
@@ -121,18 +123,16 @@ def _play_until_enough(
 ) -> tuple[list[Perturbation], int]:
     """Returns the first perturbations of each cell, and the number of episodes that they took."""
     found: dict[str, list[Perturbation]] = {name: [] for name in names}
-    columns = TextColumn(f"reactions {run.env_id}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     played, needed = 0, 0
     with (
-        EpisodePool(play_reactions, run.workers, run.timeout_s) as pool,
-        Progress(*columns) as progress,
+        episode_pool(play_reactions, run.workers, run.timeout_s, cluster=run.cluster) as pool,
+        WorkShown(f"reactions {run.env_id}", len(names) * run.perturbations) as shown,
     ):
-        bar = progress.add_task("", total=len(names) * run.perturbations)
         while played < run.episodes:
             wanted = tuple(name for name in names if _count(found[name]) < run.perturbations)
             if not wanted:
                 break
-            wave = range(played, min(played + 2 * run.workers, run.episodes))
+            wave = range(played, min(played + 2 * pool.size, run.episodes))
             tasks = [
                 ReactionTask(
                     run.env_id, run.driver, checkpoints, run.seed + i, horizon_steps, run.max_steps, wanted, run.stores
@@ -144,7 +144,7 @@ def _play_until_enough(
                     if _count(found[one.cell]) < run.perturbations:
                         found[one.cell].append(one)
                         needed = episode + 1
-                        progress.advance(bar, not one.crashed)
+                        shown.advance(not one.crashed)
             played = wave.stop
     enough = all(_count(ones) == run.perturbations for ones in found.values())
     return [one for ones in found.values() for one in ones], needed if enough else played

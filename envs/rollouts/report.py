@@ -1,5 +1,6 @@
 """Reports of `envs.evaluate`: tables for a terminal and a page, a figure by horizon, a gallery of worst cases."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,11 +9,12 @@ import matplotlib
 import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
-from rich.table import Table
 
+from envs.registry import name_with
 from envs.rollouts.episode import MODEL, NEIGHBOURS, RESIDUAL, STRAIGHT, Case
 from predictor.evaluation.accuracy import Accuracy
 from predictor.evaluation.graph_accuracy import GraphAccuracy
+from predictor.reports.fitted_table import FittedTable
 from predictor.reports.plots import save_figure
 from predictor.reports.tables import markdown_table
 from predictor.support.markdown import table
@@ -57,6 +59,13 @@ class EnvAccuracy:
     episode's end: each counts up to that end."""
     before_crash: tuple[Accuracy, Accuracy] | None = None
     """Accuracy of both over the forecasts of the last `BEFORE_CRASH_S` before a crash; None without a crash."""
+    env_kwargs: str = ""
+    """Arguments of the environment, as the text of a JSON object; empty if it had none."""
+
+    @property
+    def env(self) -> str:
+        """Id of the environment, with its arguments where it had some."""
+        return name_with(self.env_id, self.env_kwargs)
 
     @property
     def lines(self) -> list[Accuracy]:
@@ -81,7 +90,7 @@ HEADS = (
 
 def title(result: "EnvAccuracy") -> str:
     """Returns the title of one environment's table."""
-    return f"{result.env_id}, checkpoint {result.checkpoint}, driven {result.driver}"
+    return f"{result.env}, checkpoint {result.checkpoint}, driven {result.driver}"
 
 
 def remarks(result: "EnvAccuracy") -> str:
@@ -118,14 +127,11 @@ def remarks(result: "EnvAccuracy") -> str:
     return "\n".join(lines)
 
 
-def overview(results: Sequence["EnvAccuracy"]) -> Table:
+def overview(results: Sequence["EnvAccuracy"]) -> FittedTable:
     """Returns a table with one line per result."""
-    shown = Table(title="in-env accuracy, held-out seeds")
-    for i, heading in enumerate(HEADS):
-        shown.add_column(heading.replace("[", r"\["), justify="left" if i < 4 else "right")
-    for result in results:
-        shown.add_row(*_cells(result))
-    return shown
+    several = len({result.env_id for result in results}) < len(results)
+    heads = [textwrap.fill(head, 12) for head in HEADS]
+    return FittedTable("in-env accuracy, held-out seeds", heads, [_cells(r) for r in results], kept=1 + several)
 
 
 def markdown(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], str]) -> str:
@@ -143,16 +149,12 @@ def markdown(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str],
     return "\n".join(parts)
 
 
-def transfer(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], str]) -> Table:
+def transfer(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], str]) -> FittedTable:
     """Returns the transfer matrix: a column per checkpoint, a line per environment."""
-    shown = Table(title=r"transfer: minADE₁ \[m] (below constant velocity)", caption="–: does not fit, see accuracy.md")
     cells = _matrix(results, misfits)
-    shown.add_column("env")
-    for name in next(iter(cells.values())):
-        shown.add_column(name, justify="right")
-    for env_id, line in cells.items():
-        shown.add_row(env_id, *line.values())
-    return shown
+    lines = [[env_id, *line.values()] for env_id, line in cells.items()]
+    title = "transfer: minADE₁ [m] (below constant velocity)"
+    return FittedTable(title, ["env", *next(iter(cells.values()))], lines, "–: does not fit, see accuracy.md")
 
 
 def _matrix(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], str]) -> dict[str, dict[str, str]]:
@@ -171,7 +173,7 @@ def _cells(result: "EnvAccuracy") -> list[str]:
     )  # fmt: skip
     noisy, covered = result.controls.get(RESIDUAL), many.statistics.get("coverage")
     return [
-        result.env_id, result.checkpoint, f"{result.dt_s:g}", str(len(one.by_step_m)),
+        result.env, result.checkpoint, f"{result.dt_s:g}", str(len(one.by_step_m)),
         _metres(one.min_ade_m), _metres(one.min_fde_m), _metres(many.min_ade_m), _metres(many.min_joint_ade_m),
         _metres(many.energy_m), "–" if covered is None else f"{100 * covered.mean:.0f} %",
         "–" if noisy is None else _metres(noisy.min_ade_m), "–" if near is None else _metres(near.ade_m),
@@ -189,7 +191,7 @@ def write_pictures(out: Path, result: "EnvAccuracy", cases: Sequence[Case]) -> N
     """Writes `ENV.CHECKPOINT.by_horizon.png` and `….worst.png` under `out`."""
     matplotlib.use("Agg")
     out.mkdir(parents=True, exist_ok=True)
-    stem = f"{result.env_id.replace('/', '-')}.{result.checkpoint}"
+    stem = f"{result.env_id}.{result.checkpoint}".replace("/", "-")
     figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
     threshold_m = result.model.miss_threshold_m
     for ax, quantity, label in (
@@ -202,7 +204,8 @@ def write_pictures(out: Path, result: "EnvAccuracy", cases: Sequence[Case]) -> N
     figure.suptitle(f"{title(result)}; bands are 95 % intervals over episodes")
     save_figure(figure, out / f"{stem}.by_horizon.png", 130)
     if cases:
-        figure, grid = plt.subplots(2, 3, figsize=(13, 8), layout="constrained")
+        lines = -(-len(cases) // 3)
+        figure, grid = plt.subplots(lines, 3, figsize=(13, 4 * lines), squeeze=False, layout="constrained")
         for ax, case in zip(grid.flat, cases, strict=False):
             plot_case(ax, case)
         for ax in list(grid.flat)[len(cases) :]:
@@ -254,5 +257,7 @@ def plot_case(ax: Axes, case: Case) -> Axes:
     ax.plot(*np.concatenate([now, case.future]).T, color="black", lw=0.9, marker=".", ms=3, label="what happened")
     ax.set_title(f"seed {case.seed}, step {case.step}: {case.error_m:.2f} m off", fontsize=9)
     ax.set_aspect("equal", adjustable="datalim")
+    ax.set_xlabel("x [m]", fontsize=8)
+    ax.set_ylabel("y [m]", fontsize=8)
     ax.tick_params(labelsize=7)
     return ax

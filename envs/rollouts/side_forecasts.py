@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from envs.drivers.trained import sees_forecasts
 from envs.rollouts.world import World, open_world
-from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint, load_forecaster, name_of_folder
+from predictor.checkpoint import CONSTANT_VELOCITY, load_checkpoint, load_forecaster, names_of
 from predictor.forecaster import Forecaster
 from predictor.online import OnlineForecaster
 from predictor.own_forecasters import is_own
@@ -85,7 +85,7 @@ def kept_forecaster(checkpoint: str, spec: SceneSpec, source: str) -> Forecaster
 def checkpoint_forecasters(checkpoints: Sequence[str], spec: SceneSpec, env_id: str) -> dict[str, Forecaster]:
     """Returns the forecasters of all checkpoints but constant velocity, by the names of their folders."""
     return {
-        name_of_folder(name): kept_forecaster(name, spec, f"env '{env_id}'")
+        names_of(checkpoints)[name]: kept_forecaster(name, spec, f"env '{env_id}'")
         for name in checkpoints
         if name != CONSTANT_VELOCITY
     }
@@ -106,7 +106,7 @@ def fitting_checkpoints(
         except UserError as error:
             if len(checkpoints) == 1:
                 raise
-            misfits[name_of_folder(checkpoint)] = str(error)
+            misfits[names_of(checkpoints)[checkpoint]] = str(error)
             continue
         fitting.append(checkpoint)
         if spec.has_ego and checkpoint != CONSTANT_VELOCITY:

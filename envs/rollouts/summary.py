@@ -31,6 +31,8 @@ def summarise_episodes(
     episodes: Sequence[Episode],
     histories: Sequence[int] = (),
     miss_m: float | None = None,
+    shown_as: str | None = None,
+    env_kwargs: str = "",
 ) -> EnvAccuracy:
     """Returns the accuracy of one checkpoint in one environment.
 
@@ -43,6 +45,8 @@ def summarise_episodes(
         histories: numbers of steps to which the memory was limited in ablations.
         miss_m: final displacement above which a forecast misses [m]; None takes 2 m on roads, a tenth of a small
             arena's scale.
+        shown_as: name of the checkpoint in tables; None takes its folder's.
+        env_kwargs: arguments of the environment, as the text of a JSON object.
     """
     miss_m = miss_m or (MISS_THRESHOLD_M if spec.feature_scales[0] >= 50 else 0.1 * spec.feature_scales[0])
     outcomes = {key: [e.outcomes[key] for e in episodes] for key in episodes[0].outcomes}
@@ -71,7 +75,7 @@ def summarise_episodes(
     latencies_ms = 1e3 * np.concatenate([e.latencies_s[1:] or e.latencies_s for e in episodes])  # the first warms up
     return EnvAccuracy(
         env_id,
-        name_of_folder(checkpoint) if learned else checkpoint,
+        shown_as or name_of_folder(checkpoint),
         driver,
         spec.dt_s,
         line(name, first, std_m),
@@ -87,6 +91,7 @@ def summarise_episodes(
         {key: line(f"{name}, {key}", outcomes[key], std_m) for key in EDGES if key in outcomes},
         to_the_end,
         before_crash,
+        env_kwargs,
     )
 
 

@@ -5,6 +5,7 @@ one that dies, or makes no step for some time, is named and ended, and a new one
 """
 
 import contextlib
+import importlib
 import multiprocessing
 import pickle
 import time
@@ -15,8 +16,6 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
 from typing import Any, Generic, Literal, Protocol, TypeVar, runtime_checkable
-
-import torch
 
 from envs.supervision import NUMBERS, TIMEOUT_S, EnvironmentFailedError, Place, failure, reason_of, share
 from predictor.support.errors import UserError
@@ -109,6 +108,11 @@ class EpisodePool(Generic[Result]):
         for worker in self._workers:
             worker.pipe.close()
         self._workers = []
+
+    @property
+    def size(self) -> int:
+        """Number of episodes that are played at one time."""
+        return self._size
 
     def play(self, tasks: Sequence[SeededTask]) -> Iterator[Result | Failed]:
         """Yields the result of each task, in their order; `Failed` in its place with `on_error="skip"`.
@@ -217,7 +221,7 @@ def _started(play: Callable[[Any], Any]) -> _Worker:
 def _work(play: Callable[[Any], Any], pipe: Connection, numbers: Any) -> None:
     """Plays tasks until the other end of the pipe closes, or an episode fails."""
     follow_parent()
-    torch.set_num_threads(1)  # workers already fill the cores
+    importlib.import_module("torch").set_num_threads(1)  # workers already fill the cores
     place = share(numbers)
     with contextlib.suppress(OSError):  # the other end may be closed by now
         _play_all(play, pipe, place)

@@ -29,6 +29,7 @@ from envs.readers.highway_labels import SceneLabels, read_labels
 from envs.registry import (
     ENVS,
     HEURISTIC_DRIVERS,
+    arguments_of,
     checkpoint_for,
     entry_for,
     is_multiagent_id,
@@ -59,6 +60,16 @@ class World(Protocol):
 
     def reset(self, seed: int) -> None:
         """Begins the episode of a seed: environment and drivers are a function of it."""
+
+    def drive(self, driver: str) -> None:
+        """Lets another driver act from the next reset on.
+
+        Args:
+            driver: name of a driver that needs no forecasts; no policy.
+
+        Raises:
+            UserError: unknown driver, or one that does not fit the environment.
+        """
 
     def step(self) -> bool:
         """Lets all agents act once; returns whether the episode is over."""
@@ -122,6 +133,15 @@ class EgoWorld:
         self.crashed = None
         self._rng = driver_rng(seed)
         self._ego = make_ego_driver(self._name, self.env, self._rng)
+
+    def drive(self, driver: str) -> None:
+        """Lets another driver, no policy, act from the next reset on.
+
+        Raises:
+            UserError: see `make_ego_driver`.
+        """
+        make_ego_driver(driver, self.env, np.random.default_rng(0))
+        self._name, self._whole = driver, False
 
     def hand_over(self, driver: Callable[[Any], Any]) -> None:
         """Lets another driver act from now on, until the next reset: a function from observations to actions."""
@@ -213,6 +233,15 @@ class MultiagentWorld:
         self._rng = driver_rng(seed)
         self._driver = self._make_driver(self._rng)
 
+    def drive(self, driver: str) -> None:
+        """Lets another driver, no policy, act from the next reset on.
+
+        Raises:
+            UserError: see `make_driver`.
+        """
+        make_driver(driver, self.env, np.random.default_rng(0))
+        self._name = driver
+
     def step(self) -> bool:
         """Lets all agents act.
 
@@ -269,6 +298,7 @@ def open_world(
     *,
     horizon_steps: int | None = None,
     perceived_as: SceneSpec | None = None,
+    env_kwargs: str = "",
 ) -> World:
     """Makes an environment with a driver, and with forecasts if a checkpoint is given.
 
@@ -281,23 +311,26 @@ def open_world(
         horizon_steps: number of steps to forecast.
         perceived_as: layout whose `perception_m` and `max_agents` bound what an ego perceives, where no forecasts are
             made; None takes the reader's.
+        env_kwargs: arguments of the environment, as the text of a JSON object.
 
     Raises:
-        UserError: unknown env, driver or checkpoint, or ones that do not fit together.
+        UserError: unknown env, driver or checkpoint, ones that do not fit together, or arguments that the environment
+            refuses.
     """
+    kwargs = arguments_of(env_kwargs)
     if is_multiagent_id(env_id):
         options = wrapper_options(driver) if sees_forecasts(driver) else {}
         checkpoint = checkpoint or options.get("checkpoint") or _forecaster_for(env_id, driver)
         if checkpoint != options.get("checkpoint"):
             options = {"checkpoint": checkpoint}
         options |= {} if horizon_steps is None else {"horizon_steps": horizon_steps}
-        wrapped = ForecastParallelEnv(make_multiagent_env(env_id), **options)
+        wrapped = ForecastParallelEnv(make_multiagent_env(env_id, **kwargs), **options)
         multiagent = MultiagentWorld(wrapped, driver, env_id)
         if sees_forecasts(driver):
             space: Any = wrapped.observation_space(wrapped.possible_agents[0])
             require_forecaster(driver, checkpoint, space, wrapped.scene_spec, options.get("arm"))
         return multiagent
-    env = make_env(env_id, disable_env_checker=True)
+    env = make_env(env_id, disable_env_checker=True, **kwargs)
     if checkpoint is None:
         seen = env_for_driver(env, driver)
         if not isinstance(seen, ForecastObservation):
@@ -326,20 +359,24 @@ def _forecaster_for(env_id: str, driver: str) -> str:
     return checkpoint_for(env_id) if sees_forecasts(driver) else CONSTANT_VELOCITY
 
 
-def default_drivers(env_id: str) -> tuple[str, ...]:
+def default_drivers(env_id: str, env_kwargs: str = "") -> tuple[str, ...]:
     """Returns the drivers that take turns in data collection by default; the first one drives in evaluation.
+
+    Args:
+        env_id: id of the environment.
+        env_kwargs: arguments of the environment, as the text of a JSON object.
 
     Raises:
         UserError: a parallel environment cannot be made.
     """
     if env_id in ENVS or not is_multiagent_id(env_id):
         return entry_for(env_id).drivers
-    return HEURISTIC_DRIVERS if _id_has_heuristic(env_id) else entry_for(env_id).drivers
+    return HEURISTIC_DRIVERS if _has_heuristic(env_id, env_kwargs) else entry_for(env_id).drivers
 
 
 @functools.cache
-def _id_has_heuristic(env_id: str) -> bool:
-    env = make_multiagent_env(env_id)
+def _has_heuristic(env_id: str, env_kwargs: str) -> bool:
+    env = make_multiagent_env(env_id, **arguments_of(env_kwargs))
     try:
         return has_heuristic(env)
     finally:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from envs.arms import Arm
+from envs.arms import Arm, arm_of
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
 from envs.observation import ForecastStream, common_value, observe_ended, open_forecaster, require_scenes, scenes_from
 from envs.own_observation import own_part
@@ -85,7 +85,7 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         source = common_value(venv.get_attr("scene_source"), "env id")
         forecaster = open_forecaster(checkpoint, spec, source, device, forecaster)
         steps = horizon_steps or forecaster.horizon_steps
-        arm = arm or Arm()
+        arm = arm_of(arm)
         self.plan_names = ask_for_plans(
             venv.env_method, what_if, steps, "VecForecast", venv.unwrapped, arm.plays(bool(what_if))
         )

@@ -199,6 +199,10 @@ def _note(path: Path) -> dict[str, Any]:
     return as_object(_entry(path, NOTE_ENTRY, {}), f"{path}: {NOTE_ENTRY} (its note)") if os.path.lexists(path) else {}
 
 
+_DAMAGED = (OSError, RuntimeError, NotImplementedError, ValueError, zlib.error, EOFError)
+"""What `zipfile` raises for an archive that is damaged, encrypted or of a later version."""
+
+
 def _entry(path: Path, name: str, default: Any = None) -> Any:
     """Returns an entry of JSON of a policy's zip.
 
@@ -207,15 +211,17 @@ def _entry(path: Path, name: str, default: Any = None) -> Any:
         zipfile.BadZipFile: the file is no zip.
     """
     check_regular(path, MOST_BYTES)
-    with zipfile.ZipFile(path) as archive:
-        if name not in archive.namelist():
-            return default
-        if archive.getinfo(name).file_size > MOST_JSON_BYTES:
-            raise UserError(f"{path}: {name} is too large, at most {MOST_JSON_BYTES // MIB} MiB; save the policy again")
-        try:
-            return parse_json(archive.read(name), f"{path}: {name}")
-        except (OSError, RuntimeError, NotImplementedError, zlib.error, EOFError) as error:  # damaged or encrypted
-            raise zipfile.BadZipFile(str(error)) from error
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if name not in archive.namelist():
+                return default
+            too_large = archive.getinfo(name).file_size > MOST_JSON_BYTES
+            content = b"" if too_large else archive.read(name)
+    except _DAMAGED as error:
+        raise zipfile.BadZipFile(str(error)) from error
+    if too_large:
+        raise UserError(f"{path}: {name} is too large, at most {MOST_JSON_BYTES // MIB} MiB; save the policy again")
+    return parse_json(content, f"{path}: {name}")
 
 
 def algorithm_of(path: Path) -> Algorithm:

@@ -10,7 +10,7 @@ from typing import Any
 
 from envs.readers.base import MakeReader
 from envs.testing.ego import ego_problems, replay_problems
-from envs.testing.playing import Episode, ReaderProblem, open_reader, play
+from envs.testing.playing import Episode, ReaderProblem, open_reader, play, space_problems
 from envs.testing.recorded import observation_problems, recorded_problems, store_problems
 from predictor.support.errors import UserError
 
@@ -57,7 +57,7 @@ def reader_problems(
             played.append(play(env, opened, seed + number, max_steps))
     except ReaderProblem as error:
         return [str(error)]
-    problems = recorded_problems(played, opened.spec) + observation_problems(played)
+    problems = space_problems(env) + recorded_problems(played, opened.spec) + observation_problems(played)
     if opened.spec.has_ego:
         problems += ego_problems(env, opened, seed)
     return problems + replay_problems(env, opened, seed)

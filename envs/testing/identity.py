@@ -13,6 +13,9 @@ from predictor.scene import SceneSpec
 FAR = 10.0
 """Error of a predicted position, in typical errors, from which an agent is said to be elsewhere than it should."""
 
+NEAR = 1e-3
+"""Distance, in scales of positions, that is not told from standing still: parked cars sink into their springs."""
+
 
 @dataclass(frozen=True)
 class _Rule:
@@ -25,17 +28,19 @@ class _Rule:
     reach_m: float
     """Distance that a fast agent moves in a step."""
     axes: int
+    floor_m: float = 0.0
+    """Distance that is none at the scale of the scene."""
 
     @classmethod
     def of(cls, episodes: Sequence[Episode], spec: SceneSpec) -> "_Rule":
-        steps = Steps.of(episodes, spec.position_dim)
+        steps, floor_m = Steps.of(episodes, spec.position_dim), NEAR * min(spec.feature_scales[: spec.position_dim])
         if not len(steps.moved):
-            return cls(spec.dt_s, 0.0, 0.0, spec.position_dim)
+            return cls(spec.dt_s, 0.0, 0.0, spec.position_dim, floor_m)
         moving = steps.fast()
         length = step_length(moving.moved, moving.velocity()) if len(moving.moved) else spec.dt_s
         error = np.linalg.norm(steps.moved - steps.before * length, axis=1)
         reach = np.quantile(np.linalg.norm(steps.before, axis=1), 0.9) * abs(length)
-        return cls(length, float(np.median(error)), float(reach), spec.position_dim)
+        return cls(length, float(np.median(error)), float(reach), spec.position_dim, floor_m)
 
     def led_to(self, state: Float[np.ndarray, " state"], steps: int = 1) -> Float[np.ndarray, " axes"]:
         return state[: self.axes] + state[self.axes : 2 * self.axes] * self.step_s * steps
@@ -46,12 +51,12 @@ class _Rule:
     @property
     def handed_m(self) -> float:
         """Least error of an id that is said to have another agent now."""
-        return FAR * self.typical_m + 0.05 * self.reach_m
+        return max(FAR * self.typical_m + 0.05 * self.reach_m, self.floor_m)
 
     @property
     def jump_m(self) -> float:
         """Least error of an agent that is said to have jumped: further than by braking and turning at once."""
-        return FAR * self.typical_m + 3 * self.reach_m
+        return max(FAR * self.typical_m + 3 * self.reach_m, self.floor_m)
 
 
 def identity_problems(episodes: Sequence[Episode], spec: SceneSpec) -> list[str]:

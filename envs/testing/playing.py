@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from pettingzoo import ParallelEnv
 
 from envs.multiagent_observation import check_multiagent_scene
+from envs.own_observation import require_space
 from envs.readers import FunctionReader, MakeReader, multiagent_reader_for, reader_for
 from envs.readers.base import build_multiagent_reader, build_reader, require_scene, show
 from predictor.scene import Scene, SceneSpec
@@ -129,6 +130,23 @@ def open_reader(env: Any, make_reader: MakeReader | None) -> OpenReader:
     given = make_reader if make_reader is not None else reader
     given = given.read if isinstance(given, FunctionReader) else given
     return OpenReader(reader, str(getattr(given, "__name__", type(given).__name__)))
+
+
+def space_problems(env: Any) -> list[str]:
+    """Returns a line for the first space that is none of gymnasium's; nothing if all are."""
+    if isinstance(env, ParallelEnv):
+        agents = [
+            (f"'{agent}': ", env.observation_space(agent), env.action_space(agent)) for agent in env.possible_agents
+        ]
+    else:
+        agents = [("", env.observation_space, env.action_space)]
+    for whose, observation, action in agents:
+        try:
+            require_space(observation, f"{whose}the observation space")
+            require_space(action, f"{whose}the action space")
+        except UserError as error:
+            return [str(error)]
+    return []
 
 
 Act = Callable[[int], Any]

@@ -167,10 +167,12 @@ def draw_overlay(
     caption: str,
     style: OverlayStyle,
     plans: Sequence[PlanOverlay] = (),
+    future_known: bool = True,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Draws edges, true futures, forecasts, caption and legend over a picture; returns the result.
 
-    With plans of the ego, the forecasts are those for each plan, in the colour of its risk, the riskiest first.
+    With plans of the ego, the forecasts are those for each plan, in the colour of its risk, the riskiest first. Where
+    the future is not known, the legend does not name it.
     """
     size = (picture.width * SMOOTHING, picture.height * SMOOTHING)
     overlay = Image.new("RGBA", size, (0, 0, 0, 0))
@@ -189,7 +191,9 @@ def draw_overlay(
         pen.line(view.pixels(plan.path_m), style.plan_width_px, (*color, 255))
         for line in plan.others_m:
             pen.forecast(view.pixels(line), color)
-    _draw_captions(pen, picture.size, caption, PLAN_LEGEND if plans else FORECAST_LEGEND)
+    legend = PLAN_LEGEND if plans else FORECAST_LEGEND
+    shown = legend if future_known else [entry for entry in legend if entry[1] is not Pen.truth]
+    _draw_captions(pen, picture.size, caption, shown)
     smooth = overlay.resize(picture.size, Image.Resampling.BOX)
     result = picture.convert("RGB")
     result.paste(smooth, mask=smooth)

@@ -1,6 +1,7 @@
 """Writes pictures (PNG) and videos (MP4), and keeps pictures small in memory."""
 
 import io
+import subprocess
 from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
@@ -11,6 +12,9 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from predictor.support.files import new_file
+
+STILL_PX, STILL_LIMIT_S = 1000, 20.0
+"""Largest width of a still [px], and longest time that its making may take [s]."""
 
 
 def decode_png(data: bytes) -> Image.Image:
@@ -50,3 +54,17 @@ def write_video(path: str | Path, pictures: Iterable[UInt8[np.ndarray, "height w
 def write_picture(path: str | Path, picture: UInt8[np.ndarray, "height width 3"]) -> None:
     """Writes a picture as PNG."""
     Image.fromarray(picture).save(path, format="PNG")
+
+
+def still_of(film: Path) -> bytes:
+    """Returns a picture of an MP4 file as JPEG, from two seconds after its start; nothing of one that has none there.
+
+    The file may come from a stranger: it is read as MP4 alone, which names no other file, and for `STILL_LIMIT_S`.
+    """
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-protocol_whitelist", "file,pipe"]
+    command += ["-ss", "2", "-f", "mov", "-i", f"file:{film}", "-frames:v", "1", "-an"]
+    command += ["-vf", f"scale='min({STILL_PX},iw)':-2", "-f", "image2pipe", "-c:v", "mjpeg", "-q:v", "4", "pipe:1"]
+    try:
+        return subprocess.run(command, capture_output=True, timeout=STILL_LIMIT_S, check=False).stdout
+    except subprocess.TimeoutExpired:
+        return b""

@@ -14,7 +14,7 @@ from typing import Any, cast
 
 import numpy as np
 from highway_env.envs.common.graphics import EnvViewer
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 
 from envs.plans.contact import contacts
 from envs.readers.highway import HighwayReader, is_highway_env
@@ -195,11 +195,7 @@ class _Recorder:
     def begin(self) -> None:
         """Records the first picture, after the reset."""
         base = self._base
-        config = dict(base.config)
-        for name in ("screen_width", "screen_height"):
-            config[name] = 2 * round(config[name] * ENLARGE / 2)  # H.264 needs even sizes
-        config["scaling"] = config["scaling"] * ENLARGE / WIDEN
-        base.viewer = _make_viewer(base, config)
+        base.viewer = large_viewer(base)
         base.set_record_video_wrapper(self)
         self.recording.fps = int(self.frames_per_sec)
         self.recording._ego = int(self._env.scene.ids[0])
@@ -233,42 +229,56 @@ class _Recorder:
         self.recording._frames.append(frame)
 
     def _note_forecast(self) -> None:
-        scene = self._env.scene
-        forecast = self._env.stream.again(self._samples) if self._samples > 1 else self._env.forecast
-        others = np.flatnonzero(scene.valid)[1:]  # without the ego
-        keys = tuple(scene.ids[others].tolist())
-        xy_m = forecast.xy[0].double().cpu().numpy() + scene.states[0, :2]
-        probs = 1 - forecast.ego_edges()[0][0, :, 0, 0].double().cpu().numpy()  # agent → ego
-        shares = forecast.sample_probs()[0].double().cpu().numpy()[:, others].T
-        step = _Step(
-            len(self.recording._frames),
-            keys,
-            xy_m[:, others].swapaxes(0, 1),
-            shares,
-            probs[others],
-            self._plans(others),
-        )
-        self.recording._steps.append(step)
+        frame = len(self.recording._frames)
+        self.recording._steps.append(forecast_shown(self._env, self._samples, frame))
 
-    def _plans(self, others: Int[np.ndarray, " others"]) -> tuple[PlanOverlay, ...]:
-        """Returns the plans of this step with the single forecast of each other agent; none without `what_if`."""
-        env = self._env
-        if env.plans is None or env.what_if is None:
-            return ()
-        scene, plans = env.scene, env.plans
-        now_m = scene.states[:, :2]
-        futures_m = env.what_if.xy[0, :, 0].double().cpu().numpy() + now_m[0]
-        safe = contacts(env.what_if, SceneBatch.stack([scene]), plans.size_m).survival()[0, :, -1]
-        if plans.crashed is not None:
-            safe = safe * ~plans.crashed[:, -1]
-        return tuple(
-            PlanOverlay(
-                np.vstack([now_m[:1], path[:, :2]]),
-                tuple(np.vstack([now_m[agent : agent + 1], future[agent]]) for agent in others),
-                1.0 - float(survived),
-            )
-            for path, future, survived in zip(plans.states, futures_m, safe, strict=True)
+
+def forecast_shown(env: ForecastObservation, num_samples: int, frame: int) -> _Step:
+    """Returns what is drawn of the forecasts of now, and of the plans of the ego.
+
+    Args:
+        env: environment whose latest forecast is drawn.
+        num_samples: number of futures for each agent.
+        frame: index of the picture in which the forecast was made.
+    """
+    scene = env.scene
+    forecast = env.stream.again(num_samples) if num_samples > 1 else env.forecast
+    others = np.flatnonzero(scene.valid)[1:]  # without the ego
+    keys = tuple(scene.ids[others].tolist())
+    xy_m = forecast.xy[0].double().cpu().numpy() + scene.states[0, :2]
+    probs = 1 - forecast.ego_edges()[0][0, :, 0, 0].double().cpu().numpy()  # agent → ego
+    shares = forecast.sample_probs()[0].double().cpu().numpy()[:, others].T
+    return _Step(frame, keys, xy_m[:, others].swapaxes(0, 1), shares, probs[others], plans_shown(env))
+
+
+def plans_shown(env: ForecastObservation) -> tuple[PlanOverlay, ...]:
+    """Returns the plans of now with the single forecast of each other agent; none without `what_if`."""
+    if env.plans is None or env.what_if is None:
+        return ()
+    scene, plans = env.scene, env.plans
+    others = np.flatnonzero(scene.valid)[1:]
+    now_m = scene.states[:, :2]
+    futures_m = env.what_if.xy[0, :, 0].double().cpu().numpy() + now_m[0]
+    safe = contacts(env.what_if, SceneBatch.stack([scene]), plans.size_m).survival()[0, :, -1]
+    if plans.crashed is not None:
+        safe = safe * ~plans.crashed[:, -1]
+    return tuple(
+        PlanOverlay(
+            np.vstack([now_m[:1], path[:, :2]]),
+            tuple(np.vstack([now_m[agent : agent + 1], future[agent]]) for agent in others),
+            1.0 - float(survived),
         )
+        for path, future, survived in zip(plans.states, futures_m, safe, strict=True)
+    )
+
+
+def large_viewer(base: Any) -> EnvViewer:
+    """Makes a viewer of a highway-env environment that draws to memory, `ENLARGE` times as large as its own."""
+    config = dict(base.config)
+    for name in ("screen_width", "screen_height"):
+        config[name] = 2 * round(config[name] * ENLARGE / 2)  # H.264 needs even sizes
+    config["scaling"] = config["scaling"] * ENLARGE / WIDEN
+    return _make_viewer(base, config)
 
 
 def _make_viewer(base: Any, config: dict[str, Any]) -> EnvViewer:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from predictor.forecaster import Belief, Futures, Memory, WindowOutput
 from predictor.graph import pair_mask
 from predictor.layers.state_codec import Residual, StateCodec
-from predictor.noise import Noise
+from predictor.noise import Noise, TrainingNoise
 from predictor.scene import SceneSpec
 from predictor.support.config_checks import MOST_WIDTH, check_at_least, check_at_most, check_choices, check_scale_values
 from predictor.what_if import with_ego
@@ -183,7 +183,7 @@ class UnrolledForecaster(nn.Module, ABC):
         valid: Bool[Tensor, "batch time agents"],
         last_observed: Int[Tensor, " batch"],
         rollout_steps: int,
-        generator: torch.Generator | None = None,
+        generator: TrainingNoise | None = None,
     ) -> WindowOutput:
         """Runs the teacher-forced pass and the roll-out from its memory; see `TrainableForecaster.window`."""
         inputs = self.codec.inputs(states, valid)

@@ -33,7 +33,7 @@ from predictor.dgvae.networks import concrete_sample, no_edge_where_absent
 from predictor.forecaster import Belief, Futures, WindowOutput
 from predictor.graph import pair_mask
 from predictor.layers.state_codec import Residual
-from predictor.noise import Noise, NoiseOfPairs, RepeatedNoise, noise_of_pairs, repeat_scenes
+from predictor.noise import Noise, NoiseOfPairs, RepeatedNoise, TrainingNoise, noise_of_pairs, repeat_scenes
 from predictor.scene import SceneSpec
 from predictor.support.config_checks import MOST_PARTS, check_at_most
 from predictor.support.errors import UserError
@@ -243,7 +243,7 @@ class DNRI(UnrolledForecaster):
         valid: Bool[Tensor, "batch time agents"],
         last_observed: Int[Tensor, " batch"],
         rollout_steps: int,
-        generator: torch.Generator | None = None,
+        generator: TrainingNoise | None = None,
     ) -> WindowOutput:
         """Runs a teacher-forced pass along posterior draws and a roll-out along prior draws, from the same encoding."""
         inputs = self.codec.inputs(states, valid)

@@ -16,6 +16,7 @@ from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.provenance import provenance
+from predictor.support.remote import address
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,7 @@ class CrowdConfig:
         check_at_least(self, 0, "seed")
         if not self.num_agents:
             raise UserError("num_agents needs at least one number; leave it out for the default ones")
+        check_at_least(self, 2, "episode_steps")
         if not 0 <= self.at_step < self.episode_steps:
             raise UserError(f"at_step must lie between 0 and {self.episode_steps - 1}, got {self.at_step}")
 
@@ -101,7 +103,8 @@ def main() -> None:
     made = provenance(("numpy", "zarr")) | {"overlaid": source.provenance}
     write_store(config.out, StoreInfo(source.spec, f"{source.source}, overlaid", made), crowds, config.overwrite)
     counts = [int(e.valid[config.at_step].sum()) for e in crowds]
-    print(f"{config.out}: {len(crowds)} episodes of {min(counts)} to {max(counts)} agents at step {config.at_step}")
+    present = f"{min(counts)} to {max(counts)} agents at step {config.at_step}"
+    print(f"{address(config.out)}: {len(crowds)} episodes of {present}")
 
 
 if __name__ == "__main__":

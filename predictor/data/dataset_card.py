@@ -13,6 +13,7 @@ from predictor.support.errors import UserError
 from predictor.support.files import new_file
 from predictor.support.markdown import table
 from predictor.support.provenance import provenance
+from predictor.support.remote import address
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,6 @@ def save_dataset(
         **(extra or {}),
     }
     info = StoreInfo(spec, notes.title, facts)
-    config.card_path.parent.mkdir(parents=True, exist_ok=True)
     with new_file(config.card_path) as partial:
         partial.write_text(card_text(config.split, info, episodes, notes), encoding="utf-8")
         write_store(config.out, info, episodes, config.overwrite)
@@ -82,7 +82,8 @@ def check_not_empty(config: LoaderConfig, episodes: Sequence[Episode], notes: Da
 def summary(config: LoaderConfig, episodes: Sequence[Episode]) -> str:
     """Returns one line for the terminal."""
     steps = sum(len(e.states) for e in episodes)
-    return f"{config.out}: {len(episodes)} episodes, {steps} steps, split '{config.split}'; card {config.card_path}"
+    where, card = address(config.out), address(config.card_path)
+    return f"{where}: {len(episodes)} episodes, {steps} steps, split '{config.split}'; card {card}"
 
 
 def most_present(episodes: Iterable[Episode]) -> int:

@@ -20,13 +20,14 @@ from typing import Literal
 
 from predictor.data.dataset_card import DatasetNotes, most_present, save_dataset, summary
 from predictor.data.levelx_files import CLASS_FEATURES, Features, Layout, layout_of, open_recording, read_tracks
-from predictor.data.loading import NO_LIMIT_M, LoaderConfig, find_files, frames_per_step, in_split, progressed
+from predictor.data.loading import NO_LIMIT_M, LoaderConfig, find_files, frames_per_step, in_split
 from predictor.data.store import Episode
 from predictor.data.track_points import cut_episodes
 from predictor.scene import KINEMATIC_FEATURES, SceneSpec
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_positive
 from predictor.support.errors import UserError, run_entry_point
+from predictor.support.progress import track
 
 SPLIT_SEED = 360
 """Seed of the split: gives shares near 80/10/10 in all four datasets, and different locations of inD in each split."""
@@ -106,12 +107,15 @@ def load(config: LevelxConfig) -> tuple[Layout, list[Episode], DatasetNotes, lis
         both = " and ".join(str(path) for path in layouts.values())
         raise UserError(f"{both} have different layouts; give each dataset a folder of its own")
     wanted = [r for r in recordings if not config.locations or r.location in config.locations]
+    if not wanted:
+        known = sorted({r.location for r in recordings})
+        raise UserError(f"{config.source} has no recording of locations {config.locations}; there are {known}")
     chosen = [r for r in wanted if in_split(r.name, config.split, SPLIT_SEED)]
     counts: Counter[str] = Counter(
         {"recordings": len(recordings), f"recordings of split '{config.split}'": len(chosen)}
     )
     episodes: list[Episode] = []
-    for recording in progressed(chosen, "levelx"):
+    for recording in track(chosen, "levelx"):
         stride = frames_per_step(config.dt_s, recording.frames_per_s, f"recording {recording.name}")
         points = read_tracks(recording, config.features, stride)
         counts["points kept"] += len(points)

@@ -6,16 +6,17 @@ writes one episode store with a data card beside it (`predictor.data.dataset_car
 
 import hashlib
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeVar
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
+from predictor.data.store_files import check_replaceable
 from predictor.support.config_checks import check_choices
 from predictor.support.errors import UserError, short
+from predictor.support.files import check_place
 from predictor.support.reading import read_text
+from predictor.support.remote import address, exists
 
 Split = Literal["train", "val", "test", "all"]
 SPLIT_SHARES = {"test": 0.1, "val": 0.1}
@@ -63,8 +64,11 @@ class LoaderConfig:
         if not self.source.exists():
             raise UserError(f"no source at {self.source}; pass the unpacked dataset")
         for path in (self.out, self.card_path):
-            if path.exists() and not self.overwrite:
-                raise UserError(f"{path} exists; choose another path or pass --overwrite")
+            check_place(path)
+            if exists(path) and not self.overwrite:
+                raise UserError(f"{address(path)} exists; choose another path or pass --overwrite")
+        if exists(self.out):
+            check_replaceable(self.out)
 
 
 def bad_line(path: Path, line: int, problem: str, advice: str = "repair the line or get the file anew") -> UserError:
@@ -155,9 +159,12 @@ def find_files(source: Path, pattern: str, what: str) -> list[Path]:
     """Returns the files under a folder, sorted by path; a source that is a file gives that file.
 
     Raises:
-        UserError: no file matches.
+        UserError: no file matches, or the pattern is none.
     """
-    files = [source] if source.is_file() else sorted(p for p in source.glob(pattern) if p.is_file())
+    try:
+        files = [source] if source.is_file() else sorted(p for p in source.glob(pattern) if p.is_file())
+    except (ValueError, NotImplementedError) as error:
+        raise UserError(f"pattern must match paths below {source}, got '{short(pattern)}': {error}") from error
     if not files:
         raise UserError(f"{source} holds no {what} ({pattern}); pass the folder of the unpacked dataset")
     return files
@@ -175,10 +182,3 @@ def checksum(root: Path, files: Iterable[Path]) -> str:
             content = hashlib.file_digest(file, "sha256").digest()
         total.update(name.encode() + b"\0" + content)
     return total.hexdigest()
-
-
-def progressed(items: Sequence[Item], label: str) -> Iterator[Item]:
-    """Yields the items, with a progress bar on the terminal."""
-    columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns) as progress:
-        yield from progress.track(items)

@@ -17,13 +17,14 @@ import numpy as np
 from jaxtyping import Float
 
 from predictor.data.dataset_card import DatasetNotes, save_dataset, summary
-from predictor.data.loading import NO_LIMIT_M, LoaderConfig, find_files, in_split, progressed
+from predictor.data.loading import NO_LIMIT_M, LoaderConfig, find_files, in_split
 from predictor.data.mocap_files import Skeleton, joint_positions, read_motion, read_skeleton
 from predictor.data.store import Episode
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
+from predictor.support.progress import track
 
 FRAMES_PER_S = 120.0
 """Frame rate of the database [Hz]."""
@@ -131,7 +132,7 @@ def load(config: MocapConfig) -> tuple[Skeleton, list[Episode], DatasetNotes, li
     chosen = [path for path in trials if in_split(path.stem, config.split, SPLIT_SEED)]
     episodes: list[Episode] = []
     skipped = 0
-    for path in progressed(chosen, "mocap"):
+    for path in track(chosen, "mocap"):
         found = read_trial(path, skeleton, config)
         skipped += not found
         episodes += found

@@ -32,7 +32,6 @@ from predictor.data.loading import (
     find_files,
     finite,
     in_split,
-    progressed,
     read_lines,
     whole,
 )
@@ -41,6 +40,7 @@ from predictor.scene import KINEMATIC_FEATURES, SceneSpec
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
+from predictor.support.progress import track
 from predictor.support.reading import MOST_TEXT_BYTES, read_json
 
 METRES_PER_FOOT = 0.3048
@@ -323,7 +323,7 @@ def load(config: NbaConfig) -> tuple[list[Episode], DatasetNotes, list[Path]]:
     counts: Counter[str] = Counter({"files": len(files), f"files of split '{config.split}'": len(chosen)})
     counts["games"] = len({game_of(path, config.format) for path in chosen})
     episodes: list[Episode] = []
-    for path in progressed(chosen, "nba"):
+    for path in track(chosen, "nba"):
         for passage in _passages(path, config, counts):
             found = episodes_of(passage, config.episode_steps)
             counts[f"passages skipped, shorter than {config.episode_steps or 2} steps"] += not found

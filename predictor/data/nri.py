@@ -29,9 +29,10 @@ from predictor.data.springs import (
 )
 from predictor.data.store import Episode, StoreInfo
 from predictor.support.command_line import parse
-from predictor.support.config_checks import check_at_least, check_choices
+from predictor.support.config_checks import check_at_least, check_choices, check_numbers
 from predictor.support.errors import run_entry_point
 from predictor.support.memory import check_count
+from predictor.support.remote import address
 
 Law = Literal["springs", "charged"]
 
@@ -80,6 +81,7 @@ class NRIConfig:
             UserError: a value out of range.
         """
         check_choices(self)
+        check_numbers(self)
         check_at_least(self, 0, "train", "val", "test", "seed")
         check_at_least(self, 2, "num_agents", "frames", "test_frames")
         for name in ("train", "val", "test"):
@@ -139,7 +141,7 @@ def main() -> None:
     """Entry point."""
     config = parse(NRIConfig, __doc__)
     for name, seconds in make_nri(config).items():
-        print(f"{config.out / name}: {getattr(config, name)} rollouts in {seconds:.1f} s")
+        print(f"{address(config.out / name)}: {getattr(config, name)} rollouts in {seconds:.1f} s")
 
 
 if __name__ == "__main__":

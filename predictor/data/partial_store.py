@@ -2,7 +2,8 @@
 
 Beside the store that is being made, under a hidden name, are the parts that are finished, each an episode store of its
 own, and the settings that they were made with. When all episodes are there, they become one store and the parts are
-deleted. A recording that is shorter than `PART_S` writes no parts.
+deleted. A recording that is shorter than `PART_S` writes no parts. Those of a store on another file system (`s3://…`)
+are in the folder in which the command runs.
 """
 
 import json
@@ -18,6 +19,7 @@ from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.support.errors import UserError
 from predictor.support.files import delete_leftovers, write_json
 from predictor.support.reading import read_object
+from predictor.support.remote import is_remote
 
 PART_S = 30.0
 """Time after which the episodes that have been recorded since the last part are written [s]."""
@@ -35,6 +37,7 @@ class PartialStore:
         part_s: time between two parts [s].
 
     Attributes:
+        folder: folder of the parts.
         num_done: number of steps of the recording that are on disk.
         skipped: why seeds have no episode, by seed.
 
@@ -45,18 +48,19 @@ class PartialStore:
     def __init__(self, path: Path, settings: Mapping[str, Any], discard: bool = False, part_s: float = PART_S) -> None:
         """Finds the parts of an earlier attempt."""
         self._path, self._part_s = Path(path), part_s
-        self._folder = self._path.with_name(f".{self._path.name}.unfinished")
+        beside = Path(self._path.name) if is_remote(self._path) else self._path
+        self.folder = beside.with_name(f".{self._path.name}.unfinished")
         self._settings = json.loads(json.dumps(settings, default=str))
         self._info: StoreInfo | None = None
         self._new: list[Episode] = []
         self._added = 0
         self.skipped: dict[int, str] = {}
         self._written_at = time.monotonic()
-        if self._folder.exists():
+        if self.folder.exists():
             self._take_over(discard)
         self.num_done = sum(int(part.name.partition("+")[2]) for part in self._parts())
-        if (self._folder / SKIPPED).exists():
-            found = read_object(self._folder / SKIPPED)
+        if (self.folder / SKIPPED).exists():
+            found = read_object(self.folder / SKIPPED)
             self.skipped = {int(seed): str(reason) for seed, reason in found.items()}
 
     def __enter__(self) -> "PartialStore":
@@ -97,16 +101,16 @@ class PartialStore:
             info = replace(info, provenance=info.provenance | {"skipped": {"episodes": len(named), "reasons": named}})
         write_store(self._path, info, episodes, overwrite)
         self._new = []
-        shutil.rmtree(self._folder, ignore_errors=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
         return episodes
 
     def _parts(self) -> list[Path]:
-        return sorted(part for part in self._folder.glob("*+*") if part.is_dir())
+        return sorted(part for part in self.folder.glob("*+*") if part.is_dir())
 
     def _take_over(self, discard: bool) -> None:
-        delete_leftovers(self._folder)
+        delete_leftovers(self.folder)
         try:
-            found = read_object(self._folder / SETTINGS)
+            found = read_object(self.folder / SETTINGS)
         except UserError:
             found = {}
         if found == self._settings:
@@ -114,19 +118,19 @@ class PartialStore:
         if not discard:
             other = [name for name in self._settings if found.get(name) != self._settings[name]]
             raise UserError(
-                f"{self._folder} has episodes of an unfinished recording with another {', '.join(other) or 'setting'}; "
+                f"{self.folder} has episodes of an unfinished recording with another {', '.join(other) or 'setting'}; "
                 "repeat its command to go on, or pass --overwrite to begin anew"
             )
-        shutil.rmtree(self._folder)
+        shutil.rmtree(self.folder)
 
     def _write_part(self) -> None:
         self._written_at = time.monotonic()
         if not self._new or self._info is None:
             return
-        self._folder.mkdir(parents=True, exist_ok=True)
-        write_json(self._folder / SETTINGS, self._settings)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_json(self.folder / SETTINGS, self._settings)
         if self.skipped:
-            write_json(self._folder / SKIPPED, self.skipped)
-        write_store(self._folder / f"{self.num_done:08d}+{self._added}", self._info, self._new)
+            write_json(self.folder / SKIPPED, self.skipped)
+        write_store(self.folder / f"{self.num_done:08d}+{self._added}", self._info, self._new)
         self.num_done += self._added
         self._new, self._added = [], 0

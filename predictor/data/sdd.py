@@ -27,7 +27,6 @@ from predictor.data.loading import (
     finite,
     frames_per_step,
     in_split,
-    progressed,
     read_lines,
     whole,
 )
@@ -37,6 +36,7 @@ from predictor.scene import KINEMATIC_FEATURES, SceneSpec
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
+from predictor.support.progress import track
 
 LARGEST_SCALE = 1e6
 """Largest scale [m/pixel]."""
@@ -199,7 +199,7 @@ def load(config: SddConfig) -> tuple[list[Episode], DatasetNotes, list[Path]]:
     chosen = [path for path in files if in_split(names[path], config.split, SPLIT_SEED)]
     counts: Counter[str] = Counter({"videos": len(files), f"videos of split '{config.split}'": len(chosen)})
     episodes: list[Episode] = []
-    for path in progressed(chosen, "sdd"):
+    for path in track(chosen, "sdd"):
         points = read_annotations(path, scales[names[path]], config, counts)
         episodes += cut_episodes(points, config.episode_steps, names[path], counts)
     numbered = [replace(episode, seed=i) for i, episode in enumerate(episodes)]

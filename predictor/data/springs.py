@@ -15,7 +15,6 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from rich.progress import Progress
 from torch import Tensor
 
 from predictor.data.store import PERTURBATIONS, Episode, StoreInfo, write_store
@@ -25,7 +24,9 @@ from predictor.support.config_checks import check_at_least, check_choices, check
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out
 from predictor.support.memory import check_count
+from predictor.support.progress import WorkShown
 from predictor.support.provenance import provenance
+from predictor.support.remote import address, exists
 
 DT_S = 1 / 6
 FRAMES = 50
@@ -335,7 +336,7 @@ def write_splits(
     Raises:
         UserError: `out` is a file, a split exists, or no split has rollouts.
     """
-    check_out(out)
+    check_out(out, only_stores=True)
     took: dict[str, float] = {}
     made = provenance(("torch", "numpy", "zarr"))
     names = list(splits)
@@ -343,16 +344,15 @@ def write_splits(
     if not splits:
         raise UserError("nothing to simulate: " + ", ".join(names[:-1]) + f" and {names[-1]} are all 0")
     for name in splits:
-        if (out / name).exists() and not overwrite:
-            raise UserError(f"{out / name} exists; choose another --out or pass --overwrite")
-    with Progress() as progress:
-        task = progress.add_task("simulate", total=sum(splits.values()))
+        if exists(out / name) and not overwrite:
+            raise UserError(f"{address(out / name)} exists; choose another --out or pass --overwrite")
+    with WorkShown("simulate", sum(splits.values())) as shown:
         for name, count in splits.items():
             began = time.perf_counter()
             here = replace(info, provenance=made | {"split": name})
             write_store(out / name, here, episodes(name, count), overwrite)
             took[name] = time.perf_counter() - began
-            progress.advance(task, count)
+            shown.advance(count)
     return took
 
 
@@ -360,7 +360,7 @@ def main() -> None:
     """Entry point."""
     config = parse(SpringsConfig, __doc__)
     for name, seconds in make(config).items():
-        print(f"{config.out / name}: {getattr(config, name)} rollouts in {seconds:.1f} s")
+        print(f"{address(config.out / name)}: {getattr(config, name)} rollouts in {seconds:.1f} s")
 
 
 if __name__ == "__main__":

@@ -16,25 +16,29 @@ import numpy as np
 import zarr
 from jaxtyping import Bool, Float, Int
 
+from predictor.data.episode_checks import check_episode
 from predictor.data.store_files import (
     COMPRESSORS,
     DIGEST,
+    FORMAT,
+    METADATA,
     StoreHeader,
-    attributes_of,
     check_digest,
+    check_replaceable,
     digest_of,
+    most_bytes_of,
     read_arrays,
     read_header,
 )
 from predictor.scene import PADDING_ID, Scene, SceneSpec
 from predictor.support.config_checks import check_positive
 from predictor.support.errors import UserError
-from predictor.support.files import new_folder
+from predictor.support.files import check_place, new_folder
 from predictor.support.locks import locked_path
 from predictor.support.reading import version_of
+from predictor.support.remote import address, exists, is_remote, local_copy
 from predictor.support.typed_values import converted, from_table
 
-FORMAT = "dgvae-rl episodes"
 VERSION = 1
 EDGE_LABELS = ("edge_types", "edge_attributes")
 _FILL = {"edge_types": -1.0, "edge_attributes": 0.0, "causal_shift_m": np.nan}
@@ -128,14 +132,16 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
     """Writes a store; nothing appears under `path` until it is complete.
 
     Raises:
-        UserError: no episodes, non-finite states, `path` exists and `overwrite` is not set, or another process writes
-            it.
+        UserError: no episodes, arrays that do not fit, non-finite states, `path` exists and `overwrite` is not set, or
+            another process writes it.
     """
     path = Path(path)
-    if path.exists() and not overwrite:
-        raise UserError(f"{path} exists; choose another path or pass --overwrite")
-    if path.exists():
-        _check_own(path)
+    check_place(path)
+    is_there = exists(path)
+    if is_there and not overwrite:
+        raise UserError(f"{address(path)} exists; choose another path or pass --overwrite")
+    if is_there:
+        check_replaceable(path)
     with locked_path(path):
         _write(path, info, list(episodes))
 
@@ -144,11 +150,12 @@ def _write(path: Path, info: StoreInfo, episodes: Sequence[Episode]) -> None:
     """Writes a store in place of what is there."""
     if not episodes:
         raise UserError("a store needs at least one episode, got none")
+    for episode in episodes:
+        check_episode(episode, info.spec, str(path))
+        _check_finite(episode, str(path))
     marked = [e.perturbed is not None for e in episodes]
     if any(marked) and not all(marked):
-        raise UserError(f"{path}: either all episodes have perturbed or none, got both")
-    for episode in episodes:
-        _check_finite(episode, str(path))
+        raise UserError(f"{address(path)}: either all episodes have perturbed or none, got both")
     columns = max(e.states.shape[1] for e in episodes)
     lengths = np.array([len(e.states) for e in episodes])
     starts = np.concatenate([[0], np.cumsum(lengths)])
@@ -191,14 +198,6 @@ def _write(path: Path, info: StoreInfo, episodes: Sequence[Episode]) -> None:
         group.attrs.update(plain | {DIGEST: digest_of(plain)})
 
 
-def _check_own(path: Path) -> None:
-    """Checks that a path that may be replaced holds a store: another Zarr group is never overwritten."""
-    try:
-        attributes_of(path, FORMAT)
-    except UserError as error:
-        raise UserError(f"{path} is not an episode store and will not be replaced; choose another path") from error
-
-
 def read_store(path: Path) -> EpisodeStore:
     """Reads a whole store into memory.
 
@@ -206,8 +205,12 @@ def read_store(path: Path) -> EpisodeStore:
         UserError: the path holds no store, a store of another version, or non-finite states.
     """
     path = Path(path)
-    if not path.exists():
-        raise UserError(f"no episode store at {path}; make one with python -m envs.collect")
+    check_place(path)
+    if not exists(path):
+        raise UserError(f"no episode store at {address(path)}; make one with python -m envs.collect")
+    if is_remote(path):
+        with local_copy(path, most_bytes_of) as copy:
+            return read_store(copy)
     header = read_header(path, FORMAT)
     info = _info(path, header)
     labels = _checked_labels(path, header, info)
@@ -238,9 +241,13 @@ def read_info_of(path: Path) -> StoreInfo:
     Raises:
         UserError: the path holds no store.
     """
-    header = read_header(Path(path), FORMAT)
-    info = _info(Path(path), header)
-    check_digest(Path(path), header.attributes)
+    path = Path(path)
+    if is_remote(path):
+        with local_copy(path, lambda name: most_bytes_of(name) if name == METADATA else None) as copy:
+            return read_info_of(copy)
+    header = read_header(path, FORMAT)
+    info = _info(path, header)
+    check_digest(path, header.attributes)
     return info
 
 

@@ -23,7 +23,9 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from predictor.support.errors import UserError, short
 from predictor.support.memory import check_memory
 from predictor.support.reading import MIB, NoSuchFile, as_object, check_regular, read_object, unreadable
+from predictor.support.remote import address, is_remote, names_below
 
+FORMAT = "dgvae-rl episodes"
 METADATA = "zarr.json"
 DIGEST = "sha256"
 COMPRESSORS = (ZstdCodec(level=0), Crc32cCodec())
@@ -59,6 +61,17 @@ class StoreHeader:
     """Shapes of its arrays."""
 
 
+def most_bytes_of(name: str) -> int:
+    """Returns the largest size of a store's file by its name [bytes]."""
+    return MOST_METADATA_BYTES if name == METADATA else MOST_CHUNK_BYTES
+
+
+def is_unfinished(path: Path) -> bool:
+    """Returns whether an address holds what is left of a store that was being copied there, and nothing else."""
+    names = names_below(path) if is_remote(path) else []
+    return bool(names) and all(name.partition("/")[0] in _ARRAYS for name in names)
+
+
 def digest_of(attributes: Mapping[str, Any]) -> str:
     """Returns the SHA-256 of attributes, in hexadecimal digits; that of an older digest does not count."""
     kept = {key: value for key, value in attributes.items() if key != DIGEST}
@@ -84,6 +97,22 @@ def attributes_of(path: Path, format: str) -> dict[str, Any]:
     if attributes.get("format") != format:
         raise UserError(f"{short(path)} is not an episode store; make one with python -m envs.collect")
     return attributes
+
+
+def check_replaceable(path: Path) -> None:
+    """Checks that a path that may be replaced holds a store: another Zarr group is never overwritten.
+
+    Raises:
+        UserError: it holds something else.
+    """
+    if is_unfinished(path):
+        return
+    try:
+        attributes_of(path, FORMAT)
+    except UserError as error:
+        raise UserError(
+            f"{address(path)} is not an episode store and will not be replaced; choose another path"
+        ) from error
 
 
 def read_header(path: Path, format: str) -> StoreHeader:
@@ -162,7 +191,7 @@ def _check_files(path: Path) -> None:
         except OSError as error:
             raise unreadable(entry, error) from error
         if not is_folder:
-            check_regular(entry, MOST_METADATA_BYTES if entry.name == METADATA else MOST_CHUNK_BYTES)
+            check_regular(entry, most_bytes_of(entry.name))
 
 
 def _entries(path: Path) -> Iterator[Path]:

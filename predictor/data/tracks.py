@@ -33,7 +33,6 @@ from predictor.data.loading import (
     find_files,
     finite,
     in_split,
-    progressed,
     read_lines,
 )
 from predictor.data.store import Episode
@@ -43,6 +42,7 @@ from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_positive
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out
+from predictor.support.progress import track
 
 FOLDERS: tuple[Split, ...] = ("train", "val", "test")
 """Folders of a source, each of which becomes a store."""
@@ -251,7 +251,7 @@ def parts_of(config: TracksConfig) -> list[Part]:
         return [Part(config, files, tuple(path for path in files if in_split(path.stem, config.split, SPLIT_SEED)))]
     if config.split not in ("all", *folders):
         raise UserError(f"{config.source} has the folders {', '.join(folders)}, no {config.split}; leave out --split")
-    check_out(config.out)
+    check_out(config.out, only_stores=True)
     parts = []
     for name in folders:
         if config.split in ("all", name):
@@ -275,7 +275,7 @@ def load(parts: Sequence[Part]) -> list[tuple[list[Episode], DatasetNotes]]:
         Counter({"files": len(part.files), f"files of split '{part.config.split}'": len(part.chosen)}) for part in parts
     ]
     files = [(i, path) for i, part in enumerate(parts) for path in part.chosen]
-    recordings = {path: read_recording(path, parts[i].config, counts[i]) for i, path in progressed(files, "tracks")}
+    recordings = {path: read_recording(path, parts[i].config, counts[i]) for i, path in track(files, "tracks")}
     frame_step = parts[0].config.frame_step or common_frame_step(recordings)
     loaded = []
     for part, found in zip(parts, counts, strict=True):

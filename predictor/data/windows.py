@@ -43,6 +43,10 @@ class WindowBatch:
         """Returns the windows on an accelerator, by a copy that neither side waits for."""
         return self._each(lambda tensor: tensor.pin_memory().to(device, non_blocking=True))
 
+    def rows(self, rows: slice) -> "WindowBatch":
+        """Returns some of the windows, with the padding of all."""
+        return self._each(lambda tensor: tensor[rows])
+
     def _each(self, change: Callable[[Tensor], Tensor]) -> "WindowBatch":
         given = {f.name: getattr(self, f.name) for f in fields(self)}
         changed: dict[str, Any] = {name: None if tensor is None else change(tensor) for name, tensor in given.items()}

@@ -37,7 +37,7 @@ from predictor.dgvae.training_pass import TrainingPass
 from predictor.forecaster import Belief, Futures, Memory, WindowOutput
 from predictor.graph import NO_AGENT, nearest, pair_mask
 from predictor.layers.state_codec import StateCodec, check_scales
-from predictor.noise import Noise, NoiseOfPairs, noise_of_pairs, uniform_of_agents
+from predictor.noise import Noise, NoiseOfPairs, TrainingNoise, noise_of_pairs, uniform_of_agents
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
@@ -274,7 +274,7 @@ class DGVAE(nn.Module):
         valid: Bool[Tensor, "batch time agents"],
         last_observed: Int[Tensor, " batch"],
         rollout_steps: int,
-        generator: torch.Generator | None = None,
+        generator: TrainingNoise | None = None,
         num_modes: int = 1,
     ) -> WindowOutput:
         """Runs a teacher-forced pass under the posterior and a roll-out under the prior, from the same encoding.

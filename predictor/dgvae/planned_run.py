@@ -133,6 +133,8 @@ def _plans_of(graph: Padded | Packed, plans: int) -> tuple[Callable[[Tensor], Te
     if isinstance(graph, Padded):
         return repeat_scenes(plans)
     listed = len(graph.slots)
+    if not listed:  # an ego that is alone
+        return lambda pairs: pairs[:0], lambda pairs: pairs
     return lambda pairs: pairs[:listed], lambda pairs: graph.repeat_pairs(pairs, plans)[: plans * listed]
 
 

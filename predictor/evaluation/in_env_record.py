@@ -25,7 +25,7 @@ class Measurement:
     """Accuracy in one environment, with one driver and one number of samples; None where it was not measured."""
 
     env_id: str
-    """Id of the environment."""
+    """Id of the environment, with its arguments where it had some."""
     driver: str
     """Name of the driver."""
     episodes: int
@@ -144,7 +144,7 @@ def _measurement(result: dict[str, Any], config: dict[str, Any], made: dict[str,
     near = controls.get("nearest neighbours") or result.get("nearest_neighbours") or {}
     median_ms, p95_ms = result.get("latency_median_ms"), result.get("latency_p95_ms")
     return Measurement(
-        env_id=result["env_id"],
+        env_id=" ".join(filter(None, (result["env_id"], result.get("env_kwargs")))),
         driver=result.get("driver") or config["ego"],
         episodes=config["episodes"],
         samples=config["num_samples"] if "num_samples" in config else config["samples"],  # its name until version 0.1

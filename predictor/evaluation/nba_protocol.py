@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Int
-from rich.progress import track
 from torch import Tensor
 
 from predictor.baselines.constant_velocity import ConstantVelocity, NoisyConstantVelocity
@@ -32,6 +31,7 @@ from predictor.evaluation.outcomes import Outcome, run_window_batch
 from predictor.evaluation.standard_errors import batch_interval
 from predictor.forecaster import Forecaster
 from predictor.support.errors import UserError
+from predictor.support.progress import track
 
 OBSERVED_FRAMES = 8
 HISTORY_STEPS = OBSERVED_FRAMES - 1
@@ -129,7 +129,7 @@ def player_outcomes(
     """Yields the episode of each window, and forecasts and truth in which players alone are valid; keeps nothing."""
     generator, ball = torch.Generator(device).manual_seed(seed), FEATURES.index("is_ball")
     begins = range(0, len(indices), batch_size)
-    for begin in track(begins, description=label) if label else begins:
+    for begin in track(begins, label) if label else begins:
         chosen = indices[begin : begin + batch_size]
         batch = windows.batch(chosen).to(torch.device(device))
         outcome = run_window_batch(forecaster, batch, HORIZON_STEPS, num_samples, generator)

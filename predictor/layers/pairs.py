@@ -1,5 +1,7 @@
 """Layers on ordered pairs of agents: linear maps of receiver and sender, and sums of messages over senders."""
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
@@ -98,8 +100,26 @@ def sum_over_senders(
     return torch.matmul(weight[..., None, :], pairs)[..., 0, :]
 
 
-def masked_mean(values: Float[Tensor, "*batch"], valid: Bool[Tensor, "*batch"]) -> Float[Tensor, ""]:
-    """Computes the mean over valid entries; 0 if there is none."""
+Total = Callable[[Tensor], Tensor]
+"""Function that sums a tensor over all processes of a training (`predictor.training.processes`)."""
+
+
+def of_one_process(tensor: Tensor) -> Tensor:
+    """Returns a tensor as it is: its sum over the one process that there is."""
+    return tensor
+
+
+def masked_mean(
+    values: Float[Tensor, "*batch"], valid: Bool[Tensor, "*batch"], total: Total = of_one_process
+) -> Float[Tensor, ""]:
+    """Computes the mean over valid entries; 0 if there is none.
+
+    Args:
+        values: values to average.
+        valid: which entries count.
+        total: sums the counts over all processes; the result is then this process's share, and the shares add up to
+            the mean over the entries of all.
+    """
     # where, not a product: an invalid entry may be infinite, and inf · 0 is NaN.
-    total = torch.where(valid, values, torch.zeros_like(values)).sum()
-    return total / valid.sum().clamp(min=1)
+    found = torch.where(valid, values, torch.zeros_like(values)).sum()
+    return found / total(valid.sum()).clamp(min=1)

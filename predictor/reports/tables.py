@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from predictor.evaluation.accuracy import Accuracy
 from predictor.evaluation.displacement import COVERAGE_SHARE
+from predictor.reports.fitted_table import FittedTable
 from predictor.support import markdown
 
 SCALARS = (
@@ -163,29 +163,26 @@ def _signed(value: float | None) -> str:
     return "–" if value is None else f"{value:+.2f}"
 
 
-def accuracy_table(accuracies: Sequence[Accuracy], dt_s: float, title: str) -> Table:
+def accuracy_table(accuracies: Sequence[Accuracy], dt_s: float, title: str) -> FittedTable:
     """Returns a terminal table, one line per accuracy; displacement, RMSE and NLL at `MAX_STEPS_SHOWN` steps."""
-    table = Table(title=title, show_lines=True)
-    table.add_column("forecaster")
-    for heading in ("K", *SCALARS, "forecasts"):
-        table.add_column("\n".join(heading.split()).replace("[", r"\["), justify="right")
     shown = _steps_shown(accuracies)
-    for step in shown:
-        table.add_column(f"{dt_s * (step + 1):g} s", justify="right")
+    headings = ["K", *("\n".join(heading.split()) for heading in (*SCALARS, "forecasts"))]
+    headings += [f"{dt_s * (step + 1):g} s" for step in shown]
+    lines = []
     for one in accuracies:
         stacks = [(one.by_step_m[i], one.rmse_m[i], *([one.nll[i]] if one.nll else [])) for i in shown]
         cells = ["\n".join(_rounded_number(value, 2) for value in stack) for stack in stacks]
         scalars = [cell.replace(" ± ", "\n±") for cell in _scalar_cells(one)]
-        table.add_row(one.name, str(one.num_samples), *scalars, str(one.agents), *cells)
-    table.caption = (
-        r"by time ahead: displacement of the best sample \[m] / RMSE of the mean \[m] / NLL \[nats], top to bottom; "
+        lines.append([one.name, str(one.num_samples), *scalars, f"{one.agents}", *cells])
+    caption = (
+        "by time ahead: displacement of the best sample [m] / RMSE of the mean [m] / NLL [nats], top to bottom; "
         f"± standard error over subsets of the windows; missed: final displacement above "
         f"{accuracies[0].miss_threshold_m:g} m; "
         f"ADE₁, FDE₁: single forecast; energy: energy score, lower is better; "
         f"cover: truths within the central {100 * COVERAGE_SHARE:g} % of the samples; "
         f"overlap: agents nearer than that to another one of the same sample (in truth)"
     )
-    return table
+    return FittedTable(title, ["forecaster", *headings], lines, caption, ruled=True)
 
 
 def markdown_table(accuracies: Sequence[Accuracy], dt_s: float) -> str:

@@ -15,6 +15,7 @@ from typing import TypeVar, get_type_hints
 
 import tyro
 
+from predictor.support.config_checks import check_numbers
 from predictor.support.errors import UserError
 
 Config = TypeVar("Config")
@@ -50,7 +51,7 @@ def parse(config_class: type[Config], description: str | None = None, args: Sequ
     printed = io.StringIO()
     try:
         with contextlib.redirect_stderr(printed):
-            return tyro.cli(config_class, description=description, args=words)
+            config = tyro.cli(config_class, description=description, args=words)
     except SystemExit as leaving:
         if (error := _user_error_behind(leaving)) is not None:
             raise error from None
@@ -58,6 +59,8 @@ def parse(config_class: type[Config], description: str | None = None, args: Sequ
             raise UserError(sentence) from None
         print(printed.getvalue(), end="", file=sys.stderr)
         raise
+    check_numbers(config)
+    return config
 
 
 def with_new_names(config_class: type, words: Sequence[str]) -> list[str]:

@@ -5,10 +5,13 @@ They check values alone. Requirements on files or on a run are checked by the fu
 
 import math
 import types
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
+from functools import cache
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from predictor.support.errors import UserError
+import numpy as np
+
+from predictor.support.errors import UserError, short
 
 
 def check_choices(config: Any) -> None:
@@ -38,6 +41,72 @@ MOST_WIDTH = 65_536
 """Largest width of a layer; what a network of this size takes is estimated before it is built."""
 MOST_PARTS = 1_024
 """Largest number of parts of a network that are alike, such as layers, types and modes."""
+
+
+_SIMPLE: dict[type, tuple[tuple[type, ...], str]] = {
+    bool: ((bool, np.bool_), "true or false"),
+    int: ((int, np.integer), "a whole number"),
+    float: ((int, float, np.integer, np.floating), "a number"),
+    str: ((str,), "a text"),
+}
+"""Types of Python that also serve as a field's type, and its name."""
+
+
+def check_types(config: Any) -> None:
+    """Checks that fields of simple types (numbers, texts, true or false), also optional ones, have values of them.
+
+    Raises:
+        UserError: one has another.
+    """
+    config_class: Any = type(config)
+    for name, kinds in _simple_fields(config_class).items():
+        value = getattr(config, name)
+        allowed = tuple(part for kind in kinds for part in ((type(None),) if kind is type(None) else _SIMPLE[kind][0]))
+        if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in kinds):
+            wanted = " or ".join("None" if kind is type(None) else _SIMPLE[kind][1] for kind in kinds)
+            raise UserError(f"{name} must be {wanted}, got {short(repr(value), 60)}")
+
+
+@cache
+def _simple_fields(config_class: Any) -> dict[str, tuple[type, ...]]:
+    """Returns the types of the fields that have simple ones only."""
+    hints = get_type_hints(config_class)
+    found = {}
+    for field in fields(config_class):
+        hint = hints[field.name]
+        kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+        if all(kind is type(None) or kind in _SIMPLE for kind in kinds):
+            found[field.name] = tuple(kinds)
+    return found
+
+
+MOST_THREADS = 4_096
+"""Largest number of CPU threads of a process."""
+MOST_WHOLE = 10**15
+"""Largest whole number of a command line; what counts more things than this never ends."""
+MOST_NUMBER = 1e30
+"""Largest finite number of a command line; the square of a larger one is no float32."""
+
+
+def check_numbers(config: Any) -> None:
+    """Checks that no number of a config is absurd: NaN, or too large to be computed with.
+
+    Infinity passes, since it can mean that there is no limit; what has no use for it refuses it itself.
+
+    Raises:
+        UserError: a number is.
+    """
+    for field in fields(config):
+        value = getattr(config, field.name)
+        if is_dataclass(value):
+            check_numbers(value)
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, int) and abs(number) > MOST_WHOLE:
+                raise UserError(
+                    f"{field.name} must be at most {MOST_WHOLE:,}, got a number of {len(str(abs(number)))} digits"
+                )
+            if isinstance(number, float) and (math.isnan(number) or MOST_NUMBER < abs(number) < math.inf):
+                raise UserError(f"{field.name} must be a number of at most {MOST_NUMBER:g}, got {number}")
 
 
 def check_scale_values(config: Any, *names: str) -> None:

@@ -14,10 +14,23 @@ from contextlib import contextmanager
 from types import FrameType
 
 _WRONG_PATH = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
-"""Errors of the operating system when a user gives a path that does not fit."""
+"""Errors that say by themselves what is wrong, where they are not of the operating system."""
 
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO)
 """Errors of the operating system when a disk is full, over its quota, read-only or broken."""
+
+_WRONG_NAMES = {
+    errno.ENOENT: "there is no such file or folder",
+    errno.EEXIST: "something else is there, or a part of the path is a file",
+    errno.ENOTDIR: "a part of the path is a file, not a folder",
+    errno.EISDIR: "it is a folder, not a file",
+    errno.EACCES: "no permission for it",
+    errno.EPERM: "no permission for it",
+    errno.ENAMETOOLONG: "its name is too long",
+    errno.ELOOP: "it has links that lead in a circle",
+    errno.ENXIO: "it is a pipe, a device or a socket",
+}
+"""Errors of the operating system for paths that do not fit, and what is wrong with them."""
 
 
 class UserError(ValueError):
@@ -63,9 +76,13 @@ def run_entry_point(main: Callable[[], None]) -> None:
     try:
         with _terminable():
             main()
-    except (UserError, *_WRONG_PATH) as error:
+    except UserError as error:
         _leave("error", one_line(error), error, 2)
     except OSError as error:
+        if error.errno is None and isinstance(error, _WRONG_PATH):
+            _leave("error", one_line(error), error, 2)
+        if error.errno in _WRONG_NAMES:
+            _leave("error", one_line(Exception(cannot_use(error))), error, 2)
         if error.errno not in DISK_ERRORS:
             raise
         _leave("error", cannot_write(error.filename or "the output", error), error, 2)
@@ -79,6 +96,12 @@ def cannot_write(path: object, error: OSError) -> str:
     """Returns the message for a path that a disk does not take."""
     reason = os.strerror(error.errno or errno.EIO)
     return f"cannot write {path}: {reason}; what was there before is whole; make room or choose another disk"
+
+
+def cannot_use(error: OSError, path: object = None) -> str:
+    """Returns the message for a path that does not fit."""
+    path = error.filename2 or error.filename or "a path" if path is None else path
+    return f"{short(path)} cannot be used: {_WRONG_NAMES.get(error.errno or 0, error.strerror)}; choose another path"
 
 
 def _leave(word: str, message: str, error: BaseException, status: int) -> None:

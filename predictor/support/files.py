@@ -16,7 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from predictor.support.errors import DISK_ERRORS, CannotWriteError, UserError, cannot_write
+from predictor.support.errors import DISK_ERRORS, CannotWriteError, UserError, cannot_use, cannot_write, short
+from predictor.support.remote import is_remote, require_local, uploaded
 
 _FULL_BYTES = 65_536
 """Free space below which a disk counts as full when a library fails to write without saying why."""
@@ -29,7 +30,12 @@ def new_file(path: Path) -> Iterator[Path]:
 
     The content is flushed to disk before it is renamed, so that even a power cut leaves the old file or the new one.
     The temporary name has the suffix of `path`, by which encoders choose their format. A missing parent folder is made.
+    To another file system (`s3://…`) it is copied at the end.
     """
+    if is_remote(path):
+        with uploaded(path) as partial:
+            yield partial
+        return
     with disk_errors_of(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = _beside(path, path.suffix)
@@ -45,7 +51,15 @@ def new_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Yields an empty temporary folder to fill; replaces `path` by it at the end, or deletes it on an error."""
+    """Yields an empty temporary folder to fill; replaces `path` by it at the end, or deletes it on an error.
+
+    On another file system (`s3://…`) it is replaced file by file (`predictor.support.remote.uploaded`).
+    """
+    if is_remote(path):
+        with uploaded(path) as partial:
+            partial.mkdir()
+            yield partial
+        return
     with scratch_folder(path) as partial:
         with disk_errors_of(path):
             yield partial
@@ -71,6 +85,12 @@ def copy_file(source: Path, target: Path) -> None:
         shutil.copyfile(source, partial)
 
 
+def write_bytes(path: Path, content: bytes) -> None:
+    """Writes a file of bytes."""
+    with new_file(path) as partial:
+        partial.write_bytes(content)
+
+
 def write_text(path: Path, text: str) -> None:
     """Writes text as UTF-8."""
     with new_file(path) as partial:
@@ -91,14 +111,41 @@ def finite(content: Any) -> Any:
     return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
-def check_out(out: Path) -> None:
-    """Checks that the folder of a command's output is not a file; called before any work is done.
+def check_out(out: Path, only_stores: bool = False) -> None:
+    """Checks that the folder of a command's output is a local one and not a file; called before any work is done.
+
+    Args:
+        out: path of the folder.
+        only_stores: whether only stores are written below it, which may be on other file systems.
 
     Raises:
-        UserError: it is one.
+        UserError: it is not, or nothing can be written there.
     """
+    if only_stores and is_remote(out):
+        return
+    require_local(out, "--out")
+    check_place(out)
     if out.exists() and not out.is_dir():
         raise UserError(f"{out} is a file; choose another --out")
+
+
+def check_place(out: Path) -> None:
+    """Checks that a path can become a file or a folder, unless it is an address; called before any work is done.
+
+    Raises:
+        UserError: its name is too long, a part of it is a file, or it is a link that leads nowhere or in a circle.
+    """
+    if is_remote(out):
+        return
+    try:
+        os.stat(out)
+    except FileNotFoundError as error:
+        if out.is_symlink():
+            raise UserError(f"{out} is a link that leads nowhere; choose another path") from error
+    except OSError as error:
+        raise UserError(cannot_use(error, out)) from error
+    except ValueError as error:  # a NUL in the name
+        raise UserError(f"{short(out)} cannot be used: {error}; choose another path") from error
 
 
 def delete_leftovers(folder: Path) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from predictor.support.errors import UserError
+from predictor.support.remote import is_remote, require_local
 
 LOCK_FILE = ".lock"
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
@@ -26,17 +27,21 @@ def locked(folder: Path, what: str) -> Iterator[None]:
     Raises:
         UserError: another process holds it.
     """
+    require_local(folder, "--out")
     with _made(folder), _held_file(folder / LOCK_FILE, f"another {what} runs in {folder}", "--out"):
         yield
 
 
 @contextlib.contextmanager
 def locked_path(path: Path) -> Iterator[None]:
-    """Holds the lock of a store that is written as a whole, by a file beside it.
+    """Holds the lock of a store that is written as a whole, by a file beside it; other file systems have no locks.
 
     Raises:
         UserError: another process writes it.
     """
+    if is_remote(path):
+        yield
+        return
     lock = path.with_name(f".{path.name}.lock")
     with _made(path.parent), _held_file(lock, f"another process writes {path}", "path"):
         yield

@@ -13,6 +13,7 @@ from typing import IO, Any
 
 PATIENCE_S = 5.0
 """Time that a process gets to end when it is asked to, before it is killed [s]."""
+_WATCH_S = 1.0
 
 
 def follow_parent() -> None:
@@ -20,6 +21,11 @@ def follow_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if multiprocessing.parent_process() is not None:
         threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def stop_with_parent() -> None:
+    """Asks this process to stop (SIGTERM) when the one that started it, which may know nothing of it, is gone."""
+    threading.Thread(target=_ask_without, args=(os.getppid(),), daemon=True).start()
 
 
 def start(process: BaseProcess) -> None:
@@ -70,6 +76,12 @@ def how_it_ended(exit_code: int | None) -> str:
             " (by the system, if memory ran out)" if name == "SIGKILL" else ""
         )
     return f"its process ended with status {exit_code}"
+
+
+def _ask_without(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(_WATCH_S)
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _end_with_parent() -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from predictor.support.errors import UserError, short
+from predictor.support.remote import address, is_remote, read, size_of
 
 MIB = 2**20
 MOST_JSON_BYTES = 64 * MIB
@@ -47,6 +48,8 @@ def check_regular(path: Path, most_bytes: int) -> int:
     Raises:
         UserError: it does not; as `NoSuchFile` if there is nothing.
     """
+    if is_remote(path):
+        return _check_remote(path, most_bytes)
     try:
         found = os.stat(path)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
@@ -55,12 +58,23 @@ def check_regular(path: Path, most_bytes: int) -> int:
         raise UserError(f"{short(path)} cannot be read: it is a folder, not a file")
     if not stat.S_ISREG(found.st_mode):
         raise UserError(f"{short(path)} cannot be read: it is no regular file (a pipe, a device or a socket)")
-    if found.st_size > most_bytes:
+    return _check_size(found.st_size, short(path), most_bytes)
+
+
+def _check_remote(path: Path, most_bytes: int) -> int:
+    """Checks that there is a file on another file system that is not too large; returns its size."""
+    try:
+        return _check_size(size_of(path), short(address(path)), most_bytes)
+    except FileNotFoundError as error:
+        raise NoSuchFile(f"{short(address(path))} cannot be read: there is no such file; check the address") from error
+
+
+def _check_size(found: int, where: str, most_bytes: int) -> int:
+    if found > most_bytes:
         raise UserError(
-            f"{short(path)} is too large: a file of its kind has at most {_size(most_bytes)}, this one has "
-            f"{_size(found.st_size)}"
+            f"{where} is too large: a file of its kind has at most {_size(most_bytes)}, this one has {_size(found)}"
         )
-    return found.st_size
+    return found
 
 
 def unreadable(path: Path, error: Exception) -> UserError:
@@ -79,9 +93,12 @@ def read_bytes(path: Path, most_bytes: int) -> bytes:
     """
     check_regular(path, most_bytes)
     try:
-        # not blocking: the file may have become a pipe since it was checked
-        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
-            content = file.read(most_bytes + 1)
+        if is_remote(path):
+            content = read(path, most_bytes)
+        else:
+            # not blocking: the file may have become a pipe since it was checked
+            with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+                content = file.read(most_bytes + 1)
     except OSError as error:
         raise unreadable(path, error) from error
     if len(content) > most_bytes:

@@ -34,7 +34,7 @@ def resolve_device(device: str) -> str:
         return "cuda" if torch.cuda.is_available() else "cpu"
     try:
         kind = torch.device(device)
-    except RuntimeError:
+    except (RuntimeError, TypeError):
         kind = None
     if kind is None or kind.type not in ("cpu", "cuda"):
         raise UserError(f"device must be cpu, cuda or auto, got '{device}'")
@@ -106,6 +106,17 @@ def precision(kind: Precision, device: str) -> Iterator[None]:
     """Computes products inside the block at this precision, by autocast; faster where bfloat16 is native."""
     with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=kind == "bfloat16"):
         yield
+
+
+@contextlib.contextmanager
+def tensor_cores(allowed: bool) -> Iterator[None]:
+    """Lets products of float32 on CUDA round their inputs to TF32 inside the block; else keeps torch's setting."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if allowed else before)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
 
 
 def processor() -> str:

@@ -7,7 +7,7 @@ For an accelerator their shapes are fixed, and batches from the host are prepare
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
@@ -22,6 +22,8 @@ from predictor.training.config import SMALLER, TrainConfig
 
 MOST_PADDING = 3.0
 """Largest factor by which padding to a fixed size may increase the pairs of a batch; more costs more than it saves."""
+EVERY_ROW = slice(None)
+"""Rows of a batch that one process cuts alone."""
 _HISTORY_BUCKET = 8
 _POOL = 8
 """Number of steps whose windows are sorted by their number of agents, so that a batch has little padding."""
@@ -161,13 +163,21 @@ class HostBatches:
         windows: windows of each store.
         device: device of the batches.
         shapes: fixed shapes; None pads to the widest window of each batch.
+        rows: rows of each batch that are kept, those of this process; their padding is that of the whole batch.
     """
 
-    def __init__(self, windows: Sequence[Windows], device: torch.device, shapes: Shapes | None = None) -> None:
+    def __init__(
+        self,
+        windows: Sequence[Windows],
+        device: torch.device,
+        shapes: Shapes | None = None,
+        rows: slice = EVERY_ROW,
+    ) -> None:
         """Stores the arguments; nothing is copied yet."""
         self.windows = windows
         self.device = device
         self.shapes = shapes
+        self.rows = rows
 
     def on_host(self, plan: Plan) -> WindowBatch:
         """Returns the batch of a step, on the host."""
@@ -175,7 +185,7 @@ class HostBatches:
         batch = concatenate([w.batch(chosen, plan.history_steps) for w, chosen in drawn if len(chosen)])
         if self.shapes:
             batch = padded(batch, self.shapes.time(plan.history_steps), self.shapes.agents)
-        return batch
+        return batch if self.rows == EVERY_ROW else batch.rows(self.rows)
 
     def batch(self, plan: Plan) -> WindowBatch:
         """Returns the batch of a step."""
@@ -227,18 +237,26 @@ class DeviceBatches:
         windows: windows on the device.
         device: device of windows and batches.
         shapes: fixed shapes; None takes each plan's own history.
+        rows: rows of each batch that are cut, those of this process.
     """
 
-    def __init__(self, windows: ResidentWindows, device: torch.device, shapes: Shapes | None = None) -> None:
+    def __init__(
+        self,
+        windows: ResidentWindows,
+        device: torch.device,
+        shapes: Shapes | None = None,
+        rows: slice = EVERY_ROW,
+    ) -> None:
         """Stores the arguments; nothing is copied."""
         self.windows = windows
         self.device = device
         self.shapes = shapes
+        self.rows = rows
 
     def batch(self, plan: Plan) -> WindowBatch:
         """Returns the batch of a step; only the indices of its windows are copied to the device."""
         drawn = [chosen + offset for chosen, offset in zip(plan.windows, self.windows.offsets, strict=True)]
-        indices = torch.from_numpy(np.concatenate(drawn))
+        indices = torch.from_numpy(np.concatenate(drawn)[self.rows])
         if self.device.type == "cuda":
             indices = indices.pin_memory().to(self.device, non_blocking=True)
         time = self.shapes.time(plan.history_steps) if self.shapes else None
@@ -283,7 +301,13 @@ def check_batch(config: TrainConfig, agents: Int[np.ndarray, " windows"], networ
     check_memory(int(config.batch_size * each), f"a step with batch_size={config.batch_size:,}", SMALLER, available)
 
 
-def open_batches(config: TrainConfig, windows: Sequence[Windows], device: torch.device, network: Any = None) -> Source:
+def open_batches(
+    config: TrainConfig,
+    windows: Sequence[Windows],
+    device: torch.device,
+    network: Any = None,
+    rows: slice = EVERY_ROW,
+) -> Source:
     """Decides where the data is kept and whether its shapes are fixed.
 
     Args:
@@ -291,17 +315,21 @@ def open_batches(config: TrainConfig, windows: Sequence[Windows], device: torch.
         windows: windows of each store.
         device: device that trains.
         network: config of the network; None checks the memory for states alone.
+        rows: rows of each batch that this process takes.
 
     Raises:
         UserError: the data is to be kept on the device and does not fit, a batch cannot fit, or an ego is missing.
     """
     widths = tuple(window_sizes(w) for w in windows)
     agents = np.concatenate(widths)
-    check_batch(config, agents, network, device)
+    taken = len(range(config.batch_size)[rows])
+    check_batch(config if taken == config.batch_size else replace(config, batch_size=taken), agents, network, device)
     if device.type != "cuda":
         resident = config.data_device == "device"
         batches: Batches = (
-            DeviceBatches(ResidentWindows(windows, device), device) if resident else HostBatches(windows, device)
+            DeviceBatches(ResidentWindows(windows, device), device, rows=rows)
+            if resident
+            else HostBatches(windows, device, rows=rows)
         )
         return Source(batches, widths=widths if len(np.unique(agents)) > 1 else None)
     shapes: Shapes | None = Shapes(int(agents.max()), config.history_steps, config.horizon_steps)
@@ -319,11 +347,11 @@ def open_batches(config: TrainConfig, windows: Sequence[Windows], device: torch.
     budget = torch.cuda.mem_get_info()[0] // 2
     needed = bytes_needed(windows)
     if config.data_device == "device" or (config.data_device == "auto" and shapes and needed <= budget):
-        batches = DeviceBatches(ResidentWindows(windows, device, int(agents.max()), budget), device, shapes)
+        batches = DeviceBatches(ResidentWindows(windows, device, int(agents.max()), budget), device, shapes, rows)
         notes.append(f"windows are kept on the device ({needed / 2**20:,.0f} MiB)")
     else:
         plans = partial(plan, config, [len(w) for w in windows])
-        batches = PrefetchedBatches(HostBatches(windows, device, shapes), plans, config.steps)
+        batches = PrefetchedBatches(HostBatches(windows, device, shapes, rows), plans, config.steps)
         notes.append("windows are cut on the host, one batch ahead")
     return Source(batches, capture, tuple(notes))
 

@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 
 from predictor.models import ModelName
-from predictor.support.config_checks import check_at_least, check_choices, check_positive
+from predictor.support.config_checks import MOST_THREADS, check_at_least, check_at_most, check_choices, check_positive
 from predictor.support.errors import UserError
 from predictor.support.memory import check_memory
 from predictor.support.runtime import resolve_device
@@ -150,6 +150,7 @@ class TrainConfig:
             "kl_warmup_steps", "energy_weight", "joint_energy_weight", "edge_cost", "label_weight", "type_label_weight",
             "min_history_steps", "max_episodes", "reaction_weight",
         )  # fmt: skip
+        check_at_most(self, MOST_THREADS, "threads")
         if self.one_step_weight == self.rollout_weight == 0:
             raise UserError("one_step_weight and rollout_weight are both 0; nothing would be learned")
         given = [name for name in OF_THE_NETWORK if getattr(self, name) != getattr(type(self), name)]

@@ -14,7 +14,7 @@ from torch import Tensor
 from predictor.evaluation.displacement import mixture_nll
 from predictor.evaluation.energy_score import weighted_score
 from predictor.forecaster import Futures
-from predictor.layers.pairs import masked_mean
+from predictor.layers.pairs import Total, masked_mean, of_one_process
 
 REST_SHARE = 0.5
 """Weight of the features beyond position in a distance, relative to the position's."""
@@ -28,6 +28,7 @@ def energy_terms(
     scales: Float[Tensor, " state"],
     axes: int,
     weights: Float[Tensor, "batch agents"] | float = 1.0,
+    total: Total = of_one_process,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """Computes the energy score of agents (mean over agents) and of scenes (mean over scenes and steps).
 
@@ -43,6 +44,7 @@ def energy_terms(
         scales: divisors that make features comparable.
         axes: number of axes of a position.
         weights: factors of the agents' scores.
+        total: sums counts over all processes.
     """
     assert modes.mode_probs is not None
     samples = torch.cat([modes.states[:, :1].detach(), modes.states[:, 1:]], dim=1) / scales
@@ -56,7 +58,7 @@ def energy_terms(
         moved = position + REST_SHARE * rest
         return torch.where(valid[:, None], moved, 0.0).sum(-1) / steps[:, None]
 
-    agents = masked_mean(weighted_score(samples, target, modes.mode_probs, apart) * weights, there)
+    agents = masked_mean(weighted_score(samples, target, modes.mode_probs, apart) * weights, there, total)
 
     present = there[:, None].to(samples.dtype)
     count = present.sum(-1).clamp(min=1)
@@ -67,7 +69,7 @@ def energy_terms(
 
     of_scenes = (modes.mode_probs * present).sum(-1) / count
     score = weighted_score(samples, target, of_scenes[..., None].expand(-1, -1, valid.shape[-1]), scenes_apart)
-    return agents, masked_mean(score, valid.any(1))
+    return agents, masked_mean(score, valid.any(1), total)
 
 
 def spread_nll(
@@ -75,6 +77,7 @@ def spread_nll(
     truth: Float[Tensor, "batch agents horizon state"],
     valid: Bool[Tensor, "batch agents horizon"],
     axes: int,
+    total: Total = of_one_process,
 ) -> Float[Tensor, ""]:
     """Computes the negative log-likelihood [nats] under the mixture of modes at each step; it trains the spread alone.
 
@@ -86,7 +89,7 @@ def spread_nll(
     alone, _ = mixture_nll(
         positions[:, :1], target, valid, torch.ones_like(modes.mode_probs[:, :1]), modes.scale[:, :1]
     )
-    return masked_mean(mixture + alone, valid)
+    return masked_mean(mixture + alone, valid, total)
 
 
 def unit(variance: float) -> float:

@@ -12,7 +12,7 @@ from predictor.data.windows import WindowBatch
 from predictor.evaluation.graph_accuracy import edge_entropy
 from predictor.forecaster import Futures, TrainableForecaster, WindowOutput
 from predictor.graph import pair_mask
-from predictor.layers.pairs import masked_mean
+from predictor.layers.pairs import Total, masked_mean, of_one_process
 from predictor.support.config_checks import check_choice
 from predictor.support.errors import UserError
 from predictor.training.config import Likelihood, TrainConfig
@@ -27,6 +27,7 @@ def nll(
     variance: float,
     likelihood: Likelihood = "gaussian",
     weights: Float[Tensor, "*#batch"] | float = 1.0,
+    total: Total = of_one_process,
 ) -> Float[Tensor, ""]:
     """Computes the negative log-likelihood at fixed variance, up to a constant: sum of features, mean of valid entries.
 
@@ -38,6 +39,7 @@ def nll(
         variance: variance of the likelihood; σ in the paper (which uses it as a variance), 5e-5 there.
         likelihood: "gaussian" (paper) or "laplace" with the same variance, whose gradient does not grow with the error.
         weights: factors of the entries.
+        total: sums counts over all processes (`predictor.layers.pairs.masked_mean`).
 
     Raises:
         UserError: the likelihood has another name.
@@ -49,18 +51,19 @@ def nll(
         per_entry = error.square().sum(-1) / (2 * variance)
     else:
         per_entry = error.abs().sum(-1) / math.sqrt(variance / 2)
-    return masked_mean(per_entry * weights, valid)
+    return masked_mean(per_entry * weights, valid, total)
 
 
 def kl_categorical(
     posterior_logits: Float[Tensor, "*batch types"],
     prior_logits: Float[Tensor, "*batch types"],
     valid: Bool[Tensor, "*batch"],
+    total: Total = of_one_process,
 ) -> Float[Tensor, ""]:
     """Computes KL(posterior ‖ prior) over edge types [nats], mean over valid pairs."""
     log_q = torch.log_softmax(posterior_logits, dim=-1)
     log_p = torch.log_softmax(prior_logits, dim=-1)
-    return masked_mean((log_q.exp() * (log_q - log_p)).sum(-1), valid)
+    return masked_mean((log_q.exp() * (log_q - log_p)).sum(-1), valid, total)
 
 
 Terms = dict[str, Tensor]
@@ -73,6 +76,7 @@ def window_loss(
     config: TrainConfig,
     kl_scale: float | Float[Tensor, ""] = 1.0,
     scales: Float[Tensor, " state"] | None = None,
+    total: Total = of_one_process,
 ) -> tuple[Float[Tensor, ""], Terms]:
     """Computes the objective and its terms for one batch of windows.
 
@@ -83,36 +87,43 @@ def window_loss(
         config: weights of the terms.
         kl_scale: share of the KL's full weight (warm-up).
         scales: the spec's feature scales on the batch's device; None copies them there, which a captured step cannot.
+        total: sums counts over all processes; loss and terms are then this process's shares.
     """
     if scales is None:
         scales = torch.tensor(model.spec.feature_scales, device=batch.states.device)
     windows = torch.arange(len(batch.states), device=batch.states.device)[:, None]
     both = batch.valid[:, 1:] & batch.valid[:, :-1]
     terms: Terms = {}
-    one_step = nll(output.one_step[:, :-1], batch.states[:, 1:], both, scales, config.variance, config.likelihood)
-    total = config.one_step_weight * one_step
+    one_step = nll(
+        output.one_step[:, :-1], batch.states[:, 1:], both, scales, config.variance, config.likelihood, total=total
+    )
+    loss = config.one_step_weight * one_step
     terms["nll_one_step"] = one_step
     horizon = output.rollout.shape[2]
     if horizon:
         steps = batch.last_observed[:, None] + torch.arange(1, horizon + 1, device=windows.device)
         truth = batch.states[windows, steps].transpose(1, 2)
         valid = batch.valid[windows, steps].transpose(1, 2)
-        weights = reaction_weights(batch, config.reaction_weight)
-        rollout = nll(output.rollout, truth, valid, scales, config.variance, config.likelihood, weights[..., None])
-        total = total + config.rollout_weight * rollout
+        weights = reaction_weights(batch, config.reaction_weight, total)
+        rollout = nll(
+            output.rollout, truth, valid, scales, config.variance, config.likelihood, weights[..., None], total
+        )
+        loss = loss + config.rollout_weight * rollout
         terms["nll_rollout"] = rollout
         if output.modes is not None:
-            extra, mode_terms = _mode_loss(model.spec.position_dim, output.modes, truth, valid, scales, weights, config)
-            total = total + extra
+            extra, mode_terms = _mode_loss(
+                model.spec.position_dim, output.modes, truth, valid, scales, weights, config, total
+            )
+            loss = loss + extra
             terms |= mode_terms
     if output.prior_logits is not None:
-        extra, graph_terms = _graph_loss(batch, output, config, kl_scale)
-        total = total + extra
+        extra, graph_terms = _graph_loss(batch, output, config, kl_scale, total)
+        loss = loss + extra
         terms |= graph_terms
-    return total, {k: v.detach() for k, v in terms.items()}
+    return loss, {k: v.detach() for k, v in terms.items()}
 
 
-def reaction_weights(batch: WindowBatch, weight: float) -> Float[Tensor, "batch agents"]:
+def reaction_weights(batch: WindowBatch, weight: float, total: Total = of_one_process) -> Float[Tensor, "batch agents"]:
     """Computes a factor for each agent: 1 plus `weight` times the strength of the causal edges to it, over its mean.
 
     Known are the edges from an agent whose intervention is the last thing that was observed: its receivers react.
@@ -120,6 +131,7 @@ def reaction_weights(batch: WindowBatch, weight: float) -> Float[Tensor, "batch 
     Args:
         batch: windows; the first edge attribute is the strength, where there is one.
         weight: weight of a strength of 1; 0 gives 1 for all.
+        total: sums over all processes.
     """
     rows = torch.arange(len(batch.valid), device=batch.valid.device)
     visible = batch.valid[rows, batch.last_observed]
@@ -129,44 +141,52 @@ def reaction_weights(batch: WindowBatch, weight: float) -> Float[Tensor, "batch 
     is_edge = batch.edge_types[rows, batch.last_observed] > 0
     strength = torch.where(is_edge, batch.edge_attributes[rows, batch.last_observed][..., 0], 0.0).amax(-1)
     factors = factors + weight * strength
-    return factors / masked_mean(factors, visible)
+    return factors / total(masked_mean(factors, visible, total))
 
 
 def _mode_loss(
-    axes: int, modes: Futures, truth: Tensor, valid: Tensor, scales: Tensor, weights: Tensor, config: TrainConfig
+    axes: int,
+    modes: Futures,
+    truth: Tensor,
+    valid: Tensor,
+    scales: Tensor,
+    weights: Tensor,
+    config: TrainConfig,
+    total: Total,
 ) -> tuple[Tensor, Terms]:
     scale = unit(config.variance)
-    agents, scenes = (scale * term for term in energy_terms(modes, truth, valid, scales, axes, weights))
-    spread = spread_nll(modes, truth, valid, axes)
-    total = config.energy_weight * agents + config.joint_energy_weight * scenes + spread
-    return total, {"energy": agents, "joint_energy": scenes, "nll_spread": spread}
+    agents, scenes = (scale * term for term in energy_terms(modes, truth, valid, scales, axes, weights, total))
+    spread = spread_nll(modes, truth, valid, axes, total)
+    loss = config.energy_weight * agents + config.joint_energy_weight * scenes + spread
+    return loss, {"energy": agents, "joint_energy": scenes, "nll_spread": spread}
 
 
 def _graph_loss(
-    batch: WindowBatch, output: WindowOutput, config: TrainConfig, kl_scale: float | Tensor
+    batch: WindowBatch, output: WindowOutput, config: TrainConfig, kl_scale: float | Tensor, total: Total
 ) -> tuple[Tensor, Terms]:
     assert output.prior_logits is not None and output.posterior_logits is not None
     prior, posterior = output.prior_logits, output.posterior_logits
     pairs = pair_mask(batch.valid)
-    kl = kl_categorical(posterior, prior, pairs)
+    kl = kl_categorical(posterior, prior, pairs, total)
     probs = torch.softmax(prior, dim=-1)
     terms: Terms = {
         "kl": kl,
-        "prior_entropy": masked_mean(*edge_entropy(probs.detach(), pairs)),
-        "prior_edge_share": masked_mean(1 - probs.detach()[..., 0], pairs),
+        "prior_entropy": masked_mean(*edge_entropy(probs.detach(), pairs), total),
+        "prior_edge_share": masked_mean(1 - probs.detach()[..., 0], pairs, total),
     }
-    total = config.kl_weight * kl_scale * kl
+    loss = config.kl_weight * kl_scale * kl
     if config.edge_cost:
-        edges = masked_mean(1 - probs[..., 0], pairs) + masked_mean(1 - torch.softmax(posterior, -1)[..., 0], pairs)
-        total = total + config.edge_cost * edges
+        both = ((1 - probs[..., 0]), 1 - torch.softmax(posterior, -1)[..., 0])
+        edges = masked_mean(both[0], pairs, total) + masked_mean(both[1], pairs, total)
+        loss = loss + config.edge_cost * edges
     if batch.edge_types is not None:
         known = pairs & (batch.edge_types >= 0)
         # 0 is "no edge"; all other types count as an edge where the model has fewer types than the labels
         truth = batch.edge_types.long().clamp(0, prior.shape[-1] - 1)
-        terms["graph_accuracy"] = masked_mean((prior.detach().argmax(-1) == truth).float(), known)
+        terms["graph_accuracy"] = masked_mean((prior.detach().argmax(-1) == truth).float(), known, total)
         if config.type_label_weight:
-            labelled = _cross_entropy(prior, truth, known) + _cross_entropy(posterior, truth, known)
-            total = total + config.type_label_weight * labelled
+            labelled = _cross_entropy(prior, truth, known, total) + _cross_entropy(posterior, truth, known, total)
+            loss = loss + config.type_label_weight * labelled
             terms["type_label"] = labelled
     if config.label_weight and batch.edge_attributes is not None and output.features is not None:
         missing = batch.edge_attributes.shape[-1] - output.features.shape[-1]
@@ -176,21 +196,22 @@ def _graph_loss(
                 f"got {output.features.shape[-1]}; raise edge_feature_dim or set label_weight to 0"
             )
         with_edge = pairs if batch.edge_types is None else pairs & (batch.edge_types > 0)
-        label = restricted_labelling(output.features, batch.edge_attributes, with_edge)
-        total = total + config.label_weight * label
+        label = restricted_labelling(output.features, batch.edge_attributes, with_edge, total)
+        loss = loss + config.label_weight * label
         terms["label"] = label
-    return total, terms
+    return loss, terms
 
 
-def _cross_entropy(logits: Tensor, truth: Tensor, known: Tensor) -> Tensor:
+def _cross_entropy(logits: Tensor, truth: Tensor, known: Tensor, total: Total) -> Tensor:
     log_probs = functional.log_softmax(logits, dim=-1)
-    return masked_mean(-log_probs.gather(-1, truth[..., None])[..., 0], known)
+    return masked_mean(-log_probs.gather(-1, truth[..., None])[..., 0], known, total)
 
 
 def restricted_labelling(
     features: Float[Tensor, "batch time agents agents feature"],
     attributes: Float[Tensor, "batch time agents agents attributes"],
     labelled: Bool[Tensor, "batch time agents agents"],
+    total: Total = of_one_process,
 ) -> Float[Tensor, ""]:
     """Computes the mean squared error of the first feature dimensions against known edge attributes.
 
@@ -198,7 +219,8 @@ def restricted_labelling(
         features: edge features from the past; as many of the first dimensions are used as there are attributes.
         attributes: true values; arbitrary where not labelled.
         labelled: mask of pairs with an edge whose attributes are known.
+        total: sums counts over all processes.
     """
     # masked before it is squared: the gradient of an infinite error is NaN, also times zero
     error = torch.where(labelled[..., None], features[..., : attributes.shape[-1]] - attributes, 0.0)
-    return masked_mean(error.square().mean(-1), labelled)
+    return masked_mean(error.square().mean(-1), labelled, total)

@@ -5,8 +5,7 @@ that was not.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,10 +22,12 @@ from predictor.data.windows import WindowBatch, Windows, siblings, split_episode
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import run_windows
 from predictor.models import build, configure
+from predictor.noise import NoiseOfRows, TrainingNoise
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 from predictor.support.files import new_file
-from predictor.support.runtime import precision
+from predictor.support.remote import address
+from predictor.support.runtime import precision, tensor_cores
 from predictor.training.batches import Plan, open_batches, plan
 from predictor.training.config import TrainConfig
 from predictor.training.cuda_graph import (
@@ -39,6 +40,7 @@ from predictor.training.cuda_graph import (
 )
 from predictor.training.fitted_scales import typical_change, typical_neighbour, typical_spread
 from predictor.training.objective import window_loss
+from predictor.training.processes import ALONE, Group, keep_rows_of_dropout
 from predictor.training.saved_state import read_state
 
 VALIDATION_DRAWS = 5
@@ -76,7 +78,7 @@ def load_data(config: TrainConfig) -> TrainingData:
         stores = [with_causal_edges(store) for store in stores]
     spec = stores[0].info.spec
     for path, store in zip((*config.data, *config.val_data), stores, strict=True):
-        spec.check_compatible(store.info.spec, f"store {config.data[0]}", f"store {path}")
+        spec.check_compatible(store.info.spec, f"store {address(config.data[0])}", f"store {address(path)}")
     _check_labels(config, stores)
     sources = tuple(s.info.source for s in stores[: len(config.data)])
     if config.val_data:
@@ -93,8 +95,8 @@ def load_data(config: TrainConfig) -> TrainingData:
         kept = kept[: config.max_episodes or None]
         if not kept or not held_out:
             raise UserError(
-                f"{path}: {len(store.episodes)} episodes split into {len(kept)} for training and {len(held_out)} "
-                "for validation; both need at least one, so collect more"
+                f"{address(path)}: {len(store.episodes)} episodes split into {len(kept)} for training and "
+                f"{len(held_out)} for validation; both need at least one, so collect more"
             )
         mine = [store.episodes[i] for i in kept]
         train.append(_windows(config, mine, spec, validation=False))
@@ -108,7 +110,9 @@ def _check_labels(config: TrainConfig, stores: Sequence[EpisodeStore]) -> None:
     for option, name in (("label_weight", "edge_attributes"), ("type_label_weight", "edge_types")):
         for path, store in zip(config.data, stores, strict=False):
             if getattr(config, option) and any(getattr(e, name) is None for e in store.episodes[:1]):
-                raise UserError(f"{option} needs {name}, and store {path} has none; set it to 0 or use labelled data")
+                raise UserError(
+                    f"{option} needs {name}, and store {address(path)} has none; set it to 0 or use labelled data"
+                )
 
 
 def _windows(config: TrainConfig, episodes: Sequence[Episode], spec: SceneSpec, validation: bool) -> Windows:
@@ -155,27 +159,16 @@ def initial_model(config: TrainConfig, data: TrainingData) -> Any:
     source, info = load_checkpoint(config.init)
     if info.model != config.model:
         raise UserError(f"checkpoint '{config.init}' is of model {info.model}; pass --model {info.model}")
-    info.spec.check_compatible(data.spec, f"checkpoint '{config.init}'", f"store {config.data[0]}")
+    info.spec.check_compatible(data.spec, f"checkpoint '{config.init}'", f"store {address(config.data[0])}")
     if info.spec.has_ego != data.spec.has_ego:
         raise UserError(
-            f"checkpoint '{config.init}' has has_ego={info.spec.has_ego} but store {config.data[0]} has "
+            f"checkpoint '{config.init}' has has_ego={info.spec.has_ego} but store {address(config.data[0])} has "
             f"has_ego={data.spec.has_ego}; start from a checkpoint that agrees, or without --init"
         )
     spec = replace(data.spec, feature_scales=info.spec.feature_scales)  # scales are the network's, the rest the data's
     model = build(info.model, spec, info.config, config.horizon_steps)
     model.load_state_dict(source.state_dict())
     return model
-
-
-@contextmanager
-def _tensor_cores(allowed: bool) -> Iterator[None]:
-    """Lets products of float32 on CUDA round their inputs to TF32 inside the block; else keeps torch's setting."""
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("high" if allowed else before)
-    try:
-        yield
-    finally:
-        torch.set_float32_matmul_precision(before)
 
 
 class Trainer:
@@ -185,11 +178,12 @@ class Trainer:
     fits, and nothing is read back between calls of `read`.
     """
 
-    def __init__(self, config: TrainConfig, data: TrainingData) -> None:
-        """Builds model, batches and optimiser from the config and the seed."""
+    def __init__(self, config: TrainConfig, data: TrainingData, group: Group = ALONE) -> None:
+        """Builds model, batches and optimiser from the config and the seed; a group's processes share each batch."""
         self.config = config
         self.data = data
-        self.device = torch.device(config.device)
+        self.group = group
+        self.device = torch.device(group.device(config.device))
         on_cuda = self.device.type == "cuda"
         if on_cuda and self.device.index is not None:
             torch.cuda.set_device(self.device)
@@ -198,9 +192,15 @@ class Trainer:
         self.step = 0
         self.best = math.inf
         self.stale = 0
-        self.baseline_m = self._baseline()
+        self.baseline_m = self._baseline() if group.leads else math.nan
         self.noise = torch.Generator(device=self.device)
-        source = open_batches(config, data.train, self.device, self.model.config)
+        self._drawn: TrainingNoise = self.noise
+        rows = group.rows(config.batch_size)
+        if group.connected:
+            config = replace(config, capture="off")  # a recorded step would hold the messages between processes
+            self._drawn = NoiseOfRows(self.noise, rows, config.batch_size)
+            keep_rows_of_dropout(self.model, rows, config.batch_size)
+        source = open_batches(config, data.train, self.device, self.model.config, rows)
         self.batches, self.notes, self._widths = source.batches, source.notes, source.widths
         self.read_every = LOG_EVERY if on_cuda else 1
         self._checks_each_loss = not on_cuda
@@ -216,6 +216,11 @@ class Trainer:
     def finished(self) -> bool:
         """Whether all steps are done, or `patience` validations brought no progress."""
         return self.step >= self.config.steps or self.stale >= self.config.patience
+
+    @property
+    def due(self) -> bool:
+        """Whether validation follows the latest step."""
+        return self.step % self.config.eval_every == 0 or self.step == self.config.steps
 
     def train_step(self) -> Mapping[str, Tensor]:
         """Computes one optimiser step; the batch and all noise depend on (seed, step) alone.
@@ -272,22 +277,26 @@ class Trainer:
     ) -> Mapping[str, Tensor]:
         """Computes forward, loss, backward, clipping and update; on a CUDA device the host reads no result."""
         kind = self.config.precision
-        with _tensor_cores(kind == "tf32"):
+        with tensor_cores(kind == "tf32"):
             with precision("bfloat16" if kind == "bfloat16" else "float32", self.device.type):
                 more = {"num_modes": num_modes} if num_modes > 1 else {}
                 output = self.model.window(
-                    batch.states, batch.valid, batch.last_observed, rollout_steps, self.noise, **more
+                    batch.states, batch.valid, batch.last_observed, rollout_steps, self._drawn, **more
                 )
             exact = output.float()
-            loss, terms = window_loss(self.model, batch, exact, self.config, self._kl_scale, self._scales)
-            if self._checks_each_loss and not torch.isfinite(loss):
-                raise UserError(f"the loss is {float(loss.detach())} at step {self.step}; lower --lr or check the data")
+            sums = {"total": self.group.total} if self.group.connected else {}
+            loss, terms = window_loss(self.model, batch, exact, self.config, self._kl_scale, self._scales, **sums)
             self.optimizer.zero_grad(set_to_none=True)
             (weight * loss).backward()
+        found = {"loss": loss.detach(), **terms}
+        if self.group.connected:
+            found = self.group.add_gradients(list(self.model.parameters()), found)
+        if self._checks_each_loss and not torch.isfinite(found["loss"]):
+            raise UserError(f"the loss is {float(found['loss'])} at step {self.step}; lower --lr or check the data")
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.clip_norm)
         self.optimizer.step()
-        self._finite.logical_and_(torch.isfinite(loss.detach()))
-        return {"loss": loss.detach(), "grad_norm": norm, **terms}
+        self._finite.logical_and_(torch.isfinite(found["loss"]))
+        return {"grad_norm": norm, **found}
 
     def _replayed(
         self, recorder: Recorder, batch: WindowBatch, rollout_steps: int, num_modes: int
@@ -334,7 +343,7 @@ class Trainer:
         self.model.eval()
         samples = self.num_modes if self.num_modes > 1 else VALIDATION_DRAWS
         outcomes = [o for w, i in self._val_indices() for o in run_windows(
-            self.model, w, i, self.config.horizon_steps, samples, device=self.config.device)]  # fmt: skip
+            self.model, w, i, self.config.horizon_steps, samples, device=str(self.device))]  # fmt: skip
         return summarise(self.config.model, outcomes), fitted_std_m(outcomes)
 
     def save(self, path: Path) -> None:
@@ -350,10 +359,11 @@ class Trainer:
             torch.save(state, partial)
 
     def restore(self, path: Path) -> None:
-        """Continues from a saved training state, of this kind of device or another."""
+        """Continues from a saved training state, of this kind of device or another; process 0 reads it for all."""
         self._forget()  # recordings refer to tensors that are replaced here
         try:
-            state = read_state(path, self.model, self.device)
+            device = torch.device("cpu") if self.group.connected else self.device
+            state = self.group.from_leader(lambda: read_state(path, self.model, device))
             self.model.load_state_dict(state["model"])
             # Adam's settings are this run's, its moments are the saved ones
             groups = zip(self.optimizer.state_dict()["param_groups"], state["optimizer"]["param_groups"], strict=True)
@@ -366,6 +376,10 @@ class Trainer:
         except (RuntimeError, KeyError, TypeError, ValueError) as error:
             reason = " ".join(str(error).split())[:200]
             raise UserError(f"{path} cannot be read ({reason}); train anew into another --out") from error
+
+    def share_progress(self) -> None:
+        """Tells the processes that follow what the validation of process 0 brought."""
+        self.best, self.stale = self.group.from_leader(lambda: (self.best, self.stale))
 
     def close(self) -> None:
         """Stops the preparation of batches."""

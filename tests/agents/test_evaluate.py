@@ -62,7 +62,7 @@ def test_one_table_of_planner_and_constant_actions(tmp_path: Path, monkeypatch, 
     assert all(policy["success_rate"] in (0.0, 1.0) for policy in content["policies"])
     assert all(e["driving"]["time_s"] == e["length"] for episodes in content["episodes"].values() for e in episodes)
     assert {e["seed"] for episodes in content["episodes"].values() for e in episodes} == {EVALUATION_SEED}
-    assert "5/5" in capsys.readouterr().out  # the bar knows that idle is one line, not two
+    assert "5 of 5" in capsys.readouterr().out  # the bar knows that idle is one line, not two
 
 
 def test_constant_actions_are_compared_unless_others_are_named():

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from agents.results import Evaluation
+from agents.results import Evaluation, read_evaluation
 from agents.vec_envs import EpisodeResult
 from envs.rollouts.driving_measures import DrivingMeasures
 from tests.agents.helpers import EPISODES, refuse
@@ -26,6 +26,12 @@ def test_written_summary_is_valid_json_and_a_table(tmp_path: Path):
     assert lines[2].startswith("| ppo | 17.00 ± 3.51 | 24.0 ± 6.0 | 33 % (")
     assert lines[3].endswith("| – |")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["episodes.parquet", "summary.json", "summary.md"]
+
+
+def test_what_is_written_is_read_again(tmp_path: Path):
+    evaluation = Evaluation("toy-v0", 10, {"ppo": EPISODES}, env_kwargs='{"lanes": 3}')
+    evaluation.write(tmp_path)
+    assert read_evaluation(tmp_path / "summary.json") == evaluation
 
 
 def herd(seed: int, ants: float, bees: float) -> EpisodeResult:

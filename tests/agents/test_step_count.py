@@ -8,13 +8,14 @@ import pytest
 
 from agents.presets import DQNPreset, PPOPreset
 from agents.runs import CHECKPOINT_FILE, CURVE_FILE, load_model, save_model
-from agents.step_count import STEP_UNIT, StepProgress, check_step_unit
+from agents.step_count import STEP_UNIT, check_step_unit
 from agents.task import Task
 from agents.training import SaveCheckpoint, TrainingPlan, make_model, train
 from agents.vec_envs import make_venv
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.sb3.policy_file import read_note
 from predictor.support.errors import UserError
+from predictor.support.progress import WorkShown
 
 TAG = "simple_tag_v3"
 COPIES = 2
@@ -33,7 +34,6 @@ def tiny(monkeypatch: pytest.MonkeyPatch, learners: tuple[str, ...], algorithm: 
     )
 
 
-@pytest.mark.filterwarnings("ignore:rich is experimental")
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
 @pytest.mark.parametrize("learners", [("agent_0",), ("adversary",), ()], ids=["1", "3", "4"])
 def test_budget_measurements_checkpoints_and_progress_count_steps_of_copies(
@@ -50,16 +50,12 @@ def test_budget_measurements_checkpoints_and_progress_count_steps_of_copies(
         save(self)
         saved.append(self._saved_at)
 
-    class Bar:
-        def update(self, steps: int) -> None:
-            shown[0] += steps
-
-        def refresh(self) -> None: ...
-        def close(self) -> None: ...
+    def show(self: WorkShown, done: int, note: str = "") -> None:
+        shown[0] = done
 
     monkeypatch.setattr(ParallelVecEnv, "step_wait", count)
     monkeypatch.setattr(SaveCheckpoint, "_on_rollout_start", note_save)
-    monkeypatch.setattr(StepProgress, "_on_training_start", lambda self: setattr(self, "pbar", Bar()))
+    monkeypatch.setattr(WorkShown, "to", show)
     train(tiny(monkeypatch, learners, algorithm), tmp_path)
     assert stepped == shown == [64]
     assert [point["steps"] for point in json.loads((tmp_path / CURVE_FILE).read_text())] == [16, 32, 48, 64]

@@ -194,6 +194,15 @@ def test_a_run_imports_no_forecaster_that_the_command_line_does_not_name(foreign
     assert task_of(run, trusted_forecaster=own).checkpoint == own
 
 
+def test_a_run_fetches_no_checkpoint_that_the_command_line_does_not_name():
+    there = "s3://bucket/checkpoint"
+    run = RUN | {"env_id": "merge-v1", "observe": "forecast", "checkpoint": there}
+    for trusted in (None, "highway", "s3://bucket/other"):
+        with pytest.raises(UserError, match=f"would be fetched from '{there}'; .* with --checkpoint {there}"):
+            task_of(run, trusted_forecaster=trusted)
+    assert task_of(run, trusted_forecaster=there).checkpoint == there
+
+
 def test_arguments_of_a_run_name_no_foreign_class(foreign: str):
     """highway-env imports the class of other_vehicles_type, so a run's config must not choose it freely."""
     kwargs = {"config": {"other_vehicles_type": f"{foreign}.Road"}}

@@ -2,11 +2,16 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from agents.policy import load_policy
 from agents.task import Task
-from agents.watch import WatchConfig, main, play_in_window
+from agents.video import recorded
+from agents.watch import WatchConfig, main, play_in_window, write_film
+from predictor.baselines.constant_velocity import ConstantVelocity
+from predictor.scene import SceneSpec
 from predictor.support.errors import UserError, run_entry_point
 from tests.agents.helpers import TOY, policy_for
 from tests.agents.test_policy import FAST, FEW, saved
@@ -34,20 +39,50 @@ def test_what_cannot_be_drawn_is_one_sentence(
     with pytest.raises(SystemExit):
         run_entry_point(main)
     error = capsys.readouterr().err
-    assert "Meadow cannot be drawn: films are of highway-env and PettingZoo; try --window" in error
+    assert "Meadow cannot be drawn: films are of highway-env, of PettingZoo environments with a reader" in error
     assert error.count("\n") == 1 and not list(tmp_path.glob("*.mp4"))
     with pytest.raises(UserError, match="cannot make multiagent env .* with {'render_mode': 'human'}"):
         play_in_window(WatchConfig(tmp_path / "policy.zip", window=True))
 
 
-def test_a_window_plays_the_seed_at_the_policys_hands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("observe", ["none", "constant-velocity"])
+def test_a_window_shows_the_pictures_of_the_film(observe: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setattr("envs.video.window.time.sleep", lambda seconds: None)
+    path, model = saved(tmp_path, Task(FAST, observe, env_kwargs=FEW))
+    recording = recorded(Task(FAST, observe, env_kwargs=FEW), model, 5)
+    assert recording is not None
+    assert play_in_window(WatchConfig(path, seed=5, window=True)) == len(recording) > 4
+    assert play_in_window(WatchConfig(path, seed=5, window=True, max_steps=1)) < len(recording)
+
+
+def test_an_environment_that_is_not_drawn_has_its_own_window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     monkeypatch.setattr("agents.watch.time.sleep", lambda seconds: None)
-    path, model = saved(tmp_path, Task(FAST, "none", env_kwargs=FEW))
-    env = Task(FAST, "none", env_kwargs=FEW).make()
-    observation, _ = env.reset(seed=5)
-    total, over = 0.0, False
-    while not over:
-        observation, reward, *ended, _ = env.step(model.predict(observation, deterministic=True)[0])
-        total, over = total + float(reward), any(ended)
-    assert play_in_window(WatchConfig(path, seed=5, window=True)) == pytest.approx(total)
+    path, _ = saved(tmp_path, Task("CartPole-v1", "none"))
+    assert 1 < play_in_window(WatchConfig(path, seed=5, window=True, max_steps=30)) <= 30
+
+
+def made_by_hand(spec: SceneSpec) -> ConstantVelocity:
+    """A forecaster of a user's own."""
+    return ConstantVelocity(spec)
+
+
+def test_a_policy_of_ones_own_forecaster_is_filmed_and_loaded(tmp_path: Path):
+    """Its zip, which runs code anyway, names the forecaster; the run's config alone does not import it."""
+    own = f"own:{__name__}:made_by_hand"
+    saved(tmp_path, Task(FAST, "forecast", own, env_kwargs=FEW), run=True)
+    film = write_film(WatchConfig(tmp_path, out=tmp_path / "film.mp4", max_steps=2))
+    assert film.read_bytes()[4:8] == b"ftyp"
+    policy, env = load_policy(tmp_path)
+    assert env.action_space.contains(policy(env.reset(seed=0)[0]))
+    saved(tmp_path, Task(FAST, "constant-velocity", env_kwargs=FEW))
+    with pytest.raises(UserError, match="imports code; if you trust it, name it yourself with --checkpoint own:"):
+        write_film(WatchConfig(tmp_path))
+
+
+def test_ids_of_envpool_are_drawn_by_highway_env(tmp_path: Path):
+    pytest.importorskip("envpool")
+    path, _ = saved(tmp_path, Task("envpool/HighwayFast-v0", "none"))
+    film = write_film(WatchConfig(path, out=tmp_path / "film.mp4", max_steps=2))
+    assert film.read_bytes()[4:8] == b"ftyp"

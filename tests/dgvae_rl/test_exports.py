@@ -29,7 +29,9 @@ def test_each_name_is_that_of_its_package():
 def test_type_checkers_see_the_same_names():
     tree = ast.parse((ROOT / "dgvae_rl" / "__init__.py").read_text())
     (block,) = [node for node in tree.body if isinstance(node, ast.If)]
-    seen = {alias.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    names = [(node.module, name) for node in block.body if isinstance(node, ast.ImportFrom) for name in node.names]
+    assert all(name.asname == name.name for _, name in names)  # without it, mypy --strict has no export
+    seen = {name.name: module for module, name in names}
     assert seen == dgvae_rl.PACKAGE_OF
     assert set(dgvae_rl.__all__) == {*dgvae_rl.PACKAGE_OF, "__version__"}
 

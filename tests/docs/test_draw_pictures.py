@@ -20,7 +20,10 @@ def test_an_unknown_picture_is_one_line(tmp_path: Path, monkeypatch: pytest.Monk
     code, errors, _ = run_command(draw_pictures.main, ["--only", "film"], monkeypatch, capsys)
     assert (code, errors) == (
         2,
-        ["error: only must be among highway, what_if, braking_leader, causal_graph, got film"],
+        [
+            "error: only must be among highway, what_if, braking_leader, causal_graph, fans_roundabout, "
+            "fans_intersection, got film"
+        ],
     )
     assert not list(tmp_path.iterdir())
 

@@ -73,7 +73,7 @@ def test_the_command_ends_with_status_1_if_something_is_wrong(
         ({"env_id": "nowhere:Env-v0"}, "cannot make env 'nowhere:Env-v0'"),
         ({"env_id": "tests.envs.planted:a_number"}, "must give a gymnasium Env or a pettingzoo ParallelEnv, got int"),
         ({"env_id": "tests.envs.planted:Walk", "env_kwargs": '{"size": 3}'}, "unexpected keyword argument 'size'"),
-        ({"env_id": "tests.envs.planted:Walk", "env_kwargs": "size=3"}, "--env-kwargs"),
+        ({"env_id": "tests.envs.planted:Walk", "env_kwargs": "size=3"}, "env_kwargs must be a JSON object"),
         ({"env_id": "tests.envs.planted:Walk", "reader": "tests.envs.planted:absent"}, "has no function or class"),
     ],
 )

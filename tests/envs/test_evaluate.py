@@ -365,7 +365,22 @@ def test_a_driver_is_named_where_no_heuristic_knows_the_env(in_process: None):
 ERRORS = {
     "unknown-id": (["--env-ids", ROAD, "nope-v0"], "cannot make env 'nope-v0'"),
     "unknown-checkpoint": (["--checkpoint", "nowhere"], "no checkpoint 'nowhere'"),
-    "same-names": (["--checkpoint", "a/best", "b/best"], "each checkpoint needs a name of its own, got best, best"),
+    "same-twice": (["--checkpoint", "a/best", "a/best"], "each checkpoint is given once, got a/best, a/best"),
+    "arguments-of-two": (
+        ["--env-ids", ROAD, TAG, "--env-kwargs", '{"a": 1}'],
+        "env_kwargs are of one environment; give one of --env-ids, got 2",
+    ),
+    "arguments-of-graph": (
+        ["--graph", "--env-kwargs", '{"a": 1}'],
+        "env_kwargs go with accuracy, not with --reactions",
+    ),
+    "no-json": (["--env-kwargs", "size=3"], "env_kwargs must be a JSON object, got 'size=3'"),
+    "unknown-argument": (
+        ["--env-kwargs", '{"sizes": 3}'],
+        f"cannot make env '{ROAD}' with {{'sizes': 3}}: TypeError: ",
+    ),
+    "no-driver": (["--driver", "own:tests.envs.own_code:absent"], "module 'tests.envs.own_code' has no function or c"),
+    "half-a-driver": (["--driver", "own:absent"], "a driver of your own is own:module:function, got 'own:absent'"),
     "zero-episodes": (["--episodes", "0"], "episodes must be at least 1, got 0"),
     "zero-samples": (["--num-samples", "0"], "num_samples must be at least 1, got 0"),
     "zero-workers": (["--workers", "0"], "workers must be at least 1, got 0"),

@@ -31,6 +31,7 @@ from tests.envs.helpers import (
     random_actions,
     short_env,
 )
+from tests.envs.own_code import READER
 
 KINDS = ("scene", "forecast", "flat")
 
@@ -270,6 +271,25 @@ def test_the_spec_of_an_env_with_its_own_reader_round_trips(highway_checkpoint: 
     env = ForecastObservation(make_env("highway-fast-v0"), highway_checkpoint, reader=ShuffledReader)
     assert env.spec is not None
     assert_rebuilds(env, gym.make(env.spec))
+
+
+@pytest.mark.filterwarnings("ignore:.*Current gymnasium version requires")
+def test_a_reader_by_name_stands_in_the_json_of_a_spec():
+    """A reader itself cannot: JSON has no functions."""
+    env_id, name = "tests.envs.own_code:OneOnly-v0", "tests.envs.own_code:READER"
+    env = ForecastObservation(gym.make(env_id), "constant-velocity", reader=name)
+    assert env.spec is not None
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped is not env.unwrapped
+    assert again.get_wrapper_attr("reader").spec == READER.spec
+    env.reset(seed=3)
+    expected = env.scene.states
+    env.close()
+    again.reset(seed=3)
+    np.testing.assert_array_equal(again.get_wrapper_attr("scene").states, expected)
+    again.close()
+    with pytest.raises(UserError, match="module 'tests.envs.own_code' has no function or class 'ABSENT'"):
+        ForecastObservation(gym.make(env_id), "constant-velocity", reader="tests.envs.own_code:ABSENT")
 
 
 def assert_rebuilds(env: gym.Env, rebuilt: gym.Env) -> None:

@@ -10,11 +10,15 @@ from typing import Any
 
 import torch
 
+from agents.preset_settings import changed, settings_from_file
+from agents.presets import PRESETS
+from agents.results import read_evaluation
 from agents.runs import read_config
 from agents.studies.plan import read_study
 from agents.studies.results import Result, read_result, write_result
 from agents.task import task_of
 from agents.training import read_curve
+from agents.tune import TuneConfig, _check_folder, _settings_of_tuning, open_study
 from envs.sb3.policy_file import algorithm_of, read_note, read_policy_note
 from predictor.checkpoint import CheckpointInfo, load_checkpoint, save_checkpoint
 from predictor.data.levelx_files import open_recording, read_tracks
@@ -25,9 +29,11 @@ from predictor.data.store import read_info_of, read_store
 from predictor.data.track_points import cut_episodes
 from predictor.data.tracks import TracksConfig, points_of, read_recording
 from predictor.evaluation.in_env_record import read_record
+from predictor.reports.run_blocks import accuracy
 from predictor.support.files import write_json
 from predictor.train import _check_run_folder, _comparable
 from predictor.training.config import TrainConfig
+from predictor.training.curve import read_curve as errors_of
 from predictor.training.trainer import Trainer, load_data
 from tests.hostile import texts
 from tests.predictor.helpers import PLURAL, model, spec, write_circles
@@ -96,7 +102,16 @@ PIN = {
     "checkpoint": "highway", "sha256": "0" * 64, "horizon_steps": 5, "num_samples": 1, "max_agents": 12,
     "perception_m": 100.0, "arm": "forecast", "num_plans": 0, "layout": None,
 }  # fmt: skip
+TUNING = {"config": _settings_of_tuning(TuneConfig()), "provenance": []}
 POINT = {"steps": 10, "return": 1.0, "episodes": 2, "seconds": 1.0}
+VALIDATED = {
+    "step": 4, "energy_m": 1.0, "ade_m": 2.0, "fde_m": 3.0, "min_ade_m": 1.5, "min_joint_ade_m": 1.7,
+    "constant_velocity_ade_m": 4.0,
+}  # fmt: skip
+EPISODE = {"seed": 1, "episode_return": 2.0, "length": 3, "crashed": None, "mean_speed_mps": None}
+SUMMARY = {"env_id": "highway-v0", "first_seed": 1, "has_ego": True, "episodes": {"ppo": [EPISODE]}}
+LINE = {"name": "x", "num_samples": 6, "ade_m": 0.5, "fde_m": 1.0, "min_ade_m": 0.25, "agents": 12}
+ACCURACY = {"env_id": "x", "driver": "idle", "model": LINE, "model_samples": LINE, "constant_velocity": LINE}
 MEASURED = {"env_id": "highway-v0", "driver": "idle", "episodes": 3, "samples": 6, "command": "c", "commit": "x"}
 
 
@@ -110,6 +125,18 @@ def _policy(folder: Path) -> None:
 def _load_policy_notes(folder: Path) -> Any:
     path = folder / "policy.zip"
     return algorithm_of(path), read_policy_note(path), read_note(path)
+
+
+def _load_preset(folder: Path) -> Any:
+    return changed(PRESETS["ppo"], settings_from_file("ppo", folder / "mine.toml"), "mine.toml")
+
+
+def _study(folder: Path) -> Any:
+    return open_study(folder / "tuning.db")
+
+
+def void(_: Any) -> None:
+    """Drops a result."""
 
 
 def _tracks(folder: Path) -> Any:
@@ -163,8 +190,14 @@ KINDS: dict[str, Kind] = {
     "training state": Kind("run/train_state.pt", _train_state, _restore),
     "policy run": Kind("config.json", lambda f: _policy_run(f), lambda f: task_of(read_config(f, "algorithm"))),
     "curve": Kind("curve.json", _json("curve.json", [POINT]), lambda f: read_curve(f / "curve.json")),
+    "predictor's curve": Kind("curve.json", _json("curve.json", [VALIDATED]), lambda f: errors_of(f / "curve.json")),
+    "summary": Kind("summary.json", _json("summary.json", SUMMARY), lambda f: read_evaluation(f / "summary.json")),
+    "accuracy": Kind("accuracy.json", _json("accuracy.json", {"results": [ACCURACY]}), lambda f: accuracy([f])),
     "result": Kind("result.json", lambda f: _result(f), lambda f: read_result(f / "result.json")),
     "study": Kind("mine.toml", _written(mine__toml=texts.STUDY), lambda f: read_study(f / "mine.toml")),
+    "preset": Kind("mine.toml", _written(mine__toml="learning_rate = 3e-4\n"), _load_preset),
+    "tuning": Kind("tuning.json", _json("tuning.json", TUNING), lambda f: _check_folder(f, TuneConfig())),
+    "tuning study": Kind("tuning.db", lambda f: void(_study(f)), lambda f: _study(f)),
     "policy": Kind("policy.zip", _policy, _load_policy_notes),
     "record": Kind("in_env.json", _json("in_env.json", {"measurements": [MEASURED]}), read_record),
     "tracks": Kind("walk.txt", _written(walk__txt=texts.TRACKS), _tracks),

@@ -1,5 +1,6 @@
 """Any content of a file loads, or is refused as a `UserError`: found by hypothesis."""
 
+import dataclasses
 import json
 import struct
 from pathlib import Path
@@ -9,6 +10,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from agents.preset_settings import changed, settings_from_file
+from agents.presets import PRESETS
 from predictor.support.errors import UserError, one_line
 from predictor.support.reading import parse_json
 from tests.hostile.samples import KINDS
@@ -21,7 +24,8 @@ ANY_JSON = st.recursive(
 """Values of JSON, NaN and long integers included."""
 TEXTS = ("tracks", "annotations", "scales", "score", "skeleton", "motion", "levelx tracks", "levelx meta",
          "levelx recording", "study")  # fmt: skip
-OBJECTS = ("checkpoint", "policy run", "curve", "record", "sportvu", "result", "predictor run", "store info")
+OBJECTS = ("checkpoint", "policy run", "curve", "record", "sportvu", "result", "predictor run", "store info", "array")
+BINARIES = ("weights", "chunk", "policy", "training state")
 BUDGET = settings(
     max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 )
@@ -30,7 +34,7 @@ BUDGET = settings(
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A sample of each kind, whose file the tests overwrite."""
-    folders = {kind: tmp_path_factory.mktemp("loaders") for kind in (*TEXTS, *OBJECTS, "weights")}
+    folders = {kind: tmp_path_factory.mktemp("loaders") for kind in (*TEXTS, *OBJECTS, *BINARIES)}
     for kind, folder in folders.items():
         KINDS[kind].make(folder)
     return folders
@@ -85,6 +89,35 @@ def test_any_word_of_a_text(kind: str, good: dict[str, Path], data: st.DataObjec
         st.one_of(number.map(str.encode), st.binary(max_size=8), st.sampled_from([b"\n", b",", b" ", b":"]))
     )
     loads_or_is_refused(kind, good[kind], text[:first] + piece + text[last:])
+
+
+@pytest.mark.parametrize("kind", BINARIES)
+@settings(BUDGET, max_examples=30)
+@given(data=st.data())
+def test_any_bytes_of_a_binary(kind: str, good: dict[str, Path], data: st.DataObject):
+    """Some bytes are others, are missing, or there are more."""
+    content = (good[kind] / KINDS[kind].file).read_bytes()
+    first = data.draw(st.integers(0, len(content)))
+    last = data.draw(st.integers(first, min(first + 64, len(content))))
+    loads_or_is_refused(kind, good[kind], content[:first] + data.draw(st.binary(max_size=64)) + content[last:])
+
+
+@BUDGET
+@given(data=st.data())
+def test_any_hyperparameter_in_a_file(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject):
+    """A preset's values may be anything that TOML can say."""
+    name = data.draw(
+        st.sampled_from([field.name for field in dataclasses.fields(PRESETS["ppo"])]) | st.text(max_size=9)
+    )
+    value = data.draw(
+        st.integers() | st.floats() | st.booleans() | st.text(max_size=8) | st.lists(st.integers(), max_size=3)
+    )
+    path = tmp_path_factory.mktemp("preset") / "preset.toml"
+    path.write_text(f"{json.dumps(name)} = {json.dumps(value).replace('NaN', 'nan').replace('Infinity', 'inf')}")
+    try:
+        changed(PRESETS["ppo"], settings_from_file("ppo", path), str(path))
+    except UserError as error:
+        assert one_line(error).isprintable()
 
 
 @BUDGET

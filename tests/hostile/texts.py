@@ -34,10 +34,18 @@ TRACKS_CSV = (
 ) + "".join(f"0,1,{frame},{frame},0,0,2,4,1,0,0,0\n" for frame in range(0, 30, 5))
 TRACKS_META_CSV = "recordingId,trackId,class\n0,1,car\n"
 RECORDING_META_CSV = "recordingId,locationId,frameRate\n0,3,25\n"
-SCORE = "".join(
-    f"{frame} -1 {frame} 25 BALL\n" + "".join(f"{frame} {player} {player} 20 PLAYER\n" for player in range(1, 11))
-    for frame in range(0, 60, 12)
-)
+
+
+def score(frames: int) -> str:
+    """Returns a possession of NBA tracking data."""
+    lines = []
+    for frame in range(0, 12 * frames, 12):
+        lines.append(f"{frame} -1 {frame % 90} 25 BALL")
+        lines += [f"{frame} {player} {player} 20 PLAYER" for player in range(1, 11)]
+    return "\n".join(lines) + "\n"
+
+
+SCORE = score(5)
 SPORTVU = json.dumps(
     {
         "events": [

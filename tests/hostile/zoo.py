@@ -65,7 +65,7 @@ def _large(path: Path) -> None:
     os.truncate(path, 2**42)  # sparse: it takes no space
 
 
-ABSENT = "there is no such file|it has no|missing|no policy at"
+ABSENT = "there is no such file|it has no|missing|no policy at|no preset at|but no tuning"
 
 ANY_FILE: dict[str, tuple[Spoil, str]] = {
     "missing": (lambda path: path.unlink(), ABSENT),
@@ -73,7 +73,7 @@ ANY_FILE: dict[str, tuple[Spoil, str]] = {
     "fifo": (_replaced(lambda path: os.mkfifo(path)), "is no regular file"),
     "device": (_replaced(lambda path: path.symlink_to("/dev/zero")), "is no regular file"),
     "dangling link": (_replaced(lambda path: path.symlink_to("nowhere")), ABSENT),
-    "link to itself": (_replaced(lambda path: path.symlink_to(path.name)), "links that lead in a circle"),
+    "link to itself": (_replaced(lambda path: path.symlink_to(path.name)), "links that lead in a circle|but no tuning"),
     "4 TiB": (_large, "GiB"),
 }
 """What is done to files of every kind."""
@@ -103,12 +103,17 @@ NOT_JSON: dict[str, tuple[Spoil, str]] = {
     "empty object": (_bytes(b"{}"), ""),
 }
 """What is done to files of JSON."""
-JSON_KINDS = ("checkpoint", "store", "array", "predictor run", "policy run", "curve", "result", "record", "sportvu")
-TEXT_KINDS = tuple(kind for kind in KINDS if kind not in ("weights", "chunk", "training state", "policy"))
-OPTIONAL = ("curve", "record", "predictor run")
+JSON_KINDS = (
+    "checkpoint", "store", "array", "predictor run", "policy run", "curve", "result", "record", "sportvu", "tuning",
+)  # fmt: skip
+TEXT_KINDS = tuple(
+    kind for kind in KINDS if kind not in ("weights", "chunk", "training state", "policy", "tuning study")
+)
+OPTIONAL = ("curve", "predictor's curve", "accuracy", "record", "predictor run", "tuning", "tuning study")
 """Files that may be absent."""
 ACCEPTED = {
     ("annotations", "empty"): "a video without annotations has no episode, and a store without any is refused",
+    ("preset", "empty"): "a preset that changes nothing is the algorithm's own",
     ("scales", "empty"): "the first video without a scale is named",
 }
 """Inputs that are no damage, and why."""
@@ -318,6 +323,14 @@ VALUES: dict[str, list[tuple[str, Any, str]]] = {
         ("config.data", 5, "data"),
         ("config.lr", NAN, "lr"),
     ],
+    "tuning": [
+        ("config", None, "damaged"),
+        ("config", [], "damaged"),
+        ("config.steps", 5, "steps was 5"),
+        ("config.env_id", "\x1b[31mred", "env_id"),
+        ("provenance", 5, "damaged"),
+        ("provenance", [5], "damaged"),
+    ],
     "curve": [
         ("0", 5, "curve.json"),
         ("0.steps", "a", "steps"),
@@ -462,6 +475,18 @@ LINES: list[tuple[str, str, str, str]] = [
     ("levelx recording", "25", "0", "frameRate"),
     ("levelx recording", "25", "nan", "frameRate"),
     ("levelx recording", "0,3,25", "0,3,25\n0,3,25", "one recording"),
+    ("preset", "learning_rate = 3e-4", "lerning_rate = 1", "lerning_rate"),
+    ("preset", "learning_rate = 3e-4", "learning_rate = nan", "learning_rate"),
+    ("preset", "learning_rate = 3e-4", "learning_rate = -1", "learning_rate"),
+    ("preset", "learning_rate = 3e-4", "learning_rate = 'a'", "learning_rate"),
+    ("preset", "learning_rate = 3e-4", "gamma = 2", "gamma"),
+    ("preset", "learning_rate = 3e-4", "n_steps = 2.5", "n_steps"),
+    ("preset", "learning_rate = 3e-4", f"n_steps = {HUGE_NUMBER}", ""),
+    ("preset", "learning_rate = 3e-4", "n_steps = 1000000000000000", "n_steps"),
+    ("preset", "learning_rate = 3e-4", "batch_size = 0", "batch_size"),
+    ("preset", "learning_rate = 3e-4", "net_arch = [1000000000]", "net_arch"),
+    ("preset", "learning_rate = 3e-4", "net_arch = ['a']", "net_arch"),
+    ("preset", "learning_rate = 3e-4", "[table]\na = 1", "table"),
     ("study", "seeds = 2", f"seeds = {HUGE_NUMBER}", ""),
     ("study", "seeds = 2", "seeds = nan", "seeds"),
     ("study", "seeds = 2", "seeds = 1000000000000", "seeds"),
@@ -693,6 +718,10 @@ def binaries() -> Iterator[Case]:
         _state(lambda s: void([v.fill_(NAN) for v in s["model"].values() if v.is_floating_point()])),
         "finite",
     )
+    t = "tuning study"
+    yield Case(t, "zeros", lambda f: void((f / "tuning.db").write_bytes(b"\0" * 9000)), "tuning.db")
+    yield Case(t, "letters", lambda f: void((f / "tuning.db").write_bytes(b"a" * 9000)), "tuning.db")
+    yield Case(t, "half", _half("tuning.db"), "tuning.db")
     p = "policy"
     yield Case(p, "empty", lambda f: void((f / "policy.zip").write_bytes(b"")), "policy.zip")
     yield Case(p, "half", _half("policy.zip"), "policy.zip")

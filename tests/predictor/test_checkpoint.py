@@ -16,6 +16,7 @@ from predictor.checkpoint import (
     load_checkpoint,
     load_forecaster,
     name_of_folder,
+    names_of,
     resolve,
     save_checkpoint,
 )
@@ -477,3 +478,25 @@ def test_auto_is_a_device(path: Path, monkeypatch: pytest.MonkeyPatch):
     assert {parameter.device.type for parameter in loaded.parameters()} == {"cpu"}
     with pytest.raises(UserError, match="device 'cuda' was asked for but torch finds no CUDA device"):
         load_checkpoint(path, "cuda")
+
+
+def test_checkpoints_of_one_name_are_told_apart_by_the_folders_above(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    paths = ["a/run", "b/run/checkpoint", "c/other", "highway", "constant-velocity", "own:mine:make"]
+    names = ["a/run", "b/run", "other", "highway", "constant-velocity", "mine:make"]
+    assert list(names_of(paths).values()) == names
+    assert list(names_of(["x/s/run", "y/s/run", "z/run"]).values()) == ["x/s/run", "y/s/run", "z/run"]
+    assert names_of(["runs/highway", "highway"]) == {"runs/highway": "runs/highway", "highway": "highway"}
+    assert names_of([]) == {}
+
+
+@pytest.mark.parametrize("twice", [["a", "a"], ["runs/a", "runs/a/checkpoint"], ["highway", "highway"]])
+def test_a_checkpoint_given_twice_is_refused(twice: list[str]):
+    with pytest.raises(UserError, match="each checkpoint is given once, got"):
+        names_of(twice)
+
+
+def test_a_run_that_has_no_checkpoint_yet_is_named_as_one(tmp_path: Path):
+    (tmp_path / "config.json").write_text('{"config": {"out": "runs/x", "eval_every": 250}}')
+    with pytest.raises(UserError, match="is a training run without a checkpoint yet; train on, with --resume"):
+        load_checkpoint(tmp_path)

@@ -25,6 +25,7 @@ from predictor.evaluation.paper_tables import NUM_SAMPLES, Line
 from predictor.models import configure
 from predictor.reports.suite_tables import latex_table, markdown_report
 from predictor.suite import TABLES, SuiteConfig, jobs_of, line_config, line_folder, run_line, run_suite
+from predictor.support import jobs
 from predictor.support.errors import UserError
 from tests.predictor.helpers import spec
 
@@ -238,7 +239,7 @@ def test_suite_runs_what_is_missing_and_nothing_else(data: Path, tmp_path: Path,
     assert not content["failed"]
     for name in ("table.md", "table.tex", "table.json", "by_step.png"):
         assert (settings.folder / name).exists()
-    monkeypatch.setattr(suite, "_start", lambda *_: pytest.fail("a finished line was started again"))
+    monkeypatch.setattr(jobs, "_start", lambda *_: pytest.fail("a finished line was started again"))
     again = run_suite(settings)
     assert again["rows"] == content["rows"]
 
@@ -312,13 +313,13 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     class Done:
         exitcode = 0
 
-    def start(job: Any) -> tuple[Any, Path]:
+    def start(job: Any) -> Any:
         started.append(job.name)
         job.folder.mkdir(parents=True, exist_ok=True)
         run_line(job.config, job.line)
-        return Done(), job.folder / "log.txt"
+        return Done()
 
-    monkeypatch.setattr(suite, "_start", start)
+    monkeypatch.setattr(jobs, "_start", start)
     return started
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -260,7 +261,7 @@ def test_run_folder_says_how_it_was_made(tiny: None, circles: Path, tmp_path: Pa
     assert recorded["provenance"]["versions"]["torch"] == torch.__version__
     assert list((out / "tb").glob("events*"))
     assert state(out)["step"] == 7  # the last step is saved although eval_every does not divide it
-    assert sorted(p.name for p in out.iterdir()) == ["checkpoint", "config.json", "tb", "train_state.pt"]
+    assert sorted(p.name for p in out.iterdir()) == ["checkpoint", "config.json", "curve.json", "tb", "train_state.pt"]
 
 
 def test_what_a_killed_save_left_is_deleted(tiny: None, circles: Path, tmp_path: Path):
@@ -492,6 +493,15 @@ def test_bad_arguments_are_named(
     given = refused(monkeypatch, capsys, "--data", str(circles), "--out", str(tmp_path / "run"), *words)
     assert message in given
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_log_file_has_a_line_for_each_validation(
+    tiny: None, capsys: pytest.CaptureFixture[str], circles: Path, tmp_path: Path
+):
+    """Where there is no terminal, the progress bar shows nothing until the end."""
+    train(config(circles, tmp_path / "run"))
+    lines = re.findall(r"^step (\d+): energy score \d.*constant velocity .*$", capsys.readouterr().out, re.MULTILINE)
+    assert lines == ["2", "4", "6", "7"]
 
 
 def test_existing_run_is_not_overwritten(

@@ -463,7 +463,9 @@ def test_inattention_repeats_and_slips_are_random(attention: float, slip: float,
 
 @pytest.mark.parametrize("name", ["fast", "policy.zip"])
 def test_unknown_names_are_listed(name: str):
-    with pytest.raises(UserError, match=rf"driver must be one of {', '.join(DRIVER_NAMES)}, got '{name}'"):
+    with pytest.raises(
+        UserError, match=rf"driver must be one of {', '.join(DRIVER_NAMES)} or own:module:function, got '{name}'"
+    ):
         make_driver(name, make_multiagent_env("simple_tag_v3"), rng())
 
 

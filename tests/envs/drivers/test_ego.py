@@ -173,7 +173,7 @@ def test_policies_trained_on_forecasts_get_those_of_their_run(
 
 def test_unknown_names_are_listed(discrete: gym.Env):
     names = ", ".join((*EGO_DRIVER_NAMES, "lane-left", "lane-right", "faster", "slower"))
-    expected = rf"driver must be one of {names} or the path of a policy .zip, got 'fast'"
+    expected = rf"driver must be one of {names}, own:module:function or the path of a policy .zip, got 'fast'"
     with pytest.raises(UserError, match=expected):
         make_ego_driver("fast", discrete, np.random.default_rng(0))
 

@@ -80,7 +80,7 @@ def test_a_reader_that_cannot_be_bounded_is_named():
 
 
 def test_a_bound_out_of_range_is_named():
-    with pytest.raises(UserError, match="max_agents must be at least 1"):
+    with pytest.raises(UserError, match="max_agents must be a whole number from 1 to 65,536"):
         bounded(READER(None), None, 0)
 
 

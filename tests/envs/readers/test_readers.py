@@ -240,8 +240,13 @@ def test_other_families_are_named():
 
 
 @pytest.mark.parametrize(
-    ("perception_m", "max_agents", "got"), [(0.0, None, "12, 0.0"), (-5.0, None, "12, -5.0"), (None, 0, "0, 100.0")]
+    ("perception_m", "max_agents", "words"),
+    [
+        (0.0, None, "perception_m must be a positive number, got 0.0"),
+        (-5.0, None, "perception_m must be a positive number, got -5.0"),
+        (None, 0, "max_agents must be a whole number from 1 to 65,536, got 0"),
+    ],
 )
-def test_impossible_perception_is_named(perception_m: float | None, max_agents: int | None, got: str):
-    with pytest.raises(UserError, match=f"max_agents must be at least 1 and perception_m positive, got {got}"):
+def test_impossible_perception_is_named(perception_m: float | None, max_agents: int | None, words: str):
+    with pytest.raises(UserError, match=words):
         reader_for(short_env(30), perception_m, max_agents)

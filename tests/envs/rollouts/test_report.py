@@ -109,6 +109,16 @@ def test_tables_of_a_terminal_have_units_and_dashes():
     assert line.count("–") == 2
 
 
+def test_long_names_are_broken_and_not_cut():
+    name = "metadrive_reader:MetaDriveRoad-v0"
+    for table in (report.overview([result(name, "a-long-name")]), report.transfer([result(name, "a")] * 2, {})):
+        text = StringIO()
+        Console(width=60, file=text).print(table)
+        assert "…" not in text.getvalue()
+    cells = [line.split("│")[1].strip() for line in shown(report.overview([result(name)])).splitlines() if "│" in line]
+    assert set("".join(cells).split(name)) == {""}  # once in each part of the table
+
+
 def test_lines_by_horizon_carry_the_numbers():
     figure, ax = plt.subplots()
     report.plot_by_horizon(ax, [*full().lines, full().constant_velocity], 0.1, "by_step_m", "displacement [m]")

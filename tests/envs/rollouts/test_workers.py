@@ -38,7 +38,7 @@ def record(task: collect._Task) -> int:
 
 def tasks(kinds: list[str], seeds: list[int]) -> list[collect._Task]:
     settings = collect.recording_of(CollectConfig("two-way-v0", Path("unused"), workers=1))
-    return [collect._Task(env_id(kind), "random", seed, settings) for kind, seed in zip(kinds, seeds, strict=True)]
+    return [collect._Task(env_id(kind), "random", seed, settings, "") for kind, seed in zip(kinds, seeds, strict=True)]
 
 
 def test_other_episodes_go_on_beside_those_that_fail():

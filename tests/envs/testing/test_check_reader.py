@@ -1,6 +1,7 @@
 """`check_reader`: finds nothing in the readers of this project, and each of the planted mistakes."""
 
 import itertools
+import re
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,6 +11,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from envs.drivers.sampled_actions import uniform_action
+from envs.own_observation import own_spaces
 from envs.readers.base import Reader
 from envs.readers.function import FunctionReader
 from envs.registry import make_env
@@ -225,3 +228,55 @@ def test_many_agents_are_checked_too():
 def test_without_a_reader_there_is_nothing_to_check():
     with pytest.raises(UserError, match="no scene reader"):
         check_reader(gym.make("CartPole-v1"))
+
+
+class Parked(Pushed):
+    """A crowd that all but stands still and, once in an episode, sinks by less than a centimetre."""
+
+    def reset(self, **options: Any) -> Any:
+        found = super().reset(**options)
+        self._park()
+        return found
+
+    def step(self, action: np.ndarray) -> Any:
+        found = super().step(action)
+        self._park()
+        return found
+
+    def _park(self) -> None:
+        for walker in self.people:
+            x_m = 10.0 * walker.number + 0.002 * SPEC.dt_s * self.time
+            walker.state = np.array([x_m, 0.008 * (self.time > 3), 0.002, 0.0])
+
+
+def test_what_sinks_by_less_than_a_centimetre_has_not_jumped():
+    """As vehicles do that a simulator has just put on the road: far below the 10 m of the scene's scale."""
+    problems = reader_problems(Parked(shift_m=40.0), FunctionReader(read_crowd, SPEC))
+    assert not any("jumps" in line or "hands" in line for line in problems), problems
+
+
+class OldSpace:
+    """A space of another package, as VMAS has them of gym."""
+
+    low, high, shape, dtype = -1.0, 1.0, (2,), np.float32
+
+    def seed(self, seed: int) -> None: ...
+
+    def sample(self) -> np.ndarray:
+        return np.zeros(2, np.float32)
+
+
+class OldSwarm(Swarm):
+    def action_space(self, agent: str) -> Any:
+        return OldSpace()
+
+
+@pytest.mark.unchecked
+def test_spaces_of_another_package_are_found_and_refused():
+    sentence = r"the action space must be a space of gymnasium, got .*\.OldSpace; make it anew, for example gymnasium"
+    problems = reader_problems(OldSwarm(), SwarmReader)
+    assert any(re.search(sentence, line) for line in problems), problems
+    with pytest.raises(UserError, match=sentence):
+        uniform_action(OldSpace(), np.random.default_rng(0), "drivers")  # type: ignore[arg-type]
+    with pytest.raises(UserError, match="the own observation space of 'it' must be a space of gymnasium, got"):
+        own_spaces(OldSpace(), "'it'")  # type: ignore[arg-type]

@@ -142,7 +142,12 @@ def test_locations_and_splits(tmp_path: Path, loader: Loader):
     assert [e.label for e in chosen] == [f"1/{name}" for name in names[1::2]]
     loader.store.rename(tmp_path / "away")
     (loader.out / "store.md").unlink()
-    loader.refuses(tmp_path / "data", f"{tmp_path / 'data'} gives no episode for split 'all'", "--locations", "9")
+    loader.refuses(
+        tmp_path / "data",
+        f"{tmp_path / 'data'} has no recording of locations ('9',); there are ['0', '1']",
+        "--locations",
+        "9",
+    )
 
 
 @pytest.mark.parametrize(

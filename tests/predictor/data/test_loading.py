@@ -176,7 +176,12 @@ def test_what_is_in_the_way_stays(tmp_path: Path, name: str):
     (tmp_path / name).write_text("mine")
     with pytest.raises(UserError, match=rf"{name} exists; choose another path or pass --overwrite"):
         config.check_paths()
-    LoaderConfig(tmp_path, tmp_path / "store", overwrite=True).check_paths()
+    replacing = LoaderConfig(tmp_path, tmp_path / "store", overwrite=True)
+    if name == "store":
+        with pytest.raises(UserError, match="store is not an episode store and will not be replaced"):
+            replacing.check_paths()
+    else:
+        replacing.check_paths()
     with pytest.raises(UserError, match="no source at"):
         LoaderConfig(tmp_path / "absent", tmp_path / "other").check_paths()
 

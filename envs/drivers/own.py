@@ -1,0 +1,50 @@
+"""Drivers of a user's own, by name: "own:module:function", wherever collection and evaluation take a driver.
+
+What the name stands for is called once in each episode, after the reset, as `function(env, rng)`, and returns the
+driver: a function from observations to actions. With one ego these are the environment's own observation and its
+action; in a PettingZoo environment the observations of all agents and an action for each that lives, by name. Its
+module is imported, so such a name is code.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from predictor.own_forecasters import PREFIX
+from predictor.support.errors import UserError
+from predictor.support.importing import load_named
+
+
+class OwnDriver:
+    """Drives one episode as the user's function says.
+
+    Args:
+        name: "own:module:function".
+        env: environment that is driven.
+        rng: source of all randomness of this episode.
+
+    Raises:
+        UserError: there is no such function.
+    """
+
+    def __init__(self, name: str, env: Any, rng: np.random.Generator) -> None:
+        """Imports the function; it is called at the first step, when the environment has been reset."""
+        if ":" not in name.removeprefix(PREFIX):
+            raise UserError(f"a driver of your own is {PREFIX}module:function, got '{name}'")
+        self._name, self._make, self._env, self._rng = name, load_named(name.removeprefix(PREFIX)), env, rng
+        self._act: Any = None
+
+    def __call__(self, observation: Any) -> Any:
+        """Returns the action of an observation, or the actions of all agents.
+
+        Raises:
+            UserError: the user's function returned something that is no driver.
+        """
+        if self._act is None:
+            self._act = self._make(self._env, self._rng)
+            if not callable(self._act):
+                raise UserError(
+                    f"driver '{self._name}' must give a function from observations to actions, got "
+                    f"{type(self._act).__name__}"
+                )
+        return self._act(observation)

@@ -1,0 +1,43 @@
+"""Checks of an episode before it is written: types and shapes of its arrays, its ids."""
+
+from typing import Any
+
+import numpy as np
+
+from predictor.scene import SceneSpec
+from predictor.support.errors import UserError, short
+
+
+def check_episode(episode: Any, spec: SceneSpec, where: str) -> None:
+    """Checks types and shapes of an episode's states, presence and ids.
+
+    Args:
+        episode: what was given as an `Episode`.
+        spec: layout of the states.
+        where: path of the store, for messages.
+
+    Raises:
+        UserError: they do not fit, an id is negative, or two agents have the same.
+    """
+    arrays = {name: getattr(episode, name, None) for name in ("states", "valid", "ids")}
+    for name, kinds, wanted, axes in (
+        ("states", "f", "floating point", 3),
+        ("valid", "b", "bool", 2),
+        ("ids", "iu", "integers", 1),
+    ):
+        array = arrays[name]
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds or array.ndim != axes:
+            got = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else short(repr(array), 60)
+            raise UserError(f"{where}: {name} of an episode must be an array of {wanted} with {axes} axes, got {got}")
+    states, valid, ids = arrays["states"], arrays["valid"], arrays["ids"]
+    assert states is not None and valid is not None and ids is not None
+    if not len(states) or states.shape[:2] != valid.shape or states.shape[1] != len(ids):
+        raise UserError(
+            f"{where}: an episode needs one step or more, and states, valid and ids of the same agents, got "
+            f"{states.shape}, {valid.shape} and {ids.shape}"
+        )
+    if states.shape[2] != spec.num_features:
+        wanted = f"{spec.num_features} features {spec.feature_names}"
+        raise UserError(f"{where}: states need {wanted}, got {states.shape[2]}")
+    if (ids < 0).any() or len(np.unique(ids)) != len(ids):
+        raise UserError(f"{where}: ids of an episode must be different and not negative, got {short(ids.tolist())}")

@@ -1,0 +1,62 @@
+"""Figures of reports in one style: panels side by side, one legend below, colours safe for colour-blind readers.
+
+Files are SVG, and equal from run to run.
+"""
+
+import io
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f7f7f", "#8c564b", "#9467bd")
+"""Colours of lines, in the order of their use; the first eight differ for colour-blind readers, too."""
+GREY = "#777777"
+"""Colour of what the lines are compared with."""
+_WIDTH_IN, _HEIGHT_IN, _DPI = 5.4, 4.0, 130
+
+
+def panels(count: int) -> tuple[Figure, list[Axes]]:
+    """Returns a figure and its axes, at most two in a line."""
+    matplotlib.use("Agg")
+    columns = min(count, 2)
+    lines = -(-count // columns)
+    figure, grid = plt.subplots(
+        lines, columns, figsize=(_WIDTH_IN * columns, _HEIGHT_IN * lines + 0.6), squeeze=False, layout="constrained"
+    )
+    axes = list(grid.flat)
+    for spare in axes[count:]:
+        spare.set_axis_off()
+    return figure, axes[:count]
+
+
+def svg_of(figure: Figure, axes: Sequence[Axes]) -> str:
+    """Returns a figure as SVG without XML header, with one legend below the panels, and closes it."""
+    return files_of(figure, axes)[0]
+
+
+def files_of(figure: Figure, axes: Sequence[Axes]) -> tuple[str, bytes]:
+    """Returns a figure as SVG without XML header and as PNG, with one legend below the panels, and closes it."""
+    _finish(figure, axes)
+    written, pixels = io.StringIO(), io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": "dgvae-rl"}):
+        figure.savefig(written, format="svg", metadata={"Date": None, "Creator": None})
+    figure.savefig(pixels, format="png", dpi=_DPI)
+    plt.close(figure)
+    return re.sub(r"^.*?(?=<svg)", "", written.getvalue(), flags=re.DOTALL).strip(), pixels.getvalue()
+
+
+def _finish(figure: Figure, axes: Sequence[Axes]) -> None:
+    """Draws grids, and one legend below the panels."""
+    entries: dict[str, Any] = {}
+    for ax in axes:
+        ax.grid(alpha=0.3)
+        ax.spines[["top", "right"]].set_visible(False)
+        handles, labels = ax.get_legend_handles_labels()
+        entries |= {label: entries.get(label, handle) for handle, label in zip(handles, labels, strict=True)}
+    if entries:
+        figure.legend(entries.values(), entries, loc="outside lower center", ncols=3, frameon=False, fontsize=9)

@@ -1,0 +1,85 @@
+"""Checks of batches of scenes and of what is asked of a forecast, cheap enough for every step."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from predictor.scene import PADDING_ID, SceneBatch
+from predictor.support.errors import UserError
+from predictor.support.memory import check_memory
+
+MOST_STEPS = 100_000
+"""Largest number of steps of a forecast."""
+_KINDS = {"states": ("f", "floating point"), "ids": ("iu", "integers"), "valid": ("b", "bool")}
+
+
+def check_batch(scenes: SceneBatch, envs: int, agents: int, features: int) -> None:
+    """Checks types and shapes of a batch of scenes; no value is read.
+
+    Args:
+        scenes: batch.
+        envs: required number of scenes.
+        agents: required number of agents of each, padding included.
+        features: required number of features of an agent.
+
+    Raises:
+        UserError: they do not fit.
+    """
+    for name, (kinds, wanted) in _KINDS.items():
+        array = getattr(scenes, name)
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds:
+            got = f"{array.dtype}" if isinstance(array, np.ndarray) else type(array).__name__
+            raise UserError(f"{name} of scenes must be a NumPy array of {wanted}, got {got}")
+        shape = (envs, agents, features) if name == "states" else (envs, agents)
+        if array.shape != shape:
+            raise UserError(f"{name} of {envs} scenes must have the shape {shape}, got {array.shape}")
+
+
+def check_states(states: Float[np.ndarray, "envs agents state"]) -> None:
+    """Checks that the states of all agents are finite; those of absent agents must be zeros here.
+
+    Raises:
+        UserError: some are not.
+    """
+    if not np.isfinite(states).all():
+        scene, agent, _ = np.argwhere(~np.isfinite(states))[0].tolist()
+        raise UserError(f"states must be finite, got {states[scene, agent].tolist()} (scene {scene}, agent {agent})")
+
+
+def check_ids(ids: Int[np.ndarray, "envs agents"], valid: Bool[np.ndarray, "envs agents"]) -> None:
+    """Checks that the ids of the agents of each scene are different and not negative.
+
+    Args:
+        ids: ids, `PADDING_ID` where `valid` is not.
+        valid: which entries hold an agent.
+
+    Raises:
+        UserError: they are not.
+    """
+    if (ids < 0)[valid].any():
+        raise UserError(f"ids of valid agents must be non-negative, got {int(ids[valid].min())}")
+    ordered = np.sort(ids, axis=1)
+    twice = (ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] != PADDING_ID)
+    if twice.any():
+        scene, place = np.argwhere(twice)[0].tolist()
+        raise UserError(f"ids must be unique within a scene, got {int(ordered[scene, place])} twice (scene {scene})")
+
+
+def check_request(horizon_steps: object, num_samples: object, values_each: int) -> None:
+    """Checks how many steps and samples of a forecast are asked for.
+
+    Args:
+        horizon_steps: number of steps.
+        num_samples: number of samples.
+        values_each: number of values of a step of one sample, for the estimate of memory.
+
+    Raises:
+        UserError: one is no whole number from 1 on, or the forecast cannot fit into the memory.
+    """
+    for name, value in (("horizon_steps", horizon_steps), ("num_samples", num_samples)):
+        if not isinstance(value, int | np.integer) or value < 1:
+            raise UserError(f"{name} must be a whole number of at least 1, got {value!r}")
+    assert isinstance(horizon_steps, int | np.integer) and isinstance(num_samples, int | np.integer)
+    if horizon_steps > MOST_STEPS:
+        raise UserError(f"horizon_steps must be at most {MOST_STEPS:,}, got {horizon_steps:,}")
+    needed = 4 * int(horizon_steps) * int(num_samples) * values_each
+    check_memory(needed, f"a forecast with num_samples={num_samples:,}", "ask for fewer samples or steps")

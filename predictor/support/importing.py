@@ -1,0 +1,23 @@
+"""Imports what a text names: "module:function", for options that take code of a user's own."""
+
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+from predictor.support.errors import UserError
+
+
+def load_named(path: str) -> Callable[..., Any]:
+    """Imports what "module:function" names: a function, a class, or another object that can be called.
+
+    Raises:
+        UserError: there is no such module, or it has no such function or class.
+    """
+    module, _, name = path.partition(":")
+    try:
+        found: Callable[..., Any] | None = getattr(importlib.import_module(module), name, None)
+    except (ImportError, ValueError) as error:
+        raise UserError(f"cannot import '{module}' for '{path}': {error}; is its package installed?") from error
+    if not callable(found):
+        raise UserError(f"module '{module}' has no function or class '{name}'")
+    return found

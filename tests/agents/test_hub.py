@@ -1,0 +1,79 @@
+"""Policies on a hub: pushed with their warning, and loaded only by those who say that they trust them."""
+
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from agents import hub as policies
+from agents.hub import policy_from_hub, push_policy_to_hub
+from agents.policy import load_policy
+from agents.push import main
+from agents.runs import save_model
+from agents.task import Task
+from agents.watch import WatchConfig, write_film
+from predictor.support.errors import UserError, run_entry_point
+from tests.agents.test_policy import FAST, FEW, saved
+from tests.hub_stand_in import Hub, hub_for_test
+
+pytest.importorskip("huggingface_hub")
+
+
+@pytest.fixture
+def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+    with hub_for_test(tmp_path / "cache", monkeypatch, policies._fetched) as served:
+        yield served
+
+
+def test_a_policy_is_loaded_from_a_hub_by_those_who_trust_it(hub: Hub, tmp_path: Path):
+    saved(tmp_path, Task(FAST, "constant-velocity", env_kwargs=FEW), run=True)
+    push_policy_to_hub(tmp_path, "me/fast")
+    files = hub.files("me/fast")
+    assert sorted(files) == ["README.md", "config.json", "policy.zip"]
+    card = files["README.md"].decode()
+    assert "holds pickled Python objects: loading it runs code" in card and "trust_pickle=True" in card
+    asked = len(hub.asked)
+    for load in (load_policy, policy_from_hub, lambda name: write_film(WatchConfig(Path(name)))):
+        with pytest.raises(UserError, match="loading it runs code of whoever wrote it; if you trust them, say so with"):
+            load("hub:me/fast")
+    assert len(hub.asked) == asked, "nothing is downloaded before"
+    policy, env = load_policy("hub:me/fast", trust_pickle=True)
+    observation, _ = env.reset(seed=3)
+    known, twin = load_policy(tmp_path)
+    assert policy(observation) == known(twin.reset(seed=3)[0])
+    film = write_film(WatchConfig(Path("hub:me/fast"), out=tmp_path / "film.mp4", trust_pickle=True))
+    assert film.read_bytes()[4:8] == b"ftyp"
+
+
+def test_a_predictor_is_no_policy(hub: Hub):
+    hub.commit("me/merge", config__json=b"{}")
+    with pytest.raises(UserError, match="hub:me/merge has no policy.zip and is not what is asked for"):
+        load_policy("hub:me/merge", trust_pickle=True)
+
+
+def test_a_forecaster_that_others_lack_is_named(hub: Hub, tmp_path: Path):
+    task = Task(FAST, "constant-velocity", env_kwargs=FEW)
+    note = task.note
+    assert note.forecaster is not None
+    note = replace(note, forecaster=replace(note.forecaster, checkpoint="runs/merge"))
+    path, model = saved(tmp_path, task)
+    save_model(model, path, note=note)
+    with pytest.raises(UserError, match="was trained on the forecaster 'runs/merge', a folder that others do not have"):
+        push_policy_to_hub(path, "me/fast")
+    assert hub.repositories == {}
+
+
+def test_the_command_knows_policies_from_predictors(
+    hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    path, _ = saved(tmp_path, Task(FAST, "none", env_kwargs=FEW))
+    for what, name, files in (
+        ("merge", "me/merge", ["README.md", "config.json", "model.safetensors"]),
+        (str(path), "me/fast", ["README.md", "policy.zip"]),
+    ):
+        monkeypatch.setattr(sys, "argv", ["push", what, name])
+        run_entry_point(main)
+        assert capsys.readouterr().out == f"pushed to {hub.address}/{name}\n"
+        assert sorted(hub.files(name)) == files

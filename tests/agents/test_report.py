@@ -1,0 +1,171 @@
+"""The command `agents.report`: one page of a run that needs nothing else, and one sentence for what is no run."""
+
+import json
+import re
+import sys
+from dataclasses import asdict
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agents.forecast_errors import CONSTANT_ERROR, FORECAST_ERROR
+from agents.report import ReportConfig, main, write_report
+from agents.results import Evaluation, read_evaluation
+from agents.vec_envs import EpisodeResult
+from envs.video.files import write_video
+from predictor.reports.document import PNG
+from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import write_json
+from tests.hostile.samples import RUN
+
+MADE = {"command": "python train_policy.py", "commit": "abc", "machine": "m", "time": "now", "versions": {"torch": "2"}}
+POINTS = [
+    {"steps": 10 * i, "return": 3.0 * i, "episodes": 4, "seconds": 1.0, FORECAST_ERROR: 1.25 * i, CONSTANT_ERROR: 7.5}
+    for i in (1, 2, 3)
+]
+
+
+def episodes(base: float, action: str, first: int = 100) -> list[EpisodeResult]:
+    return [EpisodeResult(first + i, base + i, 30 - i, i == 0, 22.0, {}, {action: 30 - i}) for i in range(7)]
+
+
+def evaluation() -> Evaluation:
+    mixed = [EpisodeResult(e.seed, e.episode_return, e.length, e.crashed, 25.0) for e in episodes(20.0, "")]
+    return Evaluation("highway-fast-v0", 100, {"ppo (forecast)": mixed, "slower": episodes(11.0, "slower")})
+
+
+def a_run(folder: Path, **config: Any) -> Path:
+    run = folder / "run"
+    run.mkdir()
+    write_json(run / "config.json", {"config": RUN | config, "provenance": [MADE]})
+    write_json(run / "curve.json", POINTS)
+    evaluation().write(run, algorithm="ppo")
+    return run
+
+
+def page_of(run: Path, **options: Any) -> str:
+    return write_report(ReportConfig(run, **options)).read_text()
+
+
+class Addresses(HTMLParser):
+    """Collects what a page loads and links."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found += [value for name, value in attrs if name in ("src", "href", "poster", "xlink:href") and value]
+
+
+def test_the_page_shows_the_run_and_loads_nothing(tmp_path: Path):
+    run = a_run(tmp_path)
+    pictures = (np.full((48, 64, 3), 40 + i, np.uint8) for i in range(90))
+    write_video(run / "video.mp4", pictures, 30)
+    page = page_of(run)
+    for shown in (
+        "<h1>ppo on highway-fast-v0, sees forecasts</h1>", "mean return 23.00 over 7 episodes, 14 % of them with",
+        "slower, the strongest driver that always does the same, has 14.00", "<h2>Learning curve</h2>", "<svg",
+        "<td>ppo (forecast)</td><td>23.00 ± 0.82</td>", "+9.00 (+9.00 to +9.00)", "<h2>Worst episodes</h2>",
+        "<td>100</td><td>20.00</td><td>30</td><td>yes</td><td>25.0</td>", "<h2>Forecast errors in the loop</h2>",
+        "<td>30</td><td>3.75</td><td>7.50</td>", "python train_policy.py; commit abc; m; now.", "Versions: torch 2",
+        "<td>env_id</td><td>highway-fast-v0</td>",
+    ):  # fmt: skip
+        assert shown in page, shown
+    assert str(tmp_path) not in page, "no paths"
+    loaded = Addresses()
+    loaded.feed(page)
+    inside = [address.partition(";")[0] for address in loaded.found if address.startswith("data:")]
+    assert inside == ["data:image/jpeg", "data:video/mp4"], "a still, and the film"
+    assert [address for address in loaded.found if not address.startswith(("data:", "#"))] == ["video.mp4"]
+    assert not re.search(r"https?://(?!www\.w3\.org|purl\.org|creativecommons\.org|matplotlib\.org)", page)
+    assert (run / "curves.png").read_bytes().startswith(PNG)
+
+
+def test_large_films_are_linked_and_what_is_no_film_has_no_still(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    run = a_run(tmp_path)
+    (run / "worst.mp4").write_bytes(b"no film at all")
+    monkeypatch.setattr("agents.run_page.INSIDE_BYTES", 3)
+    page = page_of(run)
+    assert '<video controls preload="none" src="worst.mp4">' in page
+    assert "The worst episode of the evaluation." in page and "poster" not in page
+
+
+def test_names_of_strangers_are_text(tmp_path: Path):
+    run = a_run(tmp_path, env_id="<script>alert(1)</script>")
+    (run / "a'\"><b>.mp4").write_bytes(b"x")
+    page = page_of(run)
+    assert "<script" not in page and "&lt;script&gt;" in page and "<b>" not in page
+
+
+def test_a_run_that_goes_on_is_shown_as_far_as_it_is(tmp_path: Path):
+    run = a_run(tmp_path)
+    for name in ("summary.json", "curve.json"):
+        (run / name).unlink()
+    page = page_of(run)
+    assert "Not evaluated yet" in page and "<svg" not in page and not (run / "curves.png").exists()
+
+
+def test_accuracy_is_shown_with_the_worst_forecasts(tmp_path: Path):
+    run, measured = a_run(tmp_path), tmp_path / "accuracy"
+    line = {"name": "dG-VAE", "num_samples": 6, "ade_m": 0.5, "fde_m": 1.0, "min_ade_m": 0.25, "agents": 1234}
+    write_json(measured / "accuracy.json", {"results": [{
+        "env_id": "merge-v1", "driver": "varied", "model": line, "model_samples": line, "constant_velocity": line,
+    }]})  # fmt: skip
+    (measured / "merge-v1.merge.worst.png").write_bytes(PNG + b"rest")
+    (measured / "other.png").write_bytes(PNG)
+    page = page_of(run, accuracy=(measured,))
+    assert "merge-v1, driven varied:" in page and page.count("The worst forecasts, at most one per episode") == 2
+    assert "<td>dG-VAE</td><td>6</td><td>0.5</td><td>1</td><td>0.25</td><td>–</td><td>–</td><td>1,234</td>" in page
+    assert page.count("data:image/png") == 1
+    (measured / "merge-v1.merge.worst.png").write_bytes(b"GIF")
+    with pytest.raises(UserError, match=r"worst\.png is no PNG picture; remove it or make it anew"):
+        page_of(run, accuracy=(measured,))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "sentence"),
+    [
+        ("summary.json", {"env_id": "x", "first_seed": 0}, "key 'episodes' is missing"),
+        ("summary.json", {"env_id": "x", "first_seed": 0, "episodes": {}}, "has no episodes"),
+        ("summary.json", {"env_id": "x", "first_seed": 0, "episodes": {"p": []}}, "episodes.p has no episode"),
+        ("summary.json", {"env_id": 3, "first_seed": 0, "episodes": {"p": [{"seed": 1}]}}, "key 'episode_return' is"),
+        ("curve.json", [{"steps": 3}], "key 'return' is missing"),
+        ("config.json", {"config": {"steps": 3}}, "is the config of neither train_policy.py nor predictor.train"),
+        ("config.json", {"config": RUN, "provenance": [3]}, "provenance must be a JSON object, got 3"),
+    ],
+)  # fmt: skip
+def test_a_damaged_run_is_one_sentence(tmp_path: Path, name: str, content: Any, sentence: str):
+    run = a_run(tmp_path)
+    (run / name).write_text(json.dumps(content))
+    with pytest.raises(UserError, match=re.escape(sentence)):
+        page_of(run)
+    assert not (run / "report.html").exists()
+
+
+def test_too_many_episodes_are_refused_before_they_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    run = a_run(tmp_path)
+    monkeypatch.setattr("agents.results.MOST_EPISODES", 6)
+    with pytest.raises(UserError, match="a policy may have at most 6 episodes, got 7"):
+        page_of(run)
+
+
+def test_the_command_names_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    run = a_run(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["report", str(run)])
+    run_entry_point(main)
+    assert capsys.readouterr().out == f"report: {run / 'report.html'}\n"
+
+
+def test_an_evaluation_is_read_as_it_was_written(tmp_path: Path):
+    made = evaluation()
+    made.results["ppo (forecast)"][2] = EpisodeResult(102, 3.0, 4, None, float("nan"), {"a": 1.0}, {"b": 0})
+    made.write(tmp_path)
+    found = read_evaluation(tmp_path / "summary.json")
+    assert found.markdown() == made.markdown()
+    assert [str(asdict(e)) for e in found.results["slower"]] == [str(asdict(e)) for e in made.results["slower"]]

@@ -1,0 +1,110 @@
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agents.evaluate import checked_drivers
+from agents.task import Task
+from envs.drivers.all_agents import make_driver
+from envs.drivers.ego import make_ego_driver
+from envs.drivers.trained import trained_driver
+from envs.rollouts.world import open_world
+from envs.sb3.policy_file import PolicyNote
+from envs.supervision import EnvironmentFailedError
+from predictor.support.errors import UserError
+from tests.envs.drivers.test_trained import SPREAD, forecast_env, save_run
+
+ROAD = "highway-fast-v0"
+BRAKES, DODGES, FLOCK, NUMBER, RAISES = (
+    f"own:tests.envs.own_code:{name}" for name in ("brakes", "Dodges", "flock", "a_number", "raises")
+)
+
+
+def states(env_id: str, driver: str, seed: int, checkpoint: str | None = None, steps: int = 4) -> list[np.ndarray]:
+    world = open_world(env_id, driver, checkpoint)
+    world.reset(seed)
+    found = [world.full_scene().states]
+    for _ in range(steps):
+        if world.step():
+            break
+        found.append(world.full_scene().states)
+    world.close()
+    return found
+
+
+def test_an_ego_does_what_the_users_function_says():
+    braked = states(ROAD, BRAKES, seed=3)
+    for own, known in zip(braked, states(ROAD, "slower", seed=3), strict=True):
+        np.testing.assert_array_equal(own, known)
+    assert braked[-1][0, 2] < braked[0][0, 2] - 4.0
+
+
+@pytest.mark.parametrize(("env_id", "driver"), [(ROAD, DODGES), (SPREAD, FLOCK)])
+def test_an_episode_is_a_function_of_its_seed(env_id: str, driver: str):
+    first = [states(env_id, driver, seed) for seed in range(4)]
+    for one, again in zip(first, [states(env_id, driver, seed, "constant-velocity") for seed in range(4)], strict=True):
+        assert all(np.array_equal(a, b) for a, b in zip(one, again, strict=True))
+
+
+def test_all_agents_do_what_the_users_function_says():
+    found = states(SPREAD, FLOCK, seed=1)
+    moved = (found[-1] - found[0])[:3, :2]
+    np.testing.assert_allclose(moved[1:], np.broadcast_to(moved[:1], (2, 2)), atol=0.2)  # agents may push each other
+    assert np.abs(moved).max() > 0.2
+
+
+def test_a_world_takes_it_over():
+    world = open_world(ROAD, "idle")
+    world.drive(BRAKES)
+    world.reset(3)
+    world.step()
+    np.testing.assert_array_equal(world.full_scene().states, states(ROAD, "slower", seed=3)[1])
+    with pytest.raises(UserError, match="driver must be one of random"):
+        world.drive("absent")
+
+
+def test_it_stands_beside_a_policy():
+    task = Task(ROAD, "none")
+    assert checked_drivers(task, (BRAKES, "slower")) == (BRAKES, "slower")
+    with pytest.raises(UserError, match="has no function or class 'absent'"):
+        checked_drivers(task, ("own:tests.envs.own_code:absent",))
+
+
+@pytest.mark.parametrize(("env_id", "make"), [(ROAD, make_ego_driver), (SPREAD, make_driver)])
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        (
+            "own:absent_module:drive",
+            "cannot import 'absent_module' for 'absent_module:drive'.*package installed",
+        ),
+        ("own:tests.envs.own_code:absent", "module 'tests.envs.own_code' has no function or class 'absent'"),
+        ("own:drive", "a driver of your own is own:module:function, got 'own:drive'"),
+    ],
+)
+def test_a_name_that_stands_for_nothing_is_one_sentence(env_id: str, make: Any, name: str, sentence: str):
+    env = Task(env_id, "none").make()
+    with pytest.raises(UserError, match=sentence):
+        make(name, env, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        (NUMBER, f"driver '{NUMBER}' must give a function from observations to actions, got int"),
+        (RAISES, "highway-fast-v0, seed 0, step 1: KeyError: 'goal'"),
+    ],
+)
+def test_a_function_that_fails_is_named(name: str, sentence: str):
+    world = open_world(ROAD, name)
+    world.reset(0)
+    with pytest.raises(EnvironmentFailedError, match=sentence):
+        world.step()
+
+
+def test_a_policys_note_imports_nothing(tmp_path: Any, monkeypatch: pytest.MonkeyPatch):
+    path, _ = save_run(tmp_path, Task(SPREAD, "none", learners=("agent_0",)))
+    note = PolicyNote(None, ("agent_0",), "own:os:system", SPREAD)
+    monkeypatch.setattr("envs.drivers.trained.note_of", lambda path: note)
+    with pytest.raises(UserError, match="the note names driver 'own:os:system', which imports code"):
+        trained_driver(path, forecast_env(), np.random.default_rng(0))

@@ -1,0 +1,49 @@
+"""Simulators of which a process has one at a time (MetaDrive): collection and evaluation take them one by one."""
+
+from pathlib import Path
+
+import pytest
+
+from envs import collect, evaluate
+from predictor.data.store import read_store
+from predictor.support.reading import read_json
+from tests.envs.helpers import run_command
+from tests.envs.own_code import ONE_ONLY, OneOnly
+
+
+@pytest.fixture(autouse=True)
+def free(monkeypatch: pytest.MonkeyPatch):
+    """No simulator runs in this process, before and after."""
+    collect.close_world()
+    monkeypatch.setattr(OneOnly, "running", None)
+    yield
+    collect.close_world()
+
+
+def test_a_second_one_is_refused():
+    first, second = OneOnly(), OneOnly()
+    first.reset(seed=0)
+    with pytest.raises(RuntimeError, match="an engine in this process already"):
+        second.reset(seed=0)
+    first.close()
+    second.reset(seed=0)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_collection_in_one_process_and_in_several(
+    workers: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    arguments = ["--env-id", ONE_ONLY, "--out", str(tmp_path / "store"), "--episodes", "5", "--workers", str(workers)]
+    code, errors, _ = run_command(collect.main, arguments, monkeypatch, capsys)
+    assert (code, errors) == (0, [])
+    labels = [episode.label for episode in read_store(tmp_path / "store").episodes]
+    assert labels == ["varied", "random", "idle", "varied", "random"]
+
+
+def test_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
+    arguments = ["--env-ids", ONE_ONLY, "--checkpoint", "constant-velocity", "--episodes", "3", "--workers", "2"]
+    arguments += ["--horizon-steps", "2", "--num-samples", "2", "--out", str(tmp_path)]
+    code, errors, _ = run_command(evaluate.main, arguments, monkeypatch, capsys)
+    assert (code, errors) == (0, [])
+    (result,) = read_json(tmp_path / "accuracy.json")["results"]
+    assert result["model"]["agents"] > 0
