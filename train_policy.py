@@ -9,7 +9,7 @@ summary.md, episodes.parquet (where pyarrow is installed) and video.mp4.
 import os
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import torch
 from rich.console import Console
@@ -67,6 +67,12 @@ def sizes_for(env_id: str, backend: Backend) -> Sizes:
 @dataclass(frozen=True)
 class TrainPolicyConfig:
     """Trains a policy on forecasts, evaluates it and films it."""
+
+    EVERYDAY: ClassVar = (
+        "env_id", "algorithm", "set", "observe", "checkpoint", "num_samples", "what_if", "env_kwargs", "steps",
+        "num_envs", "backend", "seed", "out", "resume", "eval_episodes", "video", "device",
+    )  # fmt: skip
+    """Fields that --help explains."""
 
     env_id: Annotated[str, Renamed("env")] = "highway-fast-v0"
     """Environment to train on: Gymnasium id (highway-fast-v0) or PettingZoo parallel id (simple_tag_v3)."""

@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
@@ -93,6 +93,9 @@ def evaluate_with_progress(
 @dataclass(frozen=True)
 class EvaluateConfig:
     """Evaluates the policy of a training run on held-out seeds, beside random, idle and constant actions."""
+
+    EVERYDAY: ClassVar = ("run_dir", "policy", "env_id", "env_kwargs", "checkpoint", "episodes", "seed", "out")
+    """Fields that --help explains."""
 
     run_dir: Path | None = None
     """Folder of the training run, as train_policy.py wrote it; leave it out with --policy."""

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 from envs.readers.highway_labels import ATTRIBUTE_NAMES
 from envs.registry import arguments_of
@@ -49,6 +49,12 @@ PACKAGES = ("highway-env", "mpe2", "pettingzoo", "envpool", "gymnasium", "numpy"
 @dataclass(frozen=True)
 class CollectConfig:
     """Records episodes of an environment into an episode store."""
+
+    EVERYDAY: ClassVar = (
+        "env_id", "out", "episodes", "driver", "seed", "max_steps", "workers", "env_kwargs", "overwrite", "perturb",
+        "causal_labels",
+    )  # fmt: skip
+    """Fields that --help explains."""
 
     env_id: str
     """Environment to record: gymnasium id (highway-fast-v0, envpool/HighwayFast-v0) or PettingZoo parallel id

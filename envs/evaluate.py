@@ -13,7 +13,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from rich.console import Console
 
@@ -57,6 +57,12 @@ GALLERY_CASES = 6
 @dataclass(frozen=True)
 class EvaluateConfig:
     """Measures forecasts in running environments, through the deployed wrapper, beside constant velocity."""
+
+    EVERYDAY: ClassVar = (
+        "env_ids", "env_kwargs", "checkpoint", "episodes", "driver", "seed", "num_samples", "horizon_steps", "data",
+        "workers", "out", "reactions", "graph", "plans",
+    )  # fmt: skip
+    """Fields that --help explains."""
 
     env_ids: tuple[str, ...] = (*CHECKPOINTS, *MULTIAGENT_CHECKPOINTS)
     """Environments to measure in, gymnasium or PettingZoo parallel; by default all ids with a shipped checkpoint."""

@@ -435,11 +435,19 @@ def test_no_option_has_a_name_that_was_given_up():
     assert [c for c in REFUSED if "run_dir" in {f.name for f in fields(config_of(c))}] == ["agents.evaluate"]
 
 
+def test_everyday_options_are_options():
+    for command in REFUSED:
+        config = config_of(command)
+        assert set(getattr(config, "EVERYDAY", ())) <= {field.name for field in fields(config)}, command
+        required = {field.name for field in fields(config) if field.default is MISSING}
+        assert required <= set(getattr(config, "EVERYDAY", required)), command
+
+
 @pytest.mark.parametrize("command", REFUSED)
 def test_help_is_whole_phrases(command: str, capsys: pytest.CaptureFixture[str]):
     """Every option is explained, by a phrase that does not need the name of its option."""
     with pytest.raises(SystemExit) as stop:
-        parse(config_of(command), "Description.", args=["--help"])
+        parse(config_of(command), "Description.", args=["--help-all"])
     assert stop.value.code == 0
     out = " ".join(re.sub(r"[│╭╮╰╯─|]", " ", capsys.readouterr().out).split())
     source = inspect.getsource(config_of(command))

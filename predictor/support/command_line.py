@@ -9,9 +9,9 @@ import io
 import itertools
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
-from typing import TypeVar, get_type_hints
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import tyro
 
@@ -19,6 +19,9 @@ from predictor.support.config_checks import check_numbers
 from predictor.support.errors import UserError
 
 Config = TypeVar("Config")
+
+HELP_ALL = "--help-all"
+"""Option that explains all options of a command."""
 
 _SENTENCE_TITLES = ("Invalid choice", "Missing argument", "Value error")
 """Titles of tyro's boxes whose first part is a sentence; the other boxes list options and stay as they are."""
@@ -38,6 +41,9 @@ class Renamed:
 def parse(config_class: type[Config], description: str | None = None, args: Sequence[str] | None = None) -> Config:
     """Reads a config from the command line.
 
+    `--help` lists the fields that the class names in `EVERYDAY`, `--help-all` all of them; a class without it has no
+    others.
+
     Args:
         config_class: dataclass with a string under every field.
         description: text at the head of `--help`.
@@ -45,13 +51,18 @@ def parse(config_class: type[Config], description: str | None = None, args: Sequ
 
     Raises:
         UserError: the config rejects a value, or a value does not have its field's type.
-        SystemExit: options are unknown or missing (status 2, listed on stderr), or `--help` is given (status 0).
+        SystemExit: options are unknown or missing (status 2, listed on stderr), or help is asked for (status 0).
     """
     words = with_new_names(config_class, sys.argv[1:] if args is None else args)
+    if HELP_ALL in words:
+        words = ["--help"]
+    elif {"-h", "--help"} & set(words) and (hidden := _seldom_used(config_class)):
+        description = f"{(description or '').strip()}\n\n{len(hidden)} more options: {HELP_ALL}."
+        config_class = _without(config_class, hidden)
     printed = io.StringIO()
     try:
         with contextlib.redirect_stderr(printed):
-            config = tyro.cli(config_class, description=description, args=words)
+            config = tyro.cli(config_class, prog=_program(), description=description, args=words)
     except SystemExit as leaving:
         if (error := _user_error_behind(leaving)) is not None:
             raise error from None
@@ -61,6 +72,29 @@ def parse(config_class: type[Config], description: str | None = None, args: Sequ
         raise
     check_numbers(config)
     return config
+
+
+def _seldom_used(config_class: type) -> list[str]:
+    """Returns the names of the fields that a class does not name as everyday ones."""
+    everyday = getattr(config_class, "EVERYDAY", None)
+    return [field.name for field in fields(config_class) if everyday is not None and field.name not in everyday]
+
+
+def _without(config_class: Any, names: Collection[str]) -> Any:
+    """Returns a class whose help leaves out fields; tyro finds the strings of the others in the class below."""
+    hints = get_type_hints(config_class, include_extras=True)
+    content: dict[str, Any] = {field.name: field.default for field in fields(config_class) if field.name in names}
+    content["__annotations__"] = {name: Annotated[hints[name], tyro.conf.Suppress] for name in content}
+    return dataclass(frozen=True)(type(config_class.__name__, (config_class,), content))
+
+
+def _program() -> str | None:
+    """Returns how a module was called, as "python -m envs.collect"; None for a script, which has a name."""
+    main = sys.modules["__main__"]
+    spec = getattr(main, "__spec__", None)
+    if spec is None or sys.argv[0] != getattr(main, "__file__", None):  # the command dgvae sets its own
+        return None
+    return f"python -m {spec.name}"
 
 
 def with_new_names(config_class: type, words: Sequence[str]) -> list[str]:

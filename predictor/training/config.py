@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 
@@ -28,6 +28,12 @@ BEFORE_THEY_EXISTED = dict.fromkeys(OF_THE_DGVAE, False)
 @dataclass(frozen=True)
 class TrainConfig:
     """Options of training a forecaster on one or more episode stores."""
+
+    EVERYDAY: ClassVar = (
+        "data", "out", "val_data", "model", "preset", "set", "init", "steps", "batch_size", "lr", "history_steps",
+        "horizon_steps", "val_windows", "eval_every", "seed", "device", "resume",
+    )  # fmt: skip
+    """Fields that --help explains."""
 
     data: tuple[Path, ...]
     """Episode stores (python -m envs.collect makes them); several are mixed by their number of windows."""

@@ -18,7 +18,7 @@ from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from tests.storm.all_commands import LOG, NAMES, Counts, Name, try_all
 from tests.storm.running import finish, orphans, start
-from tests.storm.subjects import Subject
+from tests.storm.subjects import Subject, differs
 
 INSIDE = "STORM_INSIDE"
 ROOM = "512m"
@@ -77,7 +77,7 @@ def _fill(name: str, subject: Subject, points: int, folder: Path, rng: random.Ra
         counts.failures += not ("No space left" in said or "disk is full" in said)
         subprocess.run(["mount", "-o", f"remount,size={ROOM}", str(disk)], check=True)
         counts.failures += finish(start(words, log)) != 0
-        counts.unequal += not counts.failures and subject.results(disk) != expected
+        counts.unequal += not counts.failures and differs(name, subject.results(disk), expected)
     return counts
 
 

@@ -16,7 +16,7 @@ from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from tests.storm.all_commands import LOG, NAMES, Counts, Name, try_all
 from tests.storm.running import finish, orphans, start
-from tests.storm.subjects import Subject
+from tests.storm.subjects import Subject, differs
 
 
 @dataclass(frozen=True)
@@ -58,12 +58,12 @@ def storm(name: str, subject: Subject, kills: int, folder: Path, rng: random.Ran
             run.process.wait()
         counts.orphans += len(orphans(run))
         if subject.is_over(out):  # killed after its last write
-            counts.unequal += subject.results(out) != expected
+            counts.unequal += differs(name, subject.results(out), expected)
             shutil.rmtree(out)
         print(f"{name}: kill {counts.kills} of {kills} after {wait_s:.1f} of {whole_s:.1f} s", flush=True)
     counts.failures += finish(start(words, log)) != 0
     counts.tracebacks += log.read_text(errors="replace").count("Traceback (most recent call last)")
-    counts.unequal += not counts.failures and subject.results(out) != expected
+    counts.unequal += not counts.failures and differs(name, subject.results(out), expected)
     return counts
 
 

@@ -41,6 +41,14 @@ def make_inputs(folder: Path) -> Path:
     return folder
 
 
+def differs(name: str, found: Results, expected: Results) -> bool:
+    """Returns whether the results of a stopped command differ from those of the run in peace; prints which."""
+    keys = [key for key in sorted({*found, *expected}) if found.get(key) != expected.get(key)]
+    for key in keys:
+        print(f"{name}: {key} is {found.get(key)}, in peace {expected.get(key)}", flush=True)
+    return bool(keys)
+
+
 def digest(content: bytes) -> str:
     """Returns a short hash."""
     return hashlib.sha256(content).hexdigest()[:16]
@@ -109,9 +117,16 @@ def _suite(inputs: Path, out: Path) -> list[str]:
 
 def _measured(out: Path) -> Results:
     table = json.loads((out / "suite" / "springs-smoke" / "table.json").read_text())
-    left_out = ("provenance", "train_seconds", "measure_seconds")
-    lines = {line["key"]: {k: v for k, v in line.items() if k not in left_out} for line in table["rows"]}
-    return {"failed": table["failed"]} | {key: json.dumps(line, sort_keys=True) for key, line in lines.items()}
+    lines = {line["key"]: json.dumps(_without_costs(line), sort_keys=True) for line in table["rows"]}
+    return {"failed": table["failed"]} | lines
+
+
+def _without_costs(content: Any) -> Any:
+    """Leaves out what differs between equal runs: times, memory, and how they were made."""
+    if not isinstance(content, dict):
+        return content
+    costs = ("provenance", "train_seconds", "measure_seconds", "peak_memory_mb")
+    return {key: _without_costs(value) for key, value in content.items() if key not in costs}
 
 
 def _study(inputs: Path, out: Path) -> list[str]:

@@ -1,6 +1,7 @@
 import sys
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from importlib.machinery import ModuleSpec
+from typing import Annotated, ClassVar, Literal
 
 import pytest
 
@@ -37,6 +38,50 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_at_least(self, 1, "num_envs")
+
+
+@dataclass(frozen=True)
+class Long:
+    """Settings of which few are changed often."""
+
+    EVERYDAY: ClassVar = ("colour", "num_envs")
+
+    colour: Literal["red", "blue"] = "red"
+    """Colour of the box."""
+    num_envs: Annotated[int, Renamed("envs")] = 2
+    """Number of environments."""
+    curl: float = 0.5
+    """Curl of the field."""
+    spin: int | None = None
+    """Spin of the field."""
+
+
+def test_help_explains_the_everyday_options_and_help_all_every_one(capsys: pytest.CaptureFixture[str]):
+    shown = {}
+    for word in ("-h", "--help", "--help-all"):
+        with pytest.raises(SystemExit) as stop:
+            parse(Long, "Turns a box.", args=["--colour", "blue", word] if word != "--help-all" else [word])
+        assert stop.value.code == 0
+        shown[word] = capsys.readouterr().out
+    assert shown["-h"] == shown["--help"]
+    assert "Colour of the box." in shown["-h"] and "Number of environments." in shown["-h"]
+    assert "curl" not in shown["-h"] and "2 more options: --help-all." in shown["-h"]
+    assert all(
+        text in shown["--help-all"] for text in ("Colour of the box.", "Curl of the field.", "Spin of the field.")
+    )
+    assert "more options" not in shown["--help-all"]
+    assert parse(Long, args=["--curl", "1", "--envs", "3"]) == Long(num_envs=3, curl=1.0), "all of them are read"
+
+
+def test_a_module_is_called_by_its_name(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    main = sys.modules["__main__"]
+    monkeypatch.setattr(main, "__file__", "/somewhere/of/ours.py", raising=False)
+    monkeypatch.setattr(main, "__spec__", ModuleSpec("of.ours", None))
+    for first, name in (("/somewhere/of/ours.py", "python -m of.ours"), ("dgvae turn", "dgvae turn")):
+        monkeypatch.setattr(sys, "argv", [first])
+        with pytest.raises(SystemExit):
+            parse(Long, args=["--help"])
+        assert capsys.readouterr().out.startswith(f"usage: {name} [-h]")
 
 
 def test_words_become_a_config(capsys: pytest.CaptureFixture[str]):
