@@ -32,6 +32,8 @@ RIVALS = ("zeros", "constant-velocity")
 FLOOR, CEILING = "zeros", "oracle"
 _PLACES = ("scenario", "env_id")
 """Names that a text of an arm may hold in braces."""
+_OF_FORECASTS = ("perception_m", "what_if")
+"""Options of a scenario that an arm without forecasts does not take."""
 _OWN = ("env_id", "observe", "timeout_s")
 """Fields of `Task` that are no options: a scenario and an arm say the first two in keys of their own, and a cell runs
 its environments in its own process."""
@@ -212,7 +214,8 @@ def read_study(path: Path) -> Study:
 def task_for(scenario: Scenario, arm: StudyArm, where: str) -> Task:
     """Returns the task of an arm in a scenario.
 
-    A scenario's checkpoint goes to the arms that take one and name none of their own.
+    A scenario's checkpoint goes to the arms that take one and name none of their own; what it says of forecasts, to the
+    arms that are shown any.
 
     Raises:
         UserError: the options of arm and scenario do not fit together; the message begins with `where`.
@@ -222,6 +225,8 @@ def task_for(scenario: Scenario, arm: StudyArm, where: str) -> Task:
     shared = dict(scenario.options)
     if "checkpoint" in shared and not takes_checkpoint(arm.observe):
         del shared["checkpoint"]
+    if arm.observe == "none":
+        shared = {key: value for key, value in shared.items() if key not in _OF_FORECASTS}
     values: dict[str, Any] = {"env_id": scenario.env_id, "observe": arm.observe, **shared, **options}
     try:
         return Task(**values)

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -14,6 +15,10 @@ def test_every_study_that_ships_is_read():
     for name in shipped_studies():
         study = read_study(study_file(name))
         assert study.name == name and study.title and study.scenarios and study.arms
+        for scenario in study.scenarios:
+            options = {key: value for key, value in scenario.options.items() if key != "backend"}  # needs EnvPool 1.2.7
+            for arm in (*study.arms, StudyArm("none", "none", {})):
+                assert task_for(replace(scenario, options=options), arm, name).observe == arm.observe
 
 
 def test_a_study_is_read(tmp_path: Path):
@@ -43,6 +48,17 @@ def test_an_arm_names_a_checkpoint_by_scenario(tmp_path: Path):
     assert lstm.checkpoint == "runs/corridor/merge-v1" and none.checkpoint is None
     assert task_for(study.scenarios[0], StudyArm("forecast", "forecast", {}), "file").checkpoint == "shared"
     assert takes_checkpoint("forecast") and not takes_checkpoint("none")
+
+
+def test_what_a_scenario_says_of_forecasts_goes_to_the_arms_that_have_any(tmp_path: Path):
+    text = study_text(arms='["none", "zeros"]')
+    own = 'env_id = "highway-fast-v0"\nwhat_if = true\nperception_m = 9.0\n'
+    text = text.replace(text[text.rindex("env_id") :], own)
+    study = read_study(study_path(tmp_path, text))
+    none, zeros = (task_for(study.scenarios[0], arm, "file") for arm in study.arms)
+    assert (none.what_if, none.perception_m, zeros.what_if, zeros.perception_m) == (False, None, True, 9.0)
+    with pytest.raises(UserError, match="arm none: what_if has no effect with observe=none"):
+        task_for(study.scenarios[0], StudyArm("none", "none", {"what_if": True}), "file")
 
 
 @pytest.mark.parametrize(
