@@ -49,12 +49,12 @@ class EgoArena:
     Args:
         task: environment and what the policy sees.
         num_envs: number of parallel environments.
-        in_process: whether they run in this process.
+        in_process: whether they run in this process; None: one does, several do not.
     """
 
     baselines = ("random", "idle")
 
-    def __init__(self, task: Task, num_envs: int, in_process: bool = False) -> None:
+    def __init__(self, task: Task, num_envs: int, in_process: bool | None = None) -> None:
         """Starts the environments."""
         self._venv = make_venv(replace(task, backend="gymnasium"), num_envs, seeded=True, in_process=in_process)
 
@@ -69,8 +69,8 @@ class EgoArena:
         self._venv.close()
 
 
-def open_arena(task: Task, num_envs: int, in_process: bool = False) -> Arena:
-    """Returns the arena that fits a task; `in_process` keeps all of its environments in this process."""
+def open_arena(task: Task, num_envs: int, in_process: bool | None = None) -> Arena:
+    """Returns the arena that fits a task; `in_process` is for those of Gymnasium, see `EgoArena`."""
     return MultiagentArena(task) if task.is_multiagent else EgoArena(task, num_envs, in_process)
 
 

@@ -5,10 +5,12 @@ step of a copy with three learners counts as three. Here it counts as one, as it
 in budgets, measurements, checkpoints, the progress bar, TensorBoard and schedules alike.
 """
 
+import math
 import zipfile
 from pathlib import Path
 
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from envs.sb3.policy_file import read_note
 from predictor.support.errors import UserError
@@ -41,17 +43,21 @@ class StepProgress(BaseCallback):
     """Shows how many environment steps are done: a bar on a terminal, plain lines in a file.
 
     Args:
-        steps: number of environment steps of the whole training.
+        steps: number of environment steps of the whole training; on-policy algorithms make whole rollouts.
+        num_envs: number of parallel environments or copies.
     """
 
-    def __init__(self, steps: int) -> None:
-        """Stores the number."""
+    def __init__(self, steps: int, num_envs: int) -> None:
+        """Stores the numbers."""
         super().__init__()
-        self._steps = steps
+        self._steps, self._num_envs = steps, num_envs
         self._shown: WorkShown | None = None
 
     def _on_training_start(self) -> None:
-        self._shown = WorkShown("train", self._steps, self.model.num_timesteps)
+        done = self.model.num_timesteps
+        rollout = self.model.n_steps * self._num_envs if isinstance(self.model, OnPolicyAlgorithm) else 1
+        to_come = math.ceil((self._steps - done) / rollout) * rollout
+        self._shown = WorkShown("train", done + to_come, done)
         self._shown.__enter__()
 
     def _on_step(self) -> bool:

@@ -119,8 +119,10 @@ def train(plan: TrainingPlan, run_dir: Path, progress_bar: bool = True) -> Path:
         Path of the final policy, `run_dir/policy.zip`.
     """
     note = plan.task.note  # loads the forecaster, which draws random numbers: before the model is seeded
-    venv = make_venv(plan.task, plan.num_envs, in_process=plan.in_process, shaping=plan.shaping)
-    selection = open_arena(plan.task, min(plan.selection_envs, plan.selection_episodes), plan.in_process)
+    venv = make_venv(plan.task, plan.num_envs, in_process=plan.in_process or None, shaping=plan.shaping)
+    # a process may have but one simulator of someone else's, and that is the one that trains
+    beside = True if plan.in_process else False if ":" in plan.task.env_id else None
+    selection = open_arena(plan.task, min(plan.selection_envs, plan.selection_episodes), beside)
     try:
         model = _resume_or_make(plan, venv, run_dir)
         if model.num_timesteps < plan.steps:
@@ -139,7 +141,7 @@ def _learn(
     """Trains for the remaining steps."""
     every = max(plan.steps // plan.selections, 1)
     checkpoint = run_dir / CHECKPOINT_FILE
-    errors, progress = ForecastErrors(), StepProgress(plan.steps)
+    errors, progress = ForecastErrors(), StepProgress(plan.steps, plan.num_envs)
     restart = partial(_restart_streams, plan, model, errors) if plan.repeatable else None
     select = SelectBest(
         selection,

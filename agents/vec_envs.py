@@ -169,16 +169,17 @@ def make_multiagent_venv(task: Task, copies: int, for_learning: bool = False) ->
 
 
 def make_venv(
-    task: Task, num_envs: int, seeded: bool = False, in_process: bool = False, shaping: bool = False
+    task: Task, num_envs: int, seeded: bool = False, in_process: bool | None = None, shaping: bool = False
 ) -> VecEnv:
     """Makes the parallel environments of a task, with episode statistics and (unless `observe` is none) forecasts.
 
     Args:
         task: environment and what the policy sees.
-        num_envs: number of environments. With Gymnasium, one runs in this process and several run in spawned ones; of a
-            PettingZoo environment it is the number of copies, each with one environment of the vector per learner.
+        num_envs: number of environments; of a PettingZoo environment the number of copies, each with one environment of
+            the vector per learner.
         seeded: whether to wrap each environment in `SeededEpisodes`, for evaluation (gymnasium backend only).
-        in_process: whether several environments run in this process, too.
+        in_process: whether the environments of Gymnasium run in this process, else in spawned ones; None: one does,
+            several do not.
         shaping: whether rewards are shaped where those of the environment are rare (`agents.shaping`).
     """
     if task.is_multiagent:
@@ -195,7 +196,7 @@ def make_venv(
         )
     else:
         make = _MakeEnv(task, spec, seeded)
-        here = in_process or num_envs == 1
+        here = num_envs == 1 if in_process is None else in_process
         makers: list[Callable[[], gym.Env]] = [make] * num_envs
         venv = DummyVecEnv(makers) if here else WorkerVecEnv(makers, task.env_id, task.timeout_s)
     if task.observe != "none":

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+import train_policy
 from envs import collect, evaluate
 from predictor.data.store import read_store
 from predictor.support.reading import read_json
@@ -47,3 +48,17 @@ def test_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyt
     assert (code, errors) == (0, [])
     (result,) = read_json(tmp_path / "accuracy.json")["results"]
     assert result["model"]["agents"] > 0
+
+
+@pytest.mark.parametrize("num_envs", ["1", "2"])
+def test_training_of_a_policy(
+    num_envs: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    """It trains, measures for selection while the simulator that trains is there, evaluates and films."""
+    arguments = ["--env-id", ONE_ONLY, "--observe", "constant-velocity", "--out", str(tmp_path / "run"), "--no-video"]
+    arguments += ["--num-envs", num_envs, "--steps", "40", "--set", "n_steps=24", "batch_size=24"]
+    arguments += ["--selections", "1", "--selection-episodes", "1", "--eval-episodes", "1"]
+    code, errors, printed = run_command(train_policy.main, arguments, monkeypatch, capsys)
+    assert (code, errors) == (0, [])
+    assert (tmp_path / "run" / "policy.zip").exists()
+    assert "train: 48 of 48" in printed, "whole rollouts"
