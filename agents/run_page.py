@@ -13,7 +13,8 @@ from agents.forecast_errors import CONSTANT_ERROR, FORECAST_ERROR
 from agents.results import NOT_REPORTED, Evaluation, read_evaluation
 from agents.runs import CONFIG_FILE, CURVE_FILE, SUMMARY_FILE, read_config, read_curve
 from predictor.reports.document import JPEG, Block, Film, Heading, Paragraph, Picture, Table
-from predictor.reports.figures import COLORS, GREY, files_of, panels
+from predictor.reports.figures import files_of, panels
+from predictor.reports.looks import COLORS, GREY
 from predictor.reports.run_blocks import NOTHING, accuracy, origin, settings
 from predictor.support.errors import short
 from predictor.support.reading import MIB, check_regular, read_bytes, read_object

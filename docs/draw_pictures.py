@@ -13,6 +13,7 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib import pyplot as plt
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.patches import FancyArrowPatch, Rectangle
 
@@ -25,7 +26,9 @@ from envs.rollouts.world import World, open_world
 from envs.simulators.interventions import Intervention
 from envs.video.highway import record_episode
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.checkpoint import load_checkpoint
+from predictor.checkpoint import PRETRAINED, load_checkpoint, shipped
+from predictor.evaluation.in_env_record import read_record
+from predictor.reports.looks import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, STYLE, looks_of
 from predictor.scene import Scene
 from predictor.support.command_line import parse
 from predictor.support.errors import UserError, run_entry_point
@@ -63,7 +66,7 @@ class DrawConfig:
     """Draws the pictures of live traffic in README.md and docs/."""
 
     only: tuple[str, ...] = ()
-    """Names of pictures (highway, what_if, braking_leader, causal_graph, fans_roundabout, fans_intersection); none
+    """Names of pictures (highway, what_if, braking_leader, causal_graph, calibration, fans_…); none
     given draws all."""
 
     def __post_init__(self) -> None:
@@ -95,23 +98,23 @@ def draw_what_if(path: Path) -> None:
     env.close()
 
 
+@rc_context(STYLE)
 def draw_braking_leader(path: Path) -> None:
     """Draws what a leader's braking changes: what happens, what is forecast, and what constant velocity says."""
     world, forecasters = _at(BRAKING)
     leader, follower = _leader_and_follower(world)
     found = branch(world, Intervention(leader, "brake", 0, change_mps=8.0, at_once=True), 5)
     figure, (road, ahead) = plt.subplots(2, 1, figsize=(10, 5), layout="constrained", height_ratios=(1, 1.6))
-    _plot_scene(road, found.plain.perceived[0], {leader: "tab:red", follower: "tab:blue"})
-    road.set_title("red: the leader, blue: its follower, green: the ego", fontsize=10, loc="left")
+    _plot_scene(road, found.plain.perceived[0], {leader: ORANGE, follower: BLUE})
+    road.set_title("orange: the leader, blue: its follower, green: the ego", fontsize=10, loc="left")
     for one, marker, what in (
         (found.plain, "o", "the leader keeps its speed"),
         (found.perturbed, "s", "the leader is 8 m/s slower, at once"),
     ):
         _plot_ahead(ahead, one, forecasters, found.ids.tolist(), follower, marker, what)
-    ahead.axhline(0, color="0.6", lw=1.2, label="constant velocity, in both cases")
+    ahead.axhline(0, color=GREY, lw=1.2, label="constant velocity, in both cases")
     ahead.set(xlabel="time ahead [s]", ylabel="follower ahead of\nconstant velocity [m]")
-    ahead.grid(alpha=0.3)
-    ahead.legend(frameon=False, fontsize=9, loc="lower left")
+    ahead.legend(fontsize=9, loc="lower left")
     figure.savefig(path, dpi=130)
     plt.close(figure)
 
@@ -140,6 +143,35 @@ def draw_causal_graph(path: Path) -> None:
         _plot_edges(ax, scene, edges)
         ax.set_title(title, fontsize=10, loc="left")
     axes[1].set_xlabel("x [m]")
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+@rc_context(STYLE)
+def draw_calibration(path: Path) -> None:
+    """Draws what share of truths the central 90 % of the samples hold, from the records beside the checkpoints."""
+    records = [one for name in shipped() for one in read_record(PRETRAINED / name) if one.coverage and one.controls]
+    measured = {one.env_id: (one.coverage or (0.0, 0.0), one.controls or {}) for one in records}
+    names = list(dict.fromkeys(name for _, controls in measured.values() for name in controls))
+    looks = dict(zip(names, looks_of(names), strict=True)) | {"model + Gaussian noise": {"color": ORANGE}}
+    figure, ax = plt.subplots(figsize=(9, 4.6), layout="constrained")
+    ax.axvspan(80, 97, color=GREY, alpha=0.15, lw=0)
+    ax.axvline(90, color=BLACK, lw=0.8, ls=":", label="calibrated: 90 %")
+    for place, (spread, controls) in enumerate(measured.values()):
+        shares = {name: controls[name]["coverage"] for name in names if name in controls}
+        ax.plot(
+            100 * np.array(spread), [place, place], color=BLUE, lw=5, solid_capstyle="butt",
+            label=None if place else "dG-VAE, least to most of the steps",
+        )  # fmt: skip
+        for (name, share), marker in zip(shares.items(), "sD^", strict=False):
+            ax.plot(
+                np.nan if share is None else 100 * share, place, ls="", marker=marker, ms=6,
+                color=looks[name]["color"], label=None if place else f"{name}, all steps",
+            )  # fmt: skip
+    ax.set_yticks(range(len(measured)), list(measured))
+    ax.set(xlabel="truths within the central 90 % of 20 samples [%]", xlim=(60, 100))
+    ax.invert_yaxis()
+    figure.legend(loc="outside lower center", ncols=3, fontsize=9)
     figure.savefig(path, dpi=130)
     plt.close(figure)
 
@@ -193,7 +225,7 @@ def _plot_ahead(
         lines.append(one.forecast().xy[0, 0, place, :, 0].cpu().numpy() + scene.states[0, 0])
     truth = found.states[1:, ids.index(follower), 0]
     time_s = np.arange(len(truth) + 1)
-    for x_m, color, style, who in ((truth, "black", "-", "truth"), (lines[0], "tab:orange", "--", "forecast")):
+    for x_m, color, style, who in ((truth, BLACK, "-", "truth"), (lines[0], BLUE, "--", "forecast")):
         ax.plot(time_s, [0.0, *(x_m - lines[1])], color=color, ls=style, marker=marker, ms=5, label=f"{who}: {what}")
 
 
@@ -205,7 +237,7 @@ def _plot_scene(ax: Axes, scene: Scene, colors: dict[int, str] | None = None) ->
         outer = border in (LANES_M[0], LANES_M[-1])
         ax.plot([low, high + 150.0], [border, border], color="0.4", lw=1.0, ls="-" if outer else (0, (6, 6)), zorder=0)
     for agent, state in zip(scene.ids[scene.valid].tolist(), states, strict=True):
-        color = (colors or {}).get(agent, "tab:green" if agent == int(scene.ids[0]) else "0.75")
+        color = (colors or {}).get(agent, GREEN if agent == int(scene.ids[0]) else "0.75")
         corner = state[:2] - np.array(CAR_M) / 2
         ax.add_patch(Rectangle((float(corner[0]), float(corner[1])), *CAR_M, color=color, zorder=1))
     ax.set(xlim=(low, high), ylim=(LANES_M[-1] + 1.0, LANES_M[0] - 2.5), yticks=[])
@@ -220,7 +252,7 @@ def _plot_edges(ax: Axes, scene: Scene, edges: Sequence[tuple[int, int, float]])
         ax.add_patch(
             FancyArrowPatch(
                 tuple(places[0]), tuple(places[1]), connectionstyle="arc3,rad=0.12", arrowstyle="-|>",
-                mutation_scale=9 + 5 * prob, lw=0.4 + 2.6 * prob, color="tab:purple", alpha=0.25 + 0.65 * prob,
+                mutation_scale=9 + 5 * prob, lw=0.4 + 2.6 * prob, color=PURPLE, alpha=0.25 + 0.65 * prob,
             )
         )  # fmt: skip
 
@@ -230,6 +262,7 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     "what_if": draw_what_if,
     "braking_leader": draw_braking_leader,
     "causal_graph": draw_causal_graph,
+    "calibration": draw_calibration,
     **{
         f"fans_{env_id.partition('-')[0]}": partial(draw_film, env_id, moment, MANY_FUTURES)
         for env_id, moment in FORKS.items()

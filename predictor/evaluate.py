@@ -24,6 +24,7 @@ from predictor.data.windows import Windows
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import Outcome, run_window_batch, run_windows
 from predictor.forecaster import Forecaster
+from predictor.reports.looks import STYLE
 from predictor.reports.plots import plot_error_by_horizon, plot_scene, save_figure
 from predictor.reports.tables import MODEL_NAMES, accuracy_table, markdown_table
 from predictor.scene import SceneSpec
@@ -154,6 +155,7 @@ def _write(config: EvaluateConfig, accuracies: Sequence[Accuracy], source: str, 
     write_text(config.out / "accuracy.md", markdown_table(accuracies, dt_s))
 
 
+@matplotlib.rc_context(STYLE)
 def _plot(
     config: EvaluateConfig,
     accuracies: Sequence[Accuracy],

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from rich.console import Console
 from rich.markdown import Markdown
 
-from predictor.checkpoint import CONSTANT_VELOCITY, CheckpointInfo, load_checkpoint
+from predictor.checkpoint import CONSTANT_VELOCITY, CheckpointInfo, load_checkpoint, name_of_folder
 from predictor.data.store import StoreInfo, read_store
 from predictor.data.windows import Windows
 from predictor.evaluation.disentanglement import sklearn
@@ -227,7 +227,7 @@ def _draw(
     spec: SceneSpec,
 ) -> None:
     """Draws and writes the pictures."""
-    where = f"{config.checkpoint} on {content['source']}"
+    where = f"{name_of_folder(config.checkpoint)} on {content['source']}"
     names = [score.name for score in findings.attributes]
     figures = {
         "features.png": pictures.features_figure(shown[0], content["static_dim"], spec.dt_s, names, where),

@@ -13,7 +13,8 @@ from scipy import stats
 
 from agents.studies.estimators import CONFIDENCE, performance_profile, profile_band
 from agents.studies.findings import Findings, Line, generator_of
-from predictor.reports.figures import COLORS, panels, svg_of
+from predictor.reports.figures import panels, svg_of
+from predictor.reports.looks import COLORS
 
 _GREYS = (("#777777", "--"), ("#777777", ":"), ("#aaaaaa", "-."))
 _THRESHOLDS = 201

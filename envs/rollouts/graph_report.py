@@ -13,6 +13,7 @@ from rich.table import Table
 from envs.rollouts.graph_run import DISTANCE, LEADERS, MAJORITY, EnvGraph
 from predictor.evaluation.causal_graph import CausalScores
 from predictor.evaluation.standard_errors import Estimate
+from predictor.reports.looks import BLACK, GREY, STYLE, YELLOW, looks_of
 from predictor.reports.plots import save_figure
 from predictor.support.markdown import table
 
@@ -21,7 +22,7 @@ HEADS = (
     "calibration error", "r with shift (95 %)", "spread over senders",
 )  # fmt: skip
 """Columns of the table."""
-COLORS = {DISTANCE: "tab:green", LEADERS: "black", MAJORITY: "grey"}
+RULES = {DISTANCE: YELLOW, LEADERS: BLACK, MAJORITY: GREY}
 """Colors of the rules that need no network."""
 
 
@@ -88,40 +89,42 @@ def as_json(result: EnvGraph) -> dict[str, Any]:
     return asdict(result)
 
 
+@matplotlib.rc_context(STYLE)
 def write_picture(out: Path, result: EnvGraph) -> None:
     """Writes `ENV.graph.png` under `out`: precision against recall, and calibration."""
     matplotlib.use("Agg")
     out.mkdir(parents=True, exist_ok=True)
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
+    models = [name for name in result.scores if name not in RULES]
+    colors = RULES | {name: look["color"] for name, look in zip(models, looks_of(models), strict=True)}
     for name, found in result.scores.items():
-        plot_curve(left, name, found)
-        plot_calibration(right, name, found)
+        plot_curve(left, name, found, colors[name])
+        plot_calibration(right, name, found, colors[name])
     right.plot([0, 1], [0, 1], color="0.8", lw=0.8, zorder=0)
     for ax, x, y in ((left, "recall", "precision"), (right, "probability of an edge", "share of causal edges")):
         ax.set(xlabel=x, ylabel=y, xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
-        ax.grid(alpha=0.3)
-    left.legend(frameon=False, fontsize=8)
+    left.legend(fontsize=8)
     figure.suptitle(title(result), fontsize=11)
     save_figure(figure, out / f"{result.env_id.replace('/', '-')}.graph.png", 130)
 
 
-def plot_curve(ax: Axes, name: str, found: CausalScores) -> Axes:
+def plot_curve(ax: Axes, name: str, found: CausalScores, color: str) -> Axes:
     """Plots precision against recall over all bounds, with a mark at the rule's own bound."""
     if name != MAJORITY and found.curve:
         own = [float("nan") if one is None else one.value for one in (found.recall, found.precision)]
-        (mark,) = ax.plot(own[0], own[1], marker="o", ms=6, color=COLORS.get(name), label=name)
+        ax.plot(own[0], own[1], marker="o", ms=6, color=color, label=name)
         if len(found.curve) > 2:  # a rule that only says yes or no is one place
-            ax.plot(*zip(*found.curve, strict=True), lw=1.3, color=mark.get_color())
+            ax.plot(*zip(*found.curve, strict=True), lw=1.3, color=color)
     if name == MAJORITY:
-        ax.axhline(found.share, color=COLORS[MAJORITY], lw=0.8, ls=":", label="share of edges")
+        ax.axhline(found.share, color=color, lw=0.8, ls=":", label="share of edges")
     return ax
 
 
-def plot_calibration(ax: Axes, name: str, found: CausalScores) -> Axes:
+def plot_calibration(ax: Axes, name: str, found: CausalScores, color: str) -> Axes:
     """Plots the share of edges against the probability, by bin; the area of a mark shows the number of pairs."""
     filled = [(one.mean_prob, one.share, one.pairs) for one in found.bins if one.pairs]
     if filled:
         prob, share, pairs = zip(*filled, strict=True)
-        (line,) = ax.plot(prob, share, lw=1.0, label=name)
-        ax.scatter(prob, share, s=[8 + 300 * count / found.pairs for count in pairs], color=line.get_color(), alpha=0.6)
+        ax.plot(prob, share, lw=1.0, color=color, label=name)
+        ax.scatter(prob, share, s=[8 + 300 * count / found.pairs for count in pairs], color=color, alpha=0.6)
     return ax

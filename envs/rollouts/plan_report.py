@@ -13,6 +13,7 @@ from rich.table import Table
 
 from envs.rollouts.plan_run import EnvPlans, PlanScores
 from predictor.evaluation.standard_errors import Estimate
+from predictor.reports.looks import STYLE
 from predictor.reports.plots import save_figure
 from predictor.support.markdown import table
 
@@ -94,6 +95,7 @@ def as_json(result: EnvPlans) -> dict[str, Any]:
     return asdict(result)
 
 
+@matplotlib.rc_context(STYLE)
 def write_picture(out: Path, result: EnvPlans) -> None:
     """Writes `ENV.plans.png` under `out`: errors with and without the plan, and the choices."""
     matplotlib.use("Agg")
@@ -112,7 +114,7 @@ def plot_errors(ax: Axes, result: EnvPlans) -> Axes:
         _plot_estimates(ax, places, [getattr(found, kind).reduction for found in result.scores.values()], label)
     ax.axhline(0, color="0.7", lw=0.8)
     ax.set_ylabel("error less by, with the plan given [%]")
-    ax.legend(frameon=False, fontsize=8)
+    ax.legend(fontsize=8)
     return _named(ax, result)
 
 
@@ -122,7 +124,7 @@ def plot_choices(ax: Axes, result: EnvPlans) -> Axes:
     _plot_estimates(ax, np.arange(len(found)), [one.right for one in found], f"{found[0].choices} pairs")
     ax.axhline(50, color="0.7", lw=0.8, ls=":", label="chance")
     ax.set(ylabel="right choices [%]", ylim=(0, 102))
-    ax.legend(frameon=False, fontsize=8)
+    ax.legend(fontsize=8)
     return _named(ax, result)
 
 
@@ -137,5 +139,5 @@ def _plot_estimates(ax: Axes, places: np.ndarray, estimates: Sequence[Estimate |
 def _named(ax: Axes, result: EnvPlans) -> Axes:
     ax.set_xticks(range(len(result.scores)), list(result.scores))
     ax.set_xlim(-0.5, len(result.scores) - 0.5)
-    ax.grid(alpha=0.3, axis="y")
+    ax.grid(False, axis="x")
     return ax

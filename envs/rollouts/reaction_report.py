@@ -13,8 +13,8 @@ from rich.table import Table
 
 from envs.rollouts.reaction_cells import FALSE_BESIDE
 from envs.rollouts.reaction_run import CellReactions, EnvReactions
-from envs.rollouts.reactions import NEIGHBOURS, STRAIGHT
 from predictor.evaluation.standard_errors import Estimate
+from predictor.reports.looks import BLACK, STYLE, looks_of
 from predictor.reports.plots import save_figure
 from predictor.support.markdown import table
 
@@ -23,10 +23,6 @@ HEADS = (
     "r at the end (95 %)", "r of all steps", "false reaction (95 %)",
 )  # fmt: skip
 """Columns of the table."""
-COLORS = {STRAIGHT: "grey", NEIGHBOURS: "tab:green"}
-"""Colors of the forecasters that no checkpoint holds."""
-OTHER_COLORS = ("tab:orange", "tab:blue", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive", "tab:cyan")
-"""Colors of checkpoints, in their order."""
 
 
 def title(result: EnvReactions) -> str:
@@ -109,6 +105,7 @@ def as_json(result: EnvReactions) -> dict[str, Any]:
     return asdict(replace(result, perturbations=[])) | {"perturbations": ones}
 
 
+@matplotlib.rc_context(STYLE)
 def write_picture(out: Path, result: EnvReactions) -> None:
     """Writes `ENV.reactions.png` under `out`: a panel for each cell, a line for each forecaster."""
     matplotlib.use("Agg")
@@ -124,7 +121,7 @@ def write_picture(out: Path, result: EnvReactions) -> None:
         if name in panels and beside in panels:  # what is false is seen beside what is true
             panels[name].set_ylim(panels[beside].get_ylim())
     handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
     figure.suptitle(f"{result.env_id}: mean shift of the receiver [m]", fontsize=11)
     save_figure(figure, out / f"{result.env_id.replace('/', '-')}.reactions.png", 130)
 
@@ -132,20 +129,18 @@ def write_picture(out: Path, result: EnvReactions) -> None:
 def plot_cell(ax: Axes, cell: CellReactions, dt_s: float) -> Axes:
     """Plots the mean shift [m] against time ahead: the true one black, those of forecasters along it."""
     still = cell.name in FALSE_BESIDE
+    looks = looks_of(cell.reactions)
     for i, (name, found) in enumerate(cell.reactions.items()):
         if not i:
-            _line(ax, found.true_by_step_m, dt_s, "true", "black", 2.0)
+            _line(ax, found.true_by_step_m, dt_s, label="true", color=BLACK, lw=2.0)
         predicted = found.length_by_step_m if still else found.along_by_step_m
-        _line(ax, predicted, dt_s, name, COLORS.get(name, OTHER_COLORS[i % len(OTHER_COLORS)]), 1.3)
+        _line(ax, predicted, dt_s, label=name, lw=1.3, **(looks[i] | {"ls": "--"}))
     ax.axhline(0.0, color="0.8", lw=0.8, zorder=0)
     ax.set_title(f"{cell.name}\n(n = {cell.pairs})", fontsize=9)
     ax.set_xlabel("time ahead [s]")
-    ax.grid(alpha=0.3)
     ax.tick_params(labelsize=8)
     return ax
 
 
-def _line(ax: Axes, values: Sequence[float], dt_s: float, name: str, color: str, width: float) -> None:
-    time_s = dt_s * np.arange(len(values) + 1)
-    style = "-" if name == "true" else "--"
-    ax.plot(time_s, [0.0, *values], color=color, lw=width, ls=style, marker="o", ms=2.5, label=name)
+def _line(ax: Axes, values: Sequence[float], dt_s: float, **look: Any) -> None:
+    ax.plot(dt_s * np.arange(len(values) + 1), [0.0, *values], marker="o", ms=2.5, **look)

@@ -15,6 +15,7 @@ from envs.rollouts.episode import MODEL, NEIGHBOURS, RESIDUAL, STRAIGHT, Case
 from predictor.evaluation.accuracy import Accuracy
 from predictor.evaluation.graph_accuracy import GraphAccuracy
 from predictor.reports.fitted_table import FittedTable
+from predictor.reports.looks import BLACK, STYLE, looks_of
 from predictor.reports.plots import save_figure
 from predictor.reports.tables import markdown_table
 from predictor.support.markdown import table
@@ -187,6 +188,7 @@ def _metres(value: float) -> str:
     return f"{value:.2f}" if value >= 1 else f"{value:.3f}"
 
 
+@matplotlib.rc_context(STYLE)
 def write_pictures(out: Path, result: "EnvAccuracy", cases: Sequence[Case]) -> None:
     """Writes `ENV.CHECKPOINT.by_horizon.png` and `….worst.png` under `out`."""
     matplotlib.use("Agg")
@@ -211,30 +213,26 @@ def write_pictures(out: Path, result: "EnvAccuracy", cases: Sequence[Case]) -> N
         for ax in list(grid.flat)[len(cases) :]:
             ax.axis("off")
         handles, labels = grid.flat[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
         figure.suptitle(f"{title(result)}: the worst forecast of the {len(cases)} worst episodes")
         save_figure(figure, out / f"{stem}.worst.png", 110)
 
 
 def plot_by_horizon(ax: Axes, accuracies: Sequence[Accuracy], dt_s: float, quantity: str, label: str) -> Axes:
-    """Plots a quantity against time ahead, a curve per accuracy with its 95 % band; constant velocity is grey."""
-    for accuracy in accuracies:
+    """Plots a quantity against time ahead, a curve per accuracy with its 95 % band."""
+    labels = [a.name if a.name in (STRAIGHT, NEIGHBOURS) else f"{a.name}, K = {a.num_samples}" for a in accuracies]
+    for accuracy, entry, look in zip(accuracies, labels, looks_of(labels), strict=True):
         values = np.array(getattr(accuracy, quantity))
         time_s = dt_s * np.arange(1, len(values) + 1)
-        name, baseline = accuracy.name, accuracy.name == STRAIGHT
-        (curve,) = ax.plot(
-            time_s, values, color="grey" if baseline else None, marker="o", ms=3,
-            label=name if baseline or name == NEIGHBOURS else f"{name}, K = {accuracy.num_samples}",
-        )  # fmt: skip
+        ax.plot(time_s, values, marker="o", ms=3, label=entry, **look)
         bounds = [b if b is not None else (np.nan, np.nan) for b in accuracy.step_intervals.get(quantity, [])]
         if bounds:
             low, high = np.array(bounds).T
-            ax.fill_between(time_s, low, high, color=curve.get_color(), alpha=0.15, lw=0)
+            ax.fill_between(time_s, low, high, color=look["color"], alpha=0.15, lw=0)
     ax.set_xlabel("time ahead [s]")
     ax.set_ylabel(label)
-    ax.grid(alpha=0.3)
     if accuracies:
-        ax.legend(frameon=False, fontsize=8)
+        ax.legend(fontsize=8)
     return ax
 
 
@@ -244,17 +242,17 @@ def plot_case(ax: Axes, case: Case) -> Axes:
         seen = case.history_valid[:, agent]
         if not seen.any():
             continue
-        color, label = ("tab:blue", "history") if agent == case.agent else ("0.75", "others")
+        color, label = (BLACK, "history") if agent == case.agent else ("0.75", "others")
         known = label in ax.get_legend_handles_labels()[1]
         ax.plot(*case.history[seen, agent].T, color=color, lw=2, label=None if known else label)
         ax.plot(*case.history[seen, agent][-1], marker="s", ms=4, color=color)
     now = case.history[-1, case.agent][None]
-    styles = {MODEL: ("tab:orange", "model"), STRAIGHT: ("0.4", STRAIGHT), NEIGHBOURS: ("tab:green", NEIGHBOURS)}
-    for key, forecast in case.forecasts.items():
-        if key in styles:
-            color, label = styles[key]
-            ax.plot(*np.concatenate([now, forecast]).T, color=color, ls="--", marker=".", ms=4, lw=1.3, label=label)
-    ax.plot(*np.concatenate([now, case.future]).T, color="black", lw=0.9, marker=".", ms=3, label="what happened")
+    for key, label in ((MODEL, "model"), (STRAIGHT, STRAIGHT), (NEIGHBOURS, NEIGHBOURS)):
+        if key in case.forecasts:
+            (look,) = looks_of([label])
+            path = np.concatenate([now, case.forecasts[key]])
+            ax.plot(*path.T, marker=".", ms=4, lw=1.3, label=label, **(look | {"ls": "--"}))
+    ax.plot(*np.concatenate([now, case.future]).T, color=BLACK, lw=0.9, marker=".", ms=3, label="what happened")
     ax.set_title(f"seed {case.seed}, step {case.step}: {case.error_m:.2f} m off", fontsize=9)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_xlabel("x [m]", fontsize=8)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -17,6 +18,7 @@ from matplotlib.ticker import MaxNLocator
 
 from predictor.evaluation.edge_findings import Reading
 from predictor.evaluation.graph_accuracy import GraphAccuracy
+from predictor.reports.looks import BLUE, ORANGE, STYLE, YELLOW
 from predictor.reports.plots import plot_scene
 from predictor.reports.tables import plain
 
@@ -29,7 +31,7 @@ NUM_TRAJECTORIES = 4
 DIMENSIONS_SHOWN = 4
 """Number of feature dimensions per block of features.png."""
 
-RIGHT, MISSED, INVENTED, TRUE = "#1f5fa8", "#c0392b", "#e08e0b", "#404040"
+RIGHT, MISSED, INVENTED, TRUE = BLUE, ORANGE, YELLOW, "#404040"
 
 WIDTHS = (1.0, 5.0)
 """Line widths of drawn edges [points], from the smallest true value to the largest."""
@@ -132,6 +134,7 @@ def plot_graph(
     return ax
 
 
+@rc_context(STYLE)
 def graphs_figure(
     windows: Sequence[WindowShown],
     reading: Reading | None,
@@ -343,6 +346,7 @@ def _scale(part: Any, column: Any) -> None:
     bar.update_ticks()
 
 
+@rc_context(STYLE)
 def trajectories_figure(windows: Sequence[WindowShown], feature_names: Sequence[str], where: str) -> Figure:
     """Draws samples beside the truth; of three axes, the one with the least variance is not shown."""
     axes_shown = shown_axes(np.concatenate([w.history[w.history_valid] for w in windows]))

@@ -13,13 +13,12 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f7f7f", "#8c564b", "#9467bd")
-"""Colours of lines, in the order of their use; the first eight differ for colour-blind readers, too."""
-GREY = "#777777"
-"""Colour of what the lines are compared with."""
+from predictor.reports.looks import STYLE
+
 _WIDTH_IN, _HEIGHT_IN, _DPI = 5.4, 4.0, 130
 
 
+@matplotlib.rc_context(STYLE)
 def panels(count: int) -> tuple[Figure, list[Axes]]:
     """Returns a figure and its axes, at most two in a line."""
     matplotlib.use("Agg")
@@ -51,11 +50,9 @@ def files_of(figure: Figure, axes: Sequence[Axes]) -> tuple[str, bytes]:
 
 
 def _finish(figure: Figure, axes: Sequence[Axes]) -> None:
-    """Draws grids, and one legend below the panels."""
+    """Draws one legend below the panels."""
     entries: dict[str, Any] = {}
     for ax in axes:
-        ax.grid(alpha=0.3)
-        ax.spines[["top", "right"]].set_visible(False)
         handles, labels = ax.get_legend_handles_labels()
         entries |= {label: entries.get(label, handle) for handle, label in zip(handles, labels, strict=True)}
     if entries:

@@ -5,13 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib import pyplot as plt
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from predictor.evaluation.accuracy import Accuracy
+from predictor.reports.looks import STYLE, looks_of
 from predictor.support.files import new_file
 
 
@@ -23,18 +24,15 @@ def save_figure(figure: Figure, path: Path, dpi: int) -> None:
 
 
 def plot_error_by_horizon(ax: Axes, accuracies: Sequence[Accuracy], dt_s: float) -> Axes:
-    """Draws displacement against time ahead, a line per forecaster; constant velocity is grey, dotted with noise."""
-    for accuracy in accuracies:
+    """Draws displacement against time ahead, a line per forecaster."""
+    for accuracy, look in zip(accuracies, looks_of(a.name for a in accuracies), strict=True):
         time_s = dt_s * np.arange(1, len(accuracy.by_step_m) + 1)
-        style: dict[str, Any] = {"color": "grey"} if accuracy.name.startswith("constant velocity") else {}
-        if style and accuracy.num_samples > 1:
-            style["ls"] = ":"
-        ax.plot(time_s, accuracy.by_step_m, marker="o", label=f"{accuracy.name}, K = {accuracy.num_samples}", **style)
+        label = f"{accuracy.name}, K = {accuracy.num_samples}"
+        ax.plot(time_s, accuracy.by_step_m, marker="o", ms=3, label=label, **look)
     ax.set_xlabel("time ahead [s]")
     ax.set_ylabel("displacement of the best sample [m]")
     ax.set_ylim(bottom=0)
-    ax.grid(alpha=0.3)
-    ax.legend(frameon=False)
+    ax.legend()
     return ax
 
 
@@ -47,25 +45,21 @@ def plot_results_by_step(ax: Axes, results: Sequence[dict[str, Any]], kind: str,
         kind: test store, "test", "ood" or "crowd".
         dt_s: length of a step [s].
     """
-    for i, result in enumerate(results):
+    shown = [result for result in results if result["key"] != "least-squares"]  # the limit, orders of magnitude below
+    for result, look in zip(shown, looks_of(result["name"] for result in shown), strict=True):
         view = result["tests"][kind]["horizon_only"]
-        if result["key"] == "least-squares":  # the limit, orders of magnitude below
-            continue
         ours = result["key"].startswith(("dgvae", "dvae", "plural")) and not result["key"].endswith("-gaussian")
-        baseline = result["key"].startswith("constant-velocity")
         time_s = dt_s * np.arange(1, len(view["by_step_m"]) + 1)
         errors = [error or 0.0 for error in view["step_errors"]["by_step_m"]]
         label = f"{result['name']}, K = {view['num_samples']}"
-        dashes = "-" if ours else ":" if result["key"] == "constant-velocity-noise" else "--"
-        style: dict[str, Any] = {"ls": dashes, "lw": 2.0 if ours else 1.2, "marker": "o", "ms": 3}
-        color = "black" if baseline else colormaps["tab20"](i % 20)
-        ax.errorbar(time_s, view["by_step_m"], yerr=errors, color=color, label=label, **style)
+        style: dict[str, Any] = {"lw": 2.0 if ours else 1.2, "marker": "o", "ms": 3, **look}
+        ax.errorbar(time_s, view["by_step_m"], yerr=errors, label=label, **style)
     ax.set_yscale("log")
     ax.set_xlabel("time ahead [s]")
-    ax.grid(alpha=0.3, which="both")
     return ax
 
 
+@rc_context(STYLE)
 def figure_by_step(results: Sequence[dict[str, Any]], kinds: Sequence[str], dt_s: float, headline: str) -> Figure:
     """Draws `plot_results_by_step` for several test stores side by side, under one headline.
 
@@ -82,7 +76,7 @@ def figure_by_step(results: Sequence[dict[str, Any]], kinds: Sequence[str], dt_s
         plot_results_by_step(ax, results, kind, dt_s).set_title(kind)
     axes[0, 0].set_ylabel("displacement of the best sample [m]")
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2 * len(kinds), fontsize=7.5, frameon=False)
+    figure.legend(handles, labels, loc="outside lower center", ncols=2 * len(kinds), fontsize=7.5)
     figure.suptitle(headline, fontsize=9)
     return figure
 

@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 
 from predictor.checkpoint import BEST_OF_RUN, CARD, MOST_CARD_BYTES, CheckpointInfo, read_info
 from predictor.reports.document import Block, Code, Heading, Paragraph, Picture, Table
-from predictor.reports.figures import COLORS, GREY, files_of, panels
+from predictor.reports.figures import files_of, panels
+from predictor.reports.looks import COLORS, GREY
 from predictor.reports.run_blocks import NOTHING, accuracy, origin, settings
 from predictor.reports.tables import MODEL_NAMES
 from predictor.support.errors import UserError, short

@@ -123,10 +123,10 @@ def _measured(out: Path) -> Results:
 
 def _without_costs(content: Any) -> Any:
     """Leaves out what differs between equal runs: times, memory, and how they were made."""
-    if not isinstance(content, dict):
-        return content
-    costs = ("provenance", "train_seconds", "measure_seconds", "peak_memory_mb")
-    return {key: _without_costs(value) for key, value in content.items() if key not in costs}
+    costs = ("provenance", "seconds", "train_seconds", "measure_seconds", "peak_memory_mb")
+    if isinstance(content, dict):
+        return {key: _without_costs(value) for key, value in content.items() if key not in costs}
+    return [_without_costs(value) for value in content] if isinstance(content, list) else content
 
 
 def _study(inputs: Path, out: Path) -> list[str]:

@@ -49,23 +49,23 @@ def test_json_has_the_bins():
 
 
 def test_the_curve_is_marked_at_the_rules_own_bound():
-    ax = plot_curve(plt.figure().subplots(), DISTANCE, SCORES[DISTANCE])
+    ax = plot_curve(plt.figure().subplots(), DISTANCE, SCORES[DISTANCE], "black")
     mark, curve = ax.get_lines()
     recall, precision = SCORES[DISTANCE].recall, SCORES[DISTANCE].precision
     assert recall is not None and precision is not None
     np.testing.assert_array_equal(mark.get_xydata(), [(recall.value, precision.value)])
     np.testing.assert_array_equal(curve.get_xydata(), SCORES[DISTANCE].curve)
     yes_or_no = score_rule(EXISTS.astype(np.float64), PAIRS, 0.5)
-    assert len(plot_curve(plt.figure().subplots(), "the leader", yes_or_no).get_lines()) == 1
+    assert len(plot_curve(plt.figure().subplots(), "the leader", yes_or_no, "black").get_lines()) == 1
     plt.close("all")
 
 
 def test_calibration_leaves_out_empty_bins():
-    ax = plot_calibration(plt.figure().subplots(), "ours", MODEL)
+    ax = plot_calibration(plt.figure().subplots(), "ours", MODEL, "black")
     (line,) = ax.get_lines()
     filled = [(one.mean_prob, one.share) for one in MODEL.bins if one.pairs]
     np.testing.assert_array_equal(line.get_xydata(), filled)
-    assert len(plot_calibration(plt.figure().subplots(), DISTANCE, SCORES[DISTANCE]).get_lines()) == 0
+    assert len(plot_calibration(plt.figure().subplots(), DISTANCE, SCORES[DISTANCE], "black").get_lines()) == 0
     plt.close("all")
 
 

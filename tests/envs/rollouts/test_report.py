@@ -12,6 +12,7 @@ from envs.rollouts.episode import MODEL, NEIGHBOURS, RESIDUAL, STRAIGHT, Case, m
 from envs.rollouts.report import EnvAccuracy
 from predictor.evaluation.accuracy import Accuracy
 from predictor.evaluation.graph_accuracy import GraphAccuracy
+from predictor.reports.looks import GREY
 
 
 def accuracy(name: str, ade_m: float, samples: int = 1) -> Accuracy:
@@ -128,7 +129,7 @@ def test_lines_by_horizon_carry_the_numbers():
     ]  # fmt: skip
     np.testing.assert_allclose(lines["constant velocity"].get_xdata(), [0.1, 0.2, 0.3])
     np.testing.assert_allclose(lines["constant velocity"].get_ydata(), [1.0, 2.0, 4.0])
-    assert lines["constant velocity"].get_color() == "grey"
+    assert lines["constant velocity"].get_color() == GREY
     assert len(ax.collections) == 4  # a band each
     assert ax.get_ylabel() == "displacement [m]"
     plt.close(figure)

@@ -6,6 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from predictor.evaluation.accuracy import Accuracy
+from predictor.reports.looks import GREY
 from predictor.reports.plots import plot_error_by_horizon, plot_scene
 
 
@@ -28,7 +29,7 @@ def test_error_curves_are_drawn_over_seconds(ax: Axes):
     model, straight = ax.lines
     assert model.get_xdata().tolist() == straight.get_xdata().tolist() == [0.5, 1.0]
     assert (list(model.get_ydata()), list(straight.get_ydata())) == ([1.0, 2.0], [3.0, 4.0])
-    assert straight.get_color() == "grey" != model.get_color()
+    assert straight.get_color() == GREY != model.get_color()
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["dG-VAE, K = 20", "constant velocity, K = 1"]
 
 
