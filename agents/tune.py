@@ -146,7 +146,6 @@ def tune(config: TuneConfig) -> Path:
     check_out(folder)
     plan.check_action_space(plan.task.check())
     _check_folder(folder, config)
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
     with locked(folder, "tuning"), disk_errors_of(folder / STUDY_FILE):
         _note(folder, config)
         study = open_study(folder / STUDY_FILE)
@@ -171,6 +170,7 @@ def open_study(file: Path) -> "Study":
 
     if os.path.lexists(file):
         check_regular(file, MOST_STUDY_BYTES)
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
         return optuna.create_study(
             storage=f"sqlite:///{file}", study_name="tuning", direction="maximize", load_if_exists=True

@@ -171,6 +171,9 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     module, colon, _ = env_id.partition(":")
     if colon and not all(part.isidentifier() for part in module.split(".")):
         raise UserError(f"cannot make env '{short(env_id)}': '{short(module)}' before the colon is no name of a module")
+    mode = kwargs.get("render_mode")
+    if not isinstance(mode, str | None):
+        raise UserError(f"cannot make env '{env_id}': render_mode must be a text, got {short(mode)}")
     try:
         return gym.make(env_id, **kwargs)
     except UserError:

@@ -5,6 +5,7 @@ A checkpoint holds everything needed to run it (spec, sizes, horizon, residual s
 """
 
 import functools
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -130,8 +131,9 @@ def name_of_folder(path: str | Path) -> str:
     path = Path(path)
     if path.parent.name == "snapshots":  # a download in the cache: models--OWNER--NAME/snapshots/COMMIT
         return path.parent.parent.name.rpartition("--")[2]
-    named = path.resolve() if path.name in ("", ".", "..") else path
-    return named.resolve().parent.name if named.name == BEST_OF_RUN else named.name
+    # not resolve(), which raises where links lead in a circle
+    named = Path(os.path.realpath(path)) if path.name in ("", ".", "..", BEST_OF_RUN) else path
+    return named.parent.name if named.name == BEST_OF_RUN else named.name
 
 
 def names_of(checkpoints: Sequence[str]) -> dict[str, str]:
@@ -159,7 +161,7 @@ def _folders_of(checkpoint: str) -> tuple[str, ...]:
     known = not Path(checkpoint).is_dir() and checkpoint in (*shipped(), CONSTANT_VELOCITY)
     if is_own(checkpoint) or known:
         return (checkpoint,)
-    path = Path(checkpoint).resolve()
+    path = Path(os.path.realpath(checkpoint))
     return (path.parent if path.name == BEST_OF_RUN else path).parts
 
 

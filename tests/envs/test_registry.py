@@ -171,3 +171,8 @@ assert not envs.registry.is_multiagent_id("highway-v0") and envs.registry.is_mul
 def test_importing_the_wrappers_registers_our_ids():
     code = "import envs.wrappers, gymnasium; gymnasium.make('highway-mixed-v0'); gymnasium.make('highway-fast-v0')"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_render_mode_is_a_text():
+    with pytest.raises(UserError, match="cannot make env 'merge-v1': render_mode must be a text, got 5"):
+        make_env("merge-v1", render_mode=5)

@@ -33,9 +33,14 @@ ARGUED: tuple[tuple[str, str, str], ...] = (
         "libraries write their caches below HOME, and make the folder; nothing of ours is written",
     ),
     (
-        r"(HOME|PYTHONHASHSEED|TMPDIR)=.*: envs.collect",
+        r"(HOME|MPLCONFIGDIR|PYTHONHASHSEED|TMPDIR)=.*: envs.collect",
         "unclear",
         "Python or a library warns before our line where a worker starts, or none can start, and the line says so",
+    ),
+    (
+        r"(MPLBACKEND|SOURCE_DATE_EPOCH)=.*: envs.collect",
+        "traceback",
+        "highway-env imports matplotlib, which refuses the variable before any line of ours, and names it or its value",
     ),
     (
         r"OMP_NUM_THREADS=.*",

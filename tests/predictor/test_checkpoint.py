@@ -500,3 +500,11 @@ def test_a_run_that_has_no_checkpoint_yet_is_named_as_one(tmp_path: Path):
     (tmp_path / "config.json").write_text('{"config": {"out": "runs/x", "eval_every": 250}}')
     with pytest.raises(UserError, match="is a training run without a checkpoint yet; train on, with --resume"):
         load_checkpoint(tmp_path)
+
+
+def test_a_link_to_itself_has_a_name_and_is_refused_where_it_is_read(tmp_path: Path):
+    loop = tmp_path / "loop"
+    loop.symlink_to(loop)
+    assert name_of_folder(loop) == "loop" and names_of([str(loop)]) == {str(loop): "loop"}
+    with pytest.raises(UserError, match="loop"):
+        load_checkpoint(loop)
