@@ -10,12 +10,16 @@ import json
 import os
 import pickle
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
+import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.presets import Algorithm
@@ -32,6 +36,8 @@ BEST_FILE = "best_model.zip"
 POLICY_FILE = "policy.zip"
 CURVE_FILE = "curve.json"
 SUMMARY_FILE = "summary.json"
+SHIPPED = Path(__file__).resolve().parent / "pretrained"
+"""Folder of the policies that ship, NAME.zip each."""
 _BUFFER_ENTRY = "replay_buffer.pkl"
 
 
@@ -81,8 +87,13 @@ def read_config(run_dir: Path, *required: str) -> dict[str, Any]:
     return config
 
 
+def shipped_policies() -> list[str]:
+    """Returns the names of the policies that ship with the package."""
+    return sorted(file.stem for file in SHIPPED.glob("*.zip"))
+
+
 def policy_zip(path: str | Path) -> Path:
-    """Returns the zip of a policy: the file itself, or the final policy of a run folder.
+    """Returns the zip of a policy: the file itself, the final policy of a run folder, or a shipped one by its name.
 
     Raises:
         UserError: there is none; the message says what is there instead.
@@ -92,7 +103,13 @@ def policy_zip(path: str | Path) -> Path:
     if path.is_file():
         return path
     if not path.is_dir():
-        raise UserError(f"no policy at {path}: neither a run folder nor a .zip; train one with train_policy.py")
+        if str(path) in shipped_policies():
+            return SHIPPED / f"{path}.zip"
+        names = ", ".join(shipped_policies())
+        raise UserError(
+            f"no policy at {path}: neither a run folder nor a .zip nor one that ships ({names}); "
+            "train one with train_policy.py"
+        )
     if (path / POLICY_FILE).is_file():
         return path / POLICY_FILE
     read_config(path)
@@ -148,7 +165,7 @@ def save_model(
     path: Path,
     extra: dict[str, Any] | None = None,
     note: PolicyNote | None = None,
-    buffer: bool = False,
+    to_continue: bool = False,
 ) -> None:
     """Saves a model so that `path` is always a whole file.
 
@@ -157,15 +174,30 @@ def save_model(
         path: path of the ``.zip``, which SB3's own ``load`` also reads.
         extra: small JSON content stored inside; `envs.sb3.policy_file.read_note` returns it.
         note: what the policy needs beside its weights.
-        buffer: whether to store the replay buffer inside as well, if the algorithm has one.
+        to_continue: whether training can go on from the file: it then holds the optimiser's moments, which are twice as
+            large as the weights, and the replay buffer, if the algorithm has one.
     """
     with new_file(path) as partial:
-        with partial.open("wb") as file:
+        with partial.open("wb") as file, nullcontext() if to_continue else _without_moments(model):
             model.save(file)
         write_note(partial, note, extra or {}, algorithm_of_model(model))
-        if buffer and isinstance(model, OffPolicyAlgorithm):
+        if to_continue and isinstance(model, OffPolicyAlgorithm):
             with zipfile.ZipFile(partial, "a") as archive, archive.open(_BUFFER_ENTRY, "w", force_zip64=True) as entry:
                 pickle.dump(model.replay_buffer, entry, protocol=pickle.HIGHEST_PROTOCOL)
+
+
+@contextmanager
+def _without_moments(model: BaseAlgorithm) -> Iterator[None]:
+    """Lets a model's optimisers forget what they have averaged inside the block."""
+    parts = (recursive_getattr(model, name) for name in model._get_torch_save_params()[0])
+    kept = [(part, part.state) for part in parts if isinstance(part, torch.optim.Optimizer)]
+    try:
+        for optimizer, _ in kept:
+            optimizer.state = defaultdict(dict)
+        yield
+    finally:
+        for optimizer, state in kept:
+            optimizer.state = state
 
 
 def load_model(path: Path, algorithm: Algorithm, venv: VecEnv | None = None, device: str = "cpu") -> BaseAlgorithm:

@@ -127,7 +127,7 @@ def train(plan: TrainingPlan, run_dir: Path, progress_bar: bool = True) -> Path:
         model = _resume_or_make(plan, venv, run_dir)
         if model.num_timesteps < plan.steps:
             _learn(plan, model, selection, run_dir, note, progress_bar)
-            save_model(model, run_dir / CHECKPOINT_FILE, STEP_UNIT, note, buffer=True)
+            save_model(model, run_dir / CHECKPOINT_FILE, STEP_UNIT, note, to_continue=True)
     finally:
         venv.close()
         selection.close()
@@ -236,7 +236,7 @@ class SaveCheckpoint(BaseCallback):
     def _on_rollout_start(self) -> None:
         if self.model.num_timesteps - self._saved_at >= self._every:
             self._saved_at = self.model.num_timesteps
-            save_model(self.model, self._path, self._extra(), self._note, buffer=True)
+            save_model(self.model, self._path, self._extra(), self._note, to_continue=True)
             if self._after is not None:
                 self._after()
 

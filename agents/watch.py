@@ -14,7 +14,7 @@ from tyro.conf import Positional
 
 from agents.hub import local_policy
 from agents.policy import load_policy, task_of_policy
-from agents.runs import policy_zip
+from agents.runs import SHIPPED, policy_zip
 from agents.task import EVALUATION_SEED
 from envs.sb3 import policy_file
 from predictor.support.command_line import parse
@@ -70,7 +70,7 @@ def write_film(config: WatchConfig) -> Path:
     path = local_policy(config.policy, config.trust_pickle)
     zipped = policy_zip(path)
     task = task_of_policy(path, config.device)
-    beside = Path() if is_hub(config.policy) else zipped.parent
+    beside = Path() if is_hub(config.policy) or zipped.parent == SHIPPED else zipped.parent
     out = config.out or beside / f"watch-{config.seed}.mp4"
     check_out(out.parent)
     model = policy_file.load_policy(zipped, device=config.device)

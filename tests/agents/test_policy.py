@@ -110,7 +110,10 @@ def test_another_forecaster_is_refused(tmp_path: Path):
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
-        ("absent", "no policy at .*absent: neither a run folder nor a .zip; train one with train_policy.py"),
+        (
+            "absent",
+            "no policy at .*absent: neither a run folder nor a .zip nor one that ships .*; train one with",
+        ),
         ("empty", "empty holds no training run \\(config.json is missing\\)"),
         ("stopped", "stopped holds no policy.zip: its training has not ended; continue it with --resume, or name one"),
         ("text.zip", "text.zip (is neither a PPO nor a DQN policy|holds no policy of)"),

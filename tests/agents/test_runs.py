@@ -5,7 +5,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3 import DQN, PPO
+import torch
+from stable_baselines3 import DQN, PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from agents.runs import check_forecaster, load_model, open_run, read_config, save_model
@@ -130,10 +132,38 @@ def test_model_round_trip_with_note(tmp_path: Path, venv: VecEnv):
     assert PPO.load(tmp_path / "model.zip", device="cpu").num_timesteps == 0  # SB3 itself reads the file
 
 
+def trained(algorithm: str) -> tuple[BaseAlgorithm, list[torch.optim.Optimizer]]:
+    if algorithm == "ppo":
+        ppo = make_ppo(DummyVecEnv([Toy])).learn(16)
+        return ppo, [ppo.policy.optimizer]
+    env = DummyVecEnv([lambda: gym.make("Pendulum-v1")])
+    sac = SAC("MlpPolicy", env, learning_starts=4, buffer_size=50, batch_size=4, device="cpu").learn(16)
+    return sac, [sac.actor.optimizer, sac.critic.optimizer]
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
+def test_what_only_training_needs_is_in_checkpoints_alone(algorithm: Any, tmp_path: Path):
+    model, optimizers = trained(algorithm)
+    moments = [one.state for one in optimizers]
+    assert all(moments)
+    final, latest = tmp_path / "final.zip", tmp_path / "latest.zip"
+    save_model(model, final)
+    save_model(model, latest, to_continue=True)
+    assert final.stat().st_size < 0.6 * latest.stat().st_size
+    assert [one.state for one in optimizers] == moments, "the model goes on as before"
+    obs = model.observation_space.sample()
+    for file in (final, latest):
+        again = load_model(file, algorithm, model.get_env())
+        np.testing.assert_array_equal(
+            again.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0]
+        )
+        again.learn(8)  # of the final one from fresh moments
+
+
 def test_replay_buffer_travels_in_the_checkpoint(tmp_path: Path, venv: VecEnv):
     model = DQN("MlpPolicy", venv, buffer_size=50, learning_starts=10, seed=0, device="cpu")
     model.learn(20)
-    save_model(model, tmp_path / "model.zip", buffer=True)
+    save_model(model, tmp_path / "model.zip", to_continue=True)
     loaded = load_model(tmp_path / "model.zip", "dqn", venv)
     assert isinstance(loaded, DQN)
     assert loaded.replay_buffer is not None
