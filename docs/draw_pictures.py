@@ -107,6 +107,7 @@ def draw_braking_leader(path: Path) -> None:
     figure, (road, ahead) = plt.subplots(2, 1, figsize=(10, 5), layout="constrained", height_ratios=(1, 1.6))
     _plot_scene(road, found.plain.perceived[0], {leader: ORANGE, follower: BLUE})
     road.set_title("orange: the leader, blue: its follower, green: the ego", fontsize=10, loc="left")
+    road.set_xlabel("x [m]")
     for one, marker, what in (
         (found.plain, "o", "the leader keeps its speed"),
         (found.perturbed, "s", "the leader is 8 m/s slower, at once"),
@@ -241,6 +242,7 @@ def _plot_scene(ax: Axes, scene: Scene, colors: dict[int, str] | None = None) ->
         corner = state[:2] - np.array(CAR_M) / 2
         ax.add_patch(Rectangle((float(corner[0]), float(corner[1])), *CAR_M, color=color, zorder=1))
     ax.set(xlim=(low, high), ylim=(LANES_M[-1] + 1.0, LANES_M[0] - 2.5), yticks=[])
+    ax.grid(False)
 
 
 def _plot_edges(ax: Axes, scene: Scene, edges: Sequence[tuple[int, int, float]]) -> None:
