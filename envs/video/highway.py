@@ -8,7 +8,7 @@ to an action.
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,6 +16,7 @@ import numpy as np
 from highway_env.envs.common.graphics import EnvViewer
 from jaxtyping import Float, UInt8
 
+from envs.drivers.ego import constant_actions
 from envs.plans.contact import contacts
 from envs.readers.highway import HighwayReader, is_highway_env
 from envs.video.drawing import (
@@ -49,7 +50,7 @@ class _Frame:
 
 @dataclass(frozen=True)
 class _Step:
-    """Forecasts of one policy step."""
+    """Forecasts of one policy step, and what was done then."""
 
     frame: int
     keys: tuple[int, ...]
@@ -57,6 +58,8 @@ class _Step:
     shares: Float[np.ndarray, "agents samples"]
     edge_probs: Float[np.ndarray, " agents"]
     plans: tuple[PlanOverlay, ...] = ()
+    action: str = ""
+    reward: float = 0.0
 
 
 @dataclass
@@ -112,10 +115,20 @@ class Recording:
             for i, key in enumerate(step.keys)
             if key in frame.positions_m
         ]
-        caption = f"{self.env_id}   t = {index / self.frames_per_step * self.dt_s:.1f} s   {frame.speed_mps:.1f} m/s"
         return draw_overlay(
-            decode_png(frame.png), frame.view, frame.positions_m[self._ego], agents, caption, self.style, step.plans
-        )
+            decode_png(frame.png), frame.view, frame.positions_m[self._ego], agents, self._caption(index), self.style,
+            step.plans,
+        )  # fmt: skip
+
+    def _caption(self, index: int) -> str:
+        """Returns time, speed, the action of the step with its reward, the return up to then, and a crash."""
+        frame, at_end = self._frames[index], index == len(self) - 1
+        step, gained = self._steps[frame.step], sum(one.reward for one in self._steps[: frame.step])
+        words = [self.env_id, f"t = {index / self.frames_per_step * self.dt_s:.1f} s", f"{frame.speed_mps:.1f} m/s"]
+        if step.action:
+            words.append(f"{step.action} {step.reward:+.2f}")
+        words.append(f"return {gained:.2f}")
+        return "   ".join([*words, "crashed"] if at_end and self.crashed else words)
 
     def write_video(self, path: str | Path) -> None:
         """Writes the video as MP4 (H.264, yuv420p); `path` is never a partial file."""
@@ -165,8 +178,9 @@ def record_episode(
         recorder.begin()
         ended = False
         while not ended and recorder.recording.num_steps != max_steps:
-            obs, reward, terminated, truncated, info = env.step(act(obs))
-            recorder.note_step(float(reward), bool(info.get("crashed", False)))
+            action = act(obs)
+            obs, reward, terminated, truncated, info = env.step(action)
+            recorder.note_step(action, float(reward), bool(info.get("crashed", False)))
             ended = terminated or truncated
     finally:
         recorder.end()
@@ -191,6 +205,7 @@ class _Recorder:
             style=style,
         )
         self._reader: HighwayReader = env.get_wrapper_attr("reader")
+        self._action_names = {number: name for name, number in constant_actions(env).items()}
 
     def begin(self) -> None:
         """Records the first picture, after the reset."""
@@ -202,10 +217,13 @@ class _Recorder:
         self._note_forecast()
         self._capture_frame()
 
-    def note_step(self, reward: float, crashed: bool) -> None:
+    def note_step(self, action: Any, reward: float, crashed: bool) -> None:
         """Records the end of a policy step: its last picture shows the new forecast."""
         self.recording.total_reward += reward
         self.recording.crashed |= crashed
+        numbers = " ".join(f"{value:+.2f}" for value in np.ravel(action))
+        name = self._action_names.get(int(action), str(action)) if self._action_names else numbers
+        self.recording._steps[-1] = replace(self.recording._steps[-1], action=name, reward=reward)
         self._note_forecast()
         self._capture_frame()
 

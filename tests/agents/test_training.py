@@ -186,7 +186,7 @@ def test_damaged_best_model_is_one_clear_line(make_selection: Callable[[int], Eg
 def test_checkpoints_are_taken_between_updates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     saved: list[int] = []
 
-    def note_steps(model: PPO, path: Path, extra: Any, note: Any, buffer: bool) -> None:
+    def note_steps(model: PPO, path: Path, extra: Any, note: Any, to_continue: bool) -> None:
         saved.append(model.num_timesteps)
 
     monkeypatch.setattr("agents.training.save_model", note_steps)

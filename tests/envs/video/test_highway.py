@@ -1,5 +1,6 @@
 import subprocess
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -67,6 +68,17 @@ def test_frame_is_saved_as_drawn(recording: Recording, tmp_path: Path):
     assert index == 2 * recording.frames_per_step
     recording.write_frame(str(tmp_path / "frame.png"), index)
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "frame.png")), recording.draw(index))
+
+
+def test_the_caption_tells_what_was_done_and_what_came_of_it(recording: Recording):
+    first = recording._caption(0)
+    gained = recording._steps[0].reward
+    assert f"idle {gained:+.2f}   return 0.00" in first and gained > 0
+    assert f"return {gained:.2f}" in recording._caption(recording.frame_of_step(1))
+    last = recording._caption(len(recording) - 1)
+    assert last.endswith(f"return {recording.total_reward:.2f}") and "idle" not in last, "nothing was done any more"
+    crashed = replace(recording, crashed=True)
+    assert crashed._caption(len(recording) - 1).endswith("crashed") and "crashed" not in crashed._caption(0)
 
 
 def test_forecasts_and_truth_are_in_the_picture(recording: Recording):
