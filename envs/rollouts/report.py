@@ -199,10 +199,12 @@ def write_pictures(out: Path, result: "EnvAccuracy", cases: Sequence[Case]) -> N
     for ax, quantity, label in (
         (axes[0, 0], "by_step_m", "displacement of the best sample [m]"),
         (axes[0, 1], "rmse_m", "RMSE of the samples' mean [m]"),
-        (axes[1, 0], "coverage", "share of truths within the central 90 % of the samples"),
+        (axes[1, 0], "coverage", "truths within the samples' central 90 %"),
         (axes[1, 1], "miss_by_step", f"share more than {threshold_m:g} m off"),
     ):
         plot_by_horizon(ax, [a for a in result.lines if getattr(a, quantity)], result.dt_s, quantity, label)
+    entries = {label: line for ax in axes.flat for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(entries.values(), entries, loc="outside lower center", ncols=4)
     figure.suptitle(f"{title(result)}; bands are 95 % intervals over episodes")
     save_figure(figure, out / f"{stem}.by_horizon.png", 130)
     if cases:
@@ -231,8 +233,6 @@ def plot_by_horizon(ax: Axes, accuracies: Sequence[Accuracy], dt_s: float, quant
             ax.fill_between(time_s, low, high, color=look["color"], alpha=0.15, lw=0)
     ax.set_xlabel("time ahead [s]")
     ax.set_ylabel(label)
-    if accuracies:
-        ax.legend(fontsize=8)
     return ax
 
 
