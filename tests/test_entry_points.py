@@ -71,8 +71,8 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     "docs.draw_pictures": [
         (
             "--only film",
-            "only must be among highway, what_if, braking_leader, causal_graph, fans_roundabout, fans_intersection, "
-            "got film",
+            "only must be among highway, what_if, braking_leader, causal_graph, calibration, fans_roundabout, "
+            "fans_intersection, got film",
         )
     ],
     "predictor.card": [("--checkpoint absent --data absent --accuracy absent", "no checkpoint 'absent'")],

@@ -55,7 +55,8 @@ def test_a_signal_ends_a_command_in_one_line(inputs: Path, tmp_path: Path, name:
         assert run.process.wait(PATIENCE_S) == 128 + number, errors.read_text()
     finally:
         run.process.kill()
-    (line,) = errors.read_text().splitlines()
+    line = errors.read_text().removesuffix("\n")
+    assert "\n" not in line
     before, _, after = LINES[name].format(out=out).rpartition("*")
     assert line.startswith(before) and line.endswith(after)
     assert orphans(run) == []

@@ -534,7 +534,7 @@ def test_bad_input_is_one_clear_line_and_leaves_nothing(
 
 def test_help_explains_every_field(command: Callable[..., None], capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as exit_:
-        command("--help")
+        command("--help-all")
     assert exit_.value.code == 0
     text = " ".join(capsys.readouterr().out.split())
     for option in (

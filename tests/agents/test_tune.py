@@ -89,7 +89,7 @@ def test_seeds_are_used_by_nothing_else(tmp_path: Path, monkeypatch: pytest.Monk
 
     def trained(plan: TrainingPlan, *arguments: Any, **options: Any) -> Path:
         plans.append(plan)
-        return train(plan, *arguments, **options)
+        return train(replace(plan, in_process=True), *arguments, **options)  # where its seeds are seen
 
     monkeypatch.setattr(command, "train", trained)
     tune(config(tmp_path / "tuned", trials=1, trainings=2, seed=3))
