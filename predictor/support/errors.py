@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -109,6 +110,8 @@ def _leave(word: str, message: str, error: BaseException, status: int) -> None:
     advice = _advice(error)
     if word == "stopped" and advice is None:
         advice = "what was not written yet is lost; the same command begins anew"
+    if word == "stopped":  # in the middle of a read or a write of Zarr, which Python would tell at its end
+        warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
     text = "; ".join(filter(None, (message, advice)))
     print(f"{word}: {text}", file=sys.stderr)
     sys.exit(status)

@@ -1,6 +1,8 @@
 import errno
 import os
 import signal
+import subprocess
+import sys
 
 import pytest
 
@@ -135,3 +137,21 @@ def test_signals_that_are_ignored_stay_ignored():
             assert stops.asked is None
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def test_what_a_stop_leaves_undone_is_not_told():
+    """Zarr hands coroutines to a thread; SIGTERM may come before one is handed over."""
+    code = (
+        "import os, signal\n"
+        "from predictor.support.errors import run_entry_point\n"
+        "async def write(): ...\n"
+        "kept = []\n"
+        "def main():\n"
+        "    kept.append(write())\n"
+        "    os.kill(os.getpid(), signal.SIGTERM)\n"
+        "    signal.pause()\n"
+        "run_entry_point(main)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 143
+    assert done.stderr == "stopped: what was not written yet is lost; the same command begins anew\n"
