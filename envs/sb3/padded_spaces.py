@@ -57,22 +57,30 @@ class PaddedObservation:
 
     def stack(self, observations: Sequence[tuple[str, Any]]) -> Any:
         """Returns the padded observations of (agent, own observation) pairs, stacked; zeros for None."""
-        arrays: dict[str, NDArray[Any]] = {}
-        for key, space in self._entries.items():
-            arrays[key] = np.zeros((len(observations), *(space.shape or ())), space.dtype)
-            arrays[key] += getattr(space, "start", 0)
-        for i, (agent, seen) in enumerate(observations):
-            if seen is None:
-                continue
-            for key, array in arrays.items():
-                value = np.asarray(seen[key] if self._is_dict else seen)
-                shape = self._own[agent][key].shape
-                if value.shape != shape:
-                    raise UserError(f"the observation of agent '{agent}' must have shape {shape}, got {value.shape}")
-                array[i, ...][_corner(shape)] = value
-            if self._role_column:
+        arrays = {key: self._stacked(key, observations) for key in self._entries}
+        for i, (agent, seen) in enumerate(observations if self._role_column else ()):
+            if seen is not None:
                 arrays[self._vector][i, self._role_column[agent]] = 1
         return arrays if self._is_dict else arrays[""]
+
+    def _stacked(self, key: str, observations: Sequence[tuple[str, Any]]) -> NDArray[Any]:
+        """Returns one entry of all observations, padded."""
+        space = self._entries[key]
+        shape, start = space.shape or (), getattr(space, "start", 0)
+        padding = np.full(shape, start, space.dtype)
+        values = [
+            padding if seen is None else np.asarray(seen[key] if self._is_dict else seen) for _, seen in observations
+        ]
+        for i, ((agent, seen), value) in enumerate(zip(observations, values, strict=True)):
+            if seen is None:
+                continue
+            own = self._own[agent][key].shape
+            if value.shape != own:
+                raise UserError(f"the observation of agent '{agent}' must have shape {own}, got {value.shape}")
+            if own != shape:
+                values[i] = padding.copy()
+                values[i][_corner(own)] = value
+        return np.array(values, space.dtype).reshape(len(values), *shape)
 
     def one(self, agent: str, seen: Any) -> Any:
         """Returns a single padded observation."""

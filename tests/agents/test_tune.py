@@ -51,6 +51,16 @@ def ended(folder: Path) -> list[tuple[Any, Any, Any]]:
     return [(trial.params, trial.user_attrs["settings"], trial.value) for trial in trials]
 
 
+def test_optuna_says_nothing_of_its_own(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    optuna.logging.set_verbosity(optuna.logging.INFO)
+    optuna.logging.enable_propagation()
+    try:
+        command.open_study(tmp_path / "tuning.db")
+    finally:
+        optuna.logging.disable_propagation()
+    assert not caplog.records
+
+
 def test_the_best_trial_is_written_for_train_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     best = tune(config(tmp_path / "tuned", **HIGHWAY, steps=8))
     lines = capsys.readouterr().out.splitlines()

@@ -502,9 +502,11 @@ def test_a_run_that_has_no_checkpoint_yet_is_named_as_one(tmp_path: Path):
         load_checkpoint(tmp_path)
 
 
-def test_a_link_to_itself_has_a_name_and_is_refused_where_it_is_read(tmp_path: Path):
-    loop = tmp_path / "loop"
+@pytest.mark.parametrize(("called", "name"), [("loop", "loop"), ("checkpoint", "run")])
+def test_a_link_to_itself_has_a_name_and_is_refused_where_it_is_read(tmp_path: Path, called: str, name: str):
+    loop = tmp_path / "run" / called
+    loop.parent.mkdir()
     loop.symlink_to(loop)
-    assert name_of_folder(loop) == "loop" and names_of([str(loop)]) == {str(loop): "loop"}
-    with pytest.raises(UserError, match="loop"):
+    assert name_of_folder(loop) == name and names_of([str(loop)]) == {str(loop): name}
+    with pytest.raises(UserError, match=called):
         load_checkpoint(loop)

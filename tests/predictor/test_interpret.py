@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from predictor import interpret as interpretation
 from predictor.baselines.mlp import MLP, MLPConfig
@@ -445,6 +446,21 @@ def test_smoke_with_labels(
     text = (out / "scores.md").read_text()
     assert "| property | pairs | best | r |" in text and "* DCI: disentanglement – (not defined for one" in text
     assert "| 2 | static |" in text and "| 3 | dynamic |" in text and "nan" not in text
+
+
+def test_titles_of_pictures_hold_names_and_no_paths(monkeypatch: pytest.MonkeyPatch, springs: Path, tmp_path: Path):
+    texts: dict[str, list[str]] = {}
+
+    def keep(figure: Figure, file: Path, **_: Any) -> None:
+        texts[file.name] = [text.get_text() for text in figure.findobj(Text)]
+
+    monkeypatch.setattr(Figure, "savefig", keep)
+    checkpoint = saved(tmp_path / "toy", spring_spec(Physics(num_agents=4)))
+    interpret(InterpretConfig(str(checkpoint), springs, tmp_path / "out", 5, 4, 3, 2))
+    assert sorted(texts) == ["features.png", "graph.png", "trajectories.png"]
+    for shown in texts.values():
+        assert any("toy on springs" in text for text in shown)
+        assert not any(str(tmp_path) in text for text in shown)
 
 
 def test_without_scikit_learn_labels_are_refused_before_anything_is_measured(
