@@ -63,6 +63,7 @@ _HIGHWAY: dict[str, EnvEntry] = {
     "racetrack-oval-v1": EnvEntry(checkpoint="racetrack-oval"),
     "u-turn-v1": EnvEntry(checkpoint="u-turn"),
     "highway-mixed-v0": EnvEntry(checkpoint="highway-mixed"),
+    "highway-mixed-costly-v0": EnvEntry(checkpoint="highway-mixed"),
     "merge-mixed-v0": EnvEntry(),
     "roundabout-mixed-v0": EnvEntry(),
     "intersection-mixed-v0": EnvEntry(),

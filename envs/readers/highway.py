@@ -27,6 +27,7 @@ _FRAMES: dict[str, tuple[AxisFrame, AxisFrame]] = {
     "highway-fast-v0": _UNBOUNDED_X,
     "two-way-v0": _UNBOUNDED_X,
     "highway-mixed-v0": _UNBOUNDED_X,
+    "highway-mixed-costly-v0": _UNBOUNDED_X,
 }
 
 
