@@ -142,8 +142,6 @@ class EvaluateConfig:
         check_positive(self, "miss_m", "timeout_s")
         if arguments_of(self.env_kwargs) and len(self.env_ids) != 1:
             raise UserError(f"env_kwargs are of one environment; give one of --env-ids, got {len(self.env_ids)}")
-        if arguments_of(self.env_kwargs) and (self.reactions or self.graph or self.plans):
-            raise UserError("env_kwargs go with accuracy, not with --reactions, --graph or --plans; leave one out")
         names_of(self.checkpoint)
 
 
@@ -247,11 +245,11 @@ def evaluate_causes(config: EvaluateConfig, console: Console) -> None:
     Raises:
         UserError: an environment cannot be perturbed or copied, or no checkpoint fits it.
     """
-    drivers = {env_id: config.driver or default_drivers(env_id)[0] for env_id in config.env_ids}
+    drivers = {env_id: config.driver or default_drivers(env_id, config.env_kwargs)[0] for env_id in config.env_ids}
     for env_id, driver in drivers.items():  # raises before hours of work
-        check_can_branch(env_id, "idle" if driver.endswith(".zip") else driver)
+        check_can_branch(env_id, "idle" if driver.endswith(".zip") else driver, config.env_kwargs)
         if config.plans:
-            check_has_plans(env_id)
+            check_has_plans(env_id, config.env_kwargs)
     if config.reactions:
         runs = [_reaction_run(config, env_id, driver) for env_id, driver in drivers.items()]
         _measure_all(config, console, "reactions", runs, measure_reactions, reaction_report)
@@ -266,8 +264,8 @@ def evaluate_causes(config: EvaluateConfig, console: Console) -> None:
 def _reaction_run(config: EvaluateConfig, env_id: str, driver: str) -> ReactionRun:
     return ReactionRun(
         env_id, driver, config.checkpoint or (checkpoint_for(env_id),), config.perturbations, config.most_episodes,
-        config.seed, config.max_steps, config.workers, config.horizon_steps, _stores_of(config.data, env_id),
-        config.timeout_s, config.cluster,
+        config.seed, config.max_steps, config.workers, config.horizon_steps,
+        _stores_of(config.data, env_id, config.env_kwargs), config.timeout_s, config.cluster, config.env_kwargs,
     )  # fmt: skip
 
 
@@ -275,14 +273,14 @@ def _graph_run(config: EvaluateConfig, env_id: str, driver: str) -> GraphRun:
     checkpoints = config.checkpoint or (checkpoint_for(env_id),)
     return GraphRun(
         env_id, driver, checkpoints, config.episodes, config.seed, config.max_steps, config.workers, config.timeout_s,
-        config.cluster,
+        config.cluster, config.env_kwargs,
     )  # fmt: skip
 
 
 def _plan_run(config: EvaluateConfig, env_id: str, driver: str) -> PlanRun:
     return PlanRun(
         env_id, driver, config.checkpoint or (checkpoint_for(env_id),), config.episodes, config.seed, config.max_steps,
-        config.workers, config.horizon_steps, config.timeout_s, config.cluster,
+        config.workers, config.horizon_steps, config.timeout_s, config.cluster, config.env_kwargs,
     )  # fmt: skip
 
 

@@ -151,13 +151,13 @@ class BranchPoint:
         return Branches(intervention, self.ids, self.plain, perturbed, self._world.spec.position_dim)
 
 
-def check_can_branch(env_id: str, driver: str) -> None:
+def check_can_branch(env_id: str, driver: str, env_kwargs: str = "") -> None:
     """Checks that agents of an environment can be perturbed in copies of it.
 
     Raises:
         UserError: they cannot, or the environment or the driver is unknown.
     """
-    world = open_world(env_id, driver)
+    world = open_world(env_id, driver, env_kwargs=env_kwargs)
     try:
         kinds_of(world)
     finally:

@@ -40,6 +40,8 @@ class GraphTask:
     """Largest length of an episode [policy steps]."""
     settings: CausalSettings
     """How labels are measured."""
+    env_kwargs: str = ""
+    """Arguments of the environment, as the text of a JSON object; empty for none."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ class EdgeScene:
 
 def play_graph(task: GraphTask) -> list[EdgeScene]:
     """Plays one episode and returns its scenes with labels."""
-    world = kept_world(task.env_id, task.driver, task.checkpoints)
+    world = kept_world(task.env_id, task.driver, task.checkpoints, task.env_kwargs)
     world.reset(task.seed)
     found = checkpoint_forecasters(task.checkpoints, world.spec, task.env_id)
     forecasters = {name: SideForecaster(forecaster, world.spec, 1) for name, forecaster in found.items()}

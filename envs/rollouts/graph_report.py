@@ -30,7 +30,7 @@ def title(result: EnvGraph) -> str:
     """Returns the title of one environment's table."""
     first = next(iter(result.scores.values()))
     return (
-        f"{result.env_id}, driven {result.driver}: {first.pairs} pairs of {first.episodes} episodes, "
+        f"{result.env}, driven {result.driver}: {first.pairs} pairs of {first.episodes} episodes, "
         f"{100 * first.share:.0f} % are edges"
     )
 

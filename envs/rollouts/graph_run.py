@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from envs.registry import name_with
 from envs.rollouts.causal_labels import CausalSettings, settings_for
 from envs.rollouts.causal_scenes import EdgeScene, GraphTask, play_graph
 from envs.rollouts.cluster_pool import episode_pool
@@ -43,6 +44,8 @@ class GraphRun:
     """Largest time between two steps of an episode [s]."""
     cluster: str | None = None
     """Address of a Ray cluster that plays in place of this machine."""
+    env_kwargs: str = ""
+    """Arguments of the environment, as the text of a JSON object; empty for none."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,13 @@ class EnvGraph:
     """Scores of each checkpoint and each rule, by name."""
     misfits: dict[str, str]
     """Reason for each checkpoint that was left out, by its name."""
+    env_kwargs: str = ""
+    """Arguments of the environment, as the text of a JSON object; empty for none."""
+
+    @property
+    def env(self) -> str:
+        """Id of the environment, with its arguments where it had some."""
+        return name_with(self.env_id, self.env_kwargs)
 
 
 def measure_graph(run: GraphRun) -> EnvGraph:
@@ -70,19 +80,21 @@ def measure_graph(run: GraphRun) -> EnvGraph:
         UserError: the environment cannot be perturbed or copied, checkpoints perceive differently, none fits, or no
             label is known.
     """
-    world = open_world(run.env_id, run.driver if not run.driver.endswith(".zip") else "idle")
+    driver = run.driver if not run.driver.endswith(".zip") else "idle"
+    world = open_world(run.env_id, driver, env_kwargs=run.env_kwargs)
     spec, settings = world.spec, settings_for(world)
     world.close()
     fitting, misfits = fitting_checkpoints(run.env_id, run.checkpoints, spec)
     tasks = [
-        GraphTask(run.env_id, run.driver, fitting, run.seed + i, run.max_steps, settings) for i in range(run.episodes)
+        GraphTask(run.env_id, run.driver, fitting, run.seed + i, run.max_steps, settings, run.env_kwargs)
+        for i in range(run.episodes)
     ]
     with episode_pool(play_graph, run.workers, run.timeout_s, cluster=run.cluster) as pool:
         episodes = list(track(pool.results(tasks), f"graph {run.env_id}", total=len(tasks)))
     scores = scores_of(episodes, settings.threshold_m)
     if not next(iter(scores.values())).pairs:
         raise UserError(f"{run.env_id}: no causal label is known in {run.episodes} episodes; add --episodes")
-    return EnvGraph(run.env_id, run.driver, run.episodes, settings, scores, misfits)
+    return EnvGraph(run.env_id, run.driver, run.episodes, settings, scores, misfits, run.env_kwargs)
 
 
 def scores_of(episodes: Sequence[Sequence[EdgeScene]], threshold_m: float) -> dict[str, CausalScores]:

@@ -48,6 +48,8 @@ class PlanTask:
     """Largest length of an episode [policy steps]."""
     horizon_steps: int
     """Number of steps forecast and played."""
+    env_kwargs: str = ""
+    """Arguments of the environment, as the text of a JSON object; empty for none."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ class PlanMoment:
 
 def play_plans(task: PlanTask) -> list[PlanMoment]:
     """Plays one episode and returns its moments."""
-    world = kept_world(task.env_id, task.driver, task.checkpoints)
+    world = kept_world(task.env_id, task.driver, task.checkpoints, task.env_kwargs)
     world.reset(task.seed)
     model = plan_model_for(world.env)
     found = {STRAIGHT: ConstantVelocity(world.spec)} | checkpoint_forecasters(task.checkpoints, world.spec, task.env_id)

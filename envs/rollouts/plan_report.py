@@ -27,7 +27,7 @@ HEADS = (
 def title(result: EnvPlans) -> str:
     """Returns the title of one environment's table."""
     return (
-        f"{result.env_id}, driven {result.driver}: {result.moments} moments of {result.episodes} episodes, "
+        f"{result.env}, driven {result.driver}: {result.moments} moments of {result.episodes} episodes, "
         f"{result.horizon_steps} × {result.dt_s:g} s"
     )
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from envs.plans import plan_model_for
+from envs.registry import name_with
 from envs.rollouts.cluster_pool import episode_pool
 from envs.rollouts.plan_moments import PlanMoment, PlanTask, play_plans
 from envs.rollouts.side_forecasts import fitting_checkpoints
@@ -42,6 +43,8 @@ class PlanRun:
     """Largest time between two steps of an episode [s]."""
     cluster: str | None = None
     """Address of a Ray cluster that plays in place of this machine."""
+    env_kwargs: str = ""
+    """Arguments of the environment, as the text of a JSON object; empty for none."""
 
 
 @dataclass(frozen=True)
@@ -98,15 +101,22 @@ class EnvPlans:
     """Scores by forecaster."""
     misfits: dict[str, str]
     """Reason for each checkpoint that was left out, by its name."""
+    env_kwargs: str = ""
+    """Arguments of the environment, as the text of a JSON object; empty for none."""
+
+    @property
+    def env(self) -> str:
+        """Id of the environment, with its arguments where it had some."""
+        return name_with(self.env_id, self.env_kwargs)
 
 
-def check_has_plans(env_id: str) -> None:
+def check_has_plans(env_id: str, env_kwargs: str = "") -> None:
     """Checks that the ego of an environment has plans.
 
     Raises:
         UserError: it has none, or the environment is unknown.
     """
-    world = open_world(env_id, "idle")
+    world = open_world(env_id, "idle", env_kwargs=env_kwargs)
     try:
         if not world.spec.has_ego:
             raise UserError(f"plans are those of one ego, and {env_id} has several agents; use an env with one ego")
@@ -122,8 +132,9 @@ def measure_plans(run: PlanRun) -> EnvPlans:
         UserError: the environment has no plan model, cannot be copied, checkpoints perceive differently, none fits, or
             no episode is long enough.
     """
-    check_has_plans(run.env_id)
-    world = open_world(run.env_id, run.driver if not run.driver.endswith(".zip") else "idle")
+    check_has_plans(run.env_id, run.env_kwargs)
+    driver = run.driver if not run.driver.endswith(".zip") else "idle"
+    world = open_world(run.env_id, driver, env_kwargs=run.env_kwargs)
     spec = world.spec
     world.reset(run.seed)
     names = plan_model_for(world.env).names
@@ -131,7 +142,8 @@ def measure_plans(run: PlanRun) -> EnvPlans:
     fitting, misfits = fitting_checkpoints(run.env_id, run.checkpoints, spec)
     horizon = run.horizon_steps or load_forecaster(fitting[0], spec, run.env_id).horizon_steps
     tasks = [
-        PlanTask(run.env_id, run.driver, fitting, run.seed + i, run.max_steps, horizon) for i in range(run.episodes)
+        PlanTask(run.env_id, run.driver, fitting, run.seed + i, run.max_steps, horizon, run.env_kwargs)
+        for i in range(run.episodes)
     ]
     with episode_pool(play_plans, run.workers, run.timeout_s, cluster=run.cluster) as pool:
         played = pool.results(tasks)
@@ -151,6 +163,7 @@ def measure_plans(run: PlanRun) -> EnvPlans:
         crashed.tolist(),
         {name: scores_of(episodes, name) for name in moments[0].risk},
         misfits,
+        run.env_kwargs,
     )
 
 

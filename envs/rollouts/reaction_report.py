@@ -28,7 +28,7 @@ HEADS = (
 def title(result: EnvReactions) -> str:
     """Returns the title of one environment's table."""
     steps = f"{result.horizon_steps} steps of {result.dt_s:g} s"
-    return f"{result.env_id}, driven {result.driver}: shift of receivers after {steps}"
+    return f"{result.env}, driven {result.driver}: shift of receivers after {steps}"
 
 
 def remarks(result: EnvReactions) -> list[str]:
@@ -122,7 +122,7 @@ def write_picture(out: Path, result: EnvReactions) -> None:
             panels[name].set_ylim(panels[beside].get_ylim())
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
-    figure.suptitle(f"{result.env_id}: mean shift of the receiver [m]", fontsize=11)
+    figure.suptitle(f"{result.env}: mean shift of the receiver [m]", fontsize=11)
     save_figure(figure, out / f"{result.env_id.replace('/', '-')}.reactions.png", 130)
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from envs.registry import name_with
 from envs.rollouts.cluster_pool import episode_pool
 from envs.rollouts.interventions import kinds_of
 from envs.rollouts.reaction_cells import FALSE_BESIDE, cells_of
@@ -46,6 +47,8 @@ class ReactionRun:
     """Largest time between two steps of an episode [s]."""
     cluster: str | None = None
     """Address of a Ray cluster that plays in place of this machine."""
+    env_kwargs: str = ""
+    """Arguments of the environment, as the text of a JSON object; empty for none."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,13 @@ class EnvReactions:
     """Reason for each checkpoint that was left out, by its name."""
     perturbations: list[Perturbation]
     """All perturbations, with their shifts."""
+    env_kwargs: str = ""
+    """Arguments of the environment, as the text of a JSON object; empty for none."""
+
+    @property
+    def env(self) -> str:
+        """Id of the environment, with its arguments where it had some."""
+        return name_with(self.env_id, self.env_kwargs)
 
 
 def measure_reactions(run: ReactionRun) -> EnvReactions:
@@ -98,7 +108,8 @@ def measure_reactions(run: ReactionRun) -> EnvReactions:
     Raises:
         UserError: the environment cannot be perturbed or copied, checkpoints perceive differently, or none fits.
     """
-    world = open_world(run.env_id, run.driver if not run.driver.endswith(".zip") else "idle")
+    driver = run.driver if not run.driver.endswith(".zip") else "idle"
+    world = open_world(run.env_id, driver, env_kwargs=run.env_kwargs)
     spec, names = world.spec, [cell.name for cell in cells_of(world)]
     kinds_of(world)
     world.close()
@@ -115,6 +126,7 @@ def measure_reactions(run: ReactionRun) -> EnvReactions:
         [_cell(name, found) for name in names],
         misfits,
         found,
+        run.env_kwargs,
     )
 
 
@@ -135,7 +147,15 @@ def _play_until_enough(
             wave = range(played, min(played + 2 * pool.size, run.episodes))
             tasks = [
                 ReactionTask(
-                    run.env_id, run.driver, checkpoints, run.seed + i, horizon_steps, run.max_steps, wanted, run.stores
+                    run.env_id,
+                    run.driver,
+                    checkpoints,
+                    run.seed + i,
+                    horizon_steps,
+                    run.max_steps,
+                    wanted,
+                    run.stores,
+                    run.env_kwargs,
                 )
                 for i in wave
             ]

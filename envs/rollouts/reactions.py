@@ -64,6 +64,8 @@ class ReactionTask:
     """Names of the cells to measure; what is found in one does not depend on the others."""
     stores: tuple[str, ...] = ()
     """Stores to fit nearest neighbours to; empty leaves them out."""
+    env_kwargs: str = ""
+    """Arguments of the environment, as the text of a JSON object; empty for none."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ class Perturbation:
 
 def play_reactions(task: ReactionTask) -> list[Perturbation]:
     """Plays one episode and returns its perturbations."""
-    world = kept_world(task.env_id, task.driver, task.checkpoints)
+    world = kept_world(task.env_id, task.driver, task.checkpoints, task.env_kwargs)
     world.reset(task.seed)
     forecasters = _forecasters(task, world.spec)
     rng = reaction_rng(task.seed)

@@ -120,9 +120,10 @@ def fitting_checkpoints(
 
 
 @functools.lru_cache(maxsize=4)
-def kept_world(env_id: str, driver: str, checkpoints: tuple[str, ...]) -> World:
+def kept_world(env_id: str, driver: str, checkpoints: tuple[str, ...], env_kwargs: str = "") -> World:
     """Returns a world whose ego perceives what the first learned checkpoint was trained on, kept in a process."""
     if sees_forecasts(driver):
-        return open_world(env_id, driver, checkpoints[0])
+        return open_world(env_id, driver, checkpoints[0], env_kwargs=env_kwargs)
     learned = [name for name in checkpoints if name != CONSTANT_VELOCITY and not is_own(name)]
-    return open_world(env_id, driver, perceived_as=load_checkpoint(learned[0])[1].spec if learned else None)
+    perceived_as = load_checkpoint(learned[0])[1].spec if learned else None
+    return open_world(env_id, driver, perceived_as=perceived_as, env_kwargs=env_kwargs)

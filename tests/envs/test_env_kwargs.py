@@ -8,7 +8,9 @@ import pytest
 from envs import collect, evaluate
 from envs.collect import CollectConfig
 from envs.registry import make_env
+from envs.rollouts import side_forecasts
 from envs.rollouts.workers import EpisodePool
+from envs.rollouts.world import World, open_world
 from predictor.data.store import read_store
 from predictor.evaluation.in_env_record import measurements_of
 from predictor.support.errors import UserError
@@ -111,3 +113,29 @@ def test_data_of_another_environment_is_no_data_of_this_one(measured: dict[str, 
         with pytest.raises(UserError, match=f"data: no store of {ROAD}"):
             evaluate._stores_of([store], ROAD, kwargs)
     assert np.isfinite(measured["results"][0]["reduction"])
+
+
+@pytest.mark.parametrize("measured_by", [["--graph"], ["--plans"], ["--reactions", "--perturbations", "1"]])
+def test_causes_are_measured_in_the_changed_environment(
+    measured_by: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+):
+    crowds: list[int] = []
+
+    def opened(env_id: str, driver: str, *arguments: Any, **options: Any) -> World:
+        made = open_world(env_id, driver, *arguments, **options)
+        crowds.append(made.env.unwrapped.config["vehicles_count"])  # type: ignore[attr-defined]
+        return made
+
+    side_forecasts.kept_world.cache_clear()
+    monkeypatch.setattr(EpisodePool, "results", lambda self, tasks: map(self._play, tasks))
+    monkeypatch.setattr(side_forecasts, "open_world", opened)
+    base = ["--env-ids", ROAD, "--checkpoint", "constant-velocity", "--episodes", "3", "--workers", "1"]
+    base += ["--driver", "slower", "--max-steps", "12", "--horizon-steps", "2", "--most-episodes", "2"]
+    crowded = '{"config": {"vehicles_count": 8, "vehicles_density": 1.5}}'
+    arguments = [*base, *measured_by, "--env-kwargs", crowded, "--out", str(tmp_path)]
+    code, errors, printed = run_command(evaluate.main, arguments, monkeypatch, capsys)
+    assert (code, errors, set(crowds)) == (0, [], {8})
+    name = measured_by[0].removeprefix("--")
+    [result] = read_json(tmp_path / f"{name}.json")["results"]
+    assert result["env_kwargs"] == crowded
+    assert f"{ROAD} {crowded}" in (tmp_path / f"{name}.md").read_text() and f"{ROAD} {crowded}" in printed

@@ -370,9 +370,9 @@ ERRORS = {
         ["--env-ids", ROAD, TAG, "--env-kwargs", '{"a": 1}'],
         "env_kwargs are of one environment; give one of --env-ids, got 2",
     ),
-    "arguments-of-graph": (
-        ["--graph", "--env-kwargs", '{"a": 1}'],
-        "env_kwargs go with accuracy, not with --reactions",
+    "arguments-of-two-graphs": (
+        ["--graph", "--env-ids", ROAD, TAG, "--env-kwargs", '{"a": 1}'],
+        "env_kwargs are of one environment; give one of --env-ids, got 2",
     ),
     "no-json": (["--env-kwargs", "size=3"], "env_kwargs must be a JSON object, got 'size=3'"),
     "unknown-argument": (

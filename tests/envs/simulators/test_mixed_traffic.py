@@ -104,7 +104,8 @@ def test_a_collision_costs_a_minute_of_the_best_driving():
     ego = env.unwrapped.vehicle
     ego.speed = 30.0
     ego.target_lane_index = ego.lane_index = ("0", "1", 2)
-    ego.position = np.array([ego.position[0], 8.0])
+    ego.lane = env.unwrapped.road.network.get_lane(ego.lane_index)
+    ego.position = ego.lane.position(100.0, 0.0)
     best = env.unwrapped._reward(1)
     ego.crashed = True
     assert best == pytest.approx(0.05) and env.unwrapped._reward(1) == pytest.approx(best - 60 * 0.05)
