@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from envs import EntityRowsReader as EntityRowsReader
     from envs import EnvPoolVecEnv as EnvPoolVecEnv
     from envs import FilmForecasts as FilmForecasts
+    from envs import FilmParallelForecasts as FilmParallelForecasts
     from envs import ForecastConfig as ForecastConfig
     from envs import ForecastObservation as ForecastObservation
     from envs import ForecastParallelEnv as ForecastParallelEnv
@@ -112,11 +113,11 @@ PACKAGE_OF = {
         ),
         "envs": (
             "AgentMonitor", "AgentTensors", "BatchedReader", "EntityRowsReader", "EnvPoolVecEnv", "FilmForecasts",
-            "ForecastConfig", "ForecastObservation", "ForecastParallelEnv", "ForecastStream", "FunctionReader",
-            "HighwayParallelEnv", "MultiagentReader", "MultiagentScene", "ParallelVecEnv", "Reader", "SceneObservation",
-            "SceneReader", "SceneStream", "TensorReader", "VecForecast", "VectorForecast", "View", "VmasReader",
-            "agent_ids", "make_env", "make_multiagent_env", "pad_multiagent_scene", "reader_for", "register_reader",
-            "register_view", "unflatten",
+            "FilmParallelForecasts", "ForecastConfig", "ForecastObservation", "ForecastParallelEnv", "ForecastStream",
+            "FunctionReader", "HighwayParallelEnv", "MultiagentReader", "MultiagentScene", "ParallelVecEnv", "Reader",
+            "SceneObservation", "SceneReader", "SceneStream", "TensorReader", "VecForecast", "VectorForecast", "View",
+            "VmasReader", "agent_ids", "make_env", "make_multiagent_env", "pad_multiagent_scene", "reader_for",
+            "register_reader", "register_view", "unflatten",
         ),
         "predictor": (
             "Belief", "CheckpointInfo", "ConstantVelocity", "DGVAE", "DGVAEConfig", "Episode", "Forecast", "Forecaster",

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from envs.video.drawing import View as View
     from envs.video.film_forecasts import FilmForecasts as FilmForecasts
     from envs.video.film_forecasts import register_view as register_view
+    from envs.video.film_parallel import FilmParallelForecasts as FilmParallelForecasts
     from envs.wrappers import ForecastObservation as ForecastObservation
     from envs.wrappers import SceneObservation as SceneObservation
 
@@ -67,6 +68,7 @@ __getattr__, __all__ = lazy_exports(
         "envs.vector": ("VectorForecast",),
         "envs.video.drawing": ("View",),
         "envs.video.film_forecasts": ("FilmForecasts", "register_view"),
+        "envs.video.film_parallel": ("FilmParallelForecasts",),
         "envs.wrappers": ("ForecastObservation", "SceneObservation"),
     },
 )

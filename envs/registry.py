@@ -63,7 +63,6 @@ _HIGHWAY: dict[str, EnvEntry] = {
     "racetrack-oval-v1": EnvEntry(checkpoint="racetrack-oval"),
     "u-turn-v1": EnvEntry(checkpoint="u-turn"),
     "highway-mixed-v0": EnvEntry(checkpoint="highway-mixed"),
-    "highway-mixed-costly-v0": EnvEntry(checkpoint="highway-mixed"),
     "merge-mixed-v0": EnvEntry(),
     "roundabout-mixed-v0": EnvEntry(),
     "intersection-mixed-v0": EnvEntry(),
@@ -87,6 +86,7 @@ def _intersection(env_id: str, checkpoint: str | None = None) -> EnvEntry:
 
 ENVS: dict[str, EnvEntry] = {
     **_HIGHWAY,
+    "highway-mixed-costly-v0": EnvEntry(checkpoint="highway-mixed"),  # other rewards, the same traffic
     **{
         env_id: EnvEntry(checkpoint=_original_of(env_id).checkpoint)
         for env_id, task in ENVPOOL_IDS.items()
@@ -108,7 +108,7 @@ MULTIAGENT_IDS = tuple(env_id for env_id, entry in ENVS.items() if entry.multiag
 CHECKPOINTS: dict[str, str] = {
     env_id: entry.checkpoint for env_id, entry in ENVS.items() if entry.checkpoint and env_id in _HIGHWAY
 }
-"""Gymnasium id → name of its checkpoint; EnvPool's copies have those of their originals."""
+"""Gymnasium id → name of its checkpoint; EnvPool's copies and ids with other rewards have that of their original."""
 MULTIAGENT_CHECKPOINTS: dict[str, str] = {
     env_id: entry.checkpoint for env_id, entry in ENVS.items() if entry.checkpoint and entry.multiagent
 }

@@ -34,7 +34,8 @@ from envs.video.drawing import (
     page_width,
 )
 from envs.video.files import write_picture, write_video
-from envs.video.roles import LANDMARK, OTHER, mean_by_role, named_role, unnamed_role
+from envs.video.moments import Body, Moment, bodies_now
+from envs.video.roles import LANDMARK, OTHER, mean_by_role
 from predictor.support.errors import UserError
 
 FPS = 20
@@ -43,8 +44,6 @@ LENGTH_S = 8.0
 """Length of a video [s]; short episodes get more pictures between two steps."""
 MAX_FRAMES_PER_STEP = 8
 """Largest number of pictures per policy step."""
-
-_AT_REST_MPS = 1e-3
 
 
 @dataclass(frozen=True)
@@ -86,36 +85,6 @@ class MultiagentStyle:
     """Style of edges, true futures, forecasts and text; a forecast has its role's colour (not in the legend)."""
 
 
-@dataclass(frozen=True)
-class _Body:
-    """Agent at one policy step."""
-
-    now_m: Float[np.ndarray, "2"]
-    """Position."""
-    tick: Float[np.ndarray, "2"]
-    """Unit vector along its heading, or its velocity where agents have no heading; zeros at rest."""
-    radius_m: float
-    """Radius; 0 where scenes have none."""
-    role: str
-    """Role, which sets the colour."""
-    forecast_m: Float[np.ndarray, "samples horizon 2"]
-    """Forecast positions."""
-    shares: Float[np.ndarray, " samples"]
-    """Probability of each sample."""
-    acts: float
-    """Probability that it acts on the focus agent."""
-
-
-@dataclass(frozen=True)
-class _Moment:
-    """All agents at one policy step."""
-
-    bodies: dict[int, _Body]
-    """Agents, by id."""
-    returns: dict[str, float]
-    """Mean return so far of each role's agents."""
-
-
 @dataclass
 class MultiagentRecording:
     """Played episode, which can be drawn."""
@@ -133,7 +102,7 @@ class MultiagentRecording:
     fps: int = FPS
     """Number of pictures per second."""
     _focus_id: int = -1
-    _moments: list[_Moment] = field(default_factory=list)
+    _moments: list[Moment] = field(default_factory=list)
 
     def __len__(self) -> int:
         """Returns the number of pictures."""
@@ -148,6 +117,11 @@ class MultiagentRecording:
     def frames_per_step(self) -> int:
         """Number of pictures per policy step, for a video of `LENGTH_S`; a long episode's video is longer."""
         return int(np.clip(round(LENGTH_S * self.fps / max(1, self.num_steps)), 1, MAX_FRAMES_PER_STEP))
+
+    @property
+    def started(self) -> bool:
+        """Whether a step was recorded."""
+        return bool(self._moments)
 
     @property
     def returns(self) -> dict[str, float]:
@@ -166,7 +140,7 @@ class MultiagentRecording:
             raise UserError(f"index must lie in [0, {len(self) - 1}], got {index}")
         step, part = divmod(index, self.frames_per_step)
         arena = self._draw_arena(step, part / self.frames_per_step)
-        above = self._roles(self._moments[step])
+        above = self._roles(self._moments[step].returns)
         return draw_page(arena, self._caption(index), above, self._legend, self._width_px, self.style.lines)
 
     def write_video(self, path: str | Path) -> None:
@@ -177,34 +151,49 @@ class MultiagentRecording:
         """Writes one picture as PNG."""
         write_picture(path, self.draw(index))
 
+    @property
+    def extent_m(self) -> Float[np.ndarray, "2 axes"]:
+        """Lowest and highest coordinates of all agents at all steps so far."""
+        bodies = [body for moment in self._moments for body in moment.bodies.values()]
+        places, radii = np.array([body.now_m for body in bodies]), np.array([[body.radius_m] for body in bodies])
+        return np.stack([(places - radii).min(axis=0), (places + radii).max(axis=0)])
+
     @cached_property
     def _arena(self) -> Arena:
         """Arena that holds all agents at all steps."""
-        bodies = [body for moment in self._moments for body in moment.bodies.values()]
-        places = np.array([body.now_m for body in bodies])
-        return Arena.around(places, np.array([body.radius_m for body in bodies]), self.style.arena_px, self.y_up)
+        return Arena.around(self.extent_m, np.zeros(2), self.style.arena_px, self.y_up)
 
     @cached_property
     def _colors(self) -> dict[str, Color]:
         """Colour of each role of the episode."""
-        seen = {body.role for moment in self._moments for body in moment.bodies.values()}
-        known = {role: color for role, color in self.style.role_colors if role in seen}
-        others = zip(sorted(seen - set(known)), itertools.cycle(self.style.other_colors), strict=False)
+        return self.colors_of(self.roles_seen)
+
+    @property
+    def roles_seen(self) -> set[str]:
+        """Roles of all agents at all steps so far."""
+        return {body.role for moment in self._moments for body in moment.bodies.values()}
+
+    def colors_of(self, roles: set[str]) -> dict[str, Color]:
+        """Returns the colour of each role."""
+        known = {role: color for role, color in self.style.role_colors if role in roles}
+        others = zip(sorted(roles - set(known)), itertools.cycle(self.style.other_colors), strict=False)
         return {**known, **dict(others)}
 
     @cached_property
     def _width_px(self) -> int:
         """Width of all pictures [px]."""
-        legends = [self._roles(moment) for moment in self._moments]
+        legends = [self._roles(moment.returns) for moment in self._moments]
         return page_width(
             self._arena.size_px[0], self._caption(len(self) - 1), [*legends, self._legend], self.style.lines
         )
 
     def _caption(self, index: int) -> str:
-        time_s = index / self.frames_per_step * self.dt_s
+        return self._caption_at(index / self.frames_per_step * self.dt_s)
+
+    def _caption_at(self, time_s: float) -> str:
         return f"{self.env_id}    t = {time_s:.1f} s    grid {self._arena.grid_m:g} m"
 
-    def _roles(self, moment: _Moment) -> Legend:
+    def _roles(self, returns: dict[str, float]) -> Legend:
         """Returns the legend of roles: colours, and mean returns so far."""
 
         def sample(role: str) -> Callable[[Pen, Polyline], None]:
@@ -217,8 +206,8 @@ class MultiagentRecording:
 
             return draw
 
-        returns = {role: f": mean return {value:+.1f}" for role, value in moment.returns.items()}
-        return [(role + returns.get(role, ""), sample(role)) for role in self._colors]
+        shown = {role: f": mean return {value:+.1f}" for role, value in returns.items()}
+        return [(role + shown.get(role, ""), sample(role)) for role in self._colors]
 
     @property
     def _legend(self) -> Legend:
@@ -253,7 +242,7 @@ class MultiagentRecording:
                 pen.forecast(line, self._colors[body.role], opacity)
         return picture
 
-    def _draw_disc(self, pen: Pen, body: _Body, at: Float[np.ndarray, "2"], focused: bool = False) -> None:
+    def _draw_disc(self, pen: Pen, body: Body, at: Float[np.ndarray, "2"], focused: bool = False) -> None:
         """Draws an agent, with a tick at its rim that points ahead."""
         shown_m = body.radius_m or self.style.radius * max(self._arena.size_px) / self._arena.view.scaling
         radius = max(self.style.min_radius_px, shown_m * self._arena.view.scaling)
@@ -305,7 +294,7 @@ def record_multiagent_episode(
     Raises:
         UserError: no agent is called `focus`, or the environment has no agents after its reset.
     """
-    recorder = _Recorder(env, focus, num_samples, style or MultiagentStyle())
+    recorder = MultiagentRecorder(env, focus, num_samples, style or MultiagentStyle())
     observations, _ = env.reset(seed=seed)
     recorder.begin()
     while env.agents and recorder.recording.num_steps != max_steps:
@@ -315,10 +304,29 @@ def record_multiagent_episode(
     return recorder.recording
 
 
-class _Recorder:
-    """Records an episode; keeps the agents' names, also after the environment has dropped them."""
+class MultiagentRecorder:
+    """Records an episode; keeps the agents' names, also after the environment has dropped them.
 
-    def __init__(self, env: ForecastParallelEnv, focus: str | None, num_samples: int, style: MultiagentStyle) -> None:
+    Args:
+        env: the environment.
+        focus: name of the agent whose incoming edges are drawn; None takes the first one that lives.
+        num_samples: number of futures drawn for each agent.
+        style: colours and sizes of the drawing.
+        kind: class of the recording.
+
+    Raises:
+        UserError: no agent is called `focus`.
+    """
+
+    def __init__(
+        self,
+        env: ForecastParallelEnv,
+        focus: str | None,
+        num_samples: int,
+        style: MultiagentStyle,
+        kind: "type[MultiagentRecording]" = MultiagentRecording,
+    ) -> None:
+        """Records nothing yet."""
         if focus is not None and focus not in env.possible_agents:
             raise UserError(f"focus must be one of {', '.join(env.possible_agents)}, got '{focus}'")
         self._env = env
@@ -326,7 +334,7 @@ class _Recorder:
         self._samples = num_samples
         # y points as in the simulators' own pictures.
         y_up = not (isinstance(env.unwrapped, HighwayParallelEnv) or is_pursuit_env(env))
-        self.recording = MultiagentRecording(multiagent_env_id(env), env.scene_spec.dt_s, "", style, y_up)
+        self.recording = kind(multiagent_env_id(env), env.scene_spec.dt_s, "", style, y_up)
         self._names: dict[int, str] = {}
         self._returns: dict[str, float] = {}
 
@@ -348,35 +356,6 @@ class _Recorder:
         focus = scene.index_of.get(self.recording.focus)
         if focus is not None:
             self.recording._focus_id = int(scene.scene.ids[focus])
-        self.recording._moments.append(_Moment(self._bodies(focus), mean_by_role(self._returns)))
-
-    def _bodies(self, focus: int | None) -> dict[int, _Body]:
-        scene, spec = self._env.scene, self._env.scene_spec
-        forecast = self._env.stream.again(self._samples) if self._samples > 1 else self._env.forecast
-        states = scene.scene.states
-        xy_m = forecast.xy[0].double().cpu().numpy().swapaxes(0, 1)
-        shares = forecast.sample_probs()[0].double().cpu().numpy().T
-        probs = 1 - forecast.edge_probs[0, :, :, 0].double().cpu().numpy()  # receiver first
-        has_heading = bool(scene.heading_rad.any())
-        sizes = spec.feature_names.index("radius_m") if "radius_m" in spec.feature_names else None
-        bodies = {}
-        for i in np.flatnonzero(scene.scene.valid):
-            key = int(scene.scene.ids[i])
-            bodies[key] = _Body(
-                now_m=states[i, :2].copy(),
-                tick=_tick(states[i, 2:4], float(scene.heading_rad[i]) if has_heading else None),
-                radius_m=0.0 if sizes is None else float(states[i, sizes]),
-                role=named_role(self._names[key]) if key in self._names else unnamed_role(states[i], spec),
-                forecast_m=xy_m[i],
-                shares=shares[i],
-                acts=0.0 if focus is None else float(probs[focus, i]),
-            )
-        return bodies
-
-
-def _tick(velocity_mps: Float[np.ndarray, "2"], heading_rad: float | None) -> Float[np.ndarray, "2"]:
-    """Returns the unit vector along the heading; without one, along the velocity, zeros at rest."""
-    if heading_rad is not None:
-        return np.array([np.cos(heading_rad), np.sin(heading_rad)])
-    speed_mps = float(np.hypot(*velocity_mps))
-    return velocity_mps / speed_mps if speed_mps > _AT_REST_MPS else np.zeros(2)
+        self.recording._moments.append(
+            Moment(bodies_now(self._env, focus, self._names, self._samples), mean_by_role(self._returns))
+        )
