@@ -10,7 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.features import AttentionConfig, ForecastAttention
-from agents.plan_scores import PlanAttention, PlanScores
+from agents.plan_scores import PlanAttention, PlanScores, PlanValues
 from agents.presets import Algorithm, PPOPreset, Preset, RecurrentPPOPreset
 from envs.sb3.algorithms import algorithm_class
 from predictor.support.errors import UserError
@@ -22,8 +22,8 @@ CONTINUOUS: tuple[Algorithm, ...] = ("sac", "tqc")
 LOG_INTERVAL: dict[Algorithm, int] = {"ppo": 1, "recurrent-ppo": 1, "a2c": 25}
 """Number of rollouts between lines of the log: a line about every 128 steps; others count episodes."""
 LOG_EPISODES = 20
-SCORE_PLANS: tuple[Algorithm, ...] = ("ppo", "a2c")
-"""Algorithms whose actor scores candidate plans (`agents.plan_scores`); the others read them as features."""
+SCORE_PLANS: dict[Algorithm, type] = {"ppo": PlanScores, "a2c": PlanScores, "dqn": PlanValues}
+"""Policies of the algorithms that score candidate plans (`agents.plan_scores`); others read them as features."""
 
 
 def check_actions(algorithm: Algorithm, space: spaces.Space, env_id: str) -> None:
@@ -80,7 +80,7 @@ def new_model(
     policy: str | type = f"{kind}LstmPolicy" if isinstance(preset, RecurrentPPOPreset) else f"{kind}Policy"
     extractor = ForecastAttention
     if plan_actions is not None and algorithm in SCORE_PLANS:
-        policy, extractor = PlanScores, PlanAttention
+        policy, extractor = SCORE_PLANS[algorithm], PlanAttention
         policy_kwargs["plan_actions"] = tuple(plan_actions)
     if kind == "MultiInput":
         policy_kwargs |= {

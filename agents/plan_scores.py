@@ -1,9 +1,10 @@
-"""Actor that scores each candidate plan of the ego by what the others would do in it.
+"""Policies that score each candidate plan of the ego by what the others would do in it.
 
 An observation with `what_if` says, for each plan and agent, how close they come, when they touch, and how probable that
-is. `PlanAttention` adds a summary of each plan to the features of `ForecastAttention`. `PlanScores` gives the plan's
-summary to one small network, the same for all plans, and adds its score to the logit of the action with which the plan
-begins. A network that has learned once that a contact is bad then knows it for every action.
+is. `PlanAttention` adds a summary of each plan to the features of `ForecastAttention`. `PlanScores` (PPO, A2C) and
+`PlanValues` (DQN) give the plan's summary to one small network, the same for all plans, and add its score to the logit,
+or the value, of the action with which the plan begins. A network that has learned once that a contact is bad then knows
+it for every action.
 """
 
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ import torch
 from jaxtyping import Float
 from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import MlpExtractor
+from stable_baselines3.dqn.policies import MultiInputPolicy, QNetwork
 from torch import Tensor, nn
 
 from agents.features import VALID_KEY, WHAT_IF_GAP, AttentionConfig, ForecastAttention
@@ -120,6 +122,48 @@ class PlanScores(MultiInputActorCriticPolicy):
         )
 
 
+class PlanValues(MultiInputPolicy):
+    """SB3 policy of DQN for `PlanAttention`: an action's value is that of SB3's network, plus the score of its plan.
+
+    Args:
+        args: arguments of SB3's policy.
+        plan_actions: action with which each plan begins.
+        kwargs: arguments of SB3's policy.
+    """
+
+    def __init__(self, *args: Any, plan_actions: Sequence[int], **kwargs: Any) -> None:
+        """Makes the networks."""
+        self.plan_actions = tuple(plan_actions)
+        super().__init__(*args, **kwargs)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | {"plan_actions": self.plan_actions}
+
+    def make_q_net(self) -> QNetwork:
+        """Returns a network of values with the scores."""
+        network = super().make_q_net()
+        extractor = network.features_extractor
+        assert isinstance(extractor, PlanAttention)
+        values: Any = _Values(network.q_net, extractor.num_plans, network.features_dim, self.plan_actions)
+        network.q_net = values
+        return network.to(self.device)
+
+
+class _Values(nn.Module):
+    """Values of the actions: those of SB3's layers, plus the score of each action's plan."""
+
+    def __init__(self, own: nn.Module, num_plans: int, features_dim: int, plan_actions: Sequence[int]) -> None:
+        super().__init__()
+        assert isinstance(own, nn.Sequential) and isinstance(own[-1], nn.Linear)
+        self.own, self.score = own, _score_layers(num_plans, features_dim)
+        self.places: Tensor
+        self.register_buffer("places", _places(plan_actions, own[-1].out_features))
+
+    def forward(self, features: Float[Tensor, "batch features"]) -> Float[Tensor, "batch actions"]:
+        values: Tensor = self.own(features) + _scores(self.score, features, len(self.places)) @ self.places
+        return values
+
+
 class _WithScores(nn.Module):
     """Actor's and critic's hidden layers; the actor's end with the score of each plan."""
 
@@ -128,18 +172,14 @@ class _WithScores(nn.Module):
         self.hidden, self.num_plans = hidden, num_plans
         self.latent_dim_pi = hidden.latent_dim_pi + num_plans
         self.latent_dim_vf = hidden.latent_dim_vf
-        self._context = features_dim - num_plans * SUMMARY
-        self.score = nn.Sequential(
-            nn.Linear(self._context + SUMMARY, _HIDDEN), nn.Tanh(), nn.Linear(_HIDDEN, 1, bias=False)
-        )
+        self.score = _score_layers(num_plans, features_dim)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         return self.forward_actor(features), self.forward_critic(features)
 
     def forward_actor(self, features: Float[Tensor, "batch features"]) -> Float[Tensor, "batch latent"]:
-        context, summaries = features[:, : self._context], features[:, self._context :].unflatten(1, (-1, SUMMARY))
-        each = torch.cat([context[:, None].expand(-1, self.num_plans, -1), summaries], dim=-1)
-        return torch.cat([self.hidden.forward_actor(features), self.score(each)[..., 0]], dim=-1)
+        scores = _scores(self.score, features, self.num_plans)
+        return torch.cat([self.hidden.forward_actor(features), scores], dim=-1)
 
     def forward_critic(self, features: Float[Tensor, "batch features"]) -> Float[Tensor, "batch latent"]:
         return self.hidden.forward_critic(features)
@@ -155,11 +195,32 @@ class _Logits(nn.Module):
         with torch.no_grad():
             self.own.weight.copy_(both.weight[:, :-num_plans])
             self.own.bias.copy_(both.bias)
-        places = torch.zeros(num_plans, both.out_features)
-        places[torch.arange(num_plans), torch.tensor(plan_actions)] = 1.0
         self.places: Tensor
-        self.register_buffer("places", places)
+        self.register_buffer("places", _places(plan_actions, both.out_features))
 
     def forward(self, latent: Float[Tensor, "batch latent"]) -> Float[Tensor, "batch actions"]:
         count = len(self.places)
         return self.own(latent[:, :-count]) + latent[:, -count:] @ self.places
+
+
+def _score_layers(num_plans: int, features_dim: int) -> nn.Sequential:
+    """Returns the network that scores a plan from the features of the scene and its summary."""
+    inputs = features_dim - num_plans * SUMMARY + SUMMARY
+    return nn.Sequential(nn.Linear(inputs, _HIDDEN), nn.Tanh(), nn.Linear(_HIDDEN, 1, bias=False))
+
+
+def _scores(
+    layers: nn.Module, features: Float[Tensor, "batch features"], num_plans: int
+) -> Float[Tensor, "batch plans"]:
+    """Computes the score of each plan from the features of `PlanAttention`."""
+    context, summaries = features[:, : -num_plans * SUMMARY], features[:, -num_plans * SUMMARY :]
+    each = torch.cat([context[:, None].expand(-1, num_plans, -1), summaries.unflatten(1, (num_plans, SUMMARY))], dim=-1)
+    scores: Tensor = layers(each)[..., 0]
+    return scores
+
+
+def _places(plan_actions: Sequence[int], actions: int) -> Float[Tensor, "plans actions"]:
+    """Returns 1 where a plan begins with an action, else 0."""
+    places = torch.zeros(len(plan_actions), actions)
+    places[torch.arange(len(plan_actions)), torch.tensor(plan_actions)] = 1.0
+    return places

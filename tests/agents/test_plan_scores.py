@@ -5,11 +5,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from stable_baselines3 import PPO
+from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents.features import ForecastAttention
-from agents.plan_scores import SUMMARY, PlanAttention, PlanScores, plan_actions
+from agents.plan_scores import SUMMARY, PlanAttention, PlanScores, PlanValues, plan_actions
 from agents.task import Task
 from agents.training import TrainingPlan, make_model
 from agents.vec_envs import make_venv
@@ -60,6 +60,18 @@ def make_ppo(**changes: Any) -> PPO:
     return PPO(PlanScores, DummyVecEnv([OneFreePlan]), policy_kwargs=kwargs, device="cpu", **(options | changes))
 
 
+def make_dqn(**changes: Any) -> DQN:
+    kwargs = {"plan_actions": PLAN_ACTIONS, "features_extractor_class": PlanAttention, "net_arch": [16]}
+    options: dict[str, Any] = {"learning_starts": 64, "learning_rate": 3e-3, "gamma": 0.0, "train_freq": 1}
+    options |= {"exploration_fraction": 0.5, "buffer_size": 2000, "seed": 0, "target_update_interval": 50}
+    return DQN(PlanValues, DummyVecEnv([OneFreePlan]), policy_kwargs=kwargs, device="cpu", **(options | changes))
+
+
+def values(model: DQN, shown: dict[str, torch.Tensor]) -> torch.Tensor:
+    with torch.no_grad():
+        return model.policy.q_net(shown)
+
+
 def observed(count: int = 50, seed: int = 0) -> dict[str, torch.Tensor]:
     env = OneFreePlan()
     shown = [env.reset(seed=seed)[0], *(env.step(0)[0] for _ in range(count - 1))]
@@ -77,6 +89,45 @@ def test_what_is_learned_of_one_plan_holds_for_all():
     free = shown["what_if_risk"].amax(1).argmin(-1)
     wanted = torch.tensor(PLAN_ACTIONS)[free]
     assert (logits(model, shown).argmax(-1) == wanted).float().mean() > 0.95
+
+
+def test_values_of_plans_are_learned_for_all_at_once():
+    model = make_dqn().learn(1500)
+    shown = observed(400, seed=1)
+    free = shown["what_if_risk"].amax(1).argmin(-1)
+    wanted = torch.tensor(PLAN_ACTIONS)[free]
+    assert (values(model, shown).argmax(-1) == wanted).float().mean() > 0.95
+
+
+def test_scores_are_added_to_the_values_of_their_actions():
+    model, shown = make_dqn(), observed()
+    network: Any = model.policy.q_net.q_net
+    torch.nn.init.normal_(network.score[-1].weight)
+    with torch.no_grad():
+        features = model.policy.q_net.extract_features(shown, model.policy.q_net.features_extractor)
+        for parameter in network.own.parameters():
+            parameter.zero_()
+        context = features[:, : -PLANS * SUMMARY]
+        for plan, action in enumerate(PLAN_ACTIONS):
+            summary = features[:, -PLANS * SUMMARY :].unflatten(1, (PLANS, SUMMARY))[:, plan]
+            score = network.score(torch.cat([context, summary], dim=-1))[:, 0]
+            torch.testing.assert_close(values(model, shown)[:, action], score)
+
+
+def test_the_target_of_dqn_has_scores_of_its_own_and_follows():
+    model = make_dqn(target_update_interval=100_000).learn(200)
+    now, target = model.policy.q_net.q_net, model.policy.q_net_target.q_net
+    pairs = list(zip(now.parameters(), target.parameters(), strict=True))  # type: ignore[union-attr]
+    assert len(pairs) > 4 and not all(torch.equal(one, other) for one, other in pairs)
+    assert all(one is not other for one, other in pairs)
+
+
+def test_a_policy_of_values_is_saved_with_its_plans(tmp_path: Path):
+    model = make_dqn().learn(200)
+    model.save(tmp_path / "policy.zip")
+    loaded = DQN.load(tmp_path / "policy.zip", device="cpu")
+    torch.testing.assert_close(values(loaded, observed()), values(model, observed()), rtol=0, atol=0)
+    assert loaded.policy.plan_actions == PLAN_ACTIONS
 
 
 def test_scores_go_to_the_actions_of_their_plans():
@@ -153,7 +204,8 @@ def test_actions_of_plans_are_those_that_the_planner_takes():
         ("a2c", True, PlanAttention),
         ("recurrent-ppo", True, ForecastAttention),
         ("ppo", False, ForecastAttention),
-        ("dqn", True, ForecastAttention),
+        ("dqn", True, PlanAttention),
+        ("dqn", False, ForecastAttention),
     ],
 )
 def test_policies_with_what_if_score_plans(algorithm: Any, what_if: bool, extractor: type):
