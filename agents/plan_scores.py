@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium as gym
 import torch
 from jaxtyping import Float
-from stable_baselines3.common.policies import MultiInputActorCriticPolicy
+from stable_baselines3.common.policies import BasePolicy, MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.dqn.policies import MultiInputPolicy, QNetwork
 from torch import Tensor, nn
@@ -86,22 +86,20 @@ class PlanAttention(ForecastAttention):
         return torch.stack([*gaps, contact, risk.amax(1), any_contact], dim=-1)
 
 
-class PlanScores(MultiInputActorCriticPolicy):
-    """SB3 policy for `PlanAttention`: the logit of an action is that of SB3's actor, plus the score of its plan.
-
-    Args:
-        args: arguments of SB3's policy.
-        plan_actions: action with which each plan begins.
-        kwargs: arguments of SB3's policy.
-    """
+class _OverPlans(BasePolicy):
+    """What both policies keep: the action with which each plan begins."""
 
     def __init__(self, *args: Any, plan_actions: Sequence[int], **kwargs: Any) -> None:
-        """Makes the networks."""
+        """Makes the networks; `plan_actions` is the action with which each plan begins."""
         self.plan_actions = tuple(plan_actions)
         super().__init__(*args, **kwargs)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return super()._get_constructor_parameters() | {"plan_actions": self.plan_actions}
+
+
+class PlanScores(_OverPlans, MultiInputActorCriticPolicy):
+    """SB3 policy for `PlanAttention`: the logit of an action is that of SB3's actor, plus the score of its plan."""
 
     def _build_mlp_extractor(self) -> None:
         extractor = self.features_extractor
@@ -122,22 +120,8 @@ class PlanScores(MultiInputActorCriticPolicy):
         )
 
 
-class PlanValues(MultiInputPolicy):
-    """SB3 policy of DQN for `PlanAttention`: an action's value is that of SB3's network, plus the score of its plan.
-
-    Args:
-        args: arguments of SB3's policy.
-        plan_actions: action with which each plan begins.
-        kwargs: arguments of SB3's policy.
-    """
-
-    def __init__(self, *args: Any, plan_actions: Sequence[int], **kwargs: Any) -> None:
-        """Makes the networks."""
-        self.plan_actions = tuple(plan_actions)
-        super().__init__(*args, **kwargs)
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return super()._get_constructor_parameters() | {"plan_actions": self.plan_actions}
+class PlanValues(_OverPlans, MultiInputPolicy):
+    """SB3 policy of DQN for `PlanAttention`: an action's value is that of SB3's network, plus the score of its plan."""
 
     def make_q_net(self) -> QNetwork:
         """Returns a network of values with the scores."""
