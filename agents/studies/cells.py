@@ -149,12 +149,13 @@ def cells_of(study: Study, where: str) -> list[Cell]:
 def run_cell(cell: Cell, folder: Path) -> Result:
     """Trains from where an earlier start was stopped, plays the test seeds, writes the result into the folder."""
     torch.set_num_threads(1)
+    made = provenance(PACKAGES, _command())
     policy: BaseAlgorithm | None = None
     trained_s, curve = 0.0, list[dict[str, Any]]()
     if cell.plan is not None:
         run = folder / RUN_FOLDER
         free = (FORECASTER, "device", "checkpoint")  # the folder's name has the forecaster's hash
-        open_run(run, _run_config(cell), provenance(PACKAGES, _command()), resume=True, free=free)
+        open_run(run, _run_config(cell), made, resume=True, free=free)
         policy = load_model(train(cell.plan, run), cell.plan.algorithm)
         curve = read_curve(run / CURVE_FILE)
         trained_s = curve[-1]["seconds"]
@@ -176,7 +177,7 @@ def run_cell(cell: Cell, folder: Path) -> Result:
         tuple(curve),
         trained_s,
         time.perf_counter() - began,
-        provenance(PACKAGES, _command()),
+        made,
     )
     write_result(folder / RESULT_FILE, result)
     return result

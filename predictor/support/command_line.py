@@ -17,6 +17,7 @@ import tyro
 
 from predictor.support.config_checks import check_numbers
 from predictor.support.errors import UserError
+from predictor.support.provenance import commit_at_start
 
 Config = TypeVar("Config")
 
@@ -71,6 +72,7 @@ def parse(config_class: type[Config], description: str | None = None, args: Sequ
         print(printed.getvalue(), end="", file=sys.stderr)
         raise
     check_numbers(config)
+    commit_at_start()
     return config
 
 

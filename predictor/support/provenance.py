@@ -1,6 +1,7 @@
 """Provenance of a result: command, commit, versions, time; it is written to every run folder, store and checkpoint."""
 
 import datetime
+import functools
 import importlib.metadata
 import os
 import platform
@@ -18,7 +19,7 @@ def provenance(packages: Sequence[str], command: str | None = None) -> dict[str,
         command = " ".join([*_program(), *map(shlex.quote, sys.argv[1:])])
     return {
         "command": command,
-        "commit": _commit(),
+        "commit": commit_at_start(),
         "versions": {name: _version(name) for name in ("dgvae-rl", *packages)} | {"python": platform.python_version()},
         "machine": f"{platform.machine()}, {os.cpu_count()} logical cores",
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -46,7 +47,12 @@ def _version(package: str) -> str:
         return "not installed"
 
 
-def _commit() -> str:
+@functools.cache
+def commit_at_start() -> str:
+    """Returns the commit that was checked out at the first call, which commands make as they begin.
+
+    A result is written hours later, when another commit may be checked out than the one whose code ran.
+    """
     here = Path(__file__).resolve().parent
 
     def git(*arguments: str) -> str:

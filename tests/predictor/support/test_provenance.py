@@ -1,12 +1,21 @@
 import json
 import os
+import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from predictor.support.command_line import parse
 from predictor.support.files import write_json
-from predictor.support.provenance import provenance
+from predictor.support.provenance import commit_at_start, provenance
+
+
+@dataclass
+class Nothing:
+    """Command without options."""
 
 
 def test_provenance_says_how_a_result_was_made(monkeypatch: pytest.MonkeyPatch):
@@ -46,3 +55,19 @@ def test_crash_while_writing_leaves_the_old_file(tmp_path: Path, monkeypatch: py
     with pytest.raises(KeyboardInterrupt):
         write_json(tmp_path / "a.json", 2)
     assert (tmp_path / "a.json").read_text() == "1\n"
+
+
+def test_the_commit_is_the_one_that_was_checked_out_at_the_start(monkeypatch: pytest.MonkeyPatch):
+    """Hours later another may be: results are written at the end, by code that was loaded at the start."""
+    checked_out = ["aaa", "bbb"]
+
+    def git(words: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
+        return subprocess.CompletedProcess(words, 0, checked_out.pop(0) if "rev-parse" in words else "")
+
+    commit_at_start.cache_clear()
+    monkeypatch.setattr("predictor.support.provenance.subprocess.run", git)
+    try:
+        parse(Nothing, args=[])
+        assert provenance(())["commit"] == provenance(())["commit"] == "aaa" and checked_out == ["bbb"]
+    finally:
+        commit_at_start.cache_clear()
