@@ -30,7 +30,7 @@ from agents.task import EVALUATION_SEED, Task
 from agents.training import TrainingPlan, train
 from envs.drivers.all_agents import make_driver
 from envs.drivers.ego import make_ego_driver, named_drivers
-from envs.drivers.planner import ORACLE, PLANNER, is_planner
+from envs.drivers.planner import ORACLE, PLANNER, PlannerConfig, is_planner
 from envs.registry import checkpoint_for
 from envs.sb3.algorithms import CONTRIB
 from predictor.checkpoint import CONSTANT_VELOCITY, WEIGHTS, resolve
@@ -238,14 +238,15 @@ def _trainings(study: Study, scenario: Scenario, arm: StudyArm, where: str) -> l
 
 
 def _planner_pin(name: str, task: Task) -> dict[str, Any] | None:
-    """Returns what the planner's forecasts come from; None for other drivers."""
+    """Returns what the planner's forecasts come from, and its settings; None for other drivers."""
     if not is_planner(name):
         return None
+    settings = asdict(PlannerConfig())
     checkpoint = name.removeprefix(PLANNER).removeprefix(":") or checkpoint_for(task.env_id)
     if checkpoint in (CONSTANT_VELOCITY, ORACLE) or is_own(checkpoint):
-        return {"sha256": checkpoint}
+        return {"sha256": checkpoint, **settings}
     with (resolve(checkpoint) / WEIGHTS).open("rb") as file:
-        return {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+        return {"sha256": hashlib.file_digest(file, "sha256").hexdigest(), **settings}
 
 
 def _run_config(cell: Cell) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import pytest
 from agents.presets import PPOPreset, QRDQNPreset
 from agents.studies.cells import NETWORK, Cell, cells_of
 from agents.studies.plan import read_study
+from envs.drivers.planner import PlannerConfig
 from predictor.support.errors import UserError
 from tests.agents.studies.helpers import study_path, study_text
 
@@ -71,6 +72,17 @@ def test_the_forecaster_is_in_the_name(cells: Callable[..., list[Cell]]):
         for name in ("highway", "merge", "highway")
     )
     assert one.name == third.name != other.name and one.forecaster != other.forecaster
+
+
+def test_the_planners_settings_are_in_the_name(cells: Callable[..., list[Cell]], monkeypatch: pytest.MonkeyPatch):
+    def names() -> dict[str, str]:
+        found = cells(env_id=HIGHWAY, seeds="1", arms='["none"]', references='["planner", "planner:oracle", "slower"]')
+        return {cell.title: cell.name for cell in found}
+
+    before = names()
+    monkeypatch.setattr("agents.studies.cells.PlannerConfig", lambda: PlannerConfig(max_risk=0.3))
+    changed = {title for title, name in names().items() if name != before[title]}
+    assert changed == {"corridor, planner", "corridor, planner:oracle"}
 
 
 @pytest.mark.parametrize(
