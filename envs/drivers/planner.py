@@ -49,7 +49,7 @@ EQUAL = 1e-6
 class PlannerConfig:
     """Settings of the planner."""
 
-    max_risk: float = 0.1
+    max_risk: float = 0.05
     """Largest accepted probability of a collision within the horizon."""
     num_samples: int | None = None
     """Number of futures of each plan; None takes 20 for a forecaster with modes, else the single forecast."""
