@@ -181,6 +181,15 @@ def test_the_policy_is_saved_with_its_plans(tmp_path: Path):
     assert loaded.policy.plan_actions == PLAN_ACTIONS
 
 
+@pytest.mark.parametrize("make", [make_ppo, make_dqn])
+def test_policies_are_saved_without_their_algorithm_too(make: Any, tmp_path: Path):
+    policy, shown = make().policy, observed()
+    policy.save(str(tmp_path / "policy.pt"))
+    loaded = type(policy).load(str(tmp_path / "policy.pt"), device="cpu")
+    assert loaded.plan_actions == PLAN_ACTIONS
+    assert torch.equal(loaded._predict(shown, deterministic=True), policy._predict(shown, deterministic=True))
+
+
 def test_a_space_without_plans_is_refused():
     with pytest.raises(UserError, match="needs the entry 'what_if_gap'; wrap the environment with what_if=True"):
         PlanAttention(gym.spaces.Dict({"observation": gym.spaces.Box(-1, 1, (2,))}))

@@ -139,3 +139,11 @@ def test_causes_are_measured_in_the_changed_environment(
     [result] = read_json(tmp_path / f"{name}.json")["results"]
     assert result["env_kwargs"] == crowded
     assert f"{ROAD} {crowded}" in (tmp_path / f"{name}.md").read_text() and f"{ROAD} {crowded}" in printed
+
+
+def test_a_driver_that_sees_forecasts_drives_in_the_changed_environment(monkeypatch: pytest.MonkeyPatch):
+    side_forecasts.kept_world.cache_clear()
+    monkeypatch.setattr(side_forecasts, "sees_forecasts", lambda driver: True)
+    world = side_forecasts.kept_world(ROAD, "idle", ("constant-velocity",), FEW)
+    assert world.env.unwrapped.config["vehicles_count"] == 2  # type: ignore[attr-defined]
+    side_forecasts.kept_world.cache_clear()
