@@ -147,3 +147,13 @@ def test_a_driver_that_sees_forecasts_drives_in_the_changed_environment(monkeypa
     world = side_forecasts.kept_world(ROAD, "idle", ("constant-velocity",), FEW)
     assert world.env.unwrapped.config["vehicles_count"] == 2  # type: ignore[attr-defined]
     side_forecasts.kept_world.cache_clear()
+
+
+def test_plans_that_the_changed_environment_lacks_are_missed_before_hours_of_work(
+    monkeypatch: pytest.MonkeyPatch, capsys: Any
+):
+    monkeypatch.setattr(evaluate, "measure_graph", lambda run: pytest.fail("measured"))
+    steered = '{"config": {"action": {"type": "DiscreteAction"}}}'
+    arguments = ["--env-ids", ROAD, "--driver", "random", "--graph", "--plans", "--env-kwargs", steered]
+    code, errors, _ = run_command(evaluate.main, arguments, monkeypatch, capsys)
+    assert code == 2 and "plan" in errors[0]
