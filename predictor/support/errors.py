@@ -55,9 +55,9 @@ MOST_LETTERS = 2000
 
 
 def short(value: object, letters: int = 300) -> str:
-    """Returns a value as text of at most about this many letters, cut in the middle: for names in messages."""
+    """Returns a value as text of at most this many letters (2 or more), cut in the middle: for names in messages."""
     text = str(value)
-    return text if len(text) <= letters else f"{text[: letters // 2]}…{text[-(letters - letters // 2) :]}"
+    return text if len(text) <= letters else f"{text[: (letters - 1) // 2]}…{text[-(letters // 2) :]}"
 
 
 def one_line(error: BaseException) -> str:

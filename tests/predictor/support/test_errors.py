@@ -6,7 +6,16 @@ import sys
 
 import pytest
 
-from predictor.support.errors import CannotWriteError, ProtocolError, Terminated, UserError, run_entry_point
+from predictor.support.errors import (
+    MOST_LETTERS,
+    CannotWriteError,
+    ProtocolError,
+    Terminated,
+    UserError,
+    one_line,
+    run_entry_point,
+    short,
+)
 from predictor.support.stopping import deferred_stops, resumable
 
 
@@ -155,3 +164,14 @@ def test_what_a_stop_leaves_undone_is_not_told():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 143
     assert done.stderr == "stopped: what was not written yet is lost; the same command begins anew\n"
+
+
+@pytest.mark.parametrize("letters", [2, 3, 10, 11])
+def test_a_long_value_is_cut_to_the_letters_asked_for(letters: int):
+    assert short("a" * letters, letters) == "a" * letters
+    cut = short("a" + "b" * letters + "c", letters)
+    assert len(cut) == letters and "…" in cut and cut[-1] == "c"
+
+
+def test_a_long_message_has_as_many_letters_as_a_message_may_have():
+    assert len(one_line(UserError("x" * (MOST_LETTERS + 1)))) == MOST_LETTERS
