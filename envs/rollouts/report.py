@@ -116,6 +116,11 @@ def remarks(result: "EnvAccuracy") -> str:
                 f"{key}: minADE {own.min_ade_m:.3f} m, {low:.3f} to {high:.3f}, constant velocity "
                 f"{straight.min_ade_m:.3f} m, {own.agents} forecasts"
             )
+    if covered := result.model_samples.mixture_coverage:
+        lines.append(
+            f"{100 * min(covered):.0f} to {100 * max(covered):.0f} % of the coordinates, by step, within the central "
+            "90 % of the predicted mixture (modes with their spread)"
+        )
     graph = result.graph
     if graph is not None and graph.accuracy is not None:
         f1 = "–" if graph.f1 is None else f"{graph.f1:.2f}"

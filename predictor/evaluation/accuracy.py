@@ -17,9 +17,9 @@ from predictor.evaluation.energy_score import energy_score
 from predictor.evaluation.outcomes import Outcome
 from predictor.evaluation.standard_errors import NUM_SUBSETS, Statistic, batch_interval, ratio_statistics
 
-OPTIONAL = ("coverage", "mixture_nll")
+OPTIONAL = ("coverage", "mixture_nll", "mixture_coverage")
 """Names of quantities that are left out, not NaN, if they could not be measured."""
-SCALAR_NAMES = {"rmse_m": "overall_rmse_m", "coverage": "coverage", "mixture_nll": "mixture_nll"}
+SCALAR_NAMES = {"rmse_m": "overall_rmse_m"} | {name: name for name in OPTIONAL}
 """Names of the numbers over all steps, by name of the quantity at each step."""
 
 
@@ -70,13 +70,16 @@ class Accuracy:
     """Share of the truth that `overlap` should have."""
     mixture_nll: list[float] = field(default_factory=list)
     """Negative log-likelihood [nats] under the predicted mixture at each step; empty without predicted scales."""
+    mixture_coverage: list[float] = field(default_factory=list)
+    """Share of true coordinates within the central 90 % of the predicted mixture at each step; empty without predicted
+    scales."""
     scenes: int = 0
     """Number of scenes behind `min_joint_ade_m`."""
     axes: int = 2
     """Number of axes of a position."""
     statistics: dict[str, Statistic] = field(default_factory=dict)
-    """Mean ± standard error over subsets of the windows, by name of the scalar fields above, and "coverage" and
-    "mixture_nll" over all steps; without those that could not be measured."""
+    """Mean ± standard error over subsets of the windows, by name of the scalar fields above, and those of `OPTIONAL`
+    over all steps; without those that could not be measured."""
     step_errors: dict[str, list[float | None]] = field(default_factory=dict)
     """Standard error over these subsets at each step, by name of the list fields above."""
     intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -197,6 +200,7 @@ class Tally:
             nll=steps.get("nll", []),
             coverage=steps.get("coverage", []),
             mixture_nll=steps.get("mixture_nll", []),
+            mixture_coverage=steps.get("mixture_coverage", []),
             statistics=statistics,
             step_errors=step_errors,
             intervals=intervals,
@@ -248,6 +252,7 @@ class Tally:
             if probs is None:
                 probs = forecast.new_full(forecast.shape[:3], 1 / forecast.shape[1])
             values["mixture_nll"] = metrics.mixture_nll(forecast, future, valid, probs, outcome.scale)
+            values["mixture_coverage"] = metrics.mixture_coverage(forecast, future, valid, probs, outcome.scale)
         if len(self._std_m) >= max(1, horizon):
             std_m = torch.tensor(self._std_m[:horizon], device=forecast.device)
             values["nll"] = metrics.gaussian_mixture_nll(forecast, future, valid, std_m)

@@ -14,7 +14,7 @@ MISS_THRESHOLD_M = 2.0
 """Final displacement above which a forecast misses [m]: the usual choice in driving (Argoverse 1 and 2)."""
 
 COVERAGE_SHARE = 0.9
-"""Nominal share of truths within the interval of `coverage`."""
+"""Nominal share of truths within the interval of `coverage` and of `mixture_coverage`."""
 
 
 def displacement(
@@ -201,6 +201,31 @@ def coverage(
     below = min(int(rank), samples - 1)
     limit = torch.lerp(spread[:, below - 1], spread[:, below], rank - below)
     return (torch.linalg.vector_norm(future - centre, dim=-1) <= limit).to(future.dtype), valid
+
+
+def mixture_coverage(
+    forecast: Float[Tensor, "batch samples agents horizon axes"],
+    future: Float[Tensor, "batch agents horizon axes"],
+    valid: Bool[Tensor, "batch agents horizon"],
+    mode_probs: Float[Tensor, "batch samples agents"],
+    scale: Float[Tensor, "batch samples agents horizon axes"],
+) -> tuple[Float[Tensor, "batch agents horizon"], Bool[Tensor, "batch agents horizon"]]:
+    """Computes the share of the truth's coordinates in the central 90 % of the predicted mixture of Gaussians.
+
+    A coordinate is inside if its predicted distribution has between 5 and 95 % of its probability below it. So a mode
+    counts with its spread, which `coverage` leaves out.
+
+    Args:
+        forecast: mean of each mode [m].
+        future: true positions [m].
+        valid: which entries count.
+        mode_probs: probability of each mode.
+        scale: standard deviation of each mode [m].
+    """
+    error = torch.where(valid[:, None, ..., None], future[:, None] - forecast, 0.0)
+    below = (mode_probs[..., None, None] * torch.special.ndtr(error / scale.clamp(min=LEAST_STD_M))).sum(1)
+    inside = (below - 0.5).abs() <= COVERAGE_SHARE / 2
+    return inside.to(future.dtype).mean(-1), valid
 
 
 def overlap(

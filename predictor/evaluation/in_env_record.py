@@ -60,6 +60,9 @@ class Measurement:
     """95 % bootstrap interval of `energy_m` over episodes [m]."""
     coverage: Interval | None = None
     """Smallest and largest share of truths within the central 90 % of the samples, over the steps."""
+    mixture_coverage: Interval | None = None
+    """Smallest and largest share of true coordinates within the central 90 % of the predicted mixture, over the
+    steps; None for a checkpoint without scales."""
     overlap: tuple[float, float] | None = None
     """Share of agents' steps nearer to another agent than the miss threshold, in samples and in truth."""
     controls: dict[str, dict[str, float | None]] | None = None
@@ -171,14 +174,16 @@ def _measurement(result: dict[str, Any], config: dict[str, Any], made: dict[str,
 def _of_samples(result: dict[str, Any]) -> dict[str, Any]:
     """Returns the figures of K samples, and those of the controls."""
     many = result["model_samples"]
-    intervals, covered = many.get("intervals") or {}, [c for c in many.get("coverage") or [] if c is not None]
+    intervals = many.get("intervals") or {}
     found: dict[str, Any] = {"best_of_k_m": many["min_ade_m"]}
     if many.get("energy_m") is None:
         return found  # written before version 0.2
     for name, key in (("best_of_k", "min_ade_m"), ("joint_best_of_k", "min_joint_ade_m"), ("energy", "energy_m")):
         found[f"{name}_m"] = many[key]
         found[f"{name}_interval_m"] = _frozen(intervals.get(key))
-    found["coverage"] = (min(covered), max(covered)) if covered else None
+    for figure in ("coverage", "mixture_coverage"):
+        covered = [c for c in many.get(figure) or [] if c is not None]
+        found[figure] = (min(covered), max(covered)) if covered else None
     found["overlap"] = (many["overlap"], many["true_overlap"])
     found["controls"] = {
         key: {

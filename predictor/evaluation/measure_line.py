@@ -124,9 +124,10 @@ class _Tallies:
         horizon_only = asdict(self._horizon_only.accuracy(self._line.name))
         if self._has_density:
             density = asdict(self._density.accuracy(self._line.name))
-            horizon_only["mixture_nll"] = density["mixture_nll"]
-            for part in ("statistics", "step_errors"):
-                horizon_only[part]["mixture_nll"] = density[part]["mixture_nll"]
+            for figure in ("mixture_nll", "mixture_coverage"):
+                horizon_only[figure] = density[figure]
+                for part in ("statistics", "step_errors"):
+                    horizon_only[part][figure] = density[part][figure]
         return {
             "horizon_only": horizon_only,
             "whole_sequence": asdict(self._whole.accuracy(self._line.name)),

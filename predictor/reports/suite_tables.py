@@ -38,7 +38,8 @@ LEGEND = (
     "ADE₁, FDE₁: the single forecast, sample 0. minADE, minFDE: each agent's best sample; joint minADE: the best "
     "sample of the scene. Energy score, a proper score, and NLL [nats], of the predicted density (modes with their "
     "standard deviations, or the fitted Gaussian): lower is better. 90 % cover: share of truths within the central "
-    "90 % of the samples, at the first and the last step"
+    "90 % of the samples, at the first and the last step; … of mixture: share of true coordinates within the central "
+    "90 % of the predicted density"
 )
 
 
@@ -132,7 +133,7 @@ def _horizon(content: dict[str, Any], kind: str) -> Grid:
     caption = "Errors on the {horizon_steps} future steps after a burn-in of {burn_in_steps}. ".format(
         **content["protocol"]
     )
-    columns = ["model", "K", *HORIZON.values(), "NLL", "90 % cover"]
+    columns = ["model", "K", *HORIZON.values(), "NLL", "90 % cover", "… of mixture"]
     if overlap_m:
         columns.append("overlap (truth)")
         caption += f"Overlap: agents nearer than {overlap_m:g} m to another one of the same sample. "
@@ -141,8 +142,9 @@ def _horizon(content: dict[str, Any], kind: str) -> Grid:
         accuracy = row["tests"][kind]["horizon_only"]
         cells = [_length(row, kind, "horizon_only", name) for name in HORIZON]
         cells.append(_statistic(row, kind, "mixture_nll", 2))
-        covered = accuracy["coverage"]
-        cells.append(f"{_percent(covered[0])} / {_percent(covered[-1])} %" if covered else "–")
+        for figure in ("coverage", "mixture_coverage"):
+            covered = accuracy.get(figure)  # version 0.1.0 did not measure the mixture's
+            cells.append(f"{_percent(covered[0])} / {_percent(covered[-1])} %" if covered else "–")
         if overlap_m:
             cells.append(f"{_percent(accuracy['overlap'], 1)} ({_percent(accuracy['true_overlap'], 1)}) %")
         lines.append([row["name"], str(accuracy["num_samples"]), *cells])

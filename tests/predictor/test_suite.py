@@ -348,7 +348,8 @@ def test_every_line_has_k_samples_and_says_so(data: Path, tmp_path: Path, monkey
     assert drawn["ade_m"] == pytest.approx(noisy["ade_m"]) and drawn["fde_m"] == pytest.approx(noisy["fde_m"])
     for accuracy in (drawn, noisy):
         assert accuracy["min_ade_m"] < 0.8 * accuracy["ade_m"]
-        assert 0.7 < accuracy["statistics"]["coverage"]["mean"] <= 1
+        for figure in ("coverage", "mixture_coverage"):
+            assert 0.7 < accuracy["statistics"][figure]["mean"] <= 1
         assert accuracy["statistics"]["mixture_nll"]["mean"] == pytest.approx(np.mean(accuracy["mixture_nll"]), abs=0.1)
     lines = markdown_report(content).splitlines()
     for name in ("constant velocity + Gaussian", "constant velocity + noise"):

@@ -19,6 +19,7 @@ from predictor.evaluation.displacement import (
     min_joint_ade,
     min_joint_fde,
     miss_rate,
+    mixture_coverage,
     mixture_nll,
     overlap,
     squared_error,
@@ -205,6 +206,38 @@ def test_mixture_nll_of_a_mode_without_probability_is_that_of_the_others():
     forecast, probs = one_agent(along_x(3, 3, 3), along_x(0, 0, 0)), torch.tensor([1.0, 0.0])[None, :, None]
     value, _ = mixture_nll(forecast, STANDING, ALL, probs, torch.ones_like(forecast))
     assert value[0, 0].tolist() == pytest.approx([4.5 + math.log(2 * math.pi)] * 3)
+
+
+def test_mixture_coverage_of_one_mode_is_that_of_a_normal_distribution():
+    """The central 90 % of a normal distribution end at 1.645 standard deviations; each axis counts by itself."""
+    future = torch.tensor([[[[3.28, -3.28], [3.28, 3.30], [-3.30, 3.30]]]])
+    value, counts = mixture_coverage(
+        STANDING[:, None], future, ALL, torch.ones(1, 1, 1), torch.full((1, 1, 1, 3, 2), 2)
+    )
+    assert value[0, 0].tolist() == [1.0, 0.5, 0.0] and counts.all()
+
+
+def test_mixture_coverage_of_truth_from_the_mixture_is_90_percent():
+    """Whereas narrower modes cover less of it, and wider ones more."""
+    generator = torch.Generator().manual_seed(0)
+    windows, probs = 20_000, torch.tensor([0.6, 0.3, 0.1])
+    means, std_m = torch.tensor([[-3.0, 0.0], [2.0, 1.0], [0.5, -4.0]]), torch.tensor([0.2, 1.0, 3.0])
+    mode = torch.multinomial(probs, windows, replacement=True, generator=generator)
+    future = means[mode] + std_m[mode, None] * torch.randn(windows, 2, generator=generator)
+    forecast, scale = (t.expand(windows, 3, 2)[:, :, None, None] for t in (means, std_m[:, None].expand(3, 2)))
+    found = [
+        mixture_coverage(
+            forecast, future[:, None, None], torch.ones(windows, 1, 1).bool(), probs.expand(windows, 3)[..., None], s
+        )[0].mean()
+        for s in (0.5 * scale, scale, 2 * scale)
+    ]
+    assert found[1].item() == pytest.approx(0.9, abs=0.005) and found[0] < 0.85 and found[2] > 0.95
+
+
+def test_mixture_coverage_leaves_out_a_mode_without_probability():
+    forecast, probs = one_agent(along_x(3, 3, 3), along_x(0, 0, 0)), torch.tensor([1.0, 0.0])[None, :, None]
+    value, _ = mixture_coverage(forecast, STANDING, ALL, probs, torch.ones_like(forecast))
+    assert value[0, 0].tolist() == [0.5] * 3  # the other axis is right
 
 
 def test_mixture_nll_does_not_see_truth_that_does_not_count():
@@ -496,6 +529,9 @@ PER_AGENT: dict[str, Metric] = {
     "coverage": lambda f, t, v: coverage(f, t, v, share=0.5),
     "nll": lambda f, t, v: gaussian_mixture_nll(f, t, v, torch.full(t.shape[2:3], 1.5)),
     "mixture_nll": lambda f, t, v: mixture_nll(f, t, v, torch.full(f.shape[:3], 1 / f.shape[1]), 1 + f.abs()),
+    "mixture_coverage": lambda f, t, v: mixture_coverage(
+        f, t, v, torch.full(f.shape[:3], 1 / f.shape[1]), torch.ones_like(f)
+    ),
     "overlap": lambda f, t, v: overlap(f, v, 2.0),
 }
 METRICS = PER_AGENT | PER_SCENE

@@ -61,7 +61,8 @@ def test_everything_that_accuracy_json_says_of_a_checkpoint_is_taken_over():
 def test_samples_and_controls_are_taken_over():
     one = {"min_ade_m": 1.0, "min_fde_m": 2.0}
     many = {
-        "min_ade_m": 0.5, "min_joint_ade_m": 0.75, "energy_m": 0.625, "coverage": [0.75, 1.0, None], "overlap": 0.125,
+        "min_ade_m": 0.5, "min_joint_ade_m": 0.75, "energy_m": 0.625, "coverage": [0.75, 1.0, None],
+        "mixture_coverage": [0.875, None, 0.5], "overlap": 0.125,
         "true_overlap": 0.0, "intervals": {"min_ade_m": [0.25, 0.75], "energy_m": [0.5, 1.0]},
         "statistics": {"coverage": {"mean": 0.875}},
     }  # fmt: skip
@@ -78,6 +79,7 @@ def test_samples_and_controls_are_taken_over():
     assert (found.best_of_k_m, found.best_of_k_interval_m) == (0.5, (0.25, 0.75))
     assert (found.joint_best_of_k_m, found.joint_best_of_k_interval_m) == (0.75, None)
     assert (found.energy_m, found.energy_interval_m, found.coverage) == (0.625, (0.5, 1.0), (0.75, 1.0))
+    assert found.mixture_coverage == (0.5, 0.875)
     assert found.overlap == (0.125, 0.0) and found.neighbours_m == 3.0
     figures = {"best_of_k_m": 0.5, "joint_best_of_k_m": 0.75, "energy_m": 0.625}
     assert found.controls == {

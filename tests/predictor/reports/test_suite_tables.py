@@ -17,7 +17,8 @@ def accuracy(first: float, samples: int = 20) -> dict[str, Any]:
     statistics = {name: {"mean": value, "standard_error": 0.125} for name, value in values.items()}
     statistics["mixture_nll"] = {"mean": -1.5, "standard_error": 0.25}
     return values | {
-        "num_samples": samples, "statistics": statistics, "coverage": [0.875, 0.5, 0.25], "overlap": 0.0625,
+        "num_samples": samples, "statistics": statistics, "coverage": [0.875, 0.5, 0.25],
+        "mixture_coverage": [0.75, 0.5, 1.0], "overlap": 0.0625,
         "true_overlap": 0.03125,
     }  # fmt: skip
 
@@ -53,7 +54,7 @@ def test_a_line_shows_its_single_forecast_and_its_samples():
     assert cells(horizon, "Model") == {
         "model": "Model", "K": "20", "ADE₁": "1.000 ± 0.125", "FDE₁": "2.000 ± 0.125", "minADE": "3.000 ± 0.125",
         "minFDE": "4.000 ± 0.125", "joint minADE": "5.000 ± 0.125", "energy score": "6.000 ± 0.125",
-        "RMSE": "7.000 ± 0.125", "NLL": "-1.50 ± 0.25", "90 % cover": "88 / 25 %",
+        "RMSE": "7.000 ± 0.125", "NLL": "-1.50 ± 0.25", "90 % cover": "88 / 25 %", "… of mixture": "75 / 100 %",
     }  # fmt: skip
 
 
@@ -109,8 +110,9 @@ def test_what_was_not_measured_is_a_dash():
     test = one["tests"]["test"]
     del test["horizon_only"]["statistics"]["mixture_nll"]
     test["horizon_only"]["coverage"], test["graph"] = [], None
+    del test["horizon_only"]["mixture_coverage"]  # as in results of version 0.1.0
     horizon, whole = grids(content([joined([one])]))  # no graph, no table of graphs
-    assert (cells(horizon, "Model")["NLL"], cells(horizon, "Model")["90 % cover"]) == ("–", "–")
+    assert [cells(horizon, "Model")[head] for head in ("NLL", "90 % cover", "… of mixture")] == ["–"] * 3
     assert whole.heading == "Whole sequence"
 
 

@@ -120,7 +120,7 @@ def test_modes_are_validated_as_enumerated_and_others_by_draws(circles: Path, tm
     trainer = made(config(circles, tmp_path, **MODELS[kind]))
     (first, _), (second, _) = trainer.validate(), trainer.validate()
     assert first.num_samples == samples and first.energy_m == second.energy_m
-    assert bool(first.mixture_nll) == (kind == "dgvae-plural")
+    assert bool(first.mixture_nll) == bool(first.mixture_coverage) == (kind == "dgvae-plural")
 
 
 @pytest.mark.parametrize("model", ["dnri", "mlp"])
