@@ -212,7 +212,7 @@ def test_mixture_coverage_of_one_mode_is_that_of_a_normal_distribution():
     """The central 90 % of a normal distribution end at 1.645 standard deviations; each axis counts by itself."""
     future = torch.tensor([[[[3.28, -3.28], [3.28, 3.30], [-3.30, 3.30]]]])
     value, counts = mixture_coverage(
-        STANDING[:, None], future, ALL, torch.ones(1, 1, 1), torch.full((1, 1, 1, 3, 2), 2)
+        STANDING[:, None], future, ALL, torch.ones(1, 1, 1), torch.full((1, 1, 1, 3, 2), 2.0)
     )
     assert value[0, 0].tolist() == [1.0, 0.5, 0.0] and counts.all()
 
