@@ -86,11 +86,8 @@ def separate_spans(app: Any, what: str, name: str, obj: Any, options: Any, lines
 
 
 def setup(app: Any) -> None:
-    """Registers the change of docstrings; says what was left out; lets kernels talk through sockets of this machine."""
-    from jupyter_client.connect import ConnectionFileMixin  # of the extra docs
-
+    """Registers the change of docstrings; says what was left out."""
     app.connect("autodoc-process-docstring", separate_spans)
-    ConnectionFileMixin.transport.default_value = "ipc"  # not TCP, at which anyone on this machine could listen
     missing = sorted(set(PROJECTS) - set(intersphinx_mapping))
     if missing:
         print(f"no links into the pages of {', '.join(missing)}: they cannot be reached from here")
