@@ -222,8 +222,8 @@ def mixture_coverage(
         mode_probs: probability of each mode.
         scale: standard deviation of each mode [m].
     """
-    error = torch.where(valid[:, None, ..., None], future[:, None] - forecast, 0.0)
-    below = (mode_probs[..., None, None] * torch.special.ndtr(error / scale.clamp(min=LEAST_STD_M))).sum(1)
+    error = (future[:, None] - forecast) / scale.clamp(min=LEAST_STD_M)
+    below = (mode_probs[..., None, None] * torch.special.ndtr(error)).sum(1)
     inside = (below - 0.5).abs() <= COVERAGE_SHARE / 2
     return inside.to(future.dtype).mean(-1), valid
 

@@ -90,6 +90,8 @@ def samples_table(measurements: Sequence[Measurement]) -> str:
         if m.energy_m is None:
             continue
         covered = "–" if m.coverage is None else "{:.0f} to {:.0f} %".format(*(100 * c for c in m.coverage))
+        if m.mixture_coverage is not None:
+            covered += "; with spread {:.0f} to {:.0f} %".format(*(100 * c for c in m.mixture_coverage))
         hit = "–" if m.overlap is None else "{:.1f} ({:.1f}) %".format(*(100 * o for o in m.overlap))
         lines.append(
             [

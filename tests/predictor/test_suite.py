@@ -3,13 +3,14 @@
 import json
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from predictor import suite
 from predictor.baselines.majority import MajorityGraph
@@ -229,8 +230,21 @@ def test_an_added_option_that_is_used_gives_another_folder(data: Path, tmp_path:
     assert line_folder(base, more) != line_folder(base, less)
 
 
+def headlines_of(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Returns the list in which the figures that are drawn from now on leave their headlines."""
+    drawn, draw = [], suite.figure_by_step
+
+    def remember(results: Sequence[dict[str, Any]], kinds: Sequence[str], dt_s: float, headline: str) -> Figure:
+        drawn.append(headline)
+        return draw(results, kinds, dt_s, headline)
+
+    monkeypatch.setattr(suite, "figure_by_step", remember)
+    return drawn
+
+
 def test_suite_runs_what_is_missing_and_nothing_else(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Only the line that is trained is started, in a process of its own."""
+    drawn = headlines_of(monkeypatch)
     settings = config(data, tmp_path, lines=("constant-velocity", "mlp"), workers=2)
     before = run_line(settings, line("constant-velocity"))
     content = run_suite(settings)
@@ -239,6 +253,7 @@ def test_suite_runs_what_is_missing_and_nothing_else(data: Path, tmp_path: Path,
     assert not content["failed"]
     for name in ("table.md", "table.tex", "table.json", "by_step.png"):
         assert (settings.folder / name).exists()
+    assert ", one seed;" in drawn[0]
     monkeypatch.setattr(jobs, "_start", lambda *_: pytest.fail("a finished line was started again"))
     again = run_suite(settings)
     assert again["rows"] == content["rows"]
@@ -274,9 +289,9 @@ def test_several_seeds_are_shown_by_mean_and_range_and_resumed(
     settings = config(data, tmp_path, lines=("constant-velocity", "mlp"), seeds=2)
     for job in jobs_of(settings)[:2]:
         run_line(job.config, job.line)
-    started = in_this_process(monkeypatch)
+    started, drawn = in_this_process(monkeypatch), headlines_of(monkeypatch)
     content = run_suite(settings)
-    assert started == ["mlp, seed 1"]
+    assert started == ["mlp, seed 1"] and ", mean over 2 seeds;" in drawn[0]
     straight, mlp = content["rows"]
     assert (straight["seeds"], mlp["seeds"]) == ([0], [0, 1])
     errors = [r["tests"]["test"]["horizon_only"]["ade_m"] for r in mlp["runs"]]

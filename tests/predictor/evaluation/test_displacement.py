@@ -234,6 +234,12 @@ def test_mixture_coverage_of_truth_from_the_mixture_is_90_percent():
     assert found[1].item() == pytest.approx(0.9, abs=0.005) and found[0] < 0.85 and found[2] > 0.95
 
 
+def test_mixture_coverage_of_a_mode_without_scale_has_the_least_one():
+    future = torch.tensor([[[[1.6, 1.7], [-1.6, -1.7], [0.0, 0.0]]]]) * LEAST_STD_M
+    value, _ = mixture_coverage(STANDING[:, None], future, ALL, torch.ones(1, 1, 1), torch.zeros(1, 1, 1, 3, 2))
+    assert value[0, 0].tolist() == [0.5, 0.5, 1.0]
+
+
 def test_mixture_coverage_leaves_out_a_mode_without_probability():
     forecast, probs = one_agent(along_x(3, 3, 3), along_x(0, 0, 0)), torch.tensor([1.0, 0.0])[None, :, None]
     value, _ = mixture_coverage(forecast, STANDING, ALL, probs, torch.ones_like(forecast))

@@ -1,7 +1,9 @@
+from dataclasses import replace
+
 import pytest
 
 from predictor.evaluation.in_env_record import Measurement
-from predictor.reports.in_env_tables import measurement_table, metres, replace_tables
+from predictor.reports.in_env_tables import measurement_table, metres, replace_tables, samples_table
 from predictor.support.errors import UserError
 
 MEASURED = Measurement(
@@ -28,6 +30,12 @@ def test_a_note_stands_once_below_the_table_with_the_envs_it_concerns():
     lines = measurement_table([MEASURED, *marked]).splitlines()
     assert [line.split(" |")[0] for line in lines[2:5]] == ["| toy-v0", "| a-v0*", "| b-v0*"]
     assert lines[5:] == ["", r"\* a-v0, b-v0: selected on these seeds."]
+
+
+def test_coverage_with_the_spread_of_modes_is_told_where_it_was_measured():
+    sampled = replace(MEASURED, energy_m=1.0, coverage=(0.75, 1.0))
+    plain, spread = samples_table([sampled, replace(sampled, mixture_coverage=(0.5, 0.875))]).splitlines()[2:]
+    assert "| 75 to 100 % |" in plain and "| 75 to 100 %; with spread 50 to 88 % |" in spread
 
 
 def test_only_what_stands_between_the_markers_is_replaced():
