@@ -54,7 +54,7 @@ fuzz: .venv/.tools ## fuzz what is read from files, each kind for FUZZ_SECONDS (
 sbom: .venv/.tools ## write the bill of materials of the pinned packages, build/sbom.json; fails if a known weakness is among them
 	.venv/bin/python .ci/sbom.py
 
-soak: .venv/.tools ## step vector environments with forecasts SOAK_STEPS times each, and check that nothing grows: 25 minutes
+soak: .venv/.tools ## step vector environments with forecasts SOAK_STEPS times each, and check that nothing grows: 10 to 25 minutes
 	.venv/bin/python -m tests.storm.soak --steps $(SOAK_STEPS)
 
 check: .venv/.tools ## lint, formatting, types, who may import whom, the shape of the tree, the examples in docstrings
