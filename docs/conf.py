@@ -10,6 +10,8 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
+from jupyter_client.manager import KernelManager
+
 ROOT = Path(__file__).resolve().parents[1]
 INVENTORY_S = 3.0
 """Longest time that is waited for another project's list of names [s]."""
@@ -58,6 +60,7 @@ nb_execution_timeout = 170
 nb_output_stderr = "remove"
 nb_merge_streams = True
 nb_render_markdown_format = "gfm"
+KernelManager.transport_encryption.default_value = "auto"  # kernels warn where their sockets are not encrypted
 
 autodoc_member_order = "bysource"
 autodoc_mock_imports = ["envpool"]
