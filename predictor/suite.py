@@ -76,7 +76,7 @@ class SuiteConfig:
     steps: int = 0
     """Number of optimiser steps of every line; 0 takes that of the budget."""
     workers: Annotated[int, Renamed("jobs")] = 0
-    """Number of parallel processes, a line in each; 0 is one per core (one in all on a GPU)."""
+    """Number of parallel processes, a line in each, which share all cores; 0 is one per core (one in all on a GPU)."""
     seed: int = 0
     """Random seed for training and forecasts; the first one, if there are several."""
     device: str = "cpu"
