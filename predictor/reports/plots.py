@@ -51,9 +51,8 @@ def plot_results_by_step(ax: Axes, results: Sequence[dict[str, Any]], kind: str,
         ours = result["key"].startswith(("dgvae", "dvae", "plural")) and not result["key"].endswith("-gaussian")
         time_s = dt_s * np.arange(1, len(view["by_step_m"]) + 1)
         errors = [error or 0.0 for error in view["step_errors"]["by_step_m"]]
-        label = f"{result['name']}, K = {view['num_samples']}"
         style: dict[str, Any] = {"lw": 2.0 if ours else 1.2, "marker": "o", "ms": 3, **look}
-        ax.errorbar(time_s, view["by_step_m"], yerr=errors, label=label, **style)
+        ax.errorbar(time_s, view["by_step_m"], yerr=errors, label=result["name"], **style)
     ax.set_yscale("log")
     ax.set_xlabel("time ahead [s]")
     return ax
@@ -64,7 +63,7 @@ def figure_by_step(results: Sequence[dict[str, Any]], kinds: Sequence[str], dt_s
     """Draws `plot_results_by_step` for several test stores side by side, under one headline.
 
     Args:
-        results: results of a suite's table.json, one per line of the table.
+        results: results of a suite's table.json, one per line of the table, of as many samples each.
         kinds: test stores.
         dt_s: length of a step [s].
         headline: text above.
@@ -74,7 +73,8 @@ def figure_by_step(results: Sequence[dict[str, Any]], kinds: Sequence[str], dt_s
     )
     for ax, kind in zip(axes[0], kinds, strict=True):
         plot_results_by_step(ax, results, kind, dt_s).set_title(kind)
-    axes[0, 0].set_ylabel("displacement of the best sample [m]")
+    samples = results[0]["tests"][kinds[0]]["horizon_only"]["num_samples"]
+    axes[0, 0].set_ylabel(f"displacement of the best of {samples} samples [m]")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2 * len(kinds), fontsize=7.5)
     figure.suptitle(headline, fontsize=9)

@@ -1,3 +1,4 @@
+from predictor.evaluation.paper_tables import SPRINGS
 from predictor.reports.looks import BLUE, GREY, looks_of
 
 
@@ -18,3 +19,8 @@ def test_checkpoints_differ_from_each_other_and_from_the_controls():
     names = ["highway", "merge", "generic", "constant velocity", "nearest neighbours"]
     assert len({look["color"] for look in looks_of(names)}) == len(names)
     assert looks_of(names)[0]["color"] == BLUE, "what the plot is about"
+
+
+def test_all_lines_of_the_longest_table_differ():
+    looks = looks_of(line.name for line in SPRINGS.lines)
+    assert len({tuple(look.values()) for look in looks}) == len(looks)

@@ -5,9 +5,11 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from predictor.evaluation import paper_tables
 from predictor.evaluation.accuracy import Accuracy
+from predictor.evaluation.paper_tables import Table
 from predictor.reports.looks import GREY
-from predictor.reports.plots import plot_error_by_horizon, plot_scene
+from predictor.reports.plots import figure_by_step, plot_error_by_horizon, plot_scene
 
 
 @pytest.fixture
@@ -53,3 +55,18 @@ def test_scene_has_solid_history_dashed_forecast_and_thin_truth(ax: Axes):
     assert {line.get_color() for line in dashed} == {solid[0].get_color()}
     assert thin[0].get_linewidth() < solid[0].get_linewidth()
     assert ax.get_aspect() == 1.0
+
+
+@pytest.mark.parametrize("name", ["SPRINGS", "NBA"])
+def test_figures_by_step_have_room_for_the_names_of_their_lines(name: str):
+    table: Table = getattr(paper_tables, name)
+    view = {"by_step_m": [1.0, 2.0], "step_errors": {"by_step_m": [0.1, None]}, "num_samples": 7}
+    tests = {kind: {"horizon_only": view} for kind in table.tests}
+    results = [{"key": line.key, "name": line.name, "tests": tests} for line in table.lines]
+    figure = figure_by_step(results, list(table.tests), 0.1, "headline")
+    figure.canvas.draw()
+    legend, page = figure.legends[0].get_window_extent(), figure.bbox
+    assert page.x0 <= legend.x0 and legend.x1 <= page.x1 and page.y0 <= legend.y0
+    drawn = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert drawn == [line.name for line in table.lines if line.key != "least-squares"]
+    assert "best of 7" in figure.axes[0].get_ylabel()
