@@ -202,6 +202,7 @@ SPRINGS = Table(
         _dgvae("dvae", "dVAE+ (no edge features)", 0, edge_cost=5.0),
         _SPRINGS_PLUS,
         _SPRINGS_PLUS.with_gaussian(),
+        _dgvae("dgvae-sparse", "dG-VAE+, price of an edge 20 instead of 5 nats", 16, edge_cost=20.0),
         _dgvae("dgvae-pm", "dG-VAE+ with pair matching", 24, "static_dim=16", edge_cost=5.0),
         _dgvae(
             "dgvae-pm-window", "dG-VAE+ with pair matching, whole window in training", 24,
