@@ -12,7 +12,7 @@ from cycler import cycler
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f7f7f", "#8c564b", "#9467bd")
 """Colours of lines, in the order of their use; the first eight differ for colour-blind readers, too."""
 BLUE, ORANGE, GREEN, PINK, YELLOW, SKY, BLACK, GREY, BROWN, PURPLE = COLORS
-DASHES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (6, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5, 1, 1.5)))
+DASHES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (6, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5, 1, 1.5)), (0, (2, 3)))
 
 STYLE: Any = {
     "axes.grid": True,
