@@ -242,6 +242,11 @@ def headlines_of(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return drawn
 
 
+def test_the_line_with_a_dearer_edge_differs_in_its_price_alone():
+    usual, dear = line("dgvae"), line("dgvae-sparse")
+    assert dear.set == usual.set and dear.train == usual.train | {"edge_cost": 20.0} != usual.train
+
+
 def test_suite_runs_what_is_missing_and_nothing_else(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Only the line that is trained is started, in a process of its own."""
     drawn = headlines_of(monkeypatch)
