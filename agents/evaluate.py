@@ -20,18 +20,21 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.arena import EgoArena, open_arena
 from agents.episode_file import NO_PYARROW, has_pyarrow
+from agents.hub import local_policy
+from agents.policy import task_of_policy
 from agents.results import Evaluation
-from agents.runs import POLICY_FILE, load_model, read_config
+from agents.runs import CONFIG_FILE, load_model, policy_zip, read_config, shipped_policies
 from agents.summaries import EXTREMES
 from agents.task import EVALUATION_SEED, Task, task_of
 from envs.drivers.ego import CONSTANT_ACTIONS, constant_actions, make_ego_driver, named_drivers
 from envs.registry import arguments_of
-from envs.sb3.policy_file import read_policy_note
+from envs.sb3.policy_file import Algorithm, algorithm_of, read_policy_note
 from envs.supervision import TIMEOUT_S
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least, check_positive
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out
+from predictor.support.hub import is_hub
 from predictor.support.memory import check_count, check_processes
 from predictor.support.progress import WorkShown
 from predictor.support.runtime import keep_freed_memory, resolve_device
@@ -94,11 +97,16 @@ def evaluate_with_progress(
 class EvaluateConfig:
     """Evaluates the policy of a training run on held-out seeds, beside random, idle and constant actions."""
 
-    EVERYDAY: ClassVar = ("run_dir", "policy", "env_id", "env_kwargs", "checkpoint", "episodes", "seed", "out")
+    EVERYDAY: ClassVar = (
+        "run_dir", "trust_pickle", "policy", "env_id", "env_kwargs", "checkpoint", "episodes", "seed", "out",
+    )  # fmt: skip
     """Fields that --help explains."""
 
     run_dir: Path | None = None
-    """Folder of the training run, as train_policy.py wrote it; leave it out with --policy."""
+    """Trained policy: the folder of its run, as train_policy.py wrote it, a .zip, one that ships (highway-fast), or
+    hub:owner/name with --trust-pickle; leave it out with --policy."""
+    trust_pickle: bool = False
+    """Load a policy of a hub, which runs code of everyone who can write to its repository."""
     policy: str | None = None
     """Driver of the ego instead of a trained policy: planner (docs/what_if.md), planner:CHECKPOINT, or another name of
     envs.drivers.ego; needs --env-id and --out."""
@@ -127,7 +135,7 @@ class EvaluateConfig:
     """Key of the infos that says whether the ego has succeeded; None likewise, or is_success."""
     out: Path | None = None
     """Folder for summary.json, summary.md and, where pyarrow is installed, episodes.parquet; None takes
-    RUN_DIR/evaluation."""
+    RUN_DIR/evaluation, where that is a folder of yours."""
     films: bool = False
     """Film the trained policy's best, median and worst episode by return: best.mp4, median.mp4, worst.mp4."""
     num_envs: Annotated[int, Renamed("workers")] = os.cpu_count() or 1
@@ -154,6 +162,8 @@ class EvaluateConfig:
             raise UserError("--policy and --env-id go together; a training run has its own environment")
         if self.policy is not None and self.out is None:
             raise UserError("--policy has no run folder; say with --out where the results go")
+        if self.run_dir is not None and self.out is None and _in_no_folder(self.run_dir):
+            raise UserError(f"{self.run_dir} is no run folder; say with --out where the results go")
         if self.policy is not None and self.checkpoint is not None:
             raise UserError("--checkpoint is of a training run; the planner's is part of its name, planner:CHECKPOINT")
         if self.policy == CONSTANT_ACTIONS:
@@ -174,12 +184,13 @@ def main() -> None:
     config = parse(EvaluateConfig, __doc__)
     out = config.out or (config.run_dir or Path()) / "evaluation"
     check_out(out)
-    evaluation, noted = _of_driver(config) if config.run_dir is None else _of_run(config, config.run_dir)
+    trained = None if config.run_dir is None else _trained(config, config.run_dir)
+    evaluation, noted = _of_driver(config) if trained is None else _of_run(config, trained)
     out.mkdir(parents=True, exist_ok=True)
     evaluation.write(out, **noted)
     show(evaluation, Console())
-    if config.films and config.run_dir is not None:
-        evaluation.write(out, **noted, films=_film(config, config.run_dir, evaluation, out))
+    if config.films and trained is not None:
+        evaluation.write(out, **noted, films=_film(trained, evaluation, out))
     Console().print(f"written to {out / 'summary.json'} and {out / 'summary.md'}")
 
 
@@ -253,48 +264,66 @@ def checked_drivers(task: Task, names: Sequence[str]) -> tuple[str, ...]:
     return drivers
 
 
-def _of_run(config: EvaluateConfig, run_dir: Path) -> tuple[Evaluation, dict[str, str]]:
-    """Evaluates the policy of a training run; returns what is noted beside the results, too."""
-    run = read_config(run_dir, "observe", "algorithm")
-    task = task_of(run, config.device, config.env_id, config.checkpoint)
+def _in_no_folder(policy: Path) -> bool:
+    """Returns whether a policy is a file, ships with this package, or is on a hub."""
+    return is_hub(policy) or policy.is_file() or (not policy.exists() and str(policy) in shipped_policies())
+
+
+@dataclass(frozen=True)
+class _Trained:
+    """A trained policy, and what it is measured in."""
+
+    zipped: Path
+    algorithm: Algorithm
+    task: Task
+
+    def model(self) -> BaseAlgorithm:
+        """Loads it."""
+        return load_model(self.zipped, self.algorithm)
+
+
+def _trained(config: EvaluateConfig, policy: Path) -> _Trained:
+    """Finds a trained policy and its task, with what the command says otherwise."""
+    zipped = policy_zip(local_policy(policy, config.trust_pickle))
+    if (zipped.parent / CONFIG_FILE).is_file():
+        run = read_config(zipped.parent, "observe", "algorithm")
+        algorithm, task = run["algorithm"], task_of(run, config.device, config.env_id, config.checkpoint)
+    else:
+        algorithm, task = algorithm_of(zipped), task_of_policy(zipped, config.device)
     if config.checkpoint not in (None, task.checkpoint):
         raise UserError(
-            f"run {run_dir} was trained on forecaster {task.checkpoint}, got --checkpoint {config.checkpoint}; leave "
+            f"policy {policy} was trained on forecaster {task.checkpoint}, got --checkpoint {config.checkpoint}; leave "
             "it out"
         )
-    task = replace(task, timeout_s=config.timeout_s)
-    task = _changed(task, config)
     if config.env_id not in (None, task.env_id):
-        raise UserError(f"run {run_dir} was trained on {task.env_id}, got --env-id {config.env_id}; leave it out")
+        raise UserError(f"policy {policy} was trained on {task.env_id}, got --env-id {config.env_id}; leave it out")
+    given: dict[str, Any] = {name: getattr(config, name) for name in ("crash_key", "success_key", "env_kwargs")}
+    given = {name: value for name, value in given.items() if value is not None}
+    return _Trained(zipped, algorithm, replace(task, timeout_s=config.timeout_s, **given))
+
+
+def _of_run(config: EvaluateConfig, trained: _Trained) -> tuple[Evaluation, dict[str, str]]:
+    """Evaluates a trained policy; returns what is noted beside the results, too."""
+    task = trained.task
     task.check()
     drivers = compared_drivers(task, config.drivers)
-    policy = run_dir / POLICY_FILE
-    model = load_model(policy, run["algorithm"])
-    note, now = read_policy_note(policy), task.note
+    model = trained.model()
+    note, now = read_policy_note(trained.zipped), task.note
     if note is None:
         if now.forecaster is not None:
-            Console(stderr=True).print(NOT_PINNED.format(policy))
+            Console(stderr=True).print(NOT_PINNED.format(trained.zipped))
     elif note.forecaster is not None and now.forecaster is not None:
-        note.forecaster.check(now.forecaster, f"policy {policy}")
-    name = f"{run['algorithm']} ({run['observe']})"
+        note.forecaster.check(now.forecaster, f"policy {trained.zipped}")
+    name = f"{trained.algorithm} ({task.observe})"
     evaluation = evaluate_with_progress(task, model, name, config.episodes, config.num_envs, config.seed, drivers)
-    return evaluation, {"algorithm": run["algorithm"], "observe": run["observe"]}
+    return evaluation, {"algorithm": trained.algorithm, "observe": task.observe}
 
 
-def _changed(task: Task, config: EvaluateConfig) -> Task:
-    """Returns the task of a run with what the command says otherwise."""
-    given: dict[str, Any] = {name: getattr(config, name) for name in ("crash_key", "success_key", "env_kwargs")}
-    return replace(task, **{name: value for name, value in given.items() if value is not None})
-
-
-def _film(config: EvaluateConfig, run_dir: Path, evaluation: Evaluation, out: Path) -> dict[str, dict[str, Any]]:
+def _film(trained: _Trained, evaluation: Evaluation, out: Path) -> dict[str, dict[str, Any]]:
     """Films episodes of the trained policy, which is the first of the evaluation; returns what the films show."""
     from agents.video import film_extremes  # films alone need a video encoder
 
-    run, episodes = read_config(run_dir), next(iter(evaluation.results.values()))
-    model = load_model(run_dir / POLICY_FILE, run["algorithm"])
-    task = _changed(task_of(run, config.device, config.env_id, config.checkpoint), config)
-    films = film_extremes(task, model, episodes, out)
+    films = film_extremes(trained.task, trained.model(), next(iter(evaluation.results.values())), out)
     names = ", ".join(film["file"] for film in films.values())
     Console().print(f"films: {names or 'none, only highway-env and PettingZoo environments are drawn'}")
     return films

@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from envs import View as View
     from envs import VmasReader as VmasReader
     from envs import agent_ids as agent_ids
+    from envs import draw_observation as draw_observation
     from envs import make_env as make_env
     from envs import make_multiagent_env as make_multiagent_env
     from envs import pad_multiagent_scene as pad_multiagent_scene
@@ -116,8 +117,8 @@ PACKAGE_OF = {
             "FilmParallelForecasts", "ForecastConfig", "ForecastObservation", "ForecastParallelEnv", "ForecastStream",
             "FunctionReader", "HighwayParallelEnv", "MultiagentReader", "MultiagentScene", "ParallelVecEnv", "Reader",
             "SceneObservation", "SceneReader", "SceneStream", "TensorReader", "VecForecast", "VectorForecast", "View",
-            "VmasReader", "agent_ids", "make_env", "make_multiagent_env", "pad_multiagent_scene", "reader_for",
-            "register_reader", "register_view", "unflatten",
+            "VmasReader", "agent_ids", "draw_observation", "make_env", "make_multiagent_env", "pad_multiagent_scene",
+            "reader_for", "register_reader", "register_view", "unflatten",
         ),
         "predictor": (
             "Belief", "CheckpointInfo", "ConstantVelocity", "DGVAE", "DGVAEConfig", "Episode", "Forecast", "Forecaster",

@@ -17,7 +17,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.patches import FancyArrowPatch, Rectangle
 
-from envs import ForecastObservation, make_env
+from envs import ForecastObservation, draw_observation, make_env
 from envs.drivers.planner import Planner
 from envs.rollouts.branches import Branch, branch
 from envs.rollouts.causal_labels import causal_labels, settings_for
@@ -66,8 +66,8 @@ class DrawConfig:
     """Draws the pictures of live traffic in README.md and docs/."""
 
     only: tuple[str, ...] = ()
-    """Names of pictures (highway, what_if, braking_leader, causal_graph, calibration, fans_…); none
-    given draws all."""
+    """Names of pictures (highway, what_if, seen, braking_leader, causal_graph, calibration, fans_…);
+    none given draws all."""
 
     def __post_init__(self) -> None:
         """Checks the names.
@@ -95,6 +95,17 @@ def draw_what_if(path: Path) -> None:
     env = ForecastObservation(make_env(ROAD, render_mode="rgb_array"), what_if=True, num_samples=FUTURES)
     played = record_episode(env, Planner(env, env.forecaster), seed=PLANNED.seed, max_steps=PLANNED.step + 6)
     played.write_frame(path, played.frame_of_step(PLANNED.step))
+    env.close()
+
+
+def draw_seen(path: Path) -> None:
+    """Draws the observation of the moment of the README's picture, with plans."""
+    env = ForecastObservation(make_env(ROAD), what_if=True, num_samples=FUTURES)
+    planner = Planner(env, env.forecaster)
+    observation, _ = env.reset(seed=FILMED.seed)
+    for _ in range(FILMED.step):
+        observation, *_ = env.step(planner(observation))
+    draw_observation(observation, y_down=True).save(path)
     env.close()
 
 
@@ -262,6 +273,7 @@ def _plot_edges(ax: Axes, scene: Scene, edges: Sequence[tuple[int, int, float]])
 PICTURES: dict[str, Callable[[Path], None]] = {
     "highway": partial(draw_film, ROAD, FILMED, FUTURES),
     "what_if": draw_what_if,
+    "seen": draw_seen,
     "braking_leader": draw_braking_leader,
     "causal_graph": draw_causal_graph,
     "calibration": draw_calibration,

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from envs.video.film_forecasts import FilmForecasts as FilmForecasts
     from envs.video.film_forecasts import register_view as register_view
     from envs.video.film_parallel import FilmParallelForecasts as FilmParallelForecasts
+    from envs.video.seen import draw_observation as draw_observation
     from envs.wrappers import ForecastObservation as ForecastObservation
     from envs.wrappers import SceneObservation as SceneObservation
 
@@ -69,6 +70,7 @@ __getattr__, __all__ = lazy_exports(
         "envs.video.drawing": ("View",),
         "envs.video.film_forecasts": ("FilmForecasts", "register_view"),
         "envs.video.film_parallel": ("FilmParallelForecasts",),
+        "envs.video.seen": ("draw_observation",),
         "envs.wrappers": ("ForecastObservation", "SceneObservation"),
     },
 )

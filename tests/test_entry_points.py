@@ -71,7 +71,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     "docs.draw_pictures": [
         (
             "--only film",
-            "only must be among highway, what_if, braking_leader, causal_graph, calibration, fans_roundabout, "
+            "only must be among highway, what_if, seen, braking_leader, causal_graph, calibration, fans_roundabout, "
             "fans_intersection, got film",
         )
     ],
@@ -152,7 +152,9 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     ],
     "agents.evaluate": [
         ("--run-dir absent --out file", "file is a file; choose another --out"),
-        ("--run-dir absent", "absent holds no training run"),
+        ("--run-dir absent", "no policy at absent: neither a run folder nor a .zip nor one that ships (highway-fast,"),
+        ("--run-dir .", ". holds no training run (config.json is missing)"),
+        ("--run-dir hub:me/fast", "hub:me/fast is no run folder; say with --out where the results go"),
         ("--run-dir absent --num-envs 0", "num_envs must be at least 1, got 0"),
         ("--run-dir absent --device tpu", "device must be cpu, cuda or auto, got 'tpu'"),
         ("", "give either --run-dir (a training run) or --policy"),

@@ -154,6 +154,21 @@ def test_a_finished_policy_is_evaluated_again(finished: tuple[Path, str], monkey
     assert again["episodes"] == json.loads((run / "summary.json").read_text())["episodes"]
 
 
+def test_a_policy_that_ships_is_measured_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    words = "--run-dir highway-fast --episodes 1 --num-envs 1 --drivers none"
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", *words.split()])
+    with pytest.raises(SystemExit):
+        run_entry_point(evaluate.main)
+    assert "highway-fast is no run folder; say with --out where the results go" in error_line(capsys)
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", *words.split(), "--out", str(tmp_path)])
+    run_entry_point(evaluate.main)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (summary["algorithm"], summary["observe"], summary["env_id"]) == ("ppo", "forecast", "highway-fast-v0")
+    assert [line["policy"] for line in summary["policies"]] == ["ppo (forecast)", "random", "idle"]
+
+
 @pytest.mark.slow
 def test_best_median_and_worst_episodes_are_filmed(
     finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -1,5 +1,6 @@
 """Policies on a hub: pushed with their warning, and loaded only by those who say that they trust them."""
 
+import json
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from agents import evaluate
 from agents import hub as policies
 from agents.hub import policy_from_hub, push_policy_to_hub
 from agents.policy import load_policy
@@ -45,6 +47,35 @@ def test_a_policy_is_loaded_from_a_hub_by_those_who_trust_it(hub: Hub, tmp_path:
     assert policy(observation) == known(twin.reset(seed=3)[0])
     film = write_film(WatchConfig(Path("hub:me/fast"), out=tmp_path / "film.mp4", trust_pickle=True))
     assert film.read_bytes()[4:8] == b"ftyp"
+
+
+def test_a_policy_of_a_hub_is_measured_by_those_who_trust_it(
+    hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """The table is that of the same policy on this machine."""
+    path, _ = saved(tmp_path / "run", Task(FAST, "constant-velocity", env_kwargs=FEW))
+    push_policy_to_hub(path, "me/fast")
+    few = ["--episodes", "1", "--num-envs", "1", "--drivers", "none"]
+
+    def evaluated(*words: str) -> None:
+        monkeypatch.setattr(sys, "argv", ["evaluate", *words, *few])
+        run_entry_point(evaluate.main)
+
+    asked = len(hub.asked)
+    for words, line in (
+        (("--run-dir", "hub:me/fast", "--out", str(tmp_path / "a")), "loading it runs code of whoever wrote it"),
+        (("--run-dir", "hub:me/fast", "--trust-pickle"), "hub:me/fast is no run folder; say with --out where the"),
+        (("--run-dir", str(path)), "policy.zip is no run folder; say with --out where the results go"),
+    ):
+        with pytest.raises(SystemExit):
+            evaluated(*words)
+        assert line in " ".join(capsys.readouterr().err.split())
+    assert len(hub.asked) == asked, "nothing is downloaded before"
+    evaluated("--run-dir", "hub:me/fast", "--trust-pickle", "--out", str(tmp_path / "a"))
+    evaluated("--run-dir", str(path), "--out", str(tmp_path / "b"))
+    summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in "ab"]
+    assert [summary["observe"] for summary in summaries] == ["constant-velocity"] * 2
+    assert summaries[0]["policies"] == summaries[1]["policies"]
 
 
 def test_a_predictor_is_no_policy(hub: Hub):

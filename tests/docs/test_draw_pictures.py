@@ -21,8 +21,8 @@ def test_an_unknown_picture_is_one_line(tmp_path: Path, monkeypatch: pytest.Monk
     assert (code, errors) == (
         2,
         [
-            "error: only must be among highway, what_if, braking_leader, causal_graph, calibration, fans_roundabout, "
-            "fans_intersection, got film"
+            "error: only must be among highway, what_if, seen, braking_leader, causal_graph, calibration, "
+            "fans_roundabout, fans_intersection, got film"
         ],
     )
     assert not list(tmp_path.iterdir())
