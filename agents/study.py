@@ -45,6 +45,10 @@ class StudyConfig:
     """Folder of the study; None takes runs/study-NAME. The same command continues what is in it."""
     workers: int = 0
     """Number of cells that run side by side, each in a process with one thread; 0 is one per core."""
+    scenarios: tuple[str, ...] = ()
+    """Scenarios to run, by their names in the study; none given runs all. The report has all that were run so far."""
+    seeds: int | None = None
+    """Number of training seeds to run, the first ones of the study; None runs all."""
     cluster: str | None = None
     """Ray cluster that runs the cells, in place of --workers: auto (the one that runs on this machine) or HOST:PORT of
     its head; --out has to be on a file system that all machines share (docs/scale.md). None runs them here."""
@@ -57,6 +61,7 @@ class StudyConfig:
     def __post_init__(self) -> None:
         """Checks ranges."""
         check_at_least(self, 0, "workers")
+        check_at_least(self, 1, "seeds")
         check_processes(self.workers, "workers")
         check_address(self.cluster)
 
@@ -81,13 +86,14 @@ def run_study(config: StudyConfig) -> int:
     check_out(folder)
     _check_folder(folder)
     cells = cells_of(study, file.name)
+    chosen = _chosen(config, study, cells)
     with locked(folder, "study"):
         delete_leftovers(folder)
         results = _results_of(folder, cells)
         write_text(folder / STUDY_FILE, file.read_text(encoding="utf-8"))
-        failed = _run_missing(config, folder, cells, results)
+        failed = _run_missing(config, folder, chosen, results)
         done = [results[cell.name] for cell in cells if cell.name in results]
-        _write(config, folder, study, done, file.read_text(encoding="utf-8"), failed)
+        _write(config, folder, study, done, file.read_text(encoding="utf-8"), failed, len(cells))
     for cell in failed:
         log = folder / CELLS / cell.name / LOG_FILE
         print(f"failed: {cell.title}: {last_line(log)}; its log is {log}", file=sys.stderr)
@@ -99,6 +105,26 @@ def _with_file(study: Study, file: Path) -> Study:
         return study.headroom_only()
     except UserError as error:
         raise UserError(f"{file.name}: {error}") from error
+
+
+def _chosen(config: StudyConfig, study: Study, cells: Sequence[Cell]) -> list[Cell]:
+    """Returns the cells that the command asks for.
+
+    Raises:
+        UserError: an unknown scenario, or more training seeds than the study has.
+    """
+    known = [scenario.name for scenario in study.scenarios]
+    for name in config.scenarios:
+        if name not in known:
+            raise UserError(f"study {study.name} has no scenario '{name}'; it has {', '.join(known)}")
+    most = len(study.training_seeds)
+    if config.seeds is not None and config.seeds > most:
+        raise UserError(
+            f"study {study.name} has {most} training seeds, got --seeds {config.seeds}; change seeds in a copy of its "
+            "file"
+        )
+    seeds = {None, *study.training_seeds[: config.seeds]}
+    return [cell for cell in cells if cell.scenario in (config.scenarios or known) and cell.seed in seeds]
 
 
 def _check_folder(folder: Path) -> None:
@@ -153,8 +179,9 @@ def _notes(
 
 
 def _write(
-    config: StudyConfig, folder: Path, study: Study, results: Sequence[Result], text: str, failed: Sequence[Cell]
-) -> None:
+    config: StudyConfig, folder: Path, study: Study, results: Sequence[Result], text: str, failed: Sequence[Cell],
+    total: int,
+) -> None:  # fmt: skip
     """Writes what the study found, and says where."""
     if not results:
         return
@@ -164,7 +191,8 @@ def _write(
         print(f"written to {folder / HEADROOM}")
         return
     write_tables(folder, results)
-    write_report(folder, findings, text, made, [cell.title for cell in failed])
+    not_run = total - len(results) - len(failed)
+    write_report(folder, findings, text, made, [cell.title for cell in failed], not_run)
     print(f"written to {folder}: {REPORT}, {PAGE}, episodes.parquet, curves.parquet")
 
 

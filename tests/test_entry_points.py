@@ -186,6 +186,8 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ),
         ("--study file", "file is not valid TOML: "),
         ("--workers -1", "workers must not be negative, got -1"),
+        ("--seeds 0", "seeds must be at least 1, got 0"),
+        ("--scenarios merge nowhere", "study quick has no scenario 'nowhere'; it has merge"),
         ("--out file", "file is a file; choose another --out"),
         ("--out .", ". holds file but no study (study.toml); choose another --out"),
     ],

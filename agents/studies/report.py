@@ -19,7 +19,7 @@ NOTHING = "–"
 
 
 def write_report(
-    folder: Path, findings: Findings, text: str, provenance: dict[str, Any], failed: Sequence[str]
+    folder: Path, findings: Findings, text: str, provenance: dict[str, Any], failed: Sequence[str], not_run: int = 0
 ) -> None:
     """Writes the report as Markdown, with its pictures beside it, and as one HTML page.
 
@@ -28,9 +28,10 @@ def write_report(
         findings: results.
         text: the study file.
         provenance: provenance of this start.
-        failed: names of the cells without a result.
+        failed: names of the cells that failed.
+        not_run: number of cells that were not asked for, and have no result of before.
     """
-    blocks = blocks_of(findings, text, provenance, failed)
+    blocks = blocks_of(findings, text, provenance, failed, not_run)
     for block in blocks:
         if isinstance(block, Picture):
             write_text(folder / PICTURES / block.file, block.svg + "\n")
@@ -56,12 +57,16 @@ def title_of(findings: Findings) -> str:
     return findings.study.title or f"Study {findings.study.name}"
 
 
-def blocks_of(findings: Findings, text: str, provenance: dict[str, Any], failed: Sequence[str]) -> list[Block]:
+def blocks_of(
+    findings: Findings, text: str, provenance: dict[str, Any], failed: Sequence[str], not_run: int = 0
+) -> list[Block]:
     """Returns the blocks of the report; what differs between two runs of one study stands at its end."""
     study = findings.study
     blocks: list[Block] = [Heading(title_of(findings), 1), Paragraph(_summary(findings))]
     if failed:
         blocks.append(Paragraph(f"Without a result: {'; '.join(failed)}. The numbers below are of the others."))
+    if not_run:
+        blocks.append(Paragraph(f"Not run yet: {not_run} cells of the study. The numbers below are of the others."))
     for scenario in findings.scenarios:
         blocks += _scenario(findings, scenario)
     if study.compared_with and findings.lines(trained=True):

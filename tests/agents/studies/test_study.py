@@ -9,6 +9,7 @@ import signal
 import sys
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import agents.study
 from agents.studies.pool import START_METHOD
 from agents.study import StudyConfig, run_study
 from predictor.support.errors import UserError, run_entry_point
-from tests.agents.studies.helpers import SLOW_TOY, study_path, study_text
+from tests.agents.studies.helpers import SLOW_TOY, TOY, study_path, study_text
 
 LEFT_OUT = re.compile(r"(## Time\n|<h2>Time</h2>).*", re.DOTALL)
 """What differs between two runs of one study."""
@@ -196,6 +197,28 @@ def test_a_cell_that_fails_does_not_stop_the_others(tmp_path: Path, capsys: pyte
     assert len(results(tmp_path)) == 4
     report = (tmp_path / "out" / "report.md").read_text()
     assert "Without a result: corridor, none, ppo, seed 0." in report and "| none | 1 |" in report
+
+
+def test_a_part_of_a_study_is_run_and_the_rest_later(tmp_path: Path):
+    """Cells of a part are those of the whole, and a report of a part says so."""
+    text = study_text(steps="64", selections="1") + f'[scenarios.longer]\nenv_id = "{TOY}"\n'
+    part = replace(config(tmp_path, text), scenarios=("longer",), seeds=1)
+    report = tmp_path / "out" / "report.md"
+    assert run_study(part) == 0
+    first = results(tmp_path)
+    assert sorted(name.split(".")[0] for name in first) == ["longer"] * 4
+    assert len([name for name in first if ".none." in name]) == 1
+    assert "Not run yet: 6 cells of the study." in report.read_text() and "## corridor" not in report.read_text()
+    assert run_study(replace(part, scenarios=("corridor",))) == 0
+    assert "Not run yet: 2 cells" in report.read_text()
+    assert "## longer" in report.read_text() and "## corridor" in report.read_text()
+    assert run_study(config(tmp_path, text)) == 0
+    assert "Not run yet" not in report.read_text()
+    assert len(results(tmp_path)) == 10 and first.items() <= results(tmp_path).items()
+    with pytest.raises(UserError, match="study corridor has no scenario 'wide'; it has corridor, longer"):
+        run_study(replace(part, scenarios=("longer", "wide")))
+    with pytest.raises(UserError, match="has 2 training seeds, got --seeds 3; change seeds in a copy of its file"):
+        run_study(replace(part, seeds=3))
 
 
 def test_a_folder_with_something_else_is_refused(tmp_path: Path):
