@@ -5,15 +5,17 @@ so that `predictor.support.errors.run_entry_point` prints one line and exits wit
 """
 
 import contextlib
+import dataclasses
 import io
 import itertools
 import re
 import sys
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from typing import Annotated, Any, TypeVar, get_type_hints
 
 import tyro
+from docstring_parser import parse_from_object
 
 from predictor.support.config_checks import check_numbers
 from predictor.support.errors import UserError
@@ -57,9 +59,11 @@ def parse(config_class: type[Config], description: str | None = None, args: Sequ
     words = with_new_names(config_class, sys.argv[1:] if args is None else args)
     if HELP_ALL in words:
         words = ["--help"]
-    elif {"-h", "--help"} & set(words) and (hidden := _seldom_used(config_class)):
-        description = f"{(description or '').strip()}\n\n{len(hidden)} more options: {HELP_ALL}."
-        config_class = _without(config_class, hidden)
+        config_class = _for_help(config_class, ())
+    elif {"-h", "--help"} & set(words):
+        if hidden := _seldom_used(config_class):
+            description = f"{(description or '').strip()}\n\n{len(hidden)} more options: {HELP_ALL}."
+        config_class = _for_help(config_class, hidden)
     printed = io.StringIO()
     try:
         with contextlib.redirect_stderr(printed):
@@ -82,11 +86,21 @@ def _seldom_used(config_class: type) -> list[str]:
     return [field.name for field in fields(config_class) if everyday is not None and field.name not in everyday]
 
 
-def _without(config_class: Any, names: Collection[str]) -> Any:
-    """Returns a class whose help leaves out fields; tyro finds the strings of the others in the class below."""
+def _for_help(config_class: Any, hidden: Collection[str]) -> Any:
+    """Returns a class whose help leaves out fields, and breaks the lines of the others' strings at the width alone."""
     hints = get_type_hints(config_class, include_extras=True)
-    content: dict[str, Any] = {field.name: field.default for field in fields(config_class) if field.name in names}
-    content["__annotations__"] = {name: Annotated[hints[name], tyro.conf.Suppress] for name in content}
+    bases = reversed(config_class.__mro__[:-1])
+    texts = {one.arg_name: one.description or "" for base in bases for one in parse_from_object(base).params}
+    content: dict[str, Any] = {"__annotations__": {}}
+    for place in fields(config_class):
+        shown: Any = tyro.conf.arg(help=" ".join(texts.get(place.name, "").split()))
+        content["__annotations__"][place.name] = Annotated[
+            hints[place.name], tyro.conf.Suppress if place.name in hidden else shown
+        ]
+        if place.default_factory is not MISSING:
+            content[place.name] = dataclasses.field(default_factory=place.default_factory)
+        elif place.default is not MISSING:
+            content[place.name] = place.default
     return dataclass(frozen=True)(type(config_class.__name__, (config_class,), content))
 
 

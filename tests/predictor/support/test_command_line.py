@@ -135,6 +135,27 @@ def test_options_that_do_not_exist_are_listed_with_similar_ones(capsys: pytest.C
     assert out == "" and "Unrecognized options: --num-env" in errors and "--num-envs" in errors
 
 
+@dataclass(frozen=True)
+class Wordy:
+    """Settings with long strings, of which one is required."""
+
+    path: str
+    """Path of the
+    file."""
+    sizes: list[int] = field(default_factory=lambda: [1, 2])
+    """Sizes, the smallest
+    first."""
+
+
+@pytest.mark.parametrize("word", ["--help", "--help-all"])
+def test_lines_of_help_break_at_the_width_alone(word: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit):
+        parse(Wordy, args=[word])
+    out = capsys.readouterr().out
+    assert "Path of the file. (required)" in out and "Sizes, the smallest first. (default: 1 2)" in out
+    assert parse(Wordy, args=["--path", "a"]) == Wordy("a", [1, 2])
+
+
 def test_help_has_the_description_and_every_field(capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as stop:
         parse(Settings, "Reads settings.", args=["--help"])
