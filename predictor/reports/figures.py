@@ -50,10 +50,15 @@ def files_of(figure: Figure, axes: Sequence[Axes]) -> tuple[str, bytes]:
 
 
 def _finish(figure: Figure, axes: Sequence[Axes]) -> None:
-    """Draws one legend below the panels."""
+    """Draws one legend below the panels, in as many columns as fit the width."""
     entries: dict[str, Any] = {}
     for ax in axes:
         handles, labels = ax.get_legend_handles_labels()
         entries |= {label: entries.get(label, handle) for handle, label in zip(handles, labels, strict=True)}
-    if entries:
-        figure.legend(entries.values(), entries, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    for columns in (3, 2, 1) if entries else ():
+        legend = figure.legend(
+            entries.values(), entries, loc="outside lower center", ncols=columns, frameon=False, fontsize=9
+        )
+        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            break
+        legend.remove()
