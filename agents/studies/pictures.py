@@ -3,7 +3,7 @@
 Files are SVG, and equal from run to run.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,15 +14,27 @@ from scipy import stats
 from agents.studies.estimators import CONFIDENCE, performance_profile, profile_band
 from agents.studies.findings import Findings, Line, generator_of
 from predictor.reports.figures import panels, svg_of
-from predictor.reports.looks import COLORS
+from predictor.reports.looks import BLACK, BLUE, BROWN, COLORS, DASHES, GREY, ORANGE
 
+_ARM_COLORS = {"forecast": BLUE, "constant-velocity": GREY, "oracle": BLACK, "zeros": ORANGE, "none": BROWN}
 _GREYS = (("#777777", "--"), ("#777777", ":"), ("#aaaaaa", "-."))
 _THRESHOLDS = 201
 
 
-def style_of(index: int) -> dict[str, Any]:
-    """Returns colour and dashes of the arm with this number; the same arm looks the same in all pictures."""
-    return {"color": COLORS[index % len(COLORS)], "ls": ("-", "--", "-.")[index // len(COLORS) % 3]}
+def styles_of(lines: Sequence[Line]) -> dict[Line, dict[str, Any]]:
+    """Returns colour and dashes of each line: a colour per arm, dashes per algorithm.
+
+    Known arms have one colour in every study: that of the dG-VAE, constant velocity, the truth in all plots.
+    """
+    arms, algorithms = (list(dict.fromkeys(names)) for names in zip(*lines, strict=True)) if lines else ([], [])
+    spare = [color for color in COLORS if color not in {_ARM_COLORS.get(arm) for arm in arms}]
+    unknown = [arm for arm in arms if arm not in _ARM_COLORS]
+    styles = {}
+    for line in lines:
+        turn, place = divmod(unknown.index(line.arm), len(spare)) if line.arm in unknown else (0, 0)
+        dashes = DASHES[(algorithms.index(line.algorithm) + turn) % len(DASHES)]
+        styles[line] = {"color": _ARM_COLORS.get(line.arm, spare[place]), "ls": dashes}
+    return styles
 
 
 def plot_curve(
@@ -73,10 +85,11 @@ def plot_profile(
 def learning_curves(findings: Findings) -> str:
     """Returns the picture of all learning curves, a panel per scenario, as SVG."""
     figure, axes = panels(len(findings.scenarios))
+    styles = styles_of(findings.lines(trained=True))
     for ax, scenario in zip(axes, findings.scenarios, strict=True):
         for line in findings.lines(scenario, trained=True):
             steps, returns = curve_of(findings, scenario, line)
-            plot_curve(ax, steps, returns, findings.label(line), **style_of(_index(findings, line)))
+            plot_curve(ax, steps, returns, findings.label(line), **styles[line])
         plot_references(ax, _references(findings, scenario))
         ax.set_title(scenario)
         ax.set_xlabel("environment steps")
@@ -125,10 +138,11 @@ def _profile_panel(ax: Axes, findings: Findings, runs: Mapping[Line, Any], title
     scores = np.concatenate([np.concatenate(list(found)) for found in runs.values()])
     margin = 0.05 * (np.ptp(scores) or 1.0)
     thresholds = np.linspace(scores.min() - margin, scores.max() + margin, _THRESHOLDS)
+    styles = styles_of(findings.lines(trained=True))
     for line, found in runs.items():
         band = profile_band(found, thresholds, generator_of("profile", title, *line), findings.resamples)
-        style = style_of(_index(findings, line))
-        plot_profile(ax, thresholds, performance_profile(found, thresholds), *band, findings.label(line), **style)
+        shares = performance_profile(found, thresholds)
+        plot_profile(ax, thresholds, shares, *band, findings.label(line), **styles[line])
 
 
 def _references(findings: Findings, scenario: str) -> dict[str, float]:
@@ -136,7 +150,3 @@ def _references(findings: Findings, scenario: str) -> dict[str, float]:
     planner, constant = findings.planner(scenario), findings.best_constant(scenario)
     shown = {"planner": planner, "best constant action": constant}
     return {name: findings.mean_return(scenario, line).value for name, line in shown.items() if line is not None}
-
-
-def _index(findings: Findings, line: Line) -> int:
-    return findings.lines(trained=True).index(line)
