@@ -28,7 +28,7 @@ def without_envpool(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("env_id", "settings", "message"),
     [
-        ("merge-generic-v1", {"backend": "envpool"}, "EnvPool has no copy of 'merge-generic-v1'; it has highway-v0, "),
+        ("highway-mixed-v0", {"backend": "envpool"}, "EnvPool has no copy of 'highway-mixed-v0'; it has highway-v0, "),
         ("nonsense", {"backend": "envpool"}, "EnvPool has no copy of 'nonsense'"),
         (TAG, {"backend": "envpool"}, f"backend envpool has no {TAG}; leave it out"),
         ("highway-fast-v0", {"learners": ("adversary",)}, "highway-fast-v0 has one ego; leave them out"),

@@ -27,8 +27,9 @@ from envs.readers import multiagent_reader_for, reader_for
 from envs.readers.base import MultiagentScene, Reader, pad_multiagent_scene
 from envs.readers.entities import EntityRowsReader
 from envs.readers.function import FunctionReader
-from envs.registry import make_env, make_multiagent_env
+from envs.registry import envpool_task_of, make_env, make_multiagent_env
 from envs.scene_stream import ForecastConfig
+from envs.simulators.envpool import VARIED_SINCE, envpool_release
 from envs.wrappers import ForecastObservation
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE
@@ -314,6 +315,11 @@ def highway(env_id: str, **config: Any) -> Callable[[], gym.Env]:
     return partial(make_env, env_id, config=config, disable_env_checker=True)
 
 
+def envpool_intersection() -> gym.Env:
+    """Makes the intersection under its newest version in the EnvPool that is installed: older ones warn."""
+    return make_env(f"envpool/{envpool_task_of('intersection-v2')}")
+
+
 def table_reader(spec: SceneSpec, columns: Sequence[str], gate_m: float) -> EntityRowsReader:
     return EntityRowsReader(tuple(columns), spec, gate_m)
 
@@ -338,7 +344,8 @@ SUBJECTS: dict[str, Subject] = {
         enters=True, leaves=True, sight_m=30.0,
     ),
     "envpool-intersection": Subject(
-        partial(make_env, "envpool/Intersection-v0"), envpool_bodies, 25.0, enters=True, sight_m=50.0
+        envpool_intersection, envpool_bodies, 25.0, enters=True, sight_m=50.0,
+        leaves=envpool_release() >= VARIED_SINCE,  # vehicles leave in Intersection-v2, not in Intersection-v0
     ),
     "table-highway": Subject(
         highway("highway-fast-v0", **SMALL, observation=KINEMATICS), highway_bodies, 60.0,

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -258,7 +259,7 @@ def test_run_folder_says_how_it_was_made(tiny: None, circles: Path, tmp_path: Pa
     assert info.provenance["train_config"]["steps"] == 7
     recorded = json.loads((out / "config.json").read_text())
     assert recorded["config"]["data"] == [str(circles)]
-    assert recorded["provenance"]["versions"]["torch"] == torch.__version__
+    assert recorded["provenance"]["versions"]["torch"] == version("torch")
     assert list((out / "tb").glob("events*"))
     assert state(out)["step"] == 7  # the last step is saved although eval_every does not divide it
     assert sorted(p.name for p in out.iterdir()) == ["checkpoint", "config.json", "curve.json", "tb", "train_state.pt"]

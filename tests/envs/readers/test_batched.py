@@ -170,6 +170,7 @@ class Opcodes:
 
     def __enter__(self) -> "Opcodes":
         self.count = 0
+        sys._getframe().f_trace_opcodes = True  # Python 3.12 looks at settrace whether a frame wants instructions
         sys.settrace(self._enter)
         return self
 
