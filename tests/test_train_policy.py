@@ -520,10 +520,7 @@ def test_hyperparameters_are_recorded_and_compared_on_resume(
         (("--env-id", "simple_tag_v3", "--driver", "nonsense"), "driver must be one of random, idle, varied"),
         (("--env-id", TOY, "--observe", "none", "--learners", "ant"), "no heuristic drives meadow_v0"),
         (("--env-id", TOY, "--observe", "constant-velocity"), "no scene reader knows meadow_v0"),
-        (
-            ("--backend", "envpool", "--env-id", "roundabout-generic-v1"),
-            "EnvPool has no copy of 'roundabout-generic-v1'",
-        ),
+        (("--backend", "envpool", "--env-id", "merge-mixed-v0"), "EnvPool has no copy of 'merge-mixed-v0'"),
         (("--backend", "envpool", "--env-id", "simple_tag_v3"), "backend envpool has no simple_tag_v3"),
         (
             ("--env-id", "racetrack-v1", "--algorithm", "dqn", "--observe", "none"),
