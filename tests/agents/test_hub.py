@@ -76,6 +76,12 @@ def test_a_policy_of_a_hub_is_measured_by_those_who_trust_it(
     summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in "ab"]
     assert [summary["observe"] for summary in summaries] == ["constant-velocity"] * 2
     assert summaries[0]["policies"] == summaries[1]["policies"]
+    assert json.loads(summaries[0]["env_kwargs"]) == json.loads(FEW)
+    alone = '{"config": {"vehicles_count": 0, "duration": 3}}'
+    evaluated("--run-dir", str(path), "--out", str(tmp_path / "c"), "--env-kwargs", alone, "--crash-key", "nothing")
+    changed = json.loads((tmp_path / "c" / "summary.json").read_text())
+    assert json.loads(changed["env_kwargs"]) == json.loads(alone)
+    assert changed["policies"][0]["length_mean"] == 3 and changed["policies"][0]["crash_rate"] is None
 
 
 def test_a_predictor_is_no_policy(hub: Hub):
