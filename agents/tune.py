@@ -167,14 +167,15 @@ def open_study(file: Path) -> "Study":
     """
     import optuna
     from sqlalchemy.exc import DatabaseError
+    from sqlalchemy.pool import NullPool
 
     if os.path.lexists(file):
         check_regular(file, MOST_STUDY_BYTES)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
-        return optuna.create_study(
-            storage=f"sqlite:///{file}", study_name="tuning", direction="maximize", load_if_exists=True
-        )
+        # Without a pool each connection is closed after its use; Python 3.13 warns of those that nobody closes.
+        storage = optuna.storages.RDBStorage(f"sqlite:///{file}", engine_kwargs={"poolclass": NullPool})
+        return optuna.create_study(storage=storage, study_name="tuning", direction="maximize", load_if_exists=True)
     except (DatabaseError, optuna.exceptions.OptunaError, RuntimeError, ValueError) as error:
         if isinstance(error.__cause__, OSError) or "disk is full" in str(error) or "disk I/O" in str(error):
             raise  # a full disk, which is told elsewhere

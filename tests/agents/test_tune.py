@@ -15,7 +15,7 @@ from agents.preset_settings import settings_from_file
 from agents.presets import PPOPreset
 from agents.task import EVALUATION_SEED, SELECTION_SEED, TUNING_SEED
 from agents.training import SaveCheckpoint, TrainingPlan
-from agents.tune import TuneConfig, tune
+from agents.tune import TuneConfig, open_study, tune
 from agents.vec_envs import SeededEpisodes
 from predictor.support.errors import UserError, run_entry_point
 from tests.agents.studies.helpers import TOY
@@ -42,7 +42,7 @@ def config(out: Path, **changes: Any) -> TuneConfig:
 
 
 def study_of(folder: Path) -> optuna.Study:
-    return optuna.load_study(storage=f"sqlite:///{folder / 'tuning.db'}", study_name="tuning")
+    return open_study(folder / "tuning.db")
 
 
 def ended(folder: Path) -> list[tuple[Any, Any, Any]]:
