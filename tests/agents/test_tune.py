@@ -1,6 +1,7 @@
 """Tuning in-process and tiny: once on zeros, for the rest on a toy, which has nothing to forecast."""
 
 import json
+import os
 import sys
 import tomllib
 from dataclasses import replace
@@ -213,3 +214,14 @@ def test_a_missing_optuna_is_one_clear_line(
     error = capsys.readouterr().err
     assert error == "error: agents.tune needs the optuna package; pip install 'dgvae-rl[tune]'\n"
     assert not (tmp_path / "tuned").exists()
+
+
+def test_a_study_leaves_no_connection_open(tmp_path: Path):
+    """Python 3.13 warns of connections that nobody closes."""
+    study = open_study(tmp_path / "tuning.db")
+    study.add_trial(optuna.create_trial(value=1.0))
+    descriptors = Path("/proc/self/fd")
+    if not descriptors.exists():
+        pytest.skip("no /proc/self/fd here")
+    opened = [os.readlink(link) for link in descriptors.iterdir() if os.path.lexists(link)]
+    assert len(study.get_trials()) == 1 and not [path for path in opened if path.startswith(str(tmp_path))]

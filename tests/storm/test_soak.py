@@ -1,10 +1,12 @@
 """The soak: a short one is flat, and each kind of leak is found when it is planted."""
 
+import gc
 import mmap
 import os
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -134,3 +136,12 @@ def test_the_command_ends_with_status_1_if_something_grows(monkeypatch: pytest.M
 def test_a_run_too_short_to_judge_is_refused():
     with pytest.raises(UserError, match=r"steps must be at least 15360 \(2 · rows · samples\), got 1000"):
         SoakConfig(steps=1000)
+
+
+def test_modules_are_not_asked_what_they_hold(monkeypatch: pytest.MonkeyPatch):
+    """The collector of some releases of Python hangs once `_asyncio` has been asked."""
+    asked = set[type]()
+    ask = gc.get_referents
+    monkeypatch.setattr(gc, "get_referents", lambda *things: asked.update(map(type, things)) or ask(*things))
+    assert count_entries() > 0
+    assert asked and not any(issubclass(kind, ModuleType) for kind in asked)
