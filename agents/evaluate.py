@@ -285,7 +285,7 @@ class _Trained:
 def _trained(config: EvaluateConfig, policy: Path) -> _Trained:
     """Finds a trained policy and its task, with what the command says otherwise."""
     zipped = policy_zip(local_policy(policy, config.trust_pickle))
-    if (zipped.parent / CONFIG_FILE).is_file():
+    if (zipped.parent / CONFIG_FILE).is_file():  # of which nothing is imported that the command does not name
         run = read_config(zipped.parent, "observe", "algorithm")
         algorithm, task = run["algorithm"], task_of(run, config.device, config.env_id, config.checkpoint)
     else:

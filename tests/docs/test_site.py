@@ -96,6 +96,14 @@ def unreachable(*_: object, **__: object) -> None:
     raise OSError("no network")
 
 
+def test_the_settings_are_read_without_the_extra_of_the_site():
+    """Type checks and these tests read the file where only the other extras are installed."""
+    body = ast.parse((DOCS / "conf.py").read_text()).body
+    imported = [alias.name for line in body if isinstance(line, ast.Import) for alias in line.names]
+    imported += [str(line.module) for line in body if isinstance(line, ast.ImportFrom)]
+    assert imported and {name.partition(".")[0] for name in imported} <= sys.stdlib_module_names
+
+
 def test_the_site_builds_without_a_network(conf: Any):
     assert conf.PROJECTS and conf.intersphinx_mapping == {}
 
