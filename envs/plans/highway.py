@@ -15,7 +15,9 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 from highway_env.envs.common.action import ContinuousAction, DiscreteAction, DiscreteMetaAction
-from highway_env.vehicle.controller import ControlledVehicle
+from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
+from highway_env.vehicle.dynamics import BicycleVehicle
+from highway_env.vehicle.kinematics import Vehicle
 
 from envs.plans.base import Plans
 from envs.readers.highway import is_highway_env
@@ -35,6 +37,9 @@ called collisions.
 """
 LANES = {"": 0, " left": -1, " right": 1}
 """Lanes of plans with continuous steering, relative to the present one."""
+_MOVE_WITHOUT_LANE = (MDPVehicle, Vehicle, BicycleVehicle)
+"""Vehicles whose motion does not depend on the lane that they are found on. It is looked up once per policy step, not in
+each frame: highway-env measures the distance to every lane of the road for it."""
 
 
 class _Control(NamedTuple):
@@ -137,6 +142,8 @@ class _Alone:
         self._env.road, self._env.controlled_vehicles = self.road, [self.ego]
         self.action_type: Any = copy.copy(env.action_type)
         self.action_type.env, self.action_type.controlled_vehicle = self._env, self.ego
+        if type(self.ego) in _MOVE_WITHOUT_LANE:
+            self.ego.on_state_update = lambda: None
         self._dt_s = 1 / env.config["simulation_frequency"]
 
     def advance(self, action: Any, frames: int) -> None:
@@ -146,6 +153,7 @@ class _Alone:
                 self.action_type.act(action)
             self.road.act()
             self.road.step(self._dt_s)
+        type(self.ego).on_state_update(self.ego)
 
     def state(self) -> tuple[float, float, float, float]:
         """Returns position [m] and velocity [m/s]."""

@@ -10,6 +10,7 @@ import pytest
 
 from envs.plans import HighwayPlans, Plans, checked_plans, plan_model_for, register_plan_model
 from envs.plans import base as plans_base
+from envs.plans import highway as plans_highway
 from envs.readers.highway import HighwayReader
 from envs.registry import make_env
 from predictor.support.errors import UserError
@@ -51,6 +52,28 @@ def test_a_plan_is_what_the_ego_then_does_and_earns_alone(env_id: str):
         states, rewards = driven(deepcopy(env), [action, *plans.later_actions[plan]])
         np.testing.assert_allclose(plans.states[plan], states, atol=1e-6, err_msg=model.names[plan])
         np.testing.assert_allclose(plans.rewards[plan], rewards, atol=1e-9, err_msg=model.names[plan])
+
+
+@pytest.mark.parametrize("env_id", ["highway-fast-v0", "merge-v1", "roundabout-v1", "intersection-v2", "racetrack-v1"])
+def test_lanes_are_found_once_per_step_and_plans_stay_the_same(env_id: str, monkeypatch: pytest.MonkeyPatch):
+    env = make_env(env_id)
+    env.reset(seed=2)
+    network: Any = env.unwrapped.road.network  # type: ignore[attr-defined]
+    looked: list[Any] = []
+    find = network.get_closest_lane_index
+    monkeypatch.setattr(network, "get_closest_lane_index", lambda *a: (looked.append(a), find(*a))[1])
+    model = plan_model_for(env)
+    counts, made = [], []
+    for vehicles in (plans_highway._MOVE_WITHOUT_LANE, ()):
+        monkeypatch.setattr(plans_highway, "_MOVE_WITHOUT_LANE", vehicles)
+        looked.clear()
+        made.append(model.plans(env, HORIZON))
+        counts.append(len(looked))
+    frames: int = env.unwrapped.config["simulation_frequency"] // env.unwrapped.config["policy_frequency"]  # type: ignore[attr-defined]
+    assert counts[1] - counts[0] == len(model.names) * HORIZON * frames
+    for name in ("states", "rewards", "crash_rewards", "crashed"):
+        np.testing.assert_array_equal(getattr(made[0], name), getattr(made[1], name))
+    assert str(made[0].later_actions) == str(made[1].later_actions)
 
 
 def test_continuous_plans_are_repeated_by_their_actions():
