@@ -38,8 +38,8 @@ called collisions.
 LANES = {"": 0, " left": -1, " right": 1}
 """Lanes of plans with continuous steering, relative to the present one."""
 _MOVE_WITHOUT_LANE = (MDPVehicle, Vehicle, BicycleVehicle)
-"""Vehicles whose motion does not depend on the lane that they are found on. It is looked up once per policy step, not in
-each frame: highway-env measures the distance to every lane of the road for it."""
+"""Vehicles whose motion does not depend on the lane that they are found on. It is looked up once per policy step, not
+in each frame: highway-env measures the distance to every lane of the road for it."""
 
 
 class _Control(NamedTuple):
