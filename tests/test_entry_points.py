@@ -248,6 +248,11 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("--copies 1", "copies must be at least 2, got 1"),
         ("--env-id highway-fast-v0", "unknown multiagent env 'highway-fast-v0'; known: "),
     ],
+    "benchmarks.joint_futures": [
+        ("--agents 0", "agents must be at least 1, got (0,)"),
+        ("--env-ids absent-v0", "no checkpoint ships for env 'absent-v0'"),
+        ("--out .", "out must be a file, . is a folder; name a file"),
+    ],
     "benchmarks.rows": [
         ("--num-envs 0", "num_envs needs numbers of at least 1, got (0,)"),
         ("--max-rows 0", "max_rows must be at least 1, got 0"),
