@@ -117,7 +117,7 @@ class SceneStream:
         return self._shown(self._online.forecast(self.horizon_steps, num_samples, self._noise))
 
     def what_if(self, plans: Float[np.ndarray, "entries plans horizon state"]) -> Forecast:
-        """Forecasts each scene of the latest forecast again, for each plan of its ego, in the world frame.
+        """Forecasts each scene of the latest forecast again, for each plan of its ego, in the frame of `Forecast`.
 
         What observations hold does not change, and no noise is used up. With `config.num_plans`, samples are drawn from
         the same noise as those of the latest forecast.

@@ -48,7 +48,8 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
     Handles both autoreset modes and no autoreset: with NEXT_STEP the closing observation is the step's own and the next
     step opens the new episode; with SAME_STEP the closing observation is `infos["final_obs"]`; with DISABLED,
     histories are cleared when `reset(options={"reset_mask": …})` names their environments. After each step, `scene`
-    and `forecast` hold, in the world frame, what `observations[i]` shows of environment i.
+    (world frame) and `forecast` (world axes, relative to each ego's position) hold what `observations[i]` shows of
+    environment i.
 
     Args:
         env: Gymnasium vector environment, wrapped or not.

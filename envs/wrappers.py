@@ -164,8 +164,8 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
     ego → agent), `valid`.
     `envs.entries.ego_entries` gives the shapes. With `flatten=True` it is one Box, in the Dict's key order.
 
-    The history is cleared at reset. After each step, `scene` and `forecast` hold the observed scene and its forecast in
-    the world frame.
+    The history is cleared at reset. After each step, `scene` holds the observed scene in the world frame,
+    `forecast` its forecast: along the world's axes, relative to the ego's position.
 
     Args:
         env: any environment that a scene reader knows, or one that is already a `SceneObservation`.

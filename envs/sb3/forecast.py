@@ -37,7 +37,8 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         >>> venv = make_vec_env("highway-fast-v0", n_envs=8, wrapper_class=SceneObservation)
         >>> venv = VecForecast(venv, "highway")
 
-    After each step, `scene` and `forecast` hold, in the world frame, what `observations[i]` shows of environment i.
+    After each step, `scene` (world frame) and `forecast` (world axes, relative to each ego's position) hold what
+    `observations[i]` shows of environment i.
 
     Args:
         venv: SB3 vector environment (Dummy or Subproc) of environments in `SceneObservation`, or an `EnvPoolVecEnv`.
