@@ -14,6 +14,7 @@ from agents.presets import Algorithm
 from agents.task import SELECTION_SEED, Observe, Task
 from envs.drivers.ego import CONSTANT_ACTIONS
 from envs.drivers.planner import PLANNER, PLANNER_ORACLE
+from envs.registry import entry_for
 from envs.sb3.algorithms import algorithm_named
 from predictor.support.config_checks import check_at_least, check_at_most, check_choices
 from predictor.support.errors import UserError
@@ -227,7 +228,8 @@ def task_for(scenario: Scenario, arm: StudyArm, where: str) -> Task:
         del shared["checkpoint"]
     if arm.observe == "none":
         shared = {key: value for key, value in shared.items() if key not in _OF_FORECASTS}
-    values: dict[str, Any] = {"env_id": scenario.env_id, "observe": arm.observe, **shared, **options}
+    learners = {"learners": entry_for(scenario.env_id).learners}
+    values: dict[str, Any] = {"env_id": scenario.env_id, "observe": arm.observe, **learners, **shared, **options}
     try:
         return Task(**values)
     except UserError as error:

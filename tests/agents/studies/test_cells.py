@@ -58,6 +58,16 @@ def test_only_what_concerns_a_cell_is_in_its_name(cells: Callable[..., list[Cell
     assert tag.content["preset"]["target_kl"] == 0.01
 
 
+def test_opponents_do_not_learn_unless_the_study_says_so(tmp_path: Path):
+    def cell(options: str) -> Cell:
+        text = f'arms = ["none"]\nseeds = 1\nreferences = []\n[scenarios.tag]\nenv_id = "simple_tag_v3"\n{options}'
+        return cells_of(read_study(study_path(tmp_path, text)), "tag.toml")[0]
+
+    tag, all_learn = cell(""), cell("learners = []")
+    assert tag.task.learners == ("adversary",) and all_learn.task.learners == ()
+    assert tag.name != all_learn.name
+
+
 def test_settings_of_an_algorithm_are_those_of_its_trainings(cells: Callable[..., list[Cell]]):
     found = cells(algorithms="{ppo = {gamma = 0.7, net_arch = [64]}, qrdqn = {}}", seeds="1")
     presets = {cell.algorithm: cell.plan.preset for cell in found if cell.plan is not None}
