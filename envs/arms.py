@@ -51,6 +51,7 @@ ARMS: dict[str, Shown] = {
     "forecast": Shown("everything that the observation has room for"),
     "single": Shown("the single forecast and edges", modes=False, what_if=False),
     "no-edges": Shown("the single forecast", modes=False, edges=False, what_if=False),
+    "edges-only": Shown("edges", future=False, modes=False, what_if=False),
     "modes": Shown("all futures with their probabilities, and edges", what_if=False),
     "what-if": Shown("the single forecast, edges, and the others in each candidate plan", modes=False),
     "zeros": Shown("nothing", future=False, modes=False, edges=False, what_if=False),

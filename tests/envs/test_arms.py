@@ -44,6 +44,7 @@ def everything(bank: EntryBank) -> dict[str, Any]:
 SHOWN = {
     "single": {"forecast", "closest", "mode_probs", "xy_scale", "edge_probs", "edge_features"},
     "no-edges": {"forecast", "closest", "mode_probs", "xy_scale"},
+    "edges-only": {"edge_probs", "edge_features"},
     "modes": {"forecast", "closest", "mode_probs", "xy_scale", "edge_probs", "edge_features"},
     "what-if": {
         *("forecast", "closest", "mode_probs", "xy_scale", "edge_probs", "edge_features"),
