@@ -51,8 +51,8 @@ MOST_FUTURES = 10_000
 """Largest number of samples, and of forecast steps."""
 
 Observe = Literal[
-    "forecast", "none", "constant-velocity", "zeros", "shuffled", "single", "no-edges", "edges-only", "modes", "what-if",
-    "oracle", "oracle-what-if",
+    "forecast", "none", "constant-velocity", "zeros", "shuffled", "single", "no-edges", "edges-only", "modes",
+    "what-if", "oracle", "oracle-what-if",
 ]  # fmt: skip
 """What a policy sees: an arm of `envs.arms`, constant-velocity forecasts, or the env's own observation alone."""
 Backend = Literal["gymnasium", "envpool"]

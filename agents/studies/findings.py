@@ -205,6 +205,10 @@ class Findings:
         constant = [x for x in drivers if x.arm not in NOT_CONSTANT and not is_planner(x.arm) and ".zip" not in x.arm]
         return max(constant, key=lambda x: self.mean_return(scenario, x).value, default=None)
 
+    def heuristic(self, scenario: str) -> Line | None:
+        """Returns the line of the heuristic that drives agents of PettingZoo environments; None if there is none."""
+        return next((x for x in self.lines(scenario, trained=False) if x.arm == "heuristic"), None)
+
     def planner(self, scenario: str, true_futures: bool = False) -> Line | None:
         """Returns the line of the planner, with forecasts or with true futures; None if there is none."""
         planners = [x for x in self.lines(scenario, trained=False) if is_planner(x.arm)]

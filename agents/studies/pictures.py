@@ -93,6 +93,7 @@ def learning_curves(findings: Findings) -> str:
         plot_references(ax, _references(findings, scenario))
         ax.set_title(scenario)
         ax.set_xlabel("environment steps")
+        ax.xaxis.set_major_formatter("{x:,.0f}")
         ax.set_xlim(left=0)
     axes[0].set_ylabel("return on the selection seeds")
     return svg_of(figure, axes)
@@ -146,7 +147,10 @@ def _profile_panel(ax: Axes, findings: Findings, runs: Mapping[Line, Any], title
 
 
 def _references(findings: Findings, scenario: str) -> dict[str, float]:
-    """Returns the mean returns of the planner and of the best constant action, by their names in the legend."""
-    planner, constant = findings.planner(scenario), findings.best_constant(scenario)
-    shown = {"planner": planner, "best constant action": constant}
+    """Returns the mean returns of planner, heuristic and best constant action, by their names in the legend."""
+    shown = {
+        "planner": findings.planner(scenario),
+        "best constant action": findings.best_constant(scenario),
+        "heuristic": findings.heuristic(scenario),
+    }
     return {name: findings.mean_return(scenario, line).value for name, line in shown.items() if line is not None}

@@ -84,9 +84,9 @@ def interval(estimate: Estimate, digits: int = 2, scale: float = 1.0, unit: str 
     if np.isnan(estimate.value):
         return NOTHING
     value = f"{scale * estimate.value:.{digits}f}{unit}"
-    if not estimate.has_interval:
-        return value
-    return f"{value} ({scale * estimate.low:.{digits}f} to {scale * estimate.high:.{digits}f})"
+    if estimate.has_interval:
+        value += f" ({scale * estimate.low:.{digits}f} to {scale * estimate.high:.{digits}f})"
+    return value.replace("-", "−")
 
 
 def _summary(findings: Findings) -> str:

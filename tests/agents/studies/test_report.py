@@ -10,6 +10,7 @@ import pytest
 from agents.forecast_errors import CONSTANT_ERROR, FORECAST_ERROR
 from agents.studies.estimators import Estimate
 from agents.studies.findings import Findings, Line
+from agents.studies.pictures import learning_curves
 from agents.studies.plan import Scenario, Study, StudyArm
 from agents.studies.report import interval, write_headroom, write_report
 from agents.studies.results import Result
@@ -73,6 +74,11 @@ def test_references_are_told_apart():
     findings = found_in(study(), results())
     assert findings.best_constant("one") == Line("slower", None)
     assert findings.planner("one") == Line("planner", None)
+    assert findings.heuristic("one") is None
+    many = found_in(study(), [*results()[4:], result("heuristic", [6.0, 8.0]), result("random", [0.0, 2.0])])
+    assert (many.best_constant("one"), many.planner("one")) == (None, None)
+    drawn = learning_curves(many)
+    assert "heuristic" in drawn and "best constant" not in drawn and "heuristic" not in learning_curves(findings)
 
 
 def test_scores_of_several_scenarios_are_rescaled():
@@ -103,7 +109,7 @@ def written(folder: Path, found: list[Result], **changes: Any) -> tuple[str, str
 def test_the_report_says_what_was_found(tmp_path: Path):
     text, page = written(tmp_path, results())
     assert "| forecast | 3 | 5.00 (3.76 to 6.24) | 5.00 (4.67 to 5.33) | 50 % (50 to 50) | 10.0 | 20.0 |" in text
-    assert "| slower | – | 4.00 (-8.71 to 16.71) | – |" in text
+    assert "| slower | – | 4.00 (−8.71 to 16.71) | – |" in text
     assert "| forecast > zeros | one | 1.00 (1.00 to 1.00) | 3.00" in text
     assert re.search(r"\| one \| slower: 4.00 .* \| 7.00 .* \| 2.00 .* \| 10.00 .* \| 8.00 .* \| 38 % \(", text)
     assert "| forecast | one | 0.2 | 60.0 | 0.1 |" in text, "12 s for 200 steps"
@@ -159,6 +165,7 @@ def test_headroom_alone(tmp_path: Path):
 
 def test_intervals_as_text():
     assert interval(Estimate(0.25, 0.1, 0.4), 0, 100.0, " %") == "25 % (10 to 40)"
+    assert interval(Estimate(-1.0, -2.0, 0.5), 1) == "−1.0 (−2.0 to 0.5)"
     assert interval(Estimate(1.0, float("nan"), float("nan"))) == "1.00"
     assert interval(Estimate(float("nan"), 0.0, 0.0)) == "–"
 
