@@ -76,7 +76,7 @@ class Errors:
     joint: float
     """Displacement of the sample that is best for these agents together."""
     mixed: float
-    """Displacement of the sample that is best for them together if the samples of each come in an order of their own."""
+    """Displacement of the sample that is best for all if the samples of each agent have an order of their own."""
 
     def cells(self) -> tuple[str, ...]:
         """Returns the cells of a line of the table: errors, and how far each is below the single forecast's."""
