@@ -2,17 +2,18 @@ import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from agents.runs import save_model
-from agents.task import Task, task_of
+from agents.task import Observe, Task, task_of
 from agents.training import TrainingPlan, make_model
 from agents.vec_envs import make_venv
 from envs import ForecastObservation, make_env
+from envs.arms import ARMS
 from envs.drivers.trained import env_for_driver
 from predictor.support.errors import UserError
 from tests.agents.helpers import TOY
@@ -100,9 +101,13 @@ def test_arguments_reach_the_environment():
     env.close()
 
 
+def test_every_arm_can_be_trained_on():
+    assert set(get_args(Observe)) == {"none", "constant-velocity", *ARMS}
+
+
 @pytest.mark.parametrize("env_id", ["highway-fast-v0", TAG])
 def test_every_arm_has_the_same_space(env_id: str):
-    arms = ("forecast", "zeros", "single", "no-edges", "constant-velocity")
+    arms = ("forecast", "zeros", "single", "no-edges", "edges-only", "constant-velocity")
     spaces = []
     for arm in arms:
         env = Task(env_id, arm).wrapped(Task(env_id, arm).make())
