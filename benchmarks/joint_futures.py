@@ -53,10 +53,13 @@ class JointConfig:
         """Checks ranges.
 
         Raises:
-            UserError: a value is out of range.
+            UserError: a value is out of range or missing.
         """
         check_at_least(self, 1, "episodes", "num_samples")
         check_at_least(self, 1, "agents")
+        for name in ("env_ids", "agents"):
+            if not getattr(self, name):
+                raise UserError(f"{name} needs at least one value, got none")
         if self.out is not None and self.out.is_dir():
             raise UserError(f"out must be a file, {self.out} is a folder; name a file")
 

@@ -250,6 +250,8 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     ],
     "benchmarks.joint_futures": [
         ("--agents 0", "agents must be at least 1, got (0,)"),
+        ("--agents --", "agents needs at least one value, got none"),
+        ("--env-ids --", "env_ids needs at least one value, got none"),
         ("--env-ids absent-v0", "no checkpoint ships for env 'absent-v0'"),
         ("--out .", "out must be a file, . is a folder; name a file"),
     ],
