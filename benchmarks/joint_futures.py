@@ -55,8 +55,7 @@ class JointConfig:
         Raises:
             UserError: a value is out of range or missing.
         """
-        check_at_least(self, 1, "episodes", "num_samples")
-        check_at_least(self, 1, "agents")
+        check_at_least(self, 1, "episodes", "num_samples", "agents")
         for name in ("env_ids", "agents"):
             if not getattr(self, name):
                 raise UserError(f"{name} needs at least one value, got none")
