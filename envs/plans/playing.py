@@ -12,6 +12,11 @@ import gymnasium as gym
 import numpy as np
 import torch
 from highway_env.envs.common.abstract import AbstractEnv
+from highway_env.envs.common.observation import (
+    LidarObservation,
+    OccupancyGridObservation,
+    TimeToCollisionObservation,
+)
 from jaxtyping import Float
 
 from envs.plans.base import Plans
@@ -19,6 +24,9 @@ from envs.readers.base import SceneReader
 from envs.simulators.copies import running_copy
 from predictor.scene import Forecast, Scene, SceneBatch
 from predictor.support.errors import UserError
+
+_DRAWN = (LidarObservation, OccupancyGridObservation, TimeToCollisionObservation)
+"""Observations that cost more than a step of traffic; they draw no random numbers and change nothing."""
 
 
 def with_true_futures(
@@ -66,6 +74,8 @@ def _played(
     """Returns where each agent of the scene goes while the ego takes these actions."""
     env, reader = running_copy((env, reader), env.unwrapped)
     goes_on = isinstance(env.unwrapped, AbstractEnv)  # highway-env simulates on after the end of an episode
+    if goes_on:
+        _leave_undrawn(env.unwrapped)
     place_of = {int(agent): i for i, agent in enumerate(scene.ids) if scene.valid[i]}
     states = np.where(scene.valid[:, None], scene.states, 0.0)
     xy_m, dt_s, over = np.zeros((len(states), len(actions), 2)), reader.spec.dt_s, False
@@ -81,3 +91,11 @@ def _played(
                     states[place] = state
         xy_m[:, step] = states[:, :2]
     return xy_m
+
+
+def _leave_undrawn(copy: Any) -> None:
+    """Makes a copy of highway-env return its observation as it is now, which nobody reads, at every step."""
+    observation_type = copy.observation_type
+    if isinstance(observation_type, _DRAWN):
+        now = observation_type.observe()
+        observation_type.observe = now.copy

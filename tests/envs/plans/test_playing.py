@@ -5,6 +5,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from highway_env.envs.common.observation import (
+    LidarObservation,
+    OccupancyGridObservation,
+    TimeToCollisionObservation,
+)
 
 from envs import ForecastObservation, make_env
 from envs.arms import Arm
@@ -21,7 +26,8 @@ def positions_m(env: SceneObservation | ForecastObservation) -> dict[int, np.nda
 
 
 @pytest.mark.parametrize(
-    ("env_id", "plan"), [("highway-fast-v0", 1), ("merge-v1", 0), ("intersection-v2", 1), ("roundabout-v1", 0)]
+    ("env_id", "plan"),
+    [("highway-fast-v0", 1), ("merge-v1", 0), ("intersection-v2", 1), ("roundabout-v1", 0), ("racetrack-v1", 1)],
 )
 def test_the_oracle_is_what_then_happens(env_id: str, plan: int):
     env = ForecastObservation(make_env(env_id), what_if=True, arm=Arm("oracle-what-if"))
@@ -64,6 +70,28 @@ def test_the_environment_is_not_touched():
         shown, *_ = watched.step(1)
     plain.close()
     watched.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("OccupancyGrid", OccupancyGridObservation),
+        ("LidarObservation", LidarObservation),
+        ("TimeToCollision", TimeToCollisionObservation),
+    ],
+)
+def test_costly_observations_are_drawn_once_per_plan(name: str, kind: type, monkeypatch: pytest.MonkeyPatch):
+    """In the copy they stay as they are; the environment's own goes on being drawn."""
+    env = ForecastObservation(
+        make_env("highway-fast-v0", config={"observation": {"type": name}}), arm=Arm("oracle-what-if"), what_if=True
+    )
+    first, _ = env.reset(seed=3)
+    drawn, observe = [], kind.observe
+    monkeypatch.setattr(kind, "observe", lambda self: drawn.append(1) or observe(self))
+    second, *_ = env.step(env.plans.actions[0])
+    assert len(drawn) == 1 + len(env.plans.actions)
+    assert not np.array_equal(first["observation"], second["observation"])
+    env.close()
 
 
 def test_vector_observations_are_those_of_one_environment():
