@@ -262,7 +262,7 @@ def _run(config: TrainPolicyConfig, console: Console) -> None:
     console.print(f"policy: {policy}")
     if config.video:
         shown = film(plan.task, model, config.folder / "video.mp4")
-        console.print(f"video: {shown or 'none, only highway-env and PettingZoo environments are drawn'}")
+        console.print(f"video: {shown or 'none, no view of this environment is registered'}")
 
 
 def main() -> None:

@@ -325,7 +325,7 @@ def _film(trained: _Trained, evaluation: Evaluation, out: Path) -> dict[str, dic
 
     films = film_extremes(trained.task, trained.model(), next(iter(evaluation.results.values())), out)
     names = ", ".join(film["file"] for film in films.values())
-    Console().print(f"films: {names or 'none, only highway-env and PettingZoo environments are drawn'}")
+    Console().print(f"films: {names or 'none, no view of this environment is registered'}")
     return films
 
 
