@@ -1,7 +1,7 @@
 """Measures accuracy and time with cheaper graphs: `python -m benchmarks.graph_accuracy --checkpoint A B --data C D`.
 
 Each checkpoint is measured on the same windows of each store with all pairs, with the nearest k, and with a graph that
-is frozen when the roll-out begins, whatever it was trained with. The table shows minADE of the most likely forecast,
+is frozen when the roll-out begins, whatever it was trained with; plural checkpoints are always frozen. The table shows minADE of the most likely forecast,
 also for constant velocity; the time includes streaming the history and forecasting, one window at a time.
 """
 
@@ -83,7 +83,7 @@ def measure(forecaster: Forecaster, windows: Windows, config: GraphConfig) -> di
 
 
 def variants(checkpoint: Path, config: GraphConfig) -> list[DGVAE]:
-    """Returns the checkpoint's network with each graph; all pairs first.
+    """Returns the checkpoint's network with each graph, all pairs first; one with modes is frozen in each.
 
     Raises:
         UserError: the checkpoint holds another model.
@@ -91,7 +91,10 @@ def variants(checkpoint: Path, config: GraphConfig) -> list[DGVAE]:
     forecaster, _ = load_checkpoint(checkpoint)
     if not isinstance(forecaster, DGVAE):
         raise UserError(f"{checkpoint} is no dG-VAE; only its graph can be changed")
-    graphs = [forecaster.variant(num_neighbours=count, rollout_graph="evolving") for count in (0, *config.neighbours)]
+    counts = (0, *config.neighbours)
+    if forecaster.config.num_modes:
+        return [forecaster.variant(num_neighbours=count) for count in counts]
+    graphs = [forecaster.variant(num_neighbours=count, rollout_graph="evolving") for count in counts]
     return [*graphs, forecaster.variant(num_neighbours=0, rollout_graph="frozen")]
 
 
