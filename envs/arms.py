@@ -24,7 +24,8 @@ PRESENT_KEYS = ("agents", "valid", "ego_path")
 EDGE_KEYS = ("edge_probs", "edge_features")
 """Entries on who interacts with whom."""
 _PROBS = "mode_probs"
-_OF_SAMPLES = ("forecast", _PROBS, "xy_scale")
+_AXES_WITH_SAMPLES = {"forecast": 5, _PROBS: 3, "xy_scale": 5}
+"""Number of axes of an entry that has room for several samples, the batch included; theirs is the third."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +185,8 @@ class Arm:
         for key, space in spaces.items():
             full = np.zeros((batch, *(space.shape or ())), dtype=np.float32)
             if key in entries and self._shows(key):
-                _fill(full, entries[key], only_first=key in _OF_SAMPLES and not self.shown.modes)
+                several = full.ndim == _AXES_WITH_SAMPLES.get(key)
+                _fill(full, entries[key], only_first=several and not self.shown.modes)
             found[key] = full
         return found
 
@@ -206,6 +208,6 @@ def _fill(full: NDArray[np.float32], values: NDArray[np.float32], only_first: bo
     """
     if values.ndim < full.ndim:
         values = values[:, :, None]
-    elif only_first and full.ndim > 2:
+    elif only_first:
         values = values[:, :, :1]
     full[tuple(slice(size) for size in values.shape)] = values

@@ -77,6 +77,27 @@ def test_an_arm_shows_its_part_alone(name: str, bank: EntryBank, everything: dic
             assert not few or not found[key][:, 1:].any()
 
 
+@pytest.mark.parametrize("name", ["single", "no-edges", "what-if", "oracle", "oracle-what-if"])
+def test_a_single_forecast_is_shown_to_its_last_step(name: str, bank: EntryBank):
+    """Where the observation has room for one sample, the entry has no axis of samples that could be cut."""
+    found = observed(name, bank, num_samples=1)["forecast"]
+    shown = observed("forecast", bank, num_samples=1)["forecast"]
+    seen = shown[:, 0].any(axis=-1)
+    assert found.shape == shown.shape and seen.any()
+    assert found[seen].any(axis=-1).all()
+    if not name.startswith("oracle"):
+        np.testing.assert_array_equal(found, shown)
+
+
+def test_a_predator_sees_a_single_forecast_to_its_last_step():
+    shown = {}
+    for name in ("forecast", "no-edges"):
+        env = ForecastParallelEnv(make_multiagent_env("simple_tag_v3"), "simple-tag", arm=Arm(name))
+        observations, _ = env.reset(seed=5)
+        shown[name] = observations["adversary_0"]["forecast"]
+    np.testing.assert_array_equal(shown["no-edges"], shown["forecast"])
+
+
 def test_shuffled_is_another_scene_and_the_same_in_every_run(bank: EntryBank, everything: dict[str, Any]):
     found, again = observed("shuffled", bank), observed("shuffled", bank)
     present = found["valid"] > 0
