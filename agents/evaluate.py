@@ -27,6 +27,7 @@ from agents.runs import CONFIG_FILE, load_model, policy_zip, read_config, shippe
 from agents.summaries import EXTREMES
 from agents.task import EVALUATION_SEED, Task, task_of
 from envs.drivers.ego import CONSTANT_ACTIONS, constant_actions, make_ego_driver, named_drivers
+from envs.drivers.trained import require_own_view
 from envs.registry import arguments_of
 from envs.sb3.policy_file import Algorithm, algorithm_of, read_policy_note
 from envs.supervision import TIMEOUT_S
@@ -259,6 +260,7 @@ def checked_drivers(task: Task, names: Sequence[str]) -> tuple[str, ...]:
     env = task.make(disable_env_checker=True)
     drivers = named_drivers(names, env)
     for name in drivers:
+        require_own_view(env, name)
         make_ego_driver(name, env, np.random.default_rng(0))
     env.close()
     return drivers

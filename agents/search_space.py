@@ -4,12 +4,10 @@ The sizes of the network are fixed: all arms of a study have one network. Whole 
 powers of two. Optuna, which draws from these ranges, is an optional package (extra "tune").
 """
 
-import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from agents.presets import PPOPreset, Preset
+from agents.presets import Preset
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
@@ -71,17 +69,3 @@ def search_space(preset: Preset) -> "dict[str, BaseDistribution]":
         else:
             space[name] = FloatDistribution(found.low, found.high, log=found.log)
     return space
-
-
-def settings_of(preset: Preset, values: Mapping[str, Any], num_envs: int) -> dict[str, Any]:
-    """Returns drawn values as hyperparameters: PPO's batches divide its rollouts, so that none is cut short.
-
-    Args:
-        preset: preset that the values change.
-        values: value of each name of `search_space`.
-        num_envs: number of parallel environments.
-    """
-    settings = dict(values)
-    if isinstance(preset, PPOPreset):
-        settings["batch_size"] = math.gcd(settings["batch_size"], settings["n_steps"] * num_envs)
-    return settings

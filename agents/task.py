@@ -2,6 +2,7 @@
 
 import functools
 import importlib.util
+import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -111,7 +112,8 @@ class Task:
             raise UserError(f"checkpoint '{self.checkpoint}' has no effect with observe={self.observe}; leave one out")
         check_at_least(self, 1, "num_samples", "horizon_steps")
         check_at_most(self, MOST_FUTURES, "num_samples", "horizon_steps")
-        check_positive(self, "perception_m")
+        if self.perception_m != math.inf:  # of an environment whose agents are seen from anywhere
+            check_positive(self, "perception_m")
         if self.perception_m is not None and self.observe == "none":
             raise UserError("perception_m has no effect with observe=none; leave one out")
         check_positive(self, "timeout_s")

@@ -361,9 +361,8 @@ def driving_scalars(results: Sequence[EpisodeResult]) -> dict[str, float]:
     What an environment does not report is left out.
     """
     scalars: dict[str, float] = {}
-    crashes = [r.crashed for r in results if r.crashed is not None]
-    if crashes:
-        scalars["crash_rate"] = float(np.mean(crashes))
+    if any(r.crashed is not None for r in results):  # some environments report a crash only when it happens
+        scalars["crash_rate"] = float(np.mean([bool(r.crashed) for r in results]))
     speeds_mps = [r.mean_speed_mps for r in results if np.isfinite(r.mean_speed_mps)]
     if speeds_mps:
         scalars["speed_mps"] = float(np.mean(speeds_mps))

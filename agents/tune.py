@@ -22,7 +22,7 @@ from agents.preset_settings import changed, write_preset
 from agents.presets import Algorithm, Preset
 from agents.results import PACKAGES
 from agents.runs import load_model
-from agents.search_space import search_space, settings_of
+from agents.search_space import search_space
 from agents.task import SELECTION_SEED, TUNING_SEED, Observe, Task
 from agents.training import TrainingPlan, train
 from envs.registry import entry_for
@@ -191,8 +191,7 @@ def _run_trial(config: TuneConfig, study: "Study", index: int, preset: Preset) -
     seed = int(np.random.SeedSequence([config.seed, index]).generate_state(1)[0])
     study.sampler = optuna.samplers.TPESampler(seed=seed)
     trial = study.ask(fixed_distributions=space) if index else None
-    values = {name: getattr(preset, name) for name in space} if trial is None else trial.params
-    settings = settings_of(preset, values, config.num_envs)
+    settings = {name: getattr(preset, name) for name in space} if trial is None else dict(trial.params)
     try:
         value = _measure(config, settings, config.folder / "trials" / f"{index + 1:03d}")
     except ValueError as error:
@@ -203,7 +202,7 @@ def _run_trial(config: TuneConfig, study: "Study", index: int, preset: Preset) -
     if trial is None:
         noted = {"settings": settings}
         study.add_trial(
-            optuna.create_trial(state=state, params=values, distributions=space, value=value, user_attrs=noted)
+            optuna.create_trial(state=state, params=settings, distributions=space, value=value, user_attrs=noted)
         )
     else:
         trial.set_user_attr("settings", settings)

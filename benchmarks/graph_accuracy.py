@@ -1,8 +1,9 @@
 """Measures accuracy and time with cheaper graphs: `python -m benchmarks.graph_accuracy --checkpoint A B --data C D`.
 
 Each checkpoint is measured on the same windows of each store with all pairs, with the nearest k, and with a graph that
-is frozen when the roll-out begins, whatever it was trained with; plural checkpoints are always frozen. The table shows minADE of the most likely forecast,
-also for constant velocity; the time includes streaming the history and forecasting, one window at a time.
+is frozen when the roll-out begins, whatever it was trained with; plural checkpoints are always frozen. The table shows
+minADE of the most likely forecast, also for constant velocity; the time includes streaming the history and forecasting,
+one window at a time.
 """
 
 import time

@@ -177,9 +177,16 @@ class Arm:
         Args:
             entries: entries of the forecast, a batch of scenes each; keys and trailing sizes may be missing.
             spaces: space of each entry of one scene.
+
+        Raises:
+            UserError: the arm shows scenes of other episodes, and has none.
         """
         batch = len(entries["valid"])
-        if self.bank is not None and self.shown.other_scene:
+        if self.shown.other_scene:
+            if self.bank is None:
+                raise UserError(
+                    f"arm '{self.name}' shows other episodes: pass bank=record_bank(...) of envs.entry_bank"
+                )
             entries = {**entries, **self.bank.drawn_for(entries)}
         found = {}
         for key, space in spaces.items():

@@ -107,8 +107,13 @@ class SceneSpec:
             source: origin of the scenes, for the message (``env 'racetrack-v1'``).
 
         Raises:
-            UserError: features or time step differ.
+            UserError: features or time step differ, or only the scenes have an ego.
         """
+        if other.has_ego and not self.has_ego:
+            raise UserError(
+                f"{name} was trained on scenes without an ego but {source} has one; retrain on its data, or on tracks "
+                "with an ego"
+            )
         if self.feature_names != other.feature_names:
             raise UserError(
                 f"{name} was trained on features {self.feature_names} but {source} gives {other.feature_names}; "

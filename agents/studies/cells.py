@@ -31,6 +31,7 @@ from agents.training import TrainingPlan, train
 from envs.drivers.all_agents import make_driver
 from envs.drivers.ego import make_ego_driver, named_drivers
 from envs.drivers.planner import ORACLE, PLANNER, PlannerConfig, is_planner
+from envs.drivers.trained import require_own_view
 from envs.registry import checkpoint_for
 from envs.sb3.algorithms import CONTRIB
 from predictor.checkpoint import CONSTANT_VELOCITY, WEIGHTS, resolve
@@ -199,6 +200,7 @@ def _drivers(study: Study, scenario: Scenario, where: str) -> list[Cell]:
             env = task.make(disable_env_checker=True)
             names = named_drivers(names, env)
             for name in names:
+                require_own_view(env, name)
                 make_ego_driver(name, env, np.random.default_rng(0))
             env.close()
         return [Cell(scenario.name, name, task, None, study.episodes, _planner_pin(name, task)) for name in names]

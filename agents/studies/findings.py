@@ -24,6 +24,7 @@ from agents.studies.estimators import (
 from agents.studies.plan import Study
 from agents.studies.results import Result
 from envs.drivers.planner import PLANNER_ORACLE, is_planner
+from predictor.own_forecasters import is_own
 
 NEARLY_CONSTANT = 0.95
 """Least share of one action from which on a run is called nearly constant."""
@@ -110,9 +111,10 @@ class Findings:
 
         The interval of a driver is over its episodes.
         """
-        reported = [column(r, "crashed") for r in self.results[scenario, line]]
-        if any(len(found) == 0 for found in reported):
+        crashed = [[episode.get("crashed") for episode in r.episodes] for r in self.results[scenario, line]]
+        if all(each is None for run in crashed for each in run):
             return None
+        reported = [np.array([bool(each) for each in run], dtype=np.float64) for run in crashed]
         rates = reported[0] if line.algorithm is None else np.array([np.mean(found) for found in reported])
         return self.estimate(mean, [rates], about=("crashes", scenario, *line))
 
@@ -201,8 +203,8 @@ class Findings:
 
     def best_constant(self, scenario: str) -> Line | None:
         """Returns the best of the drivers that take one action in every step; None if there is none."""
-        drivers = self.lines(scenario, trained=False)
-        constant = [x for x in drivers if x.arm not in NOT_CONSTANT and not is_planner(x.arm) and ".zip" not in x.arm]
+        drivers = [x for x in self.lines(scenario, trained=False) if not is_planner(x.arm) and not is_own(x.arm)]
+        constant = [x for x in drivers if x.arm not in NOT_CONSTANT and ".zip" not in x.arm]
         return max(constant, key=lambda x: self.mean_return(scenario, x).value, default=None)
 
     def heuristic(self, scenario: str) -> Line | None:

@@ -129,8 +129,8 @@ class Study:
         for seed in self.training_seeds:
             if not 0 <= seed < SELECTION_SEED:
                 raise UserError(f"seeds must lie in [0, {SELECTION_SEED}), got {seed}")
-        if not self.algorithms:
-            raise UserError("algorithms must name at least one")
+        if not self.algorithms or len(set(self.algorithms)) < len(self.algorithms):
+            raise UserError(f"algorithms must name at least one, each once, got {list(self.algorithms)}")
         for rival in self.rivals or ():
             if rival not in self.arm_names:
                 raise UserError(f"rivals names '{rival}', which is no arm; there are {', '.join(self.arm_names)}")

@@ -87,12 +87,12 @@ def named_drivers(names: Sequence[str], env: gym.Env) -> tuple[str, ...]:
 
 
 def idle_action(env: gym.Env) -> Any:
-    """Returns the action that changes nothing: highway-env's IDLE, or zeros."""
+    """Returns the action that changes nothing: highway-env's IDLE, the first action, or zeros within the bounds."""
     space = env.action_space
     if isinstance(space, gym.spaces.Discrete):
-        return _meta_actions(env).get("IDLE", 0)
+        return _meta_actions(env).get("IDLE", int(space.start))
     if isinstance(space, gym.spaces.Box):
-        return np.zeros(space.shape, dtype=space.dtype)
+        return np.clip(np.zeros(space.shape, dtype=space.dtype), space.low, space.high)
     raise UserError(f"no idle action is known for {space}")
 
 

@@ -163,6 +163,17 @@ def require_view(env: gym.Env, name: str) -> None:
         raise UserError(f"policy {name} was trained on {wanted}, but the env gives {env.observation_space}")
 
 
+def require_own_view(env: gym.Env, name: str) -> None:
+    """Raises a `UserError` if the driver is a policy that does not drive by the environment's own observation."""
+    if not name.endswith(".zip"):
+        return
+    if sees_forecasts(name):
+        raise UserError(f"policy {name} sees forecasts, which a driver is not shown; measure it with --run-dir {name}")
+    wanted, given = kept_policy(name).observation_space, space_without_added(env.observation_space)
+    if given != wanted:
+        raise UserError(f"policy {name} was trained on {wanted}, but the env gives {given}")
+
+
 def sees_forecasts(name: str) -> bool:
     """Returns whether the driver is a policy that was trained on forecasts."""
     return name.endswith(".zip") and carries_forecasts(kept_policy(name).observation_space)

@@ -16,7 +16,8 @@ from highway_env.envs.common.observation import LidarObservation, OccupancyGridO
 from jaxtyping import Float
 
 from envs.plans.base import Plans
-from envs.readers.base import SceneReader
+from envs.readers.base import SceneReader, show
+from envs.readers.highway import HighwayReader
 from envs.simulators.copies import running_copy
 from predictor.scene import Forecast, Scene, SceneBatch
 from predictor.support.errors import UserError
@@ -70,7 +71,7 @@ def _played(
     """Returns where each agent of the scene goes while the ego takes these actions."""
     env, reader = running_copy((env, reader), env.unwrapped)
     goes_on = isinstance(env.unwrapped, AbstractEnv)  # highway-env simulates on after the end of an episode
-    if goes_on:
+    if goes_on and isinstance(reader, HighwayReader):  # which reads no observations
         _leave_undrawn(env.unwrapped)
     place_of = {int(agent): i for i, agent in enumerate(scene.ids) if scene.valid[i]}
     states = np.where(scene.valid[:, None], scene.states, 0.0)
@@ -79,7 +80,8 @@ def _played(
         states = states.copy()
         states[:, :2] += dt_s * states[:, 2:4]
         if not over:
-            _, _, terminated, truncated, _ = env.step(action)
+            observation, _, terminated, truncated, _ = env.step(action)
+            show(reader, observation)
             over = bool(terminated or truncated) and not goes_on
             now = reader.read_all(env)
             for agent, state, valid in zip(now.ids, now.states, now.valid, strict=True):

@@ -6,6 +6,7 @@ of the wrappers that a policy is trained with, so that the deployed scenes are r
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -176,9 +177,10 @@ class EgoWorld:
         return scene
 
     def full_scene(self) -> Scene:
-        """Returns all agents, ego first."""
+        """Returns all agents, ego first, in arrays of its own: a reader may give the simulator's."""
         with named(self._id, self._place):
-            return self._reader.read_all(self.env)
+            scene = self._reader.read_all(self.env)
+        return replace(scene, states=scene.states.copy(), ids=scene.ids.copy(), valid=scene.valid.copy())
 
     def forecast(self, num_samples: int) -> Forecast:
         """Returns the forecast of the perceived scene, from the wrapper's own stream."""

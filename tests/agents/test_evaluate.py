@@ -5,6 +5,7 @@ import pytest
 
 from agents.arena import MultiagentArena
 from agents.evaluate import checked_drivers, compared_drivers, evaluate_policy_on_seeds, main
+from agents.runs import SHIPPED
 from agents.task import EVALUATION_SEED, Task
 from predictor.support.errors import UserError
 from tests.agents.helpers import TOY, policy_for, refuse
@@ -41,6 +42,8 @@ def test_drivers_that_cannot_drive_are_refused_before_anything_runs():
         checked_drivers(Task("CartPole-v1", "none"), ("planner",))
     with pytest.raises(UserError, match=r"constant-actions needs an environment with discrete actions, got Box\("):
         checked_drivers(Task("racetrack-v1", "none"), ("constant-actions",))
+    with pytest.raises(UserError, match=r"highway-fast.zip sees forecasts, .* measure it with --run-dir"):
+        checked_drivers(Task("highway-fast-v0", "none"), (str(SHIPPED / "highway-fast.zip"),))
     assert checked_drivers(Task("simple_tag_v3", "none"), ()) == ()
 
 

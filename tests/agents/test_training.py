@@ -355,3 +355,9 @@ def test_tensorboard_shows_crashes_speed_and_actions():
     shown = driving_scalars([first, second])
     assert shown == {"crash_rate": 0.5, "speed_mps": 25.0, "share_faster": 0.5, "share_idle": 0.5}
     assert driving_scalars([EpisodeResult(0, 1.0, 1, None, float("nan"))]) == {}
+
+
+def test_a_crash_that_is_reported_only_when_it_happens_is_a_share_of_all_episodes():
+    reported = [True, None, None, None]
+    results = [EpisodeResult(i, 1.0, 1, crashed, float("nan")) for i, crashed in enumerate(reported)]
+    assert driving_scalars(results)["crash_rate"] == 0.25

@@ -172,3 +172,8 @@ def test_layout_adds_room_for_edges():
 def test_an_unknown_arm_is_refused():
     with pytest.raises(UserError, match=r"arm must be one of forecast, .*, got 'psychic'"):
         Arm("psychic")
+
+
+def test_another_scene_needs_a_bank():
+    with pytest.raises(UserError, match="record_bank"):
+        ForecastObservation(make_env(FAST), "highway", arm=Arm("shuffled")).reset(seed=0)

@@ -123,6 +123,14 @@ def test_other_features_are_named():
         SceneSpec(dt_s=1.0).check_compatible(other, "checkpoint 'a'", "env 'b'")
 
 
+def test_a_forecaster_without_an_ego_is_refused_where_there_is_one():
+    """Its positions are in the world frame, those of scenes with an ego relative to it."""
+    without, with_ego = SceneSpec(dt_s=1.0, has_ego=False), SceneSpec(dt_s=1.0)
+    with pytest.raises(UserError, match="checkpoint 'tracks' was trained on scenes without an ego but env 'b' has one"):
+        without.check_compatible(with_ego, "checkpoint 'tracks'", "env 'b'")
+    with_ego.check_compatible(without, "checkpoint 'a'", "env 'c'")
+
+
 def test_what_a_perception_system_sees_may_differ():
     mine = SceneSpec(dt_s=1.0, perception_m=50.0, max_agents=3, frame=("ego", "world"))
     mine.check_compatible(SceneSpec(dt_s=1.0 + 1e-7), "a", "b")

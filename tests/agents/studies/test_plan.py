@@ -85,6 +85,7 @@ def test_what_a_scenario_says_of_forecasts_goes_to_the_arms_that_have_any(tmp_pa
         (study_text(algorithms="{sacc = {}}"), "corridor.toml: algorithms.sacc: no such algorithm; there are ppo, dqn"),
         (study_text(algorithms="{ppo = 3}"), "corridor.toml: algorithms.ppo must be a table, got 3"),
         (study_text(algorithms="{}"), "corridor.toml: algorithms must name at least one"),
+        (study_text(algorithms='["ppo", "ppo"]'), r"corridor.toml: .* each once, got \['ppo', 'ppo'\]"),
         (
             study_text(algorithms="{ppo = {lr = 3e-4}}"),
             "corridor.toml: algorithms.ppo: ppo has no hyperparameter 'lr'; there are learning_rate, gamma, ",

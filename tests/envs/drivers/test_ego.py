@@ -58,6 +58,13 @@ def test_actions_lie_in_the_space_and_repeat_with_the_seed(name: str, env_id: st
         assert (np.array(actions) != np.array(actions_of(name, env, seed=4))).any()
 
 
+@pytest.mark.parametrize("space", [gym.spaces.Discrete(3, start=1), gym.spaces.Box(0.5, 1.0, (1,))])
+def test_idle_lies_in_the_space(space: gym.Space):
+    env = gym.Env()
+    env.action_space = space
+    assert idle_action(env) in space
+
+
 @pytest.mark.parametrize("env_id", CHECKPOINTS)
 def test_idle_is_the_simulators_idle(env_id: str):
     env = make_env(env_id)

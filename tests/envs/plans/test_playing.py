@@ -10,8 +10,10 @@ from highway_env.envs.common.observation import LidarObservation, OccupancyGridO
 from envs import ForecastObservation, make_env
 from envs.arms import Arm
 from envs.plans.playing import with_true_futures
+from envs.readers import EntityRowsReader
 from envs.sb3.forecast import VecForecast
 from envs.wrappers import SceneObservation
+from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
 
@@ -132,4 +134,22 @@ def test_plans_without_later_actions_are_refused():
 
     with pytest.raises(UserError, match="true futures need plans with later_actions"):
         with_true_futures(replace(env.plans, later_actions=None), env.env, env.env.reader, env.scene)
+    env.close()
+
+
+def test_readers_of_observations_see_what_then_happens():
+    """A table of entities is the reader's only source: the copy shows it every observation."""
+    columns = ("presence", "x", "y", "vx", "vy")
+    table = {"type": "Kinematics", "features": [*columns], "absolute": True, "normalize": False, "see_behind": True}
+    reader = EntityRowsReader(columns, SceneSpec(dt_s=1.0))
+    made = make_env("highway-fast-v0", config={"observation": table})
+    env = ForecastObservation(made, "highway", reader=reader, arm=Arm("oracle"))
+    env.reset(seed=3)
+    true, scene = env.plans.true_xy, env.scene
+    env.step(env.plans.actions[0])
+    now = positions_m(env)
+    seen = [place for place in np.flatnonzero(scene.valid) if int(scene.ids[place]) in now]
+    assert len(seen) > 2
+    for place in seen:
+        np.testing.assert_allclose(true[0, place, 0], now[int(scene.ids[place])], atol=1e-3)
     env.close()
