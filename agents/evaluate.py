@@ -62,7 +62,7 @@ def evaluate_policy_on_seeds(
         model: the trained policy, or the name of a driver.
         name: name of the policy in the table.
         num_episodes: number of episodes per policy.
-        num_envs: number of parallel environments; the results do not depend on it.
+        num_envs: number of parallel environments; the results depend on it only where several samples are drawn.
         first_seed: seed of the first episode; episode i is reset with first_seed + i.
         on_episode: called after each episode.
         drivers: names of drivers that are compared beside the arena's baselines ("planner").
@@ -140,7 +140,7 @@ class EvaluateConfig:
     films: bool = False
     """Film the trained policy's best, median and worst episode by return: best.mp4, median.mp4, worst.mp4."""
     num_envs: Annotated[int, Renamed("workers")] = os.cpu_count() or 1
-    """Number of parallel environments; the results do not depend on it."""
+    """Number of parallel environments; the results depend on it only where several samples are drawn (docs/limits.md)."""
     device: str = "cpu"
     """Device that runs forecaster and policy: cpu, cuda or auto (cuda where there is one)."""
     timeout_s: float = TIMEOUT_S
