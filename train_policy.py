@@ -203,8 +203,7 @@ class TrainPolicyConfig:
 
     @property
     def measuring_envs(self) -> int:
-        """Number of parallel environments that measure a policy; results depend on it only where samples
-        are drawn."""
+        """Number of parallel environments that measure a policy; results depend on it only where samples are drawn."""
         return min(self.sizes.num_envs, os.cpu_count() or 1)
 
 
