@@ -36,8 +36,10 @@ def check_actions(algorithm: Algorithm, space: spaces.Space, env_id: str) -> Non
         raise UserError(f"{algorithm} needs a discrete action space, {env_id} has {space}; use ppo")
     if algorithm in CONTINUOUS and not (isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)):
         raise UserError(f"{algorithm} needs a continuous action space, {env_id} has {space}; use ppo")
-    if algorithm in CONTINUOUS and isinstance(space, spaces.Box) and not space.is_bounded():
-        raise UserError(f"{algorithm} needs bounded actions, {env_id} has {space}; use ppo")
+    if isinstance(space, spaces.Box) and not space.is_bounded():
+        raise UserError(f"{algorithm} needs bounded actions, {env_id} has {space}; give its action space bounds")
+    if isinstance(space, spaces.Discrete) and space.start != 0:
+        raise UserError(f"{algorithm} counts actions from 0, {env_id} has {space}; wrap it so that its actions do, too")
 
 
 def log_interval(algorithm: Algorithm) -> int:

@@ -193,6 +193,8 @@ class OnlineForecaster:
         """Forecasts one part of the latest scenes."""
         if plans is None:
             futures = self.forecaster.rollout(belief, steps, num_samples, generator)
+            if futures.states.shape[-2] != steps:
+                raise UserError(f"the forecaster was asked for {steps} steps and gave {futures.states.shape[-2]}")
         else:
             futures = rollout_plans(self.forecaster, belief, plans, num_samples, generator)
         # float32 relative to the ego: the origin that observe() removed is the ego's own position on "ego" axes

@@ -73,10 +73,11 @@ def contacts(
     sizes = np.broadcast_to(np.asarray(size_m, np.float64), (batch, 2)).T.reshape(2, batch, 1, 1, 1, 1)
     gap = _gaps(path[:, :, :, :1], path[:, :, :, 1:], headings[:, :, :, :1], headings[:, :, :, 1:], sizes)
     gap = np.where(scenes.valid[:, None, None, 1:, None, None], gap, FAR_M).clip(max=FAR_M)
-    touched = (gap <= 0).reshape(batch, plans, samples, agents - 1, -1)
+    touching = ~(gap > 0)  # what is not a number counts as a contact, not as a free way
+    touched = touching.reshape(batch, plans, samples, agents - 1, horizon * INSTANTS)
     ever = touched.any(-1)
     share = np.where(ever, (1 + touched.argmax(-1)) / (horizon * INSTANTS), 1.0)
-    by_step = np.logical_or.accumulate((gap <= 0).any(-1), axis=-1)
+    by_step = np.logical_or.accumulate(touching.any(-1), axis=-1)
     # the probabilities of agents do not depend on the plan
     probs = forecast.sample_probs().cpu().numpy()[:, 0, :, 1:].astype(np.float64)
     return Contacts(gap.min((-2, -1)), share, by_step, probs, forecast.mode_probs is not None)

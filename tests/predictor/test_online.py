@@ -20,7 +20,7 @@ from predictor.dgvae import DGVAE
 from predictor.dgvae import model as dgvae
 from predictor.online import OnlineForecaster
 from predictor.scene import PADDING_ID, Forecast, Scene, SceneBatch
-from predictor.support.errors import ProtocolError
+from predictor.support.errors import ProtocolError, UserError
 from tests.predictor.helpers import ROAD, batch, model, random_states, scene, spec
 
 ENVS, AGENTS, EGO = 3, 4, 0
@@ -182,6 +182,17 @@ def differ(one: Forecast, other: Forecast, env: int = 0) -> float:
 def test_forecast_before_any_observation_is_refused(forecaster: DGVAE):
     with pytest.raises(ProtocolError, match=r"forecast\(\) needs an observation; call observe\(\) first"):
         online(forecaster).forecast()
+
+
+def test_a_forecaster_that_gives_other_steps_is_named_in_a_line():
+    class Short(ConstantVelocity):
+        def rollout(self, belief, num_steps, num_samples=1, generator=None):
+            return super().rollout(belief, 2, num_samples, generator)
+
+    stream = online(Short(spec()))
+    stream.observe(batch(scene(states_of(0, 0, 1), AGENTS)))
+    with pytest.raises(UserError, match="asked for 5 steps and gave 2"):
+        stream.forecast(5)
 
 
 def test_history_follows_the_id_when_places_are_sorted_anew(forecaster: DGVAE):

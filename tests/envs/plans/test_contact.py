@@ -100,3 +100,16 @@ def test_absent_agents_are_far_away():
     scene.valid[0, 1] = False
     found = contacts(forecast, scene)
     assert found.gap_m.item() == FAR_M and found.share.item() == 1.0 and not found.by_step.any()
+
+
+def test_a_forecast_that_is_no_number_is_no_free_way():
+    found = contacts(*meet(STRAIGHT, [(np.nan, np.nan), (np.nan, np.nan)], (30.0, 0.0, 10.0, 0.0)))
+    assert found.by_step.all() and found.share[0, 0, 0, 0] < 1
+
+
+def test_an_ego_alone_meets_nobody():
+    forecast, scene = meet(STRAIGHT, STRAIGHT, (30.0, 0.0, 10.0, 0.0))
+    alone = Forecast(forecast.xy[:, :, :, :1], *(torch.zeros(1, 1, 1, 2),) * 2, torch.ones(1, 1).bool())
+    found = contacts(alone, SceneBatch(scene.states[:, :1], scene.ids[:, :1], scene.valid[:, :1], scene.heading_rad))
+    assert found.share.shape == (1, 1, 1, 0)
+    np.testing.assert_array_equal(found.survival(), 1.0)
