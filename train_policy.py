@@ -28,7 +28,7 @@ from envs.registry import entry_for, envpool_task_of
 from envs.simulators.envpool import begins_alike
 from envs.supervision import TIMEOUT_S
 from predictor.support.command_line import Renamed, parse
-from predictor.support.config_checks import check_at_least, check_choices
+from predictor.support.config_checks import check_at_least, check_choices, check_positive
 from predictor.support.errors import run_entry_point
 from predictor.support.files import check_out
 from predictor.support.locks import locked
@@ -149,6 +149,7 @@ class TrainPolicyConfig:
             UserError: a value is out of range or does not fit the others.
         """
         check_choices(self)
+        check_positive(self, "perception_m")
         check_at_least(
             self, 1, "steps", "num_envs", "selections", "selection_episodes", "checkpoint_every", "eval_episodes"
         )

@@ -1,4 +1,5 @@
 import json
+import math
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -216,3 +217,12 @@ def test_arguments_of_a_run_name_no_foreign_class(foreign: str):
     assert foreign not in sys.modules
     own = {"config": {"other_vehicles_type": "highway_env.vehicle.behavior.IDMVehicle", "note": "0.5 of all. Done"}}
     assert task_of(RUN | {"env_kwargs": json.dumps(own)}).make_kwargs == own
+
+
+def test_unbounded_perception_is_a_task_of_a_policys_note():
+    """An environment of one's own may show agents from anywhere; a policy that was trained there says so in its zip."""
+    assert (
+        Task("CartPole-v1", "forecast", checkpoint="constant-velocity", perception_m=math.inf).perception_m == math.inf
+    )
+    with pytest.raises(UserError, match="perception_m must be positive, got -1"):
+        Task("CartPole-v1", "forecast", checkpoint="constant-velocity", perception_m=-1.0)
