@@ -156,21 +156,18 @@ def wrapper_options(path: str) -> dict[str, Any]:
 
 def require_view(env: gym.Env, name: str) -> None:
     """Raises a `UserError` if the driver is a policy that was trained on other observations than the env's."""
-    if not name.endswith(".zip"):
-        return
-    wanted = kept_policy(name).observation_space
-    if env.observation_space != wanted:
-        raise UserError(f"policy {name} was trained on {wanted}, but the env gives {env.observation_space}")
+    _require_space(env.observation_space, name)
 
 
 def require_own_view(env: gym.Env, name: str) -> None:
     """Raises a `UserError` if the driver is a policy that does not drive by the environment's own observation."""
-    if not name.endswith(".zip"):
-        return
     if sees_forecasts(name):
         raise UserError(f"policy {name} sees forecasts, which a driver is not shown; measure it with --run-dir {name}")
-    wanted, given = kept_policy(name).observation_space, space_without_added(env.observation_space)
-    if given != wanted:
+    _require_space(space_without_added(env.observation_space), name)
+
+
+def _require_space(given: gym.Space, name: str) -> None:
+    if name.endswith(".zip") and given != (wanted := kept_policy(name).observation_space):
         raise UserError(f"policy {name} was trained on {wanted}, but the env gives {given}")
 
 

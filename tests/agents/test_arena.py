@@ -1,13 +1,16 @@
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from agents import vec_envs
 from agents.arena import Arena, EgoArena, MultiagentArena, open_arena
-from agents.task import Task
+from agents.task import Observe, Task
 from agents.vec_envs import make_venv
+from envs.drivers.trained import EgoDriver
 from envs.registry import make_env
 
 
@@ -66,3 +69,18 @@ def test_drivers_play_beside_every_option_of_forecasts():
     (result,) = arena.play("random", [7])
     assert result.length == 25
     arena.close()
+
+
+@pytest.mark.parametrize("observe", ["none", "constant-velocity"])
+def test_a_driver_sees_the_environments_own_observation(observe: Observe, monkeypatch: pytest.MonkeyPatch):
+    """Whatever the policy beside it is shown."""
+    seen: list[Any] = []
+
+    def driver(name: str, env: gym.Env, rng: np.random.Generator) -> EgoDriver:
+        return lambda observation: seen.append(observation) or 1
+
+    monkeypatch.setattr(vec_envs, "make_ego_driver", driver)
+    arena = EgoArena(Task("merge-v1", observe), 1)
+    arena.play("idle", [2])
+    arena.close()
+    assert seen and all(isinstance(each, np.ndarray) and each.shape == (5, 5) for each in seen)

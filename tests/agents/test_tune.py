@@ -4,7 +4,7 @@ import json
 import os
 import sys
 import tomllib
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -225,3 +225,16 @@ def test_a_study_leaves_no_connection_open(tmp_path: Path):
         pytest.skip("no /proc/self/fd here")
     opened = [os.readlink(link) for link in descriptors.iterdir() if os.path.lexists(link)]
     assert len(study.get_trials()) == 1 and not [path for path in opened if path.startswith(str(tmp_path))]
+
+
+def test_the_first_trial_is_the_preset_also_where_rollouts_have_odd_sizes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """simple_tag's rollouts of 25 steps share few divisors with its batch of 480."""
+    drawn: list[Any] = []
+    monkeypatch.setattr(command, "_measure", lambda config, settings, folder: drawn.append(settings) or 0.0)
+    config = TuneConfig("simple_tag_v3", out=tmp_path, trials=1, num_envs=6)
+    tune(config)
+    preset = asdict(config.plan({}, 0).preset)
+    assert drawn[0]["batch_size"] == 480
+    assert drawn[0] == {name: preset[name] for name in drawn[0]}

@@ -50,6 +50,21 @@ def test_runs_are_scored_by_their_means():
     assert crashes is not None and crashes.value == 0.5, "the first of two episodes"
 
 
+def test_a_crash_that_is_reported_only_when_it_happens_is_a_share_of_all_episodes():
+    def runs(*crashed: bool | None) -> list[Result]:
+        return [replace(r, episodes=[e | {"crashed": c} for e, c in zip(r.episodes, crashed, strict=True)])
+                for r in results() if r.arm == "forecast"]  # fmt: skip
+
+    found = found_in(study(), runs(True, None)).crash_rate("one", SEEN)
+    assert found is not None and found.value == 0.5
+    assert found_in(study(), runs(None, None)).crash_rate("one", SEEN) is None
+
+
+def test_a_driver_of_ones_own_is_no_constant_action():
+    findings = found_in(study(), [*results(), result("own:mine:drive", [8.0, 9.0])])
+    assert findings.best_constant("one") == Line("slower", None)
+
+
 def test_headroom_is_shared_where_there_is_some():
     findings = found_in(study(), results())
     headroom, used = findings.headroom("one", "ppo"), findings.headroom_used("one", SEEN)

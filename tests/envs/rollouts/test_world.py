@@ -151,3 +151,15 @@ def test_default_drivers_can_drive(env_id: str, first: str):
     assert names[0] == first
     for name in names:
         open_world(env_id, name).close()
+
+
+def test_all_agents_are_read_into_arrays_of_their_own(monkeypatch: pytest.MonkeyPatch):
+    """A reader may give the simulator's own array, which the next step changes."""
+    world = open_world(ROAD, "idle")
+    world.reset(3)
+    held = world.full_scene()
+    monkeypatch.setattr(world._reader, "read_all", lambda env: held)
+    kept = world.full_scene()
+    held.states[:] = 0.0
+    assert kept.states.any()
+    world.close()
