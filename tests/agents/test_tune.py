@@ -231,10 +231,11 @@ def test_the_first_trial_is_the_preset_also_where_rollouts_have_odd_sizes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """simple_tag's rollouts of 25 steps share few divisors with its batch of 480."""
+    odd = PPOPreset(n_steps=25, batch_size=480, n_epochs=5)
+    monkeypatch.setattr("agents.training.preset_for", lambda *_: odd)
     drawn: list[Any] = []
     monkeypatch.setattr(command, "_measure", lambda config, settings, folder: drawn.append(settings) or 0.0)
     config = TuneConfig("simple_tag_v3", out=tmp_path, trials=1, num_envs=6)
     tune(config)
-    preset = asdict(config.plan({}, 0).preset)
     assert drawn[0]["batch_size"] == 480
-    assert drawn[0] == {name: preset[name] for name in drawn[0]}
+    assert drawn[0] == {name: asdict(odd)[name] for name in drawn[0]}
