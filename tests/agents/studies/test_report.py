@@ -52,7 +52,7 @@ def test_runs_are_scored_by_their_means():
 
 def test_a_crash_that_is_reported_only_when_it_happens_is_a_share_of_all_episodes():
     def runs(*crashed: bool | None) -> list[Result]:
-        return [replace(r, episodes=[e | {"crashed": c} for e, c in zip(r.episodes, crashed, strict=True)])
+        return [replace(r, episodes=tuple(e | {"crashed": c} for e, c in zip(r.episodes, crashed, strict=True)))
                 for r in results() if r.arm == "forecast"]  # fmt: skip
 
     found = found_in(study(), runs(True, None)).crash_rate("one", SEEN)
