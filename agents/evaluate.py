@@ -62,7 +62,7 @@ def evaluate_policy_on_seeds(
         model: the trained policy, or the name of a driver.
         name: name of the policy in the table.
         num_episodes: number of episodes per policy.
-        num_envs: number of parallel environments; the results depend on it only where several samples are drawn.
+        num_envs: number of parallel environments; the results do not depend on it.
         first_seed: seed of the first episode; episode i is reset with first_seed + i.
         on_episode: called after each episode.
         drivers: names of drivers that are compared beside the arena's baselines ("planner").

@@ -33,6 +33,7 @@ from envs.sb3.envpool import EnvPoolVecEnv
 from envs.sb3.forecast import VecForecast
 from envs.sb3.padded_spaces import learners_named
 from envs.sb3.workers import WorkerVecEnv
+from envs.scene_stream import NOISE_SEED_INFO
 from envs.seeding import driver_rng
 from envs.supervision import Place, SupervisedEnv, check_numbers, named
 from envs.wrappers import SceneObservation
@@ -225,8 +226,9 @@ class _MakeEnv:
 class SeededEpisodes(gym.Wrapper):
     """Plays queued seeds one after another and puts an `EpisodeResult` into the last info of each episode.
 
-    Episodes beyond the queue are unseeded and have no result. A driver of `envs.drivers.ego` can replace the received
-    actions; it has its own generator per seed, so its episodes do not depend on the number of environments.
+    Episodes beyond the queue are unseeded and have no result. The seed is also that of the noise of sampled forecasts,
+    so that results depend neither on the number of environments nor on the episodes before. A driver of
+    `envs.drivers.ego` can replace the received actions; it has its own generator per seed, too.
 
     Args:
         env: one environment.
@@ -263,7 +265,7 @@ class SeededEpisodes(gym.Wrapper):
         self._obs = obs
         if self._recorder is not None:
             self._recorder.begin()
-        return obs, info
+        return obs, info if self._seed is None else info | {NOISE_SEED_INFO: self._seed}
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Makes a step and records what the result needs."""

@@ -1,6 +1,6 @@
 """Makes observations of scenes and forecasts, for single environments and vector environments of gymnasium and SB3."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -149,12 +149,13 @@ class ForecastStream(SceneStream):
         ended: Int[np.ndarray, " ended"],
         successors: SceneBatch,
         plans: PlanBatch | None = None,
+        seeds: Sequence[int | None] = (),
     ) -> dict[str, NDArray[np.float32]]:
         """Takes in scenes like `observe`, ended episodes with their last; appends their successors' entries.
 
-        Plans are those of the scenes, then those of the successors.
+        Plans are those of the scenes, then those of the successors; `seeds` are those of `take_boundary`.
         """
-        forecast = self.take_boundary(scenes, ended, successors)
+        forecast = self.take_boundary(scenes, ended, successors, seeds)
         return self._entries(SceneBatch.concatenate(scenes, successors), forecast, plans)
 
     def _entries(
@@ -189,10 +190,12 @@ def observe_ended(
     ended: NDArray[np.int64],
     closing: list[Observations],
     plans: PlanBatch | None = None,
+    seeds: Sequence[int | None] = (),
 ) -> tuple[Observations, list[Observations]]:
     """Returns forecast entries of each environment, and of each closing observation with its own episode's history.
 
     Plans are ordered as in `ForecastStream.observe_boundary`: the closing ones in their places, then the opening ones.
+    `seeds` are those of the noise of the episodes that begin (`SceneStream.take_boundary`).
     """
     opening = scenes_from(observations)
     if not len(ended):
@@ -201,7 +204,7 @@ def observe_ended(
     for env, last in zip(ended, closing, strict=True):
         scenes.states[env], scenes.ids[env] = last["scene_states"], last["scene_ids"]
         scenes.valid[env], scenes.heading_rad[env] = last["scene_valid"], last["scene_heading_rad"][0]
-    both = stream.observe_boundary(scenes, ended, opening[ended], plans)
+    both = stream.observe_boundary(scenes, ended, opening[ended], plans, seeds)
     envs = len(opening)
     of_closing = {key: value[ended] for key, value in both.items()}
     for value in both.values():

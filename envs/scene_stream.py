@@ -22,6 +22,9 @@ from predictor.support.runtime import resolve_device
 NOISE_STREAM = 0x6E6F697365
 """Key that makes the samples' noise independent of what environment and drivers draw from the same seed."""
 
+NOISE_SEED_INFO = "noise_seed"
+"""Key of the infos of a reset under which an environment may give the seed of the noise of the episode that begins."""
+
 
 @dataclass(frozen=True)
 class ForecastConfig:
@@ -145,7 +148,7 @@ class SceneStream:
     def take(self, scenes: SceneBatch, envs: Int[np.ndarray, " some"] | None = None) -> Forecast:
         """Takes in one scene for each environment (of `envs`, if given); returns their forecasts."""
         self._online.observe(self._given(scenes), envs)
-        forecast = self._forecast_for(np.arange(len(self._noise)) if envs is None else envs)
+        forecast = self._forecast_for(self._noise.of(np.arange(len(self._noise)) if envs is None else envs))
         if envs is None:
             self.scenes, self.forecast = scenes, forecast
         else:
@@ -153,12 +156,23 @@ class SceneStream:
         self.seen = self.scenes
         return forecast
 
-    def take_boundary(self, scenes: SceneBatch, ended: Int[np.ndarray, " ended"], successors: SceneBatch) -> Forecast:
-        """Takes in scenes like `take`, ended episodes with their last; appends their successors' forecasts."""
+    def take_boundary(
+        self,
+        scenes: SceneBatch,
+        ended: Int[np.ndarray, " ended"],
+        successors: SceneBatch,
+        seeds: Sequence[int | None] = (),
+    ) -> Forecast:
+        """Takes in scenes like `take`, ended episodes with their last; appends their successors' forecasts.
+
+        Args:
+            scenes: scene of each environment, the last one of an episode that ended.
+            ended: indices of the environments whose episodes ended.
+            successors: scene that opens the next episode of each of `ended`.
+            seeds: seed of the noise of each next episode; None, or none at all, goes on with the noise of before.
+        """
         self._online.observe_boundary(self._given(scenes), ended, self._given(successors))
-        both = np.arange(len(scenes) + len(ended))
-        both[len(scenes) :] = ended
-        forecast = self._forecast_for(both)
+        forecast = self._forecast_for(self._noise.over(ended, seeds))
         kept = np.arange(len(scenes))
         kept[ended] = len(scenes) + np.arange(len(ended))
         index = torch.from_numpy(kept).to(forecast.xy.device)
@@ -166,9 +180,8 @@ class SceneStream:
         self.forecast = _changed(lambda field: field[index], forecast)
         return forecast
 
-    def _forecast_for(self, envs: Int[np.ndarray, " entries"]) -> Forecast:
+    def _forecast_for(self, noise: Sequence[np.random.Generator]) -> Forecast:
         """Returns the forecasts of the latest scenes; an ended episode draws its noise before its successor does."""
-        noise = self._noise.of(envs)
         self._before = deepcopy(noise) if self.config.num_plans else noise
         return self._shown(self._online.forecast(self.horizon_steps, self.config.num_samples, noise))
 
@@ -230,6 +243,17 @@ class EnvNoise(Sequence[np.random.Generator]):
     def of(self, envs: Int[np.ndarray, " some"]) -> "SomeNoise":
         """Returns the generators of some environments, in this order."""
         return SomeNoise(self, envs)
+
+    def over(self, ended: Int[np.ndarray, " ended"], seeds: Sequence[int | None]) -> Sequence[np.random.Generator]:
+        """Returns the generators of all environments, then those of the next episodes, anew where there is a seed."""
+        both = self.of(np.concatenate((np.arange(len(self)), ended)))
+        if all(seed is None for seed in seeds):
+            return both
+        now = list(both[: len(self)])  # made before they are replaced
+        for env, seed in zip(ended, seeds, strict=True):
+            if seed is not None:
+                self.restart(int(env), seed)
+        return [*now, *both[len(self) :]]
 
 
 class SomeNoise(Sequence[np.random.Generator]):

@@ -22,7 +22,7 @@ from envs.own_observation import own_part
 from envs.plans import PlanModel
 from envs.plans.batch import PLANS_INFO, PlanBatch, ask_for_plans
 from envs.readers import MakeReader
-from envs.scene_stream import ForecastConfig
+from envs.scene_stream import NOISE_SEED_INFO, ForecastConfig
 from predictor.forecaster import Forecaster
 from predictor.scene import SceneBatch
 
@@ -49,7 +49,8 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         flatten: whether observations are one Box instead of a Dict.
         device: device of the forecaster.
         forecaster: forecaster on `device`, instead of a checkpoint; the same as giving it as `checkpoint`.
-        seed: random seed of the samples' noise: environment i gets seed + i, until `seed(…)` gives others.
+        seed: random seed of the samples' noise: environment i gets seed + i, until `seed(…)` gives others, or the infos
+            of a reset (`NOISE_SEED_INFO`) that of an episode.
         reader: refused, because the environments report their scenes; give it to `SceneObservation`.
         what_if: whether observations also hold what the others are forecast to do for each candidate plan of the ego,
             as in `ForecastObservation`. True takes the environments' plan model; or a `PlanModel`, which is copied to
@@ -113,6 +114,7 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         """Resets all environments and clears all histories."""
         observations: Any = self.venv.reset()
         self.stream.reset()
+        self.stream.seed(self._noise_seeds(range(self.num_envs)))
         plans = PlanBatch.from_infos(self.venv.unwrapped.reset_infos) if self.plan_names else None
         entries = self.stream.observe(scenes_from(observations), plans=plans)
         return self._layout.batch(observations, entries)
@@ -125,7 +127,9 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         ended = np.flatnonzero(dones)
         closing = [infos[i]["terminal_observation"] for i in ended]
         plans = self._plans(infos, ended) if self.plan_names else None
-        entries, closing_entries = observe_ended(self.stream, observations, ended, closing, plans)
+        entries, closing_entries = observe_ended(
+            self.stream, observations, ended, closing, plans, self._noise_seeds(ended)
+        )
         for i, last, extra in zip(ended, closing, closing_entries, strict=True):
             infos[i]["terminal_observation"] = self._layout.one(last, extra)
         return self._layout.batch(observations, entries), rewards, dones, infos
@@ -138,6 +142,10 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         if not len(ended):
             return latest
         return latest.followed_by(PlanBatch.from_infos([opening[i] for i in ended]))
+
+    def _noise_seeds(self, envs: range | NDArray[np.int64]) -> list[int | None]:
+        """Returns the seeds of the noise of the episodes that just began, where the environments gave one."""
+        return [self.venv.unwrapped.reset_infos[env].get(NOISE_SEED_INFO) for env in envs]
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seeds the environments and their samples' noise; None leaves the noise as it is."""

@@ -7,11 +7,13 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents import vec_envs
-from agents.arena import Arena, EgoArena, MultiagentArena, open_arena
+from agents.arena import Arena, EgoArena, MultiagentArena, open_arena, run_episodes
 from agents.task import Observe, Task
-from agents.vec_envs import make_venv
+from agents.vec_envs import SeededEpisodes, make_venv
 from envs.drivers.trained import EgoDriver
 from envs.registry import make_env
+from envs.sb3.forecast import VecForecast
+from tests.envs.helpers import HIGHWAY_SPEC, short_scene_env, tiny_model
 
 
 def test_every_task_has_its_arena():
@@ -84,3 +86,34 @@ def test_a_driver_sees_the_environments_own_observation(observe: Observe, monkey
     arena.play("idle", [2])
     arena.close()
     assert seen and all(isinstance(each, np.ndarray) and each.shape == (5, 5) for each in seen)
+
+
+def test_drawn_samples_depend_on_the_seed_of_the_episode_alone():
+    """Neither on the number of environments nor on the episodes before."""
+
+    def seen(seeds: list[int], num_envs: int) -> dict[int, Any]:
+        envs = [lambda: SeededEpisodes(short_scene_env(3)) for _ in range(num_envs)]
+        venv = VecForecast(DummyVecEnv(envs), tiny_model(HIGHWAY_SPEC), num_samples=3)
+        of_env: list[list[Any]] = [[] for _ in range(num_envs)]
+
+        def policy(observations: Any, starts: Any) -> Any:
+            for env, (forecast, start) in enumerate(zip(observations["forecast"], starts, strict=True)):
+                if start:
+                    of_env[env].append([])
+                of_env[env][-1].append(forecast)
+            return np.ones(num_envs, dtype=np.int64)
+
+        run_episodes(venv, policy, seeds)
+        queues = [seeds[env::num_envs] for env in range(num_envs)]
+        return {
+            seed: np.array(own)
+            for queue, episodes in zip(queues, of_env, strict=True)
+            for seed, own in zip(queue, episodes, strict=False)
+        }
+
+    one, two, alone = seen([3, 4, 5], 1), seen([3, 4, 5], 2), seen([5], 1)
+    for seed in one:
+        np.testing.assert_allclose(one[seed], two[seed], atol=1e-4)
+    np.testing.assert_allclose(one[5], alone[5], atol=1e-4)
+    spread = one[5].std(axis=2)
+    assert spread.max() > 1e-2, "samples are drawn"

@@ -92,6 +92,22 @@ def test_over_a_boundary_scene_and_forecast_are_those_of_the_new_episode():
     assert made.forecast is not None and len(made.forecast.xy) == ENVS
 
 
+def test_over_a_boundary_a_seed_restarts_the_noise_of_the_new_episode_alone():
+    made, untouched, fresh = stream(), stream(), stream(envs=1, seed=77)
+    first, last, opening = scenes(0), scenes(1), scenes(2, 2)
+    for each in (made, untouched):
+        each.observe(first)
+    ended = np.array([1, 2])
+    found = made.observe_boundary(last, ended, opening, seeds=[77, None])
+    expected = untouched.observe_boundary(last, ended, opening)
+    for env in (0, 1, 2, ENVS + 1):
+        assert_same(of(found, env), of(expected, env), tolerance=0.0)
+    assert np.abs(found["forecast"][ENVS] - expected["forecast"][ENVS]).max() > 1e-3
+    assert_same(of(found, ENVS), of(fresh.observe(opening[np.array([0])]), 0))
+    following = scenes(3)
+    assert_same(of(made.observe(following), 1), of(fresh.observe(following[np.array([1])]), 0))
+
+
 def test_after_some_environments_scene_and_forecast_of_the_others_stay():
     made, first, second = stream(), scenes(0), scenes(1, 2)
     alone = [stream(envs=1, seed=env) for env in range(ENVS)]
