@@ -1,5 +1,8 @@
 """Measures, during a training, the forecasts that the policy acts on: it meets other scenes as it learns."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
@@ -13,22 +16,35 @@ FORECAST_ERROR, CONSTANT_ERROR = "forecast_error_m", "constant_velocity_error_m"
 
 
 class ForecastErrors(BaseCallback):
-    """Compares the forecasts of a `VecForecast` with what then happens; other environments have no errors."""
+    """Compares the forecasts of a `VecForecast` with what then happens; other environments have no errors.
 
-    def __init__(self) -> None:
+    Args:
+        before: what `sums` returned when the training was stopped.
+    """
+
+    def __init__(self, before: Mapping[str, list[Any]] | None = None) -> None:
         """Finds the forecasts when the training starts."""
         super().__init__()
+        self._before = before
         self._stream: ForecastStream | None = None
         self._errors: LoopErrors | None = None
 
     def begin(self) -> None:
-        """Begins with the present scenes: all environments were reset."""
+        """Begins with the present scenes, as all environments were reset; keeps what was compared before."""
         stream = None if self.model.env is None else _stream_of(self.model.env)
         if stream is None or stream.scenes is None or stream.forecast is None:
             return
         self._stream = stream
-        self._errors = LoopErrors(stream.horizon_steps, stream.scene_spec.dt_s)
+        if self._errors is None:
+            self._errors = LoopErrors(stream.horizon_steps, stream.scene_spec.dt_s)
+            if self._before:
+                self._errors.go_on(self._before)
+        self._errors.drop_pending()
         self._errors.add(stream.scenes, np.zeros(stream.num_envs, dtype=bool), stream.scenes, stream.forecast)
+
+    def sums(self) -> dict[str, list[Any]]:
+        """Returns what was compared since the last call of `scalars`, as content of JSON."""
+        return {} if self._errors is None else self._errors.sums()
 
     def scalars(self) -> dict[str, float]:
         """Returns the mean errors [m] since the last call, of the forecasts and of constant velocity."""

@@ -141,7 +141,8 @@ def _learn(
     """Trains for the remaining steps."""
     every = max(plan.steps // plan.selections, 1)
     checkpoint = run_dir / CHECKPOINT_FILE
-    errors, progress = ForecastErrors(), StepProgress(plan.steps, plan.num_envs)
+    kept = read_note(checkpoint)
+    errors, progress = ForecastErrors(kept.get("loop_errors")), StepProgress(plan.steps, plan.num_envs)
     restart = partial(_restart_streams, plan, model, errors) if plan.repeatable else None
     select = SelectBest(
         selection,
@@ -151,13 +152,15 @@ def _learn(
         note,
         curve=run_dir / CURVE_FILE,
         at_multiples=plan.repeatable,
-        seconds=read_note(checkpoint).get("seconds", 0.0),
+        seconds=kept.get("seconds", 0.0),
         scalars=errors.scalars,
         say=progress.say,
     )
-    save = SaveCheckpoint(
-        checkpoint, plan.checkpoint_every, note, lambda: STEP_UNIT | {"seconds": select.seconds}, restart
-    )
+
+    def extra() -> dict[str, Any]:
+        return STEP_UNIT | {"seconds": select.seconds, "loop_errors": errors.sums()}
+
+    save = SaveCheckpoint(checkpoint, plan.checkpoint_every, note, extra, restart)
     callbacks = [CountSteps(plan.num_envs), errors, save, select, *([progress] if progress_bar else [])]
     try:
         model.learn(

@@ -1,7 +1,9 @@
 """Error of the forecasts that a policy acts on, while it acts: measured as the truth arrives, without a recording."""
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -37,6 +39,19 @@ class LoopErrors:
         self._times_s = dt_s * np.arange(1, horizon_steps + 1)
         self._sums_m = np.zeros((2, horizon_steps))
         self._counts: NDArray[np.int64] = np.zeros(horizon_steps, dtype=np.int64)
+
+    def sums(self) -> dict[str, list[Any]]:
+        """Returns what was compared since the last call of `errors_m`, as content of JSON."""
+        return {"sums_m": self._sums_m.tolist(), "counts": self._counts.tolist()}
+
+    def go_on(self, sums: Mapping[str, list[Any]]) -> None:
+        """Takes in what `sums` returned; what it compared counts, too."""
+        self._sums_m += np.asarray(sums["sums_m"])
+        self._counts += np.asarray(sums["counts"])
+
+    def drop_pending(self) -> None:
+        """Forgets the forecasts whose truth has not arrived yet: all environments were reset."""
+        self._pending.clear()
 
     def add(self, seen: SceneBatch, ended: Bool[np.ndarray, " envs"], scenes: SceneBatch, forecast: Forecast) -> None:
         """Takes in one step of all environments.

@@ -38,6 +38,7 @@ from agents.training import (
     train,
 )
 from agents.vec_envs import EpisodeResult, SeededEpisodes, make_venv
+from envs.rollouts.loop_errors import LoopErrors
 from envs.sb3.algorithms import algorithm_class
 from envs.sb3.policy_file import read_note
 from predictor.support.errors import UserError
@@ -339,6 +340,37 @@ def test_a_repeatable_run_that_was_killed_ends_as_one_that_was_not(
     assert points[0] == points[1] and [p["steps"] for p in points[0]] == [16, 32, 48, 64]
     notes = [read_note(tmp_path / n / "policy.zip") for n in ("whole", "killed")]
     assert notes[0] == notes[1]
+
+
+def test_errors_in_the_loop_cover_all_steps_since_the_last_measurement(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Also those before a checkpoint, where environments start anew, and before a stop."""
+    preset = PPOPreset(n_steps=8, batch_size=8, n_epochs=1, net_arch=(8,))
+    monkeypatch.setattr("agents.training.preset_for", lambda *_: preset)
+    counted: list[int] = []
+    found = LoopErrors.errors_m
+    monkeypatch.setattr(LoopErrors, "errors_m", lambda self: counted.append(self.sums()["counts"][0]) or found(self))
+    sizes = {"steps": 64, "num_envs": 2, "selections": 1, "selection_episodes": 1, "selection_envs": 1}
+    training = plan(task=CONSTANT_VELOCITY, checkpoint_every=16, in_process=True, repeatable=True, seed=5, **sizes)
+    (tmp_path / "whole").mkdir()
+    (tmp_path / "killed").mkdir()
+    train(training, tmp_path / "whole")
+
+    save, left = SaveCheckpoint._on_rollout_start, [3]
+
+    def save_and_die(self: SaveCheckpoint) -> None:
+        save(self)
+        left[0] -= 1
+        if left[0] == 0:
+            raise Killed
+
+    monkeypatch.setattr(SaveCheckpoint, "_on_rollout_start", save_and_die)
+    with pytest.raises(Killed):
+        train(training, tmp_path / "killed")
+    assert load_model(tmp_path / "killed" / "checkpoint.zip", "ppo").num_timesteps == 32
+    left[0] = 100
+    train(training, tmp_path / "killed")
+    whole, killed = counted
+    assert whole == killed > 3 * 64, "five others in sight at most: the last 16 steps alone have no more than 80"
 
 
 def test_a_damaged_curve_is_named(tmp_path: Path):

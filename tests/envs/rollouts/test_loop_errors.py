@@ -1,3 +1,5 @@
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -59,6 +61,27 @@ def test_errors_are_those_of_every_forecast_and_truth_of_an_episode():
     wanted = tuple(np.mean([np.mean(values) for values in expected[row]]) for row in ("ours", "constant"))
     assert errors.errors_m() == pytest.approx(wanted)
     assert errors.errors_m() is None, "counted once"
+
+
+def test_what_was_compared_outlives_a_reset_and_a_stop():
+    rng = np.random.default_rng(2)
+    steps = [(scenes(rng, [[1, 2, 3]]), forecast(rng, 1)) for _ in range(8)]
+    first, second = steps[:4], steps[4:]
+    no = np.array([False])
+
+    def fed(errors: LoopErrors, part: list[tuple[SceneBatch, Forecast]]) -> LoopErrors:
+        errors.drop_pending()
+        for scene, future in part:
+            errors.add(scene, no, scene, future)
+        return errors
+
+    reset = fed(fed(LoopErrors(HORIZON, DT_S), first), second)
+    stopped = LoopErrors(HORIZON, DT_S)
+    stopped.go_on(json.loads(json.dumps(fed(LoopErrors(HORIZON, DT_S), first).sums())))
+    assert fed(stopped, second).sums() == reset.sums()
+    apart = [fed(LoopErrors(HORIZON, DT_S), part).sums()["counts"] for part in (first, second)]
+    assert reset.sums()["counts"] == np.sum(apart, axis=0).tolist(), "no forecast is compared across a reset"
+    assert stopped.errors_m() == reset.errors_m()
 
 
 def test_an_episode_that_ends_elsewhere_changes_nothing():
