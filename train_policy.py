@@ -89,6 +89,10 @@ class TrainPolicyConfig:
     arm of a controlled comparison (docs/arms.md)."""
     checkpoint: str | None = None
     """Forecaster: shipped name, folder or run folder; None takes the checkpoint that ships for the env id."""
+    sizes_of: str | None = None
+    """Checkpoint whose sizes the observation has (edges, steps, agents, range), so that policies with several
+    forecasters have the same network; None takes the one that ships for the env id, with --observe forecast the
+    sizes of --checkpoint itself."""
     num_samples: int = 1
     """Number of futures per agent in the observation."""
     horizon_steps: int | None = None
@@ -172,7 +176,7 @@ class TrainPolicyConfig:
         task = Task(
             self.env_id, self.observe, self.checkpoint, self.device, self.backend, tuple(learners), self.driver,
             self.num_samples, self.horizon_steps, self.perception_m, self.what_if, self.env_kwargs, self.timeout_s,
-            self.crash_key, self.success_key,
+            self.crash_key, self.success_key, self.sizes_of,
         )  # fmt: skip
         return TrainingPlan(
             task,
@@ -204,7 +208,7 @@ class TrainPolicyConfig:
 
     @property
     def measuring_envs(self) -> int:
-        """Number of parallel environments that measure a policy; results depend on it only where samples are drawn."""
+        """Number of parallel environments that measure a policy; results do not depend on it."""
         return min(self.sizes.num_envs, os.cpu_count() or 1)
 
 

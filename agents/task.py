@@ -95,6 +95,9 @@ class Task:
     """Key of the infos that says whether the ego has crashed; None takes the env's (`envs.readers.register_reader`)."""
     success_key: str | None = None
     """Key of the infos that says whether the ego has succeeded; None takes the env's."""
+    sizes_of: str | None = None
+    """Checkpoint whose sizes the observation has (edges, steps, agents, range), so that one network reads the forecasts
+    of several forecasters; None takes the one that ships for the id, with observe=forecast `checkpoint` itself."""
 
     def __post_init__(self) -> None:
         """Checks choices, and that the fields fit together; replaces `device="auto"` by the device that is taken."""
@@ -116,6 +119,12 @@ class Task:
             check_positive(self, "perception_m")
         if self.perception_m is not None and self.observe == "none":
             raise UserError("perception_m has no effect with observe=none; leave one out")
+        if self.sizes_of is not None and self.observe == "none":
+            raise UserError("sizes_of has no effect with observe=none; leave one out")
+        if self.sizes_of == CONSTANT_VELOCITY or is_own(self.sizes_of):
+            raise UserError(
+                f"sizes_of takes a checkpoint, '{short(self.sizes_of)}' has no sizes of its own; leave it out"
+            )
         check_positive(self, "timeout_s")
         if self.what_if and self.observe == "none":
             raise UserError("what_if has no effect with observe=none; leave one out")
@@ -151,7 +160,8 @@ class Task:
     def options(self) -> dict[str, Any]:
         """Arguments of the wrappers with forecasts, `VecForecast` included.
 
-        All arms of an id have the entries of the checkpoint that ships for it, so that one network reads each of them.
+        All arms of an id have the entries of the checkpoint that ships for it, or of `sizes_of`, so that one network
+        reads each of them.
 
         Raises:
             UserError: see `scene_spec`.
@@ -162,13 +172,13 @@ class Task:
         }  # fmt: skip
         if self.what_if:
             options["what_if"] = True
-        if self.observe == "forecast":
+        sized = self._sized
+        if self.observe == "forecast" and sized is None:
             return options
-        shipped = _shipped_for(self.env_id)
-        if shipped is not None and self.horizon_steps is None:
-            options["horizon_steps"] = shipped.horizon_steps
+        if sized is not None and self.horizon_steps is None:
+            options["horizon_steps"] = sized.horizon_steps
         name = "forecast" if self.observe == CONSTANT_VELOCITY else self.observe
-        layout = None if shipped is None else EntryLayout.of(shipped)
+        layout = None if sized is None else EntryLayout.of(sized)
         bank = _bank_of(replace(self, observe="forecast")) if self.observe == "shuffled" else None
         return options | {"arm": Arm(name, layout, bank)}
 
@@ -179,12 +189,19 @@ class Task:
             UserError: see `scene_spec`.
         """
         options = self.options
-        shipped = _shipped_for(self.env_id) if self.observe != "forecast" and not self.is_multiagent else None
-        if shipped is not None:  # constant velocity has no range of its own
-            options |= {"perception_m": shipped.spec.perception_m, "max_agents": shipped.spec.max_agents}
+        sized = None if self.is_multiagent else self._sized
+        if sized is not None:  # constant velocity has no range of its own
+            options |= {"perception_m": sized.spec.perception_m, "max_agents": sized.spec.max_agents}
         if self.perception_m is not None:
             options["perception_m"] = self.perception_m
         return ForecastParallelEnv(env, **options) if self.is_multiagent else ForecastObservation(env, **options)
+
+    @property
+    def _sized(self) -> Forecaster | None:
+        """Forecaster whose sizes the observation has; None for those of the one that is shown."""
+        if self.sizes_of is not None:
+            return _loaded(self.sizes_of)
+        return None if self.observe == "forecast" else _shipped_for(self.env_id)
 
     def make(self, **kwargs: Any) -> Any:
         """Makes the environment, without forecasts.
@@ -254,7 +271,7 @@ class Task:
 
 
 _OF_RUN = ("env_id", "observe", "checkpoint", "learners", "num_samples", "horizon_steps", "perception_m", "what_if",
-           "env_kwargs", "crash_key", "success_key")  # fmt: skip
+           "env_kwargs", "crash_key", "success_key", "sizes_of")  # fmt: skip
 """Fields of a run's config that have the name of a task's; the driver's is "partner"."""
 _OWN_PACKAGES = ("highway_env.", "envs.")
 """Packages that the arguments of a run's environment may name: those that it imports anyway."""
@@ -285,20 +302,19 @@ def task_of(
             f"the run's environment '{short(values['env_id'], 80)}' imports code; if you trust it, name it yourself "
             f"with --env-id {short(values['env_id'], 80)}"
         )
-    if is_own(values["checkpoint"]) and values["checkpoint"] != trusted_forecaster:
-        raise UserError(
-            f"the run's forecaster '{short(values['checkpoint'], 80)}' imports code; if you trust it, name it yourself "
-            f"with --checkpoint {short(values['checkpoint'], 80)}"
-        )
-    if (
-        values["checkpoint"] is not None
-        and is_remote(values["checkpoint"])
-        and values["checkpoint"] != trusted_forecaster
-    ):
-        raise UserError(
-            f"the run's checkpoint would be fetched from '{short(values['checkpoint'], 80)}'; if you trust it, name it "
-            f"yourself with --checkpoint {short(values['checkpoint'], 80)}"
-        )
+    for named in filter(None, (values["checkpoint"], values.get("sizes_of"))):
+        if named == trusted_forecaster:
+            continue
+        if is_own(named):
+            raise UserError(
+                f"the run's forecaster '{short(named, 80)}' imports code; if you trust it, name it yourself with "
+                f"--checkpoint {short(named, 80)}"
+            )
+        if is_remote(named):
+            raise UserError(
+                f"the run's checkpoint would be fetched from '{short(named, 80)}'; if you trust it, name it yourself "
+                f"with --checkpoint {short(named, 80)}"
+            )
     task = Task(device=device, **values)
     for text in _texts_of(task.make_kwargs):
         if re.fullmatch(r"\w+([.:]\w+)+", text) and not text.startswith(_OWN_PACKAGES):
@@ -325,8 +341,12 @@ def _texts_of(content: Any) -> Iterator[str]:
 def _shipped_for(env_id: str) -> Forecaster | None:
     """Returns the forecaster that ships for an id; None if none does."""
     name = entry_for(env_id).checkpoint
-    if name is None:
-        return None
+    return None if name is None else _loaded(name)
+
+
+@functools.lru_cache(maxsize=8)
+def _loaded(name: str) -> Forecaster:
+    """Returns the forecaster of a checkpoint."""
     forecaster: Forecaster = load_checkpoint(name)[0]
     return forecaster
 

@@ -166,8 +166,21 @@ class Arm:
         return None if what_if and self.shown.what_if else 1
 
     def layout_for(self, forecaster: Forecaster) -> EntryLayout:
-        """Returns the sizes of the entries with this forecaster."""
-        return self.layout or EntryLayout.of(forecaster)
+        """Returns the sizes of the entries with this forecaster.
+
+        Raises:
+            UserError: its edges, if the arm shows them, are larger than those of the layout.
+        """
+        own = EntryLayout.of(forecaster)
+        if self.layout is None:
+            return own
+        sizes = [(each.num_edge_types, each.edge_feature_dim) for each in (own, self.layout)]
+        if self.shown.edges and any(mine > room for mine, room in zip(*sizes, strict=True)):
+            raise UserError(
+                "the forecaster has edges of {} types with {} features, and the observation room for {} with {}; take "
+                "the sizes of a checkpoint with room for them (sizes_of)".format(*sizes[0], *sizes[1])
+            )
+        return self.layout
 
     def filled(
         self, entries: Mapping[str, NDArray[np.float32]], spaces: Mapping[str, gym.Space]

@@ -50,6 +50,8 @@ cell."""
 YOUNGER = {"perception_m": None, "vf_coef": 0.5, "target_kl": None, "crash_key": None, "success_key": None}
 """Fields of `Task` and of presets that came after the first cells, with the value that those had: it does not change
 their names."""
+PATHS = ("checkpoint", "sizes_of")
+"""Fields of `Task` with paths of checkpoints, of which the cells' names have hash and sizes instead."""
 RUN_FOLDER = "run"
 LOG_FILE = "log.txt"
 
@@ -98,9 +100,7 @@ class Cell:
     @property
     def content(self) -> dict[str, Any]:
         """Everything that determines the result, as JSON content."""
-        task = {
-            key: value for key, value in _named(self.task).items() if key not in ("device", "checkpoint", "timeout_s")
-        }
+        task = {key: value for key, value in _named(self.task).items() if key not in (*PATHS, "device", "timeout_s")}
         content: dict[str, Any] = {
             "measuring": MEASURING,
             "task": task,
@@ -155,7 +155,7 @@ def run_cell(cell: Cell, folder: Path) -> Result:
     trained_s, curve = 0.0, list[dict[str, Any]]()
     if cell.plan is not None:
         run = folder / RUN_FOLDER
-        free = (FORECASTER, "device", "checkpoint")  # the folder's name has the forecaster's hash
+        free = (FORECASTER, "device", *PATHS)  # the folder's name has the forecaster's hash and sizes
         open_run(run, _run_config(cell), made, resume=True, free=free)
         policy = load_model(train(cell.plan, run), cell.plan.algorithm)
         curve = read_curve(run / CURVE_FILE)

@@ -16,6 +16,7 @@ from envs.drivers.ego import CONSTANT_ACTIONS
 from envs.drivers.planner import PLANNER, PLANNER_ORACLE
 from envs.registry import entry_for
 from envs.sb3.algorithms import algorithm_named
+from predictor.own_forecasters import is_own
 from predictor.support.config_checks import check_at_least, check_at_most, check_choices
 from predictor.support.errors import UserError
 from predictor.support.memory import ENV_BYTES, check_memory
@@ -33,7 +34,7 @@ RIVALS = ("zeros", "constant-velocity")
 FLOOR, CEILING = "zeros", "oracle"
 _PLACES = ("scenario", "env_id")
 """Names that a text of an arm may hold in braces."""
-_OF_FORECASTS = ("perception_m", "what_if")
+_OF_FORECASTS = ("perception_m", "what_if", "sizes_of")
 """Options of a scenario that an arm without forecasts does not take."""
 _OWN = ("env_id", "observe", "timeout_s")
 """Fields of `Task` that are no options: a scenario and an arm say the first two in keys of their own, and a cell runs
@@ -216,7 +217,7 @@ def task_for(scenario: Scenario, arm: StudyArm, where: str) -> Task:
     """Returns the task of an arm in a scenario.
 
     A scenario's checkpoint goes to the arms that take one and name none of their own; what it says of forecasts, to the
-    arms that are shown any.
+    arms that are shown any. All of these have the sizes of the scenario's checkpoint, or of the one that ships.
 
     Raises:
         UserError: the options of arm and scenario do not fit together; the message begins with `where`.
@@ -224,8 +225,12 @@ def task_for(scenario: Scenario, arm: StudyArm, where: str) -> Task:
     places = {"scenario": scenario.name, "env_id": scenario.env_id}
     options = {key: _filled(value, places) for key, value in arm.options.items()}
     shared = dict(scenario.options)
+    sizes_of = shared.get("checkpoint") or entry_for(scenario.env_id).checkpoint
     if "checkpoint" in shared and not takes_checkpoint(arm.observe):
         del shared["checkpoint"]
+    own = {**shared, **options}.get("checkpoint")
+    if not is_own(sizes_of) and ("checkpoint" in scenario.options or (arm.observe == "forecast" and own is not None)):
+        shared.setdefault("sizes_of", sizes_of)
     if arm.observe == "none":
         shared = {key: value for key, value in shared.items() if key not in _OF_FORECASTS}
     learners = {"learners": entry_for(scenario.env_id).learners}

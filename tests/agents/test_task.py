@@ -2,6 +2,7 @@ import json
 import math
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,6 +19,7 @@ from envs.arms import ARMS
 from envs.drivers.trained import env_for_driver
 from predictor.support.errors import UserError
 from tests.agents.helpers import TOY
+from tests.envs.helpers import HIGHWAY_SPEC, save_tiny
 
 TAG = "simple_tag_v3"
 
@@ -36,6 +38,9 @@ def without_envpool(monkeypatch: pytest.MonkeyPatch) -> None:
         ("highway-fast-v0", {"learners": ("adversary",)}, "highway-fast-v0 has one ego; leave them out"),
         (TAG, {"driver": "fast"}, "driver must be one of random, idle, varied, heuristic, mixed, got 'fast'"),
         (TAG, {"observe": "none", "checkpoint": "highway"}, "has no effect with observe=none"),
+        (TAG, {"observe": "none", "sizes_of": "simple-tag"}, "sizes_of has no effect with observe=none"),
+        (TAG, {"observe": "zeros", "sizes_of": "constant-velocity"}, "'constant-velocity' has no sizes of its own"),
+        (TAG, {"observe": "zeros", "sizes_of": "own:my:forecaster"}, "'own:my:forecaster' has no sizes of its own"),
         (TAG, {"what_if": True}, f"what_if needs an environment with one ego, {TAG} has several learners"),
         ("merge-v1", {"env_kwargs": "{"}, "env_kwargs must be a JSON object, got '{': .*Expecting"),
         ("merge-v1", {"env_kwargs": "[1]"}, r"env_kwargs must be a JSON object, got '\[1\]'"),
@@ -115,6 +120,25 @@ def test_every_arm_has_the_same_space(env_id: str):
         spaces.append(env.observation_space(env.possible_agents[0]) if env_id == TAG else env.observation_space)
         env.close()
     assert all(space == spaces[0] for space in spaces)
+
+
+def test_every_arm_has_the_sizes_of_the_checkpoint_that_is_named(tmp_path: Path):
+    """Also arms with forecasters of other sizes: fewer edges, fewer steps."""
+    spec = replace(HIGHWAY_SPEC, max_agents=4, perception_m=50.0)
+    large = save_tiny(tmp_path / "large", spec, num_edge_types=4)
+    tasks = [
+        Task("highway-fast-v0", "forecast", large),
+        Task("highway-fast-v0", "forecast", large, sizes_of=large),
+        *(Task("highway-fast-v0", arm, sizes_of=large) for arm in ("zeros", "constant-velocity", "no-edges")),
+        Task("highway-fast-v0", "zeros", large, sizes_of=large),
+    ]
+    spaces = [task._forecasts()[0] for task in tasks]
+    assert spaces[0]["edge_probs"].shape == (3, 2 * 3)
+    assert all(space == spaces[0] for space in spaces)
+    for arm in ("forecast", "single"):
+        with pytest.raises(UserError, match="edges of 4 types with .* observation room for 2 with .*sizes_of"):
+            Task("highway-fast-v0", arm, large, sizes_of="highway").check()
+    Task("highway-fast-v0", "no-edges", large, sizes_of="highway").check()  # shows no edges
 
 
 def test_the_note_of_an_arm_gives_its_wrapper_back(tmp_path: Path):
@@ -200,13 +224,14 @@ def test_a_run_imports_no_forecaster_that_the_command_line_does_not_name(foreign
     assert task_of(run, trusted_forecaster=own).checkpoint == own
 
 
-def test_a_run_fetches_no_checkpoint_that_the_command_line_does_not_name():
+@pytest.mark.parametrize("key", ["checkpoint", "sizes_of"])
+def test_a_run_fetches_no_checkpoint_that_the_command_line_does_not_name(key: str):
     there = "s3://bucket/checkpoint"
-    run = RUN | {"env_id": "merge-v1", "observe": "forecast", "checkpoint": there}
+    run = RUN | {"env_id": "merge-v1", "observe": "forecast", "checkpoint": "merge", key: there}
     for trusted in (None, "highway", "s3://bucket/other"):
         with pytest.raises(UserError, match=f"would be fetched from '{there}'; .* with --checkpoint {there}"):
             task_of(run, trusted_forecaster=trusted)
-    assert task_of(run, trusted_forecaster=there).checkpoint == there
+    assert getattr(task_of(run, trusted_forecaster=there), key) == there
 
 
 def test_arguments_of_a_run_name_no_foreign_class(foreign: str):

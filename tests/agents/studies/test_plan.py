@@ -48,6 +48,18 @@ def test_an_arm_names_a_checkpoint_by_scenario(tmp_path: Path):
     assert lstm.checkpoint == "runs/corridor/merge-v1" and none.checkpoint is None
     assert task_for(study.scenarios[0], StudyArm("forecast", "forecast", {}), "file").checkpoint == "shared"
     assert takes_checkpoint("forecast") and not takes_checkpoint("none")
+    for arm in ("zeros", "constant-velocity", "forecast"):
+        assert task_for(study.scenarios[0], StudyArm(arm, arm, {}), "file").sizes_of == "shared"
+    assert lstm.sizes_of == "shared" and none.sizes_of is None
+
+
+def test_arms_with_forecasters_of_their_own_have_the_sizes_of_the_others(tmp_path: Path):
+    arms = '["zeros", "forecast", {name = "mine", observe = "forecast", checkpoint = "runs/mine"}]'
+    study = read_study(study_path(tmp_path, study_text(arms=arms, env_id="merge-v1")))
+    zeros, shipped, mine = (task_for(study.scenarios[0], arm, "file") for arm in study.arms)
+    assert (zeros.sizes_of, shipped.sizes_of, mine.sizes_of) == (None, None, "merge")
+    asked = StudyArm("mine", "forecast", {"checkpoint": "runs/mine", "sizes_of": "runs/mine"})
+    assert task_for(study.scenarios[0], asked, "file").sizes_of == "runs/mine"
 
 
 def test_what_a_scenario_says_of_forecasts_goes_to_the_arms_that_have_any(tmp_path: Path):
