@@ -38,7 +38,14 @@ def check_actions(algorithm: Algorithm, space: spaces.Space, env_id: str) -> Non
         raise UserError(f"{algorithm} needs a continuous action space, {env_id} has {space}; use ppo")
     if isinstance(space, spaces.Box) and not space.is_bounded():
         raise UserError(f"{algorithm} needs bounded actions, {env_id} has {space}; give its action space bounds")
-    if isinstance(space, spaces.Discrete) and space.start != 0:
+    if not isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+        raise UserError(
+            f"{algorithm} needs a Box, Discrete, MultiDiscrete or MultiBinary action space, {env_id} has {space}; "
+            "wrap it"
+        )
+    if isinstance(space, spaces.MultiDiscrete | spaces.MultiBinary) and len(space.shape) != 1:
+        raise UserError(f"{algorithm} needs actions in one row, {env_id} has {space}; flatten them")
+    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete) and np.any(space.start != 0):
         raise UserError(f"{algorithm} counts actions from 0, {env_id} has {space}; wrap it so that its actions do, too")
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from envs.drivers.own import OwnDriver
-from envs.drivers.sampled_actions import uniform_action, varied_actions
+from envs.drivers.sampled_actions import first_action, uniform_action, varied_actions
 from envs.readers import multiagent_env_id
 from envs.readers.mpe import mpe_scenario
 from envs.readers.pursuit import is_pursuit_env
@@ -55,8 +55,8 @@ def make_driver(name: str, env: Any, rng: np.random.Generator) -> Driver:
         rng: source of all randomness of this episode.
 
     Raises:
-        UserError: unknown name, no heuristic for this environment, or an action space that is neither Discrete nor a
-            bounded Box.
+        UserError: unknown name, no heuristic for this environment, or an action space that `uniform_action` does not
+            draw from.
     """
     if is_own(name):
         return OwnDriver(name, env, rng)
@@ -114,10 +114,8 @@ def idle_action(env: Any, agent: str) -> Any:
     own = getattr(env.unwrapped, "idle_action", None)
     if own is not None:
         return own(agent)
-    space = env.action_space(agent)
-    if isinstance(space, gym.spaces.Discrete):
-        return int(space.start) + (_PURSUIT_STAY if is_pursuit_env(env) else 0)
-    return np.clip(np.zeros(space.shape, dtype=space.dtype), space.low, space.high)
+    first = first_action(env.action_space(agent))
+    return first + _PURSUIT_STAY if is_pursuit_env(env) else first
 
 
 @dataclass(frozen=True)

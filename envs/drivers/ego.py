@@ -14,7 +14,7 @@ from highway_env.vehicle.controller import ControlledVehicle
 
 from envs.drivers.own import OwnDriver
 from envs.drivers.planner import PLANNER, is_planner, planner_driver
-from envs.drivers.sampled_actions import uniform_action, varied_actions
+from envs.drivers.sampled_actions import first_action, uniform_action, varied_actions
 from envs.drivers.trained import EgoDriver, trained_ego
 from predictor.own_forecasters import is_own
 from predictor.support.errors import UserError
@@ -87,13 +87,13 @@ def named_drivers(names: Sequence[str], env: gym.Env) -> tuple[str, ...]:
 
 
 def idle_action(env: gym.Env) -> Any:
-    """Returns the action that changes nothing: highway-env's IDLE, the first action, or zeros within the bounds."""
-    space = env.action_space
-    if isinstance(space, gym.spaces.Discrete):
-        return _meta_actions(env).get("IDLE", int(space.start))
-    if isinstance(space, gym.spaces.Box):
-        return np.clip(np.zeros(space.shape, dtype=space.dtype), space.low, space.high)
-    raise UserError(f"no idle action is known for {space}")
+    """Returns the action that changes nothing: highway-env's IDLE, the first action, or zeros within the bounds.
+
+    Raises:
+        UserError: another space.
+    """
+    first = first_action(env.action_space)
+    return _meta_actions(env).get("IDLE", first) if isinstance(env.action_space, gym.spaces.Discrete) else first
 
 
 def _meta_actions(env: gym.Env) -> dict[str, int]:

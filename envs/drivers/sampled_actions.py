@@ -1,4 +1,4 @@
-"""Actions sampled from an action space alone, for drivers of an ego and drivers of all agents."""
+"""Actions chosen from an action space alone, for drivers of an ego and drivers of all agents."""
 
 from collections.abc import Callable
 from functools import partial
@@ -15,26 +15,47 @@ def uniform_action(space: gym.Space, rng: np.random.Generator, who: str) -> Any:
     """Returns an action drawn uniformly.
 
     Args:
-        space: Discrete or a bounded Box.
+        space: Discrete, MultiDiscrete, MultiBinary or a bounded Box.
         rng: source of the draw.
         who: name of the drivers, for the message.
 
     Raises:
-        UserError: neither Discrete nor a bounded Box.
+        UserError: another space.
     """
     if isinstance(space, gym.spaces.Discrete):
         return int(space.start + rng.integers(space.n))
+    if isinstance(space, gym.spaces.MultiDiscrete):
+        return (space.start + rng.integers(space.nvec)).astype(space.dtype)
+    if isinstance(space, gym.spaces.MultiBinary):
+        return rng.integers(2, size=space.shape, dtype=space.dtype)
     if isinstance(space, gym.spaces.Box) and space.is_bounded():
         return rng.uniform(space.low, space.high).astype(space.dtype)
     require_space(space, "the action space")
-    raise UserError(f"{who} need a Discrete or a bounded Box action space, got {space}")
+    raise UserError(f"{who} need a Discrete, MultiDiscrete, MultiBinary or bounded Box action space, got {space}")
+
+
+def first_action(space: gym.Space) -> Any:
+    """Returns the first action of a space: the lowest numbers; of a Box, zeros within its bounds.
+
+    Raises:
+        UserError: a space that `uniform_action` does not draw from.
+    """
+    if isinstance(space, gym.spaces.Discrete):
+        return int(space.start)
+    if isinstance(space, gym.spaces.MultiDiscrete):
+        return space.start.copy()
+    if isinstance(space, gym.spaces.MultiBinary):
+        return np.zeros(space.shape, dtype=space.dtype)
+    if isinstance(space, gym.spaces.Box):
+        return np.clip(np.zeros(space.shape, dtype=space.dtype), space.low, space.high)
+    raise UserError(f"no idle action is known for {space}")
 
 
 def varied_actions(space: gym.Space, rng: np.random.Generator, who: str) -> Callable[[Any], Any]:
     """Returns a driver with preferences that repeats its choices for a while; both are drawn once, for an episode.
 
     Args:
-        space: Discrete or a bounded Box.
+        space: as for `uniform_action`.
         rng: source of all draws.
         who: name of the drivers, for the message.
     """

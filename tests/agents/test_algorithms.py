@@ -127,14 +127,21 @@ def test_action_spaces(algorithm: Algorithm):
         "continuous": gym.spaces.Box(-1, 1, (2,), np.float32),
         "unbounded": gym.spaces.Box(-np.inf, np.inf, (2,), np.float32),
         "from one": gym.spaces.Discrete(3, start=1),
+        "several": gym.spaces.MultiDiscrete([2, 3]),
+        "several from one": gym.spaces.MultiDiscrete([2, 3], start=[0, 1]),
+        "switches": gym.spaces.MultiBinary(2),
+        "square": gym.spaces.MultiBinary((2, 2)),
+        "tuple": gym.spaces.Tuple([gym.spaces.Discrete(2)]),
     }
-    refused = {"dqn": ("continuous",), "sac": ("discrete",)}
+    several = ("several", "switches")
+    refused = {"dqn": ("continuous", *several), "sac": ("discrete", *several)}
+    never = ("unbounded", "from one", "several from one", "square", "tuple")
     refused |= {"qrdqn": refused["dqn"], "tqc": refused["sac"]}
     for name, space in spaces.items():
-        if name not in (*refused.get(algorithm, ()), "unbounded", "from one"):
+        if name not in (*refused.get(algorithm, ()), *never):
             check_actions(algorithm, space, "some-v0")
             continue
-        with pytest.raises(UserError, match=rf"^{algorithm} .*, some-v0 has .*; (use ppo|give|wrap)"):
+        with pytest.raises(UserError, match=rf"^{algorithm} .*, some-v0 has .*; (use ppo|give|wrap|flatten)"):
             check_actions(algorithm, space, "some-v0")
 
 

@@ -476,7 +476,7 @@ def test_where_there_is_no_heuristic_the_others_are_named():
 
 
 @pytest.mark.parametrize("name", DRIVER_NAMES)
-@pytest.mark.parametrize("space", [gym.spaces.MultiBinary(3), gym.spaces.Box(-np.inf, np.inf, (2,))])
+@pytest.mark.parametrize("space", [gym.spaces.Text(3), gym.spaces.Box(-np.inf, np.inf, (2,))])
 def test_spaces_that_no_driver_supports_are_named_early(space: gym.Space, name: str):
-    with pytest.raises(UserError, match=r"drivers need a Discrete or a bounded Box action space, got (Multi|Box)"):
+    with pytest.raises(UserError, match=r"drivers need a Discrete, .* or bounded Box action space, got (Text|Box)"):
         make_driver(name, Booth(space), rng())

@@ -58,11 +58,27 @@ def test_actions_lie_in_the_space_and_repeat_with_the_seed(name: str, env_id: st
         assert (np.array(actions) != np.array(actions_of(name, env, seed=4))).any()
 
 
-@pytest.mark.parametrize("space", [gym.spaces.Discrete(3, start=1), gym.spaces.Box(0.5, 1.0, (1,))])
-def test_idle_lies_in_the_space(space: gym.Space):
+@pytest.mark.parametrize(
+    "space",
+    [
+        gym.spaces.Discrete(3, start=1),
+        gym.spaces.Box(0.5, 1.0, (1,)),
+        gym.spaces.MultiDiscrete([2, 3], start=[4, 5]),
+        gym.spaces.MultiBinary(3),
+    ],
+)
+def test_drivers_take_actions_of_every_space(space: gym.Space):
     env = gym.Env()
     env.action_space = space
     assert idle_action(env) in space
+    for name in ("random", "varied"):
+        drive = make_ego_driver(name, env, np.random.default_rng(0))
+        taken = np.array([drive(None) for _ in range(200)])
+        assert all(action in space for action in taken.astype(space.dtype))
+        if not isinstance(space, gym.spaces.Box) and name == "random":
+            rows = taken.reshape(200, -1)
+            found = [len(np.unique(row)) for row in rows.T]
+            assert found == {"Discrete": [3], "MultiDiscrete": [2, 3], "MultiBinary": [2, 2, 2]}[type(space).__name__]
 
 
 @pytest.mark.parametrize("env_id", CHECKPOINTS)
@@ -194,7 +210,7 @@ def test_spaces_without_an_idle_or_random_action_are_named():
     env = make_env("intersection-multi-agent-v2")
     with pytest.raises(UserError, match="no idle action is known for Tuple"):
         idle_action(env)
-    with pytest.raises(UserError, match="random egos need a Discrete or a bounded Box action space, got Tuple"):
+    with pytest.raises(UserError, match="random egos need a Discrete, .* or bounded Box action space, got Tuple"):
         make_ego_driver("random", env, np.random.default_rng(0))(None)
 
 
