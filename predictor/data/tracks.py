@@ -9,7 +9,8 @@ A source with folders `train`, `val` or `test` gives a store for each, `<out>/tr
 such folders give one store, and `--split` divides them: the position of SHA-256("0:<name>") in [0, 1) decides, below
 0.1 test, below 0.2 validation, else training.
 
-States: position and velocity [m, m/s], then the extra columns. Velocity is the backward difference over one step, so
+States: position and velocity [m, m/s], then the extra columns. Positions far from zero, as in coordinates of a map, are
+moved by multiples of 10 km, file by file. Velocity is the backward difference over one step, so
 a track's first step is dropped, and the first after a gap. Agents appear and disappear.
 """
 
@@ -50,6 +51,8 @@ SPLIT_SEED = 0
 """Seed of the split of files that are in no such folders."""
 MAX_AGENTS = 128
 """Least `max_agents` of a store; larger where more agents are present at once."""
+FAR_M = 10_000.0
+"""Files whose mean position is farther than half of this from zero are moved by a multiple of it [m]."""
 RIGHTS = "Those of the source, which the files do not name: a store made from it falls under the same terms."
 
 _COMMENT = re.compile("[#%]")
@@ -203,12 +206,23 @@ def points_of(recording: Recording, frame_step: int, config: TracksConfig, count
     since = recording.frames - recording.frames.min()
     kept = since % frame_step == 0
     counts["lines dropped: between steps"] += int((~kept).sum())
-    positions_m = recording.values[kept, :2] * config.scale
+    positions_m, moved = near_zero(recording.values[kept, :2] * config.scale)
+    if moved:
+        counts[f"files moved towards zero by multiples of {FAR_M / 1000:g} km"] += 1
     points = TrackPoints(since[kept] // frame_step, recording.ids[kept], positions_m)
     moving, velocities_mps, origin = with_velocities(points, config.dt_s)
     counts["lines dropped: no velocity (first of a track or after a gap)"] += len(points) - len(moving)
     extra = recording.values[kept, 2:][origin]
     return TrackPoints(moving.steps, moving.tracks, np.concatenate([moving.states, velocities_mps, extra], axis=-1))
+
+
+def near_zero(positions_m: Float[np.ndarray, "points 2"]) -> tuple[Float[np.ndarray, "points 2"], bool]:
+    """Moves positions by multiples of `FAR_M` in x and y, so that their mean lies near zero, and says if it did.
+
+    Stores and networks compute in float32, which at 5,000 km (coordinates of a map) has steps of half a metre.
+    """
+    offset_m = FAR_M * np.round(positions_m.mean(axis=0) / FAR_M)
+    return positions_m - offset_m, bool(offset_m.any())
 
 
 def scene_spec(config: TracksConfig, agents: int = 0) -> SceneSpec:

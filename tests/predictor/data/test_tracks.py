@@ -140,6 +140,18 @@ def test_recordings_are_cut_or_whole(source: Path, walk: Path, loader: Loader):
     assert "* Each recording is one episode, from its first step with an agent to its last." in loader.card
 
 
+def test_files_in_coordinates_of_a_map_keep_their_precision(source: Path, loader: Loader):
+    rows = [(780 + 10 * t, 1, 691_234.56 + 0.013 * t, 5_334_001.07 - 0.02 * t) for t in range(6)]
+    (source / "map.txt").write_text(text_of(rows, form=".3f"))
+    moved, near = loader.load(source).episodes
+    assert (moved.label, near.label) == ("map", "walk")
+    expected = np.array(rows)[1:, 2:] - (690_000, 5_330_000)
+    np.testing.assert_allclose(moved.states[:, 0, :2], expected, atol=6e-4)  # the file has millimetres
+    np.testing.assert_allclose(moved.states[:, 0, 2:], [[0.013 / 0.4, -0.02 / 0.4]] * 5, atol=3e-3)
+    np.testing.assert_allclose(near.states[0, 1, :2], [102, 50])
+    assert "| files moved towards zero by multiples of 10 km | 1 |" in loader.card
+
+
 def test_files_have_frames_and_ids_of_their_own(source: Path, loader: Loader):
     (source / "later.txt").write_text(text_of([(5003 + 10 * t, 4, 7, t) for t in range(4)]))
     (source / "alone.txt").write_text(text_of([(3, 1, 0, 0)]))  # one frame has no distance to another
