@@ -71,7 +71,8 @@ class Cell:
     episodes: int
     """Number of test episodes."""
     forecaster: Mapping[str, Any] | None
-    """Pin of the forecaster whose forecasts are shown, or by which the planner drives; None if there is none."""
+    """Pin of the forecaster whose forecasts are shown, or by which the planner drives, or of the policy that drives;
+    None if there is none."""
 
     @property
     def algorithm(self) -> Algorithm | None:
@@ -203,7 +204,7 @@ def _drivers(study: Study, scenario: Scenario, where: str) -> list[Cell]:
                 require_own_view(env, name)
                 make_ego_driver(name, env, np.random.default_rng(0))
             env.close()
-        return [Cell(scenario.name, name, task, None, study.episodes, _planner_pin(name, task)) for name in names]
+        return [Cell(scenario.name, name, task, None, study.episodes, _driver_pin(name, task)) for name in names]
     except UserError as error:
         raise UserError(f"{place}: {error}") from error
 
@@ -239,16 +240,22 @@ def _trainings(study: Study, scenario: Scenario, arm: StudyArm, where: str) -> l
     return cells
 
 
-def _planner_pin(name: str, task: Task) -> dict[str, Any] | None:
-    """Returns what the planner's forecasts come from, and its settings; None for other drivers."""
+def _driver_pin(name: str, task: Task) -> dict[str, Any] | None:
+    """Returns what the planner's forecasts come from, and its settings; a policy's hash; None for other drivers."""
+    if name.endswith(".zip"):
+        return {"sha256": _hash_of(Path(name))}
     if not is_planner(name):
         return None
     settings = asdict(PlannerConfig())
     checkpoint = name.removeprefix(PLANNER).removeprefix(":") or checkpoint_for(task.env_id)
     if checkpoint in (CONSTANT_VELOCITY, ORACLE) or is_own(checkpoint):
         return {"sha256": checkpoint, **settings}
-    with (resolve(checkpoint) / WEIGHTS).open("rb") as file:
-        return {"sha256": hashlib.file_digest(file, "sha256").hexdigest(), **settings}
+    return {"sha256": _hash_of(resolve(checkpoint) / WEIGHTS), **settings}
+
+
+def _hash_of(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _run_config(cell: Cell) -> dict[str, Any]:

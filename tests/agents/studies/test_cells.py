@@ -2,11 +2,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from stable_baselines3 import PPO
 
 from agents.presets import PPOPreset, QRDQNPreset
 from agents.studies.cells import NETWORK, Cell, cells_of
 from agents.studies.plan import read_study
 from envs.drivers.planner import PlannerConfig
+from envs.registry import make_env
 from predictor.support.errors import UserError
 from tests.agents.studies.helpers import study_path, study_text
 
@@ -82,6 +84,19 @@ def test_the_forecaster_is_in_the_name(cells: Callable[..., list[Cell]]):
         for name in ("highway", "merge", "highway")
     )
     assert one.name == third.name != other.name and one.forecaster != other.forecaster
+
+
+def test_a_policy_that_drives_is_in_the_name_by_its_content(cells: Callable[..., list[Cell]], tmp_path: Path):
+    path = tmp_path / "policy.zip"
+
+    def name(seed: int) -> str:
+        sizes = {"n_steps": 4, "batch_size": 4, "policy_kwargs": {"net_arch": [4]}}
+        PPO("MlpPolicy", make_env(HIGHWAY), seed=seed, **sizes).save(path)
+        first, again = (cells(env_id=HIGHWAY, seeds="1", references=f'["{path}"]')[0] for _ in range(2))
+        assert first.line == str(path) and first.name == again.name
+        return first.name
+
+    assert name(0) != name(1)
 
 
 def test_the_planners_settings_are_in_the_name(cells: Callable[..., list[Cell]], monkeypatch: pytest.MonkeyPatch):
