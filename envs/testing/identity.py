@@ -100,17 +100,18 @@ def _handed(episode: Episode, rule: _Rule) -> Iterator[str]:
 def _better(
     first: Moment, second: Moment, row: int, new: Float[np.ndarray, " state"], error: float, rule: _Rule
 ) -> int | None:
-    """Returns the id whose agent should be there, if it is not there itself."""
+    """Returns the id whose agent should be there and as fast, if it is not there itself.
+
+    An agent that ran into a slower one is where that one should be, too, and pushed it away; it is faster.
+    """
     rows = second.index_of
     for other, number in enumerate(first.ids.tolist()):
         if other == row or rule.error(first.states[other], new) > max(0.1 * error, 2 * rule.typical_m):
             continue
         elsewhere = number not in rows or rule.error(first.states[other], second.states[rows[number]]) > rule.handed_m
         axes = slice(rule.axes, 2 * rule.axes)
-        turned = np.linalg.norm(new[axes] - first.states[other][axes]) > np.linalg.norm(
-            new[axes] - first.states[row][axes]
-        )
-        if elsewhere and not turned:
+        changes = [float(np.linalg.norm(new[axes] - first.states[each][axes])) for each in (other, row)]
+        if elsewhere and changes[0] <= max(0.5 * changes[1], 2 * rule.typical_m / abs(rule.step_s)):
             return number
     return None
 
