@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from agents.forecast_errors import CONSTANT_ERROR, FORECAST_ERROR
 from agents.results import NOT_REPORTED, Evaluation, read_evaluation
 from agents.runs import CONFIG_FILE, CURVE_FILE, SUMMARY_FILE, read_config, read_curve
+from agents.summaries import EXTREMES
 from predictor.reports.document import JPEG, Block, Film, Heading, Paragraph, Picture, Table
 from predictor.reports.figures import files_of, panels
 from predictor.reports.looks import COLORS, GREY
@@ -25,13 +26,6 @@ INSIDE_BYTES, INSIDE_TOTAL_BYTES = 4 * MIB, 16 * MIB
 """Largest size of a film that is put into the page, and of all of them together; others are linked."""
 MOST_FILM_BYTES, MOST_FILMS = 1024 * MIB, 6
 """Largest size of a film, and largest number of films."""
-_FILMS = {
-    "video": "An evaluation episode, with the forecasts drawn in.",
-    "best": "The best episode of the evaluation.",
-    "median": "The median episode of the evaluation.",
-    "worst": "The worst episode of the evaluation.",
-}
-"""Captions of films, by the name of their file."""
 
 
 def policy_blocks(run: Path, accuracies: Sequence[Path]) -> list[Block]:
@@ -113,9 +107,21 @@ def films(run: Path) -> list[Block]:
         size = check_regular(file, MOST_FILM_BYTES)
         data = read_bytes(file, MOST_FILM_BYTES) if size <= min(INSIDE_BYTES, room) else b""
         room -= len(data)
-        caption = _FILMS.get(file.stem, "An episode of the policy, with the forecasts drawn in.")
-        blocks.append(Film(file.relative_to(run).as_posix(), caption, _still(file), data))
+        blocks.append(Film(file.relative_to(run).as_posix(), _caption(file), _still(file), data))
     return [Heading("Films"), *blocks] if blocks else []
+
+
+def _caption(file: Path) -> str:
+    """Returns what a film shows: of an extreme episode its seed and return, if the results beside it have them."""
+    if file.stem not in EXTREMES:
+        return "An episode of the policy, with the forecasts drawn in."
+    summary = file.parent / SUMMARY_FILE
+    noted = read_object(summary).get("films") if summary.is_file() else None
+    made = noted.get(file.stem) if isinstance(noted, dict) else None
+    told = f"The {file.stem} episode of an evaluation"
+    if not isinstance(made, dict) or not isinstance(made.get("return"), float):
+        return f"{told} whose results are no longer beside it."
+    return f"{told}: seed {short(str(made.get('seed')), 20)}, return {made['return']:.2f}."
 
 
 def _still(file: Path) -> bytes:

@@ -91,7 +91,22 @@ def test_large_films_are_linked_and_what_is_no_film_has_no_still(tmp_path: Path,
     monkeypatch.setattr("agents.run_page.INSIDE_BYTES", 3)
     page = page_of(run)
     assert '<video controls preload="none" src="worst.mp4">' in page
-    assert "The worst episode of the evaluation." in page and "poster" not in page
+    assert "The worst episode of an evaluation whose results are no longer beside it." in page and "poster" not in page
+
+
+def test_a_film_is_captioned_with_the_episode_of_the_evaluation_beside_it(tmp_path: Path):
+    """The run's table may be of another evaluation."""
+    run = a_run(tmp_path)
+    folder = run / "evaluation"
+    folder.mkdir()
+    for name in ("best", "median"):
+        (folder / f"{name}.mp4").write_bytes(b"no film at all")
+    write_json(folder / "summary.json", {"films": {"best": {"seed": 77, "return": 12.346, "file": "best.mp4"}}})
+    page = page_of(run)
+    assert "The best episode of an evaluation: seed 77, return 12.35." in page
+    assert "The median episode of an evaluation whose results are no longer beside it." in page
+    write_json(folder / "summary.json", {"films": {"best": ["<b>"], "median": {"return": "much"}}})
+    assert page_of(run).count("whose results are no longer beside it") == 2
 
 
 def test_names_of_strangers_are_text(tmp_path: Path):
