@@ -57,8 +57,8 @@ class TrainingPlan:
     device: str = "cpu"
     """Device that runs the policy's network: cpu, cuda or auto."""
     selections: int = 8
-    """Number of times, evenly spread, that the policy is measured on the selection seeds; once more at the end, where the
-    last rollout goes beyond `steps`."""
+    """Number of times, evenly spread, that the policy is measured on the selection seeds; once more at the end, where
+    the last rollout goes beyond `steps`."""
     selection_episodes: int = 20
     """Number of episodes per measurement; all measurements use the same seeds."""
     selection_envs: int = 2
