@@ -143,7 +143,8 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         Raises:
             UserError: see `envs.plans.checked_plans` and `envs.plans.playing.with_true_futures`.
         """
-        plans = checked_plans(plan_model, self, horizon_steps, self.reader.spec.num_features)
+        spec = self.reader.spec
+        plans = checked_plans(plan_model, self, horizon_steps, spec.num_features, self.scene, spec)
         return plans if played == 0 else with_true_futures(plans, self.env, self.reader, self.scene, played)
 
     def _observe(self, obs: Any) -> dict[str, Any]:

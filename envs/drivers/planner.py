@@ -163,7 +163,7 @@ class Planner:
         scene = self._scene()
         scenes = SceneBatch.stack([scene])
         self._online.observe(scenes)
-        plans = checked_plans(self.plan_model, self.env, self._horizon, self._spec.num_features)
+        plans = checked_plans(self.plan_model, self.env, self._horizon, self._spec.num_features, scene, self._spec)
         if plans.rewards is None:
             raise UserError(f"the planner needs rewards, but plan model {type(self.plan_model).__name__} gives none")
         forecast = self._online.forecast(self._horizon, self._samples, self._noise, plans.states[None])

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 from jaxtyping import Bool, Float
 
+from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError
 
 
@@ -65,7 +66,14 @@ def checked_model(model: Any) -> PlanModel:
     return cast(PlanModel, model)
 
 
-def checked_plans(model: PlanModel, env: gym.Env, horizon_steps: int, num_features: int) -> Plans:
+def checked_plans(
+    model: PlanModel,
+    env: gym.Env,
+    horizon_steps: int,
+    num_features: int,
+    scene: Scene | None = None,
+    spec: SceneSpec | None = None,
+) -> Plans:
     """Returns the plans of a model, after checking them.
 
     Args:
@@ -73,9 +81,12 @@ def checked_plans(model: PlanModel, env: gym.Env, horizon_steps: int, num_featur
         env: environment that was reset.
         horizon_steps: number of steps of a plan.
         num_features: number of features of a state.
+        scene: present scene of the environment's reader; with its `spec`, plans have to begin near its ego.
+        spec: layout of the scene.
 
     Raises:
-        UserError: plans of another shape, not finite numbers, or not one action for each plan and step.
+        UserError: plans of another shape, not finite numbers, not one action for each plan and step, or far from the
+            ego, as in a frame with another origin.
     """
     plans, count = model.plans(env, horizon_steps), len(model.names)
     source = f"plan model {type(model).__name__}"
@@ -104,4 +115,21 @@ def checked_plans(model: PlanModel, env: gym.Env, horizon_steps: int, num_featur
     later = None if plans.later_actions is None else [len(actions) for actions in plans.later_actions]
     if later not in (None, [horizon_steps - 1] * count):
         raise UserError(f"{source}: later_actions need {horizon_steps - 1} for each of {count} plans, got {later}")
+    if scene is not None and spec is not None:
+        _check_begin(plans.states, scene, spec, source)
     return plans
+
+
+def _check_begin(states: Float[np.ndarray, "plans horizon state"], scene: Scene, spec: SceneSpec, source: str) -> None:
+    """Raises if no plan begins near the ego: a few of its steps, and some slack at the scale of the scene."""
+    axes = spec.position_dim
+    ego = scene.states[0]
+    away_m = np.linalg.norm(states[:, 0, :axes] - ego[:axes], axis=-1)
+    steps_m = np.linalg.norm(np.diff(states[..., :axes], axis=1), axis=-1).max(initial=0.0)
+    reach_m = max(steps_m, spec.dt_s * float(np.linalg.norm(ego[axes : 2 * axes])))
+    if away_m.min() > 3 * reach_m + 0.1 * max(spec.feature_scales[:axes]):
+        first = states[away_m.argmin(), 0, :axes]
+        raise UserError(
+            f"{source}: plans must begin at the ego, in the frame of the reader; after a step the nearest is "
+            f"{away_m.min():.3g} m from it, got {first.tolist()} for an ego at {ego[:axes].tolist()}"
+        )

@@ -118,7 +118,7 @@ def moment(
         UserError: the environment cannot be copied, or its plan model does not say how plans go on.
     """
     scene = world.perceived()
-    plans = checked_plans(model, world.env, horizon_steps, world.spec.num_features)
+    plans = checked_plans(model, world.env, horizon_steps, world.spec.num_features, scene, world.spec)
     point = BranchPoint(world, horizon_steps)
     played = [point.plain, *(point.driven(_Script(actions)) for actions in _scripts(plans, model))]
     ego = int(point.ids[0])

@@ -10,11 +10,13 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from agents.features import ForecastAttention
+from envs.drivers.planner import Planner
 from envs.entries import FORECAST_KEYS, PATH_KEYS, WHAT_IF_KEYS, others_by_distance, what_if_entries
 from envs.plans import Plans
 from envs.plans.contact import contacts
 from envs.registry import make_env
-from envs.wrappers import ForecastObservation
+from envs.wrappers import ForecastObservation, SceneObservation
+from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.scene import SceneBatch
 from predictor.support.errors import UserError
 from tests.envs.helpers import assert_same
@@ -113,6 +115,26 @@ def test_a_plan_model_of_ones_own():
     assert obs["what_if_gap"].shape == (11, 1)
     assert env.what_if is not None
     np.testing.assert_allclose(env.what_if.xy[:, :, :, 0].numpy(), 0.0, atol=1e-4)  # it stays where it is
+
+
+class Elsewhere(Stay):
+    """Plans in a frame with another origin than the reader's."""
+
+    def plans(self, env: gym.Env, horizon_steps: int) -> Plans:
+        plans = super().plans(env, horizon_steps)
+        plans.states[..., 0] += 300.0
+        return plans
+
+
+def test_plans_in_another_frame_are_refused():
+    env = wrapped(what_if=Elsewhere())
+    with pytest.raises(UserError, match="plan model Elsewhere: plans must begin at the ego.*the nearest is 300 m from"):
+        env.reset(seed=0)
+    scenes = SceneObservation(make_env("highway-fast-v0"))
+    scenes.reset(seed=0)
+    planner = Planner(scenes, ConstantVelocity(scenes.scene_spec), Elsewhere())
+    with pytest.raises(UserError, match="plan model Elsewhere: plans must begin at the ego"):
+        planner(None)
 
 
 def test_environments_without_a_plan_model_are_refused():
