@@ -132,7 +132,7 @@ def load_policy(
     note = read_policy_note(zipped)
     model = policy_file.load_policy(zipped, device=device)
     if env is None:
-        task = task_of_policy(path)
+        task = task_of_policy(path, sized=False)
         env = task.make() if render_mode is None else task.make(render_mode=render_mode)
     elif render_mode is not None:
         raise UserError(f"render_mode={render_mode!r} is for a new environment; give it to the env that you pass")
@@ -142,14 +142,19 @@ def load_policy(
     return LoadedPolicy(TrainedPolicy(model, env), env)
 
 
-def task_of_policy(path: str | Path, device: str = "cpu") -> Task:
+def task_of_policy(path: str | Path, device: str = "cpu", sized: bool = True) -> Task:
     """Returns the task of a policy, by the note inside its zip or the config of its run folder.
 
     Code of a user's own (an environment "module:Id", a forecaster "own:module:name") is imported if the zip names it,
     which is as trusted as code; the config alone imports nothing.
 
+    Args:
+        path: policy, or its run folder.
+        device: device that runs the forecaster.
+        sized: whether the task's observation must have the sizes that the policy was trained with.
+
     Raises:
-        UserError: neither names an environment, or this version cannot make it.
+        UserError: neither names an environment, this version cannot make it, or only the run folder knows the sizes.
     """
     zipped = policy_zip(path)
     note = read_policy_note(zipped)
@@ -160,16 +165,16 @@ def task_of_policy(path: str | Path, device: str = "cpu") -> Task:
     if note is None or not note.env_id:
         policy_file.algorithm_of(zipped)  # has the message for what is no policy at all
         raise UserError(f"{zipped} does not say which environment it drives; pass env=, or the run folder it is from")
-    return _task_of_note(note, device)
+    return _task_of_note(note, device, sized)
 
 
-def _task_of_note(note: PolicyNote, device: str) -> Task:
+def _task_of_note(note: PolicyNote, device: str, sized: bool) -> Task:
     driven = {"device": device, "learners": note.learners, "driver": note.driver, "env_kwargs": note.env_kwargs}
     pin = note.forecaster
     if pin is None:
         return Task(note.env_id, "none", **driven)  # type: ignore[arg-type]
     constant = pin.checkpoint == CONSTANT_VELOCITY and pin.arm == "forecast"
-    return Task(
+    task = Task(
         note.env_id,
         CONSTANT_VELOCITY if constant else pin.arm,  # type: ignore[arg-type]
         None if constant else pin.checkpoint,
@@ -179,6 +184,9 @@ def _task_of_note(note: PolicyNote, device: str) -> Task:
         what_if=bool(pin.num_plans),
         **driven,  # type: ignore[arg-type]
     )
+    if sized and pin.layout is not None and pin.layout != task.options["arm"].layout:
+        raise UserError("the policy was trained with the sizes of another checkpoint (sizes_of); give its run folder")
+    return task
 
 
 def _of_many_agents(path: str, model: BaseAlgorithm, env: ParallelEnv, note: PolicyNote) -> LoadedPolicy:

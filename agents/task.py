@@ -199,9 +199,9 @@ class Task:
     @property
     def _sized(self) -> Forecaster | None:
         """Forecaster whose sizes the observation has; None for those of the one that is shown."""
-        if self.sizes_of is not None:
-            return _loaded(self.sizes_of)
-        return None if self.observe == "forecast" else _shipped_for(self.env_id)
+        if self.observe == "forecast" and self.sizes_of in (None, self.checkpoint or entry_for(self.env_id).checkpoint):
+            return None
+        return _shipped_for(self.env_id) if self.sizes_of is None else _loaded(self.sizes_of)
 
     def make(self, **kwargs: Any) -> Any:
         """Makes the environment, without forecasts.

@@ -18,6 +18,7 @@ from envs.parallel import ForecastParallelEnv
 from envs.wrappers import ForecastObservation
 from predictor.support.errors import UserError
 from tests.agents.helpers import policy_for
+from tests.envs.helpers import HIGHWAY_SPEC, save_tiny
 
 FAST, TAG = "highway-fast-v0", "simple_tag_v3"
 FEW = json.dumps({"config": {"vehicles_count": 5, "duration": 4}})
@@ -92,6 +93,18 @@ def test_an_environment_can_be_given(tmp_path: Path):
         load_policy(path, mine, render_mode="human")
     with pytest.raises(UserError, match="was trained on .* but the env gives"):
         load_policy(path, gym.make("CartPole-v1"))
+
+
+def test_the_sizes_of_another_checkpoint_stand_in_the_run_folder(tmp_path: Path):
+    """A zip alone plays in its environment, but does not say which checkpoint its sizes are from."""
+    large = save_tiny(tmp_path / "large", HIGHWAY_SPEC, num_edge_types=4)
+    path, _ = saved(tmp_path, Task(FAST, "zeros", sizes_of=large))
+    policy, env = load_policy(path)
+    observation, _ = env.reset(seed=0)
+    assert observation["edge_probs"].shape == (11, 2 * 3)
+    assert policy(observation) in env.action_space
+    with pytest.raises(UserError, match="trained with the sizes of another checkpoint .*; give its run folder"):
+        task_of_policy(path)
 
 
 def test_another_forecaster_is_refused(tmp_path: Path):
