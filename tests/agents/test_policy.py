@@ -101,7 +101,7 @@ def test_the_sizes_of_another_checkpoint_stand_in_the_run_folder(tmp_path: Path)
     path, _ = saved(tmp_path, Task(FAST, "zeros", sizes_of=large))
     policy, env = load_policy(path)
     observation, _ = env.reset(seed=0)
-    assert observation["edge_probs"].shape == (11, 2 * 3)
+    assert observation["edge_probs"].shape[-1] == 2 * 3
     assert policy(observation) in env.action_space
     with pytest.raises(UserError, match="trained with the sizes of another checkpoint .*; give its run folder"):
         task_of_policy(path)
