@@ -13,7 +13,6 @@ from predictor.checkpoint import PRETRAINED as CHECKPOINT_FOLDER
 from predictor.checkpoint import WEIGHTS, load_checkpoint
 from predictor.evaluation.in_env_record import FILE_NAME, Measurement, read_record
 from predictor.reports.in_env_tables import (
-    COLUMNS,
     card_section,
     measurement_table,
     metres,
@@ -44,10 +43,6 @@ LONG = (
     "one step of history (95 %) [m]", "nearest neighbours ADE [m]", "constant velocity ADE / FDE [m]",
     "ADE below constant velocity (95 %)", "latency median / p95 [ms]", "forecasts",
 )  # fmt: skip
-LENT = (
-    "env", "driver", "episodes", "minADE₁ [m]", "nearest neighbours ADE [m]", "constant velocity ADE / FDE [m]",
-    "ADE below constant velocity (95 %)",
-)  # fmt: skip
 
 Records = dict[str, list[Measurement]]
 """Measurements by the name of the checkpoint."""
@@ -63,7 +58,6 @@ def tables(records: Records) -> dict[str, str]:
         "forecasts": measurement_table(own, SHORT),
         "forecasts-long": measurement_table(own, LONG),
         "samples": samples_table(own),
-        "lent": _lent(at_k),
         "transfer": _transfer(records),
     }
 
@@ -108,17 +102,6 @@ def _sizes() -> str:
             ]
         )
     return table(SIZES, lines, "--r")
-
-
-def _lent(records: Records) -> str:
-    """Returns the table of ids without a checkpoint of their own, by id, each with the checkpoint measured."""
-    lines = [(m, name) for name, found in records.items() for m in found if m.env_id not in SERVED_BY]
-    heading, *rest = LENT
-    cells = [
-        [measurement.env_id, name, *(COLUMNS[column](measurement) for column in rest)]
-        for measurement, name in sorted(lines, key=lambda line: line[0].env_id)
-    ]
-    return table([heading, "checkpoint", *rest], cells, "--r")
 
 
 def _transfer(records: Records) -> str:

@@ -63,9 +63,9 @@ _HIGHWAY: dict[str, EnvEntry] = {
     "racetrack-oval-v1": EnvEntry(checkpoint="racetrack-oval"),
     "u-turn-v1": EnvEntry(checkpoint="u-turn"),
     "highway-mixed-v0": EnvEntry(checkpoint="highway-mixed"),
-    "merge-mixed-v0": EnvEntry(),
-    "roundabout-mixed-v0": EnvEntry(),
-    "intersection-mixed-v0": EnvEntry(),
+    "merge-mixed-v0": EnvEntry(checkpoint="merge-mixed"),
+    "roundabout-mixed-v0": EnvEntry(checkpoint="roundabout-mixed"),
+    "intersection-mixed-v0": EnvEntry(checkpoint="intersection-mixed"),
 }
 """highway-env's ids, and those of `envs.simulators.mixed_traffic`."""
 
@@ -92,10 +92,11 @@ ENVS: dict[str, EnvEntry] = {
         for env_id, task in ENVPOOL_IDS.items()
         if task in known_tasks()
     },
-    **{env_id: _mpe(env_id) for env_id in MPE_IDS},
+    **{env_id: _mpe(env_id, "particles") for env_id in MPE_IDS},
+    "collect_treasure_v1": _mpe("collect_treasure_v1"),
     "simple_tag_v3": _mpe("simple_tag_v3", "simple-tag", learners=("adversary",)),
     "simple_spread_v3": _mpe("simple_spread_v3", "simple-spread"),
-    "simple_world_comm_v3": _mpe("simple_world_comm_v3", learners=("adversary",)),
+    "simple_world_comm_v3": _mpe("simple_world_comm_v3", "particles", learners=("adversary",)),
     "pursuit_v5": EnvEntry("pettingzoo.sisl.pursuit.pursuit:parallel_env", drivers=HEURISTIC_DRIVERS),
     "intersection-multi-agent-v2": _intersection("intersection-multi-agent-v2", "intersection"),
     "intersection-multi-agent-v1": _intersection("intersection-multi-agent-v1"),

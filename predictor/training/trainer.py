@@ -79,6 +79,7 @@ def load_data(config: TrainConfig) -> TrainingData:
     spec = stores[0].info.spec
     for path, store in zip((*config.data, *config.val_data), stores, strict=True):
         spec.check_compatible(store.info.spec, f"store {address(config.data[0])}", f"store {address(path)}")
+    spec = replace(spec, max_agents=max(store.info.spec.max_agents for store in stores[: len(config.data)]))
     _check_labels(config, stores)
     sources = tuple(s.info.source for s in stores[: len(config.data)])
     if config.val_data:

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, MULTIAGENT_IDS
+from envs.readers.mpe import MPE_IDS
+from envs.registry import CHECKPOINTS, ENVS, MULTIAGENT_CHECKPOINTS, MULTIAGENT_IDS
 from predictor.evaluation.paper_tables import NUM_SAMPLES
 from predictor.models import configure
 from predictor.suite import TABLES, SuiteConfig, line_config
@@ -90,14 +91,15 @@ def test_what_wraps_with_one_argument_is_what_has_a_checkpoint():
         for cells in next(t for t in tables(OBSERVATIONS) if "environments" in t[0][0])
     }
     one_argument = " ".join(name for name, code in lines.items() if re.search(r"\(env\)`", code))
-    for env_id in ("simple_tag_v3", "simple_spread_v3", "highway-mixed-v0", "highway-mixed-costly-v0"):
-        assert f"`{env_id}`" in one_argument
     assert len([e for e in CHECKPOINTS if "mixed" not in e]) == 13 and "thirteen ids" in one_argument
-    assert [e for e in CHECKPOINTS if "mixed" in e] == ["highway-mixed-v0"]
-    assert set(MULTIAGENT_CHECKPOINTS) == {"simple_tag_v3", "simple_spread_v3", "intersection-multi-agent-v2"}
+    assert len([e for e in ENVS if "mixed" in e]) == 5 and "five [mixed-driver" in one_argument
+    assert len(set(MULTIAGENT_CHECKPOINTS) & set(MPE_IDS)) == 10 and "ten ids" in one_argument
     others = [e for e in MULTIAGENT_IDS if e not in MULTIAGENT_CHECKPOINTS]
-    named = next(name for name in lines if "nine more mpe2 ids" in name)
-    assert "pursuit" in named and len([e for e in others if "intersection" not in e and "pursuit" not in e]) == 9
+    assert others == [
+        "collect_treasure_v1", "pursuit_v5", "intersection-multi-agent-v1", "intersection-multi-agent-v0"
+    ]  # fmt: skip
+    named = next(name for name in lines if "pursuit" in name)
+    assert all(e.removeprefix("intersection-multi-agent").removesuffix("_v5") in named for e in others)
     assert "checkpoint" in lines[named]
 
 
@@ -108,7 +110,18 @@ def test_what_the_shipped_checkpoints_use_of_the_newer_parts_is_what_their_confi
     }
     sees_changes = {name for name, config in configs.items() if config.get("change_scales")}
     fitted = {name for name, config in configs.items() if config.get("input_scales")}
-    words = {3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine", 10: "ten"}
+    words = {
+        3: "three",
+        4: "four",
+        5: "five",
+        6: "six",
+        7: "seven",
+        8: "eight",
+        9: "nine",
+        10: "ten",
+        12: "twelve",
+        13: "thirteen",
+    }
     assert f"Of {len(configs)}, {words[len(sees_changes)]} see changes" in LIMITS
     assert f"{words[len(fitted)]} of these have fitted input scales" in LIMITS and fitted <= sees_changes
     assert all(f"`{name}`" in LIMITS.split("fitted input scales")[1].split("\n* ")[0] for name in fitted)

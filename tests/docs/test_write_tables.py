@@ -46,7 +46,7 @@ def test_every_page_has_its_tables():
     assert named == {
         "README.md": ["first"],
         "checkpoints.md": ["checkpoints", "forecasts"],
-        "in_env.md": ["forecasts-long", "samples", "lent", "transfer"],
+        "in_env.md": ["forecasts-long", "samples", "transfer"],
     }
     cards = list((ROOT / write_tables.PRETRAINED).glob("*/README.md"))
     assert len(cards) == len(RECORDS) == len(set(write_tables.SERVED_BY.values()))

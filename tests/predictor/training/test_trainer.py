@@ -217,6 +217,15 @@ def test_validation_stores_are_used_as_they_are(circles: Path, tmp_path: Path):
     )
 
 
+def test_a_checkpoint_sees_as_many_agents_as_the_largest_of_its_stores(circles: Path, tmp_path: Path):
+    larger = replace(spec(), max_agents=spec().max_agents + 5)
+    write_store(tmp_path / "larger", StoreInfo(larger, "larger"), [circling_episode(i) for i in range(6)])
+    both = config(circles, tmp_path, data=(circles, tmp_path / "larger"))
+    assert load_data(both).spec == larger
+    validated = config(circles, tmp_path, val_data=(tmp_path / "larger",))
+    assert load_data(validated).spec == spec()
+
+
 def test_validation_stores_must_fit(circles: Path, tmp_path: Path):
     write_store(tmp_path / "val", StoreInfo(spec(dt_s=0.2), "quick"), [circling_episode(0)])
     with pytest.raises(UserError, match=r"store .*circles was trained at dt_s=1 but store .*val steps at dt_s=0\.2"):
