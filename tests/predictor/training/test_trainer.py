@@ -220,7 +220,7 @@ def test_validation_stores_are_used_as_they_are(circles: Path, tmp_path: Path):
 def test_a_checkpoint_sees_as_many_agents_as_the_largest_of_its_stores(circles: Path, tmp_path: Path):
     larger = replace(spec(), max_agents=spec().max_agents + 5)
     write_store(tmp_path / "larger", StoreInfo(larger, "larger"), [circling_episode(i) for i in range(6)])
-    both = config(circles, tmp_path, data=(circles, tmp_path / "larger"))
+    both = replace(config(circles, tmp_path), data=(circles, tmp_path / "larger"))
     assert load_data(both).spec == larger
     validated = config(circles, tmp_path, val_data=(tmp_path / "larger",))
     assert load_data(validated).spec == spec()
