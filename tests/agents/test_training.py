@@ -282,6 +282,19 @@ class Killed(Exception):
     """Stands for a kill."""
 
 
+def dies_after(calls: int, kind: type, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Raises `Killed` after so many calls of a method, once."""
+    kept, left = getattr(kind, method), [calls]
+
+    def call_and_die(self: Any) -> None:
+        kept(self)
+        left[0] -= 1
+        if left[0] == 0:
+            raise Killed
+
+    monkeypatch.setattr(kind, method, call_and_die)
+
+
 @pytest.mark.filterwarnings("ignore:rich is experimental")
 @pytest.mark.parametrize(
     ("algorithm", "task", "preset"),
@@ -313,15 +326,7 @@ def test_a_repeatable_run_that_was_killed_ends_as_one_that_was_not(
         (tmp_path / name).mkdir()
     train(training, tmp_path / "whole")
 
-    measure, left = SelectBest._measure, [3]
-
-    def measure_and_die(self: SelectBest) -> None:
-        measure(self)
-        left[0] -= 1
-        if left[0] == 0:
-            raise Killed
-
-    monkeypatch.setattr(SelectBest, "_measure", measure_and_die)
+    dies_after(3, SelectBest, "_measure", monkeypatch)
     with pytest.raises(Killed):
         train(training, tmp_path / "killed")
     saved = load_model(tmp_path / "killed" / "checkpoint.zip", algorithm).num_timesteps
@@ -355,19 +360,10 @@ def test_errors_in_the_loop_cover_all_steps_since_the_last_measurement(tmp_path:
     (tmp_path / "killed").mkdir()
     train(training, tmp_path / "whole")
 
-    save, left = SaveCheckpoint._on_rollout_start, [3]
-
-    def save_and_die(self: SaveCheckpoint) -> None:
-        save(self)
-        left[0] -= 1
-        if left[0] == 0:
-            raise Killed
-
-    monkeypatch.setattr(SaveCheckpoint, "_on_rollout_start", save_and_die)
+    dies_after(3, SaveCheckpoint, "_on_rollout_start", monkeypatch)
     with pytest.raises(Killed):
         train(training, tmp_path / "killed")
     assert load_model(tmp_path / "killed" / "checkpoint.zip", "ppo").num_timesteps == 32
-    left[0] = 100
     train(training, tmp_path / "killed")
     whole, killed = counted
     assert whole == killed > 3 * 64, "five others in sight at most: the last 16 steps alone have no more than 80"
