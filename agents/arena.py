@@ -1,6 +1,6 @@
 """Measures policies: plays given seeds with a trained policy or with a named driver in its place."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -196,24 +196,12 @@ class MultiagentArena:
         while env.agents and not (lived.issuperset(returns) and returns.keys().isdisjoint(env.agents)):
             own = own_observations(observations)
             actions = driver({agent: seen for agent, seen in own.items() if agent in returns})
-            observations, rewards, *_ = env.step(actions_of_others(env, own, returns) | actions)
+            observations, rewards, *_ = env.step(env.drive_others(own) | actions)
             lived.update(env.agents)
             for agent in returns:
                 returns[agent] += float(rewards.get(agent, 0.0))
             steps += 1
         return _result(seed, steps, returns)
-
-
-def actions_of_others(env: Any, own: Mapping[str, Any], learners: Collection[str]) -> dict[str, Any]:
-    """Returns the actions of the agents that do not learn, chosen by the environment's driver.
-
-    Args:
-        env: environment with a `DrivenEnv` inside.
-        own: the environment's own observation of each living agent.
-        learners: names of the agents that learn.
-    """
-    others = {agent: seen for agent, seen in own.items() if agent not in learners}
-    return env.driver(others) if others else {}
 
 
 def _result(seed: int, steps: int, returns: Mapping[str, float]) -> EpisodeResult:

@@ -13,11 +13,10 @@ import gymnasium as gym
 from pettingzoo import ParallelEnv
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from agents.arena import actions_of_others
 from agents.hub import local_policy
 from agents.runs import CONFIG_FILE, policy_zip, read_config
 from agents.task import Task, task_of
-from agents.vec_envs import DrivenEnv, own_observations
+from agents.vec_envs import DrivenEnv
 from envs.drivers.trained import env_for_driver, wrapper_options
 from envs.parallel import ForecastParallelEnv
 from envs.sb3 import policy_file
@@ -190,7 +189,7 @@ def _task_of_note(note: PolicyNote, device: str, sized: bool) -> Task:
 
 
 def _of_many_agents(path: str, model: BaseAlgorithm, env: ParallelEnv, note: PolicyNote) -> LoadedPolicy:
-    driven: Any = DrivenEnv(env, note.driver)
+    driven: Any = DrivenEnv(env, note.driver, learners_named(env.possible_agents, note.learners, f"policy {path}"))
     if note.forecaster is not None:
         driven = ForecastParallelEnv(driven, **wrapper_options(path))
     return LoadedPolicy(_TeamPolicy(path, model, driven, note.learners), driven)
@@ -213,7 +212,7 @@ class _TeamPolicy(TrainedPolicy):
 
     def __call__(self, observation: Any) -> Any:
         seen = {agent: one for agent, one in observation.items() if agent in self._env.agents}
-        chosen = actions_of_others(self._env, own_observations(seen), self._actions)
+        chosen = self._env.drive_others(seen)
         for agent in (name for name in seen if name in self._actions):
             chosen[agent] = own_action(self._action(agent, self._padded.one(agent, seen[agent])), self._actions[agent])
         return chosen

@@ -8,7 +8,7 @@ policy sees, so that training, evaluation and video agree.
 
 import multiprocessing
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -74,29 +74,38 @@ class DrivenEnv(BaseParallelWrapper):
     Args:
         env: a PettingZoo environment.
         driver: name of the driver in `envs.drivers.all_agents`.
+        learners: names of the agents that learn.
 
     Attributes:
         episodes: number of resets so far.
     """
 
-    def __init__(self, env: ParallelEnv, driver: str) -> None:
+    def __init__(self, env: ParallelEnv, driver: str, learners: Collection[str]) -> None:
         """Wraps the environment; the first driver is made after the first reset."""
         super().__init__(env)
         self._name, self._id, self._place = driver, multiagent_env_id(env), Place()
+        self._learners = frozenset(learners)
         self._rng = driver_rng(0)
         self._driver: Driver | None = None
         self.episodes = 0
 
-    @property
-    def driver(self) -> Driver:
-        """Driver of this episode, made at the first access, as some names cannot drive some environments.
+    def drive_others(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns the actions of the agents that do not learn, chosen by the driver of this episode.
+
+        It is made when it is first needed, as some names cannot drive some environments.
+
+        Args:
+            observations: observation of each living agent, with or without forecasts.
 
         Raises:
             UserError: see `envs.drivers.all_agents.make_driver`.
         """
+        others = {name: without_added(seen) for name, seen in observations.items() if name not in self._learners}
+        if not others:
+            return {}
         if self._driver is None:
             self._driver = make_driver(self._name, self.env, self._rng)
-        return self._driver
+        return self._driver(others)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], Any]:
         """Resets the environment; a seed also fixes the drivers of this and the following episodes."""
@@ -124,7 +133,8 @@ class DrivenEnv(BaseParallelWrapper):
 
 def drive(env: Any, observations: Mapping[str, Any], generator: np.random.Generator) -> dict[str, Any]:
     """Returns the actions of the agents that do not learn, for `ParallelVecEnv`: those of the episode's driver."""
-    return env.driver(own_observations(observations))
+    actions: dict[str, Any] = env.drive_others(observations)
+    return actions
 
 
 def own_observations(observations: Mapping[str, Any]) -> dict[str, Any]:
@@ -147,7 +157,7 @@ class MakeCopy:
         """Makes the environment in a `DrivenEnv`, with forecasts around it unless the task observes none."""
         options = {} if self.render_mode is None else {"render_mode": self.render_mode}
         made = self.task.make(**options)
-        env = DrivenEnv(shaped(made) if self.for_learning else made, self.task.driver)
+        env = DrivenEnv(shaped(made) if self.for_learning else made, self.task.driver, learners_of(self.task, made))
         return env if self.task.observe == "none" else self.task.wrapped(env)
 
 

@@ -7,7 +7,6 @@ from typing import Any, Protocol, runtime_checkable
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from agents.arena import actions_of_others
 from agents.summaries import EXTREMES
 from agents.task import EVALUATION_SEED, Task
 from agents.vec_envs import EpisodeResult, MakeCopy, learners_of, make_multiagent_venv, own_observations
@@ -53,7 +52,7 @@ def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) ->
 
     def act(observations: dict[str, Any]) -> dict[str, Any]:
         own = own_observations(observations)
-        actions = actions_of_others(env, own, learners)
+        actions = env.drive_others(own)
         for agent in observations:
             if agent in learners:
                 seen = own[agent] if task.observe == "none" else observations[agent]

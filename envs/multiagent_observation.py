@@ -110,6 +110,8 @@ class MultiagentStream(SceneStream):
 
     def _views(self, scenes: Sequence[MultiagentScene], forecast: Forecast) -> list[AgentEntries]:
         arm = self.config.arm
+        if arm.shown.true_futures:
+            forecast = _as_told(scenes, forecast)
         fill = None if arm.changes_nothing else functools.partial(arm.filled, spaces=self._spaces)
         return view_entries(scenes, forecast, self.view_spec, self.config.shows_uncertainty, fill)
 
@@ -124,6 +126,19 @@ class MultiagentStream(SceneStream):
 
     def _shown(self, forecast: Forecast) -> Forecast:
         return forecast.without_first(self._front)
+
+
+def _as_told(scenes: Sequence[MultiagentScene], like: Forecast) -> Forecast:
+    """Returns a forecast that says the true positions of the scenes and nothing of their spread.
+
+    Raises:
+        UserError: a scene has none.
+    """
+    told = [scene.true_xy for scene in scenes if scene.true_xy is not None]
+    if len(told) < len(scenes):
+        raise UserError("an oracle needs scenes with true_xy, which ForecastParallelEnv adds")
+    xy = torch.from_numpy(np.stack(told)[:, None]).to(like.xy)
+    return replace(like, xy=xy, mode_probs=None, xy_scale=None)
 
 
 def _batch(scenes: Sequence[MultiagentScene]) -> SceneBatch:

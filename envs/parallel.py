@@ -12,6 +12,7 @@ with one ego, use `envs.wrappers.ForecastObservation`.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from envs.forecast_wrapper import ForecastWrapper, ObservationLayout
 from envs.multiagent_observation import MultiagentStream, check_multiagent_scene
 from envs.observation import open_forecaster
 from envs.own_observation import own_entries, own_spaces
+from envs.plans.keeping_on import all_keeping_on
 from envs.readers import MakeReader, multiagent_env_id, multiagent_reader_for
 from envs.readers.base import MultiagentReader, MultiagentScene, build_multiagent_reader, check_bounds
 from envs.scene_stream import ForecastConfig
@@ -60,8 +62,8 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         forecaster: forecaster on `device`, instead of a checkpoint; the same as giving it as `checkpoint`.
         seed: random seed of the samples' noise, until `reset(seed=…)` gives another.
         reader: function or class that makes a reader for the env; None picks one by env family.
-        arm: part of the forecast that observations show, for controlled comparisons (`envs.arms`, docs/arms.md);
-            none with true futures.
+        arm: part of the forecast that observations show, for controlled comparisons (`envs.arms`, docs/arms.md). With
+            true futures each learner repeats its last action in them.
 
     Raises:
         UserError: not a parallel env, no reader, no checkpoint, a forecaster of another spec (features, dt) or relative
@@ -101,15 +103,13 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         env_id = multiagent_env_id(env)
         forecaster = open_forecaster(checkpoint, spec, env_id, device, forecaster)
         perception_m = forecaster.spec.perception_m if perception_m is None else perception_m
-        arm = arm_of(arm)
-        if arm.shown.true_futures:
-            raise UserError(f"arm '{arm.name}' needs an environment with one ego, {self._source} has several learners")
-        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, arm=arm)
+        config = ForecastConfig(horizon_steps, num_samples, device, seed, flatten, arm=arm_of(arm))
         self.stream: MultiagentStream = MultiagentStream(forecaster, spec, config, perception_m, max_agents)
         self._layouts: dict[str, ObservationLayout] = {}
         self._forward: BatchedForward | None = None
         self._place = 0
         self._scene: MultiagentScene | None = None
+        self._last_actions: Mapping[str, Any] = {}
         for agent in getattr(env, "possible_agents", ()):
             self.observation_space(agent)
 
@@ -170,7 +170,8 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         """Resets the env and clears the history; a seed also restarts the samples' noise."""
         observations, infos = self.env.reset(seed=seed, options=options)
         self._reader.reset()
-        scene, shown = self._read(), self._own(observations)
+        self._last_actions = {}
+        scene, shown = self._read(observations), self._own(observations)
         if self._forward is not None:
             self._forward.begin(self._place, scene, shown, seed)
             return shown, infos
@@ -184,17 +185,24 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any]]:
         """Steps the env, takes in the scene and forecasts."""
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
-        scene, shown = self._read(), self._own(observations)
+        self._last_actions = dict(actions)
+        scene, shown = self._read(observations), self._own(observations)
         if self._forward is not None:
             self._forward.go_on(self._place, scene, shown)
         else:
             shown = self._with_views(scene, shown)
         return shown, rewards, terminations, truncations, infos
 
-    def _read(self) -> MultiagentScene:
-        scene = self._reader.read(self.env)
-        self._scene = check_multiagent_scene(scene, self._reader.spec, f"scene reader of {self._source}")
-        return self._scene
+    def _read(self, observations: Mapping[str, Any]) -> MultiagentScene:
+        scene = check_multiagent_scene(
+            self._reader.read(self.env), self._reader.spec, f"scene reader of {self._source}"
+        )
+        if self.stream.config.arm.shown.true_futures:
+            horizon_steps = self.stream.horizon_steps
+            xy_m = all_keeping_on(self.env, self._reader, scene.scene, observations, self._last_actions, horizon_steps)
+            scene = replace(scene, true_xy=xy_m)
+        self._scene = scene
+        return scene
 
     def _own(self, observations: Mapping[str, Any]) -> dict[str, Any]:
         return {agent: own_entries(own) for agent, own in observations.items()}

@@ -2,9 +2,10 @@
 
 This is what a perfect forecaster would say: the copy has the simulator's state and random streams, so that the others
 do in it exactly what they will do if the ego takes the plan's actions. It is the upper bound of what forecasts can
-bring, for measurements; an agent in the world has no such copy.
+bring, for measurements; an agent in the world has no such copy. Of several learners: `envs.plans.keeping_on`.
 """
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -65,6 +66,28 @@ def as_forecast(
     return replace(like, xy=positions[:, :, None], mode_probs=None, xy_scale=None)
 
 
+def followed(scene: Scene, dt_s: float, moments: Iterable[Scene | None]) -> Float[np.ndarray, "agents horizon 2"]:
+    """Returns where the agents of a scene are in each of the next moments [m], world frame.
+
+    Args:
+        scene: scene before the first moment.
+        dt_s: time between moments [s].
+        moments: all agents at each; an agent that is missing goes on at its last velocity, at a None all do.
+    """
+    place_of = {int(agent): i for i, agent in enumerate(scene.ids) if scene.valid[i]}
+    states = np.where(scene.valid[:, None], scene.states, 0.0)
+    xy_m = []
+    for now in moments:
+        states = states.copy()
+        states[:, :2] += dt_s * states[:, 2:4]
+        if now is not None:
+            for agent, state, valid in zip(now.ids, now.states, now.valid, strict=True):
+                if valid and (place := place_of.get(int(agent))) is not None:
+                    states[place] = state
+        xy_m.append(states[:, :2])
+    return np.stack(xy_m, axis=1)
+
+
 def _played(
     env: gym.Env, reader: SceneReader, scene: Scene, actions: tuple[Any, ...]
 ) -> Float[np.ndarray, "agents horizon 2"]:
@@ -73,22 +96,19 @@ def _played(
     goes_on = isinstance(env.unwrapped, AbstractEnv)  # highway-env simulates on after the end of an episode
     if goes_on and isinstance(reader, HighwayReader):  # which reads no observations
         _leave_undrawn(env.unwrapped)
-    place_of = {int(agent): i for i, agent in enumerate(scene.ids) if scene.valid[i]}
-    states = np.where(scene.valid[:, None], scene.states, 0.0)
-    xy_m, dt_s, over = np.zeros((len(states), len(actions), 2)), reader.spec.dt_s, False
-    for step, action in enumerate(actions):
-        states = states.copy()
-        states[:, :2] += dt_s * states[:, 2:4]
-        if not over:
+
+    def moments() -> Iterator[Scene | None]:
+        over = False
+        for action in actions:
+            if over:
+                yield None
+                continue
             observation, _, terminated, truncated, _ = env.step(action)
             show(reader, observation)
             over = bool(terminated or truncated) and not goes_on
-            now = reader.read_all(env)
-            for agent, state, valid in zip(now.ids, now.states, now.valid, strict=True):
-                if valid and (place := place_of.get(int(agent))) is not None:
-                    states[place] = state
-        xy_m[:, step] = states[:, :2]
-    return xy_m
+            yield reader.read_all(env)
+
+    return followed(scene, reader.spec.dt_s, moments())
 
 
 def _leave_undrawn(copy: Any) -> None:

@@ -48,6 +48,9 @@ class MultiagentScene:
     last observation."""
     heading_rad: Float[np.ndarray, " agents"]
     """Heading of each agent, which turns world axes into its own; 0 where agents have none."""
+    true_xy: Float[np.ndarray, "agents horizon 2"] | None = None
+    """Positions of all agents if the learners keep on [m], world frame; None unless an oracle has played them
+    (`envs.plans.keeping_on`)."""
 
 
 @runtime_checkable

@@ -49,6 +49,23 @@ def test_unknown_learners_are_named():
         make_multiagent_venv(Task(TAG, learners=("wolf",), observe="none"), 1)
 
 
+def test_the_oracle_of_a_task_repeats_the_learners_actions_alone():
+    """The prey, which does not learn, is driven in the copy as it is then driven in the environment."""
+    venv = make_multiagent_venv(Task(TAG, "oracle", learners=("adversary",)), 1)
+    venv.seed(5)
+    venv.reset()
+    env, pushes = venv.venv.envs[0], np.array([1, 2, 4])  # type: ignore[attr-defined]
+    assert list(env.drive_others(env.reset(seed=5)[0])) == ["agent_0"]
+    venv.seed(5)
+    venv.reset()
+    venv.step(pushes)
+    true = env.scene.true_xy
+    for step in range(true.shape[1]):
+        venv.step(pushes)
+        np.testing.assert_allclose(env.scene.scene.states[:, :2], true[:, step], atol=1e-9)
+    venv.close()
+
+
 def test_learners_observe_what_the_task_says():
     own = make_multiagent_venv(Task(SPREAD, "none"), 1)
     assert own.observation_space == make_multiagent_env(SPREAD).observation_space("agent_0")
@@ -126,28 +143,27 @@ def test_the_prey_is_driven_anew_in_each_episode_by_seed(driver: str, observe: A
     assert {len(actions) for actions in played} == {25}  # mpe2's max_cycles
 
 
-def test_a_driver_serves_one_episode():
-    env = DrivenEnv(make_multiagent_env(TAG), "random")
-    env.reset(seed=0)
-    first = env.driver
-    assert env.driver is first
-    env.reset()
-    assert env.driver is not first
-    assert env.episodes == 2
+def test_a_driver_serves_one_episode(monkeypatch: pytest.MonkeyPatch):
+    made: list[str] = []
+
+    def note(name: str, env: Any, rng: np.random.Generator) -> Any:
+        made.append(name)
+        return make_driver(name, env, rng)
+
+    monkeypatch.setattr("agents.vec_envs.make_driver", note)
+    env = DrivenEnv(make_multiagent_env(TAG), "random", ["adversary_0"])
+    for episode in range(2):
+        seen, _ = env.reset(seed=episode)
+        assert [set(env.drive_others(seen)) for _ in range(2)] == [{"adversary_1", "adversary_2", "agent_0"}] * 2
+    assert made == ["random"] * 2 and env.episodes == 2
 
 
-def test_drivers_by_name_see_no_forecasts():
+def test_drivers_by_name_see_no_forecasts(monkeypatch: pytest.MonkeyPatch):
     seen: list[Any] = []
-
-    class Driven(gym.Space[Any]):
-        agents = ["ant"]
-
-        @staticmethod
-        def driver(observations: dict[str, Any]) -> dict[str, Any]:
-            seen.append(observations)
-            return {}
-
-    drive(Driven, {"ant": {"observation": 1, "forecast": 2}, "bee": 3}, np.random.default_rng())
+    monkeypatch.setattr("agents.vec_envs.make_driver", lambda *_: lambda others: seen.append(others) or {})
+    env = DrivenEnv(make_multiagent_env(TAG), "random", ["cat"])
+    env.reset(seed=0)
+    drive(env, {"ant": {"observation": 1, "forecast": 2}, "bee": 3, "cat": 4}, np.random.default_rng())
     assert seen == [{"ant": 1, "bee": 3}]
 
 

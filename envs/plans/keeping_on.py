@@ -1,0 +1,70 @@
+"""True futures of environments with several learners: plays a copy in which each of them repeats its last action.
+
+What `envs.plans.playing` does for the plans of one ego. What the learners will do is not known; what the others do, if
+the learners keep on, is played exactly.
+"""
+
+from collections.abc import Iterator, Mapping
+from itertools import repeat
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from pettingzoo import ParallelEnv
+from pettingzoo.utils import BaseParallelWrapper
+
+from envs.plans.playing import followed
+from envs.readers.base import MultiagentReader
+from envs.simulators.copies import RunningCopy, running_copy
+from predictor.scene import Scene
+
+
+class _Copyable(RunningCopy, BaseParallelWrapper):
+    """Wrapper whose copies go on exactly."""
+
+
+def all_keeping_on(
+    env: ParallelEnv,
+    reader: MultiagentReader,
+    scene: Scene,
+    observations: Mapping[str, Any],
+    last_actions: Mapping[str, Any],
+    horizon_steps: int,
+) -> Float[np.ndarray, "agents horizon 2"]:
+    """Returns where all agents of a scene go if every learner repeats its last action [m], world frame.
+
+    Agents for which the environment has a driver (`drive_others`) do what it then decides. As long as an agent has not
+    acted yet, at the start of an episode, all go on at their velocities; later an agent that leaves does.
+
+    Args:
+        env: the environment, which is not changed.
+        reader: its reader, which is not changed.
+        scene: scene that the reader has just read.
+        observations: latest observation of each living agent.
+        last_actions: latest action of each agent.
+        horizon_steps: number of steps to play.
+
+    Raises:
+        UserError: the environment cannot be copied.
+    """
+    dt_s = reader.spec.dt_s
+    if not env.agents or not last_actions.keys() >= set(env.agents):
+        return followed(scene, dt_s, repeat(None, horizon_steps))
+    copied: Any = _Copyable(env)
+    copied, reader = running_copy((copied, reader), env.unwrapped)
+    drive_others = getattr(copied, "drive_others", _nobody)
+
+    def moments(seen: Mapping[str, Any]) -> Iterator[Scene | None]:
+        for _ in range(horizon_steps):
+            if not last_actions.keys() >= set(copied.agents) or not copied.agents:
+                yield None
+                continue
+            kept = {agent: last_actions[agent] for agent in copied.agents}
+            seen, *_ = copied.step(kept | drive_others(seen))
+            yield reader.read(copied).scene
+
+    return followed(scene, dt_s, moments(observations))
+
+
+def _nobody(observations: Mapping[str, Any]) -> dict[str, Any]:
+    return {}
