@@ -1,0 +1,45 @@
+"""Results of studies that ship are whole, belong to a study that ships, and are those of the page on the verdict."""
+
+import tarfile
+import tomllib
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agents.studies.results import Result, read_result
+
+ROOT = Path(__file__).resolve().parents[2]
+VERDICT = " ".join((ROOT / "docs" / "verdict.md").read_text().split())
+ARCHIVES = sorted((ROOT / "docs" / "studies").glob("*.tar.xz"))
+
+
+def results_of(archive: Path, folder: Path) -> list[Result]:
+    """Returns the results in an archive, each with its hash checked."""
+    with tarfile.open(archive) as packed:
+        packed.extractall(folder, filter="data")
+    return [read_result(path) for path in sorted(folder.glob("cells/*/result.json"))]
+
+
+def test_there_are_some():
+    assert ARCHIVES
+
+
+@pytest.mark.parametrize("archive", ARCHIVES, ids=lambda path: path.name.partition(".")[0])
+def test_the_page_has_the_returns_of_all_runs(archive: Path, tmp_path: Path):
+    study = tomllib.loads((ROOT / "agents" / "studies" / archive.name.replace(".tar.xz", ".toml")).read_text())
+    results = results_of(archive, tmp_path)
+    means: dict[tuple[str, str, str | None], list[float]] = defaultdict(list)
+    for each in sorted(results, key=lambda one: one.seed or 0):
+        means[each.scenario, each.arm, each.algorithm].append(
+            float(np.mean([episode["episode_return"] for episode in each.episodes]))
+        )
+        assert len(each.episodes) >= 200 and "/tmp" not in each.provenance["command"]
+    assert means
+    for (scenario, arm, algorithm), returns in means.items():
+        assert scenario in study["scenarios"]
+        if algorithm is not None:
+            assert arm in study["arms"]
+        printed = [", ".join(f"{value:.{digits}f}" for value in returns).replace("-", "−") for digits in (1, 2)]
+        assert any(text in VERDICT for text in printed), f"{scenario}, {arm}: {printed}"
