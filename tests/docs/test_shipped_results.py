@@ -36,7 +36,7 @@ def test_the_page_has_the_returns_of_all_runs(archive: Path, tmp_path: Path):
             float(np.mean([episode["episode_return"] for episode in each.episodes]))
         )
         assert len(each.episodes) >= 200 and "/tmp" not in each.provenance["command"]
-    assert means
+    assert means and (tmp_path / "study.toml").is_file(), "without it a folder is no study"
     for (scenario, arm, algorithm), returns in means.items():
         assert scenario in study["scenarios"]
         if algorithm is not None:
