@@ -11,7 +11,7 @@ from pettingzoo import ParallelEnv
 
 from agents.arena import MultiagentArena
 from agents.task import Task
-from agents.vec_envs import MakeCopy, SeededEpisodes, own_observations
+from agents.vec_envs import DrivenEnv, SeededEpisodes
 from envs.drivers.all_agents import Habits
 from envs.parallel import ForecastParallelEnv
 from envs.registry import make_env, make_multiagent_env
@@ -38,11 +38,11 @@ def in_a_world() -> tuple[ParallelEnv, Callable[[int], Any]]:
 
 def as_partners() -> tuple[ParallelEnv, Callable[[int], Any]]:
     """As policies are trained beside drivers."""
-    env: Any = MakeCopy(Task(TAG, "none"))()
+    env = DrivenEnv(make_multiagent_env(TAG), "heuristic", learners=())
 
     def play(seed: int) -> None:
         observations, _ = env.reset(seed=seed)
-        env.driver(own_observations(observations))
+        env.drive_others(observations)
 
     return env, play
 
