@@ -5,7 +5,6 @@ the learners keep on, is played exactly.
 """
 
 from collections.abc import Iterator, Mapping
-from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -33,8 +32,9 @@ def all_keeping_on(
 ) -> Float[np.ndarray, "agents horizon 2"]:
     """Returns where all agents of a scene go if every learner repeats its last action [m], world frame.
 
-    Agents for which the environment has a driver (`drive_others`) do what it then decides. As long as an agent has not
-    acted yet, at the start of an episode, all go on at their velocities; later an agent that leaves does.
+    Agents for which the environment has a driver (`drive_others`) do what it then decides. While one of the living has
+    not acted yet (at the start of an episode, or when one joins), all go on at their velocities; an agent that leaves
+    goes on at its last one.
 
     Args:
         env: the environment, which is not changed.
@@ -47,23 +47,20 @@ def all_keeping_on(
     Raises:
         UserError: the environment cannot be copied.
     """
-    dt_s = reader.spec.dt_s
-    if not env.agents or not last_actions.keys() >= set(env.agents):
-        return followed(scene, dt_s, repeat(None, horizon_steps))
     copied: Any = _Copyable(env)
     copied, reader = running_copy((copied, reader), env.unwrapped)
     drive_others = getattr(copied, "drive_others", _nobody)
 
     def moments(seen: Mapping[str, Any]) -> Iterator[Scene | None]:
         for _ in range(horizon_steps):
-            if not last_actions.keys() >= set(copied.agents) or not copied.agents:
+            if not copied.agents or not last_actions.keys() >= set(copied.agents):
                 yield None
                 continue
             kept = {agent: last_actions[agent] for agent in copied.agents}
             seen, *_ = copied.step(kept | drive_others(seen))
             yield reader.read(copied).scene
 
-    return followed(scene, dt_s, moments(observations))
+    return followed(scene, reader.spec.dt_s, moments(observations))
 
 
 def _nobody(observations: Mapping[str, Any]) -> dict[str, Any]:

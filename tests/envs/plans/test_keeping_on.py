@@ -1,5 +1,6 @@
 """True futures of several learners: what a copy does in which they keep on is what then happens."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from envs.arms import Arm
 from envs.drivers.all_agents import make_driver
 from envs.own_observation import without_added
 from envs.sb3.agents_as_rows import ParallelVecEnv
+from predictor.support.errors import UserError
 
 
 class Chased(BaseParallelWrapper):
@@ -106,6 +108,14 @@ def test_after_the_end_of_an_episode_agents_go_on_at_their_last_velocity():
     true = env.scene.true_xy
     np.testing.assert_allclose(np.diff(true[:, 1:], n=2, axis=1), 0, atol=1e-9)  # two steps are left
     assert np.abs(np.diff(true[:, :3], n=2, axis=1)).max() > 1e-3
+    env.close()
+
+
+def test_a_scene_that_nobody_played_is_refused():
+    env = watched_tag()
+    env.reset(seed=0)
+    with pytest.raises(UserError, match="an oracle needs scenes with true_xy, which ForecastParallelEnv adds"):
+        env.stream.observe(replace(env.scene, true_xy=None))
     env.close()
 
 
