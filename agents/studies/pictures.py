@@ -46,12 +46,12 @@ def plot_curve(
         ax: axis to draw on.
         steps: number of environment steps at each measurement.
         returns: mean return of each run at each measurement.
-        label: name in the legend; the number of runs is added.
+        label: name in the legend.
         **style: colour and dashes.
     """
     runs = len(returns)
     centre = returns.mean(axis=0)
-    ax.plot(steps, centre, marker="o", ms=3.5, label=f"{label} (n = {runs})", **style)
+    ax.plot(steps, centre, marker="o", ms=3.5, label=label, **style)
     if runs > 1:
         half = stats.t.ppf(0.5 + CONFIDENCE / 2, runs - 1) * returns.std(axis=0, ddof=1) / np.sqrt(runs)
         ax.fill_between(steps, centre - half, centre + half, color=style.get("color"), alpha=0.15, lw=0)
@@ -87,11 +87,12 @@ def learning_curves(findings: Findings) -> str:
     figure, axes = panels(len(findings.scenarios))
     styles = styles_of(findings.lines(trained=True))
     for ax, scenario in zip(axes, findings.scenarios, strict=True):
-        for line in findings.lines(scenario, trained=True):
+        lines = findings.lines(scenario, trained=True)
+        for line in lines:
             steps, returns = curve_of(findings, scenario, line)
             plot_curve(ax, steps, returns, findings.label(line), **styles[line])
         plot_references(ax, _references(findings, scenario))
-        ax.set_title(scenario)
+        ax.set_title(_title(scenario, [len(findings.results[scenario, line]) for line in lines]))
         ax.set_xlabel("environment steps")
         ax.xaxis.set_major_formatter("{x:,.0f}")
         ax.set_xlim(left=0)
@@ -134,8 +135,7 @@ def _profile_panel(ax: Axes, findings: Findings, runs: Mapping[Line, Any], title
     ax.set_ylim(-0.02, 1.02)
     if not runs:
         return
-    counts = sorted({sum(len(one) for one in found) for found in runs.values()})
-    ax.set_title(f"{title}, n = {' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))}")
+    ax.set_title(_title(title, [sum(len(one) for one in found) for found in runs.values()]))
     scores = np.concatenate([np.concatenate(list(found)) for found in runs.values()])
     margin = 0.05 * (np.ptp(scores) or 1.0)
     thresholds = np.linspace(scores.min() - margin, scores.max() + margin, _THRESHOLDS)
@@ -144,6 +144,13 @@ def _profile_panel(ax: Axes, findings: Findings, runs: Mapping[Line, Any], title
         band = profile_band(found, thresholds, generator_of("profile", title, *line), findings.resamples)
         shares = performance_profile(found, thresholds)
         plot_profile(ax, thresholds, shares, *band, findings.label(line), **styles[line])
+
+
+def _title(name: str, runs: Sequence[int]) -> str:
+    """Returns the title of a panel: its name and how many runs a line has, from the fewest to the most."""
+    if not runs:
+        return name
+    return f"{name}, n = {' to '.join(map(str, dict.fromkeys((min(runs), max(runs)))))}"
 
 
 def _references(findings: Findings, scenario: str) -> dict[str, float]:

@@ -96,6 +96,14 @@ def test_references_are_told_apart():
     assert "heuristic" in drawn and "best constant" not in drawn and "heuristic" not in learning_curves(findings)
 
 
+def test_a_legend_has_each_arm_once_where_scenarios_have_unequal_numbers_of_runs():
+    fewer = [r for r in results("two") if r.seed not in (1, 2) or r.arm == "oracle"]
+    drawn = learning_curves(found_in(study(("one", "two")), results() + fewer))
+    texts = re.findall(r"<!-- (.*?) -->", drawn)
+    assert [texts.count(name) for name in ("zeros", "forecast", "oracle")] == [1, 1, 1]
+    assert {"one, n = 3", "two, n = 1 to 3"} <= set(texts)
+
+
 def test_scores_of_several_scenarios_are_rescaled():
     findings = found_in(study(("one", "two")), results() + results("two", lift=2.0))
     scaled = findings.scaled_runs(SEEN, ["one", "two"])
