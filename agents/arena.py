@@ -128,7 +128,7 @@ class MultiagentArena:
         """Makes the environment of the drivers; copies for a policy are made when the first one plays."""
         self._task, self._most = task, most_copies
         self._env: Any = MakeCopy(
-            replace(task, observe="none", checkpoint=None, perception_m=None)
+            replace(task, observe="none", checkpoint=None, perception_m=None, sizes_of=None)
         )()  # has what `DrivenEnv` has
         self._learners = learners_of(task, self._env)
         self._venv: ParallelVecEnv | None = None
