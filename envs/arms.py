@@ -150,6 +150,24 @@ class Arm:
         """Parts of a forecast that the arm shows."""
         return ARMS[self.name]
 
+    def check_room(self, num_samples: int, what_if: bool) -> None:
+        """Checks that an observation has room for what the arm is named after.
+
+        Args:
+            num_samples: number of futures per agent that the observation has room for.
+            what_if: whether it has room for what the others do in each candidate plan.
+
+        Raises:
+            UserError: the arm shows several futures, or candidate plans, and there is no room: it would be another arm.
+        """
+        if self.name == "modes" and num_samples == 1:
+            raise UserError(
+                "arm modes shows several futures per agent; set num_samples to 2 or more, or take arm single"
+            )
+        if self.name in ("what-if", "oracle-what-if") and not what_if:
+            less = "single" if self.name == "what-if" else "oracle"
+            raise UserError(f"arm {self.name} shows candidate plans of the ego; set what_if, or take arm {less}")
+
     @property
     def changes_nothing(self) -> bool:
         """Whether entries are shown as they are."""

@@ -68,7 +68,7 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     Raises:
         UserError: not a parallel env, no reader, no checkpoint, a forecaster of another spec (features, dt) or relative
             to an ego, or an agent whose own observation is a Tuple, a Dict of Dicts, or has an entry of an added one's
-            name.
+            name; no room for what the arm shows.
     """
 
     def __init__(

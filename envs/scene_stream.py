@@ -64,6 +64,7 @@ class ForecastConfig:
         each_bytes = 8 * (self.horizon_steps or 1)
         check_count(self.num_samples, "num_samples", each_bytes)
         check_at_least(self, 0, "seed", "num_plans")
+        self.arm.check_room(self.num_samples, self.num_plans > 0)
         object.__setattr__(self, "device", resolve_device(self.device))
 
 

@@ -72,7 +72,7 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
 
     Raises:
         UserError: the environments report no scenes, differ from each other, or do not fit the forecaster; no plan
-            model for `what_if=True`.
+            model for `what_if=True`; no room for what the arm shows.
     """
 
     def __init__(

@@ -194,7 +194,7 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
 
     Raises:
         UserError: no reader, or one although the env is a `SceneObservation`; no checkpoint, or a forecaster of
-            another spec (features, dt); no plan model for `what_if=True`.
+            another spec (features, dt); no plan model for `what_if=True`; no room for what the arm shows.
     """
 
     def __init__(

@@ -11,7 +11,7 @@ from metadrive import MetaDriveEnv
 
 from dgvae_rl import FunctionReader, Scene, SceneSpec, agent_ids, register_reader
 
-SCENARIOS = 9973  # a prime: seeds that lie a round number apart are different scenarios
+SCENARIOS = 9973  # with this number, seeds of collection, evaluation and test are different scenarios
 STEPS_OF_PHYSICS = 10  # of 0.02 s each
 
 

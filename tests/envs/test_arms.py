@@ -89,6 +89,29 @@ def test_a_single_forecast_is_shown_to_its_last_step(name: str, bank: EntryBank)
         np.testing.assert_array_equal(found, shown)
 
 
+@pytest.mark.parametrize(
+    ("name", "room", "message"),
+    [
+        (
+            "modes",
+            {"what_if": True},
+            "arm modes shows several futures .* set num_samples to 2 or more, or take arm single",
+        ),
+        ("what-if", {"num_samples": 6}, "arm what-if shows candidate plans .* set what_if, or take arm single"),
+        ("oracle-what-if", {"num_samples": 6}, "arm oracle-what-if shows candidate plans .* or take arm oracle"),
+    ],
+)
+def test_an_arm_without_room_for_what_it_shows_is_refused(name: str, room: dict[str, Any], message: str):
+    """It would show what another arm shows, under its own name."""
+    with pytest.raises(UserError, match=message):
+        ForecastObservation(make_env(FAST), "highway", arm=Arm(name), **room)
+    with pytest.raises(UserError, match=message):
+        Task(FAST, name, **room)
+    if "what_if" not in room:
+        with pytest.raises(UserError, match=message):
+            ForecastParallelEnv(make_multiagent_env("simple_tag_v3"), "simple-tag", arm=Arm(name), **room)
+
+
 def test_a_predator_sees_a_single_forecast_to_its_last_step():
     shown = {}
     for name in ("forecast", "no-edges"):
