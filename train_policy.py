@@ -117,7 +117,8 @@ class TrainPolicyConfig:
     backend: Backend = "gymnasium"
     """Simulator in training; the policy is measured and filmed on the gymnasium environment in any case."""
     learners: tuple[str, ...] | None = None
-    """PettingZoo: agents or roles that learn, for example adversary; None takes all, in simple_tag the adversaries."""
+    """PettingZoo: agents or roles that learn, for example adversary; None takes all, in simple_tag
+    and simple_world_comm the adversaries."""
     driver: Annotated[str, Renamed("partner")] = "heuristic"
     """PettingZoo: driver of the agents that do not learn: random, idle, varied, heuristic or mixed."""
     shaping: bool = True
@@ -254,7 +255,7 @@ def _run(config: TrainPolicyConfig, console: Console) -> None:
     if config.backend == "envpool" and begins_alike(copy := envpool_task_of(config.env_id)):
         console.print(f"note: EnvPool's {copy} begins every episode in the same state; the original does not")
     policy = train(plan, config.folder)
-    model = load_model(policy, config.algorithm)
+    model = load_model(policy, config.algorithm, device=plan.device)
     evaluation = evaluate_with_progress(
         plan.task,
         model,

@@ -140,8 +140,7 @@ class EvaluateConfig:
     films: bool = False
     """Film the trained policy's best, median and worst episode by return: best.mp4, median.mp4, worst.mp4."""
     num_envs: Annotated[int, Renamed("workers")] = os.cpu_count() or 1
-    """Number of parallel environments; the results depend on it only where several samples are
-    drawn (docs/limits.md)."""
+    """Number of parallel environments; the results do not depend on it."""
     device: str = "cpu"
     """Device that runs forecaster and policy: cpu, cuda or auto (cuda where there is one)."""
     timeout_s: float = TIMEOUT_S
@@ -282,7 +281,7 @@ class _Trained:
 
     def model(self) -> BaseAlgorithm:
         """Loads it."""
-        return load_model(self.zipped, self.algorithm)
+        return load_model(self.zipped, self.algorithm, device=self.task.device)
 
 
 def _trained(config: EvaluateConfig, policy: Path) -> _Trained:

@@ -11,7 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from agents.studies.cells import LOG_FILE, PACKAGES, Cell, cells_of
+from agents.results import PACKAGES
+from agents.studies.cells import LOG_FILE, Cell, cells_of
 from agents.studies.findings import Findings
 from agents.studies.plan import Study, read_study, shipped_studies, study_file
 from agents.studies.pool import run_cells, run_cells_on
@@ -23,10 +24,9 @@ from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, delete_leftovers, write_text
-from predictor.support.jobs import last_line
 from predictor.support.locks import locked
 from predictor.support.memory import check_processes
-from predictor.support.provenance import provenance
+from predictor.support.provenance import commit_at_start, provenance
 from predictor.support.stopping import resumable
 
 CELLS = "cells"
@@ -79,7 +79,7 @@ def run_study(config: StudyConfig) -> int:
     """
     require_tables()
     file = study_file(config.study)
-    study = read_study(file)
+    study, text = read_study(file), file.read_text(encoding="utf-8")
     if config.headroom:
         study = _with_file(study, file)
     folder = config.out or Path("runs") / f"study-{study.name}"
@@ -90,13 +90,13 @@ def run_study(config: StudyConfig) -> int:
     with locked(folder, "study"):
         delete_leftovers(folder)
         results = _results_of(folder, cells)
-        write_text(folder / STUDY_FILE, file.read_text(encoding="utf-8"))
-        failed = _run_missing(config, folder, chosen, results)
+        write_text(folder / STUDY_FILE, text)
+        failed = _run_missing(config, folder, chosen, results, len(cells))
         done = [results[cell.name] for cell in cells if cell.name in results]
-        _write(config, folder, study, done, file.read_text(encoding="utf-8"), failed, len(cells))
-    for cell in failed:
+        _write(config, folder, study, done, text, [cell for cell, _ in failed], len(cells))
+    for cell, reason in failed:
         log = folder / CELLS / cell.name / LOG_FILE
-        print(f"failed: {cell.title}: {last_line(log)}; its log is {log}", file=sys.stderr)
+        print(f"failed: {cell.title}: {reason}; its log is {log}", file=sys.stderr)
     return FAILED if failed else 0
 
 
@@ -149,30 +149,32 @@ def _results_of(folder: Path, cells: Sequence[Cell]) -> dict[str, Result]:
     return {name: read_result(file) for name, file in files.items() if file.exists()}
 
 
-def _run_missing(config: StudyConfig, folder: Path, cells: Sequence[Cell], results: dict[str, Result]) -> list[Cell]:
-    """Runs the cells without a result and adds theirs; returns those that failed."""
-    missing, failed = [cell for cell in cells if cell.name not in results], list[Cell]()
+def _run_missing(
+    config: StudyConfig, folder: Path, cells: Sequence[Cell], results: dict[str, Result], total: int
+) -> list[tuple[Cell, str]]:
+    """Runs the chosen cells without a result and adds theirs; returns those that failed, and why."""
+    missing, failed = [cell for cell in cells if cell.name not in results], list[tuple[Cell, str]]()
     with connected(config.cluster if missing else None, PACKAGES) as cluster:
         side_by_side = config.num_processes if cluster is None else cluster.size
-        note = _notes(folder, results, failed, Progress(folder, len(cells), missing, side_by_side))
+        note = _notes(folder, results, failed, Progress(folder, total, len(results), missing, side_by_side))
         if cluster is None:
-            run_cells(missing, folder / CELLS, config.num_processes, note)
+            run_cells(missing, folder / CELLS, config.num_processes, commit_at_start(), note)
         else:
-            run_cells_on(cluster, missing, folder / CELLS, note)
+            run_cells_on(cluster, missing, folder / CELLS, commit_at_start(), note)
     return failed
 
 
 def _notes(
-    folder: Path, results: dict[str, Result], failed: list[Cell], progress: Progress
-) -> Callable[[Cell, bool], None]:
+    folder: Path, results: dict[str, Result], failed: list[tuple[Cell, str]], progress: Progress
+) -> Callable[[Cell, str | None], None]:
     """Returns what notes a cell that ended, among the results or those that failed."""
 
-    def note(cell: Cell, has_result: bool) -> None:
-        if has_result:
+    def note(cell: Cell, reason: str | None) -> None:
+        if reason is None:
             results[cell.name] = read_result(folder / CELLS / cell.name / RESULT_FILE)
             progress.finished(cell, results[cell.name])
         else:
-            failed.append(cell)
+            failed.append((cell, reason))
             progress.failed(cell)
 
     return note

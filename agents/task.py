@@ -11,7 +11,7 @@ from typing import Any, Literal, get_type_hints
 import gymnasium as gym
 import numpy as np
 
-from envs.arms import Arm, EntryBank, EntryLayout
+from envs.arms import ARMS, Arm, EntryBank, EntryLayout
 from envs.drivers.all_agents import DRIVER_NAMES, make_driver
 from envs.entry_bank import record_bank
 from envs.parallel import ForecastParallelEnv
@@ -56,6 +56,9 @@ Observe = Literal[
     "what-if", "oracle", "oracle-what-if",
 ]  # fmt: skip
 """What a policy sees: an arm of `envs.arms`, constant-velocity forecasts, or the env's own observation alone."""
+
+NO_CHECKPOINT: tuple[Observe, ...] = ("none", "constant-velocity")
+"""What a policy sees without a checkpoint."""
 Backend = Literal["gymnasium", "envpool"]
 
 
@@ -111,7 +114,7 @@ class Task:
             envpool_task_of(self.env_id)
             if importlib.util.find_spec("envpool") is None:
                 raise UserError("backend envpool needs the envpool package; pip install 'dgvae-rl[envpool]'")
-        if self.checkpoint is not None and self.observe in ("none", CONSTANT_VELOCITY):
+        if self.checkpoint is not None and self.observe in NO_CHECKPOINT:
             raise UserError(f"checkpoint '{self.checkpoint}' has no effect with observe={self.observe}; leave one out")
         check_at_least(self, 1, "num_samples", "horizon_steps")
         check_at_most(self, MOST_FUTURES, "num_samples", "horizon_steps")
@@ -130,6 +133,8 @@ class Task:
             raise UserError("what_if has no effect with observe=none; leave one out")
         if self.what_if and self.is_multiagent:
             raise UserError(f"what_if needs an environment with one ego, {self.env_id} has several learners")
+        if self.observe in ARMS:
+            Arm(self.observe).check_room(self.num_samples, self.what_if)
         for name in ("crash_key", "success_key"):
             if getattr(self, name) == "" or (getattr(self, name) is not None and self.is_multiagent):
                 raise UserError(f"{name} is a key of the infos of an environment with one ego; leave it out")

@@ -132,7 +132,10 @@ def train(plan: TrainingPlan, run_dir: Path, progress_bar: bool = True) -> Path:
     finally:
         venv.close()
         selection.close()
-    copy_file(run_dir / BEST_FILE, run_dir / POLICY_FILE)
+    if (run_dir / BEST_FILE).exists():
+        copy_file(run_dir / BEST_FILE, run_dir / POLICY_FILE)
+    else:  # it was damaged, and removed as the message says; the last model stands for it
+        save_model(model, run_dir / POLICY_FILE, note=note)
     return run_dir / POLICY_FILE
 
 
@@ -193,7 +196,9 @@ def _resume_or_make(plan: TrainingPlan, venv: VecEnv, run_dir: Path) -> BaseAlgo
     logs = str(run_dir / "tb")
     checkpoint = run_dir / CHECKPOINT_FILE
     if not checkpoint.exists():
-        return make_model(plan, venv, logs)
+        model = make_model(plan, venv, logs)
+        _seed_from_steps(plan, model)
+        return model
     check_step_unit(checkpoint, plan.task.is_multiagent)
     model = load_model(checkpoint, plan.algorithm, venv, plan.device)
     model.tensorboard_log = logs  # the folder may have moved
@@ -202,9 +207,13 @@ def _resume_or_make(plan: TrainingPlan, venv: VecEnv, run_dir: Path) -> BaseAlgo
 
 
 def _seed_from_steps(plan: TrainingPlan, model: BaseAlgorithm) -> None:
-    """Seeds a model for the episodes from its current step on: new ones, still a function of the plan's seed."""
+    """Seeds a model for the episodes from its current step on: a function of step and plan's seed.
+
+    Environments get this seed and those that follow it. Were it the plan's own, runs of neighbouring seeds would see
+    the same episodes, all but one of 64.
+    """
     fresh = np.random.SeedSequence([plan.seed, model.num_timesteps]).generate_state(1)[0]
-    model.set_random_seed(int(fresh) % SELECTION_SEED)
+    model.set_random_seed(int(fresh) % (SELECTION_SEED - plan.num_envs))
 
 
 def _restart_streams(plan: TrainingPlan, model: BaseAlgorithm, errors: ForecastErrors) -> None:

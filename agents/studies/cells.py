@@ -23,6 +23,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.arena import open_arena
 from agents.presets import Algorithm, Preset
+from agents.results import PACKAGES
 from agents.runs import CURVE_FILE, FORECASTER, load_model, open_run, read_curve
 from agents.studies.plan import Scenario, Study, StudyArm, task_for
 from agents.studies.results import RESULT_FILE, Result, write_result
@@ -39,10 +40,9 @@ from predictor.own_forecasters import is_own
 from predictor.support.errors import UserError
 from predictor.support.provenance import provenance
 
-PACKAGES = ("stable-baselines3", "sb3-contrib", "gymnasium", "pettingzoo", "highway-env", "mpe2", "torch", "numpy")
 RULES = ("stable-baselines3", "gymnasium", "pettingzoo", "highway-env", "mpe2")
 """Packages whose versions are part of a cell's name: the simulators and the learning algorithms."""
-MEASURING = 2
+MEASURING = 3
 """Number of the way of running and measuring, networks included; a cell of another one is another cell."""
 NETWORK = 2
 """Number of the network that reads forecasts (`agents.features`); a cell of a policy with another one is another
@@ -113,6 +113,8 @@ class Cell:
             return content | {"driver": self.line}
         if self.plan.algorithm in CONTRIB:
             content["versions"]["sb3-contrib"] = _version("sb3-contrib")
+        if self.task.backend == "envpool":
+            content["versions"]["envpool"] = _version("envpool")
         if self.task.observe != "none":
             content["network"] = NETWORK
         unrelated = {"task", "device", "in_process", "selection_envs", "settings"}
@@ -148,19 +150,25 @@ def cells_of(study: Study, where: str) -> list[Cell]:
     return cells
 
 
-def run_cell(cell: Cell, folder: Path) -> Result:
-    """Trains from where an earlier start was stopped, plays the test seeds, writes the result into the folder."""
+def run_cell(cell: Cell, folder: Path, commit: str) -> Result:
+    """Trains from where an earlier start was stopped, plays the test seeds, writes the result into the folder.
+
+    Args:
+        cell: cell to run.
+        folder: folder of the cell.
+        commit: commit that was checked out when the study began, whose code runs.
+    """
     torch.set_num_threads(1)
-    made = provenance(PACKAGES, _command())
+    made = provenance(PACKAGES, _command()) | {"commit": commit}
     policy: BaseAlgorithm | None = None
     trained_s, curve = 0.0, list[dict[str, Any]]()
     if cell.plan is not None:
         run = folder / RUN_FOLDER
         free = (FORECASTER, "device", *PATHS)  # the folder's name has the forecaster's hash and sizes
         open_run(run, _run_config(cell), made, resume=True, free=free)
-        policy = load_model(train(cell.plan, run), cell.plan.algorithm)
+        policy = load_model(train(cell.plan, run), cell.plan.algorithm, device=cell.plan.device)
         curve = read_curve(run / CURVE_FILE)
-        trained_s = curve[-1]["seconds"]
+        trained_s = curve[-1]["seconds"] if curve else 0.0  # somebody removed a damaged one
     began = time.perf_counter()
     num_envs = 1 if cell.plan is None else min(cell.plan.num_envs, cell.episodes)
     arena = open_arena(cell.task, num_envs, in_process=True)

@@ -55,6 +55,19 @@ def mean_with_t_interval(scores: Float[np.ndarray, " runs"]) -> Estimate:
     return Estimate(centre, float(centre - half), float(centre + half))
 
 
+def gain_with_t_interval(ours: Float[np.ndarray, " ours"], theirs: Float[np.ndarray, " theirs"]) -> Estimate:
+    """Computes the difference of two means with Welch's interval; without one if a sample has a single run."""
+    difference = float(np.mean(ours) - np.mean(theirs))
+    if min(len(ours), len(theirs)) < 2:
+        return Estimate(difference, np.nan, np.nan)
+    variances = np.array([np.var(each, ddof=1) / len(each) for each in (ours, theirs)])
+    if not variances.any():
+        return Estimate(difference, difference, difference)
+    freedom = variances.sum() ** 2 / (variances**2 / [len(ours) - 1, len(theirs) - 1]).sum()
+    half = stats.t.ppf(0.5 + CONFIDENCE / 2, freedom) * np.sqrt(variances.sum())
+    return Estimate(difference, float(difference - half), float(difference + half))
+
+
 def bootstrapped(
     statistic: Callable[..., float], *samples: Runs, generator: np.random.Generator, resamples: int = RESAMPLES
 ) -> Estimate:

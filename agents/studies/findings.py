@@ -15,6 +15,7 @@ from agents.studies.estimators import (
     Runs,
     bootstrapped,
     gain,
+    gain_with_t_interval,
     interquartile_mean,
     mean,
     mean_with_t_interval,
@@ -23,6 +24,7 @@ from agents.studies.estimators import (
 )
 from agents.studies.plan import Study
 from agents.studies.results import Result
+from agents.summaries import wilson_interval
 from envs.drivers.planner import PLANNER_ORACLE, is_planner
 from predictor.own_forecasters import is_own
 
@@ -109,13 +111,15 @@ class Findings:
     def crash_rate(self, scenario: str, line: Line) -> Estimate | None:
         """Returns the share of test episodes with a crash and its bootstrap interval over runs; None if not reported.
 
-        The interval of a driver is over its episodes.
+        The interval of a driver is Wilson's, over its episodes.
         """
         crashed = [[episode.get("crashed") for episode in r.episodes] for r in self.results[scenario, line]]
         if all(each is None for run in crashed for each in run):
             return None
         reported = [np.array([bool(each) for each in run], dtype=np.float64) for run in crashed]
-        rates = reported[0] if line.algorithm is None else np.array([np.mean(found) for found in reported])
+        if line.algorithm is None:
+            return Estimate(mean(reported), *wilson_interval(int(reported[0].sum()), len(reported[0])))
+        rates = np.array([np.mean(found) for found in reported])
         return self.estimate(mean, [rates], about=("crashes", scenario, *line))
 
     def mean_of(self, scenario: str, line: Line, field: str) -> float:
@@ -156,12 +160,10 @@ class Findings:
         runs = self.scaled_runs if len(scenarios) > 1 else self.raw_runs
         samples = (runs(ours, scenarios), runs(rival, scenarios))
         about = (*scenarios, *ours, *rival)
-        return Pair(
-            ours,
-            rival,
-            self.estimate(probability_of_improvement, *samples, about=("probability", *about)),
-            self.estimate(gain, *samples, about=("gain", *about)),
-        )
+        probability = self.estimate(probability_of_improvement, *samples, about=("probability", *about))
+        if len(scenarios) == 1:
+            return Pair(ours, rival, probability, gain_with_t_interval(samples[0][0], samples[1][0]))
+        return Pair(ours, rival, probability, self.estimate(gain, *samples, about=("gain", *about)))
 
     def raw_runs(self, line: Line, scenarios: Sequence[str]) -> Runs:
         """Returns the scores of a line's runs in each scenario."""
@@ -185,8 +187,7 @@ class Findings:
         ends = [Line(self.study.ceiling, algorithm), Line(self.study.floor, algorithm)]
         if any((scenario, end) not in self.results for end in ends):
             return None
-        high, low = ([self.runs(scenario, end)] for end in ends)
-        return self.estimate(gain, high, low, about=("headroom", scenario, algorithm))
+        return gain_with_t_interval(*(self.runs(scenario, end) for end in ends))
 
     def headroom_used(self, scenario: str, line: Line) -> Estimate | None:
         """Returns the share of the headroom that an arm uses; None where there is none to be seen.

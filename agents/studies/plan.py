@@ -11,7 +11,7 @@ from typing import Any, get_args, get_type_hints
 
 from agents.preset_settings import settings_from_table
 from agents.presets import Algorithm
-from agents.task import SELECTION_SEED, Observe, Task
+from agents.task import NO_CHECKPOINT, SELECTION_SEED, Observe, Task
 from envs.drivers.ego import CONSTANT_ACTIONS
 from envs.drivers.planner import PLANNER, PLANNER_ORACLE
 from envs.registry import entry_for
@@ -226,8 +226,8 @@ def task_for(scenario: Scenario, arm: StudyArm, where: str) -> Task:
     options = {key: _filled(value, places) for key, value in arm.options.items()}
     shared = dict(scenario.options)
     sizes_of = shared.get("checkpoint") or entry_for(scenario.env_id).checkpoint
-    if "checkpoint" in shared and not takes_checkpoint(arm.observe):
-        del shared["checkpoint"]
+    if arm.observe in NO_CHECKPOINT:
+        shared.pop("checkpoint", None)
     own = {**shared, **options}.get("checkpoint")
     if not is_own(sizes_of) and ("checkpoint" in scenario.options or (arm.observe == "forecast" and own is not None)):
         shared.setdefault("sizes_of", sizes_of)
@@ -239,16 +239,6 @@ def task_for(scenario: Scenario, arm: StudyArm, where: str) -> Task:
         return Task(**values)
     except UserError as error:
         raise UserError(f"{where}: scenario {scenario.name}, arm {arm.name}: {error}") from error
-
-
-def takes_checkpoint(observe: str) -> bool:
-    """Returns whether a task with this observation accepts a checkpoint."""
-    values: dict[str, Any] = {"observe": observe, "checkpoint": "any"}
-    try:
-        Task("highway-fast-v0", **values)
-    except UserError:
-        return False
-    return True
 
 
 def _settings(content: dict[str, Any], where: str) -> dict[str, dict[str, Any]]:

@@ -26,8 +26,7 @@ from agents.studies.cells import LOG_FILE, Cell, run_cell
 from agents.studies.results import RESULT_FILE
 from predictor.support.cluster import Cluster
 from predictor.support.errors import UserError
-from predictor.support.files import write_text
-from predictor.support.jobs import ended_on
+from predictor.support.jobs import ended_on, why_failed
 from predictor.support.locks import LOCK_FILE
 from predictor.support.processes import ctrl_c_ignored, end, print_into
 from predictor.support.runtime import keep_freed_memory
@@ -47,48 +46,59 @@ class Running:
     """End of a pipe; the process ends when it closes."""
 
 
-def run_cells(cells: Sequence[Cell], folder: Path, workers: int, on_end: Callable[[Cell, bool], None]) -> None:
+def run_cells(
+    cells: Sequence[Cell], folder: Path, workers: int, commit: str, on_end: Callable[[Cell, str | None], None]
+) -> None:
     """Runs cells in processes, at most `workers` at a time; returns when all have ended.
 
     Args:
         cells: cells without a result.
         folder: folder of the cells' folders.
         workers: largest number of processes.
-        on_end: called with each cell that ended, and whether it has a result.
+        commit: commit whose code runs them.
+        on_end: called with each cell that ended, and why it has no result; with None if it has one.
     """
     waiting, running = list(cells), list[Running]()
     try:
         while waiting or running:
             while waiting and len(running) < workers:
-                running.append(_start(waiting.pop(0), folder))
+                running.append(_start(waiting.pop(0), folder, commit))
             ended = wait([one.process.sentinel for one in running])
             for one in [one for one in running if one.process.sentinel in ended]:
                 one.process.join()
                 one.lifeline.close()
                 running.remove(one)
-                on_end(one.cell, one.process.exitcode == 0 and (folder / one.cell.name / RESULT_FILE).exists())
+                on_end(one.cell, _reason(folder / one.cell.name, one.process.exitcode))
     finally:
         _stop(running)
 
 
-def run_cells_on(cluster: Cluster, cells: Sequence[Cell], folder: Path, on_end: Callable[[Cell, bool], None]) -> None:
+def run_cells_on(
+    cluster: Cluster, cells: Sequence[Cell], folder: Path, commit: str, on_end: Callable[[Cell, str | None], None]
+) -> None:
     """Runs cells on the machines of a cluster, which share the folder; returns when all have ended.
 
     Args:
         cluster: cluster.
         cells: cells without a result.
         folder: folder of the cells' folders, inside that of the study, which is locked.
-        on_end: called with each cell that ended, and whether it has a result.
+        commit: commit whose code runs them.
+        on_end: called with each cell that ended, and why it has no result; with None if it has one.
 
     Raises:
         UserError: a machine does not see the folder, or has other versions.
     """
-    tasks = [_Task(cell, folder.absolute()) for cell in cells]
+    tasks = [_Task(cell, folder.absolute(), commit) for cell in cells]
     with contextlib.closing(ended_on(cluster, tasks)) as ended:
         for number, reason in ended:
-            if reason is not None and not tasks[number].log.exists():
-                write_text(tasks[number].log, reason)
-            on_end(cells[number], reason is None and tasks[number].result.exists())
+            on_end(cells[number], reason or _reason(tasks[number].folder, 0))
+
+
+def _reason(folder: Path, exit_code: int | None) -> str | None:
+    """Returns why a cell that ended has no result; None if it has one."""
+    if exit_code == 0 and (folder / RESULT_FILE).exists():
+        return None
+    return why_failed(folder / LOG_FILE, exit_code)
 
 
 @dataclass(frozen=True)
@@ -97,6 +107,7 @@ class _Task:
 
     cell: Cell
     cells: Path
+    commit: str
 
     @property
     def name(self) -> str:
@@ -107,11 +118,6 @@ class _Task:
     def folder(self) -> Path:
         """Folder of the cell."""
         return self.cells / self.cell.name
-
-    @property
-    def log(self) -> Path:
-        """File of what it prints."""
-        return self.folder / LOG_FILE
 
     @property
     def result(self) -> Path:
@@ -126,16 +132,16 @@ class _Task:
     def run(self) -> None:
         """Runs the cell."""
         _prepare()
-        run_cell(self.cell, self.folder)
+        run_cell(self.cell, self.folder, self.commit)
 
 
-def _start(cell: Cell, folder: Path) -> Running:
+def _start(cell: Cell, folder: Path, commit: str) -> Running:
     """Starts the process of a cell; what it prints goes into the cell's log."""
     context: Any = multiprocessing.get_context(START_METHOD)
     if START_METHOD == "forkserver":
         context.set_forkserver_preload([__name__])
     theirs, ours = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(cell, folder / cell.name, theirs), name=cell.name)
+    process = context.Process(target=_work, args=(cell, folder / cell.name, commit, theirs), name=cell.name)
     with ctrl_c_ignored():
         process.start()
     theirs.close()
@@ -148,7 +154,7 @@ def _stop(running: Sequence[Running]) -> None:
         one.lifeline.close()
 
 
-def _work(cell: Cell, folder: Path, lifeline: Connection) -> None:
+def _work(cell: Cell, folder: Path, commit: str, lifeline: Connection) -> None:
     """Runs one cell in a process of its own."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the study ends this process
     threading.Thread(target=_end_with, args=(lifeline,), daemon=True).start()
@@ -160,7 +166,7 @@ def _work(cell: Cell, folder: Path, lifeline: Connection) -> None:
             return
         _prepare()
         try:
-            run_cell(cell, folder)
+            run_cell(cell, folder, commit)
         except UserError as error:
             print(f"error: {error}")
             sys.exit(2)

@@ -20,16 +20,18 @@ class Progress:
     Args:
         folder: folder of the study.
         total: number of all cells.
+        done: number of cells with a result.
         missing: cells that are going to run.
         workers: number of cells that run side by side.
     """
 
-    def __init__(self, folder: Path, total: int, missing: Sequence[Cell], workers: int) -> None:
+    def __init__(self, folder: Path, total: int, done: int, missing: Sequence[Cell], workers: int) -> None:
         """Writes the first line."""
         self._log, self._total, self._missing, self._workers = folder / STUDY_LOG, total, list(missing), workers
-        self._done, self._began = total - len(missing), time.monotonic()
+        self._done, self._began = done, time.monotonic()
         self._work_done = 0.0
-        self._say(f"{total} cells, {self._done} of them finished before; {min(workers, len(missing))} at a time")
+        at_once = min(workers, len(missing))
+        self._say(f"{total} cells, {done} of them finished before, {len(missing)} to run; {at_once} at a time")
 
     def finished(self, cell: Cell, result: Result) -> None:
         """Writes the line of a cell that has a result."""

@@ -90,14 +90,16 @@ def interval(estimate: Estimate, digits: int = 2, scale: float = 1.0, unit: str 
 
 
 def _summary(findings: Findings) -> str:
-    study = findings.study
-    seeds = len(study.training_seeds)
+    counts = sorted({len(runs) for (_, line), runs in findings.results.items() if line.algorithm is not None})
+    shown = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1])))) if counts else "0"
     return (
-        f"{seeds} training {'seed' if seeds == 1 else 'seeds'} per arm; {study.episodes} test episodes per policy and "
-        "driver, on seeds that are the same for all and that neither training nor selection uses. A run is one "
-        "training; its score is its mean return over these episodes. Intervals are 95 %: Student's for means over "
-        "runs, percentiles of a bootstrap over runs for everything else. Drivers are not trained: their intervals are "
-        "over episodes and cannot be compared with those over runs."
+        f"{shown} training {'seed' if counts == [1] else 'seeds'} per arm; {findings.study.episodes} test episodes per "
+        "policy and driver, on seeds that are the same for all and that neither training nor selection uses. A run is "
+        "one training; its score is its mean return over these episodes. Intervals are 95 %: Student's for means over "
+        "runs, Welch's for differences of two of them, percentiles of a bootstrap over runs for everything else; the "
+        "latter are too narrow for few runs (that of a mean of five holds the truth in 83 % of cases). Drivers are not "
+        "trained: their intervals are over episodes (of crash rates Wilson's) and cannot be compared with those over "
+        "runs."
     )
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 from predictor.support.cluster import Cluster, Lost, Packed, check_shared
 from predictor.support.errors import run_entry_point
 from predictor.support.locks import LOCK_FILE
-from predictor.support.processes import end, follow_parent, print_into, start
+from predictor.support.processes import end, follow_parent, how_it_ended, print_into, start
 from predictor.support.progress import WorkShown
 
 SAVING_S = 60.0
@@ -54,7 +54,7 @@ class Job(Task, Protocol):
 
 
 def run_jobs(title: str, pending: Sequence[Job], workers: int) -> dict[str, str]:
-    """Runs jobs in processes of this machine; returns the last line of output of those that failed, by name.
+    """Runs jobs in processes of this machine; returns why those that failed did (`why_failed`), by name.
 
     Args:
         title: words before the progress.
@@ -75,7 +75,7 @@ def run_jobs(title: str, pending: Sequence[Job], workers: int) -> dict[str, str]
                 ended = [one for one in running if one[1].exitcode is not None]
                 for job, process in ended:
                     if process.exitcode:
-                        failed[job.name] = last_line(job.folder / LOG_FILE)
+                        failed[job.name] = why_failed(job.folder / LOG_FILE, process.exitcode)
                 running = [one for one in running if one not in ended]
                 done += len(ended)
                 if ended or ready:
@@ -126,6 +126,12 @@ def ended_on(cluster: Cluster, tasks: Sequence[Task], gpus: int = 0) -> Generato
             yield number, found.reason if isinstance(found, Lost) else found
 
 
+def why_failed(log: Path, exit_code: int | None) -> str:
+    """Returns why a process failed: how it was killed, or else the last line of its log."""
+    killed = exit_code is not None and exit_code < 0
+    return how_it_ended(exit_code) if killed else last_line(log)
+
+
 def last_line(log: Path) -> str:
     """Returns the last line of a log; a few words if there is none."""
     lines = log.read_text(errors="replace").strip().splitlines() if log.exists() else []
@@ -141,7 +147,7 @@ class _Remote(NamedTuple):
 
 
 def _run_alone(remote: _Remote) -> str | None:
-    """Does one task in a process beside this process of Ray; returns the last line of its output if it failed."""
+    """Does one task in a process beside this process of Ray; returns why it failed, or None."""
     check_shared(remote.locked_folder)
     process = _started(_work_unpacked, remote, remote.folder)
     try:
@@ -149,7 +155,7 @@ def _run_alone(remote: _Remote) -> str | None:
             time.sleep(_POLL_S)
     finally:
         end([process], SAVING_S)
-    return last_line(remote.folder / LOG_FILE) if process.exitcode else None
+    return why_failed(remote.folder / LOG_FILE, process.exitcode) if process.exitcode else None
 
 
 def _work_unpacked(remote: _Remote) -> None:

@@ -73,6 +73,13 @@ def test_drivers_play_beside_every_option_of_forecasts():
     arena.close()
 
 
+def test_drivers_play_beside_policies_with_sizes_of_another_checkpoint():
+    """What has forecasts of other sizes in training is measured beside drivers that are shown none."""
+    arena = open_arena(Task("simple_tag_v3", "zeros", sizes_of="simple-tag", learners=("adversary",)), 1)
+    assert arena.play("random", [7])[0].length == 25
+    arena.close()
+
+
 @pytest.mark.parametrize("observe", ["none", "constant-velocity"])
 def test_a_driver_sees_the_environments_own_observation(observe: Observe, monkeypatch: pytest.MonkeyPatch):
     """Whatever the policy beside it is shown."""

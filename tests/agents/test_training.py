@@ -43,7 +43,7 @@ from envs.sb3.algorithms import algorithm_class
 from envs.sb3.policy_file import read_note
 from predictor.support.errors import UserError
 from tests.agents.helpers import STEERING
-from tests.agents.studies.helpers import TOY
+from tests.agents.studies.helpers import TOY, Corridor
 
 CONSTANT_VELOCITY = Task("highway-fast-v0", "constant-velocity")
 
@@ -345,6 +345,47 @@ def test_a_repeatable_run_that_was_killed_ends_as_one_that_was_not(
     assert points[0] == points[1] and [p["steps"] for p in points[0]] == [16, 32, 48, 64]
     notes = [read_note(tmp_path / n / "policy.zip") for n in ("whole", "killed")]
     assert notes[0] == notes[1]
+
+
+def test_runs_of_neighbouring_seeds_do_not_share_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    preset = PPOPreset(n_steps=4, batch_size=8, n_epochs=1, net_arch=(8,))
+    monkeypatch.setattr("agents.training.preset_for", lambda *_: preset)
+    begun: list[int] = []
+    monkeypatch.setattr(Corridor, "reset", noted(Corridor.reset, begun))
+    sizes = {"steps": 8, "num_envs": 8, "selections": 1, "selection_episodes": 1, "selection_envs": 1}
+    of_seed = []
+    for seed in (5, 6, 5):
+        begun.clear()
+        folder = tmp_path / str(len(of_seed))
+        folder.mkdir()
+        train(plan(task=Task(TOY, "none"), seed=seed, in_process=True, **sizes), folder)
+        of_seed.append({number for number in begun if number < SELECTION_SEED})
+    assert [len(seeds) for seeds in of_seed] == [8, 8, 8]
+    assert of_seed[0] == of_seed[2] and not of_seed[0] & of_seed[1]
+
+
+def noted(reset: Callable[..., Any], begun: list[int]) -> Callable[..., Any]:
+    """Returns a reset that adds its seeds to a list."""
+
+    def noting(self: Any, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        if seed is not None:
+            begun.append(seed)
+        return reset(self, seed=seed, options=options)
+
+    return noting
+
+
+def test_a_run_at_its_end_without_its_best_model_keeps_the_last(tmp_path: Path):
+    """The best one was damaged, and removed as the message says."""
+    training = plan(task=Task(TOY, "none"), in_process=True, num_envs=1, selections=1, selection_episodes=1, steps=8,
+                    settings={"n_steps": 8, "batch_size": 8})  # fmt: skip
+    train(training, tmp_path)
+    (tmp_path / "best_model.zip").unlink()
+    (tmp_path / "policy.zip").unlink()
+    assert train(training, tmp_path) == tmp_path / "policy.zip"
+    last, kept = (load_model(tmp_path / name, "ppo").policy.state_dict() for name in ("checkpoint.zip", "policy.zip"))
+    for name, weights in last.items():
+        assert torch.equal(weights, kept[name]), name
 
 
 def test_errors_in_the_loop_cover_all_steps_since_the_last_measurement(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -1,5 +1,7 @@
 """Helpers of the tests of studies: an environment whose optimum is known, study files, made-up results."""
 
+import os
+import signal
 import time
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ from agents.studies.results import Result
 
 TOY = f"{__name__}:Corridor-v0"
 SLOW_TOY = f"{__name__}:SlowCorridor-v0"
+DEADLY_TOY = f"{__name__}:DeadlyCorridor-v0"
 NUM_STEPS = 6
 
 
@@ -41,6 +44,16 @@ class Corridor(gym.Env[np.ndarray, np.int64]):
         return np.clip(shown, -5, 5).astype(np.float32)
 
 
+class DeadlyCorridor(Corridor):
+    """Corridor in which the first step kills the process, as a system without memory does."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        os.kill(os.getpid(), signal.SIGKILL)
+        raise AssertionError("unreachable")
+
+
+if "DeadlyCorridor-v0" not in gym.registry:
+    gym.register("DeadlyCorridor-v0", entry_point=DeadlyCorridor)
 for name, sleep_s in (("Corridor-v0", 0.0), ("SlowCorridor-v0", 0.004)):
     if name not in gym.registry:
         gym.register(name, entry_point=Corridor, kwargs={"sleep_s": sleep_s})

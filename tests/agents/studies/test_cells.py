@@ -78,6 +78,13 @@ def test_settings_of_an_algorithm_are_those_of_its_trainings(cells: Callable[...
     assert versions["qrdqn"] - versions["ppo"] == {"sb3-contrib"}, "cells of other algorithms do not depend on it"
 
 
+def test_the_version_of_a_simulator_is_in_the_names_of_the_cells_that_it_trains(cells: Callable[..., list[Cell]]):
+    pytest.importorskip("envpool")
+    arms = '["none", {name = "fast", observe = "none", backend = "envpool"}]'
+    found = {cell.line: set(cell.content["versions"]) for cell in cells(env_id=HIGHWAY, arms=arms, seeds="1")}
+    assert found["fast"] - found["none"] == {"envpool"} and "envpool" not in found["random"]
+
+
 def test_the_forecaster_is_in_the_name(cells: Callable[..., list[Cell]]):
     one, other, third = (
         cells(env_id=HIGHWAY, seeds="1", arms=f'[{{name = "a", observe = "forecast", checkpoint = "{name}"}}]')[-1]

@@ -7,6 +7,7 @@ from scipy import stats
 from agents.studies.estimators import (
     bootstrapped,
     gain,
+    gain_with_t_interval,
     interquartile_mean,
     mean,
     mean_with_t_interval,
@@ -48,6 +49,19 @@ def test_the_interval_of_a_mean_is_that_of_students_test():
     assert found.value == pytest.approx(7 / 3)
     assert (found.low, found.high) == pytest.approx(stats.ttest_1samp(scores, 0).confidence_interval(0.95))
     assert not mean_with_t_interval(np.array([5.0])).has_interval
+
+
+def test_the_interval_of_a_difference_is_that_of_welchs_test():
+    ours, theirs = np.array([1.0, 2.0, 4.0, 4.5]), np.array([0.0, 0.1, 0.4])
+    found = gain_with_t_interval(ours, theirs)
+    expected = stats.ttest_ind(ours, theirs, equal_var=False).confidence_interval(0.95)
+    assert found == pytest.approx((ours.mean() - theirs.mean(), *expected))
+    same = gain_with_t_interval(np.full(3, 5.27), theirs)
+    assert same.high - same.value == pytest.approx(stats.t.ppf(0.975, 2) * stats.sem(theirs)), "one of them is constant"
+    assert gain_with_t_interval(np.array([2.0, 2.0]), np.array([1.5, 1.5, 1.5])) == (0.5, 0.5, 0.5)
+    for few in ((ours, theirs[:1]), (ours[:1], theirs)):
+        assert gain_with_t_interval(*few).value == few[0].mean() - few[1].mean()
+        assert not gain_with_t_interval(*few).has_interval
 
 
 def test_improvement_in_closed_form():

@@ -4,7 +4,7 @@ from typing import get_args
 
 import pytest
 
-from agents.studies.plan import StudyArm, read_study, shipped_studies, study_file, takes_checkpoint, task_for
+from agents.studies.plan import StudyArm, read_study, shipped_studies, study_file, task_for
 from agents.task import Observe
 from predictor.support.errors import UserError
 from tests.agents.studies.helpers import study_path, study_text
@@ -47,10 +47,18 @@ def test_an_arm_names_a_checkpoint_by_scenario(tmp_path: Path):
     none, lstm = (task_for(study.scenarios[0], arm, "file") for arm in study.arms)
     assert lstm.checkpoint == "runs/corridor/merge-v1" and none.checkpoint is None
     assert task_for(study.scenarios[0], StudyArm("forecast", "forecast", {}), "file").checkpoint == "shared"
-    assert takes_checkpoint("forecast") and not takes_checkpoint("none")
     for arm in ("zeros", "constant-velocity", "forecast"):
         assert task_for(study.scenarios[0], StudyArm(arm, arm, {}), "file").sizes_of == "shared"
     assert lstm.sizes_of == "shared" and none.sizes_of is None
+
+
+@pytest.mark.parametrize("arm", get_args(Observe))
+def test_a_checkpoint_of_a_scenario_goes_to_every_arm_that_takes_one(tmp_path: Path, arm: Observe):
+    text = study_text(arms=f'["{arm}"]')
+    own = 'env_id = "merge-v1"\ncheckpoint = "shared"\nnum_samples = 6\nwhat_if = true\n'
+    study = read_study(study_path(tmp_path, text.replace(text[text.rindex("env_id") :], own)))
+    task = task_for(study.scenarios[0], study.arms[0], "file")
+    assert task.checkpoint == (None if arm in ("none", "constant-velocity") else "shared")
 
 
 def test_arms_with_forecasters_of_their_own_have_the_sizes_of_the_others(tmp_path: Path):

@@ -60,6 +60,14 @@ def test_a_crash_that_is_reported_only_when_it_happens_is_a_share_of_all_episode
     assert found_in(study(), runs(None, None)).crash_rate("one", SEEN) is None
 
 
+def test_a_driver_without_a_crash_may_still_crash():
+    """Wilson's interval: a bootstrap of no crashes has none."""
+    safe = result("slower", [1.0] * 10)
+    safe = replace(safe, episodes=tuple(e | {"crashed": False} for e in safe.episodes))
+    found = found_in(study(), [safe]).crash_rate("one", Line("slower", None))
+    assert found is not None and found == pytest.approx((0.0, 0.0, 0.2775), abs=1e-4)
+
+
 def test_a_driver_of_ones_own_is_no_constant_action():
     findings = found_in(study(), [*results(), result("own:mine:drive", [8.0, 9.0])])
     assert findings.best_constant("one") == Line("slower", None)
@@ -68,7 +76,8 @@ def test_a_driver_of_ones_own_is_no_constant_action():
 def test_headroom_is_shared_where_there_is_some():
     findings = found_in(study(), results())
     headroom, used = findings.headroom("one", "ppo"), findings.headroom_used("one", SEEN)
-    assert headroom is not None and headroom.value == 8.0 and headroom.low > 7
+    half = 2.7764451051977987 * np.sqrt(2 * 0.25 / 3)  # Student's, four degrees of freedom
+    assert headroom == pytest.approx((8.0, 8 - half, 8 + half))
     assert used is not None and used.value == pytest.approx(3 / 8) and used.low < 3 / 8 < used.high
     level = [r for r in results() if r.arm != "oracle"]
     level += [result("oracle", [2 + d, 2 - d], seed) for seed, d in enumerate((3.0, 0.0, 1.0))]
@@ -80,6 +89,9 @@ def test_pairs_are_those_with_the_rivals():
     (seen, oracle) = found_in(study(), results()).pairs(["one"])
     assert (seen.ours, seen.rival, oracle.ours) == (SEEN, ZEROS, ORACLE)
     assert seen.probability == (1.0, 1.0, 1.0) and seen.gain.value == 3.0
+    assert seen.gain.low == pytest.approx(3 - 2.7764451051977987 * np.sqrt(2 * 0.25 / 3))
+    both = found_in(study(("one", "two")), results() + results("two", lift=2.0)).pairs(["one", "two"])[0]
+    assert both.gain.value == pytest.approx(0.5) and both.gain.low > 0.3, "rescaled, by a bootstrap within scenarios"
     assert found_in(study(rivals=()), results()).pairs(["one"]) == []
     two = found_in(study(rivals=("zeros", "forecast")), results()).pairs(["one"])
     assert [(pair.ours, pair.rival) for pair in two] == [(SEEN, ZEROS), (ORACLE, ZEROS), (ORACLE, SEEN)]
@@ -163,6 +175,13 @@ def test_reports_of_equal_results_are_equal(tmp_path: Path):
     assert written(tmp_path / "b", both) == first
     assert "## All scenarios" in first[0] and "| forecast > zeros | all, rescaled scores | 1.00" in first[0]
     assert written(tmp_path / "c", results() + results("two", lift=1.1)) != first
+
+
+def test_the_report_counts_the_runs_that_there_are(tmp_path: Path):
+    assert "3 training seeds per arm" in written(tmp_path / "all", results())[0]
+    assert "2 to 3 training seeds per arm" in written(tmp_path / "fewer", results()[:-1])[0]
+    one = [r for r in results() if r.seed in (None, 0)]
+    assert "1 training seed per arm" in written(tmp_path / "one", one)[0]
 
 
 def test_what_failed_is_named(tmp_path: Path):

@@ -17,10 +17,10 @@ import pyarrow.parquet as parquet
 import pytest
 
 import agents.study
-from agents.studies.pool import START_METHOD
+from agents.studies.pool import START_METHOD, run_cells
 from agents.study import StudyConfig, run_study
 from predictor.support.errors import UserError, run_entry_point
-from tests.agents.studies.helpers import SLOW_TOY, TOY, study_path, study_text
+from tests.agents.studies.helpers import DEADLY_TOY, SLOW_TOY, TOY, study_path, study_text
 
 LEFT_OUT = re.compile(r"(## Time\n|<h2>Time</h2>).*", re.DOTALL)
 """What differs between two runs of one study."""
@@ -199,6 +199,30 @@ def test_a_cell_that_fails_does_not_stop_the_others(tmp_path: Path, capsys: pyte
     assert "Without a result: corridor, none, ppo, seed 0." in report and "| none | 1 |" in report
 
 
+def test_a_cell_that_is_killed_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    run = config(tmp_path, study_text(DEADLY_TOY, references="[]", seeds="1"))
+    assert run_study(run) == 1
+    err = capsys.readouterr().err
+    assert "failed: corridor, none, ppo, seed 0: its process was killed by SIGKILL (by the system, if memory ran" in err
+    assert re.search("its log is .*log.txt\n$", err)
+
+
+def test_a_result_tells_of_the_start_of_the_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Cells start one after another, perhaps hours later: another commit may be checked out, the file edited."""
+    run = config(tmp_path, text := study_text(steps="64", selections="1", seeds="1"))
+
+    def edited_meanwhile(*arguments: Any) -> None:
+        Path(run.study).write_text(study_text(steps="65"))
+        run_cells(*arguments)
+
+    monkeypatch.setattr("agents.study.commit_at_start", lambda: "as-at-the-start")
+    monkeypatch.setattr("agents.study.run_cells", edited_meanwhile)
+    assert run_study(run) == 0
+    assert {json.loads(found)["provenance"]["commit"] for found in results(tmp_path).values()} == {"as-at-the-start"}
+    assert (tmp_path / "out" / "study.toml").read_text() == text
+    assert (tmp_path / "out" / "report.md").read_text().endswith(f"{text}```\n")
+
+
 def test_a_part_of_a_study_is_run_and_the_rest_later(tmp_path: Path):
     """Cells of a part are those of the whole, and a report of a part says so."""
     text = study_text(steps="64", selections="1") + f'[scenarios.longer]\nenv_id = "{TOY}"\n'
@@ -215,6 +239,8 @@ def test_a_part_of_a_study_is_run_and_the_rest_later(tmp_path: Path):
     assert run_study(config(tmp_path, text)) == 0
     assert "Not run yet" not in report.read_text()
     assert len(results(tmp_path)) == 10 and first.items() <= results(tmp_path).items()
+    began = re.findall("10 cells, (.*);", (tmp_path / "out" / "study.log").read_text())
+    assert began == [f"{done} of them finished before, {left} to run" for done, left in ((0, 4), (4, 4), (8, 2))]
     with pytest.raises(UserError, match="study corridor has no scenario 'wide'; it has corridor, longer"):
         run_study(replace(part, scenarios=("longer", "wide")))
     with pytest.raises(UserError, match="has 2 training seeds, got --seeds 3; change seeds in a copy of its file"):
