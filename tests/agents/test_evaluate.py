@@ -3,8 +3,9 @@ from pathlib import Path
 
 import pytest
 
+from agents import evaluate
 from agents.arena import MultiagentArena
-from agents.evaluate import checked_drivers, compared_drivers, evaluate_policy_on_seeds, main
+from agents.evaluate import EvaluateConfig, checked_drivers, compared_drivers, evaluate_policy_on_seeds, main
 from agents.runs import SHIPPED
 from agents.task import EVALUATION_SEED, Task
 from predictor.support.errors import UserError
@@ -88,3 +89,15 @@ def test_no_further_drivers_on_demand(tmp_path: Path, monkeypatch: pytest.Monkey
     content = json.loads((tmp_path / "summary.json").read_text(), parse_constant=refuse)
     assert [policy["policy"] for policy in content["policies"]] == ["slower", "random", "idle"]
     assert all(policy["success_rate"] is None for policy in content["policies"])
+
+
+def test_the_policy_runs_on_the_device_that_is_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Its network as well as the forecaster; no such device is needed to ask for one."""
+    asked: list[str] = []
+    for module in ("agents.evaluate", "agents.task"):
+        monkeypatch.setattr(f"{module}.resolve_device", lambda device: device)
+    monkeypatch.setattr("agents.evaluate.load_model", lambda *_, device: asked.append(device))
+    policy = Path("highway-fast")
+    trained = evaluate._trained(EvaluateConfig(run_dir=policy, device="cuda", out=tmp_path), policy)
+    trained.model()
+    assert (trained.task.device, asked) == ("cuda", ["cuda"])

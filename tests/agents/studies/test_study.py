@@ -223,6 +223,19 @@ def test_a_result_tells_of_the_start_of_the_study(tmp_path: Path, monkeypatch: p
     assert (tmp_path / "out" / "report.md").read_text().endswith(f"{text}```\n")
 
 
+def test_a_run_whose_curve_was_removed_still_has_a_result(tmp_path: Path):
+    """A message says to remove it where it is damaged."""
+    run = config(tmp_path, study_text(steps="64", selections="1", seeds="1", references="[]"))
+    assert run_study(run) == 0
+    (cell,) = (tmp_path / "out" / "cells").iterdir()
+    before = json.loads((cell / "result.json").read_text())
+    (cell / "result.json").unlink()
+    (cell / "run" / "curve.json").unlink()
+    assert run_study(run) == 0
+    after = json.loads((cell / "result.json").read_text())
+    assert after["episodes"] == before["episodes"] and after["curve"] == [] and after["train_seconds"] == 0
+
+
 def test_a_part_of_a_study_is_run_and_the_rest_later(tmp_path: Path):
     """Cells of a part are those of the whole, and a report of a part says so."""
     text = study_text(steps="64", selections="1") + f'[scenarios.longer]\nenv_id = "{TOY}"\n'
