@@ -112,8 +112,8 @@ def test_forecasts_that_pass_the_end_count_up_to_it_and_the_last_before_a_crash_
     assert found.model.min_ade_m == 1.0 and found.model.agents == 2 * HORIZON
     assert found.to_the_end[0].agents == 2 * (HORIZON + 1)
     assert found.to_the_end[0].min_ade_m == pytest.approx((HORIZON + 4.0) / (HORIZON + 1))
-    assert found.before_crash[0].agents == 1 and found.before_crash[1].min_ade_m == 4.0
-    assert "the same in the last 5 s before a crash: minADE 4.000 m" in report.remarks(found)
+    assert found.before_crash[0].agents == 2 and found.before_crash[1].min_ade_m == (1.0 + 4.0) / 2
+    assert "the same in the last 5 s before a crash: minADE 2.500 m" in report.remarks(found)
     quiet = summarise_episodes("here", STILL, "idle", HIGHWAY_SPEC, [episodes[1]])
     assert quiet.before_crash is None and quiet.to_the_end is not None
 

@@ -101,6 +101,9 @@ def test_references_are_told_apart():
     findings = found_in(study(), results())
     assert findings.best_constant("one") == Line("slower", None)
     assert findings.planner("one") == Line("planner", None)
+    straight = result("planner:constant-velocity", [1.0, 1.0])
+    assert found_in(study(), [straight, *results()]).planner("one") == Line("planner", None)
+    assert found_in(study(), [straight]).planner("one") == Line("planner:constant-velocity", None)
     assert findings.heuristic("one") is None
     many = found_in(study(), [*results()[4:], result("heuristic", [6.0, 8.0]), result("random", [0.0, 2.0])])
     assert (many.best_constant("one"), many.planner("one")) == (None, None)
