@@ -11,7 +11,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from scipy import stats
 
-from agents.studies.estimators import CONFIDENCE, performance_profile, profile_band
+from agents.studies.estimators import CONFIDENCE, Estimate, performance_profile, profile_band
 from agents.studies.findings import Findings, Line, generator_of
 from predictor.reports.figures import panels, svg_of
 from predictor.reports.looks import BLACK, BLUE, BROWN, COLORS, DASHES, GREY, ORANGE
@@ -58,6 +58,13 @@ def plot_curve(
     return ax
 
 
+def plot_score(ax: Axes, place: float, score: Estimate, **style: Any) -> Axes:
+    """Draws a mean return on the test seeds, with its interval if it has one, at a place to the right of the curves."""
+    spread = [[score.value - score.low], [score.high - score.value]] if score.has_interval else None
+    ax.errorbar([place], [score.value], spread, marker="D", ms=4.5, lw=1.2, color=style.get("color"))
+    return ax
+
+
 def plot_references(ax: Axes, references: Mapping[str, float], upright: bool = False) -> Axes:
     """Draws the mean return of drivers as grey lines over the whole axis."""
     draw = ax.axvline if upright else ax.axhline
@@ -88,9 +95,12 @@ def learning_curves(findings: Findings) -> str:
     styles = styles_of(findings.lines(trained=True))
     for ax, scenario in zip(axes, findings.scenarios, strict=True):
         lines = findings.lines(scenario, trained=True)
-        for line in lines:
+        for i, line in enumerate(lines):
             steps, returns = curve_of(findings, scenario, line)
             plot_curve(ax, steps, returns, findings.label(line), **styles[line])
+            if len(steps):
+                plot_score(ax, steps[-1] * (1.04 + 0.02 * i), findings.mean_return(scenario, line), **styles[line])
+                ax.plot([], [], "D", ms=4.5, color=BLACK, label="policies that are kept, test seeds")
         plot_references(ax, _references(findings, scenario))
         ax.set_title(_title(scenario, [len(findings.results[scenario, line]) for line in lines]))
         ax.set_xlabel("environment steps")

@@ -212,7 +212,8 @@ def _pictures(findings: Findings) -> list[Block]:
     episodes = findings.study.selection_episodes
     curves = (
         f"Mean return on the {episodes} selection seeds during training; bands: 95 % interval over runs. "
-        "Grey lines: drivers on the test seeds."
+        "Diamonds: the policies that are kept, on the test seeds, with 95 % intervals; grey lines: drivers there. "
+        "Selection seeds may be easier or harder than test seeds."
     )
     shares = "Share of runs whose score is above τ; bands: 95 % bootstrap over runs."
     return [

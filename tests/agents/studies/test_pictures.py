@@ -2,8 +2,11 @@
 
 import itertools
 
+from matplotlib import pyplot as plt
+
+from agents.studies.estimators import Estimate
 from agents.studies.findings import Line
-from agents.studies.pictures import styles_of
+from agents.studies.pictures import plot_score, styles_of
 from predictor.reports.looks import BLACK, BLUE, COLORS, GREY
 
 
@@ -31,3 +34,13 @@ def test_algorithms_differ_by_dashes_alone():
         ppo, dqn = styles[Line(arm, "ppo")], styles[Line(arm, "dqn")]
         assert ppo["color"] == dqn["color"] and ppo["ls"] != dqn["ls"]
     assert styles_of([]) == {}
+
+
+def test_a_score_is_drawn_with_its_interval_if_it_has_one():
+    _, ax = plt.subplots()
+    plot_score(ax, 3.0, Estimate(5.0, 4.0, 7.0), color=BLUE)
+    plot_score(ax, 4.0, Estimate(1.0, float("nan"), float("nan")), color=GREY)
+    plt.close(ax.figure)
+    assert [line.get_xydata().tolist() for line in ax.lines] == [[[3.0, 5.0]], [[4.0, 1.0]]]
+    (bars,) = ax.collections
+    assert [part.tolist() for part in bars.get_segments()] == [[[3.0, 4.0], [3.0, 7.0]]]

@@ -117,6 +117,7 @@ def test_a_legend_has_each_arm_once_where_scenarios_have_unequal_numbers_of_runs
     texts = re.findall(r"<!-- (.*?) -->", drawn)
     assert [texts.count(name) for name in ("zeros", "forecast", "oracle")] == [1, 1, 1]
     assert {"one, n = 3", "two, n = 1 to 3"} <= set(texts)
+    assert texts.count("policies that are kept, test seeds") == 1
 
 
 def test_scores_of_several_scenarios_are_rescaled():
