@@ -77,8 +77,8 @@ class EvaluateConfig:
     """Number of episodes in each environment."""
     driver: Annotated[str | None, Renamed("ego")] = None
     """Driver. One ego: random, idle, varied (default), keep-lane, one action in every step (slower, action-4), or the
-    path of a policy .zip (which gets the measured forecasts). Many learners: random, idle, varied, heuristic (default),
-    mixed. Both: own:module:function (docs/wrap_your_env.md)."""
+    path of a policy .zip (which gets the forecasts that it was trained on). Many learners: random, idle, varied,
+    heuristic (default), mixed. Both: own:module:function (docs/wrap_your_env.md)."""
     seed: int = 900_000
     """Random seed: episode i is reset with seed + i; the shipped checkpoints were trained on seeds from 100,000
     on."""

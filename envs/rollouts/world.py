@@ -37,6 +37,7 @@ from envs.registry import (
     make_env,
     make_multiagent_env,
 )
+from envs.rollouts.own_view import OwnParallelView, OwnView, own_view
 from envs.seeding import driver_rng
 from envs.simulators.interventions import drop_all, generator_of
 from envs.supervision import Place, named
@@ -196,8 +197,11 @@ class EgoWorld:
         self.env.close()
 
     def _seen(self) -> Any:
-        """Returns the driver's observation: the env's own, or with forecasts."""
-        return self.observation if self._whole else without_added(self.observation)
+        """Returns the driver's observation: the env's own, or with the forecasts that it was trained on."""
+        if not self._whole:
+            return without_added(self.observation)
+        aside = own_view(self.env)
+        return self.observation if aside is None else aside.whole
 
 
 class MultiagentWorld:
@@ -250,9 +254,11 @@ class MultiagentWorld:
         Raises:
             EnvironmentFailedError: the environment raised, or a driver.
         """
-        seen = self._observations
+        aside, seen = own_view(self.env), self._observations
         if not self._name.endswith(".zip"):
             seen = {name: without_added(entries) for name, entries in seen.items()}
+        elif aside is not None:
+            seen = aside.whole
         self._place.move()
         with named(self._id, self._place):
             self._observations, *_ = self.env.step(self._driver(seen))
@@ -289,8 +295,10 @@ class MultiagentWorld:
         self.env.close()
 
     def _make_driver(self, rng: np.random.Generator) -> Driver:
-        make = trained_driver if self._name.endswith(".zip") else make_driver
-        return make(self._name, self.env, rng)
+        if not self._name.endswith(".zip"):
+            return make_driver(self._name, self.env, rng)
+        aside = own_view(self.env)
+        return trained_driver(self._name, self.env if aside is None else aside.env, rng)
 
 
 def open_world(
@@ -307,7 +315,7 @@ def open_world(
     Args:
         env_id: id of a gymnasium or a PettingZoo parallel environment.
         driver: name of a driver of the ego (`envs.drivers.ego`) or of all agents (`envs.drivers.all_agents`); or the
-            path of a policy .zip.
+            path of a policy .zip, which gets the forecasts that it was trained on, beside those of `checkpoint`.
         checkpoint: checkpoint of the forecasts; None makes no forecasts for an ego, and for many learners those that
             the driver was trained on, or constant velocity.
         horizon_steps: number of steps to forecast.
@@ -321,17 +329,13 @@ def open_world(
     """
     kwargs = arguments_of(env_kwargs)
     if is_multiagent_id(env_id):
-        options = wrapper_options(driver) if sees_forecasts(driver) else {}
-        checkpoint = checkpoint or options.get("checkpoint") or _forecaster_for(env_id, driver)
-        if checkpoint != options.get("checkpoint"):
-            options = {"checkpoint": checkpoint}
-        options |= {} if horizon_steps is None else {"horizon_steps": horizon_steps}
-        wrapped = ForecastParallelEnv(make_multiagent_env(env_id, **kwargs), **options)
-        multiagent = MultiagentWorld(wrapped, driver, env_id)
-        if sees_forecasts(driver):
-            space: Any = wrapped.observation_space(wrapped.possible_agents[0])
-            require_forecaster(driver, checkpoint, space, wrapped.scene_spec, options.get("arm"))
-        return multiagent
+        parallel = _parallel_env_for_driver(make_multiagent_env(env_id, **kwargs), driver)
+        if checkpoint is None and horizon_steps is None and isinstance(parallel, ForecastParallelEnv):
+            return MultiagentWorld(parallel, driver, env_id)
+        if isinstance(parallel, ForecastParallelEnv):
+            parallel = OwnParallelView(parallel)
+        checkpoint = checkpoint or _forecaster_for(env_id, driver)
+        return MultiagentWorld(ForecastParallelEnv(parallel, checkpoint, horizon_steps=horizon_steps), driver, env_id)
     env = make_env(env_id, disable_env_checker=True, **kwargs)
     if checkpoint is None:
         seen = env_for_driver(env, driver)
@@ -340,16 +344,25 @@ def open_world(
             seen = SceneObservation(seen, *bounds)
         world = EgoWorld(seen, driver, env_id)
     else:
-        if sees_forecasts(driver):
-            seen = ForecastObservation(env, checkpoint, horizon_steps=horizon_steps)
-            require_view(seen, driver)
-            space = seen.observation_space
-            require_forecaster(driver, checkpoint, space, seen.get_wrapper_attr("scene_spec"))
-        else:
-            require_view(env, driver)
-        world = EgoWorld(ForecastObservation(env, checkpoint, horizon_steps=horizon_steps), driver, env_id)
+        own = sees_forecasts(driver) and wrapper_options(driver)
+        below = OwnView(env_for_driver(env, driver)) if own else env
+        measured = ForecastObservation(below, checkpoint, horizon_steps=horizon_steps)
+        if not own:  # a policy without a note sees what is measured
+            require_view(measured if sees_forecasts(driver) else env, driver)
+        world = EgoWorld(measured, driver, env_id)
     make_ego_driver(driver, world.env, np.random.default_rng(0))
     return world
+
+
+def _parallel_env_for_driver(env: Any, driver: str) -> Any:
+    """Returns the env, in the wrapper that a policy with a note on its forecaster was trained with."""
+    options = wrapper_options(driver) if sees_forecasts(driver) else {}
+    if not options:
+        return env
+    seen = ForecastParallelEnv(env, **options)
+    space: Any = seen.observation_space(seen.possible_agents[0])
+    require_forecaster(driver, options["checkpoint"], space, seen.scene_spec, options["arm"])
+    return seen
 
 
 def _unpadded(scene: Scene) -> Scene:

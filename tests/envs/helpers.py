@@ -68,14 +68,15 @@ def save_tiny(path: Path, spec: SceneSpec, **changes: Any) -> str:
     return str(path)
 
 
-def save_forecast_policy(run_dir: Path, env_id: str, checkpoint: str) -> Path:
-    """A policy (untrained) with its note, as train_policy leaves it."""
+def save_forecast_policy(run_dir: Path, env_id: str, checkpoint: str, noted: bool = True) -> Path:
+    """A policy (untrained) with its note, as train_policy leaves it; without one, as SB3 does."""
     env = ForecastObservation(make_env(env_id), checkpoint)
     model = PPO("MultiInputPolicy", env, n_steps=4, batch_size=4, policy_kwargs={"net_arch": [4]}, device="cpu", seed=0)
     path = run_dir / "policy.zip"
     model.save(path)
     space: Any = env.observation_space
-    write_note(path, PolicyNote(pin_forecaster(checkpoint, space, env.get_wrapper_attr("scene_spec"))), {})
+    if noted:
+        write_note(path, PolicyNote(pin_forecaster(checkpoint, space, env.get_wrapper_attr("scene_spec"))), {})
     return path
 
 

@@ -25,7 +25,16 @@ from predictor.evaluation.outcomes import Outcome
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 from tests.envs.evaluation import TAG, forget, no_processes, read_json, save_tag, tag_spec
-from tests.envs.helpers import HIGHWAY_SPEC, HORIZON, SIZES, run_command, save_forecast_policy, tiny_model
+from tests.envs.helpers import (
+    HIGHWAY_SPEC,
+    HORIZON,
+    PLURAL,
+    SIZES,
+    run_command,
+    save_forecast_policy,
+    save_tiny,
+    tiny_model,
+)
 
 ROAD = "two-way-v0"
 STILL = "constant-velocity"
@@ -248,14 +257,21 @@ def test_a_policy_trained_on_forecasts_drives(in_process: None, tmp_path: Path, 
     assert driven.model != measure(ROAD, highway_checkpoint, horizon_steps=None).model
 
 
-@pytest.mark.parametrize(("checkpoint", "horizon"), [(STILL, HORIZON), (None, 2)], ids=["edges", "horizon"])
-def test_a_policy_trained_on_other_forecasts_is_named(
-    checkpoint: str | None, horizon: int, in_process: None, tmp_path: Path, highway_checkpoint: str
+def test_a_policy_drives_the_same_episodes_whatever_is_measured(
+    in_process: None, tmp_path: Path, highway_checkpoint: str
 ):
-    """It gets the forecasts that are measured; these have other edges, or fewer steps, than it was trained on."""
     policy = str(save_forecast_policy(tmp_path, ROAD, highway_checkpoint))
-    with pytest.raises(UserError, match="policy .*policy.zip was trained on"):
-        measure(ROAD, checkpoint or highway_checkpoint, horizon_steps=horizon, driver=policy)
+    another = save_tiny(tmp_path / "another", HIGHWAY_SPEC, **PLURAL)
+    own, other = (measure(ROAD, checkpoint, driver=policy) for checkpoint in (highway_checkpoint, another))
+    assert other.constant_velocity == own.constant_velocity and other.model.min_ade_m != own.model.min_ade_m
+
+
+def test_a_policy_without_a_note_sees_what_is_measured(in_process: None, tmp_path: Path, highway_checkpoint: str):
+    policy = save_forecast_policy(tmp_path, ROAD, highway_checkpoint, noted=False)
+    with pytest.warns(UserWarning, match="has no note on its forecaster"):
+        assert measure(ROAD, highway_checkpoint, horizon_steps=None, driver=str(policy)).model.agents > 0
+    with pytest.warns(UserWarning, match="has no note"), pytest.raises(UserError, match="policy.zip was trained on"):
+        measure(ROAD, STILL, horizon_steps=HORIZON, driver=str(policy))
 
 
 def test_worst_cases_are_of_different_episodes_worst_first(in_process: None):

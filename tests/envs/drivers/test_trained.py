@@ -11,7 +11,8 @@ from agents.runs import save_model
 from agents.task import Task
 from envs.drivers.trained import trained_driver
 from envs.parallel import ForecastParallelEnv
-from envs.rollouts.world import MultiagentWorld, open_world
+from envs.rollouts.own_view import own_view
+from envs.rollouts.world import EgoWorld, MultiagentWorld, World, open_world
 from envs.seeding import driver_rng
 from predictor.support.errors import UserError
 from tests.agents.helpers import policy_for
@@ -22,7 +23,10 @@ SEED = 7
 
 def save_run(folder: Path, task: Task, noted: bool = True) -> tuple[str, PPO]:
     """A policy as train_policy leaves it."""
-    model = policy_for(task)
+    if task.is_multiagent:
+        model = policy_for(task)
+    else:
+        model = PPO("MultiInputPolicy", task.wrapped(task.make()), n_steps=4, batch_size=4, device="cpu", seed=0)
     save_model(model, folder / "policy.zip", note=task.note if noted else None)
     return str(folder / "policy.zip"), model
 
@@ -102,8 +106,43 @@ def test_a_policy_refuses_forecasts_of_other_options(tmp_path: Path):
     assert open_world(SPREAD, path, "constant-velocity")
     with pytest.raises(UserError, match="was trained on"):
         MultiagentWorld(forecast_env(num_samples=2), path)
-    with pytest.raises(UserError, match="was trained on"):
-        open_world(SPREAD, path, "constant-velocity", horizon_steps=7)
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        Task("highway-fast-v0", "forecast", "highway", num_samples=2, what_if=True),
+        Task("simple_tag_v3", "forecast", "simple-tag", num_samples=2, learners=("adversary",)),
+    ],
+    ids=["ego", "many"],
+)
+def test_it_sees_its_own_forecasts_beside_those_that_are_measured(task: Task, tmp_path: Path):
+    """The same episode as without a measurement, whatever is measured; and the measured forecasts are as without it."""
+    path, _ = save_run(tmp_path, task)
+    recorded = played_world(open_world(task.env_id, path))[0]
+    for checkpoint, horizon_steps in (("constant-velocity", 2), (task.checkpoint, 3)):
+        states, forecasts = played_world(open_world(task.env_id, path, checkpoint, horizon_steps=horizon_steps))
+        assert all(np.array_equal(one, other) for one, other in zip(states, recorded, strict=True))
+        assert all(forecast.shape[1:4:2] == (1, horizon_steps) for forecast in forecasts)
+        if checkpoint == "constant-velocity":
+            moved = np.diff(forecasts[-1], axis=3)  # from the first step to the second
+            world = open_world(task.env_id, "idle", checkpoint, horizon_steps=horizon_steps)
+            world.reset(SEED)
+            np.testing.assert_allclose(world.forecast(1).xy.numpy(), forecasts[0], atol=1e-5)
+            assert np.abs(moved).max() > 0.01
+
+
+def played_world(world: World) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """States of all agents in the first steps of the episode of the seed, and the deployed forecasts, if any."""
+    world.reset(SEED)
+    states, forecasts = [], []
+    for _ in range(6):
+        if not isinstance(world, EgoWorld) or own_view(world.env) is not None:
+            forecasts.append(world.forecast(1).xy.numpy())
+        states.append(world.full_scene().states)
+        if world.step():
+            break
+    return states, forecasts
 
 
 @pytest.mark.filterwarnings("ignore:.* has no note")
