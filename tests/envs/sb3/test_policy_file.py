@@ -14,6 +14,7 @@ from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 
 from envs.drivers.trained import env_for_driver
 from envs.registry import make_env
+from envs.rollouts.own_view import own_view
 from envs.rollouts.world import open_world
 from envs.sb3.algorithms import Algorithm, algorithm_class
 from envs.sb3.policy_file import (
@@ -137,9 +138,14 @@ def test_other_options_are_named(field: str, other: int | None):
 def test_a_policy_drives_with_its_own_forecaster_only(tmp_path: Path, highway_checkpoint: str, retrained: str):
     policy = str(save_forecast_policy(tmp_path, ENV_ID, highway_checkpoint))
     assert env_for_driver(make_env(ENV_ID), policy)
-    open_world(ENV_ID, policy, highway_checkpoint).close()
-    with pytest.raises(UserError, match="was trained on forecaster .* but gets '.*retrained"):
-        open_world(ENV_ID, policy, retrained)
+    for measured in (highway_checkpoint, retrained):
+        world = open_world(ENV_ID, policy, measured)
+        world.reset(0)
+        for env, checkpoint in ((world.env, measured), (own_view(world.env).env, highway_checkpoint)):
+            expected = ForecastObservation(make_env(ENV_ID), checkpoint)
+            expected.reset(seed=0)
+            assert torch.equal(env.forecast.xy, expected.forecast.xy)
+        world.close()
 
 
 def test_a_forecaster_trained_anew_in_place_is_noticed(tmp_path: Path, highway_checkpoint: str, retrained: str):
