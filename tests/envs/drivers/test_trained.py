@@ -1,3 +1,4 @@
+import shutil
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from envs.parallel import ForecastParallelEnv
 from envs.rollouts.own_view import own_view
 from envs.rollouts.world import EgoWorld, MultiagentWorld, World, open_world
 from envs.seeding import driver_rng
+from predictor.checkpoint import PRETRAINED
 from predictor.support.errors import UserError
 from tests.agents.helpers import policy_for
 
@@ -130,6 +132,17 @@ def test_it_sees_its_own_forecasts_beside_those_that_are_measured(task: Task, tm
             world.reset(SEED)
             np.testing.assert_allclose(world.forecast(1).xy.numpy(), forecasts[0], atol=1e-5)
             assert np.abs(moved).max() > 0.01
+
+
+@pytest.mark.parametrize("measured", [None, "constant-velocity"])
+def test_a_forecaster_that_was_trained_anew_in_place_is_noticed(measured: str | None, tmp_path: Path):
+    mine = tmp_path / "mine"
+    shutil.copytree(PRETRAINED / "simple-tag", mine)
+    path, _ = save_run(tmp_path, Task("simple_tag_v3", "forecast", str(mine), learners=("adversary",)))
+    open_world("simple_tag_v3", path, measured).close()
+    shutil.copy(PRETRAINED / "particles" / "model.safetensors", mine)
+    with pytest.raises(UserError, match="was trained on forecaster .*mine' .SHA-256 .* but gets '.*mine' .SHA-256"):
+        open_world("simple_tag_v3", path, measured)
 
 
 def played_world(world: World) -> tuple[list[np.ndarray], list[np.ndarray]]:
