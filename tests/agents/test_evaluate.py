@@ -2,6 +2,7 @@ import json
 from pathlib import Path
 
 import pytest
+from stable_baselines3 import PPO
 
 from agents import evaluate
 from agents.arena import MultiagentArena
@@ -96,8 +97,14 @@ def test_the_policy_runs_on_the_device_that_is_asked_for(monkeypatch: pytest.Mon
     asked: list[str] = []
     for module in ("agents.evaluate", "agents.task"):
         monkeypatch.setattr(f"{module}.resolve_device", lambda device: device)
-    monkeypatch.setattr("agents.evaluate.load_model", lambda *_, device: asked.append(device))
+    model = PPO.__new__(PPO)  # only handed through
+
+    def load(*_: object, device: str) -> PPO:
+        asked.append(device)
+        return model
+
+    monkeypatch.setattr("agents.evaluate.load_model", load)
     policy = Path("highway-fast")
     trained = evaluate._trained(EvaluateConfig(run_dir=policy, device="cuda", out=tmp_path), policy)
-    trained.model()
+    assert trained.model() is model
     assert (trained.task.device, asked) == ("cuda", ["cuda"])
