@@ -468,6 +468,8 @@ def test_attention_is_added_to_a_checkpoint_without_effect_at_first(circles: Pat
             _, belief = model.observe(model.empty_memory(2, 4), states, valid)
             forecasts.append((belief.edge_probs, model.rollout(belief, 3).states))
     torch.testing.assert_close(*forecasts)
+    none = made(config(circles, tmp_path / "none", init=first, set=("attention_heads=0",))).model
+    assert none.encoder.attention is None
     second = train(config(circles, tmp_path / "second", init=first, set=added))
     model, info = load_checkpoint(second)
     assert info.config.attention_heads == 3 and model.encoder.attention.out.weight.abs().max() > 0
