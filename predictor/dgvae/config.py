@@ -54,9 +54,6 @@ class DGVAEConfig:
     geometry_scales: tuple[float, ...] = ()
     """Typical distance [m] and relative speed [m/s] of neighbours; if given, the geometry of each pair at these scales
     is an input of its edge and of its messages (`predictor.dgvae.geometry`)."""
-    attention_heads: int = 0
-    """Number of comparisons among the senders of an agent; each pair's shares are an input of its edge
-    (`predictor.dgvae.attention`). 0 compares none."""
     forget_bias: float = 0.0
     """Addend of the initial bias of the LSTMs' forget gates; 2 starts them with a memory of about eight steps."""
     innovation_rounds: int = 0
@@ -98,13 +95,10 @@ class DGVAEConfig:
                 "num_modes needs rollout_graph=frozen: what is drawn is held for the whole roll-out; or set num_modes=0"
             )
         check_at_least(self, 1, "hidden_dim", "rnn_dim", "head_dim", "message_dim", "decoder_dim", "innovation_dim")
-        check_at_least(
-            self, 0, "edge_feature_dim", "innovation_rounds", "static_dim", "substeps", "num_neighbours",
-            "attention_heads",
-        )  # fmt: skip
+        check_at_least(self, 0, "edge_feature_dim", "innovation_rounds", "static_dim", "substeps", "num_neighbours")
         check_at_most(
             self, MOST_WIDTH, "hidden_dim", "rnn_dim", "head_dim", "message_dim", "decoder_dim", "innovation_dim",
-            "edge_feature_dim", "num_neighbours", "attention_heads",
+            "edge_feature_dim", "num_neighbours",
         )  # fmt: skip
         check_at_most(self, MOST_PARTS, "num_modes", "num_edge_types", "innovation_rounds", "substeps")
         check_scale_values(self, "delta_scales", "input_scales", "change_scales")

@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-from predictor.dgvae.attention import Attention
 from predictor.dgvae.config import DGVAEConfig
 from predictor.dgvae.geometry import Geometry
 from predictor.dgvae.innovation import Innovation
@@ -84,7 +83,6 @@ class Encoder(nn.Module):
         if geometry is not None:
             self.conv_geometry = nn.Linear(geometry.num_features, width, bias=False)
             self.edge_geometry = nn.Linear(geometry.num_features, width, bias=False)
-        self.attention = Attention(width, config.attention_heads) if config.attention_heads else None
         self.forward_input = nn.Linear(width, 4 * rnn)
         self.forward_hidden = nn.Linear(rnn, 4 * rnn, bias=False)
         self.backward_input = nn.Linear(width, 4 * rnn)
@@ -112,11 +110,7 @@ class Encoder(nn.Module):
         if self.geometry is not None:
             geometry = self.geometry(*ends(inputs, senders))
             to_conv, to_edge = self.conv_geometry(geometry), self.edge_geometry(geometry)
-        hidden = self.conv_pair.elu(inputs, senders, self.embed, to_conv)
-        if self.attention is not None:
-            shown = self.attention(hidden, pairs)
-            to_edge = shown if to_edge is None else to_edge + shown
-        summed = sum_over_senders(hidden, weight)
+        summed = sum_over_senders(self.conv_pair.elu(inputs, senders, self.embed, to_conv), weight)
         # Σ_j (W h_ij + b) = W Σ_j h_ij + n b: the second layer of EdgeConv costs agents, not pairs.
         count = weight.sum(-1, keepdim=True)
         nodes = functional.elu(functional.linear(summed, self.conv_out.weight) + count * self.conv_out.bias)

@@ -246,10 +246,6 @@ class Packed:
         )
         return summed.unflatten(1, pairs.shape[1:])
 
-    def of_receivers(self, nodes: Float[Tensor, "listed node"]) -> Float[Tensor, "pairs node"]:
-        """Returns the entry of each pair's receiver."""
-        return nodes.index_select(0, self.roles[:, 0] // 2)
-
     def total(self, weight: Float[Tensor, " pairs"]) -> Float[Tensor, "listed 1"]:
         """Computes the total weight of each agent's senders."""
         total = weight.new_zeros(len(self.counts))

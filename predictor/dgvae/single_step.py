@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from torch.autograd import forward_ad
 from torch.nn import functional
 
-from predictor.dgvae.attention import shares, weights
 from predictor.dgvae.networks import NO_EDGE_LOGIT, Decoder, Edges, Encoder, no_edge_where_absent
 from predictor.dgvae.packing import Packed, Padded
 from predictor.dgvae.self_edges import SelfEdges
@@ -177,15 +176,10 @@ class Stepper:
     ]:
         """Computes the memory of each pair after a step (hidden, cell), prior logits and features."""
         geometry = None if self._geometry is None else self._geometry(*graph.ends(inputs))
-        conv = elu_(_spread(inputs, self._conv, graph, geometry, self._conv_geometry))
-        nodes = _product(graph.gather(conv), (self._conv_out[0], None))
+        summed = graph.gather(elu_(_spread(inputs, self._conv, graph, geometry, self._conv_geometry)))
+        nodes = _product(summed, (self._conv_out[0], None))
         nodes = elu_(nodes.addcmul_(graph.counts, self._conv_out[1]))
-        edges = _spread(nodes, self._edge, graph, geometry, self._edge_geometry)
-        if self._attention is not None:
-            score, out = self._attention
-            weight = weights(_product(conv, score))
-            edges = _product(shares(weight, graph.of_receivers(graph.gather(weight))), out, edges)
-        edges = elu_(edges)
+        edges = elu_(_spread(nodes, self._edge, graph, geometry, self._edge_geometry))
         gates = _product(edges, self._gates, _product(hidden, self._recurrent))
         hidden, cell = lstm_step_(gates, cell)
         heads = elu_(_product(elu(hidden), self._heads))
@@ -269,8 +263,6 @@ class Stepper:
         self._edge_geometry: Layer | None = None
         if encoder.geometry is not None:
             self._conv_geometry, self._edge_geometry = _layer(encoder.conv_geometry), _layer(encoder.edge_geometry)
-        parts = None if encoder.attention is None else (encoder.attention.score, encoder.attention.out)
-        self._attention = None if parts is None else tuple((part.weight.detach(), None) for part in parts)
         self._gates = folded(encoder.forward_input, encoder.edge_out)
         self._recurrent = (encoder.forward_hidden.weight.detach(), None)
         heads = [encoder.prior_head, encoder.feature_head] if encoder.config.edge_feature_dim else [encoder.prior_head]

@@ -20,8 +20,6 @@ OF_THE_DGVAE = ("input_changes", "fit_inputs", "edge_geometry")
 """Options of the dG-VAE's inputs, without effect on other models."""
 OF_THE_NETWORK = ("preset", "set", *OF_THE_DGVAE)
 """Options that make the network; a checkpoint to start from has them already."""
-ADDED_TO_A_CHECKPOINT = "attention_heads="
-"""What `set` may change beside `init`: it adds weights, which begin without effect."""
 SMALLER = "pass a smaller --batch-size, or a shorter --horizon-steps"
 BEFORE_THEY_EXISTED = dict.fromkeys(OF_THE_DGVAE, False)
 """Values of options in runs that began before the option existed, where today's default is another one."""
@@ -54,8 +52,8 @@ class TrainConfig:
     """Fields of the network's config to change, as field=value: --set hidden_dim=64 static_dim=16."""
     init: str = ""
     """Checkpoint to start from: a shipped name, a folder or a run folder. Network and scales are the checkpoint's, so
-    leave out the options of the network, but for --set attention_heads=8, which adds attention over senders to a
-    checkpoint without; frame and range of perception are the data's. Empty starts from random weights."""
+    leave out the options of the network; frame and range of perception are the data's. Empty starts from random
+    weights."""
     input_changes: bool = True
     """Whether changes since the last step are inputs of the dG-VAE's encoder (`change_scales`, fitted to the data). No
     effect on other models."""
@@ -161,7 +159,7 @@ class TrainConfig:
         check_at_most(self, MOST_THREADS, "threads")
         if self.one_step_weight == self.rollout_weight == 0:
             raise UserError("one_step_weight and rollout_weight are both 0; nothing would be learned")
-        given = [name for name in self.without_effect if getattr(self, name) != getattr(type(self), name)]
+        given = [name for name in OF_THE_NETWORK if getattr(self, name) != getattr(type(self), name)]
         if self.init and given:
             raise UserError(f"init takes the network of '{self.init}'; leave out {', '.join(given)}")
         if self.reaction_weight and not self.causal_edges:
@@ -183,8 +181,7 @@ class TrainConfig:
     def without_effect(self) -> tuple[str, ...]:
         """Options that change nothing in this run."""
         if self.init:
-            adds = self.set and all(text.startswith(ADDED_TO_A_CHECKPOINT) for text in self.set)
-            return tuple(name for name in OF_THE_NETWORK if not (adds and name == "set"))
+            return OF_THE_NETWORK
         return () if self.model == "dgvae" else OF_THE_DGVAE
 
 

@@ -21,7 +21,7 @@ from predictor.data.store import Episode, EpisodeStore, read_store, with_causal_
 from predictor.data.windows import WindowBatch, Windows, siblings, split_episodes
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import run_windows
-from predictor.models import build, changed, configure
+from predictor.models import build, configure
 from predictor.noise import NoiseOfRows, TrainingNoise
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
@@ -152,9 +152,8 @@ def initial_model(config: TrainConfig, data: TrainingData) -> Any:
     """Builds the model with random weights, or with those of the checkpoint to start from, for the data's scenes.
 
     Raises:
-        UserError: as `model_config`; or the checkpoint cannot be read, is of another model, has the attention already
-            that is to be added, or its scenes have other features, or an ego where the data's have none, or none where
-            the data's have one.
+        UserError: as `model_config`; or the checkpoint cannot be read, is of another model, or its scenes have other
+            features, or an ego where the data's have none, or none where the data's have one.
     """
     if not config.init:
         return build(config.model, data.spec, model_config(config, data), config.horizon_steps)
@@ -168,15 +167,8 @@ def initial_model(config: TrainConfig, data: TrainingData) -> Any:
             f"has_ego={data.spec.has_ego}; start from a checkpoint that agrees, or without --init"
         )
     spec = replace(data.spec, feature_scales=info.spec.feature_scales)  # scales are the network's, the rest the data's
-    network = changed(info.model, info.config, config.set)
-    if config.set and info.config.attention_heads:
-        raise UserError(
-            f"checkpoint '{config.init}' has attention_heads={info.config.attention_heads} already; leave out --set"
-        )
-    model: Any = build(info.model, spec, network, config.horizon_steps)
-    model.load_state_dict(model.state_dict() | source.state_dict())
-    if config.set and network.attention_heads:
-        torch.nn.init.zeros_(model.encoder.attention.out.weight)
+    model = build(info.model, spec, info.config, config.horizon_steps)
+    model.load_state_dict(source.state_dict())
     return model
 
 

@@ -33,7 +33,6 @@ CONFIGS = {
     "gated": replace(FAST_LIKE, gated_messages=True, num_edge_types=3),
     "gated without features": replace(FAST_LIKE, gated_messages=True, edge_feature_dim=0),
     "changes": replace(FAST_LIKE, change_scales=CHANGES),
-    "attention": replace(FAST_LIKE, attention_heads=4),
     "substeps": replace(FAST_LIKE, substeps=2, residual="trapezoid"),
     "neighbours": replace(FAST_LIKE, num_neighbours=2, num_edge_types=3),
     "frozen": replace(FAST_LIKE, rollout_graph="frozen"),

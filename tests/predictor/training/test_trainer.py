@@ -445,8 +445,6 @@ def test_what_began_well_is_kept_if_training_makes_it_worse(circles: Path, tmp_p
     [
         ({"fit_inputs": False}, "init takes the network of 'RUN'; leave out fit_inputs"),
         ({"preset": "paper", "set": ("rnn_dim=3",)}, "leave out preset, set"),
-        ({"set": ("attention_heads=2", "rnn_dim=3")}, "leave out set"),
-        ({"set": ("attention_heads=many",)}, "attention_heads of DGVAEConfig must be of type int, got 'many'"),
         ({"model": "lstm"}, "is of model dgvae; pass --model dgvae"),
         ({"init": "nowhere"}, "nowhere"),
     ],
@@ -455,23 +453,3 @@ def test_a_start_that_does_not_fit_is_named(circles: Path, tmp_path: Path, chang
     first = str(train(config(circles, tmp_path / "first")))
     with pytest.raises(UserError, match=message.replace("RUN", first)):
         made(config(circles, tmp_path / "second", **({"init": first} | changes)))
-
-
-def test_attention_is_added_to_a_checkpoint_without_effect_at_first(circles: Path, tmp_path: Path):
-    first = str(train(config(circles, tmp_path / "first")))
-    added = ("attention_heads=3",)
-    began = made(config(circles, tmp_path / "second", init=first, set=added)).model.eval()
-    states, valid = random_states(0, 2, 4, 4), torch.ones(2, 4, dtype=torch.bool)
-    forecasts = []
-    for model in (load_checkpoint(first)[0].eval(), began):
-        with torch.no_grad():
-            _, belief = model.observe(model.empty_memory(2, 4), states, valid)
-            forecasts.append((belief.edge_probs, model.rollout(belief, 3).states))
-    torch.testing.assert_close(*forecasts)
-    none = made(config(circles, tmp_path / "none", init=first, set=("attention_heads=0",))).model
-    assert none.encoder.attention is None
-    second = train(config(circles, tmp_path / "second", init=first, set=added))
-    model, info = load_checkpoint(second)
-    assert info.config.attention_heads == 3 and model.encoder.attention.out.weight.abs().max() > 0
-    with pytest.raises(UserError, match="has attention_heads=3 already; leave out --set"):
-        made(config(circles, tmp_path / "third", init=str(second), set=added))
