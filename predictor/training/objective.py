@@ -126,7 +126,8 @@ def window_loss(
 def reaction_weights(batch: WindowBatch, weight: float, total: Total = of_one_process) -> Float[Tensor, "batch agents"]:
     """Computes a factor for each agent: 1 plus `weight` times the strength of the causal edges to it, over its mean.
 
-    Known are the edges from an agent whose intervention is the last thing that was observed: its receivers react.
+    Known are the edges from an agent whose intervention is the last thing that was observed: its receivers react. Of
+    one that was taken out, the edges are those of the step before.
 
     Args:
         batch: windows; the first edge attribute is the strength, where there is one.
@@ -138,8 +139,13 @@ def reaction_weights(batch: WindowBatch, weight: float, total: Total = of_one_pr
     factors = torch.ones_like(visible, dtype=batch.states.dtype)
     if not weight or batch.edge_attributes is None or batch.edge_types is None:
         return factors
-    is_edge = batch.edge_types[rows, batch.last_observed] > 0
-    strength = torch.where(is_edge, batch.edge_attributes[rows, batch.last_observed][..., 0], 0.0).amax(-1)
+    before = (batch.last_observed - 1).clamp(min=0)
+    gone = batch.valid[rows, before] & ~visible
+    strength = torch.zeros_like(factors)
+    for step, senders in ((batch.last_observed, visible), (before, gone)):
+        is_edge = (batch.edge_types[rows, step] > 0) & senders[:, None]
+        found = torch.where(is_edge, batch.edge_attributes[rows, step][..., 0], 0.0)
+        strength = torch.maximum(strength, found.amax(-1))
     factors = factors + weight * strength
     return factors / total(masked_mean(factors, visible, total))
 

@@ -15,7 +15,7 @@ from predictor.data.windows import WindowBatch
 from predictor.forecaster import WindowOutput
 from predictor.support.errors import UserError
 from predictor.training.config import TrainConfig
-from predictor.training.objective import nll, window_loss
+from predictor.training.objective import nll, reaction_weights, window_loss
 from tests.predictor.helpers import any_model, model, random_states
 
 # Agent 1 is absent at the last of three steps, so there are 2 · 2 ordered pairs, at the first two steps.
@@ -228,6 +228,18 @@ def test_agents_that_react_weigh_more():
         assert terms(config, windows, out)["nll_rollout"] == pytest.approx((weights[0] * 2 + weights[1] * 4) / 2)
         plain = terms(replace(config, reaction_weight=0.0), windows, out)
         assert plain["nll_rollout"] == pytest.approx((2 + 4) / 2)
+
+
+@pytest.mark.parametrize(("gone_at", "weights"), [(1, (1 / 4, 7 / 4)), (2, (1.0, 1.0))])
+def test_agents_that_react_to_one_that_is_gone_weigh_more(gone_at: int, weights: tuple[float, float]):
+    """Agent 2 has an edge of strength 2 to agent 1 at step 0, and is not there from a step on; step 1 is the last."""
+    types = torch.full((1, 3, 3, 3), -1, dtype=torch.int8)
+    strength = torch.zeros(1, 3, 3, 3, 1)
+    types[0, 0, 1, 2], strength[0, 0, 1, 2] = 1, 2.0
+    valid = torch.ones(1, 3, 3).bool()
+    valid[0, gone_at:, 2] = False
+    windows = WindowBatch(torch.zeros(1, 3, 3, 4), valid, torch.tensor([1]), types, strength)
+    assert reaction_weights(windows, 3.0)[0, :2].tolist() == pytest.approx(weights)
 
 
 def test_the_weight_of_reactions_needs_causal_labels():
