@@ -176,6 +176,8 @@ def test_every_page_of_this_repository_is_understood():
     assert len(blocks) > 15
     fences = sum(page.read_text().count("```bash") + page.read_text().count("```python") for page in pages)
     assert len(blocks) == fences
+    for block in blocks:
+        assert block.skipped or block.to_run  # an option that a short form lacks is found here, in a second
 
 
 def test_the_command_fails_with_the_block(tmp_path: Path):
