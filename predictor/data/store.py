@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
 from jaxtyping import Bool, Float, Int
 
 from predictor.data.episode_checks import check_episode
@@ -27,6 +26,7 @@ from predictor.data.store_files import (
     check_replaceable,
     digest_of,
     most_bytes_of,
+    open_group,
     read_arrays,
     read_header,
 )
@@ -171,7 +171,7 @@ def _write(path: Path, info: StoreInfo, episodes: Sequence[Episode]) -> None:
             perturbed[steps, : episode.states.shape[1]] = episode.perturbed
         ids[i, : len(episode.ids)] = episode.ids
     with new_folder(path) as partial:
-        group = zarr.open_group(partial, mode="w")
+        group = open_group(partial, mode="w")
         chunk = max(1, min(len(states), 4096))
         # every chunk is written, so that a missing one is damage, not zeros
         create = partial_of(group.create_array, compressors=COMPRESSORS, config={"write_empty_chunks": True})

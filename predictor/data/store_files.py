@@ -14,7 +14,7 @@ import stat
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import zarr
@@ -24,6 +24,7 @@ from predictor.support.errors import UserError, short
 from predictor.support.memory import check_memory
 from predictor.support.reading import MIB, NoSuchFile, as_object, check_regular, read_object, unreadable
 from predictor.support.remote import address, is_remote, names_below
+from predictor.support.stopping import deferred_stops
 
 FORMAT = "dgvae-rl episodes"
 METADATA = "zarr.json"
@@ -142,6 +143,17 @@ def check_digest(path: Path, attributes: Mapping[str, Any]) -> None:
         raise UserError(f"{path / METADATA} is damaged (its checksum does not fit); copy or collect it anew")
 
 
+def open_group(path: Path, mode: Literal["r", "w"], **options: Any) -> zarr.Group:
+    """Opens a group; Ctrl-C and SIGTERM wait until it is open.
+
+    The first group starts Zarr's event loop, which complains at its end where a signal came while it was being made.
+    """
+    with deferred_stops() as stops:
+        group = zarr.open_group(path, mode=mode, **options)
+    stops.stop()
+    return group
+
+
 def read_arrays(path: Path, header: StoreHeader) -> dict[str, np.ndarray]:
     """Reads all arrays of a store whose files have been checked.
 
@@ -149,7 +161,7 @@ def read_arrays(path: Path, header: StoreHeader) -> dict[str, np.ndarray]:
         UserError: chunks are missing or damaged; the message names one.
     """
     try:
-        group = zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
+        group = open_group(path, mode="r", zarr_format=3, use_consolidated=False)
         return {name: _read(path, name, group[name], DIGEST in header.attributes) for name in header.shapes}
     except UserError:
         raise

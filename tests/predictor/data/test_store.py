@@ -1,4 +1,6 @@
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -439,3 +441,28 @@ def test_what_is_no_store_is_never_replaced(tmp_path: Path, make: Any):
     with pytest.raises(UserError, match="store is not an episode store and will not be replaced; choose another path"):
         write_store(tmp_path / "store", INFO, [episode(1)], overwrite=True)
     assert {path: path.read_bytes() for path in before} == before
+
+
+STOPPED_WHILE_ZARR_STARTS = """
+import asyncio, os, signal, sys
+from pathlib import Path
+from predictor.data.store_files import open_group
+from predictor.support.errors import run_entry_point
+
+begin = asyncio.base_events.BaseEventLoop.__init__
+
+def asked_to_stop(loop):
+    os.kill(os.getpid(), signal.SIGTERM)
+    begin(loop)
+
+asyncio.base_events.BaseEventLoop.__init__ = asked_to_stop
+run_entry_point(lambda: open_group(Path(sys.argv[1]), mode="w") and print("went on"))
+"""
+
+
+def test_a_stop_while_zarr_starts_its_event_loop_is_one_line(tmp_path: Path):
+    """A loop that is half made complains when it is deleted."""
+    words = [sys.executable, "-c", STOPPED_WHILE_ZARR_STARTS, str(tmp_path / "store")]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (143, "")
+    assert done.stderr == "stopped: what was not written yet is lost; the same command begins anew\n"
