@@ -19,8 +19,8 @@ from predictor.reports.plots import save_figure
 from predictor.support.markdown import table
 
 HEADS = (
-    "perturbation", "n (episodes)", "forecaster", "true [m]", "predicted [m]", "slope (95 %)", "slope on one path (n)",
-    "r at the end (95 %)", "r of all steps", "false reaction (95 %)",
+    "perturbation", "n (episodes)", "forecaster", "true [m]", "predicted [m]", "slope (95 %)", "median ratio (95 %)",
+    "slope on one path (n)", "r at the end (95 %)", "r of all steps", "false reaction (95 %)",
 )  # fmt: skip
 """Columns of the table."""
 
@@ -45,7 +45,8 @@ def shown(result: EnvReactions) -> Table:
     """Returns the table of one environment for a terminal."""
     lines = Table(title=title(result))
     for i, heading in enumerate(HEADS):
-        lines.add_column(heading.replace("[", r"\["), justify="left" if i in (0, 2) else "right", no_wrap=i > 4)
+        name = heading.replace("[", r"\[")
+        lines.add_column(name, justify="left" if i in (0, 2) else "right", overflow="fold")  # nothing is cut off
     for cells in _lines(result):
         lines.add_row(*cells)
     return lines
@@ -71,7 +72,7 @@ def _lines(result: EnvReactions) -> list[list[str]]:
             lines.append(
                 [
                     *first, name, _metres(found.true_m), _metres(predicted), _with_interval(found.slope),
-                    _on_path(cell, name), _with_interval(found.correlation),
+                    _with_interval(found.median_ratio), _on_path(cell, name), _with_interval(found.correlation),
                     "–" if found.correlation_of_steps is None else f"{found.correlation_of_steps.value:.2f}",
                     _with_interval(cell.false_reactions.get(name)),
                 ]

@@ -9,6 +9,8 @@ of sender and receiver, with true shifts t and predicted shifts p at steps 1 to 
   forecast moves the other way. Where a true shift is 0 and has no direction, |p| stands in its place.
 * **slope**: Σ p · t / Σ t · t over all pairs and steps, the line of least squares through the origin: 1 is the true
   reaction, 0 none. Pairs with long shifts weigh most.
+* **median ratio**: median of p · t / t · t at the last step, over pairs that truly move by more than a metre. All of
+  them weigh the same, so it says what is usual where a few shifts are ten times as long as the others.
 * **correlation**: Pearson's r between |t| and the predicted shift along t; over the pairs at the last step, and over
   all pairs and steps. The second is higher, since both grow with the time ahead.
 * **false reaction**: mean |p| at the last step of receivers that truly do not move, over mean |p| of receivers that do.
@@ -22,10 +24,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from predictor.evaluation.standard_errors import Estimate, bootstrap_interval
+from predictor.evaluation.standard_errors import Estimate, bootstrap_draws, bootstrap_interval, central_interval
 
 NO_SHIFT_M = 1e-6
 """Length below which a true shift has no direction [m]."""
+MOVED_M = 1.0
+"""Length from which a true shift counts in the median ratio [m]: of shorter ones the ratio says little."""
 FLAT = 1e-9
 """Share of the mean square below which a variance counts as rounding."""
 
@@ -72,6 +76,8 @@ class Reaction:
     """Predicted shift along the true one at the last step [m]."""
     slope: Estimate | None = None
     """Slope of the predicted on the true shift; None if all true shifts are 0."""
+    median_ratio: Estimate | None = None
+    """Median ratio of the predicted to the true shift at the last step; None if nobody moves by more than a metre."""
     correlation: Estimate | None = None
     """Correlation over pairs at the last step; None if one of the two does not vary."""
     correlation_of_steps: Estimate | None = None
@@ -98,6 +104,7 @@ def reaction(shifts: Shifts) -> Reaction:
         float(length_m[:, -1].mean()),
         float(along_m[:, -1].mean()),
         _slope(shifts),
+        _median_ratio(true_m[:, -1], along_m[:, -1], shifts.episode),
         _correlation(true_m[:, -1:], along_m[:, -1:], shifts.episode),
         _correlation(true_m, along_m, shifts.episode),
         tuple(true_m.mean(axis=0).tolist()),
@@ -129,6 +136,29 @@ def _slope(shifts: Shifts) -> Estimate | None:
     dots = (shifts.predicted_m * shifts.true_m).sum(axis=(1, 2))
     squares = np.square(shifts.true_m).sum(axis=(1, 2))
     return _estimate(np.stack([dots, squares], axis=-1), shifts.episode, lambda sums: _ratio(sums[:, 0], sums[:, 1]))
+
+
+def _median_ratio(
+    true_m: Float[np.ndarray, " pairs"], along_m: Float[np.ndarray, " pairs"], episode: Int[np.ndarray, " pairs"]
+) -> Estimate | None:
+    far = true_m > MOVED_M
+    if not far.any():
+        return None
+    ratios = along_m[far] / true_m[far]
+    order = np.argsort(ratios)
+    episodes, batch = np.unique(episode[far][order], return_inverse=True)
+    drawn = bootstrap_draws(len(episodes))[:, batch]
+    interval = None if len(episodes) < 2 else central_interval(_medians(ratios[order], drawn))
+    return Estimate(float(np.median(ratios)), interval)
+
+
+def _medians(
+    ascending: Float[np.ndarray, " values"], times: Int[np.ndarray, "draws values"]
+) -> Float[np.ndarray, " draws"]:
+    """Returns the median of values of which each is drawn so many times."""
+    up_to = times.cumsum(axis=1)
+    lower, upper = (half(2 * up_to, up_to[:, -1:]).argmax(axis=1) for half in (np.greater_equal, np.greater))
+    return (ascending[lower] + ascending[upper]) / 2
 
 
 def _correlation(

@@ -21,13 +21,14 @@ REACTION = Reaction(
     9.0,
     -8.88,
     Estimate(0.8, (0.7, 0.9)),
+    Estimate(0.9, (0.6, 1.2)),
     Estimate(0.75, None),
     Estimate(0.85, (0.8, 0.9)),
     (5.0, 11.1),
     (4.0, 8.88),
     (4.5, 9.0),
 )
-NO_SLOPE = replace(REACTION, slope=None)
+NO_SLOPE = replace(REACTION, slope=None, median_ratio=None)
 LEADERS = CellReactions(
     LEADER_CELL.name, 20, {"ours": REACTION, STRAIGHT: NO_SLOPE}, {"ours": replace(REACTION, pairs=12)}, {}, 3
 )
@@ -45,7 +46,7 @@ def test_lines_of_the_page():
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[4:8]]
     assert cells[0] == [
         LEADER_CELL.name, "20 (6)", "ours", "11.10", "-8.88", "0.80 (0.70 to 0.90)",
-        "0.80 (0.70 to 0.90) (12)", "0.75", "0.85", "–",
+        "0.90 (0.60 to 1.20)", "0.80 (0.70 to 0.90) (12)", "0.75", "0.85", "–",
     ]  # fmt: skip
     assert cells[1][2:6] == [STRAIGHT, "11.10", "-8.88", "–"]
     assert cells[2][2:] == [
@@ -54,11 +55,12 @@ def test_lines_of_the_page():
         "9.00",
         "–",
         "–",
+        "–",
         "0.75",
         "0.85",
         "0.08 (0.05 to 0.12)",
     ]  # a length, no sign
-    assert cells[3] == ["taken out", "0"] + ["–"] * 8
+    assert cells[3] == ["taken out", "0"] + ["–"] * 9
     assert "* 40 episodes; fewer than 20 perturbations: taken out 0" in lines
     assert f"* not counted, because the receiver crashes in one branch: {LEADER_CELL.name} 3" in lines
     assert "* left out: far: steps of 0.2 s" in lines
@@ -67,8 +69,14 @@ def test_lines_of_the_page():
 
 def test_the_terminal_has_the_same_cells():
     text = StringIO()
-    Console(file=text, width=200).print(shown(RESULT))
+    Console(file=text, width=240).print(shown(RESULT))
     assert all(word in text.getvalue() for word in ("0.80 (0.70 to 0.90)", "0.08 (0.05 to 0.12)", "predicted [m]"))
+
+
+def test_a_narrow_terminal_cuts_nothing_off():
+    text = StringIO()
+    Console(file=text, width=80).print(shown(RESULT))
+    assert "…" not in text.getvalue() and text.getvalue().count("0.08") == 1
 
 
 def test_json_has_every_shift():

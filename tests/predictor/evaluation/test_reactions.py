@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from predictor.evaluation.reactions import Shifts, false_reaction, reaction
-from predictor.evaluation.standard_errors import Estimate
+from predictor.evaluation.standard_errors import Estimate, bootstrap_draws
 
 
 def shifts(true_m: object, predicted_m: object, episode: object = None) -> Shifts:
@@ -29,6 +29,7 @@ def test_a_share_of_the_true_reaction_is_the_slope(share: float):
     assert (found.pairs, found.episodes) == (30, 10)
     assert found.slope is not None and found.slope.interval == pytest.approx((share, share))
     assert value(found.slope) == pytest.approx(share)
+    assert value(found.median_ratio) == pytest.approx(share)
     assert value(found.correlation) == pytest.approx(np.sign(share))
     assert value(found.correlation_of_steps) == pytest.approx(np.sign(share))
     length_m = np.linalg.norm(true_m, axis=-1).mean(axis=0)
@@ -49,6 +50,32 @@ def test_no_reaction_has_slope_zero_and_no_correlation():
     assert found.slope == Estimate(0.0, (0.0, 0.0))
     assert found.correlation is None and found.correlation_of_steps is None
     assert found.along_m == found.length_m == 0.0 and found.true_m != 0.0
+
+
+def test_one_long_shift_rules_the_slope_and_not_the_median_ratio():
+    found = reaction(shifts([2.0, 2.0, 4.0, 4.0, 40.0, 0.5], [2.0, 1.8, 3.8, 4.0, 0.0, 9.0]))
+    assert value(found.slope) < 0.05
+    assert value(found.median_ratio) == pytest.approx(0.95)  # of 1, 0.9, 0.95, 1 and 0; half a metre does not count
+
+
+@pytest.mark.parametrize("pairs", [40, 41])
+def test_the_interval_of_the_median_ratio_is_a_bootstrap_over_episodes(pairs: int):
+    rng = np.random.default_rng(4)
+    episode, true_m = rng.integers(12, size=pairs), rng.uniform(2.0, 9.0, size=pairs)
+    ratios = rng.normal(0.8, 0.5, size=pairs) + 0.1 * episode
+    found = reaction(shifts(true_m, ratios * true_m, episode)).median_ratio
+    assert found is not None and found.value == pytest.approx(np.median(ratios))
+    present = np.unique(episode)
+    drawn = [
+        np.median(np.concatenate([np.repeat(ratios[episode == one], n) for one, n in zip(present, times, strict=True)]))
+        for times in bootstrap_draws(len(present))
+    ]
+    assert found.interval == pytest.approx(tuple(np.percentile(drawn, [2.5, 97.5])))
+
+
+def test_the_median_ratio_needs_someone_who_moves():
+    assert reaction(shifts([0.9, 0.2], [0.9, 0.1])).median_ratio is None
+    assert reaction(shifts([0.9, 3.0], [0.9, 1.5])).median_ratio == Estimate(0.5, None)  # one episode moves
 
 
 def test_a_shift_across_the_true_one_is_no_reaction():
