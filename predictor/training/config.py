@@ -36,7 +36,8 @@ class TrainConfig:
     """Fields that --help explains."""
 
     data: tuple[Path, ...]
-    """Episode stores (python -m envs.collect makes them); several are mixed by their number of windows."""
+    """Episode stores (python -m envs.collect makes them); several are mixed by their number of windows, and one
+    that is listed twice counts twice."""
     out: Path
     """Run folder, with checkpoint/, config.json, TensorBoard and training state."""
     val_data: tuple[Path, ...] = ()

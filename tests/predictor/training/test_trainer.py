@@ -243,6 +243,15 @@ def test_training_episodes_can_be_limited(circles: Path, tmp_path: Path, given: 
     assert [len(w) for w in few.val] == [len(w) for w in everything.val]
 
 
+def test_a_store_that_is_listed_twice_counts_twice(circles: Path, tmp_path: Path):
+    """Its held-out episodes stay out of both."""
+    once = load_data(config(circles, tmp_path))
+    twice = load_data(replace(config(circles, tmp_path), data=(circles, circles)))
+    assert [len(w) for w in twice.train] == 2 * [len(w) for w in once.train]
+    assert [e.seed for e in twice.train_episodes] == 2 * [e.seed for e in once.train_episodes]
+    assert len(twice.sources) == 2 and [len(w) for w in twice.val] == 2 * [len(w) for w in once.val]
+
+
 def test_validation_may_ask_for_whole_histories_and_horizons(circles: Path, tmp_path: Path):
     """As in the tables: `history_steps` of burn-in and the whole horizon; training windows stay as they were."""
     loose, strict = (load_data(config(circles, tmp_path, val_history_steps=n)) for n in (1, 3))
