@@ -18,8 +18,8 @@ from predictor.reports.plots import save_figure
 from predictor.support.markdown import table
 
 HEADS = (
-    "edges by", "accuracy", "precision", "recall", "F1 (95 %)", "F1, fitted bound", "AUC (95 %)", "average precision",
-    "calibration error", "r with shift (95 %)", "spread over senders",
+    "edges by", "accuracy", "precision", "recall", "recall: leaders / others", "F1 (95 %)", "F1, fitted bound",
+    "AUC (95 %)", "average precision", "calibration error", "r with shift (95 %)", "spread over senders",
 )  # fmt: skip
 """Columns of the table."""
 RULES = {DISTANCE: YELLOW, LEADERS: BLACK, MAJORITY: GREY}
@@ -65,7 +65,8 @@ def _lines(result: EnvGraph) -> list[list[str]]:
         spread = found.spread_between_senders
         lines.append(
             [
-                name, _value(found.accuracy), _value(found.precision), _value(found.recall), _with_interval(found.f1),
+                name, _value(found.accuracy), _value(found.precision), _value(found.recall),
+                f"{_value(found.recall_of_leaders)} / {_value(found.recall_of_others)}", _with_interval(found.f1),
                 _value(found.fitted), _with_interval(found.auc), _value(found.average_precision),
                 _value(found.calibration_error), _with_interval(found.strength),
                 "–" if spread is None or not found.bins else f"{spread:.2f}",

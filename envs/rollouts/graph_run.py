@@ -110,6 +110,7 @@ def scores_of(episodes: Sequence[Sequence[EdgeScene]], threshold_m: float) -> di
                 scene.shift_m > threshold_m,
                 np.full(len(scene.shift_m), number),
                 step * ids + scene.receiver,
+                scene.leads,
             )
             for number, step, scene in scenes
         ]
@@ -126,7 +127,6 @@ def scores_of(episodes: Sequence[Sequence[EdgeScene]], threshold_m: float) -> di
     common = float(pairs.exists[fit].mean()) if fit.any() else 0.0
     scores[MAJORITY] = score_rule(np.full(len(pairs), common), pairs, EDGE)
     scores[DISTANCE] = score_rule(-joined([scene.distance_m for *_, scene in scenes]), pairs, None)
-    if all(scene.leads is not None for *_, scene in scenes):
-        leads = joined([np.asarray(scene.leads) for *_, scene in scenes])
-        scores[LEADERS] = score_rule(leads, pairs, EDGE)
+    if pairs.leads is not None:
+        scores[LEADERS] = score_rule(pairs.leads.astype(np.float64), pairs, EDGE)
     return scores

@@ -5,6 +5,8 @@ labels. A rule gives each pair a score; a model's is its probability of an edge.
 
 * **Decision**: score above a bound. Accuracy, precision, recall, F1 of the edges. `fitted` is the F1 of the bound that
   is best on other pairs, those of the first half of the episodes; for a rule without a bound of its own it is the one.
+* **Which edges are found**: the recall among edges from a receiver's leader, and among all others, where leaders are
+  known.
 * **Ranking**: AUC is the probability that an edge scores higher than another pair, ties count half; average precision
   is the mean, over edges, of the precision where each is found.
 * **Strength**: Spearman's correlation of the score with the shift, over all pairs.
@@ -48,6 +50,8 @@ class CausalPairs:
     """Episode of each pair."""
     receiver: Int[np.ndarray, " pairs"]
     """Number of each pair's receiver at its step, unique in its episode."""
+    leads: Bool[np.ndarray, " pairs"] | None = None
+    """Whether the simulator says that the receiver follows the sender; None where it says nothing."""
 
     def __len__(self) -> int:
         """Number of pairs."""
@@ -55,13 +59,16 @@ class CausalPairs:
 
     def where(self, chosen: Bool[np.ndarray, " pairs"]) -> "CausalPairs":
         """Returns the chosen pairs."""
-        return CausalPairs(*(getattr(self, field.name)[chosen] for field in fields(self)))
+        columns: list[Any] = [getattr(self, field.name) for field in fields(self)]
+        return CausalPairs(*(None if column is None else column[chosen] for column in columns))
 
     @staticmethod
     def concatenate(parts: "Sequence[CausalPairs]") -> "CausalPairs":
-        """Joins the pairs of several episodes."""
-        columns: list[Any] = [np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(CausalPairs)]
-        return CausalPairs(*columns)
+        """Joins the pairs of several episodes; leaders are known if all parts know them."""
+        columns: list[list[Any]] = [[getattr(part, field.name) for part in parts] for field in fields(CausalPairs)]
+        return CausalPairs(
+            *(None if any(one is None for one in column) else np.concatenate(column) for column in columns)
+        )
 
 
 @dataclass(frozen=True)
@@ -98,6 +105,10 @@ class CausalScores:
     """Share of edges among those inferred."""
     recall: Estimate | None = None
     """Share of the edges that are inferred."""
+    recall_of_leaders: Estimate | None = None
+    """Share of the edges from a receiver's leader that are inferred; None without one, or where leaders are unknown."""
+    recall_of_others: Estimate | None = None
+    """Share of all other edges that are inferred; None without one, or where leaders are unknown."""
     f1: Estimate | None = None
     """Harmonic mean of both."""
     fitted: Estimate | None = None
@@ -267,11 +278,18 @@ def _estimate(sums: np.ndarray, value: Callable[[np.ndarray], np.ndarray]) -> Es
 
 
 def _decisions(score: Float[np.ndarray, " pairs"], pairs: CausalPairs, bound: float | None) -> dict[str, Any]:
-    """Returns accuracy, precision, recall and F1 of a bound."""
+    """Returns accuracy, precision, recall, of edges from leaders and of others too, and F1 of a bound."""
     inferred = np.zeros(len(pairs), dtype=np.bool_) if bound is None else score > bound
-    counts = np.stack([inferred & pairs.exists, inferred, pairs.exists, inferred == pairs.exists], axis=-1)
-    sums = _summed(np.concatenate([counts, np.ones((len(pairs), 1))], axis=-1).astype(np.float64), pairs.episode)
+    leads = np.zeros(len(pairs), dtype=np.bool_) if pairs.leads is None else pairs.leads
+    found, led = inferred & pairs.exists, leads & pairs.exists
+    counts = [found, inferred, pairs.exists, inferred == pairs.exists, np.ones(len(pairs)), found & leads, led]
+    sums = _summed(np.stack(counts, axis=-1).astype(np.float64), pairs.episode)
+    by_leader = pairs.leads is not None
     return {
+        "recall_of_leaders": _estimate(sums, lambda s: _divided(s[:, 5], s[:, 6])) if by_leader else None,
+        "recall_of_others": (
+            _estimate(sums, lambda s: _divided(s[:, 0] - s[:, 5], s[:, 2] - s[:, 6])) if by_leader else None
+        ),
         "accuracy": _estimate(sums, lambda s: _divided(s[:, 3], s[:, 4])),
         "precision": _estimate(sums, lambda s: _divided(s[:, 0], s[:, 1])),
         "recall": _estimate(sums, lambda s: _divided(s[:, 0], s[:, 2])),

@@ -28,12 +28,19 @@ def test_lines_of_the_page():
     lines = markdown([RESULT]).splitlines()
     assert lines[0] == "### merge-v1, driven varied: 40 pairs of 10 episodes, 25 % are edges"
     ours, common, near = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines[4:7])
-    assert ours[:6] == ["ours", "1.00", "1.00", "1.00", "1.00 (1.00 to 1.00)", "1.00"]
-    assert ours[8] != "–" and ours[10] != "–"
-    assert common[:5] == [MAJORITY, "0.75", "–", "0.00", "0.00 (0.00 to 0.00)"]
-    assert near[0] == DISTANCE and (near[8], near[10]) == ("–", "–")
-    assert near[6] == "0.67 (0.67 to 0.67)"
+    assert ours[:7] == ["ours", "1.00", "1.00", "1.00", "– / –", "1.00 (1.00 to 1.00)", "1.00"]
+    assert ours[9] != "–" and ours[11] != "–"
+    assert common[:6] == [MAJORITY, "0.75", "–", "0.00", "– / –", "0.00 (0.00 to 0.00)"]
+    assert near[0] == DISTANCE and (near[9], near[11]) == ("–", "–")
+    assert near[7] == "0.67 (0.67 to 0.67)"
     assert lines[-1] == "* left out: far: steps of 0.2 s"
+
+
+def test_recall_of_leaders_and_others_stand_in_one_cell():
+    late = np.arange(80) >= 60
+    found = score_rule(np.where(late, 0.3, PROB), replace(PAIRS, leads=EXISTS & ~late), 0.5)
+    line = markdown([replace(RESULT, scores={"ours": found})]).splitlines()[4]
+    assert "| 1.00 / 0.00 |" in line
 
 
 def test_the_terminal_has_the_same_cells():

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -166,3 +168,29 @@ def test_the_curve_ends_where_all_are_edges():
     assert found.curve[-1] == pytest.approx((1.0, exists[200:].mean()))
     recalls = [recall for recall, _ in found.curve]
     assert recalls == sorted(recalls)
+
+
+def test_edges_from_leaders_and_others_are_counted_apart():
+    """Of 4 edges from leaders 3 are found, of 2 others none; a leader without an edge counts in neither."""
+    exists = np.array([True] * 6 + [False] * 2)
+    leads = np.array([True] * 4 + [False] * 2 + [True, False])
+    score = np.array([0.9, 0.8, 0.7, 0.2, 0.3, 0.1, 0.9, 0.6])
+    later = replace(pairs(np.tile(exists, 2), np.repeat([0, 1], 8)), leads=np.tile(leads, 2))
+    found = score_rule(np.tile(score, 2), later, 0.5)
+    assert (value(found.recall_of_leaders), value(found.recall_of_others)) == (0.75, 0.0)
+    assert value(found.recall) == 0.5
+    unknown = score_rule(np.tile(score, 2), replace(later, leads=None), 0.5)
+    assert unknown.recall_of_leaders is None and unknown.recall_of_others is None
+    assert unknown.recall == found.recall
+    nobody_leads = score_rule(np.tile(score, 2), replace(later, leads=np.zeros(16, dtype=np.bool_)), 0.5)
+    assert nobody_leads.recall_of_leaders is None and value(nobody_leads.recall_of_others) == 0.5
+
+
+def test_leaders_of_joined_pairs_are_known_if_all_parts_know_them():
+    one = replace(pairs([True, False], [0, 0]), leads=np.array([False, True]))
+    other = pairs([False, True], [1, 1])
+    assert CausalPairs.concatenate([one, other]).leads is None
+    both = CausalPairs.concatenate([one, replace(other, leads=np.array([True, True]))])
+    assert both.leads is not None and both.leads.tolist() == [False, True, True, True]
+    chosen = both.where(np.array([True, True, False, False])).leads
+    assert chosen is not None and chosen.tolist() == [False, True]
