@@ -59,16 +59,16 @@ class CausalPairs:
 
     def where(self, chosen: Bool[np.ndarray, " pairs"]) -> "CausalPairs":
         """Returns the chosen pairs."""
-        columns: list[Any] = [getattr(self, field.name) for field in fields(self)]
-        return CausalPairs(*(None if column is None else column[chosen] for column in columns))
+        columns = [getattr(self, field.name) for field in fields(self)]
+        parts: list[Any] = [None if column is None else column[chosen] for column in columns]
+        return CausalPairs(*parts)
 
     @staticmethod
     def concatenate(parts: "Sequence[CausalPairs]") -> "CausalPairs":
         """Joins the pairs of several episodes; leaders are known if all parts know them."""
-        columns: list[list[Any]] = [[getattr(part, field.name) for part in parts] for field in fields(CausalPairs)]
-        return CausalPairs(
-            *(None if any(one is None for one in column) else np.concatenate(column) for column in columns)
-        )
+        columns = [[getattr(part, field.name) for part in parts] for field in fields(CausalPairs)]
+        joined: list[Any] = [None if any(x is None for x in found) else np.concatenate(found) for found in columns]
+        return CausalPairs(*joined)
 
 
 @dataclass(frozen=True)
