@@ -73,8 +73,8 @@ def write_card(config: CardConfig) -> Path:
         [
             f"# Predictor checkpoint `{name}`",
             f"{kind}, {parameters:,} parameters, {size_kb:.0f} kB of safetensors. Trained on recorded "
-            f"{', '.join(info.sources)}; forecasts {info.horizon_steps} steps of {info.spec.dt_s:g} s. Sees at most "
-            f"{info.spec.max_agents} agents ({ego}) within {info.spec.perception_m:g} m.",
+            f"{', '.join(dict.fromkeys(info.sources))}; forecasts {info.horizon_steps} steps of {info.spec.dt_s:g} s. "
+            f"Sees at most {info.spec.max_agents} agents ({ego}) within {info.spec.perception_m:g} m.",
             "## Accuracy in the live environment",
             f"Held-out seeds from {first_seed:,}; {left_out}. minADE₁ is the most likely forecast (K = 1); neighbours: "
             "memoryless nearest neighbours on the training data. Intervals: bootstrap over episodes.",

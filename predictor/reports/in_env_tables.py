@@ -89,9 +89,9 @@ def samples_table(measurements: Sequence[Measurement]) -> str:
     for m in measurements:
         if m.energy_m is None:
             continue
-        covered = "–" if m.coverage is None else "{:.0f} to {:.0f} %".format(*(100 * c for c in m.coverage))
+        covered = "–" if m.coverage is None else _shares(m.coverage)
         if m.mixture_coverage is not None:
-            covered += "; with spread {:.0f} to {:.0f} %".format(*(100 * c for c in m.mixture_coverage))
+            covered += f"; with spread {_shares(m.mixture_coverage)}"
         hit = "–" if m.overlap is None else "{:.1f} ({:.1f}) %".format(*(100 * o for o in m.overlap))
         lines.append(
             [
@@ -112,6 +112,11 @@ def samples_table(measurements: Sequence[Measurement]) -> str:
                 [m.env_id, str(m.samples), name, *figures, "–" if share is None else f"{100 * share:.0f} %", "–"]
             )
     return table(SAMPLES_HEADINGS, lines, "-r-r")
+
+
+def _shares(ends: Sequence[float]) -> str:
+    low, high = (f"{100 * end:.0f}" for end in ends)
+    return f"{low} %" if low == high else f"{low} to {high} %"
 
 
 def card_section(measurements: Sequence[Measurement]) -> str:

@@ -34,8 +34,10 @@ def test_a_note_stands_once_below_the_table_with_the_envs_it_concerns():
 
 def test_coverage_with_the_spread_of_modes_is_told_where_it_was_measured():
     sampled = replace(MEASURED, energy_m=1.0, coverage=(0.75, 1.0))
-    plain, spread = samples_table([sampled, replace(sampled, mixture_coverage=(0.5, 0.875))]).splitlines()[2:]
+    coverages = (None, (0.5, 0.875), (0.986, 0.99))
+    plain, spread, narrow = samples_table([replace(sampled, mixture_coverage=c) for c in coverages]).splitlines()[2:]
     assert "| 75 to 100 % |" in plain and "| 75 to 100 %; with spread 50 to 88 % |" in spread
+    assert "| 75 to 100 %; with spread 99 % |" in narrow
 
 
 def test_only_what_stands_between_the_markers_is_replaced():
