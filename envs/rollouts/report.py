@@ -17,7 +17,7 @@ from predictor.evaluation.graph_accuracy import GraphAccuracy
 from predictor.reports.fitted_table import FittedTable
 from predictor.reports.looks import BLACK, STYLE, looks_of
 from predictor.reports.plots import save_figure
-from predictor.reports.tables import markdown_table
+from predictor.reports.tables import markdown_table, percent_range
 from predictor.support.markdown import table
 
 
@@ -118,8 +118,8 @@ def remarks(result: "EnvAccuracy") -> str:
             )
     if covered := result.model_samples.mixture_coverage:
         lines.append(
-            f"{100 * min(covered):.0f} to {100 * max(covered):.0f} % of the coordinates, by step, within the central "
-            "90 % of the predicted mixture (modes with their spread)"
+            f"{percent_range(covered)} of the coordinates, by step, within the central 90 % of the predicted mixture "
+            "(modes with their spread)"
         )
     graph = result.graph
     if graph is not None and graph.accuracy is not None:

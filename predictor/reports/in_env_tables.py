@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 
 from predictor.evaluation.in_env_record import Interval, Measurement
+from predictor.reports.tables import percent_range
 from predictor.support.errors import UserError
 from predictor.support.markdown import table
 
@@ -89,9 +90,9 @@ def samples_table(measurements: Sequence[Measurement]) -> str:
     for m in measurements:
         if m.energy_m is None:
             continue
-        covered = "–" if m.coverage is None else _shares(m.coverage)
+        covered = "–" if m.coverage is None else percent_range(m.coverage)
         if m.mixture_coverage is not None:
-            covered += f"; with spread {_shares(m.mixture_coverage)}"
+            covered += f"; with spread {percent_range(m.mixture_coverage)}"
         hit = "–" if m.overlap is None else "{:.1f} ({:.1f}) %".format(*(100 * o for o in m.overlap))
         lines.append(
             [
@@ -112,11 +113,6 @@ def samples_table(measurements: Sequence[Measurement]) -> str:
                 [m.env_id, str(m.samples), name, *figures, "–" if share is None else f"{100 * share:.0f} %", "–"]
             )
     return table(SAMPLES_HEADINGS, lines, "-r-r")
-
-
-def _shares(ends: Sequence[float]) -> str:
-    low, high = (f"{100 * end:.0f}" for end in ends)
-    return f"{low} %" if low == high else f"{low} to {high} %"
 
 
 def card_section(measurements: Sequence[Measurement]) -> str:

@@ -159,6 +159,12 @@ def plain(value: float | None, places: int = 3) -> str:
     return "–" if value is None else f"{value:.{places}f}"
 
 
+def percent_range(shares: Sequence[float]) -> str:
+    """Returns the smallest and the largest of some shares as text, ``88 to 94 %``, or ``94 %`` where they are equal."""
+    low, high = f"{100 * min(shares):.0f}", f"{100 * max(shares):.0f}"
+    return f"{low} %" if low == high else f"{low} to {high} %"
+
+
 def _signed(value: float | None) -> str:
     return "–" if value is None else f"{value:+.2f}"
 
