@@ -55,7 +55,7 @@ class Moment:
 
 
 FILMED = Moment(900_021, 6)
-PLANNED = Moment(900_004, 5)
+PLANNED = Moment(900_015, 8)
 BRAKING = Moment(900_014, 6)
 GRAPH = Moment(900_010, 5)
 FORKS = {"roundabout-v1": Moment(900_000, 3), "intersection-v2": Moment(900_002, 5)}
@@ -181,7 +181,7 @@ def draw_calibration(path: Path) -> None:
                 color=looks[name]["color"], label=None if place else f"{name}, all steps",
             )  # fmt: skip
     ax.set_yticks(range(len(measured)), list(measured))
-    ax.set(xlabel="truths within the central 90 % of 20 samples [%]", xlim=(60, 100))
+    ax.set(xlabel="truths within the central 90 % of 20 samples [%]", xlim=(50, 100))
     ax.invert_yaxis()
     figure.legend(loc="outside lower center", ncols=3, fontsize=9)
     figure.savefig(path, dpi=130)
