@@ -108,26 +108,14 @@ def test_what_the_shipped_checkpoints_use_of_the_newer_parts_is_what_their_confi
         p.parent.name: json.loads(p.read_text())["config"]
         for p in (ROOT / "predictor/pretrained").glob("*/config.json")
     }
-    sees_changes = {name for name, config in configs.items() if config.get("change_scales")}
-    fitted = {name for name, config in configs.items() if config.get("input_scales")}
-    words = {
-        3: "three",
-        4: "four",
-        5: "five",
-        6: "six",
-        7: "seven",
-        8: "eight",
-        9: "nine",
-        10: "ten",
-        12: "twelve",
-        13: "thirteen",
-    }
-    assert f"Of {len(configs)}, {words[len(sees_changes)]} see changes" in LIMITS
-    assert f"{words[len(fitted)]} of these have fitted input scales" in LIMITS and fitted <= sees_changes
-    assert all(f"`{name}`" in LIMITS.split("fitted input scales")[1].split("\n* ")[0] for name in fitted)
-    plural = {name for name, config in configs.items() if config.get("num_modes")}
-    named = LIMITS.split("Plural are ")[1].split(". ")[0]
-    assert {name for name in configs if f"`{name}`" in named} == plural
+    assert f"All {len(configs)} see changes" in LIMITS and "as all that ship are" in LIMITS
+    for name, config in configs.items():
+        assert config["change_scales"] and config["input_scales"] and config["num_modes"] == 20, name
+    without = LIMITS.split("All have geometry on their edges")[1].split("\n* ")[0]
+    roundabouts = {name for name in configs if name.startswith("roundabout")}
+    named = {name for name in configs if f"`{name}`" in without}
+    assert "those of the roundabouts" in without and not named & roundabouts
+    assert named | roundabouts == {name for name, config in configs.items() if not config.get("geometry_scales")}
     for config in configs.values():
         assert not config.get("innovation_rounds") and not config.get("gated_messages")
         assert config["residual"] == "constant_velocity"
