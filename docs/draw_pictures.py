@@ -166,7 +166,7 @@ def draw_calibration(path: Path) -> None:
     measured = {one.env_id: (one.coverage or (0.0, 0.0), one.controls or {}) for one in records}
     names = list(dict.fromkeys(name for _, controls in measured.values() for name in controls))
     looks = dict(zip(names, looks_of(names), strict=True)) | {"model + Gaussian noise": {"color": ORANGE}}
-    figure, ax = plt.subplots(figsize=(9, 4.6), layout="constrained")
+    figure, ax = plt.subplots(figsize=(9, 1.4 + 0.25 * len(measured)), layout="constrained")
     ax.axvspan(80, 97, color=GREY, alpha=0.15, lw=0)
     ax.axvline(90, color=BLACK, lw=0.8, ls=":", label="calibrated: 90 %")
     for place, (spread, controls) in enumerate(measured.values()):
