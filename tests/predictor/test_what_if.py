@@ -160,7 +160,8 @@ def test_without_interactions_the_others_are_forecast_as_without_plans(kind: str
     belief = observed(made(kind), *scenes())
     planned = rollout_plans(made(kind), belief, plans_for(), 3, noise()).states
     plain = made(kind).rollout(belief, HORIZON, 3, noise()).states[:, None].expand_as(planned)
-    assert torch.equal(planned[..., 1:, :, :], plain[..., 1:, :, :])
+    # products of other batch sizes are rounded differently on some processors
+    torch.testing.assert_close(planned[..., 1:, :, :], plain[..., 1:, :, :], rtol=1e-5, atol=1e-5)
 
 
 @every_forecaster
