@@ -21,7 +21,6 @@ from predictor.checkpoint import (
     save_checkpoint,
 )
 from predictor.dgvae import DGVAE
-from predictor.forecaster import has_scale
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 from tests.predictor.helpers import EVERY_MODEL, ROAD, any_model, model, random_presence, random_states, spec
@@ -289,13 +288,6 @@ def test_everything_that_ships_is_small_and_forecasts():
         assert sum(p.stat().st_size for p in resolve(name).iterdir()) < 5_000_000, name
 
 
-def test_everything_that_ships_has_plural_futures_and_sees_changes():
-    for name in checkpoint.shipped():
-        forecaster, info = load_checkpoint(name)
-        assert has_scale(forecaster) and info.config.num_modes == 20, name
-        assert info.config.change_scales and info.config.input_scales, name
-
-
 def test_unknown_name_lists_the_known_ones(monkeypatch: pytest.MonkeyPatch, path: Path):
     monkeypatch.setattr(checkpoint, "PRETRAINED", path.parent)
     with pytest.raises(UserError) as error:
@@ -386,15 +378,6 @@ def test_checkpoints_from_before_there_were_other_models_are_dgvaes(path: Path):
     loaded, info = load_checkpoint(path)
     assert info == INFO
     assert isinstance(loaded, DGVAE)
-    assert_holds(path, made())
-
-
-def test_a_checkpoint_that_names_no_model_is_a_dgvae(path: Path):
-    content = json.loads((path / "config.json").read_text())
-    assert content.pop("model") == "dgvae"
-    (path / "config.json").write_text(json.dumps(content))
-    loaded, info = load_checkpoint(path)
-    assert type(loaded) is DGVAE and info.model == "dgvae"
     assert_holds(path, made())
 
 
