@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import matplotlib
+import torch
 
 from predictor.data.store import read_info_of
 from predictor.evaluation.ablations import ABLATIONS
@@ -76,7 +77,8 @@ class SuiteConfig:
     steps: int = 0
     """Number of optimiser steps of every line; 0 takes that of the budget."""
     workers: Annotated[int, Renamed("jobs")] = 0
-    """Number of parallel processes, a line in each, which share all cores; 0 is one per core (one in all on a GPU)."""
+    """Number of parallel processes, a line in each, which share all cores (or OMP_NUM_THREADS threads, where that is
+    set); 0 is one per core (one in all on a GPU)."""
     seed: int = 0
     """Random seed for training and forecasts; the first one, if there are several."""
     device: str = "cpu"
@@ -170,7 +172,7 @@ def line_config(config: SuiteConfig, line: Line, out: Path) -> TrainConfig:
         seed=config.seed,
         device=config.device,
         precision=config.precision,
-        threads=0 if config.device != "cpu" else max(1, (os.cpu_count() or 1) // config.num_processes),
+        threads=0 if config.device != "cpu" else max(1, torch.get_num_threads() // config.num_processes),
         resume=True,
     )
     return replace(base, **line.train)

@@ -118,6 +118,16 @@ def test_all_lines_of_a_table_share_data_steps_and_protocol(data: Path, tmp_path
         assert len({getattr(c, name) for c in configs}) == 1, name
 
 
+@pytest.mark.parametrize(("threads", "workers", "of_each"), [(4, 1, 4), (4, 2, 2), (1, 1, 1), (1, 4, 1)])
+def test_processes_share_the_threads_that_torch_has(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int, workers: int, of_each: int
+):
+    """So OMP_NUM_THREADS=1 leaves cores to other work; two commands of all cores each would wait for each other."""
+    monkeypatch.setattr("torch.get_num_threads", lambda: threads)
+    made = line_config(config(data, tmp_path, workers=workers), line("plural"), tmp_path)
+    assert made.threads == of_each
+
+
 # --- Tables beside NRI's ------------------------------------------------------------------------------------------
 
 
