@@ -264,8 +264,8 @@ def _check_same(file: Path, config: dict[str, Any], free: Sequence[str]) -> list
         if name in free or was == now:
             continue
         if isinstance(was, dict) and isinstance(now, dict):  # name the part that differs
-            part = next(key for key in was if was[key] != now.get(key))
-            name, was, now = f"{name}.{part}", was[part], now.get(part)
+            part = next(key for key in was if key not in now or was[key] != now[key])
+            name, was, now = f"{name}.{part}", was[part], now.get(part, "not there")
         raise UserError(
             f"cannot resume {file.parent}: {name} was {was!r}, now {now!r}; pass the old value or choose another --out"
         )

@@ -14,7 +14,7 @@ from envs.own_observation import without_added
 from envs.parallel import ForecastParallelEnv
 from envs.readers import multiagent_reader_for
 from envs.readers.highway import is_highway_env
-from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, make_multiagent_env
+from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS
 from envs.sb3.acting import ActingPolicy
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.simulators.envpool import ENV_IDS, HIGHWAY_ENV_OF
@@ -39,7 +39,7 @@ def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) ->
     """
     filmed = task
     if task.observe == "none":
-        if not _has_reader(task.env_id):
+        if not _has_reader(task):
             return None
         shown = None if task.env_id in MULTIAGENT_CHECKPOINTS else CONSTANT_VELOCITY
         filmed = replace(task, observe="forecast", checkpoint=shown)
@@ -74,8 +74,8 @@ def _num_drawn(forecaster: Forecaster) -> int:
     return FAN if has_scale(forecaster) else 1
 
 
-def _has_reader(env_id: str) -> bool:
-    env = make_multiagent_env(env_id)
+def _has_reader(task: Task) -> bool:
+    env = task.make()
     try:
         multiagent_reader_for(env)
     except UserError:

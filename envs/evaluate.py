@@ -302,7 +302,7 @@ def _measure_all(
         results.append(measure(run))
         console.print(reports.shown(results[-1]))
         for remark in reports.remarks(results[-1]):
-            console.print(remark)
+            console.print(remark, markup=False)
         if config.out is not None:
             reports.write_picture(config.out, results[-1])
     if config.out is not None:

@@ -24,6 +24,8 @@ HEURISTIC_DRIVERS = ("heuristic", "mixed", "varied")
 """Drivers of the multiagent environments that `envs.drivers.all_agents` has a heuristic for."""
 _OF_GYMNASIUM = ("disable_env_checker", "render_mode")
 """Arguments of `make_env` that are not a user's."""
+_REFUSALS = (TypeError, ValueError, AssertionError, ImportError)
+"""What makers raise if they refuse their arguments or lack a package; any error counts, where a user gave arguments."""
 
 
 @dataclass(frozen=True)
@@ -206,9 +208,15 @@ def make_multiagent_env(env_id: str, **kwargs: Any) -> "ParallelEnv":
     make = _maker(env_id)
     try:
         env = make(**kwargs)
-    except (TypeError, ValueError, AssertionError, ImportError, PettingZooRegistryError) as error:
-        arguments = f" with {kwargs}" if kwargs else ""
-        raise UserError(f"cannot make multiagent env '{env_id}'{arguments}: {error}") from error
+    except UserError:
+        raise
+    except Exception as error:
+        expected = isinstance(error, (*_REFUSALS, PettingZooRegistryError))
+        if not kwargs and not expected:
+            raise
+        arguments = f" with {short(kwargs)}" if kwargs else ""
+        reason = error if expected else f"{type(error).__name__}: {error}"
+        raise UserError(f"cannot make multiagent env '{env_id}'{arguments}: {reason}") from error
     if not isinstance(env, ParallelEnv):
         raise UserError(f"'{env_id}' must give a pettingzoo ParallelEnv, got {type(env).__name__}")
     return env
@@ -231,7 +239,11 @@ def make_any_env(env_id: str, **kwargs: Any) -> Any:
 
     try:
         env = make(**kwargs)
-    except (TypeError, ValueError, AssertionError, ImportError) as error:
+    except UserError:
+        raise
+    except Exception as error:
+        if not kwargs and not isinstance(error, _REFUSALS):
+            raise
         raise UserError(f"cannot make env '{env_id}': {type(error).__name__}: {error}") from error
     if not isinstance(env, gym.Env | ParallelEnv):
         raise UserError(f"'{env_id}' must give a gymnasium Env or a pettingzoo ParallelEnv, got {type(env).__name__}")

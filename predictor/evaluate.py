@@ -103,7 +103,7 @@ def _load(config: EvaluateConfig) -> _Subject:
         return _Subject(store, spec, config.horizon_steps or ConstantVelocity(spec).horizon_steps)
     model, info = load_checkpoint(config.checkpoint, config.device)
     store = read_store(config.data)
-    info.spec.check_compatible(store.info.spec, f"checkpoint '{config.checkpoint}'", f"store {config.data}")
+    info.spec.check_recorded(store.info.spec, f"checkpoint '{config.checkpoint}'", f"store {config.data}")
     name = MODEL_NAMES.get(info.model, info.model)
     return _Subject(store, info.spec, config.horizon_steps or info.horizon_steps, model, info.std_m, name)
 

@@ -89,7 +89,7 @@ def interpret(config: InterpretConfig) -> Findings:
     check_out(config.out)
     model, info = _load_model(config.checkpoint, config.device)
     store = read_store(config.data)
-    info.spec.check_compatible(store.info.spec, f"checkpoint '{config.checkpoint}'", f"store {config.data}")
+    info.spec.check_recorded(store.info.spec, f"checkpoint '{config.checkpoint}'", f"store {config.data}")
     if any(e.edge_types is not None or e.edge_attributes is not None for e in store.episodes):
         sklearn("metrics")  # raises before measuring, not after it
     try:

@@ -108,7 +108,7 @@ def measure(config: NbaScoreConfig) -> list[PlayerErrors]:
     models = [load_checkpoint(name, config.device) for name in config.checkpoint]
     windows = protocol_windows(read_store(config.data), config.data)
     for name, (_, info) in zip(config.checkpoint, models, strict=True):
-        info.spec.check_compatible(windows.spec, f"checkpoint '{name}'", f"store {config.data}")
+        info.spec.check_recorded(windows.spec, f"checkpoint '{name}'", f"store {config.data}")
     straight = ConstantVelocity(windows.spec, nba_protocol.HORIZON_STEPS)
     lines = [_measured("constant velocity", straight, windows, config, 1)]
     if config.train_data is not None and config.num_samples > 1:

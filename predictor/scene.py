@@ -125,6 +125,27 @@ class SceneSpec:
                 "retrain on its data or change the env's policy_frequency"
             )
 
+    def check_recorded(self, other: "SceneSpec", name: str, source: str) -> None:
+        """Raises unless episodes of `other` can be cut into windows of this spec.
+
+        Unlike a live scene, in which an absent ego can stand before the agents (`Scene.behind_absent`), the first agent
+        of a recording without an ego would be taken for it.
+
+        Args:
+            other: spec of the recorded episodes.
+            name: owner of this spec, for the message.
+            source: origin of the episodes, for the message.
+
+        Raises:
+            UserError: as `check_compatible`; or only one of both has an ego.
+        """
+        self.check_compatible(other, name, source)
+        if self.has_ego and not other.has_ego:
+            raise UserError(
+                f"{name} needs episodes with an ego but {source} has none (has_ego=False); record a store with an ego, "
+                "or use a checkpoint that was trained without one"
+            )
+
 
 @dataclass(frozen=True)
 class Scene:

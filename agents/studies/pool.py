@@ -161,7 +161,8 @@ def _work(cell: Cell, folder: Path, commit: str, lifeline: Connection) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / LOG_FILE).open("a", buffering=1) as log, (folder / LOCK_FILE).open("a") as lock:
         print_into(log)
-        fcntl.flock(lock, fcntl.LOCK_EX)  # the last process of a killed study may still be here, for a moment
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(lock, fcntl.LOCK_EX)  # the last process of a killed study may still be here, for a moment
         if (folder / RESULT_FILE).exists():
             return
         _prepare()

@@ -9,7 +9,7 @@ ablations forecast the same scenes.
 import functools
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -166,8 +166,9 @@ def _kept_controls(
     paths = [Path(store) for store in stores]
     model = kept_forecaster(checkpoint, spec, source)
     windows = training_windows(paths, spec, horizon_steps)
+    seen = replace(model.spec, has_ego=spec.has_ego)  # where no agent is the ego, the first is not taken for it
     return {
-        RESIDUAL: fit_residual(model, training_windows(paths, model.spec, horizon_steps), horizon_steps),
+        RESIDUAL: fit_residual(model, training_windows(paths, seen, horizon_steps), horizon_steps),
         NEIGHBOURS: fit_from_stores(paths, spec, horizon_steps),
         NOISY: fit_noise(windows, horizon_steps),
     }

@@ -124,6 +124,13 @@ def kept_world(env_id: str, driver: str, checkpoints: tuple[str, ...], env_kwarg
     """Returns a world whose ego perceives what the first learned checkpoint was trained on, kept in a process."""
     if sees_forecasts(driver):
         return open_world(env_id, driver, checkpoints[0], env_kwargs=env_kwargs)
-    learned = [name for name in checkpoints if name != CONSTANT_VELOCITY and not is_own(name)]
-    perceived_as = load_checkpoint(learned[0])[1].spec if learned else None
-    return open_world(env_id, driver, perceived_as=perceived_as, env_kwargs=env_kwargs)
+    first = next((name for name in checkpoints if name != CONSTANT_VELOCITY), None)
+    if first is None or not is_own(first):
+        perceived_as = None if first is None else load_checkpoint(first)[1].spec
+        return open_world(env_id, driver, perceived_as=perceived_as, env_kwargs=env_kwargs)
+    world = open_world(env_id, driver, env_kwargs=env_kwargs)
+    own = load_forecaster(first, world.spec, f"env '{env_id}'").spec  # may depend on the reader's
+    if (own.perception_m, own.max_agents) == (world.spec.perception_m, world.spec.max_agents):
+        return world
+    world.close()
+    return open_world(env_id, driver, perceived_as=own, env_kwargs=env_kwargs)

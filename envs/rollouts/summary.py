@@ -106,11 +106,13 @@ def _spread_and_name(checkpoint: str, forecasts: Sequence[Outcome]) -> tuple[Seq
 
 
 def _graph(episodes: Sequence[Episode]) -> GraphAccuracy | None:
-    """Returns the accuracy of inferred against true edges over all scenes; None where the simulator has none."""
-    if not any(e.edge_types for e in episodes):
+    """Returns the accuracy of inferred against true edges over all scenes; None where simulator or model has none."""
+    labelled = [episode for episode in episodes if episode.edge_types]
+    num_types = labelled[0].edge_probs[0].shape[-1] if labelled else 0
+    if num_types < 2:
         return None
-    tally = GraphTally(episodes[0].edge_probs[0].shape[-1])
-    for episode in episodes:
+    tally = GraphTally(num_types)
+    for episode in labelled:
         types = torch.from_numpy(np.stack(episode.edge_types))
         known = pair_mask((types != -1).any(-1) | (types != -1).any(-2)) & (types != -1)
         tally.add(torch.from_numpy(np.stack(episode.edge_probs)), types, known)

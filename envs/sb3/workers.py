@@ -40,18 +40,18 @@ class WorkerVecEnv(SubprocVecEnv):
         self.waiting, self.closed = False, False
         context = multiprocessing.get_context("spawn")
         self.processes: list[Any] = []
-        remotes = []
-        for number, make in enumerate(env_fns):
-            ours, theirs = context.Pipe()
-            numbers: Any = context.RawArray("q", NUMBERS)
-            wrapped = CloudpickleWrapper(make)
-            process = context.Process(target=_work, args=(theirs, ours, wrapped, env_id, numbers), daemon=True)
-            start(process)
-            theirs.close()
-            self.processes.append(process)
-            remotes.append(_WatchedRemote(ours, process, Place(numbers), f"{env_id}, environment {number}", timeout_s))
-        self.remotes: Any = tuple(remotes)
+        self.remotes: Any = ()
         try:
+            for number, make in enumerate(env_fns):
+                ours, theirs = context.Pipe()
+                numbers: Any = context.RawArray("q", NUMBERS)
+                wrapped = CloudpickleWrapper(make)
+                process = context.Process(target=_work, args=(theirs, ours, wrapped, env_id, numbers), daemon=True)
+                start(process)
+                theirs.close()
+                name = f"{env_id}, environment {number}"
+                self.processes.append(process)
+                self.remotes += (_WatchedRemote(ours, process, Place(numbers), name, timeout_s),)
             self.remotes[0].send(("get_spaces", None))
             observation_space, action_space = self.remotes[0].recv()
         except BaseException:

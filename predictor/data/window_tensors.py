@@ -244,7 +244,7 @@ def _flat_labels(labels: Sequence[np.ndarray | None], unknown: int) -> FlatLabel
 
 def _joined_labels(parts: Sequence[FlatLabels | None]) -> FlatLabels | None:
     given = [part for part in parts if part is not None]
-    if len(given) < len(parts):
+    if len(given) < len(parts) or len({part.values.shape[1:] for part in given}) > 1:
         return None
     values = [p.values for p in given]
     first = _shifted([p.first for p in given], values)

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from predictor.data.store import Episode
 from predictor.data.window_tensors import UNKNOWN_TYPE, Casts, Cut, cast, cut, flatten
@@ -46,6 +47,17 @@ class WindowBatch:
     def rows(self, rows: slice) -> "WindowBatch":
         """Returns some of the windows, with the padding of all."""
         return self._each(lambda tensor: tensor[rows])
+
+    def behind_absent(self) -> "WindowBatch":
+        """Returns the windows behind an absent agent, for a forecaster with an ego where no agent is the ego."""
+        types, attributes = self.edge_types, self.edge_attributes
+        return WindowBatch(
+            pad(self.states, (0, 0, 1, 0)),
+            pad(self.valid, (1, 0)),
+            self.last_observed,
+            None if types is None else pad(types, (1, 0, 1, 0), value=UNKNOWN_TYPE),
+            None if attributes is None else pad(attributes, (0, 0, 1, 0, 1, 0)),
+        )
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> "WindowBatch":
         given = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -219,5 +231,5 @@ def concatenate(batches: Sequence[WindowBatch]) -> WindowBatch:
 
 def _joined(tensors: Sequence[Tensor | None]) -> Tensor | None:
     known = [t for t in tensors if t is not None]
-    # some stores have labels and others do not: none are used
-    return torch.cat(known) if len(known) == len(tensors) else None
+    # some stores have labels and others do not, or attributes of another number: none are used
+    return torch.cat(known) if len(known) == len(tensors) and len({t.shape[1:] for t in known}) == 1 else None

@@ -39,9 +39,7 @@ def measure_line(
     spec = next(iter(stores.values())).info.spec
     made = line_forecaster(table, line, data, sizes, checkpoint, spec, device)
     for kind, store in stores.items():
-        made.forecaster.spec.check_compatible(
-            store.info.spec, f"line '{line.key}'", f"store {data / table.tests[kind]}"
-        )
+        made.forecaster.spec.check_recorded(store.info.spec, f"line '{line.key}'", f"store {data / table.tests[kind]}")
     results = {kind: _measure_store(made, store, table, line, sizes, seed) for kind, store in stores.items()}
     return {"parameters": made.parameters, "fitted": made.fitted, "tests": results}
 

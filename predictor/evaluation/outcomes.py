@@ -166,12 +166,15 @@ def run_windows(
 ) -> Iterator[Outcome]:
     """Yields outcomes of the given windows in batches; `whole_sequence` runs `run_sequence_batch`.
 
-    Nothing is kept between batches; `predictor.evaluation.accuracy.summarise` consumes the iterator.
+    Nothing is kept between batches; `predictor.evaluation.accuracy.summarise` consumes the iterator. A forecaster with
+    an ego gets an absent one before the agents of windows that have none, as in live scenes (`Scene.behind_absent`).
     """
     generator = torch.Generator(device=device).manual_seed(seed)
     run = run_sequence_batch if whole_sequence else run_window_batch
     for begin in range(0, len(indices), batch_size):
         batch = windows.batch(indices[begin : begin + batch_size]).to(torch.device(device))
+        if forecaster.spec.has_ego and not windows.spec.has_ego:
+            batch = batch.behind_absent()
         yield run(forecaster, batch, horizon_steps, num_samples, generator, keep_beliefs)
 
 

@@ -78,7 +78,7 @@ def load_data(config: TrainConfig) -> TrainingData:
         stores = [with_causal_edges(store) for store in stores]
     spec = stores[0].info.spec
     for path, store in zip((*config.data, *config.val_data), stores, strict=True):
-        spec.check_compatible(store.info.spec, f"store {address(config.data[0])}", f"store {address(path)}")
+        spec.check_recorded(store.info.spec, f"store {address(config.data[0])}", f"store {address(path)}")
     spec = replace(spec, max_agents=max(store.info.spec.max_agents for store in stores[: len(config.data)]))
     _check_labels(config, stores)
     sources = tuple(s.info.source for s in stores[: len(config.data)])
@@ -114,6 +114,10 @@ def _check_labels(config: TrainConfig, stores: Sequence[EpisodeStore]) -> None:
                 raise UserError(
                     f"{option} needs {name}, and store {address(path)} has none; set it to 0 or use labelled data"
                 )
+    kinds = {store.info.edge_attribute_names: address(path) for path, store in zip(config.data, stores, strict=False)}
+    if config.label_weight and len(kinds) > 1:
+        listed = ", ".join(f"{path} has {', '.join(names) or 'ones without names'}" for names, path in kinds.items())
+        raise UserError(f"label_weight needs the same edge attributes in every store, but {listed}; train on one kind")
 
 
 def _windows(config: TrainConfig, episodes: Sequence[Episode], spec: SceneSpec, validation: bool) -> Windows:
@@ -160,12 +164,7 @@ def initial_model(config: TrainConfig, data: TrainingData) -> Any:
     source, info = load_checkpoint(config.init)
     if info.model != config.model:
         raise UserError(f"checkpoint '{config.init}' is of model {info.model}; pass --model {info.model}")
-    info.spec.check_compatible(data.spec, f"checkpoint '{config.init}'", f"store {address(config.data[0])}")
-    if info.spec.has_ego != data.spec.has_ego:
-        raise UserError(
-            f"checkpoint '{config.init}' has has_ego={info.spec.has_ego} but store {address(config.data[0])} has "
-            f"has_ego={data.spec.has_ego}; start from a checkpoint that agrees, or without --init"
-        )
+    info.spec.check_recorded(data.spec, f"checkpoint '{config.init}'", f"store {address(config.data[0])}")
     spec = replace(data.spec, feature_scales=info.spec.feature_scales)  # scales are the network's, the rest the data's
     model = build(info.model, spec, info.config, config.horizon_steps)
     model.load_state_dict(source.state_dict())

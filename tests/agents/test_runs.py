@@ -66,6 +66,12 @@ def test_hyperparameters_that_older_runs_lack_have_changed_nothing(tmp_path: Pat
     open_run(tmp_path, CONFIG | {"preset": {"gamma": 0.8, "vf_coef": 0.5}}, MADE, resume=True)
 
 
+def test_a_hyperparameter_that_only_a_newer_run_has_is_named(tmp_path: Path):
+    open_run(tmp_path, CONFIG | {"preset": {"gamma": 0.8, "clip": None}}, MADE, resume=False)
+    with pytest.raises(UserError, match="preset.clip was None, now 'not there'; pass"):
+        open_run(tmp_path, CONFIG | {"preset": {"gamma": 0.8}}, MADE, resume=True)
+
+
 def test_foreign_folder_is_not_resumed(tmp_path: Path):
     (tmp_path / "thesis.tex").write_text("")
     for resume in (False, True):

@@ -8,7 +8,7 @@ from agents.arena import MultiagentArena
 from agents.task import Task
 from agents.vec_envs import EpisodeResult
 from agents.video import film, film_extremes, record_task
-from tests.agents.helpers import TOY, policy_for
+from tests.agents.helpers import TOY, Meadow, policy_for
 
 SPREAD, TAG = "simple_spread_v3", "simple_tag_v3"
 
@@ -32,6 +32,17 @@ def test_the_film_shows_the_episode_that_is_measured(
 def test_an_environment_without_reader_is_not_filmed():
     task = Task(TOY, "none")
     assert record_task(task, policy_for(task), 0, max_steps=5) is None
+
+
+def test_the_film_is_of_the_environment_with_its_arguments(monkeypatch: pytest.MonkeyPatch):
+    task = Task(f"{__name__}:grown", "none", env_kwargs='{"legs": 6}')
+    assert record_task(task, policy_for(task), 0, max_steps=5) is None
+
+
+def grown(legs: int, **kwargs: Any) -> Meadow:
+    """Environment that needs an argument."""
+    assert legs == 6
+    return Meadow(**kwargs)
 
 
 def test_what_cannot_be_drawn_gives_no_video_and_no_error(tmp_path: Path):

@@ -156,6 +156,7 @@ def test_graph_accuracy_closed_form():
     assert found.true_connectivity == pytest.approx(3 / 5)
     assert found.f1 == pytest.approx(2 * 2 / (2 * 2 + 1 + 1))
     assert _graph([Episode({}, [0.1])]) is None
+    assert _graph([Episode({}, [0.1], [np.ones((3, 3, 1))], [first])]) is None  # a model with one type
 
 
 # --- One environment --------------------------------------------------------------------------------------------------

@@ -185,6 +185,7 @@ def test_other_ids_are_not_parallel(env_id: str):
         ("pursuit_v5", {"bogus": 1}, "cannot make multiagent env 'pursuit_v5' with {'bogus': 1}: .*'bogus'"),
         ("simple_spread_v3", {"local_ratio": 2.0}, "cannot make .*'local_ratio': 2.0}: local_ratio is a proportion"),
         ("walks:make_walk", {"length": 0}, "cannot make .* with {'length': 0}: length must be positive, got 0"),
+        ("intersection-multi-agent-v2", {"action": {}}, "cannot make .* with {'action': {}}: KeyError: 'type'"),
         ("walks:make_nothing", {}, "'walks:make_nothing' must give a pettingzoo ParallelEnv, got NoneType"),
         ("walks:absent", {}, "module 'walks' has no function or class 'absent'"),
         ("walks:number", {}, "module 'walks' has no function or class 'number'"),

@@ -188,6 +188,16 @@ def test_constant_velocity_is_a_checkpoint_of_every_store(
     assert (out / "scenes.png").exists()
 
 
+def test_the_first_agent_of_a_recording_without_an_ego_is_not_taken_for_it(
+    data: Path, checkpoint: Path, tmp_path: Path
+):
+    write_store(
+        tmp_path / "equals", replace(read_store(data).info, spec=spec(has_ego=False)), read_store(data).episodes
+    )
+    with pytest.raises(UserError, match="needs episodes with an ego but store .*equals has none .* record a store"):
+        evaluate(EvaluateConfig(str(checkpoint), tmp_path / "equals"))
+
+
 def test_three_axes(tmp_path: Path):
     layout = SceneSpec(
         1.0, ("world",) * 3, feature_names=KINEMATIC_FEATURES_3D, feature_scales=(1.0,) * 6, has_ego=False, max_agents=9

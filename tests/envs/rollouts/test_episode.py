@@ -39,7 +39,7 @@ from predictor.forecaster import Belief, Futures
 from predictor.online import OnlineForecaster
 from predictor.scene import PADDING_ID, Scene, SceneBatch, SceneSpec
 from tests.envs.evaluation import TAG, forget, save_tag, tag_spec
-from tests.envs.helpers import HIGHWAY_SPEC, HORIZON, PLURAL, cruising_env
+from tests.envs.helpers import HIGHWAY_SPEC, HORIZON, MAP_SPEC, PLURAL, cruising_env, save_tiny
 from tests.envs.helpers import play as drive
 
 OFFSET_M = torch.tensor([3.0, 4.0])
@@ -293,6 +293,18 @@ def test_neighbours_that_lived_through_this_very_episode_are_exact(tmp_path: Pat
     assert {outcomes[key].forecast.shape[1] for key in (MODEL, NEIGHBOURS, NOISY, RESIDUAL)} == {made.samples}
     assert near.ade_m == pytest.approx(0.0, abs=1e-3)
     assert straight.min_ade_m > 0.1
+
+
+def test_the_residual_of_a_model_with_an_ego_is_fitted_to_recordings_without_one(tmp_path: Path):
+    """Their first agent, which leaves the crossing, is not taken for the ego."""
+    crossing = "intersection-multi-agent-v2"
+    store = tmp_path / "store"
+    recorded = list(collect(CollectConfig(crossing, store, 1, max_steps=5, workers=1)))
+    write_store(store, StoreInfo(open_world(crossing, "varied").spec, crossing), recorded)
+    checkpoint = save_tiny(tmp_path / "tiny", MAP_SPEC)
+    made = task(env_id=crossing, driver="varied", checkpoint=checkpoint, horizon_steps=1, stores=(str(store),))
+    outcomes = play(made).outcomes
+    assert outcomes[RESIDUAL].forecast.shape == outcomes[MODEL].forecast.shape
 
 
 # --- Controls at equal K ----------------------------------------------------------------------------------------------

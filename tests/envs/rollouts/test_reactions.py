@@ -1,5 +1,6 @@
 import copy
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.evaluation.reactions import Reaction, Shifts, reaction
 from predictor.models import build, configure
-from predictor.scene import Forecast, Scene
+from predictor.scene import Forecast, Scene, SceneSpec
 from tests.envs.evaluation import TAG, forget, save_tag
 from tests.envs.helpers import HIGHWAY_SPEC
 from tests.envs.interventions import assert_same_scenes, played, road_world, state_of
@@ -34,6 +35,13 @@ def nothing_is_kept() -> Iterator[None]:
     forget()
     yield
     forget()
+
+
+class Shortsighted(ConstantVelocity):
+    """Constant velocity of three agents within 30 m."""
+
+    def __init__(self, spec: SceneSpec) -> None:
+        super().__init__(replace(spec, perception_m=30.0, max_agents=3))
 
 
 class Replay(SideForecaster):
@@ -316,3 +324,5 @@ def test_an_ego_perceives_what_its_checkpoint_was_trained_on(highway_checkpoint:
     assert (spec.perception_m, spec.max_agents) == (HIGHWAY_SPEC.perception_m, HIGHWAY_SPEC.max_agents)
     plain = kept_world("two-way-v0", "idle", ("constant-velocity",))
     assert plain.spec.max_agents != HIGHWAY_SPEC.max_agents
+    own = kept_world("two-way-v0", "idle", ("constant-velocity", f"own:{__name__}:Shortsighted"))
+    assert (own.spec.perception_m, own.spec.max_agents) == (30.0, 3)

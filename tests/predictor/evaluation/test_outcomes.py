@@ -210,6 +210,26 @@ def test_true_edges_are_those_of_the_last_observed_step_and_stand_beside_the_bel
     assert found == pytest.approx(off_diagonal.float().mean().item())  # Marking says "edge" everywhere
 
 
+def test_a_forecaster_with_an_ego_forecasts_every_agent_of_windows_without_one():
+    """An absent agent stands before them: the first one is not taken for the ego, and edges stay where they are."""
+    rng = np.random.default_rng(0)
+    types, strengths = rng.integers(0, 2, (7, 3, 3)).astype(np.int8), rng.random((7, 3, 3, 1), dtype=np.float32)
+    valid = np.ones((7, 3), dtype=np.bool_)
+    valid[:2, 0] = False  # not there from the beginning, as no ego may be
+    states = rng.normal(size=(7, 3, 4)).astype(np.float32)
+    episode = Episode(states, valid, np.arange(3), edge_types=types, edge_attributes=strengths)
+    windows = Windows([episode], spec(has_ego=False), history_steps=3, horizon_steps=2)
+    chosen = np.arange(len(windows))
+    (plain,) = run_windows(Marking(spec(has_ego=False)), windows, chosen, 2, keep_beliefs=True)
+    (behind,) = run_windows(Marking(spec()), windows, chosen, 2, keep_beliefs=True)
+    assert behind.valid[:, 1:].equal(plain.valid) and not behind.valid[:, 0].any()
+    assert behind.forecast[:, :, 1:].equal(plain.forecast) and behind.future[:, 1:].equal(plain.future)
+    assert behind.edge_types is not None and behind.edge_attributes is not None
+    assert plain.edge_types is not None and behind.edge_types[:, 1:, 1:].equal(plain.edge_types)
+    assert (behind.edge_types[:, 0] == -1).all() and (behind.edge_types[:, :, 0] == -1).all()
+    assert plain.edge_attributes is not None and behind.edge_attributes[:, 1:, 1:].equal(plain.edge_attributes)
+
+
 def test_one_window_per_episode_for_the_protocol():
     cut = windows()
     assert cut.index[sequence_indices(cut, 4)].tolist() == [[0, 3], [1, 3]]

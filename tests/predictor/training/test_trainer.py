@@ -279,6 +279,21 @@ def test_weights_of_labels_need_labels(circles: Path, tmp_path: Path, option: st
         load_data(replace(fine, data=(tmp_path / "labelled", circles)))
 
 
+@pytest.mark.parametrize("data_device", ["cpu", "device"])
+def test_stores_with_other_attributes_train_together_unless_these_are_labels(tmp_path: Path, data_device: str):
+    stores = (("gap", "speed"), ("gap", "speed", "wish"))
+    for names in stores:
+        known = np.ones((1, 2, 2, len(names)), dtype=np.float32)
+        episodes = [replace(circling_episode(i), edge_attributes=known) for i in range(3)]
+        write_store(tmp_path / str(len(names)), StoreInfo(spec(), "road", edge_attribute_names=names), episodes)
+    both = (tmp_path / "2", tmp_path / "3")
+    settings = replace(config(both[0], tmp_path / "run", data_device=data_device), data=both)
+    assert train(settings).exists()
+    message = "the same edge attributes in every store, but .*2 has gap, speed, .*3 has gap, speed, wish; train on one"
+    with pytest.raises(UserError, match=message):
+        load_data(replace(settings, label_weight=1.0))
+
+
 # --- Schedules --------------------------------------------------------------------------------------------------------
 
 
@@ -438,8 +453,10 @@ def test_a_start_takes_the_frame_and_range_of_the_data(circles: Path, tmp_path: 
 def test_a_start_with_another_ego_is_named(circles: Path, tmp_path: Path):
     first = str(train(config(circles, tmp_path / "first")))
     write_store(tmp_path / "equals", StoreInfo(spec(has_ego=False), "circles"), [circling_episode(i) for i in range(6)])
-    with pytest.raises(UserError, match="has has_ego=True but store .*equals has has_ego=False; start from"):
+    with pytest.raises(UserError, match="first.*' needs episodes with an ego but store .*equals has none"):
         made(config(tmp_path / "equals", tmp_path / "second", init=first))
+    with pytest.raises(UserError, match="store .*circles needs episodes with an ego but store .*equals has none"):
+        load_data(config(circles, tmp_path / "second", val_data=(tmp_path / "equals",)))
 
 
 def test_what_began_well_is_kept_if_training_makes_it_worse(circles: Path, tmp_path: Path):
