@@ -13,7 +13,7 @@ from rich.table import Table
 from agents.differences import DRAWS, reference_policy, return_differences
 from agents.episode_file import write_episodes
 from agents.runs import SUMMARY_FILE
-from agents.summaries import PolicySummary, summarize
+from agents.summaries import NEARLY_CONSTANT, PolicySummary, summarize
 from agents.vec_envs import EpisodeResult
 from envs.registry import name_with
 from envs.rollouts.driving_measures import HARD_BRAKING_MPS2, LONGEST_S
@@ -25,8 +25,6 @@ from predictor.support.provenance import provenance
 from predictor.support.reading import read_object
 from predictor.support.typed_values import converted, from_table
 
-NEARLY_CONSTANT = 0.95
-"""Least share of one action from which on a policy is called nearly constant."""
 PACKAGES = (
     *("stable-baselines3", "sb3-contrib", "gymnasium", "pettingzoo", "highway-env", "mpe2", "envpool"),
     *("torch", "numpy"),

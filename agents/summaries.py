@@ -11,7 +11,10 @@ from agents.vec_envs import EpisodeResult
 from envs.rollouts.driving_measures import DrivingMeasures
 from predictor.support.errors import UserError
 
-_WILSON_Z = 1.959963984540054  # two-sided 95 %
+NEARLY_CONSTANT = 0.95
+"""Least share of one action from which on a policy is called nearly constant."""
+NORMAL_95 = 1.959963984540054
+"""Two-sided 95 % quantile of the normal distribution."""
 
 EXTREMES = ("best", "median", "worst")
 """Names of the extreme episodes of a policy, by return; each can be filmed."""
@@ -56,20 +59,19 @@ class PolicySummary:
     is not measured."""
 
 
-def wilson_interval(successes: int, trials: int, z: float = _WILSON_Z) -> tuple[float, float]:
-    """Computes the Wilson score interval of a rate, which lies within [0, 1] and never has zero width.
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Computes the 95 % Wilson score interval of a rate, which lies within [0, 1] and never has zero width.
 
     Args:
         successes: number of events.
         trials: number of trials; at least 1.
-        z: normal quantile; the default gives 95 %.
 
     Raises:
         UserError: `successes` or `trials` is out of range.
     """
     if not 0 <= successes <= trials or trials < 1:
         raise UserError(f"need 0 <= successes <= trials and trials >= 1, got {successes} of {trials}")
-    rate = successes / trials
+    rate, z = successes / trials, NORMAL_95
     centre = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
     half = z / (1 + z**2 / trials) * math.sqrt(rate * (1 - rate) / trials + z**2 / (4 * trials**2))
     low = 0.0 if successes == 0 else centre - half  # exact at the ends, where rounding would leave 1e-17

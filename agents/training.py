@@ -28,6 +28,7 @@ from agents.preset_settings import changed
 from agents.presets import Algorithm, Preset, preset_for
 from agents.runs import BEST_FILE, CHECKPOINT_FILE, CURVE_FILE, POLICY_FILE, load_model, read_curve, save_model
 from agents.step_count import STEP_UNIT, CountSteps, StepProgress, check_step_unit
+from agents.summaries import NORMAL_95
 from agents.task import SELECTION_SEED, Task
 from agents.vec_envs import EpisodeResult, make_venv
 from envs.sb3.algorithms import require_algorithm
@@ -36,8 +37,6 @@ from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError
 from predictor.support.files import copy_file, write_json
 from predictor.support.runtime import resolve_device
-
-_NORMAL_95 = 1.959963984540054  # two-sided 95 % quantile of the normal distribution
 
 
 @dataclass(frozen=True)
@@ -396,4 +395,4 @@ def significantly_worse(returns: Sequence[float], best: Sequence[float]) -> bool
     if len(difference) < 2:
         return False
     error = difference.std(ddof=1) / np.sqrt(len(difference))
-    return bool(difference.mean() + _NORMAL_95 * error < 0)
+    return bool(difference.mean() + NORMAL_95 * error < 0)

@@ -20,7 +20,7 @@ from rich.console import Console
 from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, arguments_of, checkpoint_for, name_with
 from envs.rollouts import graph_report, plan_report, reaction_report, report
 from envs.rollouts.branches import check_can_branch
-from envs.rollouts.cluster_pool import episode_pool
+from envs.rollouts.cluster_pool import PACKAGES, episode_pool
 from envs.rollouts.episode import (
     Case,
     Episode,
@@ -47,8 +47,6 @@ from predictor.support.memory import check_count, check_processes
 from predictor.support.progress import track
 from predictor.support.provenance import provenance
 from predictor.support.runtime import keep_freed_memory
-
-PACKAGES = ("highway-env", "mpe2", "pettingzoo", "envpool", "gymnasium", "torch", "numpy")
 
 GALLERY_CASES = 6
 """Number of worst forecasts that are drawn, at most one per episode."""

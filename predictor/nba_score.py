@@ -54,8 +54,6 @@ HEADINGS = (
     "cover",
     "time [s]",
 )
-INTERVALS_OF = ("min_ade_ft", "min_fde_ft")
-"""Columns that show an interval."""
 NOTE = (
     "minADE, minFDE: each player's best sample, in brackets 95 % bootstrap intervals over possessions; joint: best "
     "sample of all ten players together; ADE₁, FDE₁: single forecast; energy: energy score, lower is better; cover: "

@@ -52,7 +52,6 @@ MIN_HISTORY_STEPS = 8
 """Smallest number of observed steps of a training window, where the table's burn-in is not shorter."""
 ADDED = {"precision": "float32", "causal_edges": False, "reaction_weight": 0.0, "init": ""}
 """Options that came after the first lines were trained, with the values that change nothing."""
-KEPT = "the same command goes on: finished lines are kept, others continue"
 PACKAGES = ("torch", "numpy", "zarr")
 MEASURING = 2
 """Number of the way of measuring: results of another one are not taken for finished."""

@@ -24,12 +24,10 @@ from agents.studies.estimators import (
 )
 from agents.studies.plan import Study
 from agents.studies.results import Result
-from agents.summaries import wilson_interval
+from agents.summaries import NEARLY_CONSTANT, wilson_interval
 from envs.drivers.planner import PLANNER, PLANNER_ORACLE, is_planner
 from predictor.own_forecasters import is_own
 
-NEARLY_CONSTANT = 0.95
-"""Least share of one action from which on a run is called nearly constant."""
 NOT_CONSTANT = ("random", "varied", "keep-lane", "heuristic", "mixed")
 """Drivers that take no constant action, beside the planner and trained ones."""
 

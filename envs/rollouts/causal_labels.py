@@ -77,7 +77,8 @@ def causal_labels(world: World, settings: CausalSettings) -> CausalLabels:
     ids = [int(agent) for agent in scene.ids]
     shift_m = np.full((len(ids), len(ids)), np.nan, dtype=np.float32)
     steps = max(1, round(settings.horizon_s / world.spec.dt_s))
-    tried = [one for sender in senders_of(world, settings) for one in possible(world, sender, steps)]
+    tries = filter(None, (possible(world, sender, steps) for sender in _candidates(world, settings)))
+    tried = [intervention for of_sender in islice(tries, settings.senders) for intervention in of_sender]
     point = BranchPoint(world, steps) if tried else None
     for intervention in tried:
         assert point is not None
@@ -122,6 +123,11 @@ def farthest(found: Branches, threshold_m: float, steps: int | None = None) -> F
 
 def senders_of(world: World, settings: CausalSettings) -> list[int]:
     """Returns the agents to try: perceived, with another one near, and under no intervention."""
+    return list(islice((a for a in _candidates(world, settings) if possible(world, a, 1)), settings.senders))
+
+
+def _candidates(world: World, settings: CausalSettings) -> list[int]:
+    """Returns the agents to try as far as can be seen without trying, those to try first in front."""
     scene = world.perceived()
     ids, positions = scene.ids[scene.valid], scene.states[scene.valid, : world.spec.position_dim]
     apart = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
@@ -129,8 +135,7 @@ def senders_of(world: World, settings: CausalSettings) -> list[int]:
     nearest = apart.min(axis=1) if len(ids) > 1 else np.full(len(ids), np.inf)
     order = range(len(ids)) if world.spec.has_ego else np.argsort(nearest, kind="stable")
     busy = interventions_of(world)
-    near = (int(ids[i]) for i in order if nearest[i] <= settings.near_m and int(ids[i]) not in busy)
-    return list(islice((agent for agent in near if possible(world, agent, 1)), settings.senders))
+    return [int(ids[i]) for i in order if nearest[i] <= settings.near_m and int(ids[i]) not in busy]
 
 
 def possible(world: World, agent: int, steps: int) -> list[Intervention]:

@@ -40,7 +40,6 @@ from predictor.support.remote import address, exists, is_remote, local_copy
 from predictor.support.typed_values import converted, from_table
 
 VERSION = 1
-EDGE_LABELS = ("edge_types", "edge_attributes")
 _FILL = {"edge_types": -1.0, "edge_attributes": 0.0, "causal_shift_m": np.nan}
 """All labels of pairs in a store, with the value for what is not known or not there."""
 PERTURBATIONS = ("none", "brake", "accelerate", "left", "right", "remove", "kick")

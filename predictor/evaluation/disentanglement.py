@@ -11,7 +11,7 @@ ICML 2019). All functions but `direct_r2` need scikit-learn (the `scores` extra)
 
 import importlib
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -20,6 +20,8 @@ from predictor.support.errors import UserError
 
 MIN_R2 = 0.01
 """Least held-out R² of a factor that `dci` counts as predictable."""
+PENALTY = 0.05
+"""Penalty of the Lasso of `dci`; correlations below it count as zero."""
 
 
 def sklearn(module: str) -> Any:
@@ -104,22 +106,18 @@ class DCI:
 def dci(
     features: Float[np.ndarray, "points dims"],
     factors: Float[np.ndarray, "points factors"],
-    regressor: Literal["lasso", "forest"] = "lasso",
     seed: int = 0,
-    alpha: float = 0.05,
 ) -> DCI:
     """Computes DCI of features, with factors and features standardised; fitted on one half, scored on the other.
 
-    Importance is a Lasso's absolute weight (linear relations) or a random forest's impurity decrease (any). A factor
-    that the regressor cannot predict (held-out R² below `MIN_R2`) has importance 0: it would be noise, and noise in a
-    single dimension looks perfectly disentangled. If informativeness is low, the other two have little meaning.
+    Importance is a Lasso's absolute weight. A factor that it cannot predict (held-out R² below `MIN_R2`) has importance
+    0: it would be noise, and noise in a single dimension looks perfectly disentangled. If informativeness is low, the
+    other two have little meaning.
 
     Args:
         features: features of the points, such as pairs.
         factors: known attributes of the points.
-        regressor: "lasso" or "forest"; the forest takes seconds for ten thousand points.
-        seed: random seed of the halves and the forest.
-        alpha: penalty of the Lasso; correlations below it count as zero.
+        seed: random seed of the halves.
 
     Raises:
         UserError: scikit-learn is not installed.
@@ -135,11 +133,11 @@ def dci(
     everything = np.ones(len(score), dtype=np.bool_)
     scores = []
     for factor in range(factors.shape[1]):
-        model = _regressor(regressor, alpha, seed).fit(inputs[fit], outputs[fit, factor])
+        model = sklearn("linear_model").Lasso(alpha=PENALTY).fit(inputs[fit], outputs[fit, factor])
         r2 = direct_r2(model.predict(inputs[score]), outputs[score, factor], everything)
         scores.append(r2)
         if r2 is not None and r2 >= MIN_R2:
-            importance[:, factor] = np.abs(model.coef_ if regressor == "lasso" else model.feature_importances_)
+            importance[:, factor] = np.abs(model.coef_)
     known = [s for s in scores if s is not None]
     return DCI(
         _decided(importance) if factors.shape[1] > 1 else None,
@@ -178,12 +176,6 @@ def mutual_information(
         raise ValueError(f"bins must be at least 2, got {bins}")
     dims, kinds = _labels(features, bins).T, _labels(factors, bins).T
     return np.array([[_information(dim, kind) for kind in kinds] for dim in dims])
-
-
-def _regressor(kind: Literal["lasso", "forest"], alpha: float, seed: int) -> Any:
-    if kind == "lasso":
-        return sklearn("linear_model").Lasso(alpha=alpha)
-    return sklearn("ensemble").RandomForestRegressor(n_estimators=50, min_samples_leaf=5, random_state=seed)
 
 
 def _decided(importance: Float[np.ndarray, "one other"]) -> float:

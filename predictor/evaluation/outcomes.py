@@ -16,7 +16,6 @@ from torch import Tensor
 
 from predictor.data.windows import WindowBatch, Windows
 from predictor.forecaster import Belief, Forecaster
-from predictor.support.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -176,23 +175,6 @@ def run_windows(
         if forecaster.spec.has_ego and not windows.spec.has_ego:
             batch = batch.behind_absent()
         yield run(forecaster, batch, horizon_steps, num_samples, generator, keep_beliefs)
-
-
-def sequence_indices(windows: Windows, burn_in_steps: int) -> Int[np.ndarray, " some"]:
-    """Returns the window of each episode that observes its first `burn_in_steps` steps, for `run_windows`.
-
-    Episodes that end within the horizon are included, masked; build `windows` with `min_future_steps` =
-    `horizon_steps` to leave them out.
-
-    Raises:
-        UserError: the windows have a shorter history, or no episode is long enough.
-    """
-    if windows.history_steps < burn_in_steps:
-        raise UserError(f"windows of {windows.history_steps} steps of history cannot hold {burn_in_steps} of burn-in")
-    indices = np.flatnonzero(windows.index[:, 1] == burn_in_steps - 1)
-    if not len(indices):
-        raise UserError(f"no episode has {burn_in_steps} steps of burn-in and a step after them")
-    return indices
 
 
 def _observed(forecaster: Forecaster, batch: WindowBatch) -> Iterator[tuple[Int[Tensor, " batch"], Belief]]:

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from predictor.data.store import (
-    EDGE_LABELS,
     PERTURBATIONS,
     Episode,
     StoreInfo,
@@ -26,6 +25,7 @@ from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 from tests.predictor.helpers import ROAD, circling_episode, random_presence, random_states, scene, spec
 
+EDGE_LABELS = ("edge_types", "edge_attributes")
 INFO = StoreInfo(spec(ROAD), "toy-v0", {"command": "python -m envs.collect", "seeds": [3, 4]})
 
 

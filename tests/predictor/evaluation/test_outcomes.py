@@ -8,11 +8,10 @@ from torch import Tensor
 from predictor.data.store import Episode
 from predictor.data.windows import WindowBatch, Windows
 from predictor.evaluation.graph_accuracy import graph_accuracy
-from predictor.evaluation.outcomes import Outcome, run_sequence_batch, run_window_batch, run_windows, sequence_indices
+from predictor.evaluation.outcomes import Outcome, run_sequence_batch, run_window_batch, run_windows
 from predictor.forecaster import Belief, Futures, Memory
 from predictor.graph import pair_mask
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
-from predictor.support.errors import UserError
 from tests.predictor.helpers import ROAD, any_model, model, random_presence, random_states, spec
 
 SOLID = SceneSpec(
@@ -228,20 +227,3 @@ def test_a_forecaster_with_an_ego_forecasts_every_agent_of_windows_without_one()
     assert plain.edge_types is not None and behind.edge_types[:, 1:, 1:].equal(plain.edge_types)
     assert (behind.edge_types[:, 0] == -1).all() and (behind.edge_types[:, :, 0] == -1).all()
     assert plain.edge_attributes is not None and behind.edge_attributes[:, 1:, 1:].equal(plain.edge_attributes)
-
-
-def test_one_window_per_episode_for_the_protocol():
-    cut = windows()
-    assert cut.index[sequence_indices(cut, 4)].tolist() == [[0, 3], [1, 3]]
-    full = windows(min_future_steps=3)
-    assert full.index[sequence_indices(full, 4)].tolist() == [[0, 3]]
-
-
-def test_protocol_needs_windows_that_remember_the_beginning():
-    with pytest.raises(UserError, match="windows of 4 steps of history cannot hold 5 of burn-in"):
-        sequence_indices(windows(), 5)
-
-
-def test_protocol_needs_an_episode_that_is_long_enough():
-    with pytest.raises(UserError, match="no episode has 9 steps of burn-in and a step after them"):
-        sequence_indices(windows(history_steps=20), 9)
