@@ -15,6 +15,7 @@ from predictor.evaluation.causal_graph import CausalScores
 from predictor.evaluation.standard_errors import Estimate
 from predictor.reports.looks import BLACK, GREY, STYLE, YELLOW, looks_of
 from predictor.reports.plots import save_figure
+from predictor.reports.tables import with_interval
 from predictor.support.markdown import table
 
 HEADS = (
@@ -66,9 +67,9 @@ def _lines(result: EnvGraph) -> list[list[str]]:
         lines.append(
             [
                 name, _value(found.accuracy), _value(found.precision), _value(found.recall),
-                f"{_value(found.recall_of_leaders)} / {_value(found.recall_of_others)}", _with_interval(found.f1),
-                _value(found.fitted), _with_interval(found.auc), _value(found.average_precision),
-                _value(found.calibration_error), _with_interval(found.strength),
+                f"{_value(found.recall_of_leaders)} / {_value(found.recall_of_others)}", with_interval(found.f1),
+                _value(found.fitted), with_interval(found.auc), _value(found.average_precision),
+                _value(found.calibration_error), with_interval(found.strength),
                 "–" if spread is None or not found.bins else f"{spread:.2f}",
             ]
         )  # fmt: skip
@@ -77,12 +78,6 @@ def _lines(result: EnvGraph) -> list[list[str]]:
 
 def _value(estimate: Estimate | None) -> str:
     return "–" if estimate is None else f"{estimate.value:.2f}"
-
-
-def _with_interval(estimate: Estimate | None) -> str:
-    if estimate is None or estimate.interval is None:
-        return _value(estimate)
-    return f"{_value(estimate)} ({estimate.interval[0]:.2f} to {estimate.interval[1]:.2f})"
 
 
 def as_json(result: EnvGraph) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from envs.rollouts.plan_run import EnvPlans, PlanScores
 from predictor.evaluation.standard_errors import Estimate
 from predictor.reports.looks import STYLE
 from predictor.reports.plots import save_figure
+from predictor.reports.tables import metres
 from predictor.support.markdown import table
 
 HEADS = (
@@ -64,14 +65,10 @@ def markdown(results: Sequence[EnvPlans]) -> str:
 
 def _cells(name: str, found: PlanScores) -> list[str]:
     return [
-        name, _metres(found.own.without_m), _metres(found.own.with_m), _percent(found.own.reduction),
-        _metres(found.plans.without_m), _metres(found.plans.with_m), _percent(found.plans.reduction),
+        name, metres(found.own.without_m), metres(found.own.with_m), _percent(found.own.reduction),
+        metres(found.plans.without_m), metres(found.plans.with_m), _percent(found.plans.reduction),
         str(found.choices), _percent(found.right), _plain(found.brier),
     ]  # fmt: skip
-
-
-def _metres(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f}" if value >= 1 else f"{value:.3f}"
 
 
 def _percent(estimate: Estimate | None) -> str:

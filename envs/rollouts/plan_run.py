@@ -14,7 +14,7 @@ from envs.rollouts.side_forecasts import fitting_checkpoints
 from envs.rollouts.world import open_world
 from envs.supervision import TIMEOUT_S
 from predictor.checkpoint import load_forecaster
-from predictor.evaluation.standard_errors import Estimate, bootstrap_interval
+from predictor.evaluation.standard_errors import Estimate, estimate, quotient
 from predictor.support.errors import UserError
 from predictor.support.progress import track
 
@@ -177,7 +177,7 @@ def scores_of(episodes: Sequence[Sequence[PlanMoment]], name: str) -> PlanScores
     own, plans, choices, squares = (
         np.array(sums) for sums in zip(*(_sums(found, name) for found in episodes), strict=True)
     )
-    return PlanScores(_benefit(own), _benefit(plans), int(choices[:, 1].sum()), _ratio(choices), _ratio(squares))
+    return PlanScores(_benefit(own), _benefit(plans), int(choices[:, 1].sum()), _share(choices), _share(squares))
 
 
 def _sums(moments: Sequence[PlanMoment], name: str) -> tuple[Float[np.ndarray, " parts"], ...]:
@@ -198,19 +198,9 @@ def _benefit(sums: Float[np.ndarray, "episodes 3"]) -> Benefit:
     without, given, agents = sums.sum(axis=0)
     if not agents:
         return Benefit(0, None, None, None)
-    reduction = Estimate(
-        float(1 - given / without), bootstrap_interval(sums[:, :2], lambda drawn: 1 - _over(drawn[:, 1], drawn[:, 0]))
-    )
+    reduction = estimate(sums, lambda drawn: 1 - quotient(drawn[:, 1], drawn[:, 0]))
     return Benefit(int(agents), float(without / agents), float(given / agents), reduction)
 
 
-def _ratio(sums: Float[np.ndarray, "episodes 2"]) -> Estimate | None:
-    top, bottom = sums.sum(axis=0)
-    if not bottom:
-        return None
-    return Estimate(float(top / bottom), bootstrap_interval(sums, lambda drawn: _over(drawn[:, 0], drawn[:, 1])))
-
-
-def _over(top: Float[np.ndarray, " draws"], bottom: Float[np.ndarray, " draws"]) -> Float[np.ndarray, " draws"]:
-    """Returns the ratio; NaN where the denominator is 0."""
-    return np.where(bottom > 0, top / np.where(bottom > 0, bottom, 1.0), np.nan)
+def _share(sums: Float[np.ndarray, "episodes 2"]) -> Estimate | None:
+    return estimate(sums, lambda drawn: quotient(drawn[:, 0], drawn[:, 1]))

@@ -13,9 +13,9 @@ from rich.table import Table
 
 from envs.rollouts.reaction_cells import FALSE_BESIDE
 from envs.rollouts.reaction_run import CellReactions, EnvReactions
-from predictor.evaluation.standard_errors import Estimate
 from predictor.reports.looks import BLACK, STYLE, looks_of
 from predictor.reports.plots import save_figure
+from predictor.reports.tables import metres, with_interval
 from predictor.support.markdown import table
 
 HEADS = (
@@ -71,10 +71,10 @@ def _lines(result: EnvReactions) -> list[list[str]]:
             predicted = found.length_m if cell.name in FALSE_BESIDE else found.along_m
             lines.append(
                 [
-                    *first, name, _metres(found.true_m), _metres(predicted), _with_interval(found.slope),
-                    _with_interval(found.median_ratio), _on_path(cell, name), _with_interval(found.correlation),
+                    *first, name, metres(found.true_m), metres(predicted), with_interval(found.slope),
+                    with_interval(found.median_ratio), _on_path(cell, name), with_interval(found.correlation),
                     "–" if found.correlation_of_steps is None else f"{found.correlation_of_steps.value:.2f}",
-                    _with_interval(cell.false_reactions.get(name)),
+                    with_interval(cell.false_reactions.get(name)),
                 ]
             )  # fmt: skip
     return lines
@@ -82,18 +82,7 @@ def _lines(result: EnvReactions) -> list[list[str]]:
 
 def _on_path(cell: CellReactions, forecaster: str) -> str:
     found = cell.on_path.get(forecaster)
-    return "–" if found is None else f"{_with_interval(found.slope)} ({found.pairs})"
-
-
-def _metres(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f}" if abs(value) >= 1 else f"{value:.3f}"
-
-
-def _with_interval(estimate: Estimate | None) -> str:
-    if estimate is None:
-        return "–"
-    bounds = "" if estimate.interval is None else " ({:.2f} to {:.2f})".format(*estimate.interval)
-    return f"{estimate.value:.2f}{bounds}"
+    return "–" if found is None else f"{with_interval(found.slope)} ({found.pairs})"
 
 
 def as_json(result: EnvReactions) -> dict[str, Any]:

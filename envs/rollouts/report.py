@@ -17,7 +17,7 @@ from predictor.evaluation.graph_accuracy import GraphAccuracy
 from predictor.reports.fitted_table import FittedTable
 from predictor.reports.looks import BLACK, STYLE, looks_of
 from predictor.reports.plots import save_figure
-from predictor.reports.tables import markdown_table, percent_range
+from predictor.reports.tables import markdown_table, metres, percent_range
 from predictor.support.markdown import table
 
 
@@ -168,7 +168,7 @@ def _matrix(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], 
     envs = list(dict.fromkeys([r.env_id for r in results] + [env for env, _ in misfits]))
     cells = {env: dict.fromkeys(names, "–") for env in envs}
     for r in results:
-        cells[r.env_id][r.checkpoint] = f"{_metres(r.model.min_ade_m)} ({100 * r.reduction:.0f} %)"
+        cells[r.env_id][r.checkpoint] = f"{metres(r.model.min_ade_m)} ({100 * r.reduction:.0f} %)"
     return cells
 
 
@@ -180,17 +180,13 @@ def _cells(result: "EnvAccuracy") -> list[str]:
     noisy, covered = result.controls.get(RESIDUAL), many.statistics.get("coverage")
     return [
         result.env, result.checkpoint, f"{result.dt_s:g}", str(len(one.by_step_m)),
-        _metres(one.min_ade_m), _metres(one.min_fde_m), _metres(many.min_ade_m), _metres(many.min_joint_ade_m),
-        _metres(many.energy_m), "–" if covered is None else f"{100 * covered.mean:.0f} %",
-        "–" if noisy is None else _metres(noisy.min_ade_m), "–" if near is None else _metres(near.ade_m),
-        f"{_metres(straight.min_ade_m)} / {_metres(straight.min_fde_m)}",
+        metres(one.min_ade_m), metres(one.min_fde_m), metres(many.min_ade_m), metres(many.min_joint_ade_m),
+        metres(many.energy_m), "–" if covered is None else f"{100 * covered.mean:.0f} %",
+        "–" if noisy is None else metres(noisy.min_ade_m), "–" if near is None else metres(near.ade_m),
+        f"{metres(straight.min_ade_m)} / {metres(straight.min_fde_m)}",
         f"{100 * result.reduction:.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %", str(one.agents),
         f"{result.latency_median_ms:.1f}",
     ]  # fmt: skip
-
-
-def _metres(value: float) -> str:
-    return f"{value:.2f}" if value >= 1 else f"{value:.3f}"
 
 
 @matplotlib.rc_context(STYLE)

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from predictor.evaluation.standard_errors import Estimate, bootstrap_draws, bootstrap_interval, central_interval
+from predictor.evaluation.standard_errors import Estimate, bootstrap_draws, central_interval, estimate, quotient, summed
 
 BINS = 10
 """Number of bins of the calibration."""
@@ -202,7 +202,7 @@ def roc_auc(
     edges, others = hits.sum(axis=1), misses.sum(axis=1)
     below = others[:, None] - misses.cumsum(axis=1)
     area = (hits * (below + misses / 2)).sum(axis=1)
-    return _divided(area, edges * others)
+    return quotient(area, edges * others)
 
 
 def average_precision(
@@ -210,8 +210,8 @@ def average_precision(
 ) -> Float[np.ndarray, " draws"]:
     """Computes the average precision for each row of weights; NaN without an edge."""
     _, hits, taken = _by_score(score, exists, weights)
-    precision = _divided(hits.cumsum(axis=1), taken.cumsum(axis=1))
-    return _divided((hits * np.nan_to_num(precision)).sum(axis=1), hits.sum(axis=1))
+    precision = quotient(hits.cumsum(axis=1), taken.cumsum(axis=1))
+    return quotient((hits * np.nan_to_num(precision)).sum(axis=1), hits.sum(axis=1))
 
 
 def spearman(
@@ -222,7 +222,7 @@ def spearman(
     total = weights.sum(axis=1, keepdims=True)
     x, y = (rank - (weights * rank).sum(axis=1, keepdims=True) / total for rank in ranks)
     together, xx, yy = ((weights * product).sum(axis=1) for product in (x * y, x * x, y * y))
-    return _divided(together, np.sqrt(xx * yy))
+    return quotient(together, np.sqrt(xx * yy))
 
 
 def _ranks(values: Float[np.ndarray, " pairs"], weights: Weights) -> Float[np.ndarray, "draws pairs"]:
@@ -245,11 +245,6 @@ def _by_score(
     return score[order][begins], hits, taken
 
 
-def _divided(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Returns the quotient; NaN where the second is not above 0."""
-    return np.where(second > 1e-12, first / np.where(second > 1e-12, second, 1.0), np.nan)
-
-
 def _ranked(value: Callable[[Weights], Float[np.ndarray, " draws"]], pairs: CausalPairs) -> Estimate | None:
     """Returns a function of weights with its interval; None where it is not defined."""
     found = float(value(np.ones((1, len(pairs))))[0])
@@ -264,36 +259,23 @@ def _ranked(value: Callable[[Weights], Float[np.ndarray, " draws"]], pairs: Caus
     return Estimate(found, central_interval(np.concatenate([value(part[:, batch]) for part in parts])))
 
 
-def _summed(parts: Float[np.ndarray, "pairs parts"], episode: Int[np.ndarray, " pairs"]) -> np.ndarray:
-    """Returns the sums of each episode."""
-    _, batch = np.unique(episode, return_inverse=True)
-    sums = np.zeros((int(batch.max()) + 1, parts.shape[1]))
-    np.add.at(sums, batch, parts)
-    return sums
-
-
-def _estimate(sums: np.ndarray, value: Callable[[np.ndarray], np.ndarray]) -> Estimate | None:
-    found = float(value(sums.sum(axis=0, keepdims=True))[0])
-    return Estimate(found, bootstrap_interval(sums, value)) if np.isfinite(found) else None
-
-
 def _decisions(score: Float[np.ndarray, " pairs"], pairs: CausalPairs, bound: float | None) -> dict[str, Any]:
     """Returns accuracy, precision, recall, of edges from leaders and of others too, and F1 of a bound."""
     inferred = np.zeros(len(pairs), dtype=np.bool_) if bound is None else score > bound
     leads = np.zeros(len(pairs), dtype=np.bool_) if pairs.leads is None else pairs.leads
     found, led = inferred & pairs.exists, leads & pairs.exists
     counts = [found, inferred, pairs.exists, inferred == pairs.exists, np.ones(len(pairs)), found & leads, led]
-    sums = _summed(np.stack(counts, axis=-1).astype(np.float64), pairs.episode)
+    sums = summed(np.stack(counts, axis=-1).astype(np.float64), pairs.episode)
     by_leader = pairs.leads is not None
     return {
-        "recall_of_leaders": _estimate(sums, lambda s: _divided(s[:, 5], s[:, 6])) if by_leader else None,
+        "recall_of_leaders": estimate(sums, lambda s: quotient(s[:, 5], s[:, 6])) if by_leader else None,
         "recall_of_others": (
-            _estimate(sums, lambda s: _divided(s[:, 0] - s[:, 5], s[:, 2] - s[:, 6])) if by_leader else None
+            estimate(sums, lambda s: quotient(s[:, 0] - s[:, 5], s[:, 2] - s[:, 6])) if by_leader else None
         ),
-        "accuracy": _estimate(sums, lambda s: _divided(s[:, 3], s[:, 4])),
-        "precision": _estimate(sums, lambda s: _divided(s[:, 0], s[:, 1])),
-        "recall": _estimate(sums, lambda s: _divided(s[:, 0], s[:, 2])),
-        "f1": _estimate(sums, lambda s: _divided(2 * s[:, 0], s[:, 1] + s[:, 2])),
+        "accuracy": estimate(sums, lambda s: quotient(s[:, 3], s[:, 4])),
+        "precision": estimate(sums, lambda s: quotient(s[:, 0], s[:, 1])),
+        "recall": estimate(sums, lambda s: quotient(s[:, 0], s[:, 2])),
+        "f1": estimate(sums, lambda s: quotient(2 * s[:, 0], s[:, 1] + s[:, 2])),
     }
 
 
@@ -304,8 +286,8 @@ def _bin_of(score: Float[np.ndarray, " pairs"]) -> Int[np.ndarray, " pairs"]:
 def _calibration_error(score: Float[np.ndarray, " pairs"], pairs: CausalPairs) -> Estimate | None:
     inside = (_bin_of(score)[:, None] == np.arange(BINS)).astype(np.float64)
     gap = inside * (score - pairs.exists)[:, None]
-    sums = _summed(np.concatenate([gap, inside], axis=-1), pairs.episode)
-    return _estimate(sums, lambda s: _divided(np.abs(s[:, :BINS]).sum(axis=1), s[:, BINS:].sum(axis=1)))
+    sums = summed(np.concatenate([gap, inside], axis=-1), pairs.episode)
+    return estimate(sums, lambda s: quotient(np.abs(s[:, :BINS]).sum(axis=1), s[:, BINS:].sum(axis=1)))
 
 
 def _bins(score: Float[np.ndarray, " pairs"], exists: Bool[np.ndarray, " pairs"]) -> tuple[Bin, ...]:

@@ -18,13 +18,12 @@ of sender and receiver, with true shifts t and predicted shifts p at steps 1 to 
 Intervals are 95 % percentile bootstraps over episodes, since the pairs of an episode are alike.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from predictor.evaluation.standard_errors import Estimate, bootstrap_draws, bootstrap_interval, central_interval
+from predictor.evaluation.standard_errors import Estimate, bootstrap_draws, central_interval, estimate, quotient, summed
 
 NO_SHIFT_M = 1e-6
 """Length below which a true shift has no direction [m]."""
@@ -129,13 +128,13 @@ def false_reaction(unmoved: Shifts, moved: Shifts) -> Estimate | None:
         parts.append(np.zeros((len(shifts), 4)))
         parts[-1][:, 2 * place : 2 * place + 2] = np.stack([length_m, np.ones(len(shifts))], axis=-1)
     episode = np.concatenate([unmoved.episode, moved.episode])
-    return _estimate(np.concatenate(parts), episode, _ratio_of_means)
+    return estimate(summed(np.concatenate(parts), episode), _ratio_of_means)
 
 
 def _slope(shifts: Shifts) -> Estimate | None:
     dots = (shifts.predicted_m * shifts.true_m).sum(axis=(1, 2))
     squares = np.square(shifts.true_m).sum(axis=(1, 2))
-    return _estimate(np.stack([dots, squares], axis=-1), shifts.episode, lambda sums: _ratio(sums[:, 0], sums[:, 1]))
+    return estimate(summed(np.stack([dots, squares], axis=-1), shifts.episode), lambda s: quotient(s[:, 0], s[:, 1]))
 
 
 def _median_ratio(
@@ -168,28 +167,11 @@ def _correlation(
 ) -> Estimate | None:
     x, y = first - first.mean(), second - second.mean()  # about the means, so that the squares lose no digits
     parts = np.stack([np.ones_like(x), x, y, x * x, y * y, x * y], axis=-1).sum(axis=1)
-    return _estimate(parts, episode, _pearson)
-
-
-def _estimate(
-    parts: Float[np.ndarray, "pairs parts"],
-    episode: Int[np.ndarray, " pairs"],
-    value: Callable[[Float[np.ndarray, "draws parts"]], Float[np.ndarray, " draws"]],
-) -> Estimate | None:
-    """Returns a function of sums over pairs, with its interval; None where it is not defined."""
-    _, batch = np.unique(episode, return_inverse=True)
-    sums = np.zeros((int(batch.max(initial=-1)) + 1, parts.shape[1]))
-    np.add.at(sums, batch, parts)
-    found = float(value(sums.sum(axis=0, keepdims=True))[0])
-    return Estimate(found, bootstrap_interval(sums, value)) if np.isfinite(found) else None
-
-
-def _ratio(first: Float[np.ndarray, " draws"], second: Float[np.ndarray, " draws"]) -> Float[np.ndarray, " draws"]:
-    return np.where(second > 0, first / np.where(second > 0, second, 1.0), np.nan)
+    return estimate(summed(parts, episode), _pearson)
 
 
 def _ratio_of_means(sums: Float[np.ndarray, "draws parts"]) -> Float[np.ndarray, " draws"]:
-    return _ratio(_ratio(sums[:, 0], sums[:, 1]), _ratio(sums[:, 2], sums[:, 3]))
+    return quotient(quotient(sums[:, 0], sums[:, 1]), quotient(sums[:, 2], sums[:, 3]))
 
 
 def _pearson(sums: Float[np.ndarray, "draws parts"]) -> Float[np.ndarray, " draws"]:

@@ -16,6 +16,8 @@ NUM_SUBSETS = 20
 """Number of subsets, as in the paper."""
 BOOTSTRAP_DRAWS = 2000
 """Number of bootstrap draws of an interval."""
+SMALLEST = 1e-12
+"""Denominators up to this one count as 0."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,30 @@ def batch_interval(
     ratios = totals[numbers > 0] / numbers[numbers > 0]
     low, high = np.percentile(np.sqrt(ratios) if root else ratios, [2.5, 97.5])
     return float(low), float(high)
+
+
+def summed(
+    parts: Float[np.ndarray, "entries parts"], episode: Int[np.ndarray, " entries"]
+) -> Float[np.ndarray, "episodes parts"]:
+    """Returns the sums over the entries of each episode."""
+    _, batch = np.unique(episode, return_inverse=True)
+    sums = np.zeros((int(batch.max(initial=-1)) + 1, parts.shape[1]))
+    np.add.at(sums, batch, parts)
+    return sums
+
+
+def quotient(top: Float[np.ndarray, "*draws"], bottom: Float[np.ndarray, "*draws"]) -> Float[np.ndarray, "*draws"]:
+    """Returns the quotient; NaN where the denominator is not above 0."""
+    return np.where(bottom > SMALLEST, top / np.where(bottom > SMALLEST, bottom, 1.0), np.nan)
+
+
+def estimate(
+    sums: Float[np.ndarray, "episodes parts"],
+    value: Callable[[Float[np.ndarray, "draws parts"]], Float[np.ndarray, " draws"]],
+) -> Estimate | None:
+    """Returns a function of sums over episodes with its `bootstrap_interval`; None where it is not defined."""
+    found = float(value(sums.sum(axis=0, keepdims=True))[0])
+    return Estimate(found, bootstrap_interval(sums, value)) if np.isfinite(found) else None
 
 
 def bootstrap_interval(

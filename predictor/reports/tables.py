@@ -8,6 +8,7 @@ import numpy as np
 
 from predictor.evaluation.accuracy import Accuracy
 from predictor.evaluation.displacement import COVERAGE_SHARE
+from predictor.evaluation.standard_errors import Estimate
 from predictor.reports.fitted_table import FittedTable
 from predictor.support import markdown
 
@@ -159,6 +160,18 @@ def plain(value: float | None, places: int = 3) -> str:
     return "–" if value is None else f"{value:.{places}f}"
 
 
+def metres(value: float | None) -> str:
+    """Returns a length [m] with two decimals, three below 1 m, or a dash for None."""
+    return plain(value, 2 if value is not None and abs(value) >= 1 else 3)
+
+
+def with_interval(estimate: Estimate | None) -> str:
+    """Returns a number with its interval, ``0.96 (0.84 to 1.05)``, or a dash for None."""
+    if estimate is None or estimate.interval is None:
+        return plain(None if estimate is None else estimate.value, 2)
+    return "{:.2f} ({:.2f} to {:.2f})".format(estimate.value, *estimate.interval)
+
+
 def percent_range(shares: Sequence[float]) -> str:
     """Returns the smallest and the largest of some shares as text, ``88 to 94 %``, or ``94 %`` where they are equal."""
     low, high = f"{100 * min(shares):.0f}", f"{100 * max(shares):.0f}"
@@ -217,13 +230,13 @@ def _rounded_number(value: float, places: int) -> str:
 def _scalar_cells(accuracy: Accuracy) -> list[str]:
     """Returns the cells under `SCALARS`; a dash for what was not measured."""
 
-    def metres(name: str) -> str:
+    def length(name: str) -> str:
         value: float = getattr(accuracy, name)
         error = accuracy.statistics[name].standard_error if name in accuracy.statistics else None
         return _rounded_number(value, 3) + ("" if error is None else f" ± {_rounded_number(error, 3)}")
 
     lengths = [
-        metres(name)
+        length(name)
         for name in (
             "ade_m", "fde_m", "min_ade_m", "min_fde_m", "min_joint_ade_m", "min_joint_fde_m", "energy_m",
             "overall_rmse_m",
