@@ -64,7 +64,11 @@ class PlanAttention(ForecastAttention):
         assert isinstance(observation_space, gym.spaces.Dict)
         if WHAT_IF_GAP not in observation_space.spaces:
             raise UserError(f"PlanAttention needs the entry '{WHAT_IF_GAP}'; wrap the environment with what_if=True")
-        self.num_plans = (observation_space[WHAT_IF_GAP].shape or (0,))[-1]
+        others, self.num_plans = observation_space[WHAT_IF_GAP].shape or (0, 0)
+        if not others:
+            raise UserError(
+                "PlanAttention needs room for another agent; wrap the environment with max_agents of 2 or more"
+            )
         self._features_dim += SUMMARY * self.num_plans
 
     def forward(self, observations: dict[str, Tensor]) -> Float[Tensor, "batch features"]:

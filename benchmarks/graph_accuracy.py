@@ -113,7 +113,9 @@ def main() -> None:
         agents = float(np.mean([e.valid.sum(axis=1).mean() for e in store.episodes]))
         cases: list[tuple[str, str, Forecaster]] = [("", "constant velocity", ConstantVelocity(spec, horizon))]
         for checkpoint in config.checkpoint:
-            trained = load_checkpoint(checkpoint)[1].config
+            info = load_checkpoint(checkpoint)[1]
+            info.spec.check_recorded(spec, f"checkpoint '{checkpoint}'", f"store {path}")
+            trained = info.config
             cases += [(_graph(trained), _graph(other.config), other) for other in variants(checkpoint, config)]
         for trained_on, graph, forecaster in cases:
             measured = measure(forecaster, windows, config)

@@ -112,7 +112,7 @@ def draw_seen(path: Path) -> None:
 @rc_context(STYLE)
 def draw_braking_leader(path: Path) -> None:
     """Draws what a leader's braking changes: what happens, what is forecast, and what constant velocity says."""
-    world, forecasters = _at(BRAKING)
+    world, forecasters = _at(BRAKING, is_seen=False)  # each branch shows its own present
     leader, follower = _leader_and_follower(world)
     found = branch(world, Intervention(leader, "brake", 0, change_mps=8.0, at_once=True), 5)
     figure, (road, ahead) = plt.subplots(2, 1, figsize=(10, 5), layout="constrained", height_ratios=(1, 1.6))
@@ -188,8 +188,8 @@ def draw_calibration(path: Path) -> None:
     plt.close(figure)
 
 
-def _at(moment: Moment) -> tuple[World, dict[str, SideForecaster]]:
-    """Returns the world at a moment, and forecasters that have seen it up to then."""
+def _at(moment: Moment, is_seen: bool = True) -> tuple[World, dict[str, SideForecaster]]:
+    """Returns the world at a moment, and forecasters that have seen it up to then, or up to the step before."""
     model, info = load_checkpoint("highway")
     world = open_world(ROAD, "idle", perceived_as=info.spec)
     world.reset(moment.seed)
@@ -198,9 +198,11 @@ def _at(moment: Moment) -> tuple[World, dict[str, SideForecaster]]:
         "constant velocity": SideForecaster(ConstantVelocity(world.spec), world.spec, 5),
     }
     for step in range(moment.step):
-        for forecaster in forecasters.values():
-            forecaster.observe(world.perceived())
-        if step < moment.step - 1:
+        is_last = step == moment.step - 1
+        if is_seen or not is_last:
+            for forecaster in forecasters.values():
+                forecaster.observe(world.perceived())
+        if not is_last:
             world.step()
     return world, forecasters
 

@@ -120,6 +120,13 @@ class SceneStream:
         """
         return self._shown(self._online.forecast(self.horizon_steps, num_samples, self._noise))
 
+    def pictured(self, num_samples: int) -> Forecast:
+        """Returns a forecast of the latest scene of each environment with this number of samples, to be drawn.
+
+        No noise is used up: an episode that is filmed is the one that is not.
+        """
+        return self._shown(self._online.forecast(self.horizon_steps, num_samples, deepcopy(self._noise)))
+
     def what_if(self, plans: Float[np.ndarray, "entries plans horizon state"]) -> Forecast:
         """Forecasts each scene of the latest forecast again, for each plan of its ego, in the frame of `Forecast`.
 

@@ -23,7 +23,7 @@ from envs.plans import PlanModel, Plans, checked_plans, plan_model_for
 from envs.plans.contact import contacts
 from envs.plans.playing import as_forecast, with_true_futures
 from envs.readers import reader_for
-from envs.readers.base import SceneReader
+from envs.readers.base import SceneReader, show
 from envs.registry import checkpoint_for, entry_for
 from envs.wrappers import scene_source
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster
@@ -98,7 +98,8 @@ def forecaster_for(env: gym.Env, checkpoint: str | None) -> Forecaster:
     if checkpoint is None and env.has_wrapper_attr("forecaster"):
         wrapped: Forecaster = env.get_wrapper_attr("forecaster")
         return wrapped
-    return _loaded(checkpoint or checkpoint_for(scene_source(env)), reader_for(env).spec, scene_source(env))
+    spec = env.get_wrapper_attr("scene_spec") if env.has_wrapper_attr("scene_spec") else reader_for(env).spec
+    return _loaded(checkpoint or checkpoint_for(scene_source(env)), spec, scene_source(env))
 
 
 @functools.lru_cache(maxsize=4)
@@ -155,12 +156,15 @@ class Planner:
         self.chosen = 0
 
     def __call__(self, obs: Any = None) -> Any:
-        """Observes the environment's present scene and returns the best plan's action; the observation is not read.
+        """Observes the environment's present scene and returns the best plan's action.
+
+        Args:
+            obs: the environment's own observation; only a reader that reads observations (`EntityRowsReader`) needs it.
 
         Raises:
             UserError: plans of another shape, or without rewards.
         """
-        scene = self._scene()
+        scene = self._scene(obs)
         scenes = SceneBatch.stack([scene])
         self._online.observe(scenes)
         plans = checked_plans(self.plan_model, self.env, self._horizon, self._spec.num_features, scene, self._spec)
@@ -177,8 +181,9 @@ class Planner:
         self.plans, self.chosen = plans, choose(plans, self.survival, self.config.max_risk)
         return plans.actions[self.chosen]
 
-    def _scene(self) -> Scene:
+    def _scene(self, obs: Any) -> Scene:
         if self._own_reader:
+            show(self._reader, obs)
             return self._reader.read(self.env)
         scene: Scene = self.env.get_wrapper_attr("scene")
         return scene

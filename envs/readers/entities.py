@@ -150,7 +150,7 @@ class _EntityRows(Reader):
                 raise UserError("EntityRowsReader: the first line must hold the ego, but its presence is 0")
         elif self._config.padding is not None:
             scales = 1.0 if self._config.scales is None else np.array(self._config.scales)
-            valid[1:] = (table[1:] != self._config.padding * scales).any(axis=1)
+            valid[1:] = ~np.isclose(table[1:], self._config.padding * scales, rtol=1e-6, atol=0.0).all(axis=1)
         return valid
 
     def _restore(self, states: Float[np.ndarray, "agents state"]) -> None:

@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 import os
+import pickle
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -258,6 +259,9 @@ def load_policy(path: Path, venv: VecEnv | None = None, device: str = "cpu") -> 
     kind = algorithm_class(algorithm)
     try:
         return kind.load(path, env=venv, device=device)
-    except (ValueError, KeyError, TypeError, AttributeError, AssertionError, EOFError, RuntimeError) as error:
+    except (
+        *(ValueError, KeyError, TypeError, AttributeError, AssertionError, EOFError, RuntimeError),
+        *(ImportError, pickle.PickleError),
+    ) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"{path} is no {algorithm} policy that fits here: {reason}") from error

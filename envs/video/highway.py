@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8
 
 from envs.drivers.ego import constant_actions
 from envs.plans.contact import contacts
-from envs.readers.highway import HighwayReader, is_highway_env
+from envs.readers.highway import HighwayReader, is_highway_env, policy_step_s
 from envs.video.drawing import (
     AgentOverlay,
     OverlayStyle,
@@ -201,7 +201,7 @@ class _Recorder:
             env_id=env.spec.id if env.spec is not None else type(self._base).__name__,
             fps=0,
             frames_per_step=int(config["simulation_frequency"] // config["policy_frequency"]),
-            dt_s=1 / config["policy_frequency"],
+            dt_s=policy_step_s(config),
             style=style,
         )
         self._reader: HighwayReader = env.get_wrapper_attr("reader")
@@ -260,7 +260,8 @@ def forecast_shown(env: ForecastObservation, num_samples: int, frame: int) -> _S
         frame: index of the picture in which the forecast was made.
     """
     scene = env.scene
-    forecast = env.stream.again(num_samples) if num_samples > 1 else env.forecast
+    has_as_many = env.forecast.xy.shape[1] == num_samples
+    forecast = env.forecast if has_as_many else env.stream.pictured(num_samples)
     others = np.flatnonzero(scene.valid)[1:]  # without the ego
     keys = tuple(scene.ids[others].tolist())
     xy_m = forecast.xy[0].double().cpu().numpy() + scene.states[0, :2]

@@ -54,7 +54,8 @@ def bodies_now(
         num_samples: number of futures of each agent.
     """
     scene, spec = env.scene, env.scene_spec
-    forecast = env.stream.again(num_samples) if num_samples > 1 else env.forecast
+    has_as_many = env.forecast.xy.shape[1] == num_samples
+    forecast = env.forecast if has_as_many else env.stream.pictured(num_samples)
     states = scene.scene.states
     xy_m = forecast.xy[0].double().cpu().numpy().swapaxes(0, 1)
     shares = forecast.sample_probs()[0].double().cpu().numpy().T

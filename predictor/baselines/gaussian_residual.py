@@ -35,7 +35,8 @@ class GaussianResidual:
         axes = forecaster.spec.position_dim
         self.horizon_steps = len(covariance) // axes
         self.covariance = covariance
-        root = np.linalg.cholesky(covariance + LEAST_STD_M**2 * np.eye(len(covariance)))
+        least = max(LEAST_STD_M**2, 1e-12 * float(np.trace(covariance)))  # above the rounding of large units, as pixels
+        root = np.linalg.cholesky(covariance + least * np.eye(len(covariance)))
         self._root = torch.from_numpy(root).float()
 
     @classmethod

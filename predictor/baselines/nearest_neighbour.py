@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from predictor.data.store import Episode, read_store
-from predictor.data.windows import visible
+from predictor.data.windows import foreseeable, visible
 from predictor.forecaster import Belief, Futures, Memory, edgeless_belief
 from predictor.noise import Noise
 from predictor.scene import SceneSpec
@@ -312,13 +312,14 @@ def fit_from_stores(
 def _complete(
     episode: Episode, seen: Bool[np.ndarray, "time agents"], spec: SceneSpec, horizon_steps: int
 ) -> Bool[np.ndarray, "time agents"]:
-    """Returns which agents are examples at which steps."""
+    """Returns which agents are examples at which steps: as in windows, none whose future holds a new intervention."""
     steps = len(seen) - horizon_steps
     complete = np.zeros_like(seen)
     if steps < 1 or not seen.shape[1]:
         return complete
     future = np.lib.stride_tricks.sliding_window_view(episode.valid[1:], horizon_steps, axis=0)
     complete[:steps] = seen[:steps] & future.all(-1)
+    complete &= foreseeable(episode, horizon_steps)[:, None]
     if spec.has_ego:
         complete &= episode.valid[:, :1]
         complete[:, 0] = False

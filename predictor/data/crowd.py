@@ -5,12 +5,13 @@ Agents of different recordings do not interact, so an overlay tests a forecaster
 agents without influence on each other, not how crowds behave.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 
+from predictor.data.dataset_card import most_present
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.support.command_line import Renamed, parse
 from predictor.support.config_checks import check_at_least
@@ -55,9 +56,8 @@ class CrowdConfig:
             raise UserError(f"at_step must lie between 0 and {self.episode_steps - 1}, got {self.at_step}")
 
 
-def overlay(episodes: list[Episode], axes: int, seed: int) -> Episode:
-    """Returns one episode with all agents of several, each recording centred on its own mean position."""
-    steps = min(len(e.states) for e in episodes)
+def overlay(episodes: list[Episode], axes: int, seed: int, steps: int) -> Episode:
+    """Returns one episode of `steps` with all agents of several, each recording centred on its own mean position."""
     parts, presence = [], []
     for episode in episodes:
         states, valid = episode.states[:steps].copy(), episode.valid[:steps]
@@ -91,7 +91,7 @@ def make_crowds(config: CrowdConfig) -> list[Episode]:
             chosen: list[Episode] = []
             while sum(int(e.valid[config.at_step].sum()) for e in chosen) < wanted:
                 chosen.append(usable[int(rng.integers(len(usable)))])
-            crowds.append(overlay(chosen, store.info.spec.position_dim, len(crowds)))
+            crowds.append(overlay(chosen, store.info.spec.position_dim, len(crowds), config.episode_steps))
     return crowds
 
 
@@ -101,7 +101,8 @@ def main() -> None:
     crowds = make_crowds(config)
     source = read_store(config.source).info
     made = provenance(("numpy", "zarr")) | {"overlaid": source.provenance}
-    write_store(config.out, StoreInfo(source.spec, f"{source.source}, overlaid", made), crowds, config.overwrite)
+    spec = replace(source.spec, max_agents=max(source.spec.max_agents, most_present(crowds)))
+    write_store(config.out, StoreInfo(spec, f"{source.source}, overlaid", made), crowds, config.overwrite)
     counts = [int(e.valid[config.at_step].sum()) for e in crowds]
     present = f"{min(counts)} to {max(counts)} agents at step {config.at_step}"
     print(f"{address(config.out)}: {len(crowds)} episodes of {present}")

@@ -9,7 +9,7 @@ from predictor.support.errors import UserError, short
 
 
 def check_episode(episode: Any, spec: SceneSpec, where: str) -> None:
-    """Checks types and shapes of an episode's states, presence and ids.
+    """Checks types and shapes of an episode's states, presence, ids, labels and marks of interventions.
 
     Args:
         episode: what was given as an `Episode`.
@@ -41,3 +41,15 @@ def check_episode(episode: Any, spec: SceneSpec, where: str) -> None:
         raise UserError(f"{where}: states need {wanted}, got {states.shape[2]}")
     if (ids < 0).any() or len(np.unique(ids)) != len(ids):
         raise UserError(f"{where}: ids of an episode must be different and not negative, got {short(ids.tolist())}")
+    for name, kinds, axes in (("edge_types", "iu", 3), ("edge_attributes", "f", 4), ("causal_shift_m", "f", 3)):
+        labels = getattr(episode, name, None)
+        if labels is None:
+            continue
+        if labels.dtype.kind not in kinds or labels.ndim != axes or labels.shape[1:3] != (len(ids), len(ids)):
+            wanted = f"{'integers' if 'i' in kinds else 'floating point'} for each pair of the {len(ids)} agents"
+            raise UserError(f"{where}: {name} of an episode must be {wanted}, got {labels.dtype} {labels.shape}")
+    marks = getattr(episode, "perturbed", None)
+    if marks is not None and (marks.dtype.kind not in "iu" or marks.shape != valid.shape):
+        raise UserError(
+            f"{where}: perturbed of an episode must be integers of shape {valid.shape}, got {marks.dtype} {marks.shape}"
+        )

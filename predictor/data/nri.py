@@ -19,6 +19,7 @@ import torch
 
 from predictor.data.springs import (
     CHARGE_SUBSTEPS,
+    STATE_BYTES,
     Physics,
     draw_charges,
     draw_start,
@@ -85,7 +86,7 @@ class NRIConfig:
         check_at_least(self, 0, "train", "val", "test", "seed")
         check_at_least(self, 2, "num_agents", "frames", "test_frames")
         for name in ("train", "val", "test"):
-            check_count(getattr(self, name) * self.num_agents * max(self.frames, self.test_frames), name, 16)
+            check_count(getattr(self, name), name, STATE_BYTES * self.num_agents * max(self.frames, self.test_frames))
 
 
 def nri_physics(law: Law, num_agents: int = 5, frames: int = FRAMES) -> Physics:

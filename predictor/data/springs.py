@@ -31,6 +31,8 @@ from predictor.support.remote import address, exists
 DT_S = 1 / 6
 FRAMES = 50
 CHUNK = 2000
+STATE_BYTES = 16
+"""Memory of the position and velocity of a particle in a frame [bytes]."""
 CHARGE_SUBSTEPS = 4
 """Number of leapfrog steps of charges for each one of springs."""
 
@@ -116,7 +118,7 @@ class SpringsConfig:
             raise UserError(f"kicks must lie between 0 and 1, got {self.kicks}")
         check_positive(self, "kick_mps")
         for name in ("train", "val", "test", "ood"):
-            check_count(getattr(self, name), name)
+            check_count(getattr(self, name), name, STATE_BYTES * self.physics.num_agents * self.physics.frames)
 
 
 def draw_springs(

@@ -152,6 +152,8 @@ def _write(path: Path, info: StoreInfo, episodes: Sequence[Episode]) -> None:
     for episode in episodes:
         check_episode(episode, info.spec, str(path))
         _check_finite(episode, str(path))
+        if episode.perturbed is not None and not np.isin(episode.perturbed, range(len(PERTURBATIONS))).all():
+            raise UserError(f"{address(path)}: perturbed must lie between 0 and {len(PERTURBATIONS) - 1}")
     marked = [e.perturbed is not None for e in episodes]
     if any(marked) and not all(marked):
         raise UserError(f"{address(path)}: either all episodes have perturbed or none, got both")

@@ -102,7 +102,9 @@ class Windows:
         self.horizon_steps = horizon_steps
         lengths = np.array([len(e.states) for e in episodes], dtype=np.int64)
         index = _index(lengths, min_history_steps - 1, min_future_steps)
-        self.index = index[_foreseeable(index, episodes, horizon_steps)]
+        first = np.concatenate([[0], np.cumsum([len(e.states) for e in episodes], dtype=np.int64)])
+        kept = np.concatenate([np.zeros(0, np.bool_), *(foreseeable(e, horizon_steps) for e in episodes)])
+        self.index = index[kept[first[index[:, 0]] + index[:, 1]]]
         if not len(self.index):
             raise UserError(
                 f"no window fits: episodes have at most {lengths.max(initial=0)} steps, "
@@ -167,21 +169,15 @@ def _index(lengths: Int[np.ndarray, " episodes"], first: int, future_steps: int)
     return np.stack([episode, np.arange(len(episode)) - begins + first], axis=1)
 
 
-def _foreseeable(
-    index: Int[np.ndarray, "windows 2"], episodes: Sequence[Episode], horizon_steps: int
-) -> Bool[np.ndarray, " windows"]:
-    """Returns in which windows no intervention begins between the last observed step and the last one forecast."""
-    kept = np.ones(len(index), dtype=np.bool_)
-    for number, episode in enumerate(episodes):
-        if episode.perturbed is None:
-            continue
-        before = np.pad(episode.perturbed, ((1, 0), (0, 0)))[:-1]
-        begins = ((episode.perturbed != 0) & (episode.perturbed != before)).any(axis=1)
-        until = np.concatenate([[0], np.cumsum(begins)])
-        mine = slice(*np.searchsorted(index[:, 0], [number, number + 1]))
-        now = index[mine, 1]
-        kept[mine] = until[np.minimum(now + horizon_steps, len(begins))] == until[now]
-    return kept
+def foreseeable(episode: Episode, horizon_steps: int) -> Bool[np.ndarray, " time"]:
+    """Returns after which steps no intervention begins within the horizon."""
+    if episode.perturbed is None:
+        return np.ones(len(episode.states), dtype=np.bool_)
+    before = np.pad(episode.perturbed, ((1, 0), (0, 0)))[:-1]
+    begins = ((episode.perturbed != 0) & (episode.perturbed != before)).any(axis=1)
+    until = np.concatenate([[0], np.cumsum(begins)])
+    now = np.arange(len(begins))
+    return np.asarray(until[np.minimum(now + horizon_steps, len(begins))] == until[now])
 
 
 def siblings(episodes: Sequence[Episode]) -> Int[np.ndarray, " episodes"]:

@@ -51,7 +51,7 @@ class Accuracy:
     """Share of the agents of `min_fde_m` whose best final displacement is above the threshold."""
     overall_rmse_m: float = math.nan
     """Root mean squared displacement of the samples' mean [m] over all steps and agents whose truth is known. The
-    squares of all axes are added, so it is never below the mean displacement; see `rmse_per_axis_m`."""
+    squares of all axes are added, so it is never below the mean displacement."""
     coverage: list[float] = field(default_factory=list)
     """Share of truths within the central 90 % of the samples at each step; empty with too few samples."""
     miss_by_step: list[float] = field(default_factory=list)
@@ -87,15 +87,6 @@ class Accuracy:
     if not requested."""
     step_intervals: dict[str, list[tuple[float, float] | None]] = field(default_factory=dict)
     """95 % bootstrap interval over batches at each step, by name of the list fields."""
-
-    @property
-    def rmse_per_axis_m(self) -> float:
-        """Overall RMSE per coordinate [m]: root of the mean over steps, agents and axes, `overall_rmse_m` / √axes.
-
-        The paper does not define its RMSE, but reports some below the mean displacement of the same deterministic
-        model (springs, "Linear": 0.196 beside an ADE of 0.202); over equal steps only a mean over axes gives that.
-        """
-        return self.overall_rmse_m / math.sqrt(self.axes)
 
 
 class Tally:

@@ -256,7 +256,8 @@ def _size_line(content: dict[str, Any]) -> str:
         f"{kind}: {t['windows']:,} windows of {t['agents']['min']} to {t['agents']['max']} agents"
         for kind, t in (content["rows"][0]["tests"].items() if content["rows"] else ())
     ]
-    memory = max((t.get("peak_memory_mb", 0.0) for r in content["rows"] for t in r["tests"].values()), default=0.0)
+    runs = [run for row in content["rows"] for run in row.get("runs", [row])]  # a row has the mean of its runs
+    memory = max((t.get("peak_memory_mb", 0.0) for run in runs for t in run["tests"].values()), default=0.0)
     return (
         f"Measured on {'; '.join(tests)}. Parameters (training time): {', '.join(sizes)}. "
         f"Largest memory of any line's process, training included: {memory:,.0f} MB."

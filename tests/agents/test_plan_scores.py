@@ -195,6 +195,15 @@ def test_a_space_without_plans_is_refused():
         PlanAttention(gym.spaces.Dict({"observation": gym.spaces.Box(-1, 1, (2,))}))
 
 
+def test_a_space_without_another_agent_is_refused():
+    alone = {
+        name: gym.spaces.Box(-1, 1, (0, *space.shape[1:])) if name != "observation" else space
+        for name, space in OneFreePlan.observation_space.items()
+    }
+    with pytest.raises(UserError, match="PlanAttention needs room for another agent; wrap the environment with m"):
+        PlanAttention(gym.spaces.Dict(alone))
+
+
 def test_actions_of_plans_are_those_that_the_planner_takes():
     task = Task("highway-fast-v0", "constant-velocity", what_if=True)
     env = task.make()

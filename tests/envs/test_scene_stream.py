@@ -197,6 +197,17 @@ def test_forecasting_again_draws_from_the_noise_of_each_environment():
     assert_same(first[:, :1].numpy(), second[:, :1].numpy())
 
 
+@pytest.mark.parametrize("samples", [1, SAMPLES, 9])
+def test_what_is_drawn_uses_up_no_noise(samples: int):
+    """An episode that is filmed is the one that is not."""
+    filmed, plain = stream(), stream()
+    for t in range(3):
+        assert_same(filmed.observe(scenes(t)), plain.observe(scenes(t)), tolerance=0.0)
+        pictured = filmed.pictured(samples)
+        assert pictured.xy.shape[1] == samples and filmed.forecast is not None
+        assert_same(pictured.xy[:, :1].numpy(), filmed.forecast.xy[:, :1].numpy())
+
+
 def test_a_negative_seed_is_named():
     assert ForecastConfig(seed=0).seed == 0
     with pytest.raises(UserError, match="seed must not be negative, got -1"):

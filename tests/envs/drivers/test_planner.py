@@ -9,6 +9,7 @@ import pytest
 from envs.drivers.ego import make_ego_driver
 from envs.drivers.planner import Planner, PlannerConfig, choose, expected_rewards, is_planner
 from envs.plans import Plans
+from envs.readers.entities import EntityRowsReader
 from envs.registry import make_env
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.baselines.constant_velocity import ConstantVelocity
@@ -163,3 +164,45 @@ def test_environments_and_models_that_do_not_fit_are_refused():
         Planner(env, ConstantVelocity(ROAD), WithoutRewards())()
     with pytest.raises(UserError, match="max_risk must be from 0 to 1, got 1.5"):
         PlannerConfig(max_risk=1.5)
+
+
+class Rows(gym.Env):
+    """The ego stands; another agent comes towards it. What there is stands in the observation alone."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2, 4), np.float64)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.time = 0
+        return self._table(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.time += 1
+        return self._table(), 0.0, self.time == 3, False, {}
+
+    def _table(self) -> np.ndarray:
+        return np.array([[0.0, 0.0, 0.0, 0.0], [20.0 - 5.0 * self.time, 0.0, -5.0, 0.0]])
+
+
+class StayOrLeave:
+    names = ("stay", "leave")
+
+    def plans(self, env: gym.Env, horizon_steps: int) -> Plans:
+        states = np.zeros((2, horizon_steps, 4))
+        states[1, :, 1] = 50.0
+        return Plans(states, (0, 1), rewards=np.array([[1.0], [0.9]]).repeat(horizon_steps, axis=1))
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_a_reader_of_observations_serves_the_planner(wrapped: bool, monkeypatch: pytest.MonkeyPatch):
+    """Alone the planner shows it each observation; in a wrapper, the wrapper has."""
+    layout = SceneSpec(dt_s=1.0, max_agents=2)
+    monkeypatch.setattr("envs.readers._REGISTERED", {Rows: EntityRowsReader(("x", "y", "vx", "vy"), layout)})
+    monkeypatch.setattr("envs.plans._REGISTERED", {Rows: lambda env: StayOrLeave()})
+    env: gym.Env = SceneObservation(Rows()) if wrapped else Rows()
+    driver = make_ego_driver("planner:constant-velocity", env, np.random.default_rng(0))
+    obs, _ = env.reset(seed=0)
+    assert driver(obs) == 1
+    obs = env.step(1)[0]
+    assert driver(obs) == 1

@@ -84,6 +84,8 @@ def test_padding_holds_no_agent_only_if_set_and_is_never_the_ego():
     for padding, agents in ((None, 3), (-1.0, 2), (0.0, 3)):
         (scene,) = scenes_of(EntityRowsReader(columns, SPEC, padding=padding, scales=(3.0,) * 4), table)
         assert len(scene.ids) == agents
+    (scene,) = scenes_of(EntityRowsReader(columns, SPEC, padding=0.1), np.float32([[1.0] * 4, [0.1] * 4, [0.2] * 4]))
+    assert len(scene.ids) == 2  # 0.1 of float32 is another number in float64
 
 
 @pytest.mark.parametrize(

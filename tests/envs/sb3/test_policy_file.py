@@ -199,3 +199,24 @@ def test_a_zip_that_lacks_its_weights_is_one_clear_line(tmp_path: Path):
     with pytest.raises(UserError, match="damaged.zip is no ppo policy that fits here: ") as error:
         load_policy(damaged)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("content", [b"garbage", b"\x80\x02cabsent_module\nNet\n."])
+def test_weights_that_cannot_be_unpickled_are_one_clear_line(content: bytes, tmp_path: Path):
+    path, damaged = saved(tmp_path, "ppo"), tmp_path / "damaged.zip"
+    with zipfile.ZipFile(path) as whole, zipfile.ZipFile(damaged, "w") as other:
+        for name in whole.namelist():
+            other.writestr(name, content if name == "policy.pth" else whole.read(name))
+    with pytest.raises(UserError, match="damaged.zip is no ppo policy that fits here: ") as error:
+        load_policy(damaged)
+    assert "\n" not in str(error.value)
+
+
+def test_a_policy_whose_network_is_not_installed_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def absent(*args: object, **kwargs: object) -> None:
+        raise ModuleNotFoundError("No module named 'ownnet'")
+
+    path = saved(tmp_path, "ppo")
+    monkeypatch.setattr("stable_baselines3.PPO.load", absent)
+    with pytest.raises(UserError, match="is no ppo policy that fits here: No module named 'ownnet'"):
+        load_policy(path)

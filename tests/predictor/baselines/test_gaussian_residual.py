@@ -165,6 +165,14 @@ def test_errors_of_zero_are_no_reason_to_fail():
     assert noise_of(control, belief(control), 9)[..., :AXES].abs().max() < 1e-4
 
 
+def test_errors_in_large_units_that_grow_evenly_are_no_reason_to_fail():
+    """Their covariance has rank one, and pixels are large numbers."""
+    rate = 1000.0 * np.random.default_rng(0).normal(size=(500, 1, AXES))
+    control = GaussianResidual.fit(ConstantVelocity(LAYOUT), rate * np.arange(1.0, HORIZON + 1)[:, None])
+    drawn = noise_of(control, belief(control), 4000)[..., :AXES]
+    assert drawn.isfinite().all() and drawn[..., -1, :].std() == pytest.approx(1000.0 * HORIZON, rel=0.1)
+
+
 def test_a_forecast_beyond_the_fitted_steps_is_refused():
     control = fitted(100)
     now = belief(control)

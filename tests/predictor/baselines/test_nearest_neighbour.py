@@ -538,3 +538,13 @@ def test_a_store_without_an_ego_is_fitted(tmp_path: Path):
     forecaster = fit_from_stores([tmp_path / "store"], layout, HORIZON)
     assert forecaster.num_examples == 4 * 3 * 7
     assert torch.isfinite(forecaster.rollout(observe(forecaster, random_states(0, 1, 3, 4)), HORIZON).states).all()
+
+
+def test_no_example_has_an_intervention_ahead():
+    """As in windows: what nobody could foresee is no future to recall."""
+    marks = np.zeros((9, 2), dtype=np.int8)
+    marks[4, 1] = 1
+    recorded = episode(standing(9, 0.0, 5.0))
+    plain = collect_examples([recorded], spec(), HORIZON)
+    disturbed = collect_examples([replace(recorded, perturbed=marks)], spec(), HORIZON)
+    assert (len(plain.features), len(disturbed.features)) == (6, 3)  # after steps 0 to 5; not after 2, 3 and 4

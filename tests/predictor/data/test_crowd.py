@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from predictor.data.crowd import CrowdConfig, make_crowds, overlay
-from predictor.data.store import Episode, StoreInfo, write_store
+from predictor.data.crowd import CrowdConfig, main, make_crowds, overlay
+from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.support.errors import UserError
 from tests.predictor.helpers import circling_episode, spec
 
@@ -28,10 +28,24 @@ def test_crowds_hold_at_least_as_many_agents_as_wanted(tmp_path: Path):
     assert all(len(np.unique(c.ids)) == c.states.shape[1] for c in crowds)
 
 
+def test_a_crowd_has_the_steps_that_were_asked_for_and_a_store_room_for_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    source = store(tmp_path, [circling_episode(i, steps=14, agents=2) for i in range(3)])
+    out = tmp_path / "crowd"
+    sizes = ("--num-agents", 30, "--episodes", 2, "--episode-steps", 10, "--at-step", 7)
+    words = ("--source", source, "--out", out, *sizes)
+    monkeypatch.setattr("sys.argv", ["crowd", *map(str, words)])
+    main()
+    crowds = read_store(out)
+    assert [len(e.states) for e in crowds.episodes] == [10, 10]
+    assert crowds.info.spec.max_agents == max(int(e.valid.sum(axis=1).max()) for e in crowds.episodes) == 30
+
+
 def test_all_agents_move_as_recorded_and_scenes_share_a_centre():
     first, second = circling_episode(0, agents=2), circling_episode(1, agents=3)
     second.valid[:4, 1] = False
-    crowd = overlay([first, second], 2, seed=5)
+    crowd = overlay([first, second], 2, seed=5, steps=10)
     assert crowd.states.shape == (10, 5, 4) and crowd.valid[:4].sum() == 4 * 4
     for part, recorded in ((crowd.states[:, :2], first), (crowd.states[:, 2:], second)):
         np.testing.assert_array_equal(part[..., 2:][recorded.valid], recorded.states[..., 2:][recorded.valid])

@@ -460,3 +460,11 @@ def test_kicks_out_of_range_are_named(tmp_path: Path):
         SpringsConfig(tmp_path, kicks=1.5)
     with pytest.raises(UserError, match="kick_mps must be positive, got 0"):
         SpringsConfig(tmp_path, kicks=0.5, kick_mps=0.0)
+
+
+@pytest.mark.parametrize(
+    "sizes", [{"train": 10**9}, {"train": 2000, "physics": Physics(num_agents=10**4, frames=10**6)}]
+)
+def test_what_cannot_fit_into_memory_is_named_with_the_number_that_was_given(sizes: dict[str, Any], tmp_path: Path):
+    with pytest.raises(UserError, match=f"train={sizes['train']:,} needs at least"):
+        SpringsConfig(tmp_path / "springs", **sizes)

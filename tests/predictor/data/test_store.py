@@ -466,3 +466,25 @@ def test_a_stop_while_zarr_starts_its_event_loop_is_one_line(tmp_path: Path):
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (143, "")
     assert done.stderr == "stopped: what was not written yet is lost; the same command begins anew\n"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"edge_types": np.zeros((1, 3, 3))},
+            "edge_types of an episode must be integers for each pair",
+        ),
+        ({"edge_types": np.zeros((1, 2, 2), np.int8)}, r"pair of the 3 agents, got int8 \(1, 2, 2\)"),
+        ({"edge_types": np.zeros((1, 5, 5), np.int8)}, r"pair of the 3 agents, got int8 \(1, 5, 5\)"),
+        ({"edge_attributes": np.zeros((1, 3, 3))}, r"edge_attributes .* pair of the 3 agents, got float64 \(1, 3, 3\)"),
+        ({"perturbed": np.zeros((1, 3), np.int8)}, r"perturbed .* integers of shape \(4, 3\), got int8 \(1, 3\)"),
+        ({"perturbed": np.zeros((4, 3))}, r"perturbed .* integers of shape \(4, 3\), got float64 \(4, 3\)"),
+        ({"perturbed": np.full((4, 3), 99)}, "perturbed must lie between 0 and 6"),
+    ],
+)
+def test_labels_and_marks_of_another_kind_are_not_written(changes: dict[str, Any], message: str, tmp_path: Path):
+    """What is written can be read, and no label is of another pair."""
+    with pytest.raises(UserError, match=message):
+        write_store(tmp_path / "store", INFO, [replace(episode(1), **changes)])
+    assert not (tmp_path / "store").exists()

@@ -59,7 +59,6 @@ def test_joint_and_overall_numbers_closed_form():
     assert accuracy.min_joint_fde_m == pytest.approx((3.0 + 0.0) / 2)
     assert accuracy.miss_rate == pytest.approx(0.5)  # 3 m misses, 0 m does not
     assert accuracy.overall_rmse_m == pytest.approx(math.sqrt((1.5**2 + 9 + 9 + 4.5**2 + 0) / 5))
-    assert accuracy.rmse_per_axis_m == pytest.approx(accuracy.overall_rmse_m / math.sqrt(2))
     assert summarise("model", OUTCOMES, miss_threshold_m=3.0).miss_rate == 0.0
 
 
@@ -244,7 +243,6 @@ def test_no_outcome_is_refused():
 def test_three_axes():
     accuracy = summarise("a", [gaussian(0, axes=3)], (1.0, 1.0))
     assert accuracy.axes == 3
-    assert accuracy.rmse_per_axis_m == pytest.approx(accuracy.overall_rmse_m / math.sqrt(3))
     assert accuracy.overall_rmse_m == pytest.approx(math.sqrt(3 * (1 + 1 / 20)), rel=0.03)
     first = gaussian(0, samples=1, axes=3)
     assert fitted_std_m([first]) == pytest.approx([math.sqrt(2)] * 2, rel=0.05)

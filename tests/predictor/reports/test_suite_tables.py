@@ -103,6 +103,9 @@ def test_seeds_are_shown_by_mean_and_range_and_a_line_without_training_keeps_its
     assert cells(graph, "Model")["F1"] == "0.500 (0.500 to 0.500)" and cells(graph, "Cv")["F1"] == "0.500"
     assert "mean over 3 training seeds (lowest to highest)" in markdown_report(made)
     assert "One seed per line" not in markdown_report(made)
+    for run, memory in zip(rows[0]["runs"], (1000.0, 5000.0, 2000.0), strict=True):
+        run["tests"]["test"]["peak_memory_mb"] = memory
+    assert "training included: 5,000 MB" in markdown_report(made)
 
 
 def test_what_was_not_measured_is_a_dash():
