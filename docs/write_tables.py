@@ -15,10 +15,10 @@ from predictor.evaluation.in_env_record import FILE_NAME, Measurement, read_reco
 from predictor.reports.in_env_tables import (
     card_section,
     measurement_table,
-    metres,
     replace_tables,
     samples_table,
 )
+from predictor.reports.tables import metres
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_text
 from predictor.support.markdown import table

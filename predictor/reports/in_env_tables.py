@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 
 from predictor.evaluation.in_env_record import Interval, Measurement
-from predictor.reports.tables import percent_range
+from predictor.reports.tables import metres, percent_range
 from predictor.support.errors import UserError
 from predictor.support.markdown import table
 
@@ -15,17 +15,6 @@ MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 """Pattern of a table with its markers."""
 
 Column = Callable[[Measurement], str]
-
-
-def metres(value: float | None, interval: Interval | None = None) -> str:
-    """Returns three decimals below a metre and two above, with the interval if there is one; a dash for None."""
-    if value is None:
-        return "–"
-    return _rounded(value) + ("" if interval is None else " ({} to {})".format(*map(_rounded, interval)))
-
-
-def _rounded(value: float) -> str:
-    return f"{value:.2f}" if value >= 1 else f"{value:.3f}"
 
 
 def _per_cent(value: float | None, interval: Interval | None) -> str:

@@ -160,9 +160,12 @@ def plain(value: float | None, places: int = 3) -> str:
     return "–" if value is None else f"{value:.{places}f}"
 
 
-def metres(value: float | None) -> str:
-    """Returns a length [m] with two decimals, three below 1 m, or a dash for None."""
-    return plain(value, 2 if value is not None and abs(value) >= 1 else 3)
+def metres(value: float | None, interval: tuple[float, float] | None = None) -> str:
+    """Returns a length [m] with two decimals, three below 1 m, and its interval if there is one; a dash for None."""
+    if value is None:
+        return "–"
+    shown = [f"{one:.2f}" if abs(one) >= 1 else f"{one:.3f}" for one in (value, *(interval or ()))]
+    return shown[0] if interval is None else "{} ({} to {})".format(*shown)
 
 
 def with_interval(estimate: Estimate | None) -> str:

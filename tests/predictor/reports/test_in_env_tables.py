@@ -3,7 +3,8 @@ from dataclasses import replace
 import pytest
 
 from predictor.evaluation.in_env_record import Measurement
-from predictor.reports.in_env_tables import measurement_table, metres, replace_tables, samples_table
+from predictor.reports.in_env_tables import measurement_table, replace_tables, samples_table
+from predictor.reports.tables import metres
 from predictor.support.errors import UserError
 
 MEASURED = Measurement(
