@@ -173,6 +173,13 @@ def _learn(
             reset_num_timesteps=model.num_timesteps == 0,
             log_interval=log_interval(plan.algorithm),
         )
+    except ValueError as error:
+        if all(bool(weights.isfinite().all()) for weights in model.policy.parameters()):
+            raise
+        raise UserError(
+            f"the policy's weights are not finite after {model.num_timesteps} steps: its training diverged; lower the "
+            "learning rate (--set learning_rate=…)"
+        ) from error
     finally:
         progress.close()
 

@@ -320,7 +320,11 @@ def main() -> None:
     for env_id in config.env_ids:  # unknown ids and drivers raise before hours of work
         policy = config.driver is not None and config.driver.endswith(".zip")
         driver = config.driver or default_drivers(env_id, config.env_kwargs)[0]
-        open_world(env_id, "idle" if policy else driver, env_kwargs=config.env_kwargs).close()
+        world = open_world(env_id, "idle" if policy else driver, env_kwargs=config.env_kwargs)
+        world.close()
+        if len(config.checkpoint) < 2:  # what does not fit is an error; of several, it is noted
+            chosen = config.checkpoint[0] if config.checkpoint else checkpoint_for(env_id)
+            load_forecaster(chosen, world.spec, f"env '{env_id}'")
     for checkpoint in config.checkpoint:
         require_known(checkpoint)
     if causes:

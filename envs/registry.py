@@ -13,7 +13,7 @@ import gymnasium as gym
 from envs.readers.mpe import MPE_IDS
 from envs.simulators.envpool import ENV_IDS as ENVPOOL_IDS
 from envs.simulators.envpool import HIGHWAY_ENV_OF, known_tasks, register_envpool_ids
-from predictor.support.errors import UserError, short
+from predictor.support.errors import UserError, named, short
 from predictor.support.importing import load_named
 from predictor.support.reading import as_object, parse_json
 
@@ -186,9 +186,10 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
         raise UserError(f"cannot make env '{env_id}': {error}; known here: {', '.join(_HIGHWAY)}") from error
     except Exception as error:
         given = {name: value for name, value in kwargs.items() if name not in _OF_GYMNASIUM}
-        if not given:
+        if not given and not colon:
             raise
-        raise UserError(f"cannot make env '{env_id}' with {short(given)}: {type(error).__name__}: {error}") from error
+        arguments = f" with {short(given)}" if given else ""
+        raise UserError(f"cannot make env '{short(env_id)}'{arguments}: {named(error)}") from error
 
 
 def make_multiagent_env(env_id: str, **kwargs: Any) -> "ParallelEnv":
@@ -215,7 +216,7 @@ def make_multiagent_env(env_id: str, **kwargs: Any) -> "ParallelEnv":
         if not kwargs and not expected:
             raise
         arguments = f" with {short(kwargs)}" if kwargs else ""
-        reason = error if expected else f"{type(error).__name__}: {error}"
+        reason = error if expected else named(error)
         raise UserError(f"cannot make multiagent env '{env_id}'{arguments}: {reason}") from error
     if not isinstance(env, ParallelEnv):
         raise UserError(f"'{env_id}' must give a pettingzoo ParallelEnv, got {type(env).__name__}")
@@ -244,7 +245,7 @@ def make_any_env(env_id: str, **kwargs: Any) -> Any:
     except Exception as error:
         if not kwargs and not isinstance(error, _REFUSALS):
             raise
-        raise UserError(f"cannot make env '{env_id}': {type(error).__name__}: {error}") from error
+        raise UserError(f"cannot make env '{env_id}': {named(error)}") from error
     if not isinstance(env, gym.Env | ParallelEnv):
         raise UserError(f"'{env_id}' must give a gymnasium Env or a pettingzoo ParallelEnv, got {type(env).__name__}")
     return env

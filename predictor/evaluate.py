@@ -6,6 +6,7 @@ and RMSE and NLL by horizon, for K = 1 and K samples beside constant velocity (K
 `python -m envs.evaluate`.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -140,6 +141,10 @@ def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:
         noisy = NoisyConstantVelocity.fit(subject.spec, std_m)
         made = run_windows(noisy, windows, chosen, horizon, config.num_samples, config.seed)
         accuracies.append(summarise("constant velocity + noise", made, std_m))
+    if not all(math.isfinite(accuracy.min_ade_m) for accuracy in accuracies):
+        raise UserError(
+            f"checkpoint '{config.checkpoint}' forecasts numbers that are not finite; its training diverged"
+        )
     if config.out is not None:
         _write(config, accuracies, subject.store.info.source, subject.spec.dt_s)
         _plot(config, accuracies, windows, chosen, subject.model or baseline, horizon)

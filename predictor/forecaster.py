@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -16,7 +17,7 @@ from torch.nn import functional
 from predictor.graph import NO_AGENT
 from predictor.noise import Noise, TrainingNoise
 from predictor.scene import SceneSpec, dense_edges
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, short
 
 
 @dataclass(frozen=True)
@@ -226,8 +227,27 @@ def require_forecaster(given: Any) -> Forecaster:
         )
     if not isinstance(given.spec, SceneSpec):
         raise UserError(f"the spec of a forecaster must be a SceneSpec, got {type(given.spec).__name__}")
+    for part, least in (("horizon_steps", 1), ("num_edge_types", 1), ("edge_feature_dim", 0)):
+        number = getattr(given, part)
+        if not isinstance(number, int | np.integer) or number < least:
+            raise UserError(f"{part} of a forecaster must be a whole number from {least} on, got {short(number)}")
     forecaster: Forecaster = given
     return forecaster
+
+
+def check_futures(given: Any, steps: int, num_samples: int) -> None:
+    """Checks what a forecaster's `rollout` returned.
+
+    Raises:
+        UserError: it is no `Futures`, or has other numbers of samples or steps than it was asked for.
+    """
+    if not isinstance(given, Futures):
+        raise UserError(f"rollout of a forecaster must return Futures, got {type(given).__name__}")
+    if given.states.shape[1] != num_samples or given.states.shape[-2] != steps:
+        raise UserError(
+            f"the forecaster was asked for {num_samples} samples of {steps} steps and gave {given.states.shape[1]} of "
+            f"{given.states.shape[-2]}"
+        )
 
 
 class WindowOutput(NamedTuple):

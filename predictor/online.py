@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from predictor.forecaster import Belief, Forecaster, Memory
+from predictor.forecaster import Belief, Forecaster, Memory, check_futures
 from predictor.graph import NO_AGENT
 from predictor.noise import Noise
 from predictor.scene import PADDING_ID, Forecast, SceneBatch
@@ -193,8 +193,7 @@ class OnlineForecaster:
         """Forecasts one part of the latest scenes."""
         if plans is None:
             futures = self.forecaster.rollout(belief, steps, num_samples, generator)
-            if futures.states.shape[-2] != steps:
-                raise UserError(f"the forecaster was asked for {steps} steps and gave {futures.states.shape[-2]}")
+            check_futures(futures, steps, num_samples)
         else:
             futures = rollout_plans(self.forecaster, belief, plans, num_samples, generator)
         # float32 relative to the ego: the origin that observe() removed is the ego's own position on "ego" axes
@@ -204,6 +203,8 @@ class OnlineForecaster:
         if plans is not None:  # the axis of plans
             ego_now, absent = ego_now[:, None], absent[:, None]
         xy = (futures.states[..., :axes] - ego_now).masked_fill(absent, 0.0)
+        if not xy.isfinite().all():
+            raise UserError("the forecaster forecasts numbers that are not finite; its weights are damaged or diverged")
         missing = self._ids.shape[1] - belief.valid.shape[1]
         senders = belief.senders
         pairs = (0, 0, 0, missing if senders is None else 0, 0, missing)

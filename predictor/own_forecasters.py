@@ -10,7 +10,7 @@ from typing import Any
 
 from predictor.forecaster import Forecaster, require_forecaster
 from predictor.scene import SceneSpec
-from predictor.support.errors import UserError, short
+from predictor.support.errors import UserError, named, short
 
 PREFIX = "own:"
 """Beginning of the name of a forecaster of a user's own, where a checkpoint's name is expected."""
@@ -37,6 +37,8 @@ def find_own(name: str) -> Any:
         found = getattr(importlib.import_module(module), attribute, None)
     except (ImportError, ValueError) as error:
         raise UserError(f"cannot import '{short(module)}' for forecaster '{short(name)}': {error}") from error
+    except Exception as error:  # whatever the module does
+        raise UserError(f"cannot import '{short(module)}' for forecaster '{short(name)}': {named(error)}") from error
     if found is None:
         raise UserError(f"module '{short(module)}' has no '{short(attribute)}' for forecaster '{short(name)}'")
     return found

@@ -61,6 +61,12 @@ def _train(config: TrainConfig, group: Group, state_file: Path, config_file: Pat
     trainer = group.together(lambda: _prepared(config, group, config_file))
     group.check_same((_comparable(config), [len(w) for w in trainer.data.train]), "options or data")
     group.align(trainer.model)
+    if all(int(windows.flat.steps.max()) <= config.horizon_steps for windows in trainer.data.val):
+        trainer.close()
+        raise UserError(
+            f"no validation episode has {config.horizon_steps} steps of future, so no checkpoint could be chosen; "
+            "lower --horizon-steps or collect longer episodes"
+        )
     made = provenance(("torch", "numpy", "zarr", "safetensors"))
     with ExitStack() as stack:
         stack.callback(trainer.close)
@@ -74,8 +80,8 @@ def _train(config: TrainConfig, group: Group, state_file: Path, config_file: Pat
         _run(trainer, state_file, made)
     if not (config.out / BEST_OF_RUN).exists():
         raise UserError(
-            f"no validation episode has {config.horizon_steps} steps of future, so no checkpoint was chosen; "
-            "lower --horizon-steps or collect longer episodes"
+            f"no checkpoint was chosen in {config.out}: no validation error was finite, or {BEST_OF_RUN} was deleted; "
+            "train anew, with a lower --lr if it diverged"
         )
     return config.out / BEST_OF_RUN
 

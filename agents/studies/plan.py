@@ -25,6 +25,8 @@ from predictor.support.typed_values import converted, from_table
 
 SHIPPED = Path(__file__).resolve().parent
 """Folder of the studies that ship."""
+LONGEST_NAME = 64
+"""Largest number of signs of the name of an arm or a scenario."""
 MOST_SEEDS = 10_000
 """Largest number of training seeds."""
 MOST_BYTES = MIB
@@ -318,6 +320,8 @@ def _task_options(table: Mapping[str, Any], where: str, others: Sequence[str] = 
 def _check_name(name: str, where: str) -> None:
     if not name or not all(sign.isalnum() or sign in "-_" for sign in name):
         raise UserError(f"{where}: a name has letters, digits, - and _ alone, got '{name}'")
+    if len(name) > LONGEST_NAME:
+        raise UserError(f"{where}: a name is part of a folder's and has at most {LONGEST_NAME} signs, got {len(name)}")
 
 
 def _filled(value: Any, places: Mapping[str, str]) -> Any:

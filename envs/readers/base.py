@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from predictor.scene import MOST_AGENTS, PADDING_ID, Scene, SceneBatch, SceneSpec, perceived_agents
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, short
 from predictor.support.importing import load_named
 
 
@@ -238,6 +238,21 @@ def _build(make_reader: Any, env: Any, advice: str) -> Any:
             "vx_mps and vy_mps alone, or the height as a further feature (feature_names of SceneSpec)"
         )
     return reader
+
+
+def policy_step_s(config: Mapping[str, Any]) -> float:
+    """Returns the time that a policy step of highway-env or EnvPool simulates [s]: whole frames, rounded down.
+
+    Raises:
+        UserError: the frequencies are no positive numbers, or a policy step is shorter than a frame.
+    """
+    simulated, decided = config["simulation_frequency"], config["policy_frequency"]
+    if not all(isinstance(each, int | float) and each > 0 for each in (simulated, decided)) or simulated < decided:
+        raise UserError(
+            "simulation_frequency and policy_frequency must be positive numbers, the first not below the second, got "
+            f"{short(simulated)} and {short(decided)}"
+        )
+    return float(simulated // decided / simulated)
 
 
 def show(reader: Any, observation: Any) -> None:

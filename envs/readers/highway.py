@@ -7,14 +7,13 @@ driver parameters.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.vehicle.kinematics import Vehicle
 
-from envs.readers.base import Reader
+from envs.readers.base import Reader, policy_step_s
 from envs.readers.identity import IdentityDict
 from predictor.scene import KINEMATIC_FEATURES, AxisFrame, Scene, SceneSpec
 from predictor.support.errors import ProtocolError, UserError
@@ -46,12 +45,6 @@ def vehicles_of(env: gym.Env) -> list[Vehicle]:
     if road is None or ego is None:
         raise ProtocolError("the environment has no vehicles yet; call reset() first")
     return [ego] + [v for v in road.vehicles if v is not ego]
-
-
-def policy_step_s(config: dict[str, Any]) -> float:
-    """Returns the time that a policy step really simulates: whole simulation frames, rounded down."""
-    frames = config["simulation_frequency"] // config["policy_frequency"]
-    return float(frames / config["simulation_frequency"])
 
 
 class HighwayReader(Reader):

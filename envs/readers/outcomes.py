@@ -4,7 +4,7 @@ No key is guessed: what an environment does not report, and nobody named, is "no
 highway-env's "crashed" and arrivals, and "is_success", which Stable-Baselines3 and many environments share.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from envs.readers.envpool import is_envpool_env
 from envs.readers.highway import is_highway_env
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, short
 
 _ARRIVED = "rewards.arrived_reward"
 """Key of highway-env's intersections: the arrival is a part of the reward."""
@@ -30,12 +30,20 @@ class OutcomeKeys:
     def crashed(self, info: Mapping[str, Any]) -> bool | None:
         """Returns whether an info reports a crash, of any ego where there are several; None if it says nothing."""
         value = _first(info, self.crash)
-        return None if value is None else bool(np.any(value))
+        return None if value is None else bool(np.any(_flags(value, self.crash)))
 
     def succeeded(self, info: Mapping[str, Any]) -> bool | None:
         """Returns whether an info reports success, of all egos where there are several; None if it says nothing."""
         value = _first(info, self.success)
-        return None if value is None else bool(np.all(value))
+        return None if value is None else bool(np.all(_flags(value, self.success)))
+
+
+def _flags(value: Any, keys: Sequence[str]) -> np.ndarray:
+    """Returns whether, for each ego, as an array; a dict or a text, which would always be true, is refused."""
+    flags = np.asarray(value)
+    if flags.dtype.kind not in "buif":
+        raise UserError(f"info {' or '.join(keys)} must be true or false, or so for each ego, got {short(value, 60)}")
+    return flags
 
 
 _NAMED: dict[type, OutcomeKeys] = {}

@@ -12,7 +12,8 @@ import gymnasium as gym
 import numpy as np
 from highway_env.vehicle.kinematics import Vehicle
 
-from envs.readers.highway import is_highway_env, policy_step_s, vehicles_of
+from envs.readers.base import policy_step_s
+from envs.readers.highway import is_highway_env, vehicles_of
 from envs.rollouts.time_to_contact import times_to_contact
 
 LONGEST_S = 10.0

@@ -44,6 +44,7 @@ from envs.supervision import Place, named
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.scene import Forecast, Scene, SceneSpec
+from predictor.support.errors import UserError
 
 
 @runtime_checkable
@@ -359,6 +360,8 @@ def _parallel_env_for_driver(env: Any, driver: str) -> Any:
     options = wrapper_options(driver) if sees_forecasts(driver) else {}
     if not options:
         return env
+    if "what_if" in options:
+        raise UserError(f"policy {driver} was trained with plans of one ego, which PettingZoo environments do not have")
     seen = ForecastParallelEnv(env, **options)
     space: Any = seen.observation_space(seen.possible_agents[0])
     require_forecaster(driver, options["checkpoint"], space, seen.scene_spec, options["arm"])

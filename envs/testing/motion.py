@@ -81,7 +81,7 @@ def motion_problems(episodes: Sequence[Episode], spec: SceneSpec) -> list[str]:
     if not np.abs(steps.moved).max() > 0:
         return ["no position ever changes while the environment steps; does the reader return an old scene?"]
     steps = steps.fast()
-    if not np.abs(steps.before).max() > 0:
+    if not np.abs(steps.before).max(initial=0) > 0:
         return ["all velocities are zero, although positions change; give velocities in m/s"]
     if len(steps.moved) < LEAST_PAIRS:
         return []

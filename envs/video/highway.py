@@ -18,7 +18,8 @@ from jaxtyping import Float, UInt8
 
 from envs.drivers.ego import constant_actions
 from envs.plans.contact import contacts
-from envs.readers.highway import HighwayReader, is_highway_env, policy_step_s
+from envs.readers.base import policy_step_s
+from envs.readers.highway import HighwayReader, is_highway_env
 from envs.video.drawing import (
     AgentOverlay,
     OverlayStyle,

@@ -60,6 +60,11 @@ def short(value: object, letters: int = 300) -> str:
     return text if len(text) <= letters else f"{text[: (letters - 1) // 2]}…{text[-(letters // 2) :]}"
 
 
+def named(error: BaseException) -> str:
+    """Returns kind and message of an error, whose message alone may say too little (a KeyError's)."""
+    return f"{type(error).__name__}: {error}"
+
+
 def one_line(error: BaseException) -> str:
     """Returns the message of an error as one line that a terminal shows as it is.
 

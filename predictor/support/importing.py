@@ -4,7 +4,7 @@ import importlib
 from collections.abc import Callable
 from typing import Any
 
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, named
 
 
 def load_named(path: str) -> Callable[..., Any]:
@@ -18,6 +18,8 @@ def load_named(path: str) -> Callable[..., Any]:
         found: Callable[..., Any] | None = getattr(importlib.import_module(module), name, None)
     except (ImportError, ValueError) as error:
         raise UserError(f"cannot import '{module}' for '{path}': {error}; is its package installed?") from error
+    except Exception as error:  # whatever the module does
+        raise UserError(f"cannot import '{module}' for '{path}': {named(error)}") from error
     if not callable(found):
         raise UserError(f"module '{module}' has no function or class '{name}'")
     return found

@@ -430,12 +430,15 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 
 
 def test_a_single_checkpoint_that_does_not_fit_is_one_line(
-    in_process: None, highway_checkpoint: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-):
-    arguments = ["--env-ids", "racetrack-v1", "--checkpoint", highway_checkpoint, "--episodes", "1"]
+    in_process: None, highway_checkpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+):  # fmt: skip
+    """Before the first environment is measured, whose results would be lost."""
+    arguments = ["--env-ids", ROAD, "racetrack-v1", "--checkpoint", highway_checkpoint, "--out", str(tmp_path / "out")]
+    monkeypatch.setattr(evaluate, "evaluate_env", lambda *_: pytest.fail("measured before all was compared"))
     code, errors, _ = run_command(evaluate.main, arguments, monkeypatch, capsys)
     assert code == 2
-    assert len(errors) == 1
+    assert len(errors) == 1 and not (tmp_path / "out").exists()
     assert "was trained at dt_s=1 but env 'racetrack-v1' steps at dt_s=0.2" in errors[0]
 
 

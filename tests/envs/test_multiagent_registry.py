@@ -186,6 +186,7 @@ def test_other_ids_are_not_parallel(env_id: str):
         ("simple_spread_v3", {"local_ratio": 2.0}, "cannot make .*'local_ratio': 2.0}: local_ratio is a proportion"),
         ("walks:make_walk", {"length": 0}, "cannot make .* with {'length': 0}: length must be positive, got 0"),
         ("intersection-multi-agent-v2", {"action": {}}, "cannot make .* with {'action': {}}: KeyError: 'type'"),
+        (".walks:make", {}, "cannot import '.walks' for '.walks:make': TypeError: the 'package' argument is required"),
         ("walks:make_nothing", {}, "'walks:make_nothing' must give a pettingzoo ParallelEnv, got NoneType"),
         ("walks:absent", {}, "module 'walks' has no function or class 'absent'"),
         ("walks:number", {}, "module 'walks' has no function or class 'number'"),

@@ -4,8 +4,8 @@ The reference never streams: it lays out the whole episode of an environment as 
 agent has its own column, and encodes it in one call.
 """
 
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ from torch import Tensor
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.dgvae import DGVAE
 from predictor.dgvae import model as dgvae
+from predictor.forecaster import Futures
 from predictor.online import OnlineForecaster
 from predictor.scene import PADDING_ID, Forecast, Scene, SceneBatch
 from predictor.support.errors import ProtocolError, UserError
@@ -184,15 +185,25 @@ def test_forecast_before_any_observation_is_refused(forecaster: DGVAE):
         online(forecaster).forecast()
 
 
-def test_a_forecaster_that_gives_other_steps_is_named_in_a_line():
-    class Short(ConstantVelocity):
-        def rollout(self, belief, num_steps, num_samples=1, generator=None):
-            return super().rollout(belief, 2, num_samples, generator)
+def test_a_forecaster_that_gives_something_else_is_named_in_a_line():
+    class Odd(ConstantVelocity):
+        change: Callable[[Futures], Any]
 
-    stream = online(Short(spec()))
-    stream.observe(batch(scene(states_of(0, 0, 1), AGENTS)))
-    with pytest.raises(UserError, match="asked for 5 steps and gave 2"):
-        stream.forecast(5)
+        def rollout(self, *arguments: Any, **named: Any) -> Any:
+            return self.change(super().rollout(*arguments, **named))
+
+    for change, message in (
+        (lambda futures: Futures(futures.states[..., :2, :]), "was asked for 1 samples of 5 steps and gave 1 of 2"),
+        (lambda futures: Futures(futures.states[:, :0]), "was asked for 1 samples of 5 steps and gave 0 of 5"),
+        (lambda futures: futures.states, "rollout of a forecaster must return Futures, got Tensor"),
+        (lambda futures: Futures(futures.states * torch.nan), "forecasts numbers that are not finite; its weights are"),
+    ):
+        forecaster = Odd(spec())
+        forecaster.change = change
+        stream = online(forecaster)
+        stream.observe(batch(scene(states_of(0, 0, 1), AGENTS)))
+        with pytest.raises(UserError, match=message):
+            stream.forecast(5)
 
 
 def test_history_follows_the_id_when_places_are_sorted_anew(forecaster: DGVAE):

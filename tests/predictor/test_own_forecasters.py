@@ -66,6 +66,7 @@ def test_classes_functions_and_objects_have_names():
             r"no forecaster 'absent' is registered; installed packages have .* \(entry points of",
         ),
         ("own::", "cannot import ''"),
+        ("own:.relative:f", "cannot import '.relative' for forecaster 'own:.relative:f': TypeError: the 'package' arg"),
     ],
 )
 def test_what_makes_no_forecaster_is_named_in_a_line(name: str, sentence: str):

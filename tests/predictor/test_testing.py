@@ -327,3 +327,8 @@ def test_a_forecaster_needs_all_parts():
 
     with pytest.raises(UserError, match="the spec of a forecaster must be a SceneSpec, got dict"):
         require_forecaster(Half())
+    for part, number, least in (("horizon_steps", "five", 1), ("num_edge_types", 0, 1), ("edge_feature_dim", -1, 0)):
+        wrong = Smooth()
+        setattr(wrong, part, number)
+        with pytest.raises(UserError, match=f"{part} of a forecaster must be a whole number from {least} on, got"):
+            require_forecaster(wrong)

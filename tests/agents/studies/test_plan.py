@@ -92,6 +92,10 @@ def test_what_a_scenario_says_of_forecasts_goes_to_the_arms_that_have_any(tmp_pa
         (study_text(arms="[3]"), "corridor.toml: arms must hold names or tables with a name, got 3"),
         (study_text(arms='[{name = "none", chekpoint = "a"}]'), "corridor.toml: arms.none: unknown key 'chekpoint'"),
         (study_text(arms='[{name = "none", checkpoint = 3}]'), "arms.none: checkpoint must be a text, got 3"),
+        (
+            study_text(arms=f'[{{name = "{"a" * 65}", observe = "none"}}]'),
+            "a name is part of a folder's and has at most 64 signs, got 65",
+        ),
         (study_text(arms='[{name = "a/b", observe = "none"}]'), "a name has letters, digits, - and _ alone, got 'a/b'"),
         (study_text(step="3"), "corridor.toml: unknown key 'step'; there are title, algorithms, seeds, steps"),
         (study_text(steps="0"), "corridor.toml: steps must be at least 1, got 0"),

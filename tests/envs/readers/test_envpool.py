@@ -106,6 +106,12 @@ def test_dt_counts_whole_simulation_frames():
     assert envpool_spec("Merge-v0", {"simulation_frequency": 15, "policy_frequency": 1}).dt_s == 1.0
 
 
+@pytest.mark.parametrize(("simulated", "decided"), [(15, 0), (0, 1), (15, "often"), (15, 100), (15, -1)])
+def test_frequencies_without_a_frame_for_each_decision_are_named(simulated: Any, decided: Any):
+    with pytest.raises(UserError, match=f"the first not below the second, got {simulated} and {decided}"):
+        envpool_spec("Merge-v0", {"simulation_frequency": simulated, "policy_frequency": decided})
+
+
 @pytest.mark.parametrize("task_id", known_tasks())
 def test_which_tasks_always_begin_alike(task_id: str):
     pools = [vehicles_of(started(task_id, 2, seed).debug_states())[0] for seed in (0, 7)]

@@ -116,6 +116,9 @@ def test_more_samples_begin_with_the_one_that_is_observed_and_leave_it_alone(env
         assert world.step() == untouched.step()
 
 
+HIGHWAY_POLICY = Path(__file__).parents[3] / "agents" / "pretrained" / "highway-fast.zip"
+
+
 def assert_same_nested(found: Any, expected: Any) -> None:
     if isinstance(expected, dict):
         assert set(found) == set(expected)
@@ -136,6 +139,12 @@ def assert_same_nested(found: Any, expected: Any) -> None:
         (TAG, "reckless", None, "driver must be one of random"),
         (TAG, "absent.zip", None, "no policy at absent.zip"),
         (TAG, "idle", "nowhere", "no checkpoint 'nowhere'"),
+        (
+            TAG,
+            str(HIGHWAY_POLICY),
+            None,
+            "policy .*highway-fast.zip was trained with plans of one ego",
+        ),
     ],
 )
 def test_what_does_not_go_together_is_named(env_id: str, driver: str, checkpoint: str | None, message: str):
