@@ -14,6 +14,7 @@ from agents.run_page import policy_blocks
 from agents.runs import CONFIG_FILE
 from predictor.reports.document import Heading, Picture, as_html
 from predictor.reports.predictor_run import predictor_blocks
+from predictor.reports.run_blocks import ACCURACY_FILE
 from predictor.support.command_line import parse
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_bytes, write_text
@@ -43,8 +44,9 @@ def write_report(config: ReportConfig) -> Path:
     if not run.is_dir():
         raise UserError(f"no run folder at {run}; give the --out of train_policy.py or of predictor.train")
     for folder in config.accuracy:
-        if not folder.is_dir():
-            raise UserError(f"no folder at {folder}; --accuracy takes the --out of envs.evaluate or predictor.evaluate")
+        if not (folder / ACCURACY_FILE).exists():
+            takes = "--accuracy takes the --out of envs.evaluate or predictor.evaluate"
+            raise UserError(f"no {ACCURACY_FILE} in {folder}; {takes}")
     blocks_of = policy_blocks if is_policy_run(run) else predictor_blocks
     blocks = blocks_of(run, [run, run / "accuracy", *config.accuracy])
     for block in blocks:

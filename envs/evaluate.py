@@ -140,6 +140,8 @@ class EvaluateConfig:
         check_positive(self, "miss_m", "timeout_s")
         if arguments_of(self.env_kwargs) and len(self.env_ids) != 1:
             raise UserError(f"env_kwargs are of one environment; give one of --env-ids, got {len(self.env_ids)}")
+        if len(set(self.env_ids)) < len(self.env_ids):
+            raise UserError(f"each of --env-ids is given once, got {', '.join(self.env_ids)}; leave one out")
         names_of(self.checkpoint)
 
 
@@ -322,7 +324,7 @@ def main() -> None:
         driver = config.driver or default_drivers(env_id, config.env_kwargs)[0]
         world = open_world(env_id, "idle" if policy else driver, env_kwargs=config.env_kwargs)
         world.close()
-        if len(config.checkpoint) < 2:  # what does not fit is an error; of several, it is noted
+        if not causes and len(config.checkpoint) < 2:  # what does not fit is an error; of several, it is noted
             chosen = config.checkpoint[0] if config.checkpoint else checkpoint_for(env_id)
             load_forecaster(chosen, world.spec, f"env '{env_id}'")
     for checkpoint in config.checkpoint:

@@ -59,7 +59,15 @@ def write_card(config: CardConfig) -> Path:
         raise UserError(f"{config.accuracy} is not an accuracy.json of envs.evaluate ({error})") from error
     if not found:
         raise UserError(f"{config.accuracy} has no result of checkpoint '{name}'; run envs.evaluate on it")
-    stores = "\n".join(_store_line(path, read_store(path)) for path in config.data)
+    opened = {path: read_store(path) for path in config.data}
+    known = {path: store.info.source for path, store in opened.items()}
+    others = [f"{path} has {source}" for path, source in known.items() if info.sources and source not in info.sources]
+    if others or not opened:
+        wanted = ", ".join(dict.fromkeys(info.sources))
+        raise UserError(
+            f"data are the stores that '{name}' was trained on ({wanted}), got {'; '.join(others) or 'none'}"
+        )
+    stores = "\n".join(_store_line(path, store) for path, store in opened.items())
     training = _training(name, info)
     # only now that all inputs are read: a new record beside an old card would contradict it
     measured = [m for m in update_record(folder, found) if m.samples == found[0].samples]

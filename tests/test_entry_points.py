@@ -199,7 +199,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     "agents.report": [
         ("absent", "no run folder at absent; give the --out of train_policy.py or of predictor.train"),
         (".", ". holds no training run (config.json is missing)"),
-        (". --accuracy absent", "no folder at absent; --accuracy takes the --out of envs.evaluate"),
+        (". --accuracy absent", "no accuracy.json in absent; --accuracy takes the --out of envs.evaluate"),
     ],
     "agents.tune": [
         ("--env-id nope-v0", "cannot make env 'nope-v0'"),

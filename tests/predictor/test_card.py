@@ -8,9 +8,10 @@ import pytest
 from predictor.baselines.mlp import MLP, MLPConfig
 from predictor.card import CardConfig, write_card
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
+from predictor.data.store import StoreInfo, write_store
 from predictor.evaluation.in_env_record import read_record
 from predictor.support.errors import UserError
-from tests.predictor.helpers import model, spec, write_circles
+from tests.predictor.helpers import circling_episode, model, spec, write_circles
 
 ROW = {
     "checkpoint": "toy",
@@ -37,7 +38,7 @@ MADE = {
 @pytest.fixture
 def config(tmp_path: Path) -> CardConfig:
     forecaster = model()
-    info = CheckpointInfo(forecaster.spec, forecaster.config, 3, (1.0,) * 3, ("toy-v0",), MADE)
+    info = CheckpointInfo(forecaster.spec, forecaster.config, 3, (1.0,) * 3, ("circles",), MADE)
     save_checkpoint(tmp_path / "toy", forecaster, info)
     (tmp_path / "accuracy.json").write_text(json.dumps(RESULTS | {"results": [ROW | {"checkpoint": "other"}, ROW]}))
     return CardConfig(tmp_path / "toy", (write_circles(tmp_path / "data"),), tmp_path / "accuracy.json")
@@ -81,10 +82,14 @@ def test_card_without_its_accuracy_is_refused(config: CardConfig, content: Any, 
     assert_nothing_is_written(config)
 
 
-def test_card_without_its_stores_is_refused(config: CardConfig):
+def test_card_without_its_stores_is_refused(config: CardConfig, tmp_path: Path):
     """Nothing is written: a new record beside an old card would contradict it."""
     with pytest.raises(UserError, match="no episode store at .*nowhere"):
         write_card(replace(config, data=(config.checkpoint / "nowhere",)))
+    write_store(tmp_path / "other", StoreInfo(spec(), "another road"), [circling_episode(0)])
+    for data, got in (((tmp_path / "other",), "other has another road"), ((), "none")):
+        with pytest.raises(UserError, match=f"data are the stores that 'toy' was trained on .*got .*{got}"):
+            write_card(replace(config, data=data))
     assert_nothing_is_written(config)
 
 
@@ -96,7 +101,7 @@ def test_card_of_a_checkpoint_that_was_not_trained_is_refused(config: CardConfig
 
 
 def test_card_says_which_model_it_is(config: CardConfig):
-    info = CheckpointInfo(spec(), MLPConfig(), 3, (1.0,) * 3, ("toy-v0",), MADE, model="mlp")
+    info = CheckpointInfo(spec(), MLPConfig(), 3, (1.0,) * 3, ("circles",), MADE, model="mlp")
     assert "\ndG-VAE, " in write_card(config).read_text()
     save_checkpoint(config.checkpoint, MLP(spec(), MLPConfig(), 3), info)
     assert "\nMLP, " in write_card(config).read_text()
