@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import matplotlib
 import torch
 
-from predictor.data.store import read_info_of
+from predictor.data.store import content_id, read_info_of
 from predictor.evaluation.ablations import ABLATIONS
 from predictor.evaluation.disentanglement import sklearn
 from predictor.evaluation.measure_line import FEATURED, measure_line
@@ -185,7 +185,7 @@ def line_folder(config: SuiteConfig, line: Line) -> Path:
         "row": {"model": line.model, "residual_of": line.residual_of, "overlap_m": table.overlap_m},
         "measuring": MEASURING,
         "protocol": [*steps, NUM_SAMPLES, table.test_stride, sizes.test_windows, config.seed],
-        "stores": [_fingerprint(config.data / s) for s in (table.train, table.val, *table.tests.values()) if s],
+        "stores": [content_id(config.data / s) for s in (table.train, table.val, *table.tests.values()) if s],
     }
     if line.is_trained:
         values = asdict(line_config(config, line, Path()))
@@ -342,14 +342,6 @@ def _plot(config: SuiteConfig, results: Sequence[dict[str, Any]], title: str) ->
     headline = f"{title}, budget {config.budget}, {seeds}"
     figure = figure_by_step(results, kinds, dt_s, f"{headline}; bars: standard error over 20 subsets")
     save_figure(figure, config.folder / "by_step.png", 110)
-
-
-def _fingerprint(path: Path) -> str:
-    """Returns a hash of a store's layout, source, provenance and length, without reading its arrays."""
-    info = read_info_of(path)
-    made = {k: v for k, v in info.provenance.items() if k not in ("time", "machine", "versions", "commit", "command")}
-    content = json.dumps([asdict(info.spec), info.source, made, info.num_steps], sort_keys=True, default=str)
-    return hashlib.sha256(content.encode()).hexdigest()
 
 
 def main() -> None:

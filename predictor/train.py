@@ -21,6 +21,7 @@ import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from predictor.checkpoint import BEST_OF_RUN, CheckpointInfo, save_checkpoint
+from predictor.data.store import content_id
 from predictor.support.command_line import parse
 from predictor.support.errors import UserError, run_entry_point, short
 from predictor.support.files import check_out, delete_leftovers, write_json
@@ -76,7 +77,8 @@ def _train(config: TrainConfig, group: Group, state_file: Path, config_file: Pat
         if not group.leads:
             _follow(trainer)
             return config.out / BEST_OF_RUN
-        write_json(config_file, {"config": _comparable(config), "provenance": made})
+        stores = {address(path): content_id(path) for path in (*config.data, *config.val_data)}
+        write_json(config_file, {"config": _comparable(config), "stores": stores, "provenance": made})
         _run(trainer, state_file, made)
     if not (config.out / BEST_OF_RUN).exists():
         raise UserError(
@@ -225,7 +227,8 @@ def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
         return
     if not config.resume:
         raise UserError(f"{config.out} holds a run already; pass --resume to continue it or choose another --out")
-    before = as_object(read_object(config_file).get("config"), f"{config_file}: config")
+    content = read_object(config_file)
+    before = as_object(content.get("config"), f"{config_file}: config")
     now = _comparable(config)
     # of fields that did not exist when the run began
     defaults = {f.name: f.default for f in fields(TrainConfig)} | BEFORE_THEY_EXISTED
@@ -239,6 +242,12 @@ def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
         differences = ", ".join(f"{name} was {old[name]} and is now {now[name]}" for name in changed)
         options = " ".join(_option(name, old[name]) for name in changed)
         raise UserError(f"cannot resume: {differences}; use the same arguments, with {options}")
+    known = as_object(content.get("stores", {}), f"{config_file}: stores")  # runs of older versions have none
+    for path in (*config.data, *config.val_data):
+        if known.get(address(path), content_id(path)) != content_id(path):
+            raise UserError(
+                f"cannot resume: {address(path)} is another store than the run began with; choose another --out"
+            )
 
 
 def _option(name: str, value: Any) -> str:

@@ -5,6 +5,7 @@ Within an episode an agent keeps its column from its first step to its last, so 
 (`predictor.data.windows`).
 """
 
+import hashlib
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -250,6 +251,18 @@ def read_info_of(path: Path) -> StoreInfo:
     info = _info(path, header)
     check_digest(path, header.attributes)
     return info
+
+
+def content_id(path: Path) -> str:
+    """Returns a hash of a store's layout, source, provenance and length, without reading its arrays.
+
+    Raises:
+        UserError: as `read_info_of`.
+    """
+    info = read_info_of(path)
+    made = {k: v for k, v in info.provenance.items() if k not in ("time", "machine", "versions", "commit", "command")}
+    content = json.dumps([asdict(info.spec), info.source, made, info.num_steps], sort_keys=True, default=str)
+    return hashlib.sha256(content.encode()).hexdigest()
 
 
 def _info(path: Path, header: StoreHeader) -> StoreInfo:

@@ -219,7 +219,7 @@ def test_lines_keep_their_folders_when_training_gets_options_or_other_defaults(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Names of before `--causal-edges` existed; a new option goes into `ADDED` with the value that changes nothing."""
-    monkeypatch.setattr(suite, "_fingerprint", lambda path: path.name)
+    monkeypatch.setattr(suite, "content_id", lambda path: path.name)
     settings = SuiteConfig("nba", tmp_path, tmp_path)
     expected = {
         "nearest-neighbours": "ebf5a8f5df", "dnri": "8979c3fe0d", "dgvae-paper": "59b2f8d38c", "plural": "69071be171",

@@ -542,6 +542,14 @@ def test_resuming_with_other_arguments_names_them(
     assert contents(tmp_path) == before
 
 
+def test_resuming_with_another_store_at_the_same_place_is_refused(circles: Path, tmp_path: Path):
+    """Its errors would be compared with the best one of the other data."""
+    train(config(circles, tmp_path / "run"))
+    write_store(circles, StoreInfo(spec(), "circles", {"seeds": [7]}), [circling_episode(7)] * 6, overwrite=True)
+    with pytest.raises(UserError, match="cannot resume: .*circles is another store than the run began with; choose"):
+        train(config(circles, tmp_path / "run", resume=True))
+
+
 def test_the_options_that_a_message_names_continue_a_run_whose_defaults_have_changed(
     tiny: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], circles: Path, tmp_path: Path
 ):

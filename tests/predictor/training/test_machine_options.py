@@ -232,7 +232,7 @@ def test_background_work_ends_with_the_run(circles: Path, tmp_path: Path, monkey
 
 
 def test_precision_is_part_of_a_line_and_the_machine_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("predictor.suite._fingerprint", str)
+    monkeypatch.setattr("predictor.suite.content_id", str)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: True)
