@@ -186,10 +186,11 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
         raise UserError(f"cannot make env '{env_id}': {error}; known here: {', '.join(_HIGHWAY)}") from error
     except Exception as error:
         given = {name: value for name, value in kwargs.items() if name not in _OF_GYMNASIUM}
-        if not given and not colon:
+        if given:
+            raise UserError(f"cannot make env '{short(env_id)}' with {short(given)}: {named(error)}") from error
+        if not colon:
             raise
-        arguments = f" with {short(given)}" if given else ""
-        raise UserError(f"cannot make env '{short(env_id)}'{arguments}: {named(error)}") from error
+        raise UserError(f"cannot make env '{short(env_id)}': {named(error)}") from error
 
 
 def make_multiagent_env(env_id: str, **kwargs: Any) -> "ParallelEnv":
