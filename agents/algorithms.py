@@ -116,3 +116,16 @@ def even_batches(rollout: int, most: int) -> int:
     """
     even = next(rollout // count for count in range(-(-rollout // most), rollout + 1) if rollout % count == 0)
     return even if 2 * even >= most else min(rollout, most)
+
+
+def check_finite(model: BaseAlgorithm) -> None:
+    """Checks that the weights of a policy are numbers.
+
+    Raises:
+        UserError: they are not: its training diverged.
+    """
+    if not all(bool(weights.isfinite().all()) for weights in model.policy.parameters()):
+        raise UserError(
+            f"the policy's weights are not finite after {model.num_timesteps:,} steps: its training diverged; lower "
+            "the learning rate (--set learning_rate=…)"
+        )

@@ -129,3 +129,19 @@ def _mean_driving(measured: Sequence[DrivingMeasures]) -> dict[str, tuple[float,
         values = [float(value) for e in measured if (value := getattr(e, measure.name)) is not None]
         found[measure.name] = mean_and_standard_error(values) if values else (math.nan, math.nan)
     return found
+
+
+def significantly_worse(returns: Sequence[float], best: Sequence[float]) -> bool:
+    """Returns whether `returns` are significantly lower than `best`.
+
+    They are if the 95 % normal interval of the mean paired difference lies below zero; with one episode, never.
+
+    Args:
+        returns: returns of a model, one per seed.
+        best: returns of another model on the same seeds, in the same order.
+    """
+    difference = np.subtract(returns, best)
+    if len(difference) < 2:
+        return False
+    error = difference.std(ddof=1) / np.sqrt(len(difference))
+    return bool(difference.mean() + NORMAL_95 * error < 0)

@@ -19,7 +19,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.algorithms import check_actions, log_interval, new_model
+from agents.algorithms import check_actions, check_finite, log_interval, new_model
 from agents.arena import Arena, open_arena
 from agents.features import AttentionConfig
 from agents.forecast_errors import ForecastErrors
@@ -28,7 +28,7 @@ from agents.preset_settings import changed
 from agents.presets import Algorithm, Preset, preset_for
 from agents.runs import BEST_FILE, CHECKPOINT_FILE, CURVE_FILE, POLICY_FILE, load_model, read_curve, save_model
 from agents.step_count import STEP_UNIT, CountSteps, StepProgress, check_step_unit
-from agents.summaries import NORMAL_95
+from agents.summaries import significantly_worse
 from agents.task import SELECTION_SEED, Task
 from agents.vec_envs import EpisodeResult, make_venv
 from envs.sb3.algorithms import require_algorithm
@@ -173,13 +173,9 @@ def _learn(
             reset_num_timesteps=model.num_timesteps == 0,
             log_interval=log_interval(plan.algorithm),
         )
-    except ValueError as error:
-        if all(bool(weights.isfinite().all()) for weights in model.policy.parameters()):
-            raise
-        raise UserError(
-            f"the policy's weights are not finite after {model.num_timesteps} steps: its training diverged; lower the "
-            "learning rate (--set learning_rate=…)"
-        ) from error
+    except ValueError:
+        check_finite(model)
+        raise
     finally:
         progress.close()
 
@@ -387,19 +383,3 @@ def driving_scalars(results: Sequence[EpisodeResult]) -> dict[str, float]:
         scalars["speed_mps"] = float(np.mean(speeds_mps))
     actions = sum((Counter(r.action_counts) for r in results), Counter())
     return scalars | {f"share_{name}": count / actions.total() for name, count in sorted(actions.items())}
-
-
-def significantly_worse(returns: Sequence[float], best: Sequence[float]) -> bool:
-    """Returns whether `returns` are significantly lower than `best`.
-
-    They are if the 95 % normal interval of the mean paired difference lies below zero; with one episode, never.
-
-    Args:
-        returns: returns of a model, one per seed.
-        best: returns of another model on the same seeds, in the same order.
-    """
-    difference = np.subtract(returns, best)
-    if len(difference) < 2:
-        return False
-    error = difference.std(ddof=1) / np.sqrt(len(difference))
-    return bool(difference.mean() + NORMAL_95 * error < 0)

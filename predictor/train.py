@@ -244,7 +244,7 @@ def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
         raise UserError(f"cannot resume: {differences}; use the same arguments, with {options}")
     known = as_object(content.get("stores", {}), f"{config_file}: stores")  # runs of older versions have none
     for path in (*config.data, *config.val_data):
-        if known.get(address(path), content_id(path)) != content_id(path):
+        if address(path) in known and known[address(path)] != content_id(path):
             raise UserError(
                 f"cannot resume: {address(path)} is another store than the run began with; choose another --out"
             )

@@ -335,7 +335,7 @@ def open_world(
             return MultiagentWorld(parallel, driver, env_id)
         if isinstance(parallel, ForecastParallelEnv):
             parallel = OwnParallelView(parallel)
-        checkpoint = checkpoint or _forecaster_for(env_id, driver)
+        checkpoint = checkpoint or (checkpoint_for(env_id) if sees_forecasts(driver) else CONSTANT_VELOCITY)
         return MultiagentWorld(ForecastParallelEnv(parallel, checkpoint, horizon_steps=horizon_steps), driver, env_id)
     env = make_env(env_id, disable_env_checker=True, **kwargs)
     if checkpoint is None:
@@ -370,11 +370,6 @@ def _parallel_env_for_driver(env: Any, driver: str) -> Any:
 
 def _unpadded(scene: Scene) -> Scene:
     return Scene(scene.states[scene.valid], scene.ids[scene.valid], scene.valid[scene.valid])
-
-
-def _forecaster_for(env_id: str, driver: str) -> str:
-    """Returns the checkpoint for recording a PettingZoo environment with a driver that names none."""
-    return checkpoint_for(env_id) if sees_forecasts(driver) else CONSTANT_VELOCITY
 
 
 def default_drivers(env_id: str, env_kwargs: str = "") -> tuple[str, ...]:

@@ -11,7 +11,7 @@ import torch
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
-from agents.algorithms import even_batches
+from agents.algorithms import check_finite, even_batches
 from agents.arena import EgoArena
 from agents.features import ForecastAttention
 from agents.presets import (
@@ -26,6 +26,7 @@ from agents.presets import (
     preset_for,
 )
 from agents.runs import load_model, save_model
+from agents.summaries import significantly_worse
 from agents.task import EVALUATION_SEED, SELECTION_SEED, Task
 from agents.training import (
     SaveCheckpoint,
@@ -34,7 +35,6 @@ from agents.training import (
     driving_scalars,
     make_model,
     read_curve,
-    significantly_worse,
     train,
 )
 from agents.vec_envs import EpisodeResult, SeededEpisodes, make_venv
@@ -430,3 +430,11 @@ def test_a_crash_that_is_reported_only_when_it_happens_is_a_share_of_all_episode
     reported = [True, None, None, None]
     results = [EpisodeResult(i, 1.0, 1, crashed, float("nan")) for i, crashed in enumerate(reported)]
     assert driving_scalars(results)["crash_rate"] == 0.25
+
+
+def test_a_diverged_policy_is_named_in_one_line():
+    model = PPO("MlpPolicy", "CartPole-v1", n_steps=4, batch_size=4, device="cpu")
+    check_finite(model)
+    next(model.policy.parameters()).data.fill_(float("nan"))
+    with pytest.raises(UserError, match="the policy's weights are not finite after 0 steps: its training diverged;"):
+        check_finite(model)
