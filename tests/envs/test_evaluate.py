@@ -382,6 +382,7 @@ def test_a_driver_is_named_where_no_heuristic_knows_the_env(in_process: None):
 ERRORS = {
     "unknown-id": (["--env-ids", ROAD, "nope-v0"], "cannot make env 'nope-v0'"),
     "unknown-checkpoint": (["--checkpoint", "nowhere"], "no checkpoint 'nowhere'"),
+    "same-id-twice": (["--env-ids", ROAD, ROAD], f"each of --env-ids is given once, got {ROAD}, {ROAD}; leave one out"),
     "same-twice": (["--checkpoint", "a/best", "a/best"], "each checkpoint is given once, got a/best, a/best"),
     "arguments-of-two": (
         ["--env-ids", ROAD, TAG, "--env-kwargs", '{"a": 1}'],

@@ -17,7 +17,7 @@ from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.dgvae import DGVAE
 from predictor.evaluate import EvaluateConfig, evaluate
-from predictor.evaluation.accuracy import Accuracy
+from predictor.evaluation.accuracy import Accuracy, summarise
 from predictor.evaluation.standard_errors import Statistic
 from predictor.reports.tables import accuracy_table, markdown_table
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
@@ -196,6 +196,16 @@ def test_the_first_agent_of_a_recording_without_an_ego_is_not_taken_for_it(
     )
     with pytest.raises(UserError, match="needs episodes with an ego but store .*equals has none .* record a store"):
         evaluate(EvaluateConfig(str(checkpoint), tmp_path / "equals"))
+
+
+def test_forecasts_that_are_not_finite_are_no_result(data: Path, checkpoint: Path, tmp_path: Path, monkeypatch: Any):
+    def diverged(*arguments: Any, **named: Any) -> Accuracy:
+        return replace(summarise(*arguments, **named), min_ade_m=math.nan)
+
+    monkeypatch.setattr(evaluation, "summarise", diverged)
+    with pytest.raises(UserError, match="forecasts numbers that are not finite; its training diverged"):
+        evaluate(EvaluateConfig(str(checkpoint), data, out=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
 
 
 def test_three_axes(tmp_path: Path):

@@ -14,6 +14,7 @@ from envs.readers.highway import HighwayReader
 from envs.readers.highway_labels import LEADER, SceneLabels
 from envs.readers.mpe import MPE_FEATURES
 from envs.registry import make_env
+from envs.rollouts import episode as episodes
 from envs.rollouts.episode import (
     CASE_HISTORY_STEPS,
     MODEL,
@@ -295,16 +296,26 @@ def test_neighbours_that_lived_through_this_very_episode_are_exact(tmp_path: Pat
     assert straight.min_ade_m > 0.1
 
 
-def test_the_residual_of_a_model_with_an_ego_is_fitted_to_recordings_without_one(tmp_path: Path):
-    """Their first agent, which leaves the crossing, is not taken for the ego."""
+def test_the_residual_of_a_model_with_an_ego_is_fitted_to_recordings_without_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Their first agent is not taken for the ego."""
     crossing = "intersection-multi-agent-v2"
     store = tmp_path / "store"
     recorded = list(collect(CollectConfig(crossing, store, 1, max_steps=5, workers=1)))
     write_store(store, StoreInfo(open_world(crossing, "varied").spec, crossing), recorded)
     checkpoint = save_tiny(tmp_path / "tiny", MAP_SPEC)
     made = task(env_id=crossing, driver="varied", checkpoint=checkpoint, horizon_steps=1, stores=(str(store),))
+    cut, original = list[bool](), episodes.training_windows
+
+    def noted(stores: Any, spec: SceneSpec, horizon_steps: int) -> Any:
+        cut.append(spec.has_ego)
+        return original(stores, spec, horizon_steps)
+
+    monkeypatch.setattr(episodes, "training_windows", noted)
     outcomes = play(made).outcomes
     assert outcomes[RESIDUAL].forecast.shape == outcomes[MODEL].forecast.shape
+    assert cut and not any(cut)
 
 
 # --- Controls at equal K ----------------------------------------------------------------------------------------------
