@@ -69,7 +69,7 @@ def figure_by_step(results: Sequence[dict[str, Any]], kinds: Sequence[str], dt_s
         headline: text above.
     """
     figure, axes = plt.subplots(
-        1, len(kinds), figsize=(1 + 5 * len(kinds), 5.2), sharey=True, squeeze=False, layout="constrained"
+        1, len(kinds), figsize=(1 + 5 * max(2, len(kinds)), 5.2), sharey=True, squeeze=False, layout="constrained"
     )
     for ax, kind in zip(axes[0], kinds, strict=True):
         plot_results_by_step(ax, results, kind, dt_s).set_title(kind)
