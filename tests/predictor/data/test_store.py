@@ -468,6 +468,7 @@ def test_a_stop_while_zarr_starts_its_event_loop_is_one_line(tmp_path: Path):
     assert done.stderr == "stopped: what was not written yet is lost; the same command begins anew\n"
 
 
+@pytest.mark.unchecked
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
