@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
+import gymnasium as gym
 import numpy as np
 from jaxtyping import Bool
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -24,6 +25,7 @@ from envs.readers.base import role_of
 from envs.sb3.acting import ActingPolicy
 from envs.sb3.agents_as_rows import ParallelVecEnv
 from envs.seeding import driver_rng
+from predictor.support.errors import UserError, short
 
 
 @runtime_checkable
@@ -37,7 +39,11 @@ class Arena(Protocol):
     def play(
         self, policy: BaseAlgorithm | str, seeds: Sequence[int], on_episode: Callable[[], None] = lambda: None
     ) -> list[EpisodeResult]:
-        """Plays one episode per seed, in the order of the seeds; a policy takes its most likely actions."""
+        """Plays one episode per seed, in the order of the seeds; a policy takes its most likely actions.
+
+        Raises:
+            UserError: the policy was trained on observations or actions of other sizes.
+        """
 
     def close(self) -> None:
         """Closes the environments."""
@@ -62,11 +68,40 @@ class EgoArena:
         self, policy: BaseAlgorithm | str, seeds: Sequence[int], on_episode: Callable[[], None] = lambda: None
     ) -> list[EpisodeResult]:
         """Plays one episode per seed, as `Arena.play` describes."""
-        return run_episodes(self._venv, policy if isinstance(policy, str) else ActingPolicy(policy), seeds, on_episode)
+        acting = policy if isinstance(policy, str) else _acting(policy, self._venv)
+        return run_episodes(self._venv, acting, seeds, on_episode)
 
     def close(self) -> None:
         """Stops the environments."""
         self._venv.close()
+
+
+def _acting(policy: BaseAlgorithm, venv: VecEnv) -> ActingPolicy:
+    """Returns the policy as it acts in environments.
+
+    Raises:
+        UserError: it was trained on observations or actions of other sizes.
+    """
+    for what in ("observation", "action"):
+        trained, found = (_parts(getattr(of, f"{what}_space")) for of in (policy, venv))
+        for key in dict.fromkeys((*trained, *found)):
+            own, here = trained.get(key), found.get(key)
+            if own is None or here is None or _sizes(own) != _sizes(here):
+                name = f"{what} '{key}'" if key else what
+                raise UserError(
+                    f"the policy was trained with the {name} {short(own)}, got {short(here)}; give the environment the "
+                    "arguments of the training"
+                )
+    return ActingPolicy(policy)
+
+
+def _parts(space: gym.Space) -> Mapping[str, gym.Space]:
+    return space.spaces if isinstance(space, gym.spaces.Dict) else {"": space}
+
+
+def _sizes(space: gym.Space) -> Any:
+    """Returns the sizes of a space, whatever the order of its axes: Stable-Baselines3 moves those of images."""
+    return int(space.n) if isinstance(space, gym.spaces.Discrete) else sorted(space.shape or ())
 
 
 def open_arena(task: Task, num_envs: int, in_process: bool | None = None) -> Arena:
@@ -175,7 +210,7 @@ class MultiagentArena:
         observations: Any = venv.reset()
         episodes, lengths = [env.episodes for env in copies], [0] * len(copies)
         returns = [dict.fromkeys(self._learners, 0.0) for _ in copies]
-        act, starts = ActingPolicy(policy), np.ones(venv.num_envs, dtype=bool)
+        act, starts = _acting(policy, venv), np.ones(venv.num_envs, dtype=bool)
         playing = set(range(len(seeds)))
         while playing:
             observations, rewards, starts, _ = venv.step(act(observations, starts))

@@ -13,6 +13,7 @@ import gymnasium as gym
 from envs.readers.mpe import MPE_IDS
 from envs.simulators.envpool import ENV_IDS as ENVPOOL_IDS
 from envs.simulators.envpool import HIGHWAY_ENV_OF, known_tasks, register_envpool_ids
+from envs.simulators.highway_settings import check_settings
 from predictor.support.errors import UserError, named, short
 from predictor.support.importing import load_named
 from predictor.support.reading import as_object, parse_json
@@ -165,7 +166,8 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
         kwargs: for `gymnasium.make`.
 
     Raises:
-        UserError: unknown id, a missing package, or arguments that the environment refuses.
+        UserError: unknown id, a missing package, arguments that the environment refuses, or a `config` with a setting
+            that highway-env's does not have.
     """
     import highway_env  # noqa: F401  (registers its ids)
 
@@ -179,7 +181,10 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     if not isinstance(mode, str | None):
         raise UserError(f"cannot make env '{env_id}': render_mode must be a text, got {short(mode)}")
     try:
-        return gym.make(env_id, **kwargs)
+        env = gym.make(env_id, **kwargs)
+        if isinstance(config := kwargs.get("config"), Mapping):
+            check_settings(env, config)
+        return env
     except UserError:
         raise
     except (gym.error.Error, ImportError) as error:

@@ -21,6 +21,7 @@ from highway_env.envs.intersection_env import MultiAgentIntersectionEnv
 from highway_env.vehicle.kinematics import Vehicle
 from pettingzoo import ParallelEnv
 
+from envs.simulators.highway_settings import check_settings
 from predictor.support.errors import ProtocolError, UserError
 
 INTERSECTION = "intersection-multi-agent-v2"
@@ -47,7 +48,7 @@ class HighwayParallelEnv(ParallelEnv):
         highway: gymnasium environment that is adapted.
 
     Raises:
-        UserError: not an id of an intersection with several agents.
+        UserError: not an id of an intersection with several agents, or a setting that it does not have.
     """
 
     def __init__(self, env_id: str = INTERSECTION, *, render_mode: str | None = None, **config: Any) -> None:
@@ -57,6 +58,7 @@ class HighwayParallelEnv(ParallelEnv):
             made = _make(env_id, config=config, render_mode=render_mode)
         if not isinstance(made, MultiAgentIntersectionEnv):
             raise UserError(f"HighwayParallelEnv needs an intersection with several agents, got '{env_id}'")
+        check_settings(made, config)
         self.highway = made
         self.render_mode = render_mode
         self.metadata = {

@@ -90,9 +90,11 @@ class PartialStore:
         """Writes the store, deletes the parts, and returns all episodes; its provenance names the seeds without one.
 
         Raises:
-            UserError: all seeds were skipped; or as `predictor.data.store.write_store`.
+            UserError: all seeds were skipped, none has an episode; or as `predictor.data.store.write_store`.
         """
         episodes = [episode for part in self._parts() for episode in read_store(part).episodes] + self._new
+        if not episodes and not self.skipped:
+            raise UserError("no agent could be perturbed in any episode, so there are no branches; raise --max-steps")
         if self.skipped:
             if not episodes:
                 first = next(iter(self.skipped.values()))

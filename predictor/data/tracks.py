@@ -5,9 +5,9 @@ separated by spaces or tabs, by commas, or by semicolons; further columns are ig
 lines and comments (from "#" or "%" on) are skipped, and so is a first line of names. Frames and ids are whole numbers,
 also if they are written as 780.0. Each file is a recording with frames and ids of its own.
 
-A source with folders `train`, `val` or `test` gives a store for each, `<out>/train` and so on. Files that are in no
-such folders give one store, and `--split` divides them: the position of SHA-256("0:<name>") in [0, 1) decides, below
-0.1 test, below 0.2 validation, else training.
+A source with folders `train`, `val` or `test` gives a store for each, `<out>/train` and so on; files beside these
+folders are named, and left out. A source without them gives one store, and `--split` divides its files: the position
+of SHA-256("0:<name>") in [0, 1) decides, below 0.1 test, below 0.2 validation, else training.
 
 States: position and velocity [m, m/s], then the extra columns. Positions far from zero, as in coordinates of a map, are
 moved by multiples of 10 km, file by file. Velocity is the backward difference over one step, so
@@ -276,6 +276,13 @@ def parts_of(config: TracksConfig) -> list[Part]:
     return parts
 
 
+def files_beside(config: TracksConfig) -> list[Path]:
+    """Returns the files of a source that stand beside its folders train, val and test, and go into no store."""
+    if not any((config.source / name).is_dir() for name in FOLDERS):
+        return []
+    return sorted(path for path in config.source.glob(config.pattern) if path.is_file())
+
+
 def load(parts: Sequence[Part]) -> list[tuple[list[Episode], DatasetNotes]]:
     """Reads all files.
 
@@ -332,12 +339,15 @@ def _notes(config: TracksConfig, frame_step: int, counts: Counter[str]) -> Datas
 
 def main() -> None:
     """Entry point."""
-    parts = parts_of(parse(TracksConfig, __doc__))
+    config = parse(TracksConfig, __doc__)
+    parts = parts_of(config)
     loaded = load(parts)
     agents = max(most_present(episodes) for episodes, _ in loaded)
     for part, (episodes, notes) in zip(parts, loaded, strict=True):
         save_dataset(part.config, scene_spec(part.config, agents), episodes, notes, part.files)
         print(summary(part.config, episodes))
+    for path in files_beside(config):
+        print(f"warning: {path} is in none of the folders {', '.join(FOLDERS)}, and in no store")
 
 
 if __name__ == "__main__":

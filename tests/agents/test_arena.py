@@ -1,3 +1,4 @@
+import json
 from typing import Any
 
 import gymnasium as gym
@@ -13,6 +14,7 @@ from agents.vec_envs import SeededEpisodes, make_venv
 from envs.drivers.trained import EgoDriver
 from envs.registry import make_env
 from envs.sb3.forecast import VecForecast
+from predictor.support.errors import UserError
 from tests.envs.helpers import HIGHWAY_SPEC, short_scene_env, tiny_model
 
 
@@ -124,3 +126,63 @@ def test_drawn_samples_depend_on_the_seed_of_the_episode_alone():
     np.testing.assert_allclose(one[5], alone[5], atol=1e-4)
     spread = one[5].std(axis=2)
     assert spread.max() > 1e-2, "samples are drawn"
+
+
+@pytest.mark.parametrize(
+    ("observe", "name", "config"),
+    [
+        ("none", "observation", {"observation": {"type": "Kinematics", "vehicles_count": 7}}),
+        ("forecast", "observation 'observation'", {"observation": {"type": "Kinematics", "vehicles_count": 7}}),
+        ("none", "action", {"action": {"type": "DiscreteMetaAction", "lateral": False}}),
+    ],
+)
+def test_a_policy_of_other_observations_or_actions_is_refused_in_one_line(
+    observe: Observe, name: str, config: dict[str, Any]
+):
+    trained, changed = (
+        Task("highway-fast-v0", observe, env_kwargs=json.dumps({"config": given})) for given in ({}, config)
+    )
+    venv = make_venv(trained, 1)
+    policy = PPO("MlpPolicy" if observe == "none" else "MultiInputPolicy", venv, n_steps=4, batch_size=4)
+    venv.close()
+    arena = open_arena(changed, 1)
+    message = rf"^the policy was trained with the {name} (Box|Discrete)\(.*, got .*\("
+    with pytest.raises(UserError, match=message) as error:
+        arena.play(policy, [0])
+    assert "\n" not in str(error.value)
+    arena.close()
+
+
+class _Film(gym.Env):
+    """Shows noise for three steps."""
+
+    observation_space = gym.spaces.Box(0, 255, (36, 40, 3), np.uint8)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._step = 0
+        return self._frame(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._step += 1
+        return self._frame(), 1.0, self._step == 3, False, {}
+
+    def _frame(self) -> Any:
+        return self.np_random.integers(0, 256, self.observation_space.shape, np.uint8)
+
+
+def test_a_policy_that_sees_images_is_played():
+    """Stable-Baselines3 moves the axes of an image's space."""
+    gym.register("Film-v0", _Film)
+    try:
+        task = Task("Film-v0", "none")
+        venv = make_venv(task, 1)
+        policy = PPO("CnnPolicy", venv, n_steps=4, batch_size=4)
+        venv.close()
+        assert policy.observation_space.shape == (3, 36, 40)
+        arena = open_arena(task, 1)
+        assert [result.length for result in arena.play(policy, [0])] == [3]
+        arena.close()
+    finally:
+        del gym.registry["Film-v0"]

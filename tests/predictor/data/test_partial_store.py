@@ -80,3 +80,11 @@ def test_a_step_of_the_recording_may_bring_several_episodes_or_none(tmp_path: Pa
         assert partial.num_done == 2
         partial.add(INFO, third)
         assert [len(e.states) for e in partial.finish(INFO)] == [6, 7, 8]
+
+
+def test_a_recording_without_any_episode_says_why(tmp_path: Path):
+    with PartialStore(tmp_path / "store", SETTINGS_A) as partial:
+        partial.add(INFO)
+        with pytest.raises(UserError, match="no agent could be perturbed in any episode.*raise --max-steps"):
+            partial.finish(INFO)
+    assert list(tmp_path.iterdir()) == []

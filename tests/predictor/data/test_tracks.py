@@ -1,3 +1,4 @@
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -184,6 +185,17 @@ def test_each_folder_becomes_a_store(folders: Path, loader: Loader):
     assert (train.info.source, train.info.provenance["split"]) == ("Tracks, ucy/train", "train")
     assert (train.info.provenance["source_files"], test.info.provenance["source_files"]) == (2, 1)
     assert "| split | test |" in (loader.store / "test.md").read_text()
+
+
+def test_a_file_beside_the_folders_is_named(folders: Path, loader: Loader, capsys: pytest.CaptureFixture[str]):
+    loader.monkeypatch.setattr(sys, "argv", ["tracks", "--source", str(folders), "--out", str(loader.store)])
+    tracks.main()
+    *_, last = capsys.readouterr().out.splitlines()
+    assert last == f"warning: {folders / 'README.txt'} is in none of the folders train, val, test, and in no store"
+    (folders / "README.txt").unlink()
+    loader.monkeypatch.setattr(sys, "argv", [*sys.argv, "--overwrite"])
+    tracks.main()
+    assert "warning" not in capsys.readouterr().out
 
 
 def test_one_folder_can_be_chosen(folders: Path, loader: Loader):
