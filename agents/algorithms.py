@@ -118,14 +118,18 @@ def even_batches(rollout: int, most: int) -> int:
     return even if 2 * even >= most else min(rollout, most)
 
 
+class DivergedError(UserError):
+    """A training whose weights are no longer finite."""
+
+
 def check_finite(model: BaseAlgorithm) -> None:
     """Checks that the weights of a policy are numbers.
 
     Raises:
-        UserError: they are not: its training diverged.
+        DivergedError: they are not.
     """
     if not all(bool(weights.isfinite().all()) for weights in model.policy.parameters()):
-        raise UserError(
+        raise DivergedError(
             f"the policy's weights are not finite after {model.num_timesteps:,} steps: its training diverged; lower "
             "the learning rate (--set learning_rate=…)"
         )

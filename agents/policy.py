@@ -183,7 +183,8 @@ def _task_of_note(note: PolicyNote, device: str, sized: bool) -> Task:
         what_if=bool(pin.num_plans),
         **driven,  # type: ignore[arg-type]
     )
-    if sized and pin.layout is not None and pin.layout != task.options["arm"].layout:
+    arm = task.options.get("arm")
+    if sized and pin.layout is not None and (arm is None or pin.layout != arm.layout):
         raise UserError("the policy was trained with the sizes of another checkpoint (sizes_of); give its run folder")
     return task
 

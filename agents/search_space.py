@@ -1,7 +1,8 @@
 """Hyperparameters that tuning varies, and their ranges; the preset of the environment is one point of them.
 
-The sizes of the network are fixed: all arms of a study have one network. Whole numbers that must fit each other are
-powers of two. Optuna, which draws from these ranges, is an optional package (extra "tune").
+The sizes of the network are fixed but for a recurrent policy's memory; all arms of a study have one network. Whole
+numbers that must fit each other are powers of two. Optuna, which draws from these ranges, is an optional package (extra
+"tune").
 """
 
 from dataclasses import asdict, dataclass

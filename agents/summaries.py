@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
@@ -86,8 +86,15 @@ def mean_and_standard_error(values: Sequence[float]) -> tuple[float, float]:
     return float(array.mean()), error
 
 
-def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
-    """Computes the summary of one policy's episodes."""
+def summarize(policy: str, episodes: Sequence[EpisodeResult], silent_is_safe: bool = False) -> PolicySummary:
+    """Computes the summary of one policy's episodes.
+
+    Args:
+        policy: its name.
+        episodes: its episodes.
+        silent_is_safe: whether an episode without a word on crashes had none; see `reports_only_crashes`.
+    """
+    reports = silent_is_safe or any(e.crashed is not None for e in episodes)
     return_mean, return_se = mean_and_standard_error([e.episode_return for e in episodes])
     length_mean, length_se = mean_and_standard_error([float(e.length) for e in episodes])
     roles = list(dict.fromkeys(role for e in episodes for role in e.returns_by_role))
@@ -99,8 +106,8 @@ def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
         return_se,
         length_mean,
         length_se,
-        *_rate(_counted([e.crashed for e in episodes])),
-        float(np.mean([e.mean_speed_mps for e in episodes])),
+        *_rate([bool(e.crashed) if reports else None for e in episodes]),
+        mean_of_known([e.mean_speed_mps for e in episodes]),
         {
             role: mean_and_standard_error([e.returns_by_role[role] for e in episodes if role in e.returns_by_role])
             for role in roles
@@ -111,9 +118,9 @@ def summarize(policy: str, episodes: Sequence[EpisodeResult]) -> PolicySummary:
     )
 
 
-def _counted(crashed: Sequence[bool | None]) -> list[bool | None]:
-    """Returns crashes without gaps where some episodes report them: some environments do so only when they happen."""
-    return list(crashed) if all(event is None for event in crashed) else [bool(event) for event in crashed]
+def reports_only_crashes(crashed: Iterable[bool | None]) -> bool:
+    """Returns whether the environment reports crashes only when they happen, judged by the episodes of all policies."""
+    return set(crashed) - {None} == {True}
 
 
 def _rate(events: Sequence[bool | None]) -> tuple[float | None, float | None, float | None]:
@@ -129,6 +136,12 @@ def _mean_driving(measured: Sequence[DrivingMeasures]) -> dict[str, tuple[float,
         values = [float(value) for e in measured if (value := getattr(e, measure.name)) is not None]
         found[measure.name] = mean_and_standard_error(values) if values else (math.nan, math.nan)
     return found
+
+
+def mean_of_known(values: Sequence[float]) -> float:
+    """Returns the mean of the values that are not NaN; NaN if all are."""
+    known = [value for value in values if not math.isnan(value)]
+    return float(np.mean(known)) if known else math.nan
 
 
 def significantly_worse(returns: Sequence[float], best: Sequence[float]) -> bool:

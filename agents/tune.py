@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from agents.algorithms import DivergedError
 from agents.arena import open_arena
 from agents.preset_settings import changed, write_preset
 from agents.presets import Algorithm, Preset
@@ -195,7 +196,7 @@ def _run_trial(config: TuneConfig, study: "Study", index: int, preset: Preset) -
     try:
         value = _measure(config, settings, config.folder / "trials" / f"{index + 1:03d}")
     except ValueError as error:
-        if not str(error).startswith(DIVERGED):
+        if not isinstance(error, DivergedError) and not str(error).startswith(DIVERGED):
             raise
         value = None
     state = optuna.trial.TrialState.PRUNED if value is None else optuna.trial.TrialState.COMPLETE

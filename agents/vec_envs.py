@@ -284,7 +284,8 @@ class SeededEpisodes(gym.Wrapper):
         obs, reward, terminated, truncated, info = self.env.step(action)
         self._obs = obs
         self._rewards.append(float(reward))
-        self._speeds_mps.append(float(info.get("speed", np.nan)))
+        if "speed" in info:
+            self._speeds_mps.append(float(info["speed"]))
         if self._action_names:
             self._actions[self._action_names[int(action)]] += 1
         crashed = self._keys.crashed(info)
@@ -303,7 +304,7 @@ class SeededEpisodes(gym.Wrapper):
             float(np.sum(self._rewards)),
             len(self._rewards),
             self._crashed,
-            float(np.mean(self._speeds_mps)),
+            float(np.mean(self._speeds_mps)) if self._speeds_mps else float("nan"),
             action_counts=dict(self._actions),
             success=None if success is None else success and not self._crashed,
             driving=None if self._recorder is None else self._recorder.measures(),

@@ -12,6 +12,7 @@ import shlex
 import signal
 import sys
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext, redirect_stderr
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -77,8 +78,9 @@ def _train(config: TrainConfig, group: Group, state_file: Path, config_file: Pat
         if not group.leads:
             _follow(trainer)
             return config.out / BEST_OF_RUN
-        stores = {address(path): content_id(path) for path in (*config.data, *config.val_data)}
-        write_json(config_file, {"config": _comparable(config), "stores": stores, "provenance": made})
+        if not trainer.finished or trainer.owes_validation:  # else the file tells how the run was made
+            stores = {address(path): content_id(path) for path in (*config.data, *config.val_data)}
+            write_json(config_file, {"config": _comparable(config), "stores": stores, "provenance": made})
         _run(trainer, state_file, made)
     if not (config.out / BEST_OF_RUN).exists():
         raise UserError(
@@ -110,6 +112,8 @@ def _follow(trainer: Trainer) -> None:
     with deferred_stops() as stops:
         try:
             if config.init and not trainer.step:
+                trainer.share_progress()
+            if trainer.owes_validation:
                 trainer.share_progress()
             while not trainer.finished:
                 terms = trainer.train_step()
@@ -143,6 +147,10 @@ def _run(trainer: Trainer, state_file: Path, made: dict[str, Any]) -> None:
         if config.init and not trainer.step:
             note = _validate_and_save(trainer, writer, made)  # so that the result is no worse than where it began
             progress.say(note)
+            trainer.share_progress()
+        if trainer.owes_validation:
+            progress.say(_validate_and_save(trainer, writer, made))
+            trainer.save(state_file)
             trainer.share_progress()
         began, since = time.perf_counter(), trainer.step
         while not trainer.finished:
@@ -237,17 +245,25 @@ def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
         if not isinstance(value, float | int if isinstance(now[name], float) else type(now[name])):
             kind = type(now[name]).__name__
             raise UserError(f"{config_file}: config.{name} must be of type {kind}, got {short(repr(value), 80)}")
-    changed = [name for name in now if old[name] != now[name] and name not in ("steps", *config.without_effect)]
+    known = as_object(content.get("stores", {}), f"{config_file}: stores")  # runs of older versions have none
+    stores = {name: [known.get(str(path)) for path in old[name]] for name in ("data", "val_data")}
+    moved = [name for name, contents in stores.items() if _are(getattr(config, name), contents)]
+    free = ("steps", "out", *config.without_effect, *moved)
+    changed = [name for name in now if old[name] != now[name] and name not in free]
     if changed:
         differences = ", ".join(f"{name} was {old[name]} and is now {now[name]}" for name in changed)
         options = " ".join(_option(name, old[name]) for name in changed)
         raise UserError(f"cannot resume: {differences}; use the same arguments, with {options}")
-    known = as_object(content.get("stores", {}), f"{config_file}: stores")  # runs of older versions have none
     for path in (*config.data, *config.val_data):
         if address(path) in known and known[address(path)] != content_id(path):
             raise UserError(
                 f"cannot resume: {address(path)} is another store than the run began with; choose another --out"
             )
+
+
+def _are(stores: Sequence[Path], contents: Sequence[Any]) -> bool:
+    """Returns whether stores, wherever they are now, have these contents."""
+    return len(stores) == len(contents) and None not in contents and [content_id(p) for p in stores] == contents
 
 
 def _option(name: str, value: Any) -> str:

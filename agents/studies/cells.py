@@ -196,7 +196,7 @@ def run_cell(cell: Cell, folder: Path, commit: str) -> Result:
 def _drivers(study: Study, scenario: Scenario, where: str) -> list[Cell]:
     """Returns the cells of a scenario's references, each checked by making its driver once."""
     task = task_for(scenario, StudyArm("none", "none", {}), where)
-    names, place = scenario.references, f"{where}: scenario {scenario.name}"
+    names, place = tuple(dict.fromkeys(scenario.references)), f"{where}: scenario {scenario.name}"
     try:
         task.check()
         if task.is_multiagent:

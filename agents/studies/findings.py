@@ -24,7 +24,7 @@ from agents.studies.estimators import (
 )
 from agents.studies.plan import Study
 from agents.studies.results import Result
-from agents.summaries import NEARLY_CONSTANT, wilson_interval
+from agents.summaries import NEARLY_CONSTANT, reports_only_crashes, wilson_interval
 from envs.drivers.planner import PLANNER, PLANNER_ORACLE, is_planner
 from predictor.own_forecasters import is_own
 
@@ -111,14 +111,18 @@ class Findings:
 
         The interval of a driver is Wilson's, over its episodes.
         """
-        crashed = [[episode.get("crashed") for episode in r.episodes] for r in self.results[scenario, line]]
-        if all(each is None for run in crashed for each in run):
+        crashed = [_crashed(r) for r in self.results[scenario, line]]
+        if all(each is None for run in crashed for each in run) and not self._silence_is_safe(scenario):
             return None
         reported = [np.array([bool(each) for each in run], dtype=np.float64) for run in crashed]
         if line.algorithm is None:
             return Estimate(mean(reported), *wilson_interval(int(reported[0].sum()), len(reported[0])))
         rates = np.array([np.mean(found) for found in reported])
         return self.estimate(mean, [rates], about=("crashes", scenario, *line))
+
+    def _silence_is_safe(self, scenario: str) -> bool:
+        lines = (results for (name, _), results in self.results.items() if name == scenario)
+        return reports_only_crashes(crashed for results in lines for r in results for crashed in _crashed(r))
 
     def mean_of(self, scenario: str, line: Line, field: str) -> float:
         """Returns the mean of a field over all episodes of all runs; NaN if it is not reported."""
@@ -221,6 +225,10 @@ def column(result: Result, field: str) -> Float[np.ndarray, " episodes"]:
     """Returns a field of all episodes of a result, without those that do not report it."""
     values: list[Any] = [episode.get(field) for episode in result.episodes]
     return np.array([float(value) for value in values if value is not None], dtype=np.float64)
+
+
+def _crashed(result: Result) -> list[bool | None]:
+    return [episode.get("crashed") for episode in result.episodes]
 
 
 def generator_of(*names: str | None) -> np.random.Generator:

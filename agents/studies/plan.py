@@ -137,6 +137,8 @@ class Study:
         for rival in self.rivals or ():
             if rival not in self.arm_names:
                 raise UserError(f"rivals names '{rival}', which is no arm; there are {', '.join(self.arm_names)}")
+        for key, name in (("floor", self.floor), ("ceiling", self.ceiling)):
+            self._arm_called(name, key)
 
     @property
     def training_seeds(self) -> tuple[int, ...]:

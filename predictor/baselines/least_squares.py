@@ -2,8 +2,9 @@
 
 Springs are linear in their constants: over a step, Δv_i = Σ_j k_ij ∫(r_j − r_i) dt. The integral follows from positions
 and velocities at both ends (Hermite, exact to fourth order in dt). Each receiver keeps its normal equations over
-senders, so streaming is exact; the two estimates of a spring are averaged. Steps in which an agent may have touched a
-wall are left out. Columns of the equations are agents, so agents must keep their places.
+senders, so streaming is exact; the two estimates of a spring are averaged. Steps in which the receiver may have touched
+a wall are left out; a sender that touches one bends the integral a little. Columns of the equations are agents, so
+agents must keep their places.
 """
 
 from typing import NamedTuple

@@ -107,9 +107,10 @@ def load(config: LevelxConfig) -> tuple[Layout, list[Episode], DatasetNotes, lis
         both = " and ".join(str(path) for path in layouts.values())
         raise UserError(f"{both} have different layouts; give each dataset a folder of its own")
     wanted = [r for r in recordings if not config.locations or r.location in config.locations]
-    if not wanted:
-        known = sorted({r.location for r in recordings})
-        raise UserError(f"{config.source} has no recording of locations {config.locations}; there are {known}")
+    known = {r.location for r in recordings}
+    missing = tuple(location for location in config.locations if location not in known)
+    if missing:
+        raise UserError(f"{config.source} has no recording of locations {missing}; there are {sorted(known)}")
     chosen = [r for r in wanted if in_split(r.name, config.split, SPLIT_SEED)]
     counts: Counter[str] = Counter(
         {"recordings": len(recordings), f"recordings of split '{config.split}'": len(chosen)}

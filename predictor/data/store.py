@@ -9,7 +9,6 @@ import hashlib
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial as partial_of
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +17,11 @@ from jaxtyping import Bool, Float, Int
 
 from predictor.data.episode_checks import check_episode
 from predictor.data.store_files import (
-    COMPRESSORS,
+    CONTENT,
     DIGEST,
     FORMAT,
     METADATA,
+    ArrayWriter,
     StoreHeader,
     check_digest,
     check_replaceable,
@@ -175,17 +175,14 @@ def _write(path: Path, info: StoreInfo, episodes: Sequence[Episode]) -> None:
     with new_folder(path) as partial:
         group = open_group(partial, mode="w")
         chunk = max(1, min(len(states), 4096))
-        # every chunk is written, so that a missing one is damage, not zeros
-        create = partial_of(group.create_array, compressors=COMPRESSORS, config={"write_empty_chunks": True})
-        create("states", data=states, chunks=(chunk, columns, states.shape[-1]))
-        create("valid", data=valid, chunks=(chunk, columns))
+        arrays = ArrayWriter(group)
+        arrays.write("states", states, chunks=(chunk, columns, states.shape[-1]))
+        arrays.write("valid", valid, chunks=(chunk, columns))
         if any(marked):
-            create("perturbed", data=perturbed, chunks=(chunk, columns))
-        create("ids", data=ids)
-        create("starts", data=starts)
-        create("seeds", data=np.array([e.seed for e in episodes], dtype=np.int64))
-        for name, labels in _padded_labels(episodes, columns, str(path)).items():
-            create(name, data=labels)
+            arrays.write("perturbed", perturbed, chunks=(chunk, columns))
+        small = {"ids": ids, "starts": starts, "seeds": np.array([e.seed for e in episodes], dtype=np.int64)}
+        for name, data in (small | _padded_labels(episodes, columns, str(path))).items():
+            arrays.write(name, data)
         attributes = {
             "format": FORMAT,
             "version": VERSION,
@@ -195,6 +192,7 @@ def _write(path: Path, info: StoreInfo, episodes: Sequence[Episode]) -> None:
             "labels": [e.label for e in episodes],
             "edge_attribute_names": list(info.edge_attribute_names),
             "causal_threshold_m": info.causal_threshold_m,
+            CONTENT: arrays.content.hexdigest(),
         }
         plain = json.loads(json.dumps(attributes, default=str))
         group.attrs.update(plain | {DIGEST: digest_of(plain)})
@@ -243,26 +241,28 @@ def read_info_of(path: Path) -> StoreInfo:
     Raises:
         UserError: the path holds no store.
     """
-    path = Path(path)
-    if is_remote(path):
-        with local_copy(path, lambda name: most_bytes_of(name) if name == METADATA else None) as copy:
-            return read_info_of(copy)
-    header = read_header(path, FORMAT)
-    info = _info(path, header)
-    check_digest(path, header.attributes)
-    return info
+    return _info_and_hash(Path(path))[0]
 
 
 def content_id(path: Path) -> str:
-    """Returns a hash of a store's layout, source, provenance and length, without reading its arrays.
+    """Returns a hash of layout, source, provenance, length and arrays (of older stores without arrays); reads none.
 
     Raises:
         UserError: as `read_info_of`.
     """
-    info = read_info_of(path)
+    info, arrays = _info_and_hash(Path(path))
     made = {k: v for k, v in info.provenance.items() if k not in ("time", "machine", "versions", "commit", "command")}
-    content = json.dumps([asdict(info.spec), info.source, made, info.num_steps], sort_keys=True, default=str)
+    content = json.dumps([asdict(info.spec), info.source, made, info.num_steps, *arrays], sort_keys=True, default=str)
     return hashlib.sha256(content.encode()).hexdigest()
+
+
+def _info_and_hash(path: Path) -> tuple[StoreInfo, list[Any]]:
+    if is_remote(path):
+        with local_copy(path, lambda name: most_bytes_of(name) if name == METADATA else None) as copy:
+            return _info_and_hash(copy)
+    header = read_header(path, FORMAT)
+    check_digest(path, header.attributes)
+    return _info(path, header), [header.attributes[key] for key in (CONTENT,) if key in header.attributes]
 
 
 def _info(path: Path, header: StoreHeader) -> StoreInfo:

@@ -28,6 +28,7 @@ from predictor.support.stopping import deferred_stops
 
 FORMAT = "dgvae-rl episodes"
 METADATA = "zarr.json"
+CONTENT = "content_sha256"
 DIGEST = "sha256"
 COMPRESSORS = (ZstdCodec(level=0), Crc32cCodec())
 """Codecs of a new array: compression, and a checksum of each chunk."""
@@ -77,6 +78,29 @@ def digest_of(attributes: Mapping[str, Any]) -> str:
     """Returns the SHA-256 of attributes, in hexadecimal digits; that of an older digest does not count."""
     kept = {key: value for key, value in attributes.items() if key != DIGEST}
     return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
+
+
+class ArrayWriter:
+    """Writes arrays into a group: every chunk, so that a missing one is damage, not zeros.
+
+    Args:
+        group: group of a store.
+
+    Attributes:
+        content: SHA-256 of names, types, shapes and values of the arrays so far.
+    """
+
+    def __init__(self, group: zarr.Group) -> None:
+        """Starts with no array."""
+        self._group = group
+        self.content = hashlib.sha256()
+
+    def write(self, name: str, data: np.ndarray, **options: Any) -> None:
+        """Writes an array; `options` are Zarr's."""
+        self.content.update(f"{name} {data.dtype.str} {data.shape}".encode() + np.ascontiguousarray(data).tobytes())
+        self._group.create_array(
+            name, data=data, compressors=COMPRESSORS, config={"write_empty_chunks": True}, **options
+        )
 
 
 def attributes_of(path: Path, format: str) -> dict[str, Any]:

@@ -192,6 +192,7 @@ class Trainer:
         self.step = 0
         self.best = math.inf
         self.stale = 0
+        self.validated = 0
         self.baseline_m = self._baseline() if group.leads else math.nan
         self.noise = torch.Generator(device=self.device)
         self._drawn: TrainingNoise = self.noise
@@ -221,6 +222,11 @@ class Trainer:
     def due(self) -> bool:
         """Whether validation follows the latest step."""
         return self.step % self.config.eval_every == 0 or self.step == self.config.steps
+
+    @property
+    def owes_validation(self) -> bool:
+        """Whether the run was stopped between its latest step and the validation that follows it."""
+        return self.step > 0 and self.due and self.validated < self.step
 
     def train_step(self) -> Mapping[str, Tensor]:
         """Computes one optimiser step; the batch and all noise depend on (seed, step) alone.
@@ -341,6 +347,7 @@ class Trainer:
     def validate(self) -> tuple[Accuracy, tuple[float, ...]]:
         """Returns accuracy on held-out episodes, and the spread of the single forecast per step and axis [m]."""
         self.model.eval()
+        self.validated = self.step
         samples = self.num_modes if self.num_modes > 1 else VALIDATION_DRAWS
         outcomes = [o for w, i in self._val_indices() for o in run_windows(
             self.model, w, i, self.config.horizon_steps, samples, device=str(self.device))]  # fmt: skip
@@ -354,6 +361,7 @@ class Trainer:
             "step": self.step,
             "best": self.best,
             "stale": self.stale,
+            "validated": self.validated,
         }
         with new_file(path) as partial:
             torch.save(state, partial)
@@ -370,6 +378,7 @@ class Trainer:
             state["optimizer"]["param_groups"] = [ours | {"params": theirs["params"]} for ours, theirs in groups]
             self.optimizer.load_state_dict(state["optimizer"])
             self.step, self.best, self.stale = state["step"], state["best"], state["stale"]
+            self.validated = state["validated"]
             self._finite_until = self.step
         except UserError:
             raise
@@ -380,6 +389,7 @@ class Trainer:
     def share_progress(self) -> None:
         """Tells the processes that follow what the validation of process 0 brought."""
         self.best, self.stale = self.group.from_leader(lambda: (self.best, self.stale))
+        self.validated = self.step
 
     def close(self) -> None:
         """Stops the preparation of batches."""

@@ -13,7 +13,7 @@ from stable_baselines3 import PPO
 from agents.arena import MultiagentArena
 from agents.policy import CountedEpisodes, TrainedPolicy, is_recurrent, load_policy, task_of_policy
 from agents.runs import save_model
-from agents.task import Task
+from agents.task import Observe, Task
 from envs.parallel import ForecastParallelEnv
 from envs.wrappers import ForecastObservation
 from predictor.support.errors import UserError
@@ -95,10 +95,11 @@ def test_an_environment_can_be_given(tmp_path: Path):
         load_policy(path, gym.make("CartPole-v1"))
 
 
-def test_the_sizes_of_another_checkpoint_stand_in_the_run_folder(tmp_path: Path):
+@pytest.mark.parametrize("observe", ["zeros", "forecast"])
+def test_the_sizes_of_another_checkpoint_stand_in_the_run_folder(tmp_path: Path, observe: Observe):
     """A zip alone plays in its environment, but does not say which checkpoint its sizes are from."""
-    large = save_tiny(tmp_path / "large", HIGHWAY_SPEC, num_edge_types=4)
-    path, _ = saved(tmp_path, Task(FAST, "zeros", sizes_of=large))
+    large = save_tiny(tmp_path / "large", HIGHWAY_SPEC, num_edge_types=4, edge_feature_dim=8)
+    path, _ = saved(tmp_path, Task(FAST, observe, sizes_of=large))
     policy, env = load_policy(path)
     observation, _ = env.reset(seed=0)
     assert observation["edge_probs"].shape[-1] == 2 * 3

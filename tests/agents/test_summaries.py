@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import pytest
 
+from agents.results import Evaluation
 from agents.summaries import mean_and_standard_error, summarize, wilson_interval
 from agents.vec_envs import EpisodeResult
 from envs.rollouts.driving_measures import DrivingMeasures
@@ -80,3 +81,19 @@ def test_measures_of_driving_are_means_over_the_episodes_that_have_them():
     assert driving["low_time_to_contact_s"] == pytest.approx((2.0, 0.5))
     assert driving["hard_brake_share"][0] == 0.5 and math.isnan(driving["hard_brake_share"][1])
     assert all(math.isnan(value) for value in driving["jerk_rms_mps3"])
+
+
+def test_a_policy_without_a_crash_has_none_where_only_crashes_are_reported():
+    crash, silent = replace(EPISODES[0], crashed=True), replace(EPISODES[1], crashed=None)
+    evaluation = Evaluation("toy-v0", 10, {"bold": [crash, silent], "careful": [silent, silent]})
+    assert [line.crash_rate for line in evaluation.summaries] == [0.5, 0.0]
+    assert Evaluation("toy-v0", 10, {"careful": [silent]}).summaries[0].crash_rate is None
+    safe = replace(EPISODES[0], crashed=False)
+    told = Evaluation("toy-v0", 10, {"bold": [crash, safe], "unknown": [silent]})
+    assert [line.crash_rate for line in told.summaries] == [0.5, None]
+
+
+def test_an_episode_without_a_speed_leaves_the_others():
+    fast, unknown = replace(EPISODES[0], mean_speed_mps=20.0), replace(EPISODES[1], mean_speed_mps=math.nan)
+    assert summarize("ppo", [fast, unknown]).mean_speed_mps == 20.0
+    assert math.isnan(summarize("ppo", [unknown]).mean_speed_mps)

@@ -1,6 +1,7 @@
 """Tuning in-process and tiny: once on zeros, for the rest on a toy, which has nothing to forecast."""
 
 import json
+import math
 import os
 import sys
 import tomllib
@@ -10,6 +11,8 @@ from typing import Any
 
 import optuna
 import pytest
+import torch
+from stable_baselines3 import PPO
 
 from agents import tune as command
 from agents.preset_settings import settings_from_file
@@ -185,6 +188,21 @@ def test_trials_whose_networks_diverge_count_as_worst(
     message = "another error"
     with pytest.raises(ValueError, match="another error"):
         tune(config(tmp_path / "other"))
+
+
+@pytest.mark.usefixtures("toy")
+def test_a_training_that_ends_with_weights_that_are_no_numbers_is_a_trial_that_diverged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def diverge(model: PPO, *_: Any, **__: Any) -> None:
+        with torch.no_grad():
+            next(iter(model.policy.parameters())).fill_(math.nan)
+        raise ValueError("Expected parameter logits ...")
+
+    monkeypatch.setattr(PPO, "learn", diverge)
+    with pytest.raises(UserError, match="the networks of all 2 trials diverged"):
+        tune(config(tmp_path / "tuned"))
+    assert "trial 1 of 2: diverged, " in (told := capsys.readouterr().out) and "trial 2 of 2: diverged, " in told
 
 
 @pytest.mark.usefixtures("toy")

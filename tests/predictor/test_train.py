@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -246,6 +247,30 @@ def test_interrupted_run_ends_like_one_that_was_not(
         assert ours[0] == expected[0] and torch.equal(ours[1], expected[1])
 
 
+@pytest.mark.parametrize("step", [3, 4, 7], ids=["between_validations", "before_a_validation", "before_the_last"])
+def test_a_run_that_a_signal_stops_ends_like_one_that_was_not(
+    tiny: None, circles: Path, uninterrupted: Path, tmp_path: Path, step: int
+):
+    """The signal comes during a step, after which a validation may be due."""
+    settings, train_step = config(circles, tmp_path / "run", **SCHEDULES), Trainer.train_step
+
+    def signalled(trainer: Trainer) -> Mapping[str, torch.Tensor]:
+        terms = train_step(trainer)
+        if trainer.step == step:
+            signal.raise_signal(signal.SIGINT)
+        return terms
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Trainer, "train_step", signalled)
+        with pytest.raises(KeyboardInterrupt):
+            train(settings)
+    assert state(tmp_path / "run")["step"] == step
+    train(replace(settings, resume=True))
+    assert_same_state(state(tmp_path / "run"), state(uninterrupted))
+    curves = [json.loads((folder / "curve.json").read_text()) for folder in (tmp_path / "run", uninterrupted)]
+    assert curves[0] == curves[1]
+
+
 def checkpoint_of(out: Path) -> dict[str, torch.Tensor]:
     return load_checkpoint(out / "checkpoint")[0].state_dict()
 
@@ -276,7 +301,8 @@ def test_what_a_killed_save_left_is_deleted(tiny: None, circles: Path, tmp_path:
 def test_finished_run_is_left_as_it_is(tiny: None, circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     settings = config(circles, tmp_path / "run")
     train(settings)
-    files = [*(tmp_path / "run" / "checkpoint").iterdir(), tmp_path / "run" / "train_state.pt"]
+    files = [p for p in (tmp_path / "run").rglob("*") if p.is_file() and p.parent.name != "tb"]
+    assert tmp_path / "run" / "config.json" in files
     before = {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in files}
     monkeypatch.setattr(Trainer, "train_step", interrupt)
     train(replace(settings, resume=True))
@@ -548,6 +574,18 @@ def test_resuming_with_another_store_at_the_same_place_is_refused(circles: Path,
     write_store(circles, StoreInfo(spec(), "circles", {"seeds": [7]}), [circling_episode(7)] * 6, overwrite=True)
     with pytest.raises(UserError, match="cannot resume: .*circles is another store than the run began with; choose"):
         train(config(circles, tmp_path / "run", resume=True))
+
+
+def test_a_run_goes_on_wherever_it_and_its_data_are(tiny: None, circles: Path, tmp_path: Path):
+    shutil.copytree(circles, tmp_path / "before")
+    train(config(tmp_path / "before", tmp_path / "run", steps=2))
+    (tmp_path / "run").rename(tmp_path / "elsewhere")
+    (tmp_path / "before").rename(tmp_path / "after")
+    train(config(tmp_path / "after", tmp_path / "elsewhere", steps=4, resume=True))
+    assert state(tmp_path / "elsewhere")["step"] == 4
+    write_store(tmp_path / "other", StoreInfo(spec(), "circles"), [circling_episode(3)] * 6)
+    with pytest.raises(UserError, match="cannot resume: data was .*after.* and is now .*other"):
+        train(config(tmp_path / "other", tmp_path / "elsewhere", steps=4, resume=True))
 
 
 def test_the_options_that_a_message_names_continue_a_run_whose_defaults_have_changed(

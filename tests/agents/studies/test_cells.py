@@ -60,6 +60,12 @@ def test_only_what_concerns_a_cell_is_in_its_name(cells: Callable[..., list[Cell
     assert tag.content["preset"]["target_kl"] == 0.01
 
 
+def test_a_driver_that_is_listed_twice_is_one_cell(cells: Callable[..., list[Cell]]):
+    for env_id in (HIGHWAY, "simple_tag_v3"):
+        found = cells(env_id=env_id, seeds="1", arms='["none"]', references='["random", "random"]')
+        assert len([cell for cell in found if cell.plan is None]) == 1, env_id
+
+
 def test_opponents_do_not_learn_unless_the_study_says_so(tmp_path: Path):
     def cell(options: str) -> Cell:
         text = f'arms = ["none"]\nseeds = 1\nreferences = []\n[scenarios.tag]\nenv_id = "simple_tag_v3"\n{options}'

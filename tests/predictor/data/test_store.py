@@ -1,7 +1,9 @@
+import hashlib
+import json
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +18,13 @@ from predictor.data.store import (
     PERTURBATIONS,
     Episode,
     StoreInfo,
+    content_id,
     read_info_of,
     read_store,
     with_causal_edges,
     write_store,
 )
+from predictor.data.store_files import METADATA, digest_of
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 from tests.predictor.helpers import ROAD, circling_episode, random_presence, random_states, scene, spec
@@ -489,3 +493,30 @@ def test_labels_and_marks_of_another_kind_are_not_written(changes: dict[str, Any
     with pytest.raises(UserError, match=message):
         write_store(tmp_path / "store", INFO, [replace(episode(1), **changes)])
     assert not (tmp_path / "store").exists()
+
+
+def test_the_hash_of_a_store_is_that_of_what_it_holds(tmp_path: Path):
+    """Simulators note their seed in the command alone, which does not count."""
+    info = StoreInfo(spec(), "circles", {"command": "one", "time": "now"})
+    write_store(tmp_path / "a", info, [circling_episode(7), circling_episode(9)])
+    write_store(tmp_path / "b", replace(info, provenance={"command": "two"}), read_store(tmp_path / "a").episodes)
+    assert content_id(tmp_path / "a") == content_id(tmp_path / "b")
+    moved = circling_episode(7)
+    moved.states[3, 0, 0] += 1e-3
+    absent = circling_episode(7)
+    absent.valid[-1, 0] = False
+    for number, first in enumerate((moved, absent, replace(circling_episode(7), seed=5))):
+        write_store(tmp_path / str(number), info, [first, circling_episode(9)])
+        assert content_id(tmp_path / str(number)) != content_id(tmp_path / "a"), number
+
+
+def test_a_store_of_before_the_hash_keeps_its_own(tmp_path: Path):
+    write_store(tmp_path / "a", StoreInfo(spec(), "circles"), [circling_episode(7)])
+    file = tmp_path / "a" / METADATA
+    content = json.loads(file.read_text())
+    del content["attributes"]["content_sha256"]
+    content["attributes"]["sha256"] = digest_of(content["attributes"])
+    now = content_id(tmp_path / "a")
+    file.write_text(json.dumps(content))
+    parts = [asdict(spec()), "circles", {}, 10]
+    assert content_id(tmp_path / "a") == hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest() != now
