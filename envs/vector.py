@@ -127,7 +127,7 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         envs = np.arange(self.num_envs) if chosen is None else np.flatnonzero(chosen)
         self.stream.reset(envs)
         if seed is not None:
-            seeds = seed if isinstance(seed, list) else [seed + env for env in range(self.num_envs)]
+            seeds = [seed + env for env in range(self.num_envs)] if isinstance(seed, int | np.integer) else list(seed)
             self.stream.seed([own if env in envs else None for env, own in enumerate(seeds)])
         self._ended[envs] = False
         # A partial reset repeats the others' observations, which were taken in already and must not count twice.

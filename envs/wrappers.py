@@ -76,6 +76,7 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         self._plan_model: PlanModel | None = None
         self._plan_steps = 0
         self._played: int | None = 0
+        self._over = False
         self.observation_space = gym.spaces.Dict({**own, **scene_spaces(self.reader.spec)})
 
     @property
@@ -119,11 +120,13 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         """Resets the env; identities start anew."""
         obs, info = self.env.reset(seed=seed, options=options)
         self.reader.reset()
+        self._over = False
         return self._observe(obs), self._with_plans(info)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Steps the env and reads the scene."""
         obs, reward, terminated, truncated, info = self.env.step(action)
+        self._over = bool(terminated or truncated)
         # some highway-env ids return NumPy's bool, which SB3 refuses
         return self._observe(obs), reward, bool(terminated), bool(truncated), self._with_plans(info)
 
@@ -145,7 +148,7 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         """
         spec = self.reader.spec
         plans = checked_plans(plan_model, self, horizon_steps, spec.num_features, self.scene, spec)
-        return plans if played == 0 else with_true_futures(plans, self.env, self.reader, self.scene, played)
+        return plans if played == 0 else with_true_futures(plans, self.env, self.reader, self.scene, played, self._over)
 
     def _observe(self, obs: Any) -> dict[str, Any]:
         show(self.reader, obs)

@@ -6,6 +6,9 @@ action; in a PettingZoo environment the observations of all agents and an action
 module is imported, so such a name is code.
 """
 
+import contextlib
+import copy
+from types import CellType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -48,3 +51,26 @@ class OwnDriver:
                     f"{type(self._act).__name__}"
                 )
         return self._act(observation)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "OwnDriver":
+        """Returns a driver with a state of its own, for a copy of the running environment."""
+        copied = object.__new__(OwnDriver)
+        memo[id(self)] = copied
+        vars(copied).update({name: _copied(value, memo) for name, value in vars(self).items()})
+        return copied
+
+
+def _copied(value: Any, memo: dict[int, Any]) -> Any:
+    """Returns a deep copy; that of a function has copies of what it closes over, which `copy.deepcopy` shares."""
+    if not isinstance(value, FunctionType) or value.__closure__ is None:
+        return value if isinstance(value, ModuleType) else copy.deepcopy(value, memo)
+    if id(value) in memo:
+        return memo[id(value)]
+    cells = tuple(CellType() for _ in value.__closure__)
+    made = FunctionType(value.__code__, value.__globals__, value.__name__, value.__defaults__, cells)
+    made.__kwdefaults__ = value.__kwdefaults__
+    memo[id(value)] = made
+    for cell, own in zip(cells, value.__closure__, strict=True):
+        with contextlib.suppress(ValueError):  # a variable without a value yet
+            cell.cell_contents = _copied(own.cell_contents, memo)
+    return made

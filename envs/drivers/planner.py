@@ -25,7 +25,7 @@ from envs.plans.playing import as_forecast, with_true_futures
 from envs.readers import reader_for
 from envs.readers.base import SceneReader, show
 from envs.registry import checkpoint_for, entry_for
-from envs.wrappers import scene_source
+from envs.wrappers import SceneObservation, scene_source
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster
 from predictor.forecaster import Forecaster, has_scale
 from predictor.online import OnlineForecaster
@@ -172,7 +172,8 @@ class Planner:
             raise UserError(f"the planner needs rewards, but plan model {type(self.plan_model).__name__} gives none")
         forecast = self._online.forecast(self._horizon, self._samples, self._noise, plans.states[None])
         if self.config.true_futures:
-            true = with_true_futures(plans, self.env, self._reader, scene).true_xy
+            env = self.env if self._own_reader else _below_scenes(self.env)
+            true = with_true_futures(plans, env, self._reader, scene).true_xy
             assert true is not None
             forecast = as_forecast(true[None], scenes, forecast)
         length_m, width_m = (size + plans.margin_m for size in plans.size_m)  # half of it around each agent
@@ -187,6 +188,13 @@ class Planner:
             return self._reader.read(self.env)
         scene: Scene = self.env.get_wrapper_attr("scene")
         return scene
+
+
+def _below_scenes(env: gym.Env) -> gym.Env:
+    """Returns the environment whose steps and observations a `SceneObservation` shows to its reader."""
+    while isinstance(env, gym.Wrapper) and not isinstance(env, SceneObservation):
+        env = env.env
+    return env.env if isinstance(env, SceneObservation) else env
 
 
 def expected_rewards(plans: Plans, survival: Float[np.ndarray, "plans horizon"]) -> Float[np.ndarray, " plans"]:

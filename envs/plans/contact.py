@@ -60,7 +60,8 @@ def contacts(
     Args:
         forecast: forecast with an axis of plans, agents as in `scenes`.
         scenes: observed scenes, which give where and how agents move now.
-        size_m: length and width of every agent [m], of all scenes or of each.
+        size_m: length and width of every agent [m], of all scenes or of each. Which way another agent faces is known
+            from its motion alone: one that stands still, and is forecast to, is taken to face along x.
     """
     xy = forecast.xy.cpu().numpy().astype(np.float64)
     batch, plans, samples, agents, horizon = xy.shape[:5]

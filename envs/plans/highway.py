@@ -128,6 +128,7 @@ class _Alone:
     def __init__(self, env: Any) -> None:
         ego, road = env.vehicle, env.road
         self.road = copy.copy(road)
+        vars(self.road).pop("act", None)  # interventions in force, which would act on the road itself
         self.road.vehicles, self.road.record_history = [], False
         self.road.np_random = copy.deepcopy(road.np_random)
         kept = (road.network, ego.lane)

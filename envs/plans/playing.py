@@ -19,7 +19,7 @@ from jaxtyping import Float
 from envs.plans.base import Plans
 from envs.readers.base import SceneReader, show
 from envs.readers.highway import HighwayReader
-from envs.simulators.copies import running_copy
+from envs.simulators.copies import RunningCopy, running_copy
 from predictor.scene import Forecast, Scene, SceneBatch
 from predictor.support.errors import UserError
 
@@ -27,8 +27,12 @@ _DRAWN = (LidarObservation, OccupancyGridObservation)
 """Observations that cost more than a step of traffic; they draw no random numbers and change nothing."""
 
 
+class _Copyable(RunningCopy, gym.Wrapper[Any, Any, Any, Any]):
+    """Wrapper whose copies go on exactly."""
+
+
 def with_true_futures(
-    plans: Plans, env: gym.Env, reader: SceneReader, scene: Scene, played: int | None = None
+    plans: Plans, env: gym.Env, reader: SceneReader, scene: Scene, played: int | None = None, over: bool = False
 ) -> Plans:
     """Returns the plans with the positions of all agents of the scene when they are played.
 
@@ -41,6 +45,7 @@ def with_true_futures(
         reader: its reader, which is not changed.
         scene: scene that the reader has just read.
         played: number of plans that are played, the first ones; None plays all.
+        over: whether the episode is over.
 
     Raises:
         UserError: the plans lack later actions, or the environment cannot be copied.
@@ -48,7 +53,7 @@ def with_true_futures(
     if plans.later_actions is None:
         raise UserError("true futures need plans with later_actions, the actions of every step after the first")
     actions = [(first, *later) for first, later in zip(plans.actions, plans.later_actions, strict=True)][:played]
-    return replace(plans, true_xy=np.stack([_played(env, reader, scene, each) for each in actions]))
+    return replace(plans, true_xy=np.stack([_played(env, reader, scene, each, over) for each in actions]))
 
 
 def as_forecast(
@@ -89,23 +94,24 @@ def followed(scene: Scene, dt_s: float, moments: Iterable[Scene | None]) -> Floa
 
 
 def _played(
-    env: gym.Env, reader: SceneReader, scene: Scene, actions: tuple[Any, ...]
+    env: gym.Env, reader: SceneReader, scene: Scene, actions: tuple[Any, ...], over: bool
 ) -> Float[np.ndarray, "agents horizon 2"]:
     """Returns where each agent of the scene goes while the ego takes these actions."""
-    env, reader = running_copy((env, reader), env.unwrapped)
+    copied, reader = running_copy((_Copyable(env), reader), env.unwrapped)
+    env = copied.env
     goes_on = isinstance(env.unwrapped, AbstractEnv)  # highway-env simulates on after the end of an episode
     if goes_on and isinstance(reader, HighwayReader):  # which reads no observations
         _leave_undrawn(env.unwrapped)
 
     def moments() -> Iterator[Scene | None]:
-        over = False
+        ended = over and not goes_on
         for action in actions:
-            if over:
+            if ended:
                 yield None
                 continue
             observation, _, terminated, truncated, _ = env.step(action)
             show(reader, observation)
-            over = bool(terminated or truncated) and not goes_on
+            ended = bool(terminated or truncated) and not goes_on
             yield reader.read_all(env)
 
     return followed(scene, reader.spec.dt_s, moments())

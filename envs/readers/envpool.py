@@ -112,6 +112,7 @@ class PoolIdentity:
             passed_s: time since each environment's last update [s]; 0 repeats it.
         """
         if not place.shape[1]:
+            self._known[envs] = False
             return np.zeros(valid.shape, dtype=np.int64)
         self._make_room(place.shape[1])
         cost = self._costs(place, motion, valid, envs, passed_s)

@@ -162,7 +162,7 @@ def _perturbed(
 
 def _drawn(sender: int, kind: Kind, horizon: int, mix: BranchMix, rng: np.random.Generator) -> Intervention:
     if kind == "remove":
-        return Intervention(sender, kind, horizon)
+        return Intervention(sender, kind, horizon + 1)  # mpe2's last step would show it again
     change_mps = rng.uniform(*(mix.brake_mps if kind == "brake" else mix.accelerate_mps))
     steps = 0 if rng.random() < FREE else int(rng.integers(1, horizon + 1))
     return Intervention(sender, kind, steps, change_mps, at_once=True)

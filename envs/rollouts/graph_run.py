@@ -102,14 +102,14 @@ def scores_of(episodes: Sequence[Sequence[EdgeScene]], threshold_m: float) -> di
     scenes = [(number, step, scene) for number, found in enumerate(episodes) for step, scene in enumerate(found)]
     if not sum(len(scene.shift_m) for *_, scene in scenes):
         return {MAJORITY: CausalScores(0, 0, 0.0, None)}
-    ids = 1 + max(int(scene.receiver.max(initial=0)) for *_, scene in scenes)
+    ids = np.unique(np.concatenate([scene.receiver for *_, scene in scenes]))  # of names, numbers of 62 bits
     pairs = CausalPairs.concatenate(
         [
             CausalPairs(
                 scene.shift_m,
                 scene.shift_m > threshold_m,
                 np.full(len(scene.shift_m), number),
-                step * ids + scene.receiver,
+                step * len(ids) + np.searchsorted(ids, scene.receiver),
                 scene.leads,
             )
             for number, step, scene in scenes

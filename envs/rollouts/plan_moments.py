@@ -186,7 +186,7 @@ def _error_m(
 
 
 def _risk(planned: Forecast, scene: Scene, plans: Plans) -> Float[np.ndarray, " plans"]:
-    """Computes the probability of a collision of each plan, as the planner does; the first entry is no plan's."""
+    """Computes the risk of each plan, as the planner does but without its margin; the first entry is no plan's."""
     survival = contacts(planned, SceneBatch.stack([scene]), plans.size_m).survival()[0, 1:, -1]
     if plans.crashed is not None:
         survival = survival * ~plans.crashed[:, -1]

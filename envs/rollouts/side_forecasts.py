@@ -122,9 +122,9 @@ def fitting_checkpoints(
 @functools.lru_cache(maxsize=4)
 def kept_world(env_id: str, driver: str, checkpoints: tuple[str, ...], env_kwargs: str = "") -> World:
     """Returns a world whose ego perceives what the first learned checkpoint was trained on, kept in a process."""
-    if sees_forecasts(driver):
-        return open_world(env_id, driver, checkpoints[0], env_kwargs=env_kwargs)
     first = next((name for name in checkpoints if name != CONSTANT_VELOCITY), None)
+    if sees_forecasts(driver):
+        return open_world(env_id, driver, first or CONSTANT_VELOCITY, env_kwargs=env_kwargs)
     if first is None or not is_own(first):
         perceived_as = None if first is None else load_checkpoint(first)[1].spec
         return open_world(env_id, driver, perceived_as=perceived_as, env_kwargs=env_kwargs)

@@ -171,7 +171,7 @@ class EgoWorld:
 
     def reread(self) -> tuple[Scene, Scene]:
         """Reads anew what the ego perceives and all agents."""
-        return self._reader.read(self.env), self._reader.read_all(self.env)
+        return self._reader.read(self.env), _unpadded(self._reader.read_all(self.env))
 
     def perceived(self) -> Scene:
         """Returns the ego's perceived scene."""
@@ -179,10 +179,9 @@ class EgoWorld:
         return scene
 
     def full_scene(self) -> Scene:
-        """Returns all agents, ego first, in arrays of its own: a reader may give the simulator's."""
+        """Returns all agents that are there, ego first, in arrays of its own: a reader may give the simulator's."""
         with named(self._id, self._place):
-            scene = self._reader.read_all(self.env)
-        return replace(scene, states=scene.states.copy(), ids=scene.ids.copy(), valid=scene.valid.copy())
+            return _unpadded(self._reader.read_all(self.env))
 
     def forecast(self, num_samples: int) -> Forecast:
         """Returns the forecast of the perceived scene, from the wrapper's own stream."""
@@ -369,7 +368,9 @@ def _parallel_env_for_driver(env: Any, driver: str) -> Any:
 
 
 def _unpadded(scene: Scene) -> Scene:
-    return Scene(scene.states[scene.valid], scene.ids[scene.valid], scene.valid[scene.valid])
+    """Returns the agents that are there, in arrays of their own."""
+    there = scene.valid
+    return replace(scene, states=scene.states[there], ids=scene.ids[there], valid=there[there])
 
 
 def default_drivers(env_id: str, env_kwargs: str = "") -> tuple[str, ...]:

@@ -37,6 +37,26 @@ def flock(env: Any, rng: np.random.Generator) -> Callable[[Any], dict[str, int]]
     return lambda observations: {agent: push for agent in env.agents if agent in observations}
 
 
+def wavers(env: gym.Env, rng: np.random.Generator) -> Callable[[Any], int]:
+    """An ego whose function closes over its generator, a counter, itself and a module."""
+    import operator
+
+    steps = 0
+
+    def act(observation: Any) -> int:
+        nonlocal steps
+        steps += 1
+        assert callable(act) and operator.ge(steps, 1)
+        return int(rng.integers(5)) if steps % 2 else 1
+
+    return act
+
+
+def shoves(env: Any, rng: np.random.Generator) -> Callable[[Any], dict[str, int]]:
+    """All agents of mpe2 push anywhere, drawn in each step; its function closes over the environment, too."""
+    return lambda observations: {agent: int(rng.integers(5)) for agent in env.agents if agent in observations}
+
+
 def a_number(env: Any, rng: np.random.Generator) -> int:
     """No driver."""
     return 3

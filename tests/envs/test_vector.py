@@ -464,6 +464,14 @@ def test_a_reset_seeds_the_noise_of_the_environments_it_resets(highway_checkpoin
     assert_same(one_of(found, 1), alone.step(int(ACTIONS[0, 1]))[0])
 
 
+def test_seeds_may_come_in_any_sequence():
+    """As Gymnasium's own vector environments take them."""
+    env = VectorForecast(SyncVectorEnv(MAKERS), "constant-velocity")
+    seeds = [3, 4, 5, 6, 7, 8][: env.num_envs]
+    listed = env.reset(seed=seeds)[0]
+    assert_same(env.reset(seed=tuple(seeds))[0], listed)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("maker", ["sb3", "gymnasium"])
 def test_samples_of_an_env_are_those_of_its_environment_alone(maker: str, highway_checkpoint: str):
     """Also over the ends of episodes, where the stream forecasts an environment twice in one batch."""

@@ -4,6 +4,9 @@ import numpy as np
 
 from envs import make_env
 from envs.drivers.planner import planner_driver
+from envs.readers import EntityRowsReader
+from envs.wrappers import SceneObservation
+from predictor.scene import SceneSpec
 
 
 def test_it_knows_who_will_brake():
@@ -23,3 +26,16 @@ def test_it_knows_who_will_brake():
     env.close()
     assert risks["planner:oracle"] == 1.0
     assert risks["planner"] < 0.9
+
+
+def test_over_a_wrapper_it_shows_the_copys_own_observations_to_the_reader():
+    columns = ("presence", "x", "y", "vx", "vy")
+    table = {"type": "Kinematics", "features": [*columns], "absolute": True, "normalize": False, "see_behind": True}
+    made = make_env("highway-fast-v0", config={"observation": table})
+    env = SceneObservation(made, reader=EntityRowsReader(columns, SceneSpec(dt_s=1.0)))
+    observation, _ = env.reset(seed=0)
+    planner = planner_driver("planner:oracle", env, np.random.default_rng(0))
+    for _ in range(2):
+        observation, *_ = env.step(planner(observation))
+    assert planner.survival.shape == (5, 5) and set(np.unique(planner.survival)) <= {0.0, 1.0}
+    env.close()

@@ -13,6 +13,8 @@ from envs.plans import base as plans_base
 from envs.plans import highway as plans_highway
 from envs.readers.highway import HighwayReader
 from envs.registry import make_env
+from envs.simulators.highway_interventions import intervene_on_road, log_road
+from envs.simulators.intervention import Intervention
 from predictor.support.errors import UserError
 
 HORIZON = 4
@@ -131,6 +133,22 @@ def test_the_other_vehicles_change_no_plan():
     base.road.vehicles = [base.vehicle]
     after = plan_model_for(env).plans(env, HORIZON)
     np.testing.assert_array_equal(before.states, after.states)
+
+
+def test_plans_are_the_same_while_an_intervention_is_in_force_and_use_up_nothing_of_it():
+    """It is called in place of `Road.act`, by whichever road has it."""
+    env = make_env("highway-fast-v0")
+    env.reset(seed=2)
+    before = plan_model_for(env).plans(env, HORIZON)
+    base: Any = env.unwrapped
+    log = log_road(base)
+    intervene_on_road(base, base.road.vehicles[1], Intervention(1, "brake", 2, change_mps=5.0))
+    frames = [one.frames for one in base.road.act.running]
+    after = plan_model_for(env).plans(env, HORIZON)
+    np.testing.assert_array_equal(before.states, after.states)
+    np.testing.assert_array_equal(before.rewards, after.rewards)
+    assert [one.frames for one in base.road.act.running] == frames != []
+    assert len(log.frames) == 0
 
 
 def test_a_collision_is_worth_what_the_environment_says():

@@ -5,15 +5,17 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.utils import EzPickle
 from highway_env.envs.common.observation import LidarObservation, OccupancyGridObservation
 
 from envs import ForecastObservation, make_env
 from envs.arms import Arm
+from envs.plans import Plans
 from envs.plans.playing import with_true_futures
-from envs.readers import EntityRowsReader
+from envs.readers import EntityRowsReader, FunctionReader
 from envs.sb3.forecast import VecForecast
 from envs.wrappers import SceneObservation
-from predictor.scene import SceneSpec
+from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError
 
 
@@ -153,3 +155,57 @@ def test_readers_of_observations_see_what_then_happens():
     for place in seen:
         np.testing.assert_allclose(true[0, place, 0], now[int(scene.ids[place])], atol=1e-3)
     env.close()
+
+
+class Pair(gym.Env, EzPickle):
+    """Another agent walks ahead of the ego; copies and pickles as its constructor's arguments, as mpe2 does."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,))
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, steps: int = 3) -> None:
+        EzPickle.__init__(self, steps)
+        self._steps, self._left = steps, 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.states = np.array([[0.0, 0.0, 1.0, 0.0], [10.0, 0.0, 2.0, 0.0]])
+        self._left = self._steps
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if not self._left:
+            raise RuntimeError("the episode is over")
+        self._left -= 1
+        self.states[:, 0] += self.states[:, 2] * [1.0, 1.0 + (self._left == 1)]  # hurries in its last but one step
+        return np.zeros(1, np.float32), 0.0, not self._left, False, {}
+
+
+class TwoPlans:
+    """Plans of the pair's ego."""
+
+    names = ("keep", "stop")
+
+    def plans(self, env: gym.Env, horizon_steps: int) -> Plans:
+        states = np.zeros((2, horizon_steps, 4))
+        return Plans(states, (0, 1), later_actions=((0,) * (horizon_steps - 1),) * 2)
+
+
+def read_pair(env: gym.Env) -> Scene:
+    states = env.unwrapped.states  # type: ignore[attr-defined]
+    return Scene(states.copy(), np.arange(2), np.ones(2, bool))
+
+
+def test_a_simulator_that_copies_as_it_was_made_is_played_from_where_it_is():
+    env = SceneObservation(Pair(), reader=FunctionReader(read_pair, SceneSpec(dt_s=1.0, max_agents=2)))
+    env.reset(seed=0)
+    found = []
+    for _ in range(3):
+        found.append(env.make_plans(TwoPlans(), 2, None).true_xy[:, 1, :, 0].tolist())
+        env.step(0)
+    assert found == [[[12.0, 16.0]] * 2, [[16.0, 18.0]] * 2, [[18.0, 20.0]] * 2]
+    assert env.scene.states[1, 0] == 18.0
+    over = env.make_plans(TwoPlans(), 2, None)  # after the end nothing is played: on at the last velocity
+    assert over.true_xy[:, 1, :, 0].tolist() == [[20.0, 22.0]] * 2
+    env.reset(seed=0)
+    assert env.make_plans(TwoPlans(), 2, None).true_xy[0, 1, :, 0].tolist() == [12.0, 16.0]

@@ -247,6 +247,15 @@ def test_many_envs_at_once_are_as_one_by_one(seed: int, agents: int, gate_m: flo
             assert found[n].tolist() == single[i].update(place[n], motion[n], present[n]).tolist()
 
 
+def test_who_comes_after_nobody_was_there_is_new():
+    pool, single = PoolIdentity(1, GATE_M), IdentityTracker(DT_S, GATE_M)
+    here, still, there = np.array([[10.0, 0.0]]), np.zeros((1, 2)), np.ones(1, dtype=bool)
+    for place, motion, valid in ((here, still, there), (here[:0], still[:0], there[:0]), (here + 1, still, there)):
+        found = pool.update(place[None], motion[None], valid[None], np.arange(1), np.array([DT_S]))
+        assert found[0].tolist() == single.update(place, motion, valid).tolist()
+    assert found.tolist() == [[1]]
+
+
 def test_a_skipped_step_is_part_of_the_motion():
     pool, envs, order = started("HighwayFast-v0", 2), np.arange(2), np.r_[0, 20:0:-1]
     reader = PoolReader(envpool_spec("HighwayFast-v0", pool.config), 2)

@@ -87,6 +87,20 @@ def test_no_window_has_an_intervention_that_nobody_could_foresee():
     assert len(Windows(undisturbed, world.spec, 3, 2)) > len(windows)
 
 
+@pytest.mark.parametrize(("env_id", "settings"), [(ROAD, ON_ROAD), (TAG, IN_ARENA)])
+def test_who_is_taken_out_stays_away(env_id: str, settings: BranchRecording):
+    """To the last step: mpe2 puts an agent back within the step in which its absence ends."""
+    world = open_world(env_id, "varied")
+    removed = 0
+    for seed in range(12):
+        for episode in record_branches(world, seed, "varied", 12, settings):
+            step, column = moment_of(episode)
+            if PERTURBATIONS[episode.perturbed[step, column]] == "remove":
+                assert not episode.valid[step + 1 :, column].any()
+                removed += 1
+    assert removed >= 3
+
+
 def test_who_has_just_appeared_is_not_perturbed():
     """On the intersection vehicles appear all the time: one that was never seen could not be missed."""
     world = open_world(ROAD, "idle")

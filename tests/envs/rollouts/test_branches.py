@@ -16,7 +16,10 @@ WORLDS = [
     ("intersection-v2", "random"),
     ("roundabout-mixed-v0", "varied"),
     ("racetrack-v1", "keep-lane"),
+    ("highway-fast-v0", "planner:constant-velocity"),
+    ("highway-fast-v0", "own:tests.envs.own_code:wavers"),
     ("simple_tag_v3", "mixed"),
+    ("simple_tag_v3", "own:tests.envs.own_code:shoves"),
     ("simple_spread_v3", "heuristic"),
     ("intersection-multi-agent-v2", "varied"),
 ]

@@ -117,3 +117,12 @@ def test_labels_of_one_step_do_not_change_the_next():
     world.step(), untouched.step()
     labelled_scene(world, {}, ON_ROADS)
     assert_same_scenes(played(world, 4), played(untouched, 4))
+
+
+def test_a_policy_that_sees_forecasts_perceives_what_the_first_learned_checkpoint_does(monkeypatch: pytest.MonkeyPatch):
+    opened: list[str] = []
+    monkeypatch.setattr(side_forecasts, "sees_forecasts", lambda driver: True)
+    monkeypatch.setattr(side_forecasts, "open_world", lambda env_id, driver, seen, **_: opened.append(seen))
+    for checkpoints in (("constant-velocity", "mine"), ("mine", "yours"), ("constant-velocity",)):
+        side_forecasts.kept_world.__wrapped__("highway-fast-v0", "policy.zip", checkpoints)
+    assert opened == ["mine", "mine", "constant-velocity"]

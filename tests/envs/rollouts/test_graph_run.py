@@ -63,6 +63,13 @@ def test_receivers_of_different_steps_are_apart():
     assert scores_of([both] * 4, 1.0)["flat"].spread_between_senders == pytest.approx(0.0, abs=1e-9)
 
 
+def test_ids_of_names_are_told_apart():
+    """Whole numbers of 62 bits (`envs.readers.agent_ids`)."""
+    small = [[scene(3 * i + j) for j in range(3)] for i in range(6)]
+    large = [[replace(one, receiver=one.receiver + 2**62 - 4) for one in found] for found in small]
+    assert scores_of(large, 1.0) == scores_of(small, 1.0)
+
+
 def test_the_commoner_answer_may_be_an_edge():
     episodes = [[scene(i)] for i in range(4)]
     scores = scores_of(episodes, 0.05)

@@ -2,14 +2,16 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 
+from envs.readers import FunctionReader
 from envs.readers.highway_labels import LEADER
 from envs.rollouts.world import EgoWorld, MultiagentWorld, World, default_drivers, open_world
 from envs.wrappers import ForecastObservation, SceneObservation
-from predictor.scene import Scene
+from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError
 from tests.envs.evaluation import TAG, save_tag
 from tests.envs.helpers import HIGHWAY_SPEC, PLURAL, save_tiny
@@ -172,3 +174,35 @@ def test_all_agents_are_read_into_arrays_of_their_own(monkeypatch: pytest.Monkey
     held.states[:] = 0.0
     assert kept.states.any()
     world.close()
+
+
+def test_agents_that_a_reader_marks_as_absent_are_not_there():
+    """A reader with a fixed table may keep the place, and the id, of who has left."""
+
+    def read(env: gym.Env) -> Scene:
+        states = np.array([[0.0, 0.0, 1.0, 0.0], [20.0, 0.0, 1.0, 0.0]]) * [[1.0], [float(env.unwrapped.left > 2)]]  # type: ignore[attr-defined]
+        return Scene(states, np.array([0, 7]), np.array([True, env.unwrapped.left > 2]), 0.5)  # type: ignore[attr-defined]
+
+    world = EgoWorld(
+        SceneObservation(Leaving(), reader=FunctionReader(read, SceneSpec(dt_s=1.0, max_agents=2))), "idle"
+    )
+    full = [scene for _, scene in watched(world, 0, steps=2)]
+    assert [scene.ids.tolist() for scene in full] == [[0, 7], [0, 7], [0]]
+    assert all(scene.valid.all() and scene.heading_rad == 0.5 for scene in full)
+    assert world.reread()[1].ids.tolist() == [0]
+
+
+class Leaving(gym.Env):
+    """Counts its steps down from 4."""
+
+    observation_space = gym.spaces.Box(0, 1, (1,))
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.left = 4
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.left -= 1
+        return np.zeros(1, np.float32), 0.0, False, False, {}
