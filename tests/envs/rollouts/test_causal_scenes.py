@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from envs.rollouts import causal_scenes
+from envs.rollouts import causal_scenes, side_forecasts
 from envs.rollouts.causal_labels import IN_ARENAS, ON_ROADS, causal_labels
 from envs.rollouts.causal_scenes import EVERY, FIRST_STEP, GraphTask, labelled_scene, play_graph
 from envs.rollouts.side_forecasts import SideForecaster
