@@ -5,6 +5,7 @@ observation that closes an episode carries the forecast made from that episode's
 starts from one step. `envs.sb3.forecast` serves Stable-Baselines3, which this module does not import.
 """
 
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -119,11 +120,11 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         return self._scenes()
 
     def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Resets all environments, or those of `options["reset_mask"]`, and clears their histories."""
         chosen = (options or {}).get("reset_mask")  # inner wrappers may remove it from the options
-        observations, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+        observations, infos = self.env.reset(seed=seed, options=options)
         envs = np.arange(self.num_envs) if chosen is None else np.flatnonzero(chosen)
         self.stream.reset(envs)
         if seed is not None:

@@ -469,7 +469,7 @@ def test_seeds_may_come_in_any_sequence():
     env = VectorForecast(SyncVectorEnv(MAKERS), "constant-velocity")
     seeds = [3, 4, 5, 6, 7, 8][: env.num_envs]
     listed = env.reset(seed=seeds)[0]
-    assert_same(env.reset(seed=tuple(seeds))[0], listed)  # type: ignore[arg-type]
+    assert_same(env.reset(seed=tuple(seeds))[0], listed)
 
 
 @pytest.mark.parametrize("maker", ["sb3", "gymnasium"])

@@ -119,6 +119,7 @@ def test_labels_of_one_step_do_not_change_the_next():
     assert_same_scenes(played(world, 4), played(untouched, 4))
 
 
+@pytest.mark.unchecked
 def test_a_policy_that_sees_forecasts_perceives_what_the_first_learned_checkpoint_does(monkeypatch: pytest.MonkeyPatch):
     opened: list[str] = []
     monkeypatch.setattr(side_forecasts, "sees_forecasts", lambda driver: True)
