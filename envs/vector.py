@@ -124,7 +124,7 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
     ) -> tuple[Any, dict[str, Any]]:
         """Resets all environments, or those of `options["reset_mask"]`, and clears their histories."""
         chosen = (options or {}).get("reset_mask")  # inner wrappers may remove it from the options
-        observations, infos = self.env.reset(seed=seed, options=options)
+        observations, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         envs = np.arange(self.num_envs) if chosen is None else np.flatnonzero(chosen)
         self.stream.reset(envs)
         if seed is not None:
