@@ -1,6 +1,6 @@
 """Forecasters of a user's own, by name: "own:module:function", or "own:NAME" of an installed package's entry point.
 
-Every option that takes a checkpoint takes such a name, too. What it names is a forecaster, or a class or function that
+Wrappers and every option of `envs` and `agents` that takes a checkpoint take such a name, too. What it names is a forecaster, or a class or function that
 makes one of a `SceneSpec`. Its module is imported, so such a name is code: a run's config alone must not bring one.
 """
 

@@ -355,14 +355,8 @@ class Trainer:
 
     def save(self, path: Path) -> None:
         """Writes the training state so that a kill leaves the old or the new one."""
-        state = {
-            "model": self.model.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "step": self.step,
-            "best": self.best,
-            "stale": self.stale,
-            "validated": self.validated,
-        }
+        progress = {name: getattr(self, name) for name in ("step", "best", "stale", "validated")}
+        state = {"model": self.model.state_dict(), "optimizer": self.optimizer.state_dict()} | progress
         with new_file(path) as partial:
             torch.save(state, partial)
 
