@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -15,7 +16,7 @@ from agents.runs import CONFIG_FILE, CURVE_FILE, SUMMARY_FILE, read_config, read
 from agents.summaries import EXTREMES
 from predictor.reports.document import JPEG, Block, Film, Heading, Paragraph, Picture, Table
 from predictor.reports.figures import files_of, panels
-from predictor.reports.looks import COLORS, GREY
+from predictor.reports.looks import AS_TEXT, COLORS, GREY
 from predictor.reports.run_blocks import NOTHING, accuracy, origin, settings
 from predictor.support.errors import short
 from predictor.support.reading import MIB, check_regular, read_bytes, read_object
@@ -67,6 +68,7 @@ def references(evaluation: Evaluation) -> dict[str, float]:
     return {name: drivers[name] for name in dict.fromkeys((best, "random")) if name is not None and name in drivers}
 
 
+@rc_context(AS_TEXT)
 def drawn(points: Sequence[Mapping[str, Any]], lines: Mapping[str, float]) -> tuple[Figure, list[Axes]]:
     """Draws the return against the steps of training and, where they were measured, the errors of the forecasts.
 
@@ -100,7 +102,8 @@ def films(run: Path) -> list[Block]:
     Raises:
         UserError: one of them is no regular file.
     """
-    found = [file for folder in (run, run / "evaluation") for file in sorted(folder.glob("*.mp4"))]
+    folders = (run, run / "evaluation")
+    found = [file for folder in folders for file in sorted(folder.glob("*.mp4")) if not file.name.startswith(".")]
     blocks: list[Block] = []
     room = INSIDE_TOTAL_BYTES
     for file in found[:MOST_FILMS]:

@@ -33,7 +33,7 @@ from envs.rollouts.reaction_run import ReactionRun, measure_reactions
 from envs.rollouts.report import EnvAccuracy
 from envs.rollouts.summary import summarise_episodes
 from envs.rollouts.world import default_drivers, open_world
-from envs.supervision import TIMEOUT_S
+from envs.supervision import TIMEOUT_S, EnvironmentFailedError
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, names_of, require_known, resolve
 from predictor.data.store import read_info_of
 from predictor.own_forecasters import is_own
@@ -224,6 +224,8 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
         for checkpoint in config.checkpoint or (None,):
             try:
                 result, cases = evaluate_env(config, env_id, checkpoint)
+            except EnvironmentFailedError:
+                raise
             except UserError as error:
                 if len(config.checkpoint) < 2 or checkpoint is None:
                     raise

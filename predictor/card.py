@@ -62,11 +62,10 @@ def write_card(config: CardConfig) -> Path:
     opened = {path: read_store(path) for path in config.data}
     known = {path: store.info.source for path, store in opened.items()}
     others = [f"{path} has {source}" for path, source in known.items() if info.sources and source not in info.sources]
-    if others or not opened:
-        wanted = ", ".join(dict.fromkeys(info.sources))
-        raise UserError(
-            f"data are the stores that '{name}' was trained on ({wanted}), got {'; '.join(others) or 'none'}"
-        )
+    missing = set(info.sources) - set(known.values())
+    if others or missing or not opened:
+        wanted, given = ", ".join(dict.fromkeys(info.sources)), "; ".join(others or known.values())
+        raise UserError(f"data are the stores that '{name}' was trained on ({wanted}), got {given or 'none'}")
     stores = "\n".join(_store_line(path, store) for path, store in opened.items())
     training = _training(name, info)
     # only now that all inputs are read: a new record beside an old card would contradict it

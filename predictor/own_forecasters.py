@@ -1,7 +1,8 @@
 """Forecasters of a user's own, by name: "own:module:function", or "own:NAME" of an installed package's entry point.
 
-Wrappers and every option of `envs` and `agents` that takes a checkpoint take such a name, too. What it names is a forecaster, or a class or function that
-makes one of a `SceneSpec`. Its module is imported, so such a name is code: a run's config alone must not bring one.
+Wrappers and every option of `envs` and `agents` that takes a checkpoint take such a name, too. What it names is a
+forecaster, or a class or function that makes one of a `SceneSpec`. Its module is imported, so such a name is code: a
+run's config alone must not bring one.
 """
 
 import importlib
@@ -79,5 +80,5 @@ def _registered(name: str) -> Any:
         )
     try:
         return known[name].load()
-    except (ImportError, AttributeError) as error:
-        raise UserError(f"forecaster '{name}' cannot be imported from {known[name].value}: {error}") from error
+    except Exception as error:
+        raise UserError(f"forecaster '{name}' cannot be imported from {known[name].value}: {named(error)}") from error

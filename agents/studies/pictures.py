@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from scipy import stats
 
 from agents.studies.estimators import CONFIDENCE, Estimate, performance_profile, profile_band
 from agents.studies.findings import Findings, Line, generator_of
 from predictor.reports.figures import panels, svg_of
-from predictor.reports.looks import BLACK, BLUE, BROWN, COLORS, DASHES, GREY, ORANGE
+from predictor.reports.looks import AS_TEXT, BLACK, BLUE, BROWN, COLORS, DASHES, GREY, ORANGE
 
 _ARM_COLORS = {"forecast": BLUE, "constant-velocity": GREY, "oracle": BLACK, "zeros": ORANGE, "none": BROWN}
 _GREYS = (("#777777", "--"), ("#777777", ":"), ("#aaaaaa", "-."))
@@ -89,6 +90,7 @@ def plot_profile(
     return ax
 
 
+@rc_context(AS_TEXT)
 def learning_curves(findings: Findings) -> str:
     """Returns the picture of all learning curves, a panel per scenario, as SVG."""
     figure, axes = panels(len(findings.scenarios))
@@ -110,6 +112,7 @@ def learning_curves(findings: Findings) -> str:
     return svg_of(figure, axes)
 
 
+@rc_context(AS_TEXT)
 def profiles(findings: Findings) -> str:
     """Returns the picture of the performance profiles as SVG: a panel per scenario, one over all if there are several.
 

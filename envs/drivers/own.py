@@ -6,9 +6,9 @@ action; in a PettingZoo environment the observations of all agents and an action
 module is imported, so such a name is code.
 """
 
-import contextlib
 import copy
-from types import CellType, FunctionType, ModuleType
+from collections.abc import Iterator
+from types import CellType, FunctionType
 from typing import Any
 
 import numpy as np
@@ -61,16 +61,42 @@ class OwnDriver:
 
 
 def _copied(value: Any, memo: dict[int, Any]) -> Any:
-    """Returns a deep copy; that of a function has copies of what it closes over, which `copy.deepcopy` shares."""
+    """Returns a deep copy; that of a function has copies of what it closes over, which `copy.deepcopy` shares.
+
+    Functions inside of containers and partials are shared with all that they close over.
+    """
     if not isinstance(value, FunctionType) or value.__closure__ is None:
-        return value if isinstance(value, ModuleType) else copy.deepcopy(value, memo)
+        return copy.deepcopy(value, memo)
     if id(value) in memo:
         return memo[id(value)]
     cells = tuple(CellType() for _ in value.__closure__)
     made = FunctionType(value.__code__, value.__globals__, value.__name__, value.__defaults__, cells)
     made.__kwdefaults__ = value.__kwdefaults__
     memo[id(value)] = made
+    vars(made).update(copy.deepcopy(vars(value), memo))
     for cell, own in zip(cells, value.__closure__, strict=True):
-        with contextlib.suppress(ValueError):  # a variable without a value yet
-            cell.cell_contents = _copied(own.cell_contents, memo)
+        try:
+            content = own.cell_contents
+        except ValueError:
+            continue  # a variable without a value yet
+        cell.cell_contents = _copied_or_shared(content, memo)
     return made
+
+
+def _copied_or_shared(content: Any, memo: dict[int, Any]) -> Any:
+    """Returns a copy of what a function closes over; modules, locks, networks in training and such are shared.
+
+    Raises:
+        UserError: it has a place in a sequence, which a copy would move on.
+    """
+    try:
+        return _copied(content, memo)
+    except UserError:
+        raise
+    except Exception as error:
+        if isinstance(content, Iterator):
+            raise UserError(
+                f"a driver of your own that keeps a {type(content).__name__} cannot be copied with its environment; "
+                "keep numbers instead, or an object that can be copied"
+            ) from error
+        return content

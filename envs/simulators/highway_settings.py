@@ -12,6 +12,8 @@ from predictor.support.errors import UserError, short
 def check_settings(env: gym.Env, names: Iterable[str]) -> None:
     """Checks that an environment has settings of these names; any environment that is not highway-env's passes.
 
+    Names inside of "observation" and "action" are those of the chosen class, and are not checked.
+
     Args:
         env: environment, wrapped or not.
         names: names in the `config` that it was made with.

@@ -1,5 +1,6 @@
 """Shows pictures in a window, one after the other."""
 
+import os
 import time
 from collections.abc import Iterable
 from typing import Any
@@ -29,6 +30,8 @@ def play(pictures: Iterable[UInt8[np.ndarray, "height width 3"]], fps: int | flo
     shown = 0
     try:
         pygame.display.init()
+        if pygame.display.get_driver() == "offscreen" != os.environ.get("SDL_VIDEODRIVER"):
+            raise pygame.error("there is no screen")  # SDL draws into memory then, without a word
         for picture in pictures:
             began = time.monotonic()
             if not shown:

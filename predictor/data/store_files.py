@@ -97,7 +97,9 @@ class ArrayWriter:
 
     def write(self, name: str, data: np.ndarray, **options: Any) -> None:
         """Writes an array; `options` are Zarr's."""
-        self.content.update(f"{name} {data.dtype.str} {data.shape}".encode() + np.ascontiguousarray(data).tobytes())
+        self.content.update(f"{name} {data.dtype.str} {data.shape}".encode())
+        if data.size:
+            self.content.update(np.ascontiguousarray(data).data.cast("B"))
         self._group.create_array(
             name, data=data, compressors=COMPRESSORS, config={"write_empty_chunks": True}, **options
         )

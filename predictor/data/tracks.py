@@ -280,7 +280,8 @@ def files_beside(config: TracksConfig) -> list[Path]:
     """Returns the files of a source that stand beside its folders train, val and test, and go into no store."""
     if not any((config.source / name).is_dir() for name in FOLDERS):
         return []
-    return sorted(path for path in config.source.glob(config.pattern) if path.is_file())
+    found = [path for path in config.source.glob(config.pattern) if path.is_file()]
+    return sorted(path for path in found if path.relative_to(config.source).parts[0] not in FOLDERS)
 
 
 def load(parts: Sequence[Part]) -> list[tuple[list[Episode], DatasetNotes]]:

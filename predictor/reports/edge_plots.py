@@ -18,7 +18,7 @@ from matplotlib.ticker import MaxNLocator
 
 from predictor.evaluation.edge_findings import Reading
 from predictor.evaluation.graph_accuracy import GraphAccuracy
-from predictor.reports.looks import BLUE, ORANGE, STYLE, YELLOW
+from predictor.reports.looks import AS_TEXT, BLUE, ORANGE, STYLE, YELLOW
 from predictor.reports.plots import plot_scene
 from predictor.reports.tables import plain
 
@@ -248,6 +248,7 @@ def plot_matrix(
     return ax
 
 
+@rc_context(AS_TEXT)
 def features_figure(
     window: WindowShown, static_dim: int, dt_s: float, attribute_names: Sequence[str], where: str
 ) -> Figure:

@@ -13,7 +13,7 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from predictor.reports.looks import STYLE
+from predictor.reports.looks import AS_TEXT, STYLE
 
 _WIDTH_IN, _HEIGHT_IN, _DPI = 5.4, 4.0, 130
 
@@ -49,6 +49,7 @@ def files_of(figure: Figure, axes: Sequence[Axes]) -> tuple[str, bytes]:
     return re.sub(r"^.*?(?=<svg)", "", written.getvalue(), flags=re.DOTALL).strip(), pixels.getvalue()
 
 
+@matplotlib.rc_context(AS_TEXT)
 def _finish(figure: Figure, axes: Sequence[Axes]) -> None:
     """Draws one legend below the panels, in as many columns as fit the width."""
     entries: dict[str, Any] = {}

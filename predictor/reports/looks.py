@@ -14,7 +14,9 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#00
 BLUE, ORANGE, GREEN, PINK, YELLOW, SKY, BLACK, GREY, BROWN, PURPLE = COLORS
 DASHES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (6, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5, 1, 1.5)), (0, (2, 3)))
 
-STYLE: Any = {
+AS_TEXT: Any = {"text.parse_math": False}
+"""Matplotlib's setting for names from files, which may hold dollars and are no formulas."""
+STYLE: Any = AS_TEXT | {
     "axes.grid": True,
     "axes.prop_cycle": cycler(color=COLORS),
     "axes.spines.right": False,

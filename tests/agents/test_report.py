@@ -14,9 +14,11 @@ import pytest
 from agents.forecast_errors import CONSTANT_ERROR, FORECAST_ERROR
 from agents.report import ReportConfig, main, write_report
 from agents.results import Evaluation, read_evaluation
+from agents.run_page import drawn
 from agents.vec_envs import EpisodeResult
 from envs.video.files import write_video
 from predictor.reports.document import PNG
+from predictor.reports.figures import files_of
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_json
 from tests.hostile.samples import RUN
@@ -114,6 +116,19 @@ def test_names_of_strangers_are_text(tmp_path: Path):
     (run / "a'\"><b>.mp4").write_bytes(b"x")
     page = page_of(run)
     assert "<script" not in page and "&lt;script&gt;" in page and "<b>" not in page
+
+
+def test_a_name_with_dollars_is_no_formula(tmp_path: Path):
+    """Matplotlib's formulas are a language of their own, which raises at what it does not know."""
+    figure, axes = drawn([{"steps": 1, "return": 2.0}], {r"runs/$\old$": 1.0})
+    picture, _ = files_of(figure, axes)
+    assert "\\old" in picture
+
+
+def test_a_film_that_is_being_written_is_not_shown(tmp_path: Path):
+    run = a_run(tmp_path)
+    (run / ".video.mp4.12ab34cd.partial.mp4").write_bytes(b"half a film")
+    assert "partial" not in page_of(run)
 
 
 def test_a_run_that_goes_on_is_shown_as_far_as_it_is(tmp_path: Path):

@@ -4,12 +4,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from agents.policy import load_policy
 from agents.task import Task
 from agents.video import recorded
 from agents.watch import WatchConfig, main, play_in_window, write_film
+from envs.video.window import play
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError, run_entry_point
@@ -86,3 +88,12 @@ def test_ids_of_envpool_are_drawn_by_highway_env(tmp_path: Path):
     path, _ = saved(tmp_path, Task("envpool/HighwayFast-v0", "none"))
     film = write_film(WatchConfig(path, out=tmp_path / "film.mp4", max_steps=2))
     assert film.read_bytes()[4:8] == b"ftyp"
+
+
+def test_without_a_screen_there_is_no_window(monkeypatch: pytest.MonkeyPatch):
+    """SDL draws into memory where it finds none, without a word."""
+    for name in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("pygame.display.get_driver", lambda: "offscreen")
+    with pytest.raises(UserError, match="cannot open a window: there is no screen; leave out --window"):
+        play([np.zeros((8, 8, 3), np.uint8)], 10.0, "film")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib import pyplot as plt
+from rich.console import Console
 
 from envs import evaluate
 from envs.collect import CollectConfig, collect
@@ -19,6 +20,7 @@ from envs.rollouts import report
 from envs.rollouts.episode import EDGES, MODEL, STRAIGHT, Episode
 from envs.rollouts.report import EnvAccuracy
 from envs.rollouts.summary import CONTROLS, _graph, _reduction, summarise_episodes
+from envs.supervision import EnvironmentFailedError
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.data.store import StoreInfo, write_store
 from predictor.evaluation.outcomes import Outcome
@@ -461,3 +463,13 @@ def test_missing_neighbours_are_no_misfit_of_a_checkpoint(
     code, errors, _ = run_command(evaluate.main, arguments, monkeypatch, capsys)
     assert (code, len(errors)) == (2, 1)
     assert errors[0].startswith("error: nowhere is not an episode store (it has no zarr.json)")
+
+
+def test_an_environment_that_fails_is_no_misfit(monkeypatch: pytest.MonkeyPatch):
+    def fail(*_: Any) -> Any:
+        raise EnvironmentFailedError("merge-v1, seed 3, step 2: RuntimeError: engine")
+
+    monkeypatch.setattr(evaluate, "evaluate_env", fail)
+    config = EvaluateConfig(env_ids=("merge-v1",), checkpoint=("merge", "exit"))
+    with pytest.raises(EnvironmentFailedError, match="engine"):
+        evaluate.evaluate(config, Console())

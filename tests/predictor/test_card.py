@@ -93,6 +93,14 @@ def test_card_without_its_stores_is_refused(config: CardConfig, tmp_path: Path):
     assert_nothing_is_written(config)
 
 
+def test_card_with_some_of_its_stores_is_refused(config: CardConfig):
+    info = CheckpointInfo(model().spec, model().config, 3, (1.0,) * 3, ("circles", "another road"), MADE)
+    save_checkpoint(config.checkpoint, model(), info)
+    with pytest.raises(UserError, match=r"was trained on \(circles, another road\), got circles"):
+        write_card(config)
+    assert_nothing_is_written(config)
+
+
 def test_card_of_a_checkpoint_that_was_not_trained_is_refused(config: CardConfig):
     save_checkpoint(config.checkpoint, model(), CheckpointInfo(model().spec, model().config, 3))
     with pytest.raises(UserError, match="checkpoint 'toy' does not say how it was trained; write cards of checkpoints"):

@@ -104,3 +104,6 @@ def test_an_installed_package_registers_its_own(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(UserError, match="forecaster 'lost' cannot be imported from thirdparty_mean:Absent"):
         require_known("own:lost")
     monkeypatch.delitem(sys.modules, "thirdparty_mean")
+    (tmp_path / "thirdparty_mean.py").write_text("raise RuntimeError('there is no licence file on this machine')")
+    with pytest.raises(UserError, match="'mean' cannot be imported from .*: RuntimeError: there is no licence file"):
+        find_own("own:mean")

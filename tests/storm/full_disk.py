@@ -76,8 +76,10 @@ def _fill(name: str, subject: Subject, points: int, folder: Path, rng: random.Ra
         counts.kills += 1
         counts.failures += not ("No space left" in said or "disk is full" in said)
         subprocess.run(["mount", "-o", f"remount,size={ROOM}", str(disk)], check=True)
-        counts.failures += finish(start(words, log)) != 0
-        counts.unequal += not counts.failures and differs(name, subject.results(disk), expected)
+        failed = finish(start(words, log)) != 0
+        counts.failures += failed
+        counts.unequal += not failed and differs(name, subject.results(disk), expected)
+    counts.failures += counts.kills < points
     return counts
 
 

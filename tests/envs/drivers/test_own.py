@@ -1,3 +1,5 @@
+import copy
+import threading
 from typing import Any
 
 import numpy as np
@@ -7,6 +9,7 @@ from agents.evaluate import checked_drivers
 from agents.task import Task
 from envs.drivers.all_agents import make_driver
 from envs.drivers.ego import make_ego_driver
+from envs.drivers.own import OwnDriver
 from envs.drivers.trained import trained_driver
 from envs.rollouts.world import open_world
 from envs.sb3.policy_file import PolicyNote
@@ -61,6 +64,39 @@ def test_a_world_takes_it_over():
     np.testing.assert_array_equal(world.full_scene().states, states(ROAD, "slower", seed=3)[1])
     with pytest.raises(UserError, match="driver must be one of random"):
         world.drive("absent")
+
+
+def counts_on_itself(env: Any, rng: np.random.Generator) -> Any:
+    """Keeps its count as an attribute, and a lock, which cannot be copied."""
+    lock = threading.Lock()
+
+    def act(observation: Any) -> int:
+        with lock:
+            act.steps += 1  # type: ignore[attr-defined]
+        return act.steps % 5  # type: ignore[attr-defined]
+
+    act.steps = 0  # type: ignore[attr-defined]
+    return act
+
+
+def follows_a_list(env: Any, rng: np.random.Generator) -> Any:
+    """Takes its actions from a generator, whose place no copy can have."""
+    actions = (int(rng.integers(5)) for _ in range(99))
+    return lambda observation: next(actions)
+
+
+def test_copies_count_for_themselves_and_share_what_cannot_be_copied():
+    driver = OwnDriver(f"own:{__name__}:counts_on_itself", None, np.random.default_rng(0))
+    assert [driver(None), driver(None)] == [1, 2]
+    copied = copy.deepcopy(driver)
+    assert [copied(None), copied(None)] == [3, 4] and driver(None) == 3
+
+
+def test_a_driver_with_a_place_in_a_sequence_is_not_copied():
+    driver = OwnDriver(f"own:{__name__}:follows_a_list", None, np.random.default_rng(0))
+    driver(None)
+    with pytest.raises(UserError, match="a driver of your own that keeps a generator cannot be copied with its env"):
+        copy.deepcopy(driver)
 
 
 def test_it_stands_beside_a_policy():

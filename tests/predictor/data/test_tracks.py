@@ -192,8 +192,10 @@ def test_a_file_beside_the_folders_is_named(folders: Path, loader: Loader, capsy
     tracks.main()
     *_, last = capsys.readouterr().out.splitlines()
     assert last == f"warning: {folders / 'README.txt'} is in none of the folders train, val, test, and in no store"
+    loader.monkeypatch.setattr(sys, "argv", [*sys.argv, "--overwrite", "--pattern", "**/*.txt"])
+    tracks.main()
+    assert capsys.readouterr().out.count("warning") == 1
     (folders / "README.txt").unlink()
-    loader.monkeypatch.setattr(sys, "argv", [*sys.argv, "--overwrite"])
     tracks.main()
     assert "warning" not in capsys.readouterr().out
 

@@ -1,5 +1,7 @@
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -71,3 +73,29 @@ def test_the_commit_is_the_one_that_was_checked_out_at_the_start(monkeypatch: py
         assert provenance(())["commit"] == provenance(())["commit"] == "aaa" and checked_out == ["bbb"]
     finally:
         commit_at_start.cache_clear()
+
+
+def test_an_installed_package_does_not_take_the_commit_of_the_project_around_it(tmp_path: Path):
+    folder = tmp_path / "lib"
+    folder.mkdir()
+    shutil.copy(sys.modules["predictor.support.provenance"].__file__ or "", folder / "copied.py")
+
+    def git(*words: str) -> None:
+        own = {"GIT_CONFIG_GLOBAL": os.devnull, "PATH": os.environ["PATH"]}
+        names = ("-c", "user.name=a", "-c", "user.email=b@c")
+        subprocess.run(["git", *names, *words], cwd=tmp_path, check=True, capture_output=True, env=own)
+
+    def commit() -> str:
+        code = "import copied; print(copied.commit_at_start())"
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), *sys.path])}
+        return subprocess.run(
+            [sys.executable, "-c", code], env=environment, check=True, capture_output=True, text=True
+        ).stdout.strip()
+
+    assert commit() == "unknown"
+    git("init", "-q")
+    git("commit", "-q", "--allow-empty", "-m", "theirs")
+    assert commit() == "unknown"
+    git("add", "lib/copied.py")
+    git("commit", "-q", "-m", "ours")
+    assert re.fullmatch("[0-9a-f]{12}", commit())
