@@ -269,9 +269,8 @@ def features_figure(
     truths = _true_matrices(window, attribute_names)
     side = float(np.clip(0.14 * len(names), 2.2, 4.4))
     columns = min(DIMENSIONS_SHOWN, max(len(block) for _, block in blocks)) + len(truths)
-    figure = Figure(
-        figsize=(0.6 + 1.15 * side * columns, len(blocks) * (2.35 * side + 1.1) + 0.8), layout="constrained"
-    )
+    size = (0.6 + 1.15 * side * columns, len(blocks) * (2.35 * side + 1.1) + 0.8)
+    figure = Figure(figsize=size, layout="constrained")
     figure.suptitle(
         f"Edge features: {where}, {window.place}\nrow: receiver (which is influenced), column: sender; grey: no pair"
         + (", or in the truth no edge" if truths else "")
