@@ -135,7 +135,7 @@ def programs_and_options(code: str) -> set[str]:
     """Returns the modules and scripts that bash code runs, and the names of their options."""
     words = shlex.split(code.replace("\\\n", " "), comments=True)
     options = {word.partition("=")[0] for word in words if re.match(r"--[a-z]", word)}
-    modules = {after for word, after in zip(words, words[1:], strict=False) if word in ("-m", "make")}
+    modules = {after for word, after in zip(words, words[1:], strict=False) if word in ("-m", "make", "dgvae")}
     return options | modules | {word for word in words if word.endswith((".py", ".sh"))}
 
 
