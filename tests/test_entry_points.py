@@ -182,7 +182,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     "agents.study": [
         (
             "--study absent",
-            "no study 'absent': neither a file nor one that ships (costly, foresight, foresight-fast, ",
+            "no study 'absent': neither a file nor one that ships (costly, crossing, foresight, foresight-fast, ",
         ),
         ("--study file", "file is not valid TOML: "),
         ("--workers -1", "workers must not be negative, got -1"),
