@@ -4,6 +4,7 @@
 Those seeds are disjoint from training and from the final evaluation, so selection does not bias the final numbers.
 """
 
+import math
 import time
 import zipfile
 from collections import Counter
@@ -28,7 +29,7 @@ from agents.preset_settings import changed
 from agents.presets import Algorithm, Preset, preset_for
 from agents.runs import BEST_FILE, CHECKPOINT_FILE, CURVE_FILE, POLICY_FILE, load_model, read_curve, save_model
 from agents.step_count import STEP_UNIT, CountSteps, StepProgress, check_step_unit
-from agents.summaries import significantly_worse
+from agents.summaries import mean_of_known, significantly_worse
 from agents.task import SELECTION_SEED, Task
 from agents.vec_envs import EpisodeResult, make_venv
 from envs.sb3.algorithms import require_algorithm
@@ -378,8 +379,8 @@ def driving_scalars(results: Sequence[EpisodeResult]) -> dict[str, float]:
     scalars: dict[str, float] = {}
     if any(r.crashed is not None for r in results):  # some environments report a crash only when it happens
         scalars["crash_rate"] = float(np.mean([bool(r.crashed) for r in results]))
-    speeds_mps = [r.mean_speed_mps for r in results if np.isfinite(r.mean_speed_mps)]
-    if speeds_mps:
-        scalars["speed_mps"] = float(np.mean(speeds_mps))
+    speed_mps = mean_of_known([r.mean_speed_mps for r in results])
+    if not math.isnan(speed_mps):
+        scalars["speed_mps"] = speed_mps
     actions = sum((Counter(r.action_counts) for r in results), Counter())
     return scalars | {f"share_{name}": count / actions.total() for name, count in sorted(actions.items())}

@@ -17,7 +17,7 @@ from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from tests.storm.all_commands import LOG, NAMES, Counts, Name, try_all
-from tests.storm.running import finish, orphans, start
+from tests.storm.running import TRACEBACK, finish, orphans, start, tracebacks_below
 from tests.storm.subjects import Subject, differs
 
 INSIDE = "STORM_INSIDE"
@@ -67,8 +67,7 @@ def _fill(name: str, subject: Subject, points: int, folder: Path, rng: random.Ra
         status = finish(run)
         counts.orphans += len(orphans(run))
         said = run.said()
-        counts.tracebacks += said.count("Traceback (most recent call last)")
-        counts.tracebacks += sum(text.count("Traceback (most recent call last)") for text in _logs(disk))
+        counts.tracebacks += said.count(TRACEBACK) + tracebacks_below(disk)
         last = (said.strip().splitlines() or [""])[-1]
         print(f"{name}: full disk {counts.kills + 1} of {points}: status {status}: {last}", flush=True)
         if not status:
@@ -94,10 +93,6 @@ def _mount(disk: Path, size: str) -> None:
 
 def _used(disk: Path) -> int:
     return sum(_BLOCK * -(-path.lstat().st_size // _BLOCK) for path in disk.rglob("*"))
-
-
-def _logs(disk: Path) -> list[str]:
-    return [path.read_text(errors="replace") for path in disk.rglob("log.txt")]
 
 
 def main() -> None:

@@ -15,10 +15,8 @@ from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from tests.storm.all_commands import LOG, NAMES, Counts, Name, try_all
-from tests.storm.running import finish, orphans, start
+from tests.storm.running import TRACEBACK, finish, orphans, start, tracebacks_below
 from tests.storm.subjects import Subject, differs
-
-TRACEBACK = "Traceback (most recent call last)"
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,7 @@ def storm(name: str, subject: Subject, kills: int, folder: Path, rng: random.Ran
         try:
             if run.process.wait(wait_s):
                 counts.failures += 1
-            counts.tracebacks += _told_below(out)
+            counts.tracebacks += tracebacks_below(out)
             shutil.rmtree(out, ignore_errors=True)  # it came to its end: anew
         except subprocess.TimeoutExpired:
             counts.kills += 1
@@ -62,18 +60,13 @@ def storm(name: str, subject: Subject, kills: int, folder: Path, rng: random.Ran
         counts.orphans += len(orphans(run))
         if subject.is_over(out):  # killed after its last write
             counts.unequal += differs(name, subject.results(out), expected)
-            counts.tracebacks += _told_below(out)
+            counts.tracebacks += tracebacks_below(out)
             shutil.rmtree(out)
         print(f"{name}: kill {counts.kills} of {kills} after {wait_s:.1f} of {whole_s:.1f} s", flush=True)
     counts.failures += finish(start(words, log)) != 0
-    counts.tracebacks += log.read_text(errors="replace").count(TRACEBACK) + _told_below(out)
+    counts.tracebacks += log.read_text(errors="replace").count(TRACEBACK) + tracebacks_below(out)
     counts.unequal += not counts.failures and differs(name, subject.results(out), expected)
     return counts
-
-
-def _told_below(out: Path) -> int:
-    """Returns the number of tracebacks in the logs of a command's own processes."""
-    return sum(path.read_text(errors="replace").count(TRACEBACK) for path in out.rglob("log.txt"))
 
 
 def main() -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 ORPHAN_S = 60.0
 """Longest time that a process may live on after the command that started it [s]."""
+TRACEBACK = "Traceback (most recent call last)"
 _MARK = "STORM_RUN"
 
 
@@ -72,3 +73,8 @@ def _processes_with(mark: str) -> list[int]:
         if wanted in inherited and not is_dead:
             found.append(int(folder.name))
     return found
+
+
+def tracebacks_below(folder: Path) -> int:
+    """Returns the number of tracebacks in the logs that a command's own processes wrote below a folder."""
+    return sum(path.read_text(errors="replace").count(TRACEBACK) for path in folder.rglob("log.txt"))

@@ -58,6 +58,12 @@ def test_a_crash_that_is_reported_only_when_it_happens_is_a_share_of_all_episode
     found = found_in(study(), runs(True, None)).crash_rate("one", SEEN)
     assert found is not None and found.value == 0.5
     assert found_in(study(), runs(None, None)).crash_rate("one", SEEN) is None
+    crash, silent = (
+        replace(r, episodes=tuple(e | {"crashed": each} for e in r.episodes), arm=arm)
+        for r, arm, each in ((runs(True, None)[0], "bold", True), (runs(None, None)[0], SEEN.arm, None))
+    )
+    careful = found_in(study(), [crash, silent]).crash_rate("one", SEEN)
+    assert careful is not None and careful.value == 0.0, "another line tells that crashes are reported"
 
 
 def test_a_driver_without_a_crash_may_still_crash():

@@ -146,6 +146,7 @@ def test_locations_and_splits(tmp_path: Path, loader: Loader):
         tmp_path / "data",
         f"{tmp_path / 'data'} has no recording of locations ('9',); there are ['0', '1']",
         "--locations",
+        "1",
         "9",
     )
 
