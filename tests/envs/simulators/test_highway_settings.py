@@ -1,3 +1,5 @@
+from typing import Any
+
 import gymnasium as gym
 import pytest
 
@@ -18,6 +20,54 @@ def test_a_setting_that_the_environment_does_not_have_is_refused(env_id: str, na
     settings = {name: 3} if "multi" in env_id else {"config": {name: 3}}
     with pytest.raises(UserError, match=f"'{env_id}' has no setting '{name}' in its config; {advice}"):
         make_any_env(env_id, **settings)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "config", "message"),
+    [
+        (
+            "highway-fast-v0",
+            {"observation": {"type": "Kinematics", "vehicle_count": 9}},
+            r"KinematicObservation of 'highway-fast-v0' has no setting 'vehicle_count' in its observation; "
+            r"did you mean vehicles_count\?",
+        ),
+        (
+            "highway-fast-v0",
+            {"observation": {"type": "TimeToCollision", "vehicles_count": 9}},
+            "TimeToCollisionObservation of 'highway-fast-v0' has no setting 'vehicles_count' in its observation; it "
+            "has horizon, type",
+        ),
+        (
+            "merge-v1",
+            {"action": {"type": "DiscreteMetaAction", "target_speed": [20, 30]}},
+            r"DiscreteMetaAction of 'merge-v1' has no setting 'target_speed' in its action; did you mean target_speeds",
+        ),
+        (
+            "intersection-multi-agent-v2",
+            {"action": {"type": "MultiAgentAction", "action_config": {"type": "DiscreteMetaAction", "laterel": False}}},
+            r"DiscreteMetaAction of 'intersection-multi-agent-v2' has no setting 'laterel' in its "
+            r"action.action_config; did you mean lateral",
+        ),
+    ],
+)
+def test_a_setting_that_an_observation_or_action_does_not_have_is_refused(
+    env_id: str, config: dict[str, Any], message: str
+):
+    with pytest.raises(UserError, match=message):
+        make_any_env(env_id, **(config if "multi" in env_id else {"config": config}))
+
+
+@pytest.mark.parametrize(
+    "observation",
+    [
+        {"type": "Kinematics", "features": ["x", "y"], "absolute": True, "order": "shuffled"},
+        {"type": "OccupancyGrid", "features": ["presence"], "grid_step": [5, 5]},
+        {"type": "LidarObservation", "cells": 8},
+    ],
+)
+def test_settings_of_a_type_that_the_config_chooses_are_taken(observation: dict[str, Any]):
+    env = make_env("highway-fast-v0", config={"observation": observation})
+    assert env.unwrapped.config["observation"] == observation  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("env_id", CHECKPOINTS)
