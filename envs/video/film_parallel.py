@@ -112,14 +112,14 @@ class LiveRecording(MultiagentRecording):
 
     @property
     def _colors(self) -> dict[str, Color]:
-        """Colour of each role so far."""
-        return self.colors_of(self.roles_seen)
+        """Colour of each role, of agents that have not come yet as well."""
+        return self.colors_of(self.roles_seen | self.expected_roles)
 
     @cached_property
     def _width_px(self) -> int:
         """Width of all pictures, with room for longer numbers [px]."""
         caption = self._caption_at(_WIDEST_TIME_S)
-        widest = self._roles(dict.fromkeys(self.returns, _WIDEST_RETURN))
+        widest = self._roles(dict.fromkeys(self.returns.keys() | self.expected_roles, _WIDEST_RETURN))
         return page_width(self.style.arena_px, caption, [widest, self._legend], self.style.lines)
 
     @property

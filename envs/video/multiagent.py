@@ -35,7 +35,7 @@ from envs.video.drawing import (
 )
 from envs.video.files import write_picture, write_video
 from envs.video.moments import Body, Moment, bodies_now
-from envs.video.roles import LANDMARK, OTHER, mean_by_role
+from envs.video.roles import LANDMARK, OTHER, mean_by_role, named_role
 from predictor.support.errors import UserError
 
 FPS = 20
@@ -101,6 +101,8 @@ class MultiagentRecording:
     """Whether y points up in the picture."""
     fps: int = FPS
     """Number of pictures per second."""
+    expected_roles: frozenset[str] = frozenset()
+    """Roles of the environment's named agents, those that have not come yet included."""
     _focus_id: int = -1
     _moments: list[Moment] = field(default_factory=list)
 
@@ -334,7 +336,8 @@ class MultiagentRecorder:
         self._samples = num_samples
         # y points as in the simulators' own pictures.
         y_up = not (isinstance(env.unwrapped, HighwayParallelEnv) or is_pursuit_env(env))
-        self.recording = kind(multiagent_env_id(env), env.scene_spec.dt_s, "", style, y_up)
+        roles = frozenset(map(named_role, env.possible_agents))
+        self.recording = kind(multiagent_env_id(env), env.scene_spec.dt_s, "", style, y_up, expected_roles=roles)
         self._names: dict[int, str] = {}
         self._returns: dict[str, float] = {}
 

@@ -18,6 +18,7 @@ from envs.parallel import ForecastParallelEnv
 from envs.readers.base import MultiagentScene, pad_multiagent_scene
 from envs.simulators.highway_multiagent import HighwayParallelEnv
 from envs.video.drawing import Arena
+from envs.video.film_parallel import FilmParallelForecasts
 from envs.video.multiagent import LANDMARK, MultiagentRecording, MultiagentStyle, record_multiagent_episode
 from predictor.scene import KINEMATIC_FEATURES, Forecast, Scene, SceneSpec
 from predictor.support.errors import UserError
@@ -426,3 +427,21 @@ def test_pictures_and_steps_outside_the_episode_are_named(recording: MultiagentR
         recording.draw(index)
     with pytest.raises(UserError, match=f"got {index}"):
         recording.frame_of_step(index)
+
+
+def test_a_live_film_has_room_and_colours_for_agents_that_come_later():
+    class LateAgents(StraightEnv):
+        def present(self) -> list[str]:
+            return [name for name in super().present() if not name.startswith("agent") or self.step_count >= JOINS]
+
+    env = ForecastParallelEnv(
+        LateAgents(), "constant-velocity", horizon_steps=HORIZON, reader=lambda env: StraightReader(env)
+    )
+    film = FilmParallelForecasts(env, style=PLAIN)
+    film.reset()
+    pictures = [film.render()]
+    while film.agents:
+        film.step(act(dict.fromkeys(film.agents)))
+        pictures.append(film.render())
+    assert len({picture.shape for picture in pictures}) == 1
+    assert count(pictures[0], BLUE) > 0  # the legend of a role that nobody has yet
