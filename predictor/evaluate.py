@@ -8,7 +8,7 @@ and RMSE and NLL by horizon, for K = 1 and K samples beside constant velocity (K
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -50,7 +50,7 @@ class EvaluateConfig:
     out: Path | None = None
     """Folder for accuracy.json, accuracy.md and plots; none are written if left out."""
     num_samples: Annotated[int, Renamed("samples")] = 20
-    """Number of forecasts drawn (K) for the second line; the first is always K = 1, the most likely forecast."""
+    """Number of forecasts (K) of the model, and of constant velocity, which has noise if K is above 1."""
     history_steps: int = 10
     """Number of observed steps that the model gets before each forecast (fewer where the episode has just begun)."""
     horizon_steps: int | None = None
@@ -140,7 +140,8 @@ def _evaluate(config: EvaluateConfig, subject: _Subject) -> list[Accuracy]:
     else:
         noisy = NoisyConstantVelocity.fit(subject.spec, std_m)
         made = run_windows(noisy, windows, chosen, horizon, config.num_samples, config.seed)
-        accuracies.append(summarise("constant velocity + noise", made, std_m))
+        # draws hold the spread already: the density is one Gaussian around the single forecast
+        accuracies.append(replace(summarise("constant velocity + noise", made, std_m), nll=straight.nll))
     if not all(math.isfinite(accuracy.min_ade_m) for accuracy in accuracies):
         raise UserError(
             f"checkpoint '{config.checkpoint}' forecasts numbers that are not finite; its training diverged"

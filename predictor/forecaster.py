@@ -262,9 +262,11 @@ class WindowOutput(NamedTuple):
     posterior_logits: Float[Tensor, "batch time agents agents types"] | None = None
     """Logits of edge types from past and future."""
     features: Float[Tensor, "batch time agents agents feature"] | None = None
-    """Edge features from the past."""
+    """Edge features from the past; those that are averaged over the whole window in training know all of it."""
     modes: Futures | None = None
     """Enumerated futures after `last_observed`, `rollout` first; None for models without modes."""
+    pairs: Bool[Tensor, "batch time agents agents"] | None = None
+    """Pairs whose edges were inferred; None stands for all that are there."""
 
     def float(self) -> "WindowOutput":
         """Returns the output in float32."""
@@ -276,6 +278,8 @@ class WindowOutput(NamedTuple):
                 else None
                 if value is None
                 else value.float()
+                if value.is_floating_point()
+                else value
             )
 
         return WindowOutput(*map(exact, self))

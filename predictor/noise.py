@@ -46,7 +46,7 @@ class PairNoise:
                 f"samples need one generator per scene, got {len(generators)} generators for {len(present)} scenes"
             )
         pairs = (draws * present.flatten(1).sum(1)).tolist()
-        drawn = [
+        drawn = [np.empty((steps, 0, types), dtype=np.float32)] + [
             generator.random((steps, count, types), dtype=np.float32)
             for generator, count in zip(generators, pairs, strict=True)
         ]

@@ -26,7 +26,7 @@ from envs.rollouts.world import EgoWorld, MultiagentWorld, World, open_world
 from envs.scene_stream import ForecastConfig
 from envs.wrappers import ForecastObservation
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.baselines.nearest_neighbour import fit_from_stores
+from predictor.baselines.nearest_neighbour import K, fit_from_stores
 from predictor.dgvae import DGVAE
 from predictor.dgvae.edge_ablation import Ablation, EdgeAblation
 from predictor.evaluation.controls import fit_noise, fit_residual, training_windows
@@ -160,16 +160,16 @@ def _world(task: EpisodeTask) -> World:
 
 @functools.lru_cache(maxsize=2)
 def _kept_controls(
-    stores: tuple[str, ...], checkpoint: str, spec: SceneSpec, source: str, horizon_steps: int
+    stores: tuple[str, ...], checkpoint: str, spec: SceneSpec, source: str, horizon_steps: int, samples: int
 ) -> dict[str, Forecaster]:
-    """Returns the controls that are fitted to recorded data, by key."""
+    """Returns the controls that are fitted to recorded data, by key; sample 0 of the neighbours is their mean."""
     paths = [Path(store) for store in stores]
     model = kept_forecaster(checkpoint, spec, source)
     windows = training_windows(paths, spec, horizon_steps)
     seen = replace(model.spec, has_ego=spec.has_ego)  # where no agent is the ego, the first is not taken for it
     return {
         RESIDUAL: fit_residual(model, training_windows(paths, seen, horizon_steps), horizon_steps),
-        NEIGHBOURS: fit_from_stores(paths, spec, horizon_steps),
+        NEIGHBOURS: fit_from_stores(paths, spec, horizon_steps, k=max(K, samples - 1)),
         NOISY: fit_noise(windows, horizon_steps),
     }
 
@@ -178,7 +178,9 @@ def _baselines(task: EpisodeTask, spec: SceneSpec) -> dict[str, SideForecaster]:
     """Returns new controls and ablations for an episode, by key."""
     found = {STRAIGHT: SideForecaster(ConstantVelocity(spec), spec, task.horizon_steps)}
     if task.stores:
-        fitted = _kept_controls(task.stores, task.checkpoint, spec, task.env_id, task.horizon_steps)
+        fitted = _kept_controls(
+            task.stores, task.checkpoint, spec, task.env_id, task.horizon_steps, task.samples
+        )
         for key, control in fitted.items():
             found[key] = SideForecaster(control, spec, task.horizon_steps, samples=task.samples, seed=task.seed)
     for steps in task.histories:

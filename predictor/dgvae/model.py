@@ -146,7 +146,8 @@ class DGVAE(nn.Module):
         padded = self._graph_now(states, valid)
         if padded.senders is not None:
             memory = memory.to_slots(padded.senders, padded.present)
-        layers = self._layers()
+        # lists without entries cannot be lengthened, and there is nothing to compute quickly
+        layers = self._layers() if len(states) else self._plain()
         graph: Padded | Packed = padded
         if isinstance(layers, Stepper):
             graph = Packed.of(padded, valid, self.self_edges is not None)

@@ -50,7 +50,8 @@ class TrainingPass:
     ) -> WindowOutput:
         """Returns predictions and graphs; `nodes` and `pairs` are the memory before the first step."""
         decoder, self_edges = self.layers.decoder, self.layers.self_edges
-        inputs, graph, (node, seen) = self.reading.codec.inputs(states, valid), self._graph(states, valid), nodes
+        inferred = self._inferred(states, valid)
+        inputs, graph, (node, seen) = self.reading.codec.inputs(states, valid), self._graph(valid, inferred), nodes
         edges, features, past = self.reading.steps(inputs, valid, graph, Past(*pairs, seen))
         posterior = self.layers.encoder.posterior_logits(edges, graph.present, graph.senders)
         sampled = self.sampler(posterior)
@@ -68,7 +69,7 @@ class TrainingPass:
         prior_posterior_features = _dense_outputs(graph, edges.prior_logits, posterior, shown)
         if not rollout_steps:
             nothing = states.new_zeros(len(states), states.shape[2], 0, states.shape[3])
-            return WindowOutput(one_step, nothing, *prior_posterior_features)
+            return WindowOutput(one_step, nothing, *prior_posterior_features, pairs=inferred)
 
         # the longest history; reading it from a GPU would wait for the device
         steps = states.shape[1] if last_observed.is_cuda else int(last_observed.max())
@@ -86,12 +87,12 @@ class TrainingPass:
                 states[now], valid[now], begin, logits, features[now], own[now], burned_in[now], rollout_steps,
                 num_modes,
             )  # fmt: skip
-            return WindowOutput(one_step, modes.states[:, 0], *prior_posterior_features, modes)
+            return WindowOutput(one_step, modes.states[:, 0], *prior_posterior_features, modes, inferred)
         future = free_run(
             self.reading, self.motion, self.layers, states[now], valid[now], begin, features[now],
             Past(*(t[now] for t in past)), burned_in[now], logits, rollout_steps, self.sampler,
         )  # fmt: skip
-        return WindowOutput(one_step, future, *prior_posterior_features)
+        return WindowOutput(one_step, future, *prior_posterior_features, pairs=inferred)
 
     def _to_itself(self, inputs: Tensor, held: HeldType | None) -> Tensor:
         """Computes each agent's message to itself along its held type; a zero for a model without self-edges."""
@@ -138,12 +139,17 @@ class TrainingPass:
         """Returns whether slot j is agent j, which self-edges and what is computed from reverse pairs need."""
         return self.layers.self_edges is not None or self.reading.config.needs_reverse_pairs or agents == 1
 
-    def _graph(self, states: Tensor, valid: Tensor) -> Padded:
+    def _inferred(self, states: Tensor, valid: Tensor) -> Tensor | None:
+        """Returns the pairs of the nearest agents that have edges; None if all pairs have."""
+        near = self.reading.config.num_neighbours
+        if not near:
+            return None
+        axes = self.reading.codec.spec.position_dim
+        return pair_mask(valid) & among_nearest(states[..., :axes].detach(), valid, near)
+
+    def _graph(self, valid: Tensor, inferred: Tensor | None) -> Padded:
         """Returns the pairs of each step: each agent with all others, or with the nearest."""
-        present, near = pair_mask(valid), self.reading.config.num_neighbours
-        if near:
-            axes = self.reading.codec.spec.position_dim
-            present = present & among_nearest(states[..., :axes].detach(), valid, near)
+        present = pair_mask(valid) if inferred is None else inferred
         if self.layers.self_edges is not None:
             present = present | torch.diag_embed(valid)
         if self._dense(valid.shape[-1]):

@@ -192,7 +192,8 @@ def accuracy_table(accuracies: Sequence[Accuracy], dt_s: float, title: str) -> F
     headings += [f"{dt_s * (step + 1):g} s" for step in shown]
     lines = []
     for one in accuracies:
-        stacks = [(one.by_step_m[i], one.rmse_m[i], *([one.nll[i]] if one.nll else [])) for i in shown]
+        nll = one.mixture_nll or one.nll  # the density that the model predicts, where it predicts one
+        stacks = [(one.by_step_m[i], one.rmse_m[i], *([nll[i]] if nll else [])) for i in shown]
         cells = ["\n".join(_rounded_number(value, 2) for value in stack) for stack in stacks]
         scalars = [cell.replace(" ± ", "\n±") for cell in _scalar_cells(one)]
         lines.append([one.name, str(one.num_samples), *scalars, f"{one.agents}", *cells])

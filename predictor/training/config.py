@@ -97,11 +97,13 @@ class TrainConfig:
     kl_warmup_steps: int = 0
     """Number of optimiser steps over which the KL weight grows linearly from 0."""
     edge_cost: float = 0.0
-    """Cost [nats] of a certain edge, which removes edges that explain nothing; 0 is the paper's."""
+    """Cost [nats] of a certain edge, in the prior and again in the posterior, which removes edges that explain nothing;
+    0 is the paper's."""
     label_weight: float = 0.0
-    """Weight of restricted labelling: regression of the first feature dimensions on known edge attributes."""
+    """Weight of restricted labelling: regression of the first feature dimensions on known edge attributes (dG-VAE)."""
     type_label_weight: float = 0.0
-    """Weight of restricted labelling of edge types: the prior's and posterior's cross-entropy with known types."""
+    """Weight of restricted labelling of edge types: the prior's and posterior's cross-entropy with known types (dG-VAE
+    and dNRI)."""
     reaction_weight: float = 0.0
     """Additional weight of agents that are about to react to an intervention: the roll-out's errors of an agent count
     1 + this times the strength of its causal edge; needs `causal_edges`."""
@@ -163,6 +165,10 @@ class TrainConfig:
         given = [name for name in OF_THE_NETWORK if getattr(self, name) != getattr(type(self), name)]
         if self.init and given:
             raise UserError(f"init takes the network of '{self.init}'; leave out {', '.join(given)}")
+        unknown = [name for name in self._of_graphs if getattr(self, name)]
+        if unknown:
+            lacking = "edge features" if self.model == "dnri" else "edges"
+            raise UserError(f"model {self.model} has no {lacking}: set {' and '.join(unknown)} to 0")
         if self.reaction_weight and not self.causal_edges:
             raise UserError("reaction_weight needs the causal labels of branches; pass --causal-edges, or set it to 0")
         if self.min_history_steps > self.history_steps:
@@ -177,6 +183,13 @@ class TrainConfig:
             raise UserError("data needs at least one episode store; make one with python -m envs.collect")
         object.__setattr__(self, "device", resolve_device(self.device))
         check_precision(self.precision, self.device)
+
+    @property
+    def _of_graphs(self) -> tuple[str, ...]:
+        """Weights that the model has no term for."""
+        if self.model == "dgvae":
+            return ()
+        return ("label_weight",) if self.model == "dnri" else ("edge_cost", "label_weight", "type_label_weight")
 
     @property
     def without_effect(self) -> tuple[str, ...]:

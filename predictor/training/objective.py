@@ -172,7 +172,7 @@ def _graph_loss(
 ) -> tuple[Tensor, Terms]:
     assert output.prior_logits is not None and output.posterior_logits is not None
     prior, posterior = output.prior_logits, output.posterior_logits
-    pairs = pair_mask(batch.valid)
+    pairs = pair_mask(batch.valid) if output.pairs is None else output.pairs
     kl = kl_categorical(posterior, prior, pairs, total)
     probs = torch.softmax(prior, dim=-1)
     terms: Terms = {

@@ -208,7 +208,7 @@ class Trainer:
         self._recorder: Recorder | None = CudaRecorder(self.device, self.noise) if source.capture else None
         self._recorded: dict[Any, CapturedStep] = {}
         self.optimizer = self._adam(capturable=source.capture)
-        self._scales = torch.tensor(data.spec.feature_scales, device=self.device)
+        self._scales = torch.tensor(self.model.spec.feature_scales, device=self.device)
         self._kl_scale = torch.ones((), device=self.device)
         self._finite = torch.ones((), dtype=torch.bool, device=self.device)
         self._finite_until = 0

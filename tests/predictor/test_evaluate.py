@@ -118,6 +118,13 @@ def test_one_sample_gives_one_line(data: Path, checkpoint: Path):
     ]
 
 
+def test_the_likelihood_of_the_control_is_that_of_its_own_gaussian(data: Path, checkpoint: Path):
+    """Its samples hold the spread already, which must not count twice."""
+    _, one = evaluate(EvaluateConfig(str(checkpoint), data, num_samples=1))
+    _, many = evaluate(EvaluateConfig(str(checkpoint), data, num_samples=20))
+    assert many.nll == one.nll and len(one.nll) == 2
+
+
 def test_rows_bear_the_name_of_the_model(data: Path, tmp_path: Path):
     torch.manual_seed(0)
     save_checkpoint(tmp_path / "mlp", MLP(spec(), MLPConfig(), 2), CheckpointInfo(spec(), MLPConfig(), 2, model="mlp"))

@@ -65,6 +65,17 @@ def test_parts_of_a_batch_are_forecast_like_the_whole(kind: str, rows: int):
             assert_equal(found, expected)
 
 
+@pytest.mark.parametrize("kind", ["dgvae", "dgvae-plural-rich", "dgvae-neighbours", "lstm-joint"])
+def test_no_scene_at_all_is_a_batch_too(kind: str):
+    """All environments of some kind may be over at once."""
+    online = OnlineForecaster(made(kind), ENVS, AGENTS)
+    scenes = drawn_scenes(np.random.default_rng(0), ENVS)
+    online.observe(scenes[np.array([], dtype=int)], np.array([], dtype=int))
+    assert online.forecast(HORIZON, 2, []).xy.shape == (0, 2, AGENTS, HORIZON, 2)
+    online.observe(scenes)
+    assert online.forecast(HORIZON).xy.isfinite().all()
+
+
 def test_no_call_gets_more_scenes_than_it_may(monkeypatch: pytest.MonkeyPatch):
     forecaster, sizes = model(frame=ROAD), []
     observe = forecaster.observe

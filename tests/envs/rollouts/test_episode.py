@@ -296,6 +296,17 @@ def test_neighbours_that_lived_through_this_very_episode_are_exact(tmp_path: Pat
     assert straight.min_ade_m > 0.1
 
 
+def test_each_sample_of_the_neighbours_is_another_recorded_future(tmp_path: Path):
+    """Sample 0 is the mean of all; with few episodes, two may have been the same."""
+    made = task(TAG, checkpoint=save_tag(tmp_path / "tag", **PLURAL), driver="heuristic", samples=20)
+    recorded = collect(CollectConfig(TAG, tmp_path, 3, ("heuristic",), 50, 12, False, 1))
+    write_store(tmp_path / "store", StoreInfo(tag_spec(), TAG), recorded)
+    near = play(replace(made, stores=(str(tmp_path / "store"),))).outcomes[NEIGHBOURS]
+    futures = near.forecast.transpose(1, 2)[near.valid.all(-1)].flatten(2)
+    assert len(futures) and min(len(samples.unique(dim=0)) for samples in futures) > 15
+    torch.testing.assert_close(futures[:, 0], futures[:, 1:].mean(1), rtol=1e-4, atol=1e-4)
+
+
 def test_the_residual_of_a_model_with_an_ego_is_fitted_to_recordings_without_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -175,6 +175,33 @@ def test_type_labels_count_where_they_are_known():
     assert "type_label" not in without and without["total"] == pytest.approx(0.0, abs=1e-6)
 
 
+def test_pairs_whose_edges_are_not_inferred_say_nothing():
+    """A network of the nearest agents holds a constant for all other pairs."""
+    types, config = [[[[0, 1], [1, 0]]] * 3], replace(SILENT, type_label_weight=1.0, edge_cost=3.0)
+    prior = logits([0.8, 0.8], [0.5, 0.5])
+    prior[0, :2, 1, 0] = torch.tensor([1e4, -1e4])
+    inferred = torch.zeros(1, 3, 2, 2, dtype=torch.bool)
+    inferred[0, :2, 0, 1] = True
+    found = terms(config, batch(types), output(prior, prior)._replace(pairs=inferred))
+    assert found["type_label"] == pytest.approx(-2 * math.log(0.8))
+    assert found["graph_accuracy"] == 1.0 and found["prior_edge_share"] == pytest.approx(0.8)
+    assert found["total"] == pytest.approx(found["type_label"] + 3.0 * 2 * 0.8)
+
+
+@pytest.mark.parametrize(
+    ("model", "weights", "message"),
+    [
+        ("lstm", {"edge_cost": 5.0, "label_weight": 1.0}, "model lstm has no edges: set edge_cost and label_weight to 0"),
+        ("mlp", {"type_label_weight": 5.0}, "model mlp has no edges: set type_label_weight to 0"),
+        ("dnri", {"label_weight": 5.0}, "model dnri has no edge features: set label_weight to 0"),
+    ],
+)
+def test_weights_of_edges_need_a_model_that_infers_them(model: Any, weights: dict[str, float], message: str):
+    with pytest.raises(UserError, match=message):
+        replace(CONFIG, model=model, preset="fast", **weights)
+    assert replace(CONFIG, model="dnri", edge_cost=1.0, type_label_weight=1.0).edge_cost == 1.0
+
+
 def test_unknown_types_say_nothing():
     prior = logits([0.2, 0.9], [0.3, 0.4]).requires_grad_()
     windows = batch([[UNKNOWN] * 3])

@@ -450,6 +450,14 @@ def test_a_start_takes_the_frame_and_range_of_the_data(circles: Path, tmp_path: 
     assert kept.spec == began.model.spec
 
 
+def test_a_start_weighs_errors_by_the_scales_of_the_checkpoint(circles: Path, tmp_path: Path):
+    first = str(train(config(circles, tmp_path / "first")))
+    others = replace(spec(), feature_scales=tuple(10 * scale for scale in spec().feature_scales))
+    write_store(tmp_path / "others", StoreInfo(others, "circles"), [circling_episode(i) for i in range(6)])
+    began = made(config(tmp_path / "others", tmp_path / "second", init=first))
+    assert tuple(began._scales.tolist()) == spec().feature_scales
+
+
 def test_a_start_with_another_ego_is_named(circles: Path, tmp_path: Path):
     first = str(train(config(circles, tmp_path / "first")))
     write_store(tmp_path / "equals", StoreInfo(spec(has_ego=False), "circles"), [circling_episode(i) for i in range(6)])
