@@ -90,6 +90,7 @@ def _intersection(env_id: str, checkpoint: str | None = None) -> EnvEntry:
 ENVS: dict[str, EnvEntry] = {
     **_HIGHWAY,
     "highway-mixed-costly-v0": EnvEntry(checkpoint="highway-mixed"),  # other rewards, the same traffic
+    "intersection-costly-v0": EnvEntry(checkpoint="intersection"),
     **{
         env_id: EnvEntry(checkpoint=_original_of(env_id).checkpoint)
         for env_id, task in ENVPOOL_IDS.items()
@@ -161,7 +162,7 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     """Makes a Gymnasium environment.
 
     Args:
-        env_id: id of highway-env, of `envs.simulators.mixed_traffic`, of EnvPool ("envpool/Highway-v0"), or any other
+        env_id: id of highway-env, of `envs.simulators`, of EnvPool ("envpool/Highway-v0"), or any other
             that Gymnasium knows.
         kwargs: for `gymnasium.make`.
 
@@ -171,7 +172,7 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     """
     import highway_env  # noqa: F401  (registers its ids)
 
-    from envs.simulators import mixed_traffic  # noqa: F401  (registers its ids)
+    from envs.simulators import costly_collisions, mixed_traffic  # noqa: F401  (register their ids)
 
     register_envpool_ids()
     module, colon, _ = env_id.partition(":")

@@ -32,7 +32,7 @@ from envs.readers.highway import HighwayReader, is_highway_env
 from envs.readers.mpe import MPE_IDS, MpeReader, is_mpe_env, mpe_scenario
 from envs.readers.outcomes import OutcomeKeys, outcome_keys, register_outcomes
 from envs.readers.pursuit import PursuitReader, is_pursuit_env
-from envs.simulators import mixed_traffic  # noqa: F401  (registers its ids, as the import of highway-env does)
+from envs.simulators import costly_collisions, mixed_traffic  # noqa: F401  (register ids, as highway-env does)
 from predictor.support.errors import UserError
 
 __all__ = [

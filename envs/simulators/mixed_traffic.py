@@ -7,6 +7,7 @@ Importing this module registers the ids; a process that has not imported it make
 `gym.make("envs.simulators.mixed_traffic:highway-mixed-v0")`.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal
 
@@ -240,22 +241,6 @@ class MixedHighwayEnv(_Mixed, HighwayEnvFast):
     """highway-fast-v0 among mixed drivers, which start at about equal speeds and change to their wished ones."""
 
 
-class CostlyMixedHighwayEnv(MixedHighwayEnv):
-    """highway-mixed-v0 where a collision costs as much as a minute of the best driving: foresight has to pay here.
-
-    In the base a collision ends the episode and costs little else: who drives fast into the next car returns as much
-    as who keeps clear of it. Rewards are a tenth of the base's before these are normalised (0.05 for the fastest
-    second in the right lane), so that returns are of the order of one.
-    """
-
-    changes = {
-        "normalize_reward": False,
-        "collision_reward": -3.0,
-        "high_speed_reward": 0.04,
-        "right_lane_reward": 0.01,
-    }
-
-
 class MixedMergeEnv(_Mixed, ConnectedLaneMergeGenericEnv):
     """merge-generic-v1 among more, mixed drivers."""
 
@@ -284,24 +269,22 @@ class MixedIntersectionEnv(_Mixed, ConnectedLaneIntersectionEnv):
 
 BASE_ID = {
     "highway-mixed-v0": "highway-fast-v0",
-    "highway-mixed-costly-v0": "highway-fast-v0",
     "merge-mixed-v0": "merge-generic-v1",
     "roundabout-mixed-v0": "roundabout-generic-v1",
     "intersection-mixed-v0": "intersection-v2",
 }
 """Id defined here → the id of highway-env that it varies."""
-_CLASSES: dict[str, type[_Mixed]] = {
+_CLASSES: Mapping[str, type[AbstractEnv]] = {
     "highway-mixed-v0": MixedHighwayEnv,
-    "highway-mixed-costly-v0": CostlyMixedHighwayEnv,
     "merge-mixed-v0": MixedMergeEnv,
     "roundabout-mixed-v0": MixedRoundaboutEnv,
     "intersection-mixed-v0": MixedIntersectionEnv,
 }
 
 
-def register_scenarios() -> None:
-    """Registers the ids with gymnasium; may be called again."""
-    for env_id, env_class in _CLASSES.items():
+def register_scenarios(classes: Mapping[str, type[AbstractEnv]] = _CLASSES) -> None:
+    """Registers ids with gymnasium; may be called again."""
+    for env_id, env_class in classes.items():
         if env_id not in gym.registry:
             gym.register(env_id, entry_point=f"{env_class.__module__}:{env_class.__qualname__}")
 
