@@ -17,8 +17,7 @@ from agents.hub import local_policy
 from agents.runs import CONFIG_FILE, policy_zip, read_config
 from agents.task import Task, task_of
 from agents.vec_envs import DrivenEnv
-from envs.drivers.trained import env_for_driver, wrapper_options
-from envs.parallel import ForecastParallelEnv
+from envs.drivers.trained import env_for_driver, parallel_env_for_driver
 from envs.sb3 import policy_file
 from envs.sb3.padded_spaces import PaddedObservation, learners_named, own_action, roles_of
 from envs.sb3.policy_file import PolicyNote, read_policy_note
@@ -191,8 +190,7 @@ def _task_of_note(note: PolicyNote, device: str, sized: bool) -> Task:
 
 def _of_many_agents(path: str, model: BaseAlgorithm, env: ParallelEnv, note: PolicyNote) -> LoadedPolicy:
     driven: Any = DrivenEnv(env, note.driver, learners_named(env.possible_agents, note.learners, f"policy {path}"))
-    if note.forecaster is not None:
-        driven = ForecastParallelEnv(driven, **wrapper_options(path))
+    driven = parallel_env_for_driver(driven, path)
     return LoadedPolicy(_TeamPolicy(path, model, driven, note.learners), driven)
 
 

@@ -133,6 +133,25 @@ def env_for_driver(env: gym.Env, name: str) -> gym.Env:
     return env
 
 
+def parallel_env_for_driver(env: Any, driver: str) -> Any:
+    """Returns a PettingZoo env, in the wrapper that a policy with a note on its forecaster was trained with.
+
+    Raises:
+        UserError: the policy was trained on another forecaster, or with plans.
+    """
+    options = wrapper_options(driver) if sees_forecasts(driver) else {}
+    if not options:
+        return env
+    if "what_if" in options:
+        raise UserError(f"policy {driver} was trained with plans of one ego, which PettingZoo environments do not have")
+    from envs.parallel import ForecastParallelEnv  # most drivers need no wrapper
+
+    seen = ForecastParallelEnv(env, **options)
+    space: Any = seen.observation_space(seen.possible_agents[0])
+    require_forecaster(driver, options["checkpoint"], space, seen.scene_spec, options["arm"])
+    return seen
+
+
 def wrapper_options(path: str) -> dict[str, Any]:
     """Returns the arguments of the wrapper that shows what a policy was trained on; none if it has no note on it.
 

@@ -178,9 +178,7 @@ def _baselines(task: EpisodeTask, spec: SceneSpec) -> dict[str, SideForecaster]:
     """Returns new controls and ablations for an episode, by key."""
     found = {STRAIGHT: SideForecaster(ConstantVelocity(spec), spec, task.horizon_steps)}
     if task.stores:
-        fitted = _kept_controls(
-            task.stores, task.checkpoint, spec, task.env_id, task.horizon_steps, task.samples
-        )
+        fitted = _kept_controls(task.stores, task.checkpoint, spec, task.env_id, task.horizon_steps, task.samples)
         for key, control in fitted.items():
             found[key] = SideForecaster(control, spec, task.horizon_steps, samples=task.samples, seed=task.seed)
     for steps in task.histories:

@@ -15,7 +15,7 @@ from envs.drivers.all_agents import Driver, has_heuristic, make_driver
 from envs.drivers.ego import make_ego_driver
 from envs.drivers.trained import (
     env_for_driver,
-    require_forecaster,
+    parallel_env_for_driver,
     require_view,
     sees_forecasts,
     trained_driver,
@@ -44,7 +44,6 @@ from envs.supervision import Place, named
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.scene import Forecast, Scene, SceneSpec
-from predictor.support.errors import UserError
 
 
 @runtime_checkable
@@ -329,7 +328,7 @@ def open_world(
     """
     kwargs = arguments_of(env_kwargs)
     if is_multiagent_id(env_id):
-        parallel = _parallel_env_for_driver(make_multiagent_env(env_id, **kwargs), driver)
+        parallel = parallel_env_for_driver(make_multiagent_env(env_id, **kwargs), driver)
         if checkpoint is None and horizon_steps is None and isinstance(parallel, ForecastParallelEnv):
             return MultiagentWorld(parallel, driver, env_id)
         if isinstance(parallel, ForecastParallelEnv):
@@ -352,19 +351,6 @@ def open_world(
         world = EgoWorld(measured, driver, env_id)
     make_ego_driver(driver, world.env, np.random.default_rng(0))
     return world
-
-
-def _parallel_env_for_driver(env: Any, driver: str) -> Any:
-    """Returns the env, in the wrapper that a policy with a note on its forecaster was trained with."""
-    options = wrapper_options(driver) if sees_forecasts(driver) else {}
-    if not options:
-        return env
-    if "what_if" in options:
-        raise UserError(f"policy {driver} was trained with plans of one ego, which PettingZoo environments do not have")
-    seen = ForecastParallelEnv(env, **options)
-    space: Any = seen.observation_space(seen.possible_agents[0])
-    require_forecaster(driver, options["checkpoint"], space, seen.scene_spec, options["arm"])
-    return seen
 
 
 def _unpadded(scene: Scene) -> Scene:

@@ -55,6 +55,4 @@ class CostlyIntersectionEnv(_Costly, ConnectedLaneIntersectionEnv):
 BASE_ID = {"highway-mixed-costly-v0": "highway-mixed-v0", "intersection-costly-v0": "intersection-v2"}
 """Id defined here → the id with the same traffic."""
 
-register_scenarios(
-    {"highway-mixed-costly-v0": CostlyMixedHighwayEnv, "intersection-costly-v0": CostlyIntersectionEnv}
-)
+register_scenarios({"highway-mixed-costly-v0": CostlyMixedHighwayEnv, "intersection-costly-v0": CostlyIntersectionEnv})

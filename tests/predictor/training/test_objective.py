@@ -191,7 +191,11 @@ def test_pairs_whose_edges_are_not_inferred_say_nothing():
 @pytest.mark.parametrize(
     ("model", "weights", "message"),
     [
-        ("lstm", {"edge_cost": 5.0, "label_weight": 1.0}, "model lstm has no edges: set edge_cost and label_weight to 0"),
+        (
+            "lstm",
+            {"edge_cost": 5.0, "label_weight": 1.0},
+            "model lstm has no edges: set edge_cost and label_weight to 0",
+        ),
         ("mlp", {"type_label_weight": 5.0}, "model mlp has no edges: set type_label_weight to 0"),
         ("dnri", {"label_weight": 5.0}, "model dnri has no edge features: set label_weight to 0"),
     ],
