@@ -9,7 +9,7 @@ summary.md, episodes.parquet (where pyarrow is installed) and video.mp4.
 import os
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from rich.console import Console
@@ -27,7 +27,7 @@ from envs.readers.mpe import MPE_IDS
 from envs.registry import entry_for, envpool_task_of
 from envs.simulators.envpool import begins_alike
 from envs.supervision import TIMEOUT_S
-from predictor.support.command_line import Renamed, parse
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices, check_positive
 from predictor.support.errors import run_entry_point
 from predictor.support.files import check_out
@@ -74,7 +74,7 @@ class TrainPolicyConfig:
     )  # fmt: skip
     """Fields that --help explains."""
 
-    env_id: Annotated[str, Renamed("env")] = "highway-fast-v0"
+    env_id: str = "highway-fast-v0"
     """Environment to train on: Gymnasium id (highway-fast-v0) or PettingZoo parallel id (simple_tag_v3)."""
     algorithm: Algorithm = "ppo"
     """Learning algorithm: ppo, dqn (discrete actions), a2c, sac (continuous actions); with the extra contrib also qrdqn
@@ -111,7 +111,7 @@ class TrainPolicyConfig:
     steps: int | None = None
     """Number of environment steps to train for, over all environments; one step of a PettingZoo copy is one, however
     many agents learn. None takes 20,000, in mpe2's particle worlds (simple_tag_v3) 60,000."""
-    num_envs: Annotated[int | None, Renamed("envs")] = None
+    num_envs: int | None = None
     """Number of parallel environments: processes, environments of EnvPool, or copies of a PettingZoo environment. None
     takes 6, with EnvPool and in mpe2's particle worlds 64."""
     backend: Backend = "gymnasium"
@@ -119,14 +119,14 @@ class TrainPolicyConfig:
     learners: tuple[str, ...] | None = None
     """PettingZoo: agents or roles that learn, for example adversary; None takes all, in simple_tag
     and simple_world_comm the adversaries."""
-    driver: Annotated[str, Renamed("partner")] = "heuristic"
+    driver: str = "heuristic"
     """PettingZoo: driver of the agents that do not learn: random, idle, varied, heuristic or mixed."""
     shaping: bool = True
     """simple_tag: learn also from a reward of 10 for each metre that a predator comes closer to the prey; selection and
     evaluation never count it."""
     seed: int = 0
     """Random seed for torch, NumPy and the environments; evaluation seeds do not depend on it."""
-    out: Annotated[Path | None, Renamed("run_dir")] = None
+    out: Path | None = None
     """Run folder to write; None takes runs/ENV_ID-ALGORITHM-OBSERVE-SEED."""
     resume: bool = False
     """Continue the run in `out`, or start it if the folder holds none."""

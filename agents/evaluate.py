@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ from envs.drivers.trained import require_own_view
 from envs.registry import arguments_of
 from envs.sb3.policy_file import Algorithm, algorithm_of, read_policy_note
 from envs.supervision import TIMEOUT_S
-from predictor.support.command_line import Renamed, parse
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_positive
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out
@@ -139,7 +139,7 @@ class EvaluateConfig:
     RUN_DIR/evaluation, where that is a folder of yours."""
     films: bool = False
     """Film the trained policy's best, median and worst episode by return: best.mp4, median.mp4, worst.mp4."""
-    num_envs: Annotated[int, Renamed("workers")] = os.cpu_count() or 1
+    num_envs: int = os.cpu_count() or 1
     """Number of parallel environments; the results do not depend on it."""
     device: str = "cpu"
     """Device that runs forecaster and policy: cpu, cuda or auto (cuda where there is one)."""

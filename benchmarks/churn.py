@@ -9,7 +9,7 @@ import gc
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -21,7 +21,7 @@ from envs.sb3.forecast import VecForecast
 from envs.wrappers import SceneObservation
 from predictor.checkpoint import load_checkpoint
 from predictor.scene import Scene, SceneSpec
-from predictor.support.command_line import Renamed, parse
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_json
@@ -35,9 +35,9 @@ class ChurnConfig:
 
     steps: int = 200_000
     """Number of environment steps, over all environments."""
-    num_envs: Annotated[int, Renamed("rows")] = 8
+    num_envs: int = 8
     """Number of parallel environments."""
-    num_agents: Annotated[int, Renamed("agents")] = 6
+    num_agents: int = 6
     """Number of agents around the ego, on average."""
     replaced: float = 0.2
     """Share of the agents that is replaced at each step."""
@@ -45,7 +45,7 @@ class ChurnConfig:
     """Forecaster: shipped name, folder or run folder."""
     horizon_steps: int = 2
     """Number of steps to forecast; only observing keeps memory, and short forecasts leave more time for it."""
-    measurements: Annotated[int, Renamed("samples")] = 200
+    measurements: int = 200
     """Number of measurements of memory over the run."""
     out: Path | None = None
     """JSON file to write the result to."""

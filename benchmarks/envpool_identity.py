@@ -9,7 +9,7 @@ highway-env as well, where vehicles also appear and vanish and the simulator giv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Annotated, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -20,7 +20,7 @@ from envs.readers.envpool import PoolIdentity, PoolReader, envpool_spec
 from envs.readers.highway import HighwayReader
 from envs.registry import make_env
 from envs.simulators.envpool import HIGHWAY_ENV_OF, make_pool
-from predictor.support.command_line import Renamed, parse
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 
@@ -33,7 +33,7 @@ class IdentityConfig:
     """EnvPool tasks to drive."""
     vehicle_steps: int = 100_000
     """Number of pairs of a vehicle and a step to count per task, without the ego."""
-    num_envs: Annotated[int, Renamed("envs")] = 32
+    num_envs: int = 32
     """Number of parallel environments."""
     seed: int = 0
     """Random seed for environments, actions and shuffles."""

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -25,7 +25,7 @@ from envs.registry import make_env
 from envs.seeding import driver_rng
 from envs.simulators.envpool import ENV_IDS, HIGHWAY_ENV_OF, begins_alike
 from envs.wrappers import ForecastObservation
-from predictor.support.command_line import Renamed, parse
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_json
@@ -50,7 +50,7 @@ class ParityConfig:
     """Number of policy steps from each initial state."""
     episodes: int = 30
     """Number of episodes per task, simulator and driver; 0 leaves these tables out."""
-    driver: Annotated[tuple[str, ...], Renamed("egos")] = ("random", "idle")
+    driver: tuple[str, ...] = ("random", "idle")
     """Drivers of the ego: random, idle or varied."""
     policy: Path | None = None
     """Policy .zip of Stable-Baselines3 that drives as well, in both simulators."""

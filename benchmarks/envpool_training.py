@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -21,7 +21,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from agents.task import Task
 from agents.training import TrainingPlan, make_model
 from agents.vec_envs import make_venv
-from predictor.support.command_line import Renamed, parse
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import run_entry_point
 from predictor.support.files import write_json
@@ -35,15 +35,15 @@ class TrainingSpeedConfig:
 
     env_id: str = "highway-fast-v0"
     """Environment by highway-env's id; EnvPool trains on its own copy of it."""
-    num_envpool_envs: Annotated[int, Renamed("native_envs")] = 64
+    num_envpool_envs: int = 64
     """Number of parallel environments in EnvPool."""
-    num_plain_envs: Annotated[int, Renamed("plain_envs")] = 6
+    num_plain_envs: int = 6
     """Number of parallel environments of highway-env; the default is that of train_policy.py."""
     blocks: int = 5
     """Number of pairs of blocks; the median of their ratios is reported."""
     plain_steps: int = 768
     """Number of environment steps in a plain block (one rollout of 128 steps and its update)."""
-    envpool_steps: Annotated[int, Renamed("native_steps")] = 8192
+    envpool_steps: int = 8192
     """Number of environment steps in a block with forecasts."""
     threads: int = 2
     """Number of torch threads of the forecaster and of both policies."""

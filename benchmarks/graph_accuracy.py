@@ -9,7 +9,7 @@ one window at a time.
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from predictor.evaluation.accuracy import Tally
 from predictor.evaluation.measure_line import protocol_indices
 from predictor.evaluation.outcomes import run_windows
 from predictor.forecaster import Forecaster
-from predictor.support.command_line import Renamed, parse
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_json
@@ -38,17 +38,17 @@ from predictor.support.runtime import tune
 class GraphConfig:
     """Measures checkpoints with several graphs."""
 
-    checkpoint: Annotated[tuple[Path, ...], Renamed("checkpoints")]
+    checkpoint: tuple[Path, ...]
     """Checkpoints of dG-VAEs to measure: shipped names, folders or run folders."""
-    data: Annotated[tuple[Path, ...], Renamed("stores")]
+    data: tuple[Path, ...]
     """Episode stores to measure on."""
     neighbours: tuple[int, ...] = (2, 4, 8, 16)
     """Numbers of neighbours to measure with; all pairs, evolving and frozen, are always measured."""
-    burn_in_steps: Annotated[int, Renamed("history_steps")] = 40
+    burn_in_steps: int = 40
     """Number of steps observed in every window before the forecast begins."""
     horizon_steps: int = 10
     """Number of steps to forecast."""
-    max_windows: Annotated[int, Renamed("windows")] = 100
+    max_windows: int = 100
     """Number of windows measured at most in each store, drawn evenly."""
     stride: int = 5
     """Number of steps between two windows of an episode."""

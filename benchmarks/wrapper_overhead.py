@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from predictor.dgvae import DGVAE
 from predictor.dgvae.config import PRESETS
 from predictor.forecaster import Forecaster
 from predictor.scene import SceneSpec
-from predictor.support.command_line import Renamed, parse
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_json
@@ -46,7 +46,7 @@ class OverheadConfig:
     """Forecaster: shipped name, folder or run folder; None takes the checkpoint that ships for the id."""
     paper_size: bool = False
     """Forecast with an untrained network of the paper's size instead of a checkpoint."""
-    num_envs: Annotated[int, Renamed("envs")] = 8
+    num_envs: int = 8
     """Number of parallel environments."""
     vec: Literal["dummy", "subproc"] = "dummy"
     """Processes of the environments: dummy (one for all) or subproc (one for each)."""

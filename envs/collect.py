@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from envs.readers.highway_labels import ATTRIBUTE_NAMES
 from envs.registry import arguments_of
@@ -28,7 +28,7 @@ from predictor.data.partial_store import PartialStore
 from predictor.data.store import Episode, StoreInfo
 from predictor.data.store_files import check_replaceable
 from predictor.support.cluster import check_address
-from predictor.support.command_line import Renamed, parse
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices, check_positive
 from predictor.support.errors import UserError, run_entry_point, short
 from predictor.support.files import check_place
@@ -63,7 +63,7 @@ class CollectConfig:
     """Folder of the new store (Zarr)."""
     episodes: int = 400
     """Number of episodes to record."""
-    driver: Annotated[tuple[str, ...], Renamed("ego")] = ()
+    driver: tuple[str, ...] = ()
     """Driver; several take turns, one per episode. One ego: random, idle, varied, keep-lane, planner, one action in
     every step (slower, action-4), or the path of a policy .zip. Many learners: random, idle, varied, heuristic, mixed.
     Both: own:module:function (docs/wrap_your_env.md). None given: varied random idle, or heuristic mixed varied."""

@@ -13,7 +13,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 from rich.console import Console
 
@@ -39,7 +39,7 @@ from predictor.data.store import read_info_of
 from predictor.own_forecasters import is_own
 from predictor.reports.tables import accuracy_table
 from predictor.support.cluster import check_address
-from predictor.support.command_line import Renamed, parse
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_positive
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, finite, write_json, write_text
@@ -73,23 +73,23 @@ class EvaluateConfig:
     matrix."""
     episodes: int = 50
     """Number of episodes in each environment."""
-    driver: Annotated[str | None, Renamed("ego")] = None
+    driver: str | None = None
     """Driver. One ego: random, idle, varied (default), keep-lane, one action in every step (slower, action-4), or the
     path of a policy .zip (which gets the forecasts that it was trained on). Many learners: random, idle, varied,
     heuristic (default), mixed. Both: own:module:function (docs/wrap_your_env.md)."""
     seed: int = 900_000
     """Random seed: episode i is reset with seed + i; the shipped checkpoints were trained on seeds from 100,000
     on."""
-    num_samples: Annotated[int, Renamed("samples")] = 20
+    num_samples: int = 20
     """Number of forecasts drawn (K) for the second line; the first is K = 1, the most likely forecast."""
     horizon_steps: int | None = None
     """Number of steps to forecast; None takes each checkpoint's."""
-    memory_steps: Annotated[tuple[int, ...], Renamed("history_steps")] = ()
+    memory_steps: tuple[int, ...] = ()
     """Numbers of steps to which the model's memory is limited, each measured as well: the value of its memory."""
     edge_ablations: bool = False
     """Whether to measure as well the model with every receiver's edges averaged over its senders, and with all edges
     cut: the value of its graph."""
-    data: Annotated[tuple[Path, ...], Renamed("neighbours")] = ()
+    data: tuple[Path, ...] = ()
     """Recorded data to which the controls are fitted (constant velocity with noise, the model's single forecast with
     noise, nearest neighbours): stores, or folders of stores named by env id; stores of other environments are left
     out."""

@@ -10,7 +10,7 @@ import csv
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -22,7 +22,7 @@ from envs.readers.highway import HighwayReader, is_highway_env, vehicles_of
 from envs.registry import make_env
 from envs.seeding import driver_rng
 from predictor.data.store import Episode
-from predictor.support.command_line import Renamed, parse
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choice
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, new_folder, write_json
@@ -52,7 +52,7 @@ class ExportConfig:
     """Folder of the new recordings."""
     episodes: int = 10
     """Number of episodes; each becomes a recording."""
-    driver: Annotated[str, Renamed("ego")] = "varied"
+    driver: str = "varied"
     """Driver of the ego: random, idle, varied, keep-lane."""
     seed: int = 0
     """Random seed: episode i is reset with seed + i."""

@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 import matplotlib
 import numpy as np
@@ -29,7 +28,7 @@ from predictor.reports.looks import STYLE
 from predictor.reports.plots import plot_error_by_horizon, plot_scene, save_figure
 from predictor.reports.tables import MODEL_NAMES, accuracy_table, markdown_table
 from predictor.scene import SceneSpec
-from predictor.support.command_line import Renamed, parse
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, write_json, write_text
@@ -49,7 +48,7 @@ class EvaluateConfig:
     """Episode store that was not trained on."""
     out: Path | None = None
     """Folder for accuracy.json, accuracy.md and plots; none are written if left out."""
-    num_samples: Annotated[int, Renamed("samples")] = 20
+    num_samples: int = 20
     """Number of forecasts (K) of the model, and of constant velocity, which has noise if K is above 1."""
     history_steps: int = 10
     """Number of observed steps that the model gets before each forecast (fewer where the episode has just begun)."""

@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ from predictor.evaluation.outcomes import run_window_batch
 from predictor.reports import edge_plots as pictures
 from predictor.reports.tables import scores_markdown
 from predictor.scene import SceneSpec
-from predictor.support.command_line import Renamed, parse
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, scratch_folder, write_json, write_text
@@ -55,13 +55,13 @@ class InterpretConfig:
     """Episode store that was not trained on; edge labels are used where it has them."""
     out: Path
     """Folder for the three pictures, scores.json and scores.md."""
-    max_windows: Annotated[int, Renamed("windows")] = 300
+    max_windows: int = 300
     """Number of windows measured at most, drawn evenly from the store."""
-    burn_in_steps: Annotated[int, Renamed("history_steps")] = 40
+    burn_in_steps: int = 40
     """Number of steps observed in every window before features are read and the forecast begins."""
     horizon_steps: int = 10
     """Number of steps forecast in trajectories.png; a window has so many after its burn-in."""
-    num_samples: Annotated[int, Renamed("samples")] = 20
+    num_samples: int = 20
     """Number of forecasts drawn for each agent."""
     seed: int = 0
     """Random seed for window sampling, forecasts and shuffles."""

@@ -11,7 +11,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import matplotlib
 import torch
@@ -27,7 +27,7 @@ from predictor.evaluation.training_seeds import joined
 from predictor.reports.plots import figure_by_step, save_figure
 from predictor.reports.suite_tables import latex_table, markdown_report
 from predictor.support.cluster import check_address, connected
-from predictor.support.command_line import Renamed, parse
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_json, write_text
@@ -71,11 +71,11 @@ class SuiteConfig:
     budget: Budget = "cpu"
     """Sizes of networks and training: "smoke" takes minutes, "cpu" hours on two cores with smaller networks,
     "paper" needs a GPU for the paper's sizes."""
-    lines: Annotated[tuple[str, ...], Renamed("rows")] = ()
+    lines: tuple[str, ...] = ()
     """Keys of the lines to run; none runs all."""
     steps: int = 0
     """Number of optimiser steps of every line; 0 takes that of the budget."""
-    workers: Annotated[int, Renamed("jobs")] = 0
+    workers: int = 0
     """Number of parallel processes, a line in each, which share all cores (or OMP_NUM_THREADS threads, where that is
     set); 0 is one per core (one in all on a GPU)."""
     seed: int = 0
@@ -90,7 +90,7 @@ class SuiteConfig:
     """Ray cluster that runs the lines, each on one CPU (and one GPU with --device cuda): auto (the one that runs on
     this machine) or HOST:PORT of its head; --data and --out have to be on a file system that all machines share
     (docs/scale.md). None runs them here."""
-    only_line: Annotated[str, Renamed("only_row")] = ""
+    only_line: str = ""
     """Key of a line to run in this process, without a table."""
 
     def __post_init__(self) -> None:

@@ -21,7 +21,7 @@ from envs.sb3.forecast import VecForecast
 from envs.vector import VectorForecast
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.data.store import StoreInfo, write_store
-from predictor.support.command_line import parse, renamed_options
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_choices
 from predictor.support.errors import UserError, run_entry_point
 from tests.predictor.helpers import circling_episode, spec
@@ -285,44 +285,6 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
 }
 """Words of a command line → how the one line begins after "error: ", for each command."""
 
-RENAMED: dict[str, dict[str, str]] = {
-    "predictor.evaluate": {"--samples": "--num-samples"},
-    "predictor.suite": {"--jobs": "--workers", "--rows": "--lines", "--only-row": "--only-line"},
-    "predictor.interpret": {
-        "--samples": "--num-samples",
-        "--windows": "--max-windows",
-        "--history-steps": "--burn-in-steps",
-    },
-    "predictor.data.crowd": {"--agents": "--num-agents", "--steps": "--episode-steps"},
-    "predictor.data.nba": {"--window-steps": "--episode-steps"},
-    "envs.collect": {"--ego": "--driver"},
-    "envs.evaluate": {
-        "--ego": "--driver",
-        "--samples": "--num-samples",
-        "--history-steps": "--memory-steps",
-        "--neighbours": "--data",
-    },
-    "envs.export_levelx": {"--ego": "--driver"},
-    "agents.evaluate": {"--workers": "--num-envs"},
-    "train_policy": {"--env": "--env-id", "--envs": "--num-envs", "--partner": "--driver", "--run-dir": "--out"},
-    "benchmarks.wrapper_overhead": {"--envs": "--num-envs"},
-    "benchmarks.graph_accuracy": {
-        "--checkpoints": "--checkpoint",
-        "--stores": "--data",
-        "--windows": "--max-windows",
-        "--history-steps": "--burn-in-steps",
-    },
-    "benchmarks.churn": {"--rows": "--num-envs", "--agents": "--num-agents", "--samples": "--measurements"},
-    "benchmarks.envpool_identity": {"--envs": "--num-envs"},
-    "benchmarks.envpool_parity": {"--egos": "--driver"},
-    "benchmarks.envpool_training": {
-        "--native-envs": "--num-envpool-envs",
-        "--plain-envs": "--num-plain-envs",
-        "--native-steps": "--envpool-steps",
-    },
-}
-"""Old option → new option, for each command."""
-
 REQUIRED: dict[str, list[str]] = {
     "predictor.train": ["--data", "store", "--out", "run"],
     "predictor.evaluate": ["--checkpoint", "highway", "--data", "store"],
@@ -348,12 +310,6 @@ REQUIRED: dict[str, list[str]] = {
     "benchmarks.gpu_springs": ["--device", "cpu"],
 }
 """Required options of a command."""
-
-VALUE_OF = {
-    "--driver": "varied", "--out": "elsewhere", "--env-id": "merge-v1", "--checkpoint": "a", "--data": "b",
-    "--lines": "mlp", "--only-line": "mlp",
-}  # fmt: skip
-"""Value of an option that does not take the number 60."""
 
 
 def source_of(command: str) -> str:
@@ -411,28 +367,6 @@ def test_bad_values_end_in_one_line(
 
 
 # --- Names of options -------------------------------------------------------------------------------------------------
-
-
-def test_renamed_options_are_those_of_the_table():
-    found = {command: renamed_options(config_of(command)) for command in REFUSED}
-    assert {command: renamed for command, renamed in found.items() if renamed} == RENAMED
-
-
-@pytest.mark.parametrize(
-    ("command", "old", "new"), [(command, *names) for command, table in RENAMED.items() for names in table.items()]
-)
-def test_an_old_option_is_the_new_one_and_says_so(command: str, old: str, new: str, capsys: pytest.CaptureFixture[str]):
-    config, value = config_of(command), VALUE_OF.get(new, "60")
-    base = [word for word in REQUIRED.get(command, [])]
-    if new in base:
-        at = base.index(new)
-        del base[at : at + 2]
-    if command == "train_policy" and new == "--driver":
-        base += ["--env-id", "simple_tag_v3"]
-    expected = parse(config, args=[*base, new, value])
-    assert capsys.readouterr().err == ""
-    assert parse(config, args=[*base, old, value]) == expected
-    assert capsys.readouterr().err == f"option {old} is now {new}; the next release drops {old}\n"
 
 
 def test_no_option_has_a_name_that_was_given_up():

@@ -7,13 +7,12 @@ agents without influence on each other, not how crowds behave.
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 
 from predictor.data.dataset_card import most_present
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
-from predictor.support.command_line import Renamed, parse
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.provenance import provenance
@@ -28,11 +27,11 @@ class CrowdConfig:
     """Episode store whose scenes are overlaid; it has no ego."""
     out: Path
     """Folder of the new store (Zarr)."""
-    num_agents: Annotated[tuple[int, ...], Renamed("agents")] = (2, 5, 10, 20, 50, 100, 150)
+    num_agents: tuple[int, ...] = (2, 5, 10, 20, 50, 100, 150)
     """Numbers of agents wanted at the last observed step; each gives `episodes` episodes."""
     episodes: int = 8
     """Number of episodes for each number of agents."""
-    episode_steps: Annotated[int, Renamed("steps")] = 50
+    episode_steps: int = 50
     """Length of an episode [steps]; shorter ones of the source are left out."""
     at_step: int = 39
     """Step at which agents are counted: the last step of the burn-in."""

@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -37,7 +37,7 @@ from predictor.data.loading import (
 )
 from predictor.data.store import Episode
 from predictor.scene import KINEMATIC_FEATURES, SceneSpec
-from predictor.support.command_line import Renamed, parse
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.progress import track
@@ -255,7 +255,7 @@ class NbaConfig(LoaderConfig):
 
     format: Literal["score", "sportvu"] = "score"
     """Format of the files: score (text files of possessions) or sportvu (raw JSON of games)."""
-    episode_steps: Annotated[int, Renamed("window_steps")] = 50
+    episode_steps: int = 50
     """Length of an episode [steps of 0.12 s]; shorter rests of a passage are dropped. 0 keeps passages whole."""
     skip_broken: bool = False
     """Leave broken files out and count them, instead of stopping at the first."""

@@ -1,4 +1,4 @@
-"""Parsing of a command line into a config: tyro's options, errors in one line, old names of options.
+"""Parsing of a command line into a config: tyro's options, errors in one line.
 
 Configs are checked in `__post_init__`. tyro prints such an error in a box and exits; `parse` raises the error itself,
 so that `predictor.support.errors.run_entry_point` prints one line and exits with status 2.
@@ -30,17 +30,6 @@ _SENTENCE_TITLES = ("Invalid choice", "Missing argument", "Value error")
 """Titles of tyro's boxes whose first part is a sentence; the other boxes list options and stay as they are."""
 
 
-@dataclass(frozen=True)
-class Renamed:
-    """Marks a config's field whose option had another name: `num_envs: Annotated[int, Renamed("envs")] = 1`.
-
-    The old option works for one release and prints the new name on stderr.
-    """
-
-    old: str
-    """Former name of the field; the option is --old-name."""
-
-
 def parse(config_class: type[Config], description: str | None = None, args: Sequence[str] | None = None) -> Config:
     """Reads a config from the command line.
 
@@ -56,7 +45,7 @@ def parse(config_class: type[Config], description: str | None = None, args: Sequ
         UserError: the config rejects a value, or a value does not have its field's type.
         SystemExit: options are unknown or missing (status 2, listed on stderr), or help is asked for (status 0).
     """
-    words = with_new_names(config_class, sys.argv[1:] if args is None else args)
+    words = sys.argv[1:] if args is None else list(args)
     if HELP_ALL in words:
         words = ["--help"]
         config_class = _for_help(config_class, ())
@@ -111,37 +100,6 @@ def _program() -> str | None:
     if spec is None or sys.argv[0] != getattr(main, "__file__", None):  # the command dgvae sets its own
         return None
     return f"python -m {spec.name}"
-
-
-def with_new_names(config_class: type, words: Sequence[str]) -> list[str]:
-    """Returns the words with options' old names replaced; prints a line on stderr for each."""
-    new_names = renamed_options(config_class)
-    replaced = []
-    for word in words:
-        name, equals, value = word.partition("=")
-        spelled = name.replace("_", "-")
-        if name.startswith("--") and spelled in new_names:
-            print(f"option {name} is now {new_names[spelled]}; the next release drops {name}", file=sys.stderr)
-            word = new_names[spelled] + equals + value
-        replaced.append(word)
-    return replaced
-
-
-def renamed_options(config_class: type) -> dict[str, str]:
-    """Returns the new option of each old one, such as {"--envs": "--num-envs"}."""
-    hints = get_type_hints(config_class, include_extras=True)
-    renamed: dict[str, str] = {}
-    for field in fields(config_class):
-        for mark in getattr(hints[field.name], "__metadata__", ()):
-            if isinstance(mark, Renamed):
-                renamed[_option(mark.old)] = _option(field.name)
-                if hints[field.name].__origin__ is bool:
-                    renamed[_option(f"no_{mark.old}")] = _option(f"no_{field.name}")
-    return renamed
-
-
-def _option(name: str) -> str:
-    return "--" + name.replace("_", "-")
 
 
 def _user_error_behind(error: BaseException | None) -> UserError | None:

@@ -122,7 +122,9 @@ def test_another_forecaster_is_refused(of_one_ego: bool, tmp_path: Path):
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in (entries | {"note.json": json.dumps(note).encode()}).items():
             archive.writestr(name, content)
-    with pytest.raises(UserError, match="was trained on forecaster '(highway|simple-tag)' .* but gets '(highway|simple-tag)'"):
+    with pytest.raises(
+        UserError, match="was trained on forecaster '(highway|simple-tag)' .* but gets '(highway|simple-tag)'"
+    ):
         load_policy(path)
 
 

@@ -1,11 +1,11 @@
 import sys
 from dataclasses import dataclass, field
 from importlib.machinery import ModuleSpec
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import pytest
 
-from predictor.support.command_line import Renamed, parse, renamed_options
+from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 
@@ -25,11 +25,11 @@ class Box:
 class Settings:
     """Settings of a test."""
 
-    num_envs: Annotated[int | None, Renamed("envs")] = 2
+    num_envs: int | None = 2
     """Number of environments."""
-    out_paths: Annotated[tuple[str, ...], Renamed("run_dirs")] = ()
+    out_paths: tuple[str, ...] = ()
     """Folders to write."""
-    record: Annotated[bool, Renamed("film")] = True
+    record: bool = True
     """Film it."""
     colour: Literal["red", "blue"] = "red"
     """Colour of the box."""
@@ -48,7 +48,7 @@ class Long:
 
     colour: Literal["red", "blue"] = "red"
     """Colour of the box."""
-    num_envs: Annotated[int, Renamed("envs")] = 2
+    num_envs: int = 2
     """Number of environments."""
     curl: float = 0.5
     """Curl of the field."""
@@ -70,7 +70,7 @@ def test_help_explains_the_everyday_options_and_help_all_every_one(capsys: pytes
         text in shown["--help-all"] for text in ("Colour of the box.", "Curl of the field.", "Spin of the field.")
     )
     assert "more options" not in shown["--help-all"]
-    assert parse(Long, args=["--curl", "1", "--envs", "3"]) == Long(num_envs=3, curl=1.0), "all of them are read"
+    assert parse(Long, args=["--curl", "1", "--num-envs", "3"]) == Long(num_envs=3, curl=1.0), "all of them are read"
 
 
 def test_a_module_is_called_by_its_name(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
@@ -163,33 +163,3 @@ def test_help_has_the_description_and_every_field(capsys: pytest.CaptureFixture[
     assert stop.value.code == 0 and errors == ""
     for text in ("Reads settings.", "--num-envs", "Number of environments.", "--box.width", "Width of the box."):
         assert text in out
-    assert "--envs" not in out
-
-
-@pytest.mark.parametrize(
-    ("words", "same_as", "lines"),
-    [
-        (["--envs", "3"], ["--num-envs", "3"], [("--envs", "--num-envs")]),
-        (["--envs=3"], ["--num-envs=3"], [("--envs", "--num-envs")]),
-        (["--run-dirs", "a", "b"], ["--out-paths", "a", "b"], [("--run-dirs", "--out-paths")]),
-        (["--run_dirs", "a"], ["--out-paths", "a"], [("--run_dirs", "--out-paths")]),
-        (["--film"], ["--record"], [("--film", "--record")]),
-        (["--no-film"], ["--no-record"], [("--no-film", "--no-record")]),
-        (["--out-paths", "envs"], ["--out-paths", "envs"], []),
-    ],
-)
-def test_old_names_of_options_work_and_say_so(
-    words: list[str], same_as: list[str], lines: list[tuple[str, str]], capsys: pytest.CaptureFixture[str]
-):
-    assert parse(Settings, args=words) == parse(Settings, args=same_as)
-    said = "".join(f"option {old} is now {new}; the next release drops {old}\n" for old, new in lines)
-    assert capsys.readouterr() == ("", said)
-
-
-def test_renamed_options_are_listed():
-    assert renamed_options(Settings) == {
-        "--envs": "--num-envs",
-        "--run-dirs": "--out-paths",
-        "--film": "--record",
-        "--no-film": "--no-record",
-    }
