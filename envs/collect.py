@@ -24,7 +24,7 @@ from envs.rollouts.world import World, default_drivers, open_world
 from envs.simulators.interventions import Kind
 from envs.supervision import TIMEOUT_S
 from envs.testing import store_problems
-from predictor.data.partial_store import PartialStore
+from predictor.data.partial_store import PartialStore, beside
 from predictor.data.store import Episode, StoreInfo
 from predictor.data.store_files import check_replaceable
 from predictor.support.cluster import check_address
@@ -329,7 +329,7 @@ def main() -> None:
         check_replaceable(config.out)
     with open_pool(config) as pool:
         info = _info_from(config, pool)
-        with locked_path(config.out):
+        with locked_path(config.out), locked_path(beside(config.out)):
             partial = PartialStore(config.out, _settings(config, info), discard=config.overwrite)
             done = partial.num_done
             with resumable(lambda: _kept(config, partial)), partial:

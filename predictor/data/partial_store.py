@@ -3,11 +3,11 @@
 Beside the store that is being made, under a hidden name, are the parts that are finished, each an episode store of its
 own, and the settings that they were made with. When all episodes are there, they become one store and the parts are
 deleted. A recording that is shorter than `PART_S` writes no parts. Those of a store on another file system (`s3://…`)
-are in the folder in which the command runs.
+are in the folder in which the command runs, under a name that its address determines.
 """
 
+import hashlib
 import json
-import shutil
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -17,18 +17,26 @@ from typing import Any
 
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.support.errors import UserError
-from predictor.support.files import delete_leftovers, write_json
+from predictor.support.files import delete_folder, delete_leftovers, write_json
 from predictor.support.reading import read_object
-from predictor.support.remote import is_remote
+from predictor.support.remote import address, is_remote
 
 PART_S = 30.0
 """Time after which the episodes that have been recorded since the last part are written [s]."""
 SETTINGS = "settings.json"
-SKIPPED = "skipped.json"
+
+
+def beside(path: Path) -> Path:
+    """Returns the path beside which the parts of a store are: its own, or one in this folder for an address."""
+    if not is_remote(path):
+        return path
+    return Path(f"{path.name}-{hashlib.sha256(address(path).encode()).hexdigest()[:8]}")
 
 
 class PartialStore:
     """Episodes of a store that is being recorded, in their order; a context manager, which writes what it has at exit.
+
+    Nobody else may write `beside(path)` meanwhile.
 
     Args:
         path: path of the store.
@@ -48,20 +56,22 @@ class PartialStore:
     def __init__(self, path: Path, settings: Mapping[str, Any], discard: bool = False, part_s: float = PART_S) -> None:
         """Finds the parts of an earlier attempt."""
         self._path, self._part_s = Path(path), part_s
-        beside = Path(self._path.name) if is_remote(self._path) else self._path
-        self.folder = beside.with_name(f".{self._path.name}.unfinished")
+        kept = beside(self._path)
+        self.folder = kept.with_name(f".{kept.name}.unfinished")
         self._settings = json.loads(json.dumps(settings, default=str))
         self._info: StoreInfo | None = None
         self._new: list[Episode] = []
         self._added = 0
         self.skipped: dict[int, str] = {}
         self._written_at = time.monotonic()
+        for name in (kept.name, self.folder.name):
+            delete_leftovers(kept.parent, name)
         if self.folder.exists():
             self._take_over(discard)
-        self.num_done = sum(int(part.name.partition("+")[2]) for part in self._parts())
-        if (self.folder / SKIPPED).exists():
-            found = read_object(self.folder / SKIPPED)
-            self.skipped = {int(seed): str(reason) for seed, reason in found.items()}
+        parts = self._parts()
+        self.num_done = sum(map(_steps, parts))
+        for reasons in filter(Path.exists, map(_reasons, parts)):
+            self.skipped |= {int(seed): str(reason) for seed, reason in read_object(reasons).items()}
 
     def __enter__(self) -> "PartialStore":
         """Returns itself."""
@@ -103,7 +113,8 @@ class PartialStore:
             info = replace(info, provenance=info.provenance | {"skipped": {"episodes": len(named), "reasons": named}})
         write_store(self._path, info, episodes, overwrite)
         self._new = []
-        shutil.rmtree(self.folder, ignore_errors=True)
+        if self.folder.exists():
+            delete_folder(self.folder)
         return episodes
 
     def _parts(self) -> list[Path]:
@@ -111,6 +122,9 @@ class PartialStore:
 
     def _take_over(self, discard: bool) -> None:
         delete_leftovers(self.folder)
+        if not self._parts():  # the disk was full before the first one
+            delete_folder(self.folder)
+            return
         try:
             found = read_object(self.folder / SETTINGS)
         except UserError:
@@ -123,7 +137,7 @@ class PartialStore:
                 f"{self.folder} has episodes of an unfinished recording with another {', '.join(other) or 'setting'}; "
                 "repeat its command to go on, or pass --overwrite to begin anew"
             )
-        shutil.rmtree(self.folder)
+        delete_folder(self.folder)
 
     def _write_part(self) -> None:
         self._written_at = time.monotonic()
@@ -131,8 +145,19 @@ class PartialStore:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
         write_json(self.folder / SETTINGS, self._settings)
+        part = self.folder / f"{self.num_done:08d}+{self._added}"
         if self.skipped:
-            write_json(self.folder / SKIPPED, self.skipped)
-        write_store(self.folder / f"{self.num_done:08d}+{self._added}", self._info, self._new)
+            write_json(_reasons(part), self.skipped)  # counts once the part is there
+        write_store(part, self._info, self._new)
         self.num_done += self._added
         self._new, self._added = [], 0
+
+
+def _steps(part: Path) -> int:
+    """Returns the number of steps of the recording that a part holds."""
+    return int(part.name.partition("+")[2])
+
+
+def _reasons(part: Path) -> Path:
+    """Returns the file that says why seeds had no episode until a part was written."""
+    return part.with_name(f"{part.name}.json")

@@ -6,6 +6,7 @@ with the new one at once; elsewhere it is absent for a moment, and after a crash
 """
 
 import ctypes
+import glob
 import json
 import math
 import os
@@ -21,6 +22,8 @@ from predictor.support.remote import is_remote, require_local, uploaded
 
 _FULL_BYTES = 65_536
 """Free space below which a disk counts as full when a library fails to write without saying why."""
+_CODE = 8
+"""Number of digits in the name of an unfinished file."""
 _HERE, _EXCHANGE = -100, 2  # AT_FDCWD of <fcntl.h>, RENAME_EXCHANGE of <linux/fs.h>
 
 
@@ -148,17 +151,25 @@ def check_place(out: Path) -> None:
         raise UserError(f"{short(out)} cannot be used: {error}; choose another path") from error
 
 
-def delete_leftovers(folder: Path) -> None:
-    """Deletes the unfinished files that a killed process left in a folder."""
-    for leftover in folder.glob(".*.partial*"):
+def delete_leftovers(folder: Path, name: str = "") -> None:
+    """Deletes the unfinished files that a killed process left in a folder, those of the file `name` if given."""
+    pattern = f".{glob.escape(name)}.{'[0-9a-f]' * _CODE}.partial*" if name else ".*.partial*"
+    for leftover in folder.glob(pattern):
         if leftover.is_dir():
             shutil.rmtree(leftover, ignore_errors=True)
         else:
             leftover.unlink(missing_ok=True)
 
 
+def delete_folder(folder: Path) -> None:
+    """Deletes a folder as a whole: one that is deleted in part has another name."""
+    doomed = _beside(folder)
+    folder.rename(doomed)
+    shutil.rmtree(doomed, ignore_errors=True)
+
+
 def _beside(path: Path, suffix: str = "") -> Path:
-    return path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.partial{suffix}")
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex[:_CODE]}.partial{suffix}")
 
 
 def _flush(path: Path) -> None:

@@ -1,9 +1,11 @@
+import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from predictor.data.partial_store import SETTINGS, PartialStore
+from predictor.data.partial_store import SETTINGS, PartialStore, beside
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.support.errors import UserError
 from tests.predictor.helpers import circling_episode, spec
@@ -68,6 +70,66 @@ def test_an_unfinished_part_does_not_count(tmp_path: Path):
     (folder / ".00000002+3.abc.partial").mkdir()
     assert PartialStore(tmp_path / "store", SETTINGS_A).num_done == 2
     assert sorted(p.name for p in folder.iterdir()) == ["00000000+1", "00000001+1", SETTINGS]
+
+
+def test_what_a_kill_while_parts_are_deleted_leaves_is_no_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Else the parts that are left would be taken for the first ones."""
+    stopped(tmp_path / "store", 3)
+
+    delete = shutil.rmtree
+
+    def killed(folder: Path, **options: Any) -> None:
+        if "unfinished" not in Path(folder).name:
+            return delete(folder, **options)
+        delete(folder / "00000000+1")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(shutil, "rmtree", killed)
+    with pytest.raises(KeyboardInterrupt), PartialStore(tmp_path / "store", SETTINGS_A) as partial:
+        partial.finish(INFO)
+    monkeypatch.undo()
+    assert len(read_store(tmp_path / "store").episodes) == 3
+    assert PartialStore(tmp_path / "store", SETTINGS_A).num_done == 0
+    assert [p.name for p in tmp_path.iterdir()] == ["store"]
+
+
+def test_a_recording_begins_anew_if_the_disk_was_full_before_its_first_part(tmp_path: Path):
+    (tmp_path / ".store.unfinished").mkdir()
+    assert PartialStore(tmp_path / "store", SETTINGS_A).num_done == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unfinished_files_of_other_stores_stay(tmp_path: Path):
+    names = [".store.0123abcd.partial", ".store.b.0123abcd.partial", ".other.0123abcd.partial"]
+    for name in names:
+        (tmp_path / name).mkdir()
+    PartialStore(tmp_path / "store", SETTINGS_A)
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names[1:])
+
+
+def test_a_seed_was_skipped_only_if_its_part_is_there(tmp_path: Path):
+    """The episode of a seed that failed by chance may be recorded by the next attempt."""
+    first, second, *_ = episodes()
+    with pytest.raises(KeyboardInterrupt), PartialStore(tmp_path / "store", SETTINGS_A, part_s=1e6) as partial:
+        partial.skip(0, "it hangs")
+        partial.add(INFO, second)
+        raise KeyboardInterrupt
+    assert PartialStore(tmp_path / "store", SETTINGS_A).skipped == {0: "it hangs"}
+    shutil.rmtree(tmp_path / ".store.unfinished" / "00000000+2")  # as after a kill before the part was written
+    with PartialStore(tmp_path / "store", SETTINGS_A) as partial:
+        assert partial.num_done == 0 and partial.skipped == {}
+        partial.add(INFO, first, second)
+        partial.finish(INFO)
+    assert "skipped" not in read_store(tmp_path / "store").info.provenance
+
+
+def test_stores_at_different_addresses_have_parts_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    one, other = (Path(f"memory://{place}/store") for place in ("a", "b"))
+    stopped(one, 2)
+    assert PartialStore(other, SETTINGS_A).num_done == 0
+    assert PartialStore(one, SETTINGS_A).num_done == 2
+    assert beside(one) != beside(other) and beside(tmp_path / "store") == tmp_path / "store"
 
 
 def test_a_step_of_the_recording_may_bring_several_episodes_or_none(tmp_path: Path):
