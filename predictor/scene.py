@@ -19,6 +19,8 @@ from predictor.support.errors import UserError
 
 KINEMATIC_FEATURES = ("x_m", "y_m", "vx_mps", "vy_mps")
 KINEMATIC_FEATURES_3D = ("x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps")
+LARGEST = 1e30
+"""Largest size of a state; single precision holds it, and differences of two."""
 PADDING_ID = -1
 MOST_AGENTS = 65_536
 """Largest number of agents of a scene."""
@@ -192,10 +194,10 @@ class Scene:
         number = isinstance(self.heading_rad, int | float | np.integer | np.floating)
         if not number or not np.isfinite(self.heading_rad):
             raise UserError(f"{source}: heading_rad must be one finite number, got {self.heading_rad}")
-        if not np.isfinite(self.states).all():
-            raise UserError(
-                f"{source}: states must be finite, those of padded agents too (zeros), got {self.states.tolist()}"
-            )
+        if not (np.abs(self.states) <= LARGEST).all():
+            finite = np.isfinite(self.states).all()
+            wanted = f"at most {LARGEST:g} in size" if finite else "finite, those of padded agents too (zeros)"
+            raise UserError(f"{source}: states must be {wanted}, got {self.states.tolist()}")
 
     def _check_arrays(self, source: str, spec: SceneSpec | None, agents: int | None) -> None:
         for name, array, kind, wanted, axes in (

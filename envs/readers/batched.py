@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from envs.readers.base import perceive_batch
-from predictor.scene import PADDING_ID, SceneBatch, SceneSpec
+from predictor.scene import LARGEST, PADDING_ID, SceneBatch, SceneSpec
 from predictor.support.errors import UserError
 
 Array = Tensor | np.ndarray
@@ -132,6 +132,7 @@ def check_scenes(scenes: SceneBatch, spec: SceneSpec, source: str = "TensorReade
     if not spec.has_ego and agents > spec.max_agents:
         raise UserError(f"{source}: {agents} agents do not fit max_agents={spec.max_agents}; raise max_agents")
     _refuse(source, "the states of present agents must be finite", ~np.isfinite(scenes.states).all(axis=(1, 2)))
+    _refuse(source, f"states must be at most {LARGEST:g} in size", (np.abs(scenes.states) > LARGEST).any(axis=(1, 2)))
     _refuse(source, "heading_rad must be finite", ~np.isfinite(scenes.heading_rad))
     _refuse(source, "ids of present agents must not be negative", ((scenes.ids < 0) & scenes.valid).any(axis=1))
     ordered = np.sort(np.where(scenes.valid, scenes.ids, -1 - np.arange(agents)), axis=1)

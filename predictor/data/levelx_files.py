@@ -18,8 +18,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from predictor.data.loading import LARGEST, bad_line, finite, read_lines, whole
+from predictor.data.loading import bad_line, finite, read_lines, whole
 from predictor.data.track_points import TrackPoints
+from predictor.scene import LARGEST
 from predictor.support.errors import UserError
 from predictor.support.reading import MOST_TEXT_BYTES, check_regular
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 from predictor.data.store_files import check_replaceable
+from predictor.scene import LARGEST
 from predictor.support.config_checks import check_choices
 from predictor.support.errors import UserError, short
 from predictor.support.files import check_place
@@ -21,8 +22,8 @@ from predictor.support.remote import address, exists
 Split = Literal["train", "val", "test", "all"]
 SPLIT_SHARES = {"test": 0.1, "val": 0.1}
 """Shares of the splits; the rest is for training."""
-LARGEST, LARGEST_WHOLE = 1e30, 10**15 - 1
-"""Largest numbers that are read: float32 holds differences of the former, and float64 is exact for the latter."""
+LARGEST_WHOLE = 10**15 - 1
+"""Largest whole number that is read; float64 holds all up to it."""
 NO_LIMIT_M = 1e6
 """Perception range of scenes without an ego [m]."""
 

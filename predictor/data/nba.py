@@ -24,7 +24,6 @@ from jaxtyping import Float, Int
 
 from predictor.data.dataset_card import DatasetNotes, save_dataset, summary
 from predictor.data.loading import (
-    LARGEST,
     LARGEST_WHOLE,
     NO_LIMIT_M,
     LoaderConfig,
@@ -36,7 +35,7 @@ from predictor.data.loading import (
     whole,
 )
 from predictor.data.store import Episode
-from predictor.scene import KINEMATIC_FEATURES, SceneSpec
+from predictor.scene import KINEMATIC_FEATURES, LARGEST, SceneSpec
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point

@@ -31,7 +31,7 @@ from predictor.data.store_files import (
     read_arrays,
     read_header,
 )
-from predictor.scene import PADDING_ID, Scene, SceneSpec
+from predictor.scene import LARGEST, PADDING_ID, Scene, SceneSpec
 from predictor.support.config_checks import check_positive
 from predictor.support.errors import UserError
 from predictor.support.files import check_place, new_folder
@@ -391,10 +391,11 @@ def causal_strength(shift_m: Float[np.ndarray, "*pairs"], threshold_m: float) ->
 
 
 def _check_finite(episode: Episode, where: str) -> None:
-    finite = np.isfinite(episode.states).all(axis=-1)
-    if not finite.all():
-        t, agent = np.argwhere(~finite)[0]
+    fine = (np.abs(episode.states) <= LARGEST).all(axis=-1)
+    if not fine.all():
+        t, agent = np.argwhere(~fine)[0]
+        wanted = f"at most {LARGEST:g} in size" if np.isfinite(episode.states[t, agent]).all() else "finite"
         raise UserError(
-            f"{where}: states must be finite, got {episode.states[t, agent].tolist()} "
+            f"{where}: states must be {wanted}, got {episode.states[t, agent].tolist()} "
             f"(episode seed {episode.seed}, step {t}, agent {episode.ids[agent]}); remove the episode"
         )

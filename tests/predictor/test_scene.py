@@ -147,8 +147,9 @@ def test_good_scene_passes_its_check():
         ({"ids": np.array([0, 8, 8])}, r"my reader: ids must be unique within a scene, got \[0, 8, 8\]"),
         ({"ids": np.array([0, 8, -3])}, r"my reader: ids of valid agents must be non-negative, got \[0, 8, -3\]"),
         ({"states": np.full((3, 4), np.inf)}, "my reader: states must be finite"),
+        ({"states": np.full((3, 4), -1e39)}, r"my reader: states must be at most 1e\+30 in size, got"),
     ],
-    ids=["no_ego", "twice", "negative", "infinite"],
+    ids=["no_ego", "twice", "negative", "infinite", "too large"],
 )
 def test_broken_scene_is_refused(change: Mapping[str, np.ndarray], message: str):
     good = {"states": np.zeros((3, 4)), "ids": np.array([0, 8, 3]), "valid": np.ones(3, dtype=np.bool_)}

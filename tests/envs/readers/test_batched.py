@@ -86,6 +86,7 @@ def put(place: Any, value: Any) -> Callable[[torch.Tensor], torch.Tensor]:
     [
         (dict(states=lambda s: s[..., :3]), r"states need 4 features .*, got 3"),
         (dict(states=put((1, 0, 2), torch.inf)), r"must be finite, but it is not so in 1 of 3, entry 1 first"),
+        (dict(states=put((1, 0, 2), -1e38)), r"states must be at most 1e\+30 in size, but it is not so in 1 of 3"),
         (dict(heading_rad=put(2, torch.nan)), r"heading_rad must be finite, but it is not so in 1 of 3, entry 2"),
         (dict(valid=put((2, 0), False)), r"agent 0 must be the ego.* in 1 of 3, entry 2 first"),
         (dict(ids=put((0, 0), -3)), r"ids of present agents must not be negative.*entry 0"),

@@ -228,6 +228,15 @@ def test_non_finite_states_are_refused_with_their_place(tmp_path: Path, value: f
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.unchecked
+def test_states_that_single_precision_cannot_hold_are_refused(tmp_path: Path):
+    large = broken(0.0, True)
+    large = replace(large, states=large.states.astype(np.float64) + 1e300)
+    with pytest.raises(UserError, match=r"states must be at most 1e\+30 in size, got \[1e\+300, .* step 0, agent"):
+        write_store(tmp_path / "store", INFO, [large])
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_non_finite_states_in_a_store_are_refused_with_their_place(tmp_path: Path):
     write_store(tmp_path / "store", INFO, [episode(1), episode(3)])
     states: Any = zarr.open_group(tmp_path / "store", mode="r+")["states"]
