@@ -315,6 +315,14 @@ def _check_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
         places = arrays.get(name)
         if places is not None and (places[0] != 0 or places[-1] != last[name] or (np.diff(places) < 1).any()):
             raise UserError(f"{path}: '{name}' must rise from 0 to {last[name]}; copy or collect it anew")
+    if "label_starts" in arrays:
+        labelled, steps = np.diff(arrays["label_starts"]), np.diff(arrays["starts"])
+        if ((labelled != 1) & (labelled != steps)).any():
+            raise UserError(f"{path}: an episode's edges need one step or every step; collect it anew")
+    if "edge_types" in arrays and (arrays["edge_types"] < _FILL["edge_types"]).any():
+        raise UserError(f"{path}: 'edge_types' must be at least {_FILL['edge_types']:.0f}; collect it anew")
+    if "edge_attributes" in arrays and not np.isfinite(arrays["edge_attributes"]).all():
+        raise UserError(f"{path}: 'edge_attributes' must be finite; collect it anew")
     for i, ids in enumerate(arrays["ids"]):
         live = ids[ids != PADDING_ID]
         if (live < 0).any() or len(np.unique(live)) < len(live):

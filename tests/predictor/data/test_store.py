@@ -228,6 +228,25 @@ def test_non_finite_states_are_refused_with_their_place(tmp_path: Path, value: f
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("name", "place", "value", "message"),
+    [
+        ("label_starts", 1, 3, "an episode's edges need one step or every step"),
+        ("edge_types", (5, 0, 1), -7, "'edge_types' must be at least -1"),
+        ("edge_attributes", (0, 0, 1, 0), np.nan, "'edge_attributes' must be finite"),
+    ],
+)
+def test_labels_of_edges_that_fit_no_episode_are_refused(
+    tmp_path: Path, name: str, place: Any, value: float, message: str
+):
+    """Else training would read labels of the next episode, or beyond the last."""
+    write_store(tmp_path / "store", INFO, [labelled(i, label_steps=4) for i in range(2)])
+    array: Any = zarr.open_group(tmp_path / "store", mode="r+")[name]
+    array[place] = value
+    with pytest.raises(UserError, match=f"store: {message}; collect it anew"):
+        read_store(tmp_path / "store")
+
+
 @pytest.mark.unchecked
 def test_states_that_single_precision_cannot_hold_are_refused(tmp_path: Path):
     large = broken(0.0, True)
