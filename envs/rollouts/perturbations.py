@@ -69,18 +69,28 @@ class Perturber:
         self._weights = weights / weights.sum()
         steps = np.mean(self._mix.duration_s) / world.spec.dt_s
         self._start = share / (share + steps * (1 - share))  # idle for (1 - p) / p steps on average
+        self._latest: tuple[int, Kind] | None = None  # agent and kind, until a step without intervention
 
     def __call__(self) -> None:
-        """Begins an intervention, or none; called before each step."""
-        if interventions_of(self._world) or self._rng.random() >= self._start:
+        """Begins an intervention, or none; called before each step.
+
+        None repeats what ended at the step before: in a recording, both would be one.
+        """
+        if interventions_of(self._world):
+            return
+        ended, self._latest = self._latest, None
+        if self._rng.random() >= self._start:
             return
         scene = self._world.perceived()
         for agent in self._rng.permutation(scene.ids[scene.valid]):
             for kind in self._rng.choice(self._kinds, len(self._kinds), replace=False, p=self._weights):
+                if (agent, kind) == ended:
+                    continue
                 try:
                     intervene(self._world, self._draw(int(agent), kind))
                 except UserError:
                     continue  # a landmark, the outermost lane, the ego taken out
+                self._latest = (int(agent), kind)
                 return
 
     def _draw(self, agent: int, kind: Kind) -> Intervention:

@@ -41,6 +41,24 @@ def test_always_and_only_one_kind():
         world.step()
 
 
+def test_none_repeats_what_has_just_ended():
+    """The marks of a recording could not tell the two apart, and windows would hold a beginning in their future."""
+    world, begun = open_world("simple_push_v3", "idle"), 0
+    for seed in range(6):
+        world.reset(seed)
+        perturber = Perturber(world, 1.0, (), perturbation_rng(seed))
+        before = None
+        for _ in range(40):
+            perturber()
+            now = next(iter(interventions_of(world).values()), None)
+            if now is not None and now is not before:
+                begun += 1
+                assert before is None or (now.agent, now.kind) != (before.agent, before.kind)
+            before = now
+            world.step()
+    assert begun > 20
+
+
 def test_interventions_follow_from_the_seed_alone():
     found = []
     for _ in range(2):
