@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from predictor.support.errors import UserError
 from predictor.support.files import new_file
 
 STILL_PX, STILL_LIMIT_S = 1000, 20.0
@@ -36,10 +37,15 @@ def write_video(path: str | Path, pictures: Iterable[UInt8[np.ndarray, "height w
         path: path of the video.
         pictures: at least one, all of one size; height and width must be even for H.264.
         fps: number of pictures per second.
+
+    Raises:
+        UserError: there is no picture, or one of another size.
     """
     path = Path(path)
     rest = iter(pictures)
-    first = next(rest)
+    first = next(rest, None)
+    if first is None:
+        raise UserError(f"{path} needs at least one picture, got none")
     with new_file(path) as partial:
         writer = imageio_ffmpeg.write_frames(
             partial, first.shape[1::-1], fps=fps, codec="libx264", quality=7, macro_block_size=2
@@ -48,6 +54,8 @@ def write_video(path: str | Path, pictures: Iterable[UInt8[np.ndarray, "height w
             writer.send(None)
             writer.send(np.ascontiguousarray(first))
             for picture in rest:
+                if picture.shape != first.shape:  # ffmpeg would cut the stream of bytes elsewhere
+                    raise UserError(f"all pictures of {path} need the size {first.shape}, got {picture.shape}")
                 writer.send(np.ascontiguousarray(picture))
 
 

@@ -64,12 +64,18 @@ class LoaderConfig:
         """
         if not self.source.exists():
             raise UserError(f"no source at {self.source}; pass the unpacked dataset")
+        if not self.out.name:
+            raise UserError(
+                f"out must be the path of a new store, got '{self.out}'; name one, such as data/{self.split}"
+            )
         for path in (self.out, self.card_path):
             check_place(path)
             if exists(path) and not self.overwrite:
                 raise UserError(f"{address(path)} exists; choose another path or pass --overwrite")
         if exists(self.out):
             check_replaceable(self.out)
+        elif exists(self.card_path):
+            raise UserError(f"{address(self.card_path)} belongs to no store; delete it, or choose another path")
 
 
 def bad_line(path: Path, line: int, problem: str, advice: str = "repair the line or get the file anew") -> UserError:

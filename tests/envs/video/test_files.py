@@ -6,6 +6,7 @@ import pytest
 from PIL import Image
 
 from envs.video.files import write_picture, write_video
+from predictor.support.errors import UserError
 
 PICTURE = np.arange(32 * 48 * 3, dtype=np.uint8).reshape(32, 48, 3)
 
@@ -17,3 +18,16 @@ def test_files_are_named_by_strings_or_paths(kind: type, tmp_path: Path):
     write_picture(kind(tmp_path / "x.png"), PICTURE)
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "x.png")), PICTURE)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["x.mp4", "x.png"]
+
+
+@pytest.mark.parametrize(
+    ("pictures", "message"),
+    [
+        ([], "x.mp4 needs at least one picture, got none"),
+        ([PICTURE, PICTURE[:16]], r"all pictures of .*x.mp4 need the size \(32, 48, 3\), got \(16, 48, 3\)"),
+    ],
+)
+def test_pictures_that_make_no_film_are_one_sentence(pictures: list[np.ndarray], message: str, tmp_path: Path):
+    with pytest.raises(UserError, match=message):
+        write_video(tmp_path / "x.mp4", pictures, fps=4)
+    assert list(tmp_path.iterdir()) == []

@@ -177,13 +177,18 @@ def test_what_is_in_the_way_stays(tmp_path: Path, name: str):
     with pytest.raises(UserError, match=rf"{name} exists; choose another path or pass --overwrite"):
         config.check_paths()
     replacing = LoaderConfig(tmp_path, tmp_path / "store", overwrite=True)
-    if name == "store":
-        with pytest.raises(UserError, match="store is not an episode store and will not be replaced"):
-            replacing.check_paths()
-    else:
+    why = "is not an episode store and will not" if name == "store" else "belongs to no store; delete it, or choose"
+    with pytest.raises(UserError, match=f"{name} {why}"):
         replacing.check_paths()
+    assert (tmp_path / name).read_text() == "mine"
     with pytest.raises(UserError, match="no source at"):
         LoaderConfig(tmp_path / "absent", tmp_path / "other").check_paths()
+
+
+@pytest.mark.parametrize("out", [".", "/"])
+def test_a_store_has_a_name(tmp_path: Path, out: str):
+    with pytest.raises(UserError, match=f"out must be the path of a new store, got '{out}'; name one, such as data/"):
+        LoaderConfig(tmp_path, Path(out)).check_paths()
 
 
 def test_overwrite_replaces_both(tmp_path: Path):
