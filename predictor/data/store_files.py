@@ -20,6 +20,7 @@ import numpy as np
 import zarr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
+from predictor.data.store_chunks import check_codecs, check_unpacked
 from predictor.support.errors import UserError, short
 from predictor.support.memory import check_memory
 from predictor.support.reading import MIB, NoSuchFile, as_object, check_regular, read_object, unreadable
@@ -33,7 +34,6 @@ DIGEST = "sha256"
 COMPRESSORS = (ZstdCodec(level=0), Crc32cCodec())
 """Codecs of a new array: compression, and a checksum of each chunk."""
 MOST_METADATA_BYTES, MOST_CHUNK_BYTES = 256 * MIB, 16_384 * MIB
-_CODECS = ("bytes", "zstd", "crc32c", "blosc", "gzip", "transpose")
 _FLOAT, _INT = ("float32", "float64"), ("int8", "int16", "int32", "int64")
 _ARRAYS: dict[str, tuple[tuple[str, ...], int]] = {
     "states": (_FLOAT, 3),
@@ -230,6 +230,8 @@ def _check_files(path: Path) -> None:
             raise unreadable(entry, error) from error
         if not is_folder:
             check_regular(entry, most_bytes_of(entry.name))
+        elif entry.is_symlink():  # what is behind it would be read unchecked
+            raise UserError(f"{entry} is a link to a folder, and a store has none; copy the store with its files")
 
 
 def _entries(path: Path) -> Iterator[Path]:
@@ -258,9 +260,10 @@ def _array(path: Path, name: str) -> tuple[tuple[int, ...], int]:
     codecs = content.get("codecs")
     if not isinstance(codecs, list) or not codecs:
         raise UserError(f"{where}: codecs must be an array of codecs, got {short(repr(codecs), 60)}")
-    for codec in codecs:
-        if not isinstance(codec, dict) or codec.get("name") not in _CODECS:
-            raise UserError(f"{where}: a codec must be one of {', '.join(_CODECS)}, got {short(repr(codec), 60)}")
+    names = [codec.get("name") if isinstance(codec, dict) else codec for codec in codecs]
+    check_codecs(names, where)
+    if "zstd" in names:
+        check_unpacked(path, chunk)
     if content.get("storage_transformers"):
         raise UserError(f"{where}: storage_transformers must be empty")
     return shape, size

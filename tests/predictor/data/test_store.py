@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numcodecs.zstd
 import numpy as np
 import pytest
 import zarr
@@ -464,6 +465,42 @@ def test_a_store_without_checksums_still_loads(tmp_path: Path):
     old.attrs.update({key: value for key, value in new.attrs.items() if key not in ("sha256", "causal_threshold_m")})
     assert not (tmp_path / "old" / "seeds" / "c").exists()
     assert_equal(read_store(tmp_path / "old").episodes[1], replace(episode(2), seed=0))
+
+
+def test_a_chunk_that_unpacks_to_more_than_its_array_is_refused_before_it_is(tmp_path: Path):
+    write_store(tmp_path / "store", INFO, [episode(1)])
+    array = tmp_path / "store" / "states"
+    metadata = json.loads((array / "zarr.json").read_text())
+    metadata["codecs"] = [codec for codec in metadata["codecs"] if codec["name"] != "crc32c"]
+    (array / "zarr.json").write_text(json.dumps(metadata))
+    (array / "c" / "0" / "0" / "0").write_bytes(numcodecs.zstd.compress(np.zeros(2**27, np.uint8), 1))
+    size = 4 * 4 * 3 * 4  # steps, agents, features, bytes
+    with pytest.raises(UserError, match=f"chunk c/0/0/0 of 'states' is damaged .*unpack to {size} bytes, got {2**27}"):
+        read_store(tmp_path / "store")
+
+
+@pytest.mark.parametrize(
+    "names", [["bytes", "zstd", "zstd"], ["zstd", "bytes"], ["bytes", "gzip"], ["bytes", "blosc", "crc32c"]]
+)
+def test_other_codecs_are_refused(tmp_path: Path, names: list[str]):
+    write_store(tmp_path / "store", INFO, [episode(1)])
+    file = tmp_path / "store" / "states" / "zarr.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"codecs": [{"name": name} for name in names]}))
+    with pytest.raises(UserError, match="codecs must be some of transpose, bytes, zstd, crc32c, in this order, got"):
+        read_store(tmp_path / "store")
+
+
+def test_a_link_to_a_folder_is_refused(tmp_path: Path):
+    """A pipe behind it would be waited for."""
+    write_store(tmp_path / "store", INFO, [episode(1)])
+    (tmp_path / "store" / "seeds" / "c").rename(tmp_path / "elsewhere")
+    (tmp_path / "store" / "seeds" / "c").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(UserError, match="store/seeds/c is a link to a folder, and a store has none; copy the store"):
+        read_store(tmp_path / "store")
+    (tmp_path / "link").symlink_to(tmp_path / "store")
+    (tmp_path / "store" / "seeds" / "c").unlink()
+    (tmp_path / "elsewhere").rename(tmp_path / "store" / "seeds" / "c")
+    assert len(read_store(tmp_path / "link").episodes) == 1
 
 
 @pytest.mark.parametrize("make", [foreign_folder, foreign_file, foreign_group])
