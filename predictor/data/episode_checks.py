@@ -1,10 +1,10 @@
-"""Checks of an episode before it is written: types and shapes of its arrays, its ids."""
+"""Checks of an episode before it is written: types and shapes of its arrays, its ids, sizes of its states."""
 
 from typing import Any
 
 import numpy as np
 
-from predictor.scene import SceneSpec
+from predictor.scene import LARGEST, SceneSpec
 from predictor.support.errors import UserError, short
 
 
@@ -52,4 +52,16 @@ def check_episode(episode: Any, spec: SceneSpec, where: str) -> None:
     if marks is not None and (marks.dtype.kind not in "iu" or marks.shape != valid.shape):
         raise UserError(
             f"{where}: perturbed of an episode must be integers of shape {valid.shape}, got {marks.dtype} {marks.shape}"
+        )
+
+
+def check_finite(episode: Any, where: str) -> None:
+    """Raises a `UserError` if a state of an episode is not finite, or too large; names the place of the first."""
+    fine = (np.abs(episode.states) <= LARGEST).all(axis=-1)
+    if not fine.all():
+        t, agent = np.argwhere(~fine)[0]
+        wanted = f"at most {LARGEST:g} in size" if np.isfinite(episode.states[t, agent]).all() else "finite"
+        raise UserError(
+            f"{where}: states must be {wanted}, got {episode.states[t, agent].tolist()} "
+            f"(episode seed {episode.seed}, step {t}, agent {episode.ids[agent]}); remove the episode"
         )

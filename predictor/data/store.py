@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from predictor.data.episode_checks import check_episode
+from predictor.data.episode_checks import check_episode, check_finite
 from predictor.data.store_files import (
     CONTENT,
     DIGEST,
@@ -31,7 +31,7 @@ from predictor.data.store_files import (
     read_arrays,
     read_header,
 )
-from predictor.scene import LARGEST, PADDING_ID, Scene, SceneSpec
+from predictor.scene import PADDING_ID, Scene, SceneSpec
 from predictor.support.config_checks import check_positive
 from predictor.support.errors import UserError
 from predictor.support.files import check_place, new_folder
@@ -152,7 +152,7 @@ def _write(path: Path, info: StoreInfo, episodes: Sequence[Episode]) -> None:
         raise UserError("a store needs at least one episode, got none")
     for episode in episodes:
         check_episode(episode, info.spec, str(path))
-        _check_finite(episode, str(path))
+        check_finite(episode, str(path))
         if episode.perturbed is not None and not np.isin(episode.perturbed, range(len(PERTURBATIONS))).all():
             raise UserError(f"{address(path)}: perturbed must lie between 0 and {len(PERTURBATIONS) - 1}")
     marked = [e.perturbed is not None for e in episodes]
@@ -230,7 +230,7 @@ def read_store(path: Path) -> EpisodeStore:
             perturbed=arrays["perturbed"][start:stop][:, present] if "perturbed" in arrays else None,
             **_labels_of(edge_labels, arrays.get("label_starts"), i, present),
         )
-        _check_finite(episode, str(path))
+        check_finite(episode, str(path))
         episodes.append(episode)
     return EpisodeStore(info, episodes)
 
@@ -396,14 +396,3 @@ def with_causal_edges(store: EpisodeStore, threshold_m: float | None = None) -> 
 def causal_strength(shift_m: Float[np.ndarray, "*pairs"], threshold_m: float) -> Float[np.ndarray, "*pairs"]:
     """Returns the strength of causal edges, log(1 + shift / threshold); 0 where unknown."""
     return np.log1p(np.nan_to_num(shift_m) / threshold_m).astype(np.float32)
-
-
-def _check_finite(episode: Episode, where: str) -> None:
-    fine = (np.abs(episode.states) <= LARGEST).all(axis=-1)
-    if not fine.all():
-        t, agent = np.argwhere(~fine)[0]
-        wanted = f"at most {LARGEST:g} in size" if np.isfinite(episode.states[t, agent]).all() else "finite"
-        raise UserError(
-            f"{where}: states must be {wanted}, got {episode.states[t, agent].tolist()} "
-            f"(episode seed {episode.seed}, step {t}, agent {episode.ids[agent]}); remove the episode"
-        )
