@@ -67,7 +67,7 @@ def test_every_line_of_a_table_of_models_says_how_many_forecasts_it_chooses_from
 def test_every_table_of_results_has_the_stochastic_control():
     found = lines_with_k(RESULTS)
     errors = [lines for lines in found if any("minADE" in heading for heading in lines[0])]
-    assert (len(found), len(errors)) == (15, 11)  # two views and the graph of four; three have two sets
+    assert (len(found), len(errors)) == (16, 12)  # two views and the graph of four, three with two sets; three seeds
     assert all(CONTROL in {line[""] for line in lines} for lines in errors)
     assert any(CONTROL in {line[""] for line in lines} for lines in lines_with_k(PREDICTORS))
 
