@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
+from envs.drivers.content import content_of
 from envs.readers.highway_labels import ATTRIBUTE_NAMES
 from envs.registry import arguments_of
 from envs.rollouts.branch_recording import branch_mix_for
@@ -308,7 +309,8 @@ def _info(config: CollectConfig, seed: int) -> StoreInfo:
 def _settings(config: CollectConfig, info: StoreInfo) -> dict[str, Any]:
     """Returns all that an episode depends on, for recordings that are taken up again."""
     given = {name: value for name, value in asdict(config).items() if name not in FREE}
-    return given | {name: info.provenance[name] for name in ("commit", "versions")} | {"drivers": config.drivers}
+    made = {name: info.provenance[name] for name in ("commit", "versions")}
+    return given | made | {"drivers": config.drivers, "content_of_drivers": list(map(content_of, config.drivers))}
 
 
 def _kept(config: CollectConfig, partial: PartialStore) -> str:
