@@ -208,17 +208,42 @@ def fan(lines: Iterable[Polyline], shares: Iterable[float] = ()) -> list[tuple[P
     return sorted(zip(drawn, opacities, strict=True), key=lambda pair: pair[1])
 
 
-def dashes(line: Polyline, dash: float) -> list[Polyline]:
-    """Cuts a polyline into dashes of length `dash` with gaps of equal length; corners are kept."""
+def dashes(line: Polyline, dash: float, low: tuple[float, float], high: tuple[float, float]) -> list[Polyline]:
+    """Cuts a polyline into dashes of length `dash` with gaps of equal length; corners are kept.
+
+    Only dashes that reach into the box between two corners come back: a line may end a thousand kilometres away.
+    """
     lengths = np.hypot(*np.diff(line, axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(lengths)])
+    enter, leave = _inside(line, low, high)
+    firsts = np.ceil((along[:-1] + enter * lengths - dash) / (2 * dash)).clip(0)
+    lasts = np.floor((along[:-1] + leave * lengths) / (2 * dash))
+    numbers = {n for first, last in zip(firsts, lasts, strict=True) for n in range(int(first), int(last) + 1)}
     pieces = []
-    for start in np.arange(0.0, along[-1], 2 * dash):
+    for start in (number * 2 * dash for number in sorted(numbers)):
+        if start >= along[-1]:
+            break
         end = min(start + dash, along[-1])
         inside = along[(along > start) & (along < end)]
         at = np.concatenate([[start], inside, [end]])
         pieces.append(np.stack([np.interp(at, along, line[:, 0]), np.interp(at, along, line[:, 1])], axis=-1))
     return pieces
+
+
+def _inside(
+    line: Polyline, low: tuple[float, float], high: tuple[float, float]
+) -> tuple[Float[np.ndarray, " pieces"], Float[np.ndarray, " pieces"]]:
+    """Returns at which share of each straight piece it enters a box and leaves it; enters at 1, leaves at 0 if never.
+
+    Clips as Liang and Barsky do.
+    """
+    steps = np.diff(line, axis=0)
+    steps[steps == 0] = 1e-12  # along an axis: inside or outside of the box as a whole
+    to_low, to_high = (low - line[:-1]) / steps, (high - line[:-1]) / steps
+    enter = np.minimum(to_low, to_high).max(axis=1).clip(0, 1)
+    leave = np.maximum(to_low, to_high).min(axis=1).clip(0, 1)
+    never = enter > leave
+    return np.where(never, 1.0, enter), np.where(never, 0.0, leave)
 
 
 @dataclass(frozen=True)
@@ -241,7 +266,9 @@ class Pen:
     def forecast(self, line: Polyline, color: Color | None = None, opacity: float = 1.0) -> None:
         """Draws a forecast: dashed, with a dot at each point but the first; None takes the style's colour."""
         paint = (*(color or self.style.forecast_color), round(255 * opacity))
-        for piece in dashes(line, self.style.dash_px):
+        margin = self.style.forecast_width_px
+        width, height = (side / SMOOTHING + margin for side in self.canvas.im.size)
+        for piece in dashes(line, self.style.dash_px, (-margin, -margin), (width, height)):
             self.line(piece, self.style.forecast_width_px, paint)
         for point in line[1:]:
             self.disc(point, 1.2 * self.style.forecast_width_px, paint)

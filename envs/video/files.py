@@ -1,9 +1,11 @@
 """Writes pictures (PNG) and videos (MP4), and keeps pictures small in memory."""
 
+import errno
 import io
 import subprocess
 from collections.abc import Iterable
 from contextlib import closing
+from itertools import chain
 from pathlib import Path
 
 import imageio_ffmpeg  # type: ignore[import-untyped]
@@ -39,24 +41,40 @@ def write_video(path: str | Path, pictures: Iterable[UInt8[np.ndarray, "height w
         fps: number of pictures per second.
 
     Raises:
-        UserError: there is no picture, or one of another size.
+        UserError: no pictures, pictures of different sizes, or an ffmpeg that fails.
     """
     path = Path(path)
     rest = iter(pictures)
     first = next(rest, None)
     if first is None:
-        raise UserError(f"{path} needs at least one picture, got none")
-    with new_file(path) as partial:
-        writer = imageio_ffmpeg.write_frames(
-            partial, first.shape[1::-1], fps=fps, codec="libx264", quality=7, macro_block_size=2
+        raise UserError(f"the video {path} needs at least one picture, got none; play at least one step")
+    try:
+        with new_file(path) as partial:
+            writer = imageio_ffmpeg.write_frames(
+                partial, first.shape[1::-1], fps=fps, codec="libx264", quality=7, macro_block_size=2
+            )
+            with closing(writer):
+                writer.send(None)
+                for number, picture in enumerate(chain([first], rest), start=1):
+                    _check_size(path, number, picture, first)
+                    writer.send(np.ascontiguousarray(picture))
+    except OSError as error:
+        if error.errno not in (None, errno.ENOENT):  # of the pipe to ffmpeg, or of the file that it did not write
+            raise
+        raise UserError(
+            f"ffmpeg must write the video {path}, but it is missing or it failed; repair it with pip install "
+            "--force-reinstall imageio-ffmpeg, or unset IMAGEIO_FFMPEG_EXE"
+        ) from error
+
+
+def _check_size(path: Path, number: int, picture: np.ndarray, first: np.ndarray) -> None:
+    """Raises a `UserError` if a picture has another size than the first one: ffmpeg would cut the stream elsewhere."""
+    if picture.shape != first.shape:
+        (height, width), (wanted_height, wanted_width) = picture.shape[:2], first.shape[:2]
+        raise UserError(
+            f"all pictures of the video {path} must have the size of the first one, {wanted_width}×{wanted_height} px, "
+            f"got {width}×{height} px for number {number}; let the environment render one size"
         )
-        with closing(writer):
-            writer.send(None)
-            writer.send(np.ascontiguousarray(first))
-            for picture in rest:
-                if picture.shape != first.shape:  # ffmpeg would cut the stream of bytes elsewhere
-                    raise UserError(f"all pictures of {path} need the size {first.shape}, got {picture.shape}")
-                writer.send(np.ascontiguousarray(picture))
 
 
 def write_picture(path: str | Path, picture: UInt8[np.ndarray, "height width 3"]) -> None:

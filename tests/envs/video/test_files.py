@@ -1,3 +1,4 @@
+import gc
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -20,14 +21,27 @@ def test_files_are_named_by_strings_or_paths(kind: type, tmp_path: Path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["x.mp4", "x.png"]
 
 
-@pytest.mark.parametrize(
-    ("pictures", "message"),
-    [
-        ([], "x.mp4 needs at least one picture, got none"),
-        ([PICTURE, PICTURE[:16]], r"all pictures of .*x.mp4 need the size \(32, 48, 3\), got \(16, 48, 3\)"),
-    ],
-)
-def test_pictures_that_make_no_film_are_one_sentence(pictures: list[np.ndarray], message: str, tmp_path: Path):
-    with pytest.raises(UserError, match=message):
+def test_a_video_without_pictures_is_refused(tmp_path: Path):
+    with pytest.raises(UserError, match="needs at least one picture, got none; play at least one step"):
+        write_video(tmp_path / "x.mp4", [], fps=4)
+
+
+def test_pictures_of_another_size_are_refused(tmp_path: Path):
+    pictures = [PICTURE] * 3 + [PICTURE[:16]] * 4
+    with pytest.raises(UserError, match="size of the first one, 48×32 px, got 48×16 px for number 4; let the environ"):
         write_video(tmp_path / "x.mp4", pictures, fps=4)
-    assert list(tmp_path.iterdir()) == []
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # imageio-ffmpeg leaves its pipe open
+@pytest.mark.parametrize("script", [None, "exit 1", "head -c 1000 > /dev/null; exit 1"], ids=["gone", "silent", "dies"])
+def test_an_ffmpeg_that_fails_is_named(script: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    program = tmp_path / "ffmpeg"
+    if script is not None:
+        program.write_text(f"#!/bin/sh\n{script}\n")
+        program.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+    with pytest.raises(UserError, match="x.mp4, but it is missing or it failed; repair it with pip install"):
+        write_video(tmp_path / "films" / "x.mp4", [PICTURE] * 40, fps=4)
+    assert not list((tmp_path / "films").iterdir())
+    gc.collect()

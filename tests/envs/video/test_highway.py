@@ -150,9 +150,32 @@ def test_edge_width_follows_its_probability():
 
 
 def test_dashes_alternate_and_keep_corners():
-    pieces = dashes(np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 4.0]]), dash=2.0)
+    box = (0.0, 0.0), (9.0, 9.0)
+    pieces = dashes(np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 4.0]]), 2.0, *box)
     assert [p.tolist() for p in pieces] == [[[0, 0], [2, 0]], [[3, 1], [3, 3]]]
-    assert dashes(np.array([[1.0, 1.0], [1.0, 1.0]]), dash=2.0) == []
+    assert dashes(np.array([[1.0, 1.0], [1.0, 1.0]]), 2.0, *box) == []
+    assert dashes(np.array([[1.0, 1.0]]), 2.0, *box) == []
+
+
+def test_dashes_that_reach_into_the_box_are_those_of_the_whole_line():
+    low, high = (0.0, 0.0), (30.0, 20.0)
+    rng = np.random.default_rng(0)
+    some = 0
+    for _ in range(50):
+        line = np.concatenate([rng.uniform(-40, 60, (4, 2)), [[10.0, 70.0], [10.0, -70.0]]])
+        whole = dashes(line, 3.0, (-1e3, -1e3), (1e3, 1e3))
+        found = [piece.tolist() for piece in dashes(line, 3.0, low, high)]
+        assert [piece for piece in (one.tolist() for one in whole) if piece in found] == found
+        points = [(piece.tolist(), np.linspace(piece[:-1], piece[1:], 99)) for piece in whole]
+        seen = [piece for piece, at in points if ((at >= low) & (at <= high)).all(axis=-1).any()]
+        assert all(piece in found for piece in seen)
+        some += len(seen)
+    assert some > 200
+
+
+def test_a_forecast_that_ends_far_away_is_as_quick_to_draw_as_any():
+    far = np.array([[5.0, 5.0], [1e9, 1e9], [5.0, 9.0]])
+    assert len(dashes(far, 7.0, (-2.0, -2.0), (602.0, 302.0))) < 100
 
 
 # --- Plans of the ego -------------------------------------------------------------------------------------------------
