@@ -27,21 +27,22 @@ from envs.supervision import TIMEOUT_S
 from envs.testing import store_problems
 from predictor.data.partial_store import PartialStore, beside
 from predictor.data.store import Episode, StoreInfo
-from predictor.data.store_files import check_replaceable
+from predictor.data.store_files import check_new_store
 from predictor.support.cluster import check_address
 from predictor.support.command_line import parse
-from predictor.support.config_checks import check_at_least, check_choices, check_positive
+from predictor.support.config_checks import check_at_least, check_at_most, check_choices, check_positive
 from predictor.support.errors import UserError, run_entry_point, short
-from predictor.support.files import check_place
 from predictor.support.locks import locked_path
 from predictor.support.memory import check_count, check_processes
 from predictor.support.progress import WorkShown
 from predictor.support.provenance import provenance
-from predictor.support.remote import address, exists, is_remote
+from predictor.support.remote import address, is_remote
 from predictor.support.stopping import resumable
 
 FREE = ("out", "workers", "cluster", "overwrite", "on_error", "timeout_s")
 """Options that episodes do not depend on."""
+MOST_CAUSAL_S = 3600
+"""Longest time that copies are played for causal labels [s]."""
 MOST_REASONS = 10
 """Largest number of skipped episodes whose reasons are printed; the store has them all."""
 PACKAGES = ("highway-env", "mpe2", "pettingzoo", "envpool", "gymnasium", "numpy")
@@ -127,6 +128,7 @@ class CollectConfig:
         check_processes(min(self.workers, self.episodes), "workers")
         check_address(self.cluster)
         check_positive(self, "causal_horizon_s", "causal_threshold_m", "timeout_s")
+        check_at_most(self, MOST_CAUSAL_S, "causal_horizon_s")
         if not 0 <= self.perturb <= 1:
             raise UserError(f"perturb must lie between 0 and 1, got {self.perturb:g}")
         if self.perturb_kinds and not self.perturb:
@@ -324,11 +326,7 @@ def _kept(config: CollectConfig, partial: PartialStore) -> str:
 def main() -> None:
     """Entry point."""
     config = parse(CollectConfig, __doc__)
-    check_place(config.out)
-    if exists(config.out):
-        if not config.overwrite:
-            raise UserError(f"{address(config.out)} exists; choose another path or pass --overwrite")
-        check_replaceable(config.out)
+    check_new_store(config.out, config.overwrite)
     with open_pool(config) as pool:
         info = _info_from(config, pool)
         with locked_path(config.out), locked_path(beside(config.out)):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeVar
 
-from predictor.data.store_files import check_replaceable
+from predictor.data.store_files import check_new_store
 from predictor.scene import LARGEST
 from predictor.support.config_checks import check_choices
 from predictor.support.errors import UserError, short
@@ -64,17 +64,11 @@ class LoaderConfig:
         """
         if not self.source.exists():
             raise UserError(f"no source at {self.source}; pass the unpacked dataset")
-        if not self.out.name:
-            raise UserError(
-                f"out must be the path of a new store, got '{self.out}'; name one, such as data/{self.split}"
-            )
-        for path in (self.out, self.card_path):
-            check_place(path)
-            if exists(path) and not self.overwrite:
-                raise UserError(f"{address(path)} exists; choose another path or pass --overwrite")
-        if exists(self.out):
-            check_replaceable(self.out)
-        elif exists(self.card_path):
+        check_new_store(self.out, self.overwrite)
+        check_place(self.card_path)
+        if exists(self.card_path) and not self.overwrite:
+            raise UserError(f"{address(self.card_path)} exists; choose another path or pass --overwrite")
+        if exists(self.card_path) and not exists(self.out):
             raise UserError(f"{address(self.card_path)} belongs to no store; delete it, or choose another path")
 
 

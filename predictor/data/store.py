@@ -24,7 +24,7 @@ from predictor.data.store_files import (
     ArrayWriter,
     StoreHeader,
     check_digest,
-    check_replaceable,
+    check_new_store,
     digest_of,
     most_bytes_of,
     open_group,
@@ -136,12 +136,7 @@ def write_store(path: Path, info: StoreInfo, episodes: Iterable[Episode], overwr
             another process writes it.
     """
     path = Path(path)
-    check_place(path)
-    is_there = exists(path)
-    if is_there and not overwrite:
-        raise UserError(f"{address(path)} exists; choose another path or pass --overwrite")
-    if is_there:
-        check_replaceable(path)
+    check_new_store(path, overwrite)
     with locked_path(path):
         _write(path, info, list(episodes))
 

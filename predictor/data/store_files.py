@@ -22,9 +22,10 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from predictor.data.store_chunks import check_codecs, check_unpacked
 from predictor.support.errors import UserError, short
+from predictor.support.files import check_place
 from predictor.support.memory import check_memory
 from predictor.support.reading import MIB, NoSuchFile, as_object, check_regular, read_object, unreadable
-from predictor.support.remote import address, is_remote, names_below
+from predictor.support.remote import address, exists, is_remote, names_below
 from predictor.support.stopping import deferred_stops
 
 FORMAT = "dgvae-rl episodes"
@@ -124,6 +125,21 @@ def attributes_of(path: Path, format: str) -> dict[str, Any]:
     if attributes.get("format") != format:
         raise UserError(f"{short(path)} is not an episode store; make one with python -m envs.collect")
     return attributes
+
+
+def check_new_store(path: Path, overwrite: bool) -> None:
+    """Checks, before any work is done, that a store may be written at a path.
+
+    Raises:
+        UserError: the path cannot be one or has no name, or something is there that may not be replaced.
+    """
+    check_place(path)
+    if path.name in ("", ".."):
+        raise UserError(f"a store needs a path that ends in its name, got {address(path)}; pass that of a new folder")
+    if exists(path):
+        if not overwrite:
+            raise UserError(f"{address(path)} exists; choose another path or pass --overwrite")
+        check_replaceable(path)
 
 
 def check_replaceable(path: Path) -> None:

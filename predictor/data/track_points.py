@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from predictor.data.store import Episode
 from predictor.support.errors import UserError
+from predictor.support.memory import check_memory
 
 MOST_STEPS = 5_000_000
 """Largest number of steps from the first point of a recording to its last."""
@@ -61,7 +62,7 @@ def cut_episodes(points: TrackPoints, episode_steps: int, label: str, counts: Co
     shorter. Episodes without any agent and those of one step are left out and counted.
 
     Raises:
-        UserError: the recording spans more than `MOST_STEPS` steps.
+        UserError: the recording spans more than `MOST_STEPS` steps, or an episode does not fit into the memory.
     """
     episodes = []
     first, last = (int(points.steps.min()), int(points.steps.max())) if len(points) else (0, -1)
@@ -81,6 +82,9 @@ def cut_episodes(points: TrackPoints, episode_steps: int, label: str, counts: Co
 
 def _episode(points: TrackPoints, begin: int, length: int, label: str) -> Episode:
     ids, columns = np.unique(points.tracks, return_inverse=True)
+    needed = length * len(ids) * (4 * points.states.shape[1] + 1)
+    what = f"{label}: an episode of {length:,} steps with {len(ids):,} tracks"
+    check_memory(needed, what, "pass a smaller --episode-steps, not 0")
     states = np.zeros((length, len(ids), points.states.shape[1]), dtype=np.float32)
     valid = np.zeros((length, len(ids)), dtype=np.bool_)
     states[points.steps - begin, columns] = points.states

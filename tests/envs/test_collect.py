@@ -235,6 +235,7 @@ ERRORS = {
     "share-above-one": (["--perturb", "1.5"], "perturb must lie between 0 and 1, got 1.5"),
     "kinds-of-nothing": (["--perturb-kinds", "brake"], "perturb_kinds needs perturb above 0, got 0"),
     "negative-labels": (["--causal-labels", "-1"], "causal_labels must not be negative, got -1"),
+    "long-horizon": (["--causal-labels", "1", "--causal-horizon-s", "3601"], "causal_horizon_s must be at most 3,600"),
     "horizon-of-nothing": (["--causal-horizon-s", "2"], "causal_horizon_s and causal_threshold_m need causal_labels"),
     "no-senders": (["--causal-labels", "2", "--causal-senders", "0"], "causal_senders must be at least 1, got 0"),
     "no-lanes": (

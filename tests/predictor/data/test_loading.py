@@ -17,7 +17,7 @@ from predictor.data.loading import (
     split_of,
     whole,
 )
-from predictor.data.store import Episode, read_store
+from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
@@ -185,10 +185,14 @@ def test_what_is_in_the_way_stays(tmp_path: Path, name: str):
         LoaderConfig(tmp_path / "absent", tmp_path / "other").check_paths()
 
 
-@pytest.mark.parametrize("out", [".", "/"])
-def test_a_store_has_a_name(tmp_path: Path, out: str):
-    with pytest.raises(UserError, match=f"out must be the path of a new store, got '{out}'; name one, such as data/"):
-        LoaderConfig(tmp_path, Path(out)).check_paths()
+@pytest.mark.parametrize("out", [".", "/", "deep/.."])
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_store_needs_a_name(tmp_path: Path, out: str, overwrite: bool):
+    """Card, lock and unfinished files are beside it, under names that begin with its own."""
+    with pytest.raises(UserError, match=f"^a store needs a path that ends in its name, got {out}; pass that of a new"):
+        LoaderConfig(tmp_path, Path(out), overwrite=overwrite).check_paths()
+    with pytest.raises(UserError, match="^a store needs a path that ends in its name"):
+        write_store(Path(out), StoreInfo(spec(), "toy"), [episode()], overwrite)
 
 
 def test_overwrite_replaces_both(tmp_path: Path):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from predictor.data.track_points import TrackPoints, cut_episodes, with_velocities
+from predictor.support.errors import UserError
 
 
 def points(*entries: tuple[int, int, float]) -> TrackPoints:
@@ -27,6 +28,15 @@ def test_velocities_look_back_and_gaps_have_none():
 def test_a_recording_without_consecutive_points_gives_nothing():
     kept, velocities_mps, origin = with_velocities(points((0, 1, 0.0), (0, 2, 0.0), (2, 1, 0.0)), 0.1)
     assert (len(kept), velocities_mps.shape, origin.tolist()) == (0, (0, 2), [])
+
+
+def test_an_episode_that_cannot_fit_into_the_memory_is_refused(monkeypatch: pytest.MonkeyPatch):
+    """A recording that is kept whole has a column for each track at each of its steps."""
+    monkeypatch.setattr("predictor.support.memory.memory_bytes", lambda: 2**20)
+    given = points(*((100 * track, track, 1.0) for track in range(400)))
+    with pytest.raises(UserError, match=r"^here: an episode of 39,901 steps with 400 tracks needs .* --episode-steps"):
+        cut_episodes(given, 39_901, "here", Counter())
+    assert cut_episodes(given, 50, "here", Counter())
 
 
 def test_episodes_tile_a_recording():
