@@ -65,7 +65,8 @@ def save_dataset(
     }
     info = StoreInfo(spec, notes.title, facts)
     with new_file(config.card_path) as partial:
-        partial.write_text(card_text(config.split, info, episodes, notes), encoding="utf-8")
+        text = card_text(config.split, info, episodes, notes)
+        partial.write_text(text, encoding="utf-8", errors="backslashreplace")
         write_store(config.out, info, episodes, config.overwrite)
 
 

@@ -142,7 +142,7 @@ def frames_per_step(dt_s: float, frames_per_s: float, source: str) -> int:
 
 def split_of(name: str, seed: int) -> str:
     """Returns the split of a name by a hash of seed and name, so adding files changes no other split."""
-    digest = hashlib.sha256(f"{seed}:{name}".encode()).digest()
+    digest = hashlib.sha256(f"{seed}:{name}".encode("utf-8", "surrogateescape")).digest()
     position = int.from_bytes(digest[:8], "big") / 2**64
     for split, share in SPLIT_SHARES.items():
         if position < share:
@@ -174,12 +174,13 @@ def find_files(source: Path, pattern: str, what: str) -> list[Path]:
 def checksum(root: Path, files: Iterable[Path]) -> str:
     """Computes the SHA-256 over the files' paths (relative to `root`, sorted) and contents.
 
-    For each file the digest takes the path in UTF-8, a zero byte and the SHA-256 of the content.
+    For each file the digest takes the path in UTF-8 (other bytes as they are), a zero byte and the SHA-256 of the
+    content.
     """
     root = root.parent if root.is_file() else root
     total = hashlib.sha256()
     for name, path in sorted((path.relative_to(root).as_posix(), path) for path in files):
         with path.open("rb") as file:
             content = hashlib.file_digest(file, "sha256").digest()
-        total.update(name.encode() + b"\0" + content)
+        total.update(name.encode("utf-8", "surrogateescape") + b"\0" + content)
     return total.hexdigest()

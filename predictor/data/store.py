@@ -189,7 +189,8 @@ def _write(path: Path, info: StoreInfo, episodes: Sequence[Episode]) -> None:
             "causal_threshold_m": info.causal_threshold_m,
             CONTENT: arrays.content.hexdigest(),
         }
-        plain = json.loads(json.dumps(attributes, default=str))
+        text = json.dumps(attributes, default=str, ensure_ascii=False)
+        plain = json.loads(text.encode("utf-8", "replace").decode())  # a label may be the name of a file, no UTF-8
         group.attrs.update(plain | {DIGEST: digest_of(plain)})
 
 

@@ -18,7 +18,7 @@ def provenance(packages: Sequence[str], command: str | None = None) -> dict[str,
     if command is None:
         command = " ".join([*_program(), *map(shlex.quote, sys.argv[1:])])
     return {
-        "command": command,
+        "command": command.encode("utf-8", "backslashreplace").decode(),  # names of files may be no UTF-8
         "commit": commit_at_start(),
         "versions": {name: _version(name) for name in ("dgvae-rl", *packages)} | {"python": platform.python_version()},
         "machine": f"{platform.machine()}, {os.cpu_count()} logical cores",

@@ -1,4 +1,6 @@
 import hashlib
+import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -151,6 +153,18 @@ def test_the_card_says_what_was_measured(tmp_path: Path):
     assert facts["split"] == "all"
     assert most_present([episode()]) == 2
     assert most_present([]) == 0
+
+
+def test_names_that_are_no_text_make_a_store_that_can_be_read(tmp_path: Path):
+    source = tmp_path / os.fsdecode(b"caf\xe9")
+    source.write_text("data")
+    config = LoaderConfig(source, tmp_path / "store")
+    named = replace(NOTES, title=source.name)
+    save_dataset(config, spec(), [replace(episode(), label=source.name)], named, [source], {"name": source.name})
+    store = read_store(config.out)
+    assert (store.episodes[0].label, store.info.source, store.info.provenance["name"]) == ("caf?",) * 3
+    assert config.card_path.read_text().startswith("# caf\\udce9\n")
+    assert split_of(source.name, 0) in ("train", "val", "test")
 
 
 def test_no_episodes_leave_nothing(tmp_path: Path):

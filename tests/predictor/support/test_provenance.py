@@ -35,6 +35,11 @@ def test_a_command_of_dgvae_is_written_as_it_was_typed(monkeypatch: pytest.Monke
     assert provenance(())["command"] == "dgvae collect --env-id merge-v1"
 
 
+def test_a_command_with_bytes_that_are_no_text_can_be_written(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys, "argv", ["dgvae collect", "--out", os.fsdecode(b"caf\xe9")])
+    assert provenance(())["command"].encode() == rb"dgvae collect --out 'caf\udce9'"
+
+
 def test_given_command_is_kept():
     assert (
         provenance((), command="python -m predictor.train --steps 3")["command"]
