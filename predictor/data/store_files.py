@@ -1,8 +1,9 @@
 """Checks of a store's files before Zarr opens them, and reading of its arrays with the damaged chunk named.
 
 Zarr reads whatever a group declares: other formats, whose arrays may be pickles, sizes of any height, pipes. So a store
-is Zarr's format 3, has only arrays that a store has, of their types and a few codecs, and fits into memory. New stores
-carry a CRC-32C of every chunk (Zarr's codec crc32c) and a SHA-256 of their attributes; older ones have neither.
+is Zarr's format 3, has only arrays that a store has, of their types and codecs, and fits into memory, and so does what
+each chunk unpacks to. New stores carry a CRC-32C of every chunk (Zarr's codec crc32c) and a SHA-256 of their
+attributes; older ones have neither.
 """
 
 import hashlib
@@ -20,7 +21,7 @@ import numpy as np
 import zarr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
-from predictor.data.store_chunks import check_codecs, check_unpacked
+from predictor.data.zstd_frames import unpacked_bytes
 from predictor.support.errors import UserError, short
 from predictor.support.files import check_place
 from predictor.support.memory import check_memory
@@ -35,6 +36,9 @@ DIGEST = "sha256"
 COMPRESSORS = (ZstdCodec(level=0), Crc32cCodec())
 """Codecs of a new array: compression, and a checksum of each chunk."""
 MOST_METADATA_BYTES, MOST_CHUNK_BYTES = 256 * MIB, 16_384 * MIB
+_CODECS = (["bytes", "zstd", "crc32c"], ["bytes", "zstd"])
+"""Codecs of an array, in their order: of a new store, and of an older one."""
+_CRC_BYTES = 4
 _FLOAT, _INT = ("float32", "float64"), ("int8", "int16", "int32", "int64")
 _ARRAYS: dict[str, tuple[tuple[str, ...], int]] = {
     "states": (_FLOAT, 3),
@@ -217,6 +221,7 @@ def _read(path: Path, name: str, stored: Any, has_checksums: bool) -> np.ndarray
     if has_checksums or name not in ("ids", "starts", "seeds", "label_starts"):
         if stored.nchunks_initialized != stored.nchunks:  # Zarr reads what is missing as zeros
             raise UserError(f"{path}: chunks of '{name}' are missing; copy or collect it anew")
+    _check_chunks(path, name, stored)
     try:
         return np.asarray(stored)
     except _BAD as error:
@@ -224,6 +229,20 @@ def _read(path: Path, name: str, stored: Any, has_checksums: bool) -> np.ndarray
         raise UserError(
             f"{path}: chunk {_damaged(stored)} of '{name}' is damaged ({reason}); copy or collect it anew"
         ) from error
+
+
+def _check_chunks(path: Path, name: str, stored: Any) -> None:
+    """Raises a `UserError` if a chunk unpacks to more than its array has in a chunk, without unpacking it."""
+    most = math.prod(stored.chunks) * stored.dtype.itemsize
+    trailer = _CRC_BYTES * any(isinstance(codec, Crc32cCodec) for codec in stored.metadata.codecs)
+    for entry in _entries(path / name):
+        chunk = entry.relative_to(path / name)
+        if chunk.parts[0] != "c" or not all(part.isdecimal() for part in chunk.parts[1:]) or entry.is_dir():
+            continue  # nothing that Zarr reads as a chunk
+        size = unpacked_bytes(entry, trailer)
+        if size is None or size > most:
+            reason = "it is not one whole frame of zstd" if size is None else f"it unpacks to {size} bytes, not {most}"
+            raise UserError(f"{path}: chunk {chunk} of '{name}' is damaged ({reason}); copy or collect it anew")
 
 
 def _damaged(stored: Any) -> str:
@@ -276,10 +295,15 @@ def _array(path: Path, name: str) -> tuple[tuple[int, ...], int]:
     codecs = content.get("codecs")
     if not isinstance(codecs, list) or not codecs:
         raise UserError(f"{where}: codecs must be an array of codecs, got {short(repr(codecs), 60)}")
-    names = [codec.get("name") if isinstance(codec, dict) else codec for codec in codecs]
-    check_codecs(names, where)
-    if "zstd" in names:
-        check_unpacked(path, chunk)
+    if [codec.get("name") if isinstance(codec, dict) else None for codec in codecs] not in _CODECS:
+        raise UserError(
+            f"{where}: codecs must be {', '.join(_CODECS[0])}, got {short(repr(codecs), 200)}; collect the store anew"
+        )
+    keys = as_object(content.get("chunk_key_encoding"), f"{where}: chunk_key_encoding")
+    if keys.get("name") != "default" or keys.get("configuration", {}) not in ({}, {"separator": "/"}):
+        raise UserError(
+            f"{where}: chunk_key_encoding must be default with /, got {short(repr(keys), 100)}; collect the store anew"
+        )
     if content.get("storage_transformers"):
         raise UserError(f"{where}: storage_transformers must be empty")
     return shape, size

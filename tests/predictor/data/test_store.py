@@ -7,13 +7,14 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numcodecs.zstd
+import google_crc32c
 import numpy as np
 import pytest
 import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from numcodecs.zstd import compress
 
 from predictor.data.store import (
     PERTURBATIONS,
@@ -467,26 +468,55 @@ def test_a_store_without_checksums_still_loads(tmp_path: Path):
     assert_equal(read_store(tmp_path / "old").episodes[1], replace(episode(2), seed=0))
 
 
-def test_a_chunk_that_unpacks_to_more_than_its_array_is_refused_before_it_is(tmp_path: Path):
+def zeros(size: int) -> bytes:
+    """One frame of zstd."""
+    return bytes(compress(np.zeros(size, np.uint8), 1))
+
+
+def without_size(blocks: int) -> bytes:
+    """One frame that does not name its size: blocks that repeat a zero 131,072 times, with a window of 1 MiB."""
+    kinds = [2**17 << 3 | 1 << 1 | (block == blocks - 1) for block in range(blocks)]
+    return bytes.fromhex("28b52ffd0050") + b"".join(kind.to_bytes(3, "little") + b"\0" for kind in kinds)
+
+
+BOMBS = {
+    "one frame": (zeros(10**7), "it unpacks to 10000000 bytes, not 192"),
+    "many frames": (zeros(192) + zeros(10**7), "it is not one whole frame of zstd"),
+    "after another": (zeros(192) * 9, "it is not one whole frame of zstd"),
+    "no size": (without_size(99), "it is not one whole frame of zstd"),
+    "cut": (zeros(10**7)[:-3], "it is not one whole frame of zstd"),
+    "empty": (b"", "it is not one whole frame of zstd"),
+}
+
+
+@pytest.mark.parametrize("case", BOMBS)
+def test_a_chunk_that_unpacks_to_more_than_its_array_is_refused_before_it_is_unpacked(case: str, tmp_path: Path):
+    content, reason = BOMBS[case]
     write_store(tmp_path / "store", INFO, [episode(1)])
-    array = tmp_path / "store" / "states"
-    metadata = json.loads((array / "zarr.json").read_text())
-    metadata["codecs"] = [codec for codec in metadata["codecs"] if codec["name"] != "crc32c"]
-    (array / "zarr.json").write_text(json.dumps(metadata))
-    (array / "c" / "0" / "0" / "0").write_bytes(numcodecs.zstd.compress(np.zeros(2**27, np.uint8), 1))
-    size = 4 * 4 * 3 * 4  # steps, agents, features, bytes
-    with pytest.raises(UserError, match=f"chunk c/0/0/0 of 'states' is damaged .*unpack to {size} bytes, got {2**27}"):
+    checksum = google_crc32c.value(content).to_bytes(4, "little")
+    (tmp_path / "store" / "states" / "c" / "0" / "0" / "0").write_bytes(content + checksum)
+    with pytest.raises(UserError, match=rf"chunk c/0/0/0 of 'states' is damaged \({reason}\); copy or collect"):
         read_store(tmp_path / "store")
 
 
-@pytest.mark.parametrize(
-    "names", [["bytes", "zstd", "zstd"], ["zstd", "bytes"], ["bytes", "gzip"], ["bytes", "blosc", "crc32c"]]
-)
-def test_other_codecs_are_refused(tmp_path: Path, names: list[str]):
+DECLARED = {
+    "gzip": ("codecs", [{"name": "bytes"}, {"name": "gzip"}], "codecs must be bytes, zstd, crc32c, got"),
+    "twice": ("codecs", [{"name": "bytes"}, {"name": "zstd"}, {"name": "zstd"}], "codecs must be bytes, zstd, crc32c"),
+    "keys": (
+        "chunk_key_encoding",
+        {"name": "default", "configuration": {"separator": "."}},
+        "chunk_key_encoding must be default with /, got",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", DECLARED)
+def test_only_what_a_store_has_is_unpacked(case: str, tmp_path: Path):
+    key, value, message = DECLARED[case]
     write_store(tmp_path / "store", INFO, [episode(1)])
-    file = tmp_path / "store" / "states" / "zarr.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | {"codecs": [{"name": name} for name in names]}))
-    with pytest.raises(UserError, match="codecs must be some of transpose, bytes, zstd, crc32c, in this order, got"):
+    metadata = tmp_path / "store" / "states" / "zarr.json"
+    metadata.write_text(json.dumps(json.loads(metadata.read_text()) | {key: value}))
+    with pytest.raises(UserError, match=message):
         read_store(tmp_path / "store")
 
 
