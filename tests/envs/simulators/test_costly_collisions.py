@@ -3,8 +3,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
-from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from envs.plans.highway import HighwayPlans
 from envs.readers import reader_for
@@ -43,15 +41,6 @@ def test_each_id_has_the_traffic_of_its_base_and_other_rewards(env_id: str, base
     assert entry_for(env_id).checkpoint == entry_for(base_id).checkpoint
     for seed in range(3):
         assert watched(env, seed, 8) == watched(base, seed, 8)
-
-
-@pytest.mark.filterwarnings("ignore:.*value is -?infinity:UserWarning")  # highway-env's own observations
-@pytest.mark.filterwarnings("ignore:Your observation  has an unconventional shape:UserWarning")
-@pytest.mark.parametrize("env_id", BASE_ID)
-def test_contracts_of_gymnasium_and_sb3(env_id: str):
-    env = make(env_id)
-    check_env(env.unwrapped, skip_render_check=True)
-    check_env_sb3(env)
 
 
 def test_a_collision_costs_a_minute_of_the_best_driving():

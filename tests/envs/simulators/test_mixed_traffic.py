@@ -17,6 +17,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from envs.readers import reader_for
 from envs.readers.highway import HighwayReader, vehicles_of
+from envs.simulators.costly_collisions import BASE_ID as COSTLY
 from envs.simulators.mixed_traffic import (
     BASE_ID,
     DRIVER_KINDS,
@@ -105,7 +106,7 @@ def test_registering_again_changes_nothing():
 
 @pytest.mark.filterwarnings("ignore:.*value is -?infinity:UserWarning")  # highway-env's own observations
 @pytest.mark.filterwarnings("ignore:Your observation  has an unconventional shape:UserWarning")
-@pytest.mark.parametrize("env_id", BASE_ID)
+@pytest.mark.parametrize("env_id", [*BASE_ID, *COSTLY])
 def test_contracts_of_gymnasium_and_sb3(env_id: str):
     env = make(env_id)
     check_env(env.unwrapped, skip_render_check=True)

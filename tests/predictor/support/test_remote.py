@@ -1,5 +1,6 @@
 """Addresses on other file systems: what is written there comes back, and what is wrong there is one line."""
 
+import fcntl
 import os
 import re
 from collections.abc import Iterator
@@ -22,7 +23,7 @@ from predictor.checkpoint import (
     resolve,
     save_checkpoint,
 )
-from predictor.data.partial_store import PartialStore
+from predictor.data.partial_store import PartialStore, beside
 from predictor.data.springs import SpringsConfig, make
 from predictor.data.store import EpisodeStore, StoreInfo, read_info_of, read_store, write_store
 from predictor.dgvae.config import PRESETS
@@ -346,6 +347,18 @@ def test_an_unfinished_recording_is_kept_where_the_command_runs(
         partial.finish(INFO)
     assert same(read_store(there / "store"), [circling_episode(0), circling_episode(1)])
     assert not kept.exists()
+
+
+def test_one_process_at_a_time_records_to_an_address(there: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    words = ["collect", "--env-id", "two-way-v0", "--out", address(there / "store"), "--episodes", "1"]
+    monkeypatch.setattr("sys.argv", [*words, "--max-steps", "2", "--workers", "1"])
+    parts = beside(there / "store")
+    with (tmp_path / f".{parts}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # as another process
+        with pytest.raises(UserError, match=f"another process writes {parts} "):
+            collect.main()
+    assert not exists(there / "store")
 
 
 def test_folders_with_locks_stay_here(there: Path, tmp_path: Path):
