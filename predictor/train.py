@@ -18,6 +18,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch.utils.tensorboard import SummaryWriter
 
@@ -186,8 +187,9 @@ def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, 
     writer.add_scalar("val/constant_velocity_ade_m", trainer.baseline_m, trainer.step)
     errors = {name: getattr(accuracy, name) for name in KEYS[:-1]} | {KEYS[-1]: trainer.baseline_m}
     add_point(trainer.config.out / CURVE_FILE, {"step": trainer.step} | errors)
-    if accuracy.energy_m < trainer.best:
-        trainer.best, trainer.stale = accuracy.energy_m, 0
+    score = trainer.score(accuracy)
+    if score < trainer.best:
+        trainer.best, trainer.stale = score, 0
         result = {
             "step": trainer.step,
             "val_energy_m": accuracy.energy_m,
@@ -198,6 +200,8 @@ def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, 
             "val_min_fde_m": accuracy.min_fde_m,
             "val_constant_velocity_ade_m": trainer.baseline_m,
         }
+        if accuracy.mixture_nll:
+            result["val_mixture_nll"] = float(np.mean(accuracy.mixture_nll))
         info = CheckpointInfo(
             spec=trainer.model.spec,
             config=trainer.model.config,
@@ -210,8 +214,9 @@ def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, 
         save_checkpoint(trainer.config.out / BEST_OF_RUN, trainer.model, info)
     else:
         trainer.stale += 1
+    name, unit = ("negative log-likelihood", "nats") if trainer.config.only_spread else ("energy score", "m")
     return (
-        f"step {trainer.step:,}: energy score {accuracy.energy_m:.3f} m (best {trainer.best:.3f}), "
+        f"step {trainer.step:,}: {name} {score:.3f} {unit} (best {trainer.best:.3f}), "
         f"ADE {accuracy.ade_m:.3f} m (constant velocity {trainer.baseline_m:.3f})"
     )
 

@@ -84,6 +84,9 @@ class DGVAEConfig:
     num_modes: int = 0
     """Number of types of an agent's edge to itself, each of which is a possible future (`predictor.dgvae.self_edges`);
     0 is the paper's model, which has none. Needs rollout_graph="frozen": what is drawn is held for the roll-out."""
+    spread_by_type: bool = False
+    """Whether each of these types has a spread of its own. Type 0 stands for all futures when it is shown alone, the
+    others for one each, so that their spread is several times smaller."""
 
     def __post_init__(self) -> None:
         """Checks choices and ranges."""
@@ -138,7 +141,7 @@ _FAST = DGVAEConfig(
 PRESETS: dict[str, DGVAEConfig] = {
     "paper": DGVAEConfig(),
     "fast": _FAST,
-    "plural": replace(_FAST, num_modes=20, rollout_graph="frozen"),
+    "plural": replace(_FAST, num_modes=20, spread_by_type=True, rollout_graph="frozen"),
 }
 """Named sizes: "paper" is the paper's model, "fast" a small one for policies on a CPU, "plural" the small one with
 modes: its samples are enumerated futures with probabilities."""

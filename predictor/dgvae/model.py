@@ -78,7 +78,7 @@ class DGVAE(nn.Module):
         self.self_edges: SelfEdges | None = None
         if config.num_modes:
             sizes = (config.rnn_dim, config.head_dim, config.message_dim, config.decoder_dim)
-            self.self_edges = SelfEdges(inputs, *sizes, config.num_modes, spec.position_dim)
+            self.self_edges = SelfEdges(inputs, *sizes, config.num_modes, spec.position_dim, config.spread_by_type)
         self._per_change: Tensor
         per_change = self.codec.scales / torch.tensor(config.change_scales) if self.sees_changes else torch.ones(0)
         self.register_buffer("_per_change", per_change, persistent=False)
@@ -212,8 +212,9 @@ class DGVAE(nn.Module):
         layers, graph, valid, motion = known.layers, known.graph, belief.valid, self._motion
         share = layers.feature_share(known.features)
         if num_samples == 1:
-            context = Context(graph, known.probs, share, self.self_edges.hold(known.own))
-            first = graph.unpack_nodes(self.self_edges.growth(known.node_after))
+            held = self.self_edges.hold(known.own)
+            context = Context(graph, known.probs, share, held)
+            first = graph.unpack_nodes(self.self_edges.growth(known.node_after, held))
             states, growth = motion.held_run(
                 layers, known.next_states, valid, context, known.node_after, horizon_steps - 1
             )

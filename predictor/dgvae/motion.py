@@ -95,13 +95,13 @@ class Motion:
 
         With plans, one for each mode, agent 0 follows them.
         """
-        assert self.self_edges is not None
+        assert self.self_edges is not None and context.held is not None
         future, growth = [], []
         for step in range(horizon_steps):
             node, states = self.step(layers, states, valid, context, node)
             states = states if plan is None else with_ego(states, plan[..., step, :])
             future.append(states)
-            growth.append(context.graph.unpack_nodes(self.self_edges.growth(node)))
+            growth.append(context.graph.unpack_nodes(self.self_edges.growth(node, context.held)))
         if not future:
             nothing = states[..., None, :][..., :0, :]
             return nothing, nothing[..., : self.codec.spec.position_dim]

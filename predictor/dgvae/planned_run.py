@@ -93,11 +93,13 @@ class PlannedRun(NamedTuple):
             held = self_edges.hold(own, graph.pack_nodes(of_types[..., None])[..., 0])
             return Context(graph.for_modes(), weights, share, held)
 
+        begin = context(types)
+        assert begin.held is not None
         if samples == 1:  # the single forecast's first step was made when the scene was observed
             node, states = known.node_after[:, None], known.next_states[:, None]
         else:
-            node, states = motion.step(layers, first, there, context(types), known.node_before[:, None])
-        growth = graph.unpack_nodes(self_edges.growth(node))
+            node, states = motion.step(layers, first, there, begin, known.node_before[:, None])
+        growth = graph.unpack_nodes(self_edges.growth(node, begin.held))
         plans = self.plans.repeat_interleave(samples, dim=1)
         states, node, growth, types = (_of_plans(t, count) for t in (states, node, growth, types))
         states = with_ego(states, plans[:, :, 0])

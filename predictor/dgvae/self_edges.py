@@ -26,6 +26,8 @@ class HeldType(NamedTuple):
     """Addend of the held type."""
     gain: Float[Tensor, "*types message"]
     """Factor of the held type."""
+    spread: Float[Tensor, "*types axes"] | None
+    """Addend of the held type in the growth of its spread; None where all types grow alike."""
 
 
 class SelfEdges(nn.Module):
@@ -39,9 +41,20 @@ class SelfEdges(nn.Module):
         decoder: size of the decoder's memory.
         types: number of types.
         axes: number of axes of a position.
+        spread_by_type: whether each type has an addend of its own in the growth of its spread.
     """
 
-    def __init__(self, inputs: int, memory: int, head: int, message: int, decoder: int, types: int, axes: int) -> None:
+    def __init__(
+        self,
+        inputs: int,
+        memory: int,
+        head: int,
+        message: int,
+        decoder: int,
+        types: int,
+        axes: int,
+        spread_by_type: bool,
+    ) -> None:
         """Creates the layers, in the order in which data passes them."""
         super().__init__()
         self.prior_head = nn.Sequential(nn.Linear(memory, head), nn.ELU(), nn.Linear(head, types))
@@ -51,6 +64,7 @@ class SelfEdges(nn.Module):
         self.gain = nn.Parameter(1 + GAIN_STD * torch.randn(types, message))
         self.out = nn.Linear(message, message)
         self.spread = nn.Linear(decoder, axes)
+        self.spread_shift = nn.Parameter(torch.zeros(types, axes)) if spread_by_type else None
 
     def hold(self, past: Float[Tensor, "*agents memory"], types: Int[Tensor, "*types"] | None = None) -> HeldType:
         """Returns what the given types (None: type 0 for all) add, from the activated memory of each self-edge.
@@ -58,12 +72,14 @@ class SelfEdges(nn.Module):
         Types and agents are broadcast together.
         """
         chosen: Tensor | int = 0 if types is None else types
-        return HeldType(self.past(past), self.shift[chosen], self.gain[chosen])
+        spread = None if self.spread_shift is None else self.spread_shift[chosen]
+        return HeldType(self.past(past), self.shift[chosen], self.gain[chosen], spread)
 
     def layer(self, inputs: Float[Tensor, "*agents inputs"], held: HeldType) -> Float[Tensor, "*held message"]:
         """Computes the hidden layer of each agent's message to itself; `out` makes it the message."""
         return functional.elu((self.input(inputs) + held.past) * held.gain + held.shift)
 
-    def growth(self, node: Float[Tensor, "*agents decoder"]) -> Float[Tensor, "*agents axes"]:
+    def growth(self, node: Float[Tensor, "*held decoder"], held: HeldType) -> Float[Tensor, "*held axes"]:
         """Computes by how much the spread grows in a step, in units of `delta_scales`; of no effect on the memory."""
-        return functional.softplus(self.spread(functional.elu(node.detach())))
+        grown = self.spread(functional.elu(node.detach()))
+        return functional.softplus(grown if held.spread is None else grown + held.spread)

@@ -55,6 +55,9 @@ class TrainConfig:
     """Checkpoint to start from: a shipped name, a folder or a run folder. Network and scales are the checkpoint's, so
     leave out the options of the network; frame and range of perception are the data's. Empty starts from random
     weights."""
+    only_spread: bool = False
+    """Whether to train the spread of the modes alone (`Forecast.xy_scale`): the forecasts of `init` and their
+    probabilities stay as they are, and the likelihood of the mixture selects the checkpoint."""
     input_changes: bool = True
     """Whether changes since the last step are inputs of the dG-VAE's encoder (`change_scales`, fitted to the data). No
     effect on other models."""
@@ -165,6 +168,8 @@ class TrainConfig:
         given = [name for name in OF_THE_NETWORK if getattr(self, name) != getattr(type(self), name)]
         if self.init and given:
             raise UserError(f"init takes the network of '{self.init}'; leave out {', '.join(given)}")
+        if self.only_spread and not self.init:
+            raise UserError("only_spread needs the checkpoint whose spread it trains; pass --init, or leave it out")
         unknown = [name for name in self._of_graphs if getattr(self, name)]
         if unknown:
             lacking = "edge features" if self.model == "dnri" else "edges"

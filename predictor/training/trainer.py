@@ -16,12 +16,10 @@ import torch
 from torch import Tensor
 
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.checkpoint import load_checkpoint
 from predictor.data.store import Episode, EpisodeStore, read_store, with_causal_edges
 from predictor.data.windows import WindowBatch, Windows, siblings, split_episodes
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import run_windows
-from predictor.models import build, configure
 from predictor.noise import NoiseOfRows, TrainingNoise
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
@@ -38,10 +36,10 @@ from predictor.training.cuda_graph import (
     default_generator,
     signature,
 )
-from predictor.training.fitted_scales import typical_change, typical_neighbour, typical_spread
 from predictor.training.objective import window_loss
 from predictor.training.processes import ALONE, Group, keep_rows_of_dropout
 from predictor.training.saved_state import read_state
+from predictor.training.start import initial_model
 
 VALIDATION_DRAWS = 5
 """Number of samples for model selection, of models without modes."""
@@ -134,43 +132,6 @@ def _windows(config: TrainConfig, episodes: Sequence[Episode], spec: SceneSpec, 
     )
 
 
-def model_config(config: TrainConfig, data: TrainingData) -> Any:
-    """Builds the network's config, with scales fitted to the training data.
-
-    Raises:
-        UserError: --set names a field that the model does not have.
-    """
-    plain = configure(config.model, config.preset, config.set)
-    fitted = {"delta_scales": typical_change(data.train_episodes, data.spec, plain.residual)}
-    if config.model == "dgvae":
-        if config.input_changes:
-            fitted["change_scales"] = typical_change(data.train_episodes, data.spec, "state")
-        if config.fit_inputs:
-            fitted["input_scales"] = typical_spread(data.train_episodes, data.spec)
-        if config.edge_geometry:
-            fitted["geometry_scales"] = typical_neighbour(data.train_episodes, data.spec)
-    return configure(config.model, config.preset, config.set, **fitted)
-
-
-def initial_model(config: TrainConfig, data: TrainingData) -> Any:
-    """Builds the model with random weights, or with those of the checkpoint to start from, for the data's scenes.
-
-    Raises:
-        UserError: as `model_config`; or the checkpoint cannot be read, is of another model, or its scenes have other
-            features, or an ego where the data's have none, or none where the data's have one.
-    """
-    if not config.init:
-        return build(config.model, data.spec, model_config(config, data), config.horizon_steps)
-    source, info = load_checkpoint(config.init)
-    if info.model != config.model:
-        raise UserError(f"checkpoint '{config.init}' is of model {info.model}; pass --model {info.model}")
-    info.spec.check_recorded(data.spec, f"checkpoint '{config.init}'", f"store {address(config.data[0])}")
-    spec = replace(data.spec, feature_scales=info.spec.feature_scales)  # scales are the network's, the rest the data's
-    model = build(info.model, spec, info.config, config.horizon_steps)
-    model.load_state_dict(source.state_dict())
-    return model
-
-
 class Trainer:
     """Runs the training: model, optimiser, data and progress.
 
@@ -188,7 +149,7 @@ class Trainer:
         if on_cuda and self.device.index is not None:
             torch.cuda.set_device(self.device)
         torch.manual_seed(config.seed)
-        self.model: Any = initial_model(config, data).to(self.device)
+        self.model: Any = initial_model(config, data.spec, data.train_episodes).to(self.device)
         self.step = 0
         self.best = math.inf
         self.stale = 0
@@ -343,6 +304,13 @@ class Trainer:
         optimizer = torch.optim.Adam(self.model.parameters(), lr=rate, capturable=capturable, fused=fused)
         optimizer._warned_capturable_if_run_uncaptured = True
         return optimizer
+
+    def score(self, accuracy: Accuracy) -> float:
+        """Returns what selects the checkpoint, the lower the better: the energy score of the samples [m].
+
+        They do not depend on the spread, so that this is selected by the mixture's negative log-likelihood [nats].
+        """
+        return float(np.mean(accuracy.mixture_nll)) if self.config.only_spread else accuracy.energy_m
 
     def validate(self) -> tuple[Accuracy, tuple[float, ...]]:
         """Returns accuracy on held-out episodes, and the spread of the single forecast per step and axis [m]."""

@@ -52,6 +52,7 @@ RICH = replace(
 PLURAL = replace(
     FAST_LIKE,
     num_modes=4,
+    spread_by_type=True,
     rollout_graph="frozen",
     change_scales=(3.0, 3.0, 2.0, 2.0),
     static_dim=2,
@@ -92,6 +93,15 @@ def spec(
     )
 
 
+@torch.no_grad()
+def enlarge(network: Any) -> None:
+    """Makes fresh weights large enough for every path to leave a trace; those that begin at zero are drawn."""
+    for parameter in network.parameters():
+        parameter.mul_(1.7)
+        if not parameter.any():
+            parameter.normal_()
+
+
 @cache
 def model(
     size: Literal["fast", "paper", "rich"] = "fast",
@@ -107,9 +117,7 @@ def model(
         config = replace(config, residual=residual)
     torch.manual_seed(7)
     made = DGVAE(spec(frame, has_ego), config, horizon_steps)
-    with torch.no_grad():
-        for parameter in made.parameters():
-            parameter.mul_(1.7)
+    enlarge(made)
     return made.eval().requires_grad_(False)
 
 
@@ -125,9 +133,7 @@ def any_model(kind: str) -> Any:
     name, config = EVERY_MODEL[kind]
     torch.manual_seed(7)
     made = build(name, spec(), config, horizon_steps=3)
-    with torch.no_grad():
-        for parameter in made.parameters():
-            parameter.mul_(1.7)
+    enlarge(made)
     return made.eval().requires_grad_(False)
 
 

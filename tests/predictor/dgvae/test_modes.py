@@ -21,7 +21,7 @@ from predictor.dgvae.config import DGVAEConfig
 from predictor.dgvae.networks import edge_probabilities
 from predictor.forecaster import Belief, Futures, has_scale
 from predictor.support.errors import UserError
-from tests.predictor.helpers import FAST_LIKE, PLURAL, RICH, random_presence, random_states, spec
+from tests.predictor.helpers import FAST_LIKE, PLURAL, RICH, enlarge, random_presence, random_states, spec
 
 BATCH, TIME, AGENTS, HORIZON = 2, 5, 4, 3
 CLOSE = {"rtol": 1e-4, "atol": 1e-4}
@@ -38,9 +38,7 @@ def made(variant: str = "plural") -> DGVAE:
     """An untrained model with weights large enough for every path to leave a trace."""
     torch.manual_seed(7)
     model = DGVAE(spec(), VARIANTS[variant], HORIZON)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.mul_(1.7)
+    enlarge(model)
     return model.eval().requires_grad_(False)
 
 
@@ -329,7 +327,22 @@ def test_the_spread_teaches_nothing_but_its_own_layer():
     assert output.modes is not None and output.modes.scale is not None
     output.modes.scale.sum().backward()
     moved = {name for name, p in model.named_parameters() if p.grad is not None and p.grad.any()}
-    assert moved == {"self_edges.spread.weight", "self_edges.spread.bias"}
+    assert moved == {"self_edges.spread.weight", "self_edges.spread.bias", "self_edges.spread_shift"}
+
+
+def test_the_spread_of_a_type_is_its_own():
+    """An addend of type 2 moves the spread of scene 2 alone, from the first step on; no position, no probability."""
+    now, before = belief(), made()
+    after = made().variant()
+    assert after.self_edges is not None and after.self_edges.spread_shift is not None
+    with torch.no_grad():
+        after.self_edges.spread_shift[2] -= 1.0
+    beliefs = observed(after, *scenes())
+    one, other = before.rollout(now, HORIZON, 4), after.rollout(beliefs[-1], HORIZON, 4)
+    assert one.scale is not None and other.scale is not None and one.mode_probs is not None
+    assert torch.equal(one.states, other.states) and torch.equal(one.mode_probs, other.mode_probs)
+    assert torch.equal(one.scale[:, [0, 1, 3]], other.scale[:, [0, 1, 3]])
+    assert (other.scale[:, 2] < one.scale[:, 2]).transpose(0, 1)[..., 0, :].all()
 
 
 # --- Config -----------------------------------------------------------------------------------------------------------

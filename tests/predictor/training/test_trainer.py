@@ -22,7 +22,8 @@ from predictor.training import trainer as trainer_module
 from predictor.training.config import TrainConfig
 from predictor.training.fitted_scales import typical_change, typical_neighbour, typical_spread
 from predictor.training.objective import window_loss
-from predictor.training.trainer import Trainer, load_data, model_config
+from predictor.training.start import model_config
+from predictor.training.trainer import Trainer, TrainingData, load_data
 from tests.predictor.helpers import FAST_LIKE, circling_episode, random_states, spec, write_circles
 
 SMALL = {"steps": 2, "batch_size": 4, "history_steps": 3, "horizon_steps": 2, "val_fraction": 0.34, "eval_every": 2}
@@ -51,6 +52,10 @@ def config(data: Path, out: Path, **changes: Any) -> TrainConfig:
 
 def made(settings: TrainConfig) -> Trainer:
     return Trainer(settings, load_data(settings))
+
+
+def fitted_config(settings: TrainConfig, data: TrainingData) -> Any:
+    return model_config(settings, data.spec, data.train_episodes)
 
 
 # --- Every kind of model ----------------------------------------------------------------------------------------------
@@ -139,7 +144,7 @@ def test_scales_are_fitted_to_the_training_episodes(circles: Path, tmp_path: Pat
     """All of them, unless options say otherwise."""
     settings = config(circles, tmp_path, set=("residual=trapezoid",))
     data = load_data(settings)
-    fitted = model_config(settings, data)
+    fitted = fitted_config(settings, data)
     assert fitted.delta_scales == typical_change(data.train_episodes, spec(), "trapezoid")
     assert fitted.change_scales == typical_change(data.train_episodes, spec(), "state")
     assert fitted.input_scales == typical_spread(data.train_episodes, spec())
@@ -149,13 +154,13 @@ def test_scales_are_fitted_to_the_training_episodes(circles: Path, tmp_path: Pat
     plain = replace(fitted, delta_scales=(), change_scales=(), input_scales=(), geometry_scales=())
     assert plain == replace(FAST_LIKE, residual="trapezoid")
     for option, scales in INPUTS.items():
-        unset = model_config(replace(settings, **{option: False}), data)
+        unset = fitted_config(replace(settings, **{option: False}), data)
         assert unset == replace(fitted, **{scales: ()}) != fitted
 
 
 def test_a_network_that_nothing_was_said_about_is_plural_and_has_all_inputs(circles: Path, tmp_path: Path):
     settings = TrainConfig((circles,), tmp_path)
-    made_of = model_config(settings, load_data(settings))
+    made_of = fitted_config(settings, load_data(settings))
     plural = PRESETS["plural"]
     assert plural.num_modes and all(getattr(made_of, scales) for scales in INPUTS.values())
     assert replace(made_of, delta_scales=(), **dict.fromkeys(INPUTS.values(), ())) == plural
@@ -163,7 +168,7 @@ def test_a_network_that_nothing_was_said_about_is_plural_and_has_all_inputs(circ
 
 def test_given_scales_win_over_fitted_ones(circles: Path, tmp_path: Path):
     settings = config(circles, tmp_path, model="mlp", set=("delta_scales=1,2,3,4",))
-    assert model_config(settings, load_data(settings)).delta_scales == (1.0, 2.0, 3.0, 4.0)
+    assert fitted_config(settings, load_data(settings)).delta_scales == (1.0, 2.0, 3.0, 4.0)
 
 
 @pytest.mark.parametrize("model", ["dnri", "imma", "lstm", "mlp"])
@@ -171,7 +176,7 @@ def test_inputs_of_the_dgvae_have_no_effect_on_other_models(circles: Path, tmp_p
     settings = config(circles, tmp_path, model=model)
     data = load_data(settings)
     without = replace(settings, **dict.fromkeys(INPUTS, False))
-    assert model_config(settings, data) == model_config(without, data)
+    assert fitted_config(settings, data) == fitted_config(without, data)
     assert settings.without_effect == tuple(INPUTS) and replace(settings, model="dgvae").without_effect == ()
 
 
@@ -438,6 +443,43 @@ def test_training_may_start_from_a_checkpoint(circles: Path, tmp_path: Path):
     assert began.model.config == info.config and began.model.horizon_steps == 1
     for name, value in source.state_dict().items():
         assert torch.equal(began.model.state_dict()[name], value), name
+
+
+def test_the_spread_alone_may_be_trained(circles: Path, tmp_path: Path):
+    """Of a checkpoint whose modes have one spread, too: means, probabilities and all other weights stay bit by bit."""
+    first = train(config(circles, tmp_path / "first", set=("num_modes=3", "rollout_graph=frozen")))
+    settings = config(
+        circles, tmp_path / "second", init=str(tmp_path / "first"), only_spread=True, steps=40, lr=0.1, eval_every=20
+    )
+    began = made(settings)
+    before, _ = began.validate()
+    last = train(settings)
+    (old, old_info), (new, new_info) = load_checkpoint(first), load_checkpoint(last)
+    assert new_info.config == replace(old_info.config, spread_by_type=True)
+    moved = {
+        name for name, value in new.state_dict().items() if not torch.equal(value, old.state_dict().get(name, value))
+    }
+    assert moved == {"self_edges.spread.weight", "self_edges.spread.bias"}
+    assert len(new.self_edges.spread_shift.unique(dim=0)) == 3
+    states = random_states(0, 2, 1, 3, 4)
+    one, other = (m.rollout(m.observe(m.empty_memory(2, 3), states[:, 0], torch.ones(2, 3).bool())[1], 2, 3)
+                  for m in (old, new))  # fmt: skip
+    assert torch.equal(one.states, other.states) and torch.equal(one.mode_probs, other.mode_probs)
+    result = new_info.provenance["result"]
+    assert result["step"] > 0 and result["val_mixture_nll"] < float(np.mean(before.mixture_nll))
+    assert began.score(before) == float(np.mean(before.mixture_nll)) != before.energy_m
+    plain = made(config(circles, tmp_path / "third"))
+    assert plain.score(before) == before.energy_m
+    again = made(replace(settings, init=str(last)))
+    assert torch.equal(again.model.self_edges.spread_shift, new.self_edges.spread_shift)
+
+
+def test_only_the_spread_needs_a_checkpoint_that_has_one(circles: Path, tmp_path: Path):
+    with pytest.raises(UserError, match="only_spread needs the checkpoint whose spread it trains; pass --init"):
+        config(circles, tmp_path / "second", only_spread=True)
+    train(config(circles, tmp_path / "first"))
+    with pytest.raises(UserError, match="only_spread needs a checkpoint with modes, and '.*first' has none"):
+        made(config(circles, tmp_path / "second", init=str(tmp_path / "first"), only_spread=True))
 
 
 def test_a_start_takes_the_frame_and_range_of_the_data(circles: Path, tmp_path: Path):

@@ -1,0 +1,62 @@
+"""The model with which a training begins: fresh weights with scales fitted to the data, or those of a checkpoint."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from predictor.checkpoint import load_checkpoint
+from predictor.data.store import Episode
+from predictor.models import build, configure
+from predictor.scene import SceneSpec
+from predictor.support.errors import UserError
+from predictor.support.remote import address
+from predictor.training.config import TrainConfig
+from predictor.training.fitted_scales import typical_change, typical_neighbour, typical_spread
+
+
+def model_config(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episode]) -> Any:
+    """Builds the network's config, with scales fitted to the training data.
+
+    Raises:
+        UserError: --set names a field that the model does not have.
+    """
+    plain = configure(config.model, config.preset, config.set)
+    fitted = {"delta_scales": typical_change(episodes, spec, plain.residual)}
+    if config.model == "dgvae":
+        if config.input_changes:
+            fitted["change_scales"] = typical_change(episodes, spec, "state")
+        if config.fit_inputs:
+            fitted["input_scales"] = typical_spread(episodes, spec)
+        if config.edge_geometry:
+            fitted["geometry_scales"] = typical_neighbour(episodes, spec)
+    return configure(config.model, config.preset, config.set, **fitted)
+
+
+def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episode]) -> Any:
+    """Builds the model with random weights, or with those of the checkpoint to start from, for the data's scenes.
+
+    Raises:
+        UserError: as `model_config`; or the checkpoint cannot be read, is of another model, or its scenes have other
+            features, or an ego where the data's have none, or none where the data's have one; or only its spread
+            shall be trained, and it has none.
+    """
+    if not config.init:
+        return build(config.model, spec, model_config(config, spec, episodes), config.horizon_steps)
+    source, info = load_checkpoint(config.init)
+    if info.model != config.model:
+        raise UserError(f"checkpoint '{config.init}' is of model {info.model}; pass --model {info.model}")
+    info.spec.check_recorded(spec, f"checkpoint '{config.init}'", f"store {address(config.data[0])}")
+    spec = replace(spec, feature_scales=info.spec.feature_scales)  # scales are the network's, the rest the data's
+    if not config.only_spread:
+        model = build(info.model, spec, info.config, config.horizon_steps)
+        model.load_state_dict(source.state_dict())
+        return model
+    if not getattr(info.config, "num_modes", 0):
+        raise UserError(f"only_spread needs a checkpoint with modes, and '{config.init}' has none; leave it out")
+    model = build(info.model, spec, replace(info.config, spread_by_type=True), config.horizon_steps)
+    of_types = model.self_edges.spread_shift
+    model.load_state_dict({"self_edges.spread_shift": of_types, **source.state_dict()})
+    model.requires_grad_(False)
+    model.self_edges.spread.requires_grad_(True)
+    of_types.requires_grad_(True)
+    return model
