@@ -107,7 +107,8 @@ def _store_line(path: Path, store: EpisodeStore) -> str:
 
 def _training(name: str, info: CheckpointInfo) -> str:
     try:
-        return _trained(info.provenance)
+        spread = info.provenance.get("spread")
+        return _trained(info.provenance) + (_spread(spread) if spread else "")
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise UserError(
             f"checkpoint '{name}' does not say how it was trained; write cards of checkpoints of predictor.train"
@@ -125,6 +126,15 @@ def _trained(made: Mapping[str, Any]) -> str:
         f"validation at step {result['step']}: {reached} against "
         f"{result['val_constant_velocity_ade_m']:.3f} m of constant velocity. Equal seeds give equal weights on "
         "the same CPU and torch."
+    )
+
+
+def _spread(made: Mapping[str, Any]) -> str:
+    result, config = made["result"], made["train_config"]
+    return (
+        f"\n\nThe spread of its modes was then trained alone, which moves no forecast: `{made['command']}`, seed "
+        f"{config['seed']}, commit {made['commit']}. Best validation at step {result['step']}: negative log-likelihood "
+        f"{result['val_mixture_nll']:.2f} nats."
     )
 
 

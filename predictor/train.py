@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext, redirect_stderr
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch.utils.tensorboard import SummaryWriter
 
-from predictor.checkpoint import BEST_OF_RUN, CheckpointInfo, save_checkpoint
+from predictor.checkpoint import BEST_OF_RUN, CheckpointInfo, load_checkpoint, save_checkpoint
 from predictor.data.store import content_id
 from predictor.support.command_line import parse
 from predictor.support.errors import UserError, run_entry_point, short
@@ -202,15 +202,20 @@ def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, 
         }
         if accuracy.mixture_nll:
             result["val_mixture_nll"] = float(np.mean(accuracy.mixture_nll))
-        info = CheckpointInfo(
-            spec=trainer.model.spec,
-            config=trainer.model.config,
-            model=trainer.config.model,
-            horizon_steps=trainer.config.horizon_steps,
-            std_m=std_m,
-            sources=trainer.data.sources,
-            provenance=made | {"train_config": _comparable(trainer.config), "result": result},
-        )
+        told = made | {"train_config": _comparable(trainer.config), "result": result}
+        if trainer.config.only_spread:
+            _, before = load_checkpoint(trainer.config.init)
+            info = replace(before, config=trainer.model.config, provenance=before.provenance | {"spread": told})
+        else:
+            info = CheckpointInfo(
+                spec=trainer.model.spec,
+                config=trainer.model.config,
+                model=trainer.config.model,
+                horizon_steps=trainer.config.horizon_steps,
+                std_m=std_m,
+                sources=trainer.data.sources,
+                provenance=told,
+            )
         save_checkpoint(trainer.config.out / BEST_OF_RUN, trainer.model, info)
     else:
         trainer.stale += 1

@@ -115,5 +115,21 @@ def test_card_says_which_model_it_is(config: CardConfig):
     assert "\nMLP, " in write_card(config).read_text()
 
 
+def test_card_says_how_the_spread_was_trained(config: CardConfig):
+    told = {"command": "python -m predictor.train --init toy --only-spread", "commit": "def", "train_config": {"seed": 4},
+            "result": {"step": 300, "val_mixture_nll": -0.256}}  # fmt: skip
+    forecaster = model()
+    info = CheckpointInfo(forecaster.spec, forecaster.config, 3, (1.0,) * 3, ("circles",), MADE | {"spread": told})
+    assert "spread of its modes was then" not in write_card(config).read_text()
+    save_checkpoint(config.checkpoint, forecaster, info)
+    text = write_card(config).read_text()
+    assert (
+        "Seed 3, commit abc" in text and "alone, which moves no forecast: `python -m predictor.train --init toy" in text
+    )
+    assert (
+        "--only-spread`, seed 4, commit def. Best validation at step 300: negative log-likelihood -0.26 nats." in text
+    )
+
+
 def assert_nothing_is_written(config: CardConfig) -> None:
     assert sorted(path.name for path in config.checkpoint.iterdir()) == ["config.json", "model.safetensors"]

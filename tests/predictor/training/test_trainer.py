@@ -455,7 +455,12 @@ def test_the_spread_alone_may_be_trained(circles: Path, tmp_path: Path):
     before, _ = began.validate()
     last = train(settings)
     (old, old_info), (new, new_info) = load_checkpoint(first), load_checkpoint(last)
-    assert new_info.config == replace(old_info.config, spread_by_type=True)
+    told = new_info.provenance["spread"]
+    assert new_info == replace(
+        old_info,
+        config=replace(old_info.config, spread_by_type=True),
+        provenance=old_info.provenance | {"spread": told},
+    )
     moved = {
         name for name, value in new.state_dict().items() if not torch.equal(value, old.state_dict().get(name, value))
     }
@@ -465,8 +470,12 @@ def test_the_spread_alone_may_be_trained(circles: Path, tmp_path: Path):
     one, other = (m.rollout(m.observe(m.empty_memory(2, 3), states[:, 0], torch.ones(2, 3).bool())[1], 2, 3)
                   for m in (old, new))  # fmt: skip
     assert torch.equal(one.states, other.states) and torch.equal(one.mode_probs, other.mode_probs)
-    result = new_info.provenance["result"]
-    assert result["step"] > 0 and result["val_mixture_nll"] < float(np.mean(before.mixture_nll))
+    result = told["result"]
+    assert (
+        told["train_config"]["only_spread"]
+        and result["step"] > 0
+        and result["val_mixture_nll"] < float(np.mean(before.mixture_nll))
+    )
     assert began.score(before) == float(np.mean(before.mixture_nll)) != before.energy_m
     plain = made(config(circles, tmp_path / "third"))
     assert plain.score(before) == before.energy_m
