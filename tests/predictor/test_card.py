@@ -116,8 +116,9 @@ def test_card_says_which_model_it_is(config: CardConfig):
 
 
 def test_card_says_how_the_spread_was_trained(config: CardConfig):
-    told = {"command": "python -m predictor.train --init toy --only-spread", "commit": "def", "train_config": {"seed": 4},
-            "result": {"step": 300, "val_mixture_nll": -0.256}}  # fmt: skip
+    result = {"step": 300, "val_mixture_nll": -0.256}
+    command = "python -m predictor.train --init toy --only-spread"
+    told = {"command": command, "commit": "def", "train_config": {"seed": 4}, "result": result}
     forecaster = model()
     info = CheckpointInfo(forecaster.spec, forecaster.config, 3, (1.0,) * 3, ("circles",), MADE | {"spread": told})
     assert "spread of its modes was then" not in write_card(config).read_text()
