@@ -109,8 +109,8 @@ class EvaluateConfig:
     trust_pickle: bool = False
     """Load a policy of a hub, which runs code of everyone who can write to its repository."""
     policy: str | None = None
-    """Driver of the ego instead of a trained policy: planner (docs/what_if.md), planner:CHECKPOINT, or another name of
-    envs.drivers.ego; needs --env-id and --out."""
+    """Driver of the ego instead of a trained policy: planner (docs/what_if.md), planner:CHECKPOINT, planner@RISK (its
+    bound on the risk: planner@0.3), or another name of envs.drivers.ego; needs --env-id and --out."""
     env_id: str | None = None
     """Environment of --policy; a training run has its own. Where a run's imports code ("module:Id"), name it here as
     well, if you trust it: the run's config alone imports nothing."""

@@ -31,7 +31,7 @@ from agents.task import EVALUATION_SEED, Task
 from agents.training import TrainingPlan, train
 from envs.drivers.all_agents import make_driver
 from envs.drivers.ego import make_ego_driver, named_drivers
-from envs.drivers.planner import ORACLE, PLANNER, PlannerConfig, is_planner
+from envs.drivers.planner import ORACLE, is_planner, planner_checkpoint, planner_config
 from envs.drivers.trained import require_own_view
 from envs.registry import checkpoint_for
 from envs.sb3.algorithms import CONTRIB
@@ -254,8 +254,8 @@ def _driver_pin(name: str, task: Task) -> dict[str, Any] | None:
         return {"sha256": _hash_of(Path(name))}
     if not is_planner(name):
         return None
-    settings = asdict(PlannerConfig())
-    checkpoint = name.removeprefix(PLANNER).removeprefix(":") or checkpoint_for(task.env_id)
+    settings = asdict(planner_config(name))
+    checkpoint = planner_checkpoint(name) or checkpoint_for(task.env_id)
     if checkpoint in (CONSTANT_VELOCITY, ORACLE) or is_own(checkpoint):
         return {"sha256": checkpoint, **settings}
     return {"sha256": _hash_of(resolve(checkpoint) / WEIGHTS), **settings}

@@ -25,7 +25,7 @@ from agents.studies.estimators import (
 from agents.studies.plan import Study
 from agents.studies.results import Result
 from agents.summaries import NEARLY_CONSTANT, reports_only_crashes, wilson_interval
-from envs.drivers.planner import PLANNER, PLANNER_ORACLE, is_planner
+from envs.drivers.planner import ORACLE, PLANNER, is_planner, planner_checkpoint
 from predictor.own_forecasters import is_own
 
 NOT_CONSTANT = ("random", "varied", "keep-lane", "heuristic", "mixed")
@@ -217,7 +217,7 @@ class Findings:
     def planner(self, scenario: str, true_futures: bool = False) -> Line | None:
         """Returns the line of the planner, with forecasts or with true futures; None if there is none."""
         planners = [x for x in self.lines(scenario, trained=False) if is_planner(x.arm)]
-        found = [x for x in planners if (x.arm == PLANNER_ORACLE) == true_futures]
+        found = [x for x in planners if (planner_checkpoint(x.arm) == ORACLE) == true_futures]
         return min(found, key=lambda x: x.arm != PLANNER, default=None)  # with the shipped forecasts, if it is listed
 
 

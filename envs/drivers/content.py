@@ -4,7 +4,7 @@ import hashlib
 import importlib.util
 from pathlib import Path
 
-from envs.drivers.planner import ORACLE, PLANNER
+from envs.drivers.planner import ORACLE, is_planner, planner_checkpoint
 from predictor.checkpoint import CONSTANT_VELOCITY, WEIGHTS, resolve
 from predictor.own_forecasters import PREFIX, is_own
 
@@ -28,7 +28,6 @@ def _file_of(driver: str) -> Path | None:
         module, colon, _ = driver.removeprefix(PREFIX).partition(":")
         found = importlib.util.find_spec(module) if colon else None
         return None if found is None or found.origin is None else Path(found.origin)
-    kind, _, checkpoint = driver.partition(":")
-    if kind == PLANNER and checkpoint not in ("", ORACLE, CONSTANT_VELOCITY):
+    if is_planner(driver) and (checkpoint := planner_checkpoint(driver)) not in ("", ORACLE, CONSTANT_VELOCITY):
         return resolve(checkpoint) / WEIGHTS
     return None

@@ -31,9 +31,10 @@ def make_ego_driver(name: str, env: gym.Env, rng: np.random.Generator) -> EgoDri
     Args:
         name: "random" (uniform actions), "idle" (no action), "varied" (each episode draws its own preferences and how
             long a choice is kept), "keep-lane" (steers along its lane; continuous steering only), "planner" (the best
-            of its plans by what-if forecasts, `envs.drivers.planner`; "planner:CHECKPOINT" names the forecaster), an
-            action that is taken in every step, by its name in `constant_actions` ("slower", "action-4"), one of a
-            user's own ("own:module:function", `envs.drivers.own`), or the path of a Stable-Baselines3 ``.zip``.
+            of its plans by what-if forecasts, `envs.drivers.planner`; "planner:CHECKPOINT" names the forecaster,
+            "planner@0.3" the bound on the risk), an action that is taken in every step, by its name in
+            `constant_actions` ("slower", "action-4"), one of a user's own ("own:module:function", `envs.drivers.own`),
+            or the path of a Stable-Baselines3 ``.zip``.
         env: the environment that will be driven.
         rng: source of all randomness of this episode.
 

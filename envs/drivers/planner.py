@@ -12,7 +12,7 @@ equal ones that with the highest value, then the first.
 """
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
@@ -34,7 +34,8 @@ from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError
 
 PLANNER = "planner"
-"""Name of the driver; `planner:CHECKPOINT` names its forecaster too."""
+"""Name of the driver; `planner:CHECKPOINT` names its forecaster too, `planner@RISK` its bound on the risk, and
+`planner@RISK:CHECKPOINT` both."""
 ORACLE = "oracle"
 """Name in the place of a checkpoint: the planner gets the true futures, an upper bound for measurements."""
 PLANNER_ORACLE = f"{PLANNER}:{ORACLE}"
@@ -67,26 +68,47 @@ class PlannerConfig:
 
 def is_planner(name: str) -> bool:
     """Returns whether a driver's name is that of the planner."""
-    return name == PLANNER or name.startswith(f"{PLANNER}:")
+    return name.partition(":")[0].partition("@")[0] == PLANNER
+
+
+def planner_checkpoint(name: str) -> str:
+    """Returns the checkpoint, or `ORACLE`, in the name of a planner; empty where it has none."""
+    return name.partition(":")[2]
+
+
+def planner_config(name: str) -> PlannerConfig:
+    """Returns the settings with the bound on the risk that the name of a planner gives.
+
+    Raises:
+        UserError: the bound is no number from 0 to 1.
+    """
+    _, at, risk = name.partition(":")[0].partition("@")
+    try:
+        return PlannerConfig(max_risk=float(risk)) if at else PlannerConfig()
+    except (ValueError, UserError) as error:
+        raise UserError(
+            f"{PLANNER}@RISK needs a largest probability of a collision from 0 to 1 ({PLANNER}@0.3), got '{name}'"
+        ) from error
 
 
 def planner_driver(name: str, env: gym.Env, rng: np.random.Generator) -> "Planner":
     """Returns the planner as a driver for one episode.
 
     Args:
-        name: "planner", or "planner:CHECKPOINT" with a shipped name, a folder, "constant-velocity" or "oracle".
+        name: "planner", or "planner:CHECKPOINT" with a shipped name, a folder, "constant-velocity" or "oracle"; with
+            "@RISK" behind the first word, the bound on the risk is another one.
         env: environment that will be driven.
         rng: source of the samples' noise.
 
     Raises:
-        UserError: no plan model or no checkpoint fits the environment.
+        UserError: no plan model or no checkpoint fits the environment, or the bound is none.
     """
-    checkpoint = name.partition(":")[2]
+    checkpoint, config = planner_checkpoint(name), planner_config(name)
     model = plan_model_for(env)
     if checkpoint == ORACLE:
         forecaster = forecaster_for(env, entry_for(scene_source(env)).checkpoint or CONSTANT_VELOCITY)
-        return Planner(env, forecaster, model, rng, PlannerConfig(true_futures=True))
-    return Planner(env, forecaster_for(env, checkpoint or None), model, rng)
+        return Planner(env, forecaster, model, rng, replace(config, true_futures=True))
+    return Planner(env, forecaster_for(env, checkpoint or None), model, rng, config)
 
 
 def forecaster_for(env: gym.Env, checkpoint: str | None) -> Forecaster:

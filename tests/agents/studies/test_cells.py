@@ -114,13 +114,14 @@ def test_a_policy_that_drives_is_in_the_name_by_its_content(cells: Callable[...,
 
 def test_the_planners_settings_are_in_the_name(cells: Callable[..., list[Cell]], monkeypatch: pytest.MonkeyPatch):
     def names() -> dict[str, str]:
-        found = cells(env_id=HIGHWAY, seeds="1", arms='["none"]', references='["planner", "planner:oracle", "slower"]')
-        return {cell.title: cell.name for cell in found}
+        drivers = '["planner", "planner:oracle", "planner@0.3", "slower"]'
+        return {cell.title: cell.name for cell in cells(env_id=HIGHWAY, seeds="1", arms='["none"]', references=drivers)}
 
     before = names()
-    monkeypatch.setattr("agents.studies.cells.PlannerConfig", lambda: PlannerConfig(max_risk=0.3))
+    assert len(set(before.values())) == len(before)
+    monkeypatch.setattr("agents.studies.cells.planner_config", lambda _: PlannerConfig(max_risk=0.7))
     changed = {title for title, name in names().items() if name != before[title]}
-    assert changed == {"corridor, planner", "corridor, planner:oracle"}
+    assert changed == {"corridor, planner", "corridor, planner:oracle", "corridor, planner@0.3"}
 
 
 @pytest.mark.parametrize(

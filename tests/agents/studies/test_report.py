@@ -110,6 +110,9 @@ def test_references_are_told_apart():
     straight = result("planner:constant-velocity", [1.0, 1.0])
     assert found_in(study(), [straight, *results()]).planner("one") == Line("planner", None)
     assert found_in(study(), [straight]).planner("one") == Line("planner:constant-velocity", None)
+    bold = [result(f"planner@0.3{of}", [2.0, 2.0]) for of in (":oracle", "")]
+    assert found_in(study(), bold).planner("one") == Line("planner@0.3", None)
+    assert found_in(study(), bold).planner("one", true_futures=True) == Line("planner@0.3:oracle", None)
     assert findings.heuristic("one") is None
     many = found_in(study(), [*results()[4:], result("heuristic", [6.0, 8.0]), result("random", [0.0, 2.0])])
     assert (many.best_constant("one"), many.planner("one")) == (None, None)

@@ -6,7 +6,9 @@ from envs.drivers.content import content_of
 from tests.envs.helpers import HIGHWAY_SPEC, save_tiny
 
 
-@pytest.mark.parametrize("name", ["random", "heuristic", "planner", "planner:oracle", "planner:constant-velocity"])
+@pytest.mark.parametrize(
+    "name", ["random", "heuristic", "planner", "planner@0.3", "planner:oracle", "planner:constant-velocity"]
+)
 def test_a_driver_of_this_package_has_no_content(name: str):
     assert content_of(name) is None
 
@@ -19,6 +21,7 @@ def test_other_code_or_weights_under_one_name_are_another_driver(tmp_path: Path,
         str(tmp_path / "policy.zip"): tmp_path / "policy.zip",
         "own:a_driver_of_mine:drive": tmp_path / "a_driver_of_mine.py",
         f"planner:{checkpoint}": checkpoint / "model.safetensors",
+        f"planner@0.3:{checkpoint}": checkpoint / "model.safetensors",
     }
     for name, file in files.items():
         if not file.exists():

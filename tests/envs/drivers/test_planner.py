@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 
 from envs.drivers.ego import make_ego_driver
-from envs.drivers.planner import Planner, PlannerConfig, choose, expected_rewards, is_planner
+from envs.drivers.planner import (
+    Planner,
+    PlannerConfig,
+    choose,
+    expected_rewards,
+    is_planner,
+    planner_checkpoint,
+    planner_config,
+)
 from envs.plans import Plans
 from envs.readers.entities import EntityRowsReader
 from envs.registry import make_env
@@ -136,6 +144,27 @@ def test_the_driver_is_the_same_over_any_wrapper(wrap: Any):
 
 def test_names_of_the_planner():
     assert is_planner("planner") and is_planner("planner:highway") and not is_planner("planners")
+    assert is_planner("planner@0.3") and is_planner("planner@0.3:highway") and not is_planner("own:planner@0.3")
+    named = {"planner": ("", 0.05), "planner:highway": ("highway", 0.05), "planner@0.3": ("", 0.3)}
+    named |= {"planner@1:hub:me/mine@main": ("hub:me/mine@main", 1.0), "planner:hub:me/mine@1": ("hub:me/mine@1", 0.05)}
+    for name, (checkpoint, risk) in named.items():
+        assert (planner_checkpoint(name), planner_config(name).max_risk) == (checkpoint, risk)
+
+
+@pytest.mark.parametrize("risk", ["", "much", "1.5", "-0.1", "nan"])
+def test_a_bound_that_is_none_is_refused(risk: str):
+    with pytest.raises(
+        UserError, match=r"planner@RISK needs a largest .* from 0 to 1 \(planner@0.3\), got 'plann"
+    ):
+        make_ego_driver(f"planner@{risk}", make_env("highway-fast-v0"), np.random.default_rng(0))
+
+
+def test_the_bound_in_the_name_is_the_drivers():
+    env = make_env("highway-fast-v0")
+    env.reset(seed=0)
+    for name, expected in {"planner": 0.05, "planner@0.3": 0.3, "planner@0.4:oracle": 0.4}.items():
+        driver: Any = make_ego_driver(name, env, np.random.default_rng(0))
+        assert driver.config == PlannerConfig(max_risk=expected, true_futures="oracle" in name)
 
 
 class Blank(gym.Env):
