@@ -17,12 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from pettingzoo import ParallelEnv
+from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
 from envs.arms import Arm, arm_of
 from envs.batched_forward import BatchedForward, can_share
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout
+from envs.kinds import require_kind
 from envs.multiagent_observation import MultiagentStream, check_multiagent_scene
 from envs.observation import open_forecaster
 from envs.own_observation import own_entries, own_spaces
@@ -88,11 +89,12 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         arm: Arm | None = None,
     ) -> None:
         """Loads the forecaster and extends the observation spaces."""
-        if not isinstance(env, ParallelEnv):
+        if isinstance(env, AECEnv):
             raise UserError(
                 f"ForecastParallelEnv needs a PettingZoo parallel env, got {type(env).__name__}; make it with "
                 "parallel_env(), or convert an AEC env with pettingzoo.utils.conversions.aec_to_parallel"
             )
+        require_kind(env, (ParallelEnv, "a PettingZoo parallel env"), "ForecastParallelEnv")
         BaseParallelWrapper.__init__(self, env)
         check_bounds(perception_m, max_agents)
         self._source = f"env '{multiagent_env_id(env)}'"

@@ -16,6 +16,7 @@ from gymnasium.utils import RecordConstructorArgs
 
 from envs.arms import Arm, arm_of
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
+from envs.kinds import SINGLE, refuse_autoreset, require_kind
 from envs.observation import ForecastStream, carries_scenes, open_forecaster, scene_entries, scene_spaces
 from envs.own_observation import own_entries, own_part, own_spaces
 from envs.plans import PlanModel, Plans, checked_model, checked_plans, plan_model_for
@@ -56,8 +57,8 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         reader: function or class that makes a reader for the env; None picks one by env family.
 
     Raises:
-        UserError: no reader knows the env; or its observation is a Tuple, a Dict of Dicts, or has an entry of an added
-            one's name.
+        UserError: not one gymnasium environment, or one with Autoreset inside; no reader knows the env; or its
+            observation is a Tuple, a Dict of Dicts, or has an entry of an added one's name.
     """
 
     def __init__(
@@ -68,6 +69,8 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         reader: MakeReader | None = None,
     ) -> None:
         """Picks the reader and extends the observation space."""
+        require_kind(env, SINGLE, "SceneObservation")
+        refuse_autoreset(env, "SceneObservation")
         RecordConstructorArgs.__init__(self, perception_m=perception_m, max_agents=max_agents, reader=reader)
         gym.Wrapper.__init__(self, env)
         own = own_spaces(env.observation_space, f"env '{scene_source(env)}'")
@@ -196,8 +199,9 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         what_if: forecast for these plans, world axes, with an axis of plans; None without `what_if`.
 
     Raises:
-        UserError: no reader, or one although the env is a `SceneObservation`; no checkpoint, or a forecaster of
-            another spec (features, dt); no plan model for `what_if=True`; no room for what the arm shows.
+        UserError: not one gymnasium environment, or one with Autoreset or forecasts inside; no reader, or one although
+            the env is a `SceneObservation`; no checkpoint, or a forecaster of another spec (features, dt); no plan
+            model for `what_if=True`; no room for what the arm shows.
     """
 
     def __init__(
@@ -218,6 +222,8 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         arm: Arm | None = None,
     ) -> None:
         """Loads the forecaster and extends the observation space."""
+        require_kind(env, SINGLE, "ForecastObservation")
+        refuse_autoreset(env, "ForecastObservation")
         checkpoint = str(checkpoint) if isinstance(checkpoint, Path) else checkpoint  # a spec is JSON
         RecordConstructorArgs.__init__(
             self, checkpoint=checkpoint, horizon_steps=horizon_steps, num_samples=num_samples, flatten=flatten,
