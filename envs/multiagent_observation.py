@@ -6,7 +6,7 @@ An agent's view is cut to its perception; the forecast itself is made from all a
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -22,7 +22,7 @@ from envs.readers.base import MultiagentScene
 from envs.scene_stream import ForecastConfig, SceneStream
 from predictor.forecaster import Forecaster
 from predictor.scene import PADDING_ID, Forecast, SceneBatch, SceneSpec, perceived_agents
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, short
 
 Entries = dict[str, NDArray[np.float32]]
 """Entries of many views, by key."""
@@ -233,6 +233,21 @@ def check_multiagent_scene(scene: Any, spec: SceneSpec, source: str = "reader") 
         if not 0 <= index < spec.max_agents or not scene.scene.valid[index]:
             raise UserError(f"{source}: agent '{name}' has index {index}, but the scene has no agent there")
     return scene
+
+
+def require_indexed(scene: MultiagentScene, agents: Iterable[str], source: str = "reader") -> None:
+    """Checks that a scene says where these agents are; the view of one that it does not name would be all zeros.
+
+    Raises:
+        UserError: some are not in `index_of`.
+    """
+    missing = [agent for agent in agents if agent not in scene.index_of]
+    if missing:
+        known = short([*scene.index_of], 100)
+        raise UserError(
+            f"{source}: index_of must have the index of each living agent that is observed, but lacks "
+            f"{short(missing, 100)} of the environment; its names are {known}; name agents as the environment does"
+        )
 
 
 def _views(

@@ -11,7 +11,7 @@ with one ego, use `envs.wrappers.ForecastObservation`.
 (5, 2)
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from envs.arms import Arm, arm_of
 from envs.batched_forward import BatchedForward, can_share
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout
 from envs.kinds import require_kind
-from envs.multiagent_observation import MultiagentStream, check_multiagent_scene
+from envs.multiagent_observation import MultiagentStream, check_multiagent_scene, require_indexed
 from envs.observation import open_forecaster
 from envs.own_observation import own_entries, own_spaces
 from envs.plans.keeping_on import all_keeping_on
@@ -46,7 +46,8 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     then agent → other), `valid`.
     `envs.entries.ego_entries` gives the shapes. Agents may differ in their own spaces, die and join at any step. An
     agent's last observation has forecasts too; if the reader no longer reports the agent, all its entries are zero,
-    `valid` too. With `flatten=True` an observation is one Box, in the Dict's key order.
+    `valid` too. The reader must report each agent that lives. With `flatten=True` an observation is one Box, in the
+    Dict's key order.
 
     The history is cleared at reset only. After each step, `scene` and `forecast` hold all agents in the world frame.
 
@@ -173,7 +174,7 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         observations, infos = self.env.reset(seed=seed, options=options)
         self._reader.reset()
         self._last_actions = {}
-        scene, shown = self._read(observations), self._own(observations)
+        scene, shown = self._read(observations, observations), self._own(observations)
         if self._forward is not None:
             self._forward.begin(self._place, scene, shown, seed)
             return shown, infos
@@ -188,17 +189,24 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         """Steps the env, takes in the scene and forecasts."""
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
         self._last_actions = dict(actions)
-        scene, shown = self._read(observations), self._own(observations)
+        ended = {agent for over in (terminations, truncations) for agent in over if over[agent]}
+        scene, shown = self._read(observations, self._living(observations, ended)), self._own(observations)
         if self._forward is not None:
             self._forward.go_on(self._place, scene, shown)
         else:
             shown = self._with_views(scene, shown)
         return shown, rewards, terminations, truncations, infos
 
-    def _read(self, observations: Mapping[str, Any]) -> MultiagentScene:
-        scene = check_multiagent_scene(
-            self._reader.read(self.env), self._reader.spec, f"scene reader of {self._source}"
-        )
+    def _living(self, observations: Mapping[str, Any], ended: set[str]) -> list[str]:
+        """Returns the observed agents that live on; the simulator knows better than a wrapper that shows the dead."""
+        inside = getattr(self.env.unwrapped, "agents", self.env.agents)
+        living = {*self.env.agents}.intersection(inside) - ended
+        return [agent for agent in observations if agent in living]
+
+    def _read(self, observations: Mapping[str, Any], living: Iterable[str]) -> MultiagentScene:
+        source = f"scene reader of {self._source}"
+        scene = check_multiagent_scene(self._reader.read(self.env), self._reader.spec, source)
+        require_indexed(scene, living, source)
         if self.stream.config.arm.shown.true_futures:
             horizon_steps = self.stream.horizon_steps
             xy_m = all_keeping_on(self.env, self._reader, scene.scene, observations, self._last_actions, horizon_steps)
