@@ -26,7 +26,7 @@ from envs.forecast_wrapper import ForecastWrapper, ObservationLayout
 from envs.kinds import require_kind
 from envs.multiagent_observation import MultiagentStream, check_multiagent_scene, require_indexed
 from envs.observation import open_forecaster
-from envs.own_observation import own_entries, own_spaces
+from envs.own_observation import check_own, check_reward, own_entries, own_spaces
 from envs.plans.keeping_on import all_keeping_on
 from envs.readers import MakeReader, multiagent_env_id, multiagent_reader_for
 from envs.readers.base import MultiagentReader, MultiagentScene, build_multiagent_reader, check_bounds
@@ -113,6 +113,7 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         self._place = 0
         self._scene: MultiagentScene | None = None
         self._last_actions: Mapping[str, Any] = {}
+        self._unchecked = {"reset", "step"}
         for agent in getattr(env, "possible_agents", ()):
             self.observation_space(agent)
 
@@ -172,6 +173,11 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Resets the env and clears the history; a seed also restarts the samples' noise."""
         observations, infos = self.env.reset(seed=seed, options=options)
+        if "reset" in self._unchecked:
+            for agent, seen in observations.items():
+                source = f"'{agent}' of {self._source}"
+                check_own(own_spaces(self.env.observation_space(agent), source), seen, source)
+            self._unchecked.remove("reset")
         self._reader.reset()
         self._last_actions = {}
         scene, shown = self._read(observations, observations), self._own(observations)
@@ -188,6 +194,10 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any]]:
         """Steps the env, takes in the scene and forecasts."""
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
+        if "step" in self._unchecked:
+            for agent, reward in rewards.items():
+                check_reward(reward, f"'{agent}' of {self._source}")
+            self._unchecked.remove("step")
         self._last_actions = dict(actions)
         ended = {agent for over in (terminations, truncations) for agent in over if over[agent]}
         scene, shown = self._read(observations, self._living(observations, ended)), self._own(observations)

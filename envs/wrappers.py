@@ -18,7 +18,7 @@ from envs.arms import Arm, arm_of
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
 from envs.kinds import SINGLE, refuse_autoreset, require_kind
 from envs.observation import ForecastStream, carries_scenes, open_forecaster, scene_entries, scene_spaces
-from envs.own_observation import own_entries, own_part, own_spaces
+from envs.own_observation import check_own, check_reward, own_entries, own_part, own_spaces
 from envs.plans import PlanModel, Plans, checked_model, checked_plans, plan_model_for
 from envs.plans.batch import PlanBatch, plans_info
 from envs.plans.playing import with_true_futures
@@ -74,6 +74,7 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         RecordConstructorArgs.__init__(self, perception_m=perception_m, max_agents=max_agents, reader=reader)
         gym.Wrapper.__init__(self, env)
         own = own_spaces(env.observation_space, f"env '{scene_source(env)}'")
+        self._own_spaces, self._unchecked = own, {"reset", "step"}
         self.reader = _reader_of(env, reader, perception_m, max_agents)
         self._scene: Scene | None = None
         self._plan_model: PlanModel | None = None
@@ -120,8 +121,15 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         return tuple(self._plan_model.names)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Resets the env; identities start anew."""
+        """Resets the env; identities start anew.
+
+        Raises:
+            UserError: the first observation does not lie in the env's own space.
+        """
         obs, info = self.env.reset(seed=seed, options=options)
+        if "reset" in self._unchecked:
+            check_own(self._own_spaces, obs, f"env '{self.scene_source}'")
+            self._unchecked.remove("reset")
         self.reader.reset()
         self._over = False
         return self._observe(obs), self._with_plans(info)
@@ -129,6 +137,9 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Steps the env and reads the scene."""
         obs, reward, terminated, truncated, info = self.env.step(action)
+        if "step" in self._unchecked:
+            check_reward(reward, f"env '{self.scene_source}'")
+            self._unchecked.remove("step")
         self._over = bool(terminated or truncated)
         # some highway-env ids return NumPy's bool, which SB3 refuses
         return self._observe(obs), reward, bool(terminated), bool(truncated), self._with_plans(info)
