@@ -130,6 +130,6 @@ def check_finite(model: BaseAlgorithm) -> None:
     """
     if not all(bool(weights.isfinite().all()) for weights in model.policy.parameters()):
         raise DivergedError(
-            f"the policy's weights are not finite after {model.num_timesteps:,} steps: its training diverged; lower "
-            "the learning rate (--set learning_rate=…)"
+            f"the policy's weights are not finite after {model.num_timesteps:,} steps: its training diverged; "
+            "scale rewards and observations of many thousands down, or lower the learning rate (--set learning_rate=…)"
         )

@@ -137,7 +137,10 @@ class Evaluation:
         if not self.has_ego:
             return f"{caption}; return: mean over the learners."
         if all(summary.crash_rate is None for summary in self.summaries):
-            return f"{caption}; crashes are not reported: name their key with --crash-key or in register_reader."
+            return (
+                f"{caption}; crashes are not reported: no info has their key; name it, spelt as there, with "
+                "--crash-key or in register_reader."
+            )
         return f"{caption}, crash rate with its 95 % Wilson interval." if intervals else f"{caption}."
 
     def _driving(self, summaries: Sequence[PolicySummary]) -> list["TablePart"]:

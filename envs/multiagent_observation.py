@@ -6,7 +6,7 @@ An agent's view is cut to its perception; the forecast itself is made from all a
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -22,7 +22,7 @@ from envs.readers.base import MultiagentScene
 from envs.scene_stream import ForecastConfig, SceneStream
 from predictor.forecaster import Forecaster
 from predictor.scene import PADDING_ID, Forecast, SceneBatch, SceneSpec, perceived_agents
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, short
 
 Entries = dict[str, NDArray[np.float32]]
 """Entries of many views, by key."""
@@ -221,18 +221,37 @@ def check_multiagent_scene(scene: Any, spec: SceneSpec, source: str = "reader") 
     if not isinstance(scene, MultiagentScene):
         raise UserError(f"{source}: reading must give a MultiagentScene (envs.readers), got {type(scene).__name__}")
     scene.scene.check(source, spec, agents=spec.max_agents)
-    heading = scene.heading_rad
-    if heading.shape != (spec.max_agents,) or not np.isfinite(heading).all():
+    heading: Any = scene.heading_rad
+    if np.shape(heading) != (spec.max_agents,) or not np.isfinite(heading).all():
         raise UserError(
-            f"{source}: heading_rad must hold {spec.max_agents} finite numbers, one per agent, got {heading.tolist()}"
+            f"{source}: heading_rad must hold {spec.max_agents} finite numbers, one per agent, got "
+            f"{short(np.asarray(heading).tolist())}"
         )
+    index_of: Any = scene.index_of
+    if not isinstance(index_of, Mapping) or not all(isinstance(i, int | np.integer) for i in index_of.values()):
+        raise UserError(f"{source}: index_of must be a dict of whole numbers by agents' names, got {short(index_of)}")
     taken = list(scene.index_of.values())
     if len(set(taken)) != len(taken):
-        raise UserError(f"{source}: every agent needs an index of its own, got {dict(scene.index_of)}")
+        raise UserError(f"{source}: every agent needs an index of its own, got {short(dict(scene.index_of))}")
     for name, index in scene.index_of.items():
         if not 0 <= index < spec.max_agents or not scene.scene.valid[index]:
             raise UserError(f"{source}: agent '{name}' has index {index}, but the scene has no agent there")
     return scene
+
+
+def require_indexed(scene: MultiagentScene, agents: Iterable[str], source: str = "reader") -> None:
+    """Checks that a scene says where these agents are; the view of one that it does not name would be all zeros.
+
+    Raises:
+        UserError: some are not in `index_of`.
+    """
+    missing = [agent for agent in agents if agent not in scene.index_of]
+    if missing:
+        known = short([*scene.index_of], 100)
+        raise UserError(
+            f"{source}: index_of must have the index of each living agent that is observed, but lacks "
+            f"{short(missing, 100)} of the environment; its names are {known}; name agents as the environment does"
+        )
 
 
 def _views(

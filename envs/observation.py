@@ -1,6 +1,7 @@
 """Makes observations of scenes and forecasts, for single environments and vector environments of gymnasium and SB3."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from predictor.checkpoint import load_forecaster
 from predictor.forecaster import Forecaster, require_forecaster
 from predictor.online import use_one_thread_after_fork
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, short
 
 Observations = dict[str, NDArray[Any]]
 
@@ -220,5 +221,14 @@ def common_value(values: Any, what: str) -> Any:
         UserError: they differ.
     """
     if any(value != values[0] for value in values):
-        raise UserError(f"all environments must have the same {what}, got {sorted({str(v) for v in values})}")
+        raise UserError(f"all environments must have the same {what}, got {_differences(values)}")
     return values[0]
+
+
+def _differences(values: Any) -> str:
+    """Returns in what values differ: of scene specs the fields that do."""
+    if not all(isinstance(value, SceneSpec) for value in values):
+        return short(sorted({str(value) for value in values}))
+    names = [one.name for one in fields(SceneSpec) if len({getattr(value, one.name) for value in values}) > 1]
+    each = dict.fromkeys(", ".join(f"{name}={getattr(value, name)}" for name in names) for value in values)
+    return short(" and ".join(each))

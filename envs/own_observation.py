@@ -8,9 +8,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 
 from envs.entries import FORECAST_KEYS, PATH_KEYS, SCENE_KEYS, UNCERTAINTY_KEYS, WHAT_IF_KEYS
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, short
 
 OWN_KEY = "observation"
 """Name of the entry that holds an environment's own observation where that is no Dict."""
@@ -73,6 +74,69 @@ def own_spaces(space: gym.Space, source: str) -> dict[str, gym.Space]:
 def own_entries(observation: Any) -> dict[str, Any]:
     """Returns an environment's own observation as entries, in a new dict."""
     return dict(observation) if isinstance(observation, Mapping) else {OWN_KEY: observation}
+
+
+def check_own(own: Mapping[str, gym.Space], observation: Any, source: str) -> None:
+    """Checks that an environment's own observation lies in its space, up to rounding and to a safe change of type.
+
+    Learners keep observations in arrays of the space's type: floats in a space of integers would be cut to these.
+
+    Args:
+        own: spaces of its entries (`own_spaces`).
+        observation: its own observation.
+        source: name of the environment, for messages.
+
+    Raises:
+        UserError: it does not.
+    """
+    entries = own_entries(observation)
+    missing = [key for key in own if key not in entries]
+    if missing:
+        raise UserError(
+            f"the own observation of {source} must have the entries {short([*own], 100)} of its observation space, got "
+            f"{short([*entries], 100)}; return what the space says"
+        )
+    for key, space in own.items():
+        fault = _fault(space, entries[key])
+        if fault:
+            entry = f", entry '{key}'," if isinstance(observation, Mapping) else ""
+            raise UserError(
+                f"the own observation of {source}{entry} must lie in its space {short(space, 150)}, got {fault}; "
+                "change the observation or its space"
+            )
+
+
+def check_reward(reward: Any, source: str) -> None:
+    """Checks that a reward is a finite number, or several.
+
+    Raises:
+        UserError: it is not.
+    """
+    try:
+        values = np.asarray(reward)
+        fine = values.dtype.kind in "biuf" and bool(np.isfinite(values).all())
+    except (TypeError, ValueError, RuntimeError):
+        fine = False
+    if not fine:
+        raise UserError(f"the reward of {source} must be a finite number, got {short(reward, 60)}; return a float")
+
+
+def _fault(space: gym.Space, value: Any) -> str | None:
+    """Returns in words what does not fit a space, if anything."""
+    if not isinstance(space, gym.spaces.Box):
+        fits = space.contains(value) or (np.size(value) == 1 and space.contains(np.asarray(value).item()))
+        return None if fits else short(value, 60)
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError):
+        return f"a {type(value).__name__}"
+    if array.shape != space.shape or array.dtype.kind not in "biuf":
+        return f"{array.dtype} of the shape {array.shape}"
+    if np.issubdtype(space.dtype, np.integer) and array.dtype.kind == "f":
+        return f"numbers of type {array.dtype}"
+    slack = 1e-4 * np.maximum(1.0, np.abs(np.where(np.isfinite(array), array, 0.0).astype(np.float64)))
+    outside = ~((array >= space.low - slack) & (array <= space.high + slack))
+    return f"{short(array[outside].flat[0], 40)}" if outside.any() else None
 
 
 def own_part(space: gym.spaces.Dict) -> dict[str, gym.Space]:

@@ -11,21 +11,22 @@ with one ego, use `envs.wrappers.ForecastObservation`.
 (5, 2)
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from pettingzoo import ParallelEnv
+from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
 from envs.arms import Arm, arm_of
 from envs.batched_forward import BatchedForward, can_share
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout
-from envs.multiagent_observation import MultiagentStream, check_multiagent_scene
+from envs.kinds import require_kind
+from envs.multiagent_observation import MultiagentStream, check_multiagent_scene, require_indexed
 from envs.observation import open_forecaster
-from envs.own_observation import own_entries, own_spaces
+from envs.own_observation import check_own, check_reward, own_entries, own_spaces
 from envs.plans.keeping_on import all_keeping_on
 from envs.readers import MakeReader, multiagent_env_id, multiagent_reader_for
 from envs.readers.base import MultiagentReader, MultiagentScene, build_multiagent_reader, check_bounds
@@ -45,7 +46,8 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     then agent → other), `valid`.
     `envs.entries.ego_entries` gives the shapes. Agents may differ in their own spaces, die and join at any step. An
     agent's last observation has forecasts too; if the reader no longer reports the agent, all its entries are zero,
-    `valid` too. With `flatten=True` an observation is one Box, in the Dict's key order.
+    `valid` too. The reader must report each agent that lives. With `flatten=True` an observation is one Box, in the
+    Dict's key order.
 
     The history is cleared at reset only. After each step, `scene` and `forecast` hold all agents in the world frame.
 
@@ -88,11 +90,12 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         arm: Arm | None = None,
     ) -> None:
         """Loads the forecaster and extends the observation spaces."""
-        if not isinstance(env, ParallelEnv):
+        if isinstance(env, AECEnv):
             raise UserError(
                 f"ForecastParallelEnv needs a PettingZoo parallel env, got {type(env).__name__}; make it with "
                 "parallel_env(), or convert an AEC env with pettingzoo.utils.conversions.aec_to_parallel"
             )
+        require_kind(env, (ParallelEnv, "a PettingZoo parallel env"), "ForecastParallelEnv")
         BaseParallelWrapper.__init__(self, env)
         check_bounds(perception_m, max_agents)
         self._source = f"env '{multiagent_env_id(env)}'"
@@ -110,6 +113,7 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
         self._place = 0
         self._scene: MultiagentScene | None = None
         self._last_actions: Mapping[str, Any] = {}
+        self._unchecked = {"reset", "step"}
         for agent in getattr(env, "possible_agents", ()):
             self.observation_space(agent)
 
@@ -169,9 +173,14 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Resets the env and clears the history; a seed also restarts the samples' noise."""
         observations, infos = self.env.reset(seed=seed, options=options)
+        if "reset" in self._unchecked:
+            for agent, seen in observations.items():
+                source = f"'{agent}' of {self._source}"
+                check_own(own_spaces(self.env.observation_space(agent), source), seen, source)
+            self._unchecked.remove("reset")
         self._reader.reset()
         self._last_actions = {}
-        scene, shown = self._read(observations), self._own(observations)
+        scene, shown = self._read(observations, observations), self._own(observations)
         if self._forward is not None:
             self._forward.begin(self._place, scene, shown, seed)
             return shown, infos
@@ -185,18 +194,29 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any]]:
         """Steps the env, takes in the scene and forecasts."""
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
+        if "step" in self._unchecked:
+            for agent, reward in rewards.items():
+                check_reward(reward, f"'{agent}' of {self._source}")
+            self._unchecked.remove("step")
         self._last_actions = dict(actions)
-        scene, shown = self._read(observations), self._own(observations)
+        ended = {agent for over in (terminations, truncations) for agent in over if over[agent]}
+        scene, shown = self._read(observations, self._living(observations, ended)), self._own(observations)
         if self._forward is not None:
             self._forward.go_on(self._place, scene, shown)
         else:
             shown = self._with_views(scene, shown)
         return shown, rewards, terminations, truncations, infos
 
-    def _read(self, observations: Mapping[str, Any]) -> MultiagentScene:
-        scene = check_multiagent_scene(
-            self._reader.read(self.env), self._reader.spec, f"scene reader of {self._source}"
-        )
+    def _living(self, observations: Mapping[str, Any], ended: set[str]) -> list[str]:
+        """Returns the observed agents that live on; the simulator knows better than a wrapper that shows the dead."""
+        inside = getattr(self.env.unwrapped, "agents", self.env.agents)
+        living = {*self.env.agents}.intersection(inside) - ended
+        return [agent for agent in observations if agent in living]
+
+    def _read(self, observations: Mapping[str, Any], living: Iterable[str]) -> MultiagentScene:
+        source = f"scene reader of {self._source}"
+        scene = check_multiagent_scene(self._reader.read(self.env), self._reader.spec, source)
+        require_indexed(scene, living, source)
         if self.stream.config.arm.shown.true_futures:
             horizon_steps = self.stream.horizon_steps
             xy_m = all_keeping_on(self.env, self._reader, scene.scene, observations, self._last_actions, horizon_steps)

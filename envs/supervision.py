@@ -1,4 +1,4 @@
-"""Environments that raise, hang, die or return NaN: one sentence that names environment, seed and step.
+"""Environments that raise, hang, die or return no finite numbers: one sentence that names environment, seed and step.
 
 A `Place` says where an episode is. In a process that plays for another one its numbers are in memory that both see, so
 that the place is known even of a process that was killed.
@@ -25,7 +25,7 @@ _shared: Any = None
 
 
 class EnvironmentFailedError(UserError):
-    """Raised when an environment raised, hung, died or returned NaN."""
+    """Raised when an environment raised, hung, died or returned NaN or infinity."""
 
 
 class Place:
@@ -92,14 +92,14 @@ def share(numbers: Any) -> Place:
 
 
 class SupervisedEnv(gym.Wrapper):
-    """Names the environment, seed and step in what an environment raises, and refuses NaN.
+    """Names the environment, seed and step in what an environment raises, and refuses NaN and infinity.
 
     Args:
         env: environment.
         env_id: id in messages.
 
     Raises:
-        EnvironmentFailedError: in `reset` and `step`, if the environment raises or returns NaN.
+        EnvironmentFailedError: in `reset` and `step`, if the environment raises or returns NaN or infinity.
     """
 
     def __init__(self, env: gym.Env, env_id: str) -> None:
@@ -155,21 +155,28 @@ def reason_of(error: BaseException) -> str:
 
 
 def check_numbers(observation: Any, reward: Any = 0.0) -> None:
-    """Checks that neither a reward nor an observation (an array, or a Dict or Tuple of arrays) has a NaN.
+    """Checks that neither a reward nor an observation (an array, or a Dict or Tuple of arrays) has NaN or infinity.
 
     Raises:
         UserError: one has.
     """
-    if math.isnan(float(reward)):
-        raise UserError("the reward must be a number, got NaN")
-    if _has_nan(observation):
-        raise UserError("the observation must be of numbers, got NaN")
+    if not math.isfinite(float(reward)):
+        raise UserError(f"the reward must be a finite number, got {_kind(float(reward))}")
+    found = _not_finite(observation)
+    if found is not None:
+        raise UserError(f"the observation must be of finite numbers, got {_kind(found)}")
 
 
-def _has_nan(value: Any) -> bool:
-    if isinstance(value, dict):
-        return any(_has_nan(part) for part in value.values())
-    if isinstance(value, tuple):
-        return any(_has_nan(part) for part in value)
+def _kind(number: float) -> str:
+    return "NaN" if math.isnan(number) else "infinity"
+
+
+def _not_finite(value: Any) -> float | None:
+    """Returns a number of an observation that is not finite, if there is one."""
+    if isinstance(value, dict | tuple):
+        parts = value.values() if isinstance(value, dict) else value
+        return next((found for part in parts if (found := _not_finite(part)) is not None), None)
     array = np.asarray(value)
-    return array.dtype.kind == "f" and bool(np.isnan(array).any())
+    if array.dtype.kind != "f" or np.isfinite(array).all():
+        return None
+    return float(array[~np.isfinite(array)].flat[0])

@@ -17,6 +17,7 @@ from gymnasium.vector.utils import batch_space
 
 from envs.arms import Arm, arm_of
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
+from envs.kinds import VECTOR, require_kind
 from envs.observation import (
     ForecastStream,
     Observations,
@@ -72,8 +73,8 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         plan_names: names of the candidate plans; none without `what_if`.
 
     Raises:
-        UserError: the environments report no scenes, differ from each other, or do not fit the forecaster; no plan
-            model for `what_if=True`; no room for what the arm shows.
+        UserError: no vector environment, or one with forecasts already; the environments report no scenes, differ from
+            each other, or do not fit the forecaster; no plan model for `what_if=True`; no room for what the arm shows.
     """
 
     def __init__(
@@ -92,6 +93,7 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         arm: Arm | None = None,
     ) -> None:
         """Loads the forecaster and extends the observation space."""
+        require_kind(env, VECTOR, "VectorForecast")
         gym.vector.VectorWrapper.__init__(self, env)
         refuse_reader(reader, "VectorForecast")
         space = require_scenes(env.single_observation_space, "VectorForecast")

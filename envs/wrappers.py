@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from envs.arms import Arm, arm_of
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
+from envs.kinds import SINGLE, refuse_autoreset, require_kind
 from envs.observation import ForecastStream, carries_scenes, open_forecaster, scene_entries, scene_spaces
-from envs.own_observation import own_entries, own_part, own_spaces
+from envs.own_observation import check_own, check_reward, own_entries, own_part, own_spaces
 from envs.plans import PlanModel, Plans, checked_model, checked_plans, plan_model_for
 from envs.plans.batch import PlanBatch, plans_info
 from envs.plans.playing import with_true_futures
@@ -56,8 +58,8 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         reader: function or class that makes a reader for the env; None picks one by env family.
 
     Raises:
-        UserError: no reader knows the env; or its observation is a Tuple, a Dict of Dicts, or has an entry of an added
-            one's name.
+        UserError: not one gymnasium environment, or one with Autoreset inside; no reader knows the env; or its
+            observation is a Tuple, a Dict of Dicts, or has an entry of an added one's name.
     """
 
     def __init__(
@@ -68,9 +70,12 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         reader: MakeReader | None = None,
     ) -> None:
         """Picks the reader and extends the observation space."""
+        require_kind(env, SINGLE, "SceneObservation")
+        refuse_autoreset(env, "SceneObservation")
         RecordConstructorArgs.__init__(self, perception_m=perception_m, max_agents=max_agents, reader=reader)
         gym.Wrapper.__init__(self, env)
         own = own_spaces(env.observation_space, f"env '{scene_source(env)}'")
+        self._own_spaces, self._unchecked = own, {"reset", "step", "plans"}
         self.reader = _reader_of(env, reader, perception_m, max_agents)
         self._scene: Scene | None = None
         self._plan_model: PlanModel | None = None
@@ -117,8 +122,15 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         return tuple(self._plan_model.names)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Resets the env; identities start anew."""
+        """Resets the env; identities start anew.
+
+        Raises:
+            UserError: the first observation does not lie in the env's own space.
+        """
         obs, info = self.env.reset(seed=seed, options=options)
+        if "reset" in self._unchecked:
+            check_own(self._own_spaces, obs, f"env '{self.scene_source}'")
+            self._unchecked.remove("reset")
         self.reader.reset()
         self._over = False
         return self._observe(obs), self._with_plans(info)
@@ -126,6 +138,9 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Steps the env and reads the scene."""
         obs, reward, terminated, truncated, info = self.env.step(action)
+        if "step" in self._unchecked:
+            check_reward(reward, f"env '{self.scene_source}'")
+            self._unchecked.remove("step")
         self._over = bool(terminated or truncated)
         # some highway-env ids return NumPy's bool, which SB3 refuses
         return self._observe(obs), reward, bool(terminated), bool(truncated), self._with_plans(info)
@@ -144,10 +159,18 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
             played: number of plans that are played in a copy of the simulator, the first ones; None plays all.
 
         Raises:
-            UserError: see `envs.plans.checked_plans` and `envs.plans.playing.with_true_futures`.
+            UserError: making the plans moves agents; see `envs.plans.checked_plans` and
+                `envs.plans.playing.with_true_futures`.
         """
         spec = self.reader.spec
         plans = checked_plans(plan_model, self, horizon_steps, spec.num_features, self.scene, spec)
+        if "plans" in self._unchecked:
+            self._unchecked.remove("plans")
+            if not np.array_equal(self.reader.read(self.env).states, self.scene.states):
+                raise UserError(
+                    f"plan model {type(plan_model).__name__}: plans must leave the environment as it is, but its "
+                    "agents moved; step a copy, copy.deepcopy(env.unwrapped), instead"
+                )
         return plans if played == 0 else with_true_futures(plans, self.env, self.reader, self.scene, played, self._over)
 
     def _observe(self, obs: Any) -> dict[str, Any]:
@@ -196,8 +219,9 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         what_if: forecast for these plans, world axes, with an axis of plans; None without `what_if`.
 
     Raises:
-        UserError: no reader, or one although the env is a `SceneObservation`; no checkpoint, or a forecaster of
-            another spec (features, dt); no plan model for `what_if=True`; no room for what the arm shows.
+        UserError: not one gymnasium environment, or one with Autoreset or forecasts inside; no reader, or one although
+            the env is a `SceneObservation`; no checkpoint, or a forecaster of another spec (features, dt); no plan
+            model for `what_if=True`; no room for what the arm shows.
     """
 
     def __init__(
@@ -218,6 +242,8 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         arm: Arm | None = None,
     ) -> None:
         """Loads the forecaster and extends the observation space."""
+        require_kind(env, SINGLE, "ForecastObservation")
+        refuse_autoreset(env, "ForecastObservation")
         checkpoint = str(checkpoint) if isinstance(checkpoint, Path) else checkpoint  # a spec is JSON
         RecordConstructorArgs.__init__(
             self, checkpoint=checkpoint, horizon_steps=horizon_steps, num_samples=num_samples, flatten=flatten,

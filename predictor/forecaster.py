@@ -235,18 +235,81 @@ def require_forecaster(given: Any) -> Forecaster:
     return forecaster
 
 
-def check_futures(given: Any, steps: int, num_samples: int) -> None:
-    """Checks what a forecaster's `rollout` returned.
+def check_empty(given: Any, envs: int, agents: int) -> None:
+    """Checks what a forecaster's `empty_memory` returned; no value is read.
 
     Raises:
-        UserError: it is no `Futures`, or has other numbers of samples or steps than it was asked for.
+        UserError: it is no `Memory`, or has no place for each environment and agent.
+    """
+    if not isinstance(given, Memory):
+        raise UserError(f"empty_memory of a forecaster must return a Memory, got {type(given).__name__}")
+    for tensor in (*given.nodes, *given.pairs):
+        if tuple(tensor.shape[:2]) != (envs, agents):
+            raise UserError(
+                f"empty_memory of a forecaster: the shape of each part must begin with {(envs, agents)}, got "
+                f"{tuple(tensor.shape)}; check_forecaster (dgvae_rl.testing) finds the cause"
+            )
+
+
+def check_observed(given: Any, states: Float[Tensor, "batch agents state"], forecaster: Forecaster) -> None:
+    """Checks types and shapes of what a forecaster's `observe` returned for these states; no value is read.
+
+    Raises:
+        UserError: they do not fit.
+    """
+    if not (isinstance(given, tuple) and len(given) == 2 and isinstance(given[1], Belief)):
+        raise UserError(f"observe of a forecaster must return a Memory and a Belief, got {type(given).__name__}")
+    if not isinstance(given[0], Memory):
+        raise UserError(f"observe of a forecaster must return a Memory first, got {type(given[0]).__name__}")
+    belief = given[1]
+    batch, agents, _ = states.shape
+    slots = agents if belief.senders is None else belief.senders.shape[-1]
+    wanted = {
+        "states": tuple(states.shape),
+        "valid": (batch, agents),
+        "edge_probs": (batch, agents, slots, forecaster.num_edge_types),
+        "edge_features": (batch, agents, slots, forecaster.edge_feature_dim),
+    }
+    for name, shape in wanted.items():
+        _check_shape(f"observe of a forecaster: {name} of the belief", getattr(belief, name), shape)
+
+
+def check_futures(
+    given: Any, steps: int, num_samples: int, observed: Float[Tensor, "batch agents state"], axes: int
+) -> None:
+    """Checks what a forecaster's `rollout` returned.
+
+    Args:
+        given: what it returned.
+        steps: number of steps that it was asked for.
+        num_samples: number of samples that it was asked for.
+        observed: states that it went on from.
+        axes: number of axes of a position.
+
+    Raises:
+        UserError: it is no `Futures`, or has other sizes than it was asked for.
     """
     if not isinstance(given, Futures):
         raise UserError(f"rollout of a forecaster must return Futures, got {type(given).__name__}")
-    if given.states.shape[1] != num_samples or given.states.shape[-2] != steps:
+    if given.states.ndim == 5 and (given.states.shape[1] != num_samples or given.states.shape[-2] != steps):
         raise UserError(
             f"the forecaster was asked for {num_samples} samples of {steps} steps and gave {given.states.shape[1]} of "
             f"{given.states.shape[-2]}"
+        )
+    batch, agents, features = observed.shape
+    each = (batch, num_samples, agents)
+    _check_shape("rollout of a forecaster: states", given.states, (*each, steps, features))
+    if given.mode_probs is not None:
+        _check_shape("rollout of a forecaster: mode_probs", given.mode_probs, each)
+    if given.scale is not None:
+        _check_shape("rollout of a forecaster: scale", given.scale, (*each, steps, axes))
+
+
+def _check_shape(what: str, given: Any, shape: tuple[int, ...]) -> None:
+    found = tuple(getattr(given, "shape", ()))
+    if found != shape:
+        raise UserError(
+            f"{what} must have the shape {shape}, got {found}; check_forecaster (dgvae_rl.testing) finds the cause"
         )
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from predictor.forecaster import Belief, Forecaster, Memory, check_futures
+from predictor.forecaster import Belief, Forecaster, Memory, check_empty, check_futures, check_observed
 from predictor.graph import NO_AGENT
 from predictor.noise import Noise
 from predictor.scene import PADDING_ID, Forecast, SceneBatch
@@ -67,6 +67,7 @@ class OnlineForecaster:
         self.forecaster, self._max_rows = forecaster, max_rows
         self.device = torch.device(resolve_device(device))
         self._memory = forecaster.empty_memory(envs, agents)
+        check_empty(self._memory, envs, agents)
         self._fresh = forecaster.empty_memory(1, agents)
         self._ids: Int[np.ndarray, "envs agents"] = np.full((envs, agents), PADDING_ID, dtype=np.int64)
         self._ego_axes = np.array([f == "ego" for f in forecaster.spec.frame], dtype=np.float64)
@@ -193,7 +194,7 @@ class OnlineForecaster:
         """Forecasts one part of the latest scenes."""
         if plans is None:
             futures = self.forecaster.rollout(belief, steps, num_samples, generator)
-            check_futures(futures, steps, num_samples)
+            check_futures(futures, steps, num_samples, belief.states, self.forecaster.spec.position_dim)
         else:
             futures = rollout_plans(self.forecaster, belief, plans, num_samples, generator)
         # float32 relative to the ego: the origin that observe() removed is the ego's own position on "ego" axes
@@ -276,7 +277,9 @@ class OnlineForecaster:
         origins = local[:, 0, :axes] * self._ego_axes
         local[..., :axes] -= origins[:, None]
         states = torch.from_numpy(np.where(valid[..., None], local, 0.0).astype(np.float32)).to(self.device)
-        memory, belief = self.forecaster.observe(memory, states, torch.from_numpy(valid).to(self.device))
+        observed: Any = self.forecaster.observe(memory, states, torch.from_numpy(valid).to(self.device))
+        check_observed(observed, states, self.forecaster)
+        memory, belief = observed
         return _Taken(memory.padded(ids.shape[1]), ids, belief, origins)
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from predictor.graph import to_dense
 from predictor.support.config_checks import check_types
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, short, some
 
 KINEMATIC_FEATURES = ("x_m", "y_m", "vx_mps", "vy_mps")
 KINEMATIC_FEATURES_3D = ("x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps")
@@ -188,16 +188,17 @@ class Scene:
             raise UserError(f"{source}: agent 0 must be the ego, but it is not valid")
         live = self.ids[self.valid].tolist()
         if len(set(live)) != len(live):
-            raise UserError(f"{source}: ids must be unique within a scene, got {live}")
+            raise UserError(f"{source}: ids must be unique within a scene, got {short(live)}")
         if min(live, default=0) < 0:
-            raise UserError(f"{source}: ids of valid agents must be non-negative, got {live}")
+            raise UserError(f"{source}: ids of valid agents must be non-negative, got {short(live)}")
         number = isinstance(self.heading_rad, int | float | np.integer | np.floating)
         if not number or not np.isfinite(self.heading_rad):
             raise UserError(f"{source}: heading_rad must be one finite number, got {self.heading_rad}")
         if not (np.abs(self.states) <= LARGEST).all():
             finite = np.isfinite(self.states).all()
             wanted = f"at most {LARGEST:g} in size" if finite else "finite, those of padded agents too (zeros)"
-            raise UserError(f"{source}: states must be {wanted}, got {self.states.tolist()}")
+            bad = ~(np.abs(self.states) <= LARGEST).all(axis=1)
+            raise UserError(f"{source}: states must be {wanted}, got {some(self.states[bad].tolist())}")
 
     def _check_arrays(self, source: str, spec: SceneSpec | None, agents: int | None) -> None:
         for name, array, kind, wanted, axes in (

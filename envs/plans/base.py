@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from predictor.scene import Scene, SceneSpec
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, short
 
 
 @dataclass(frozen=True)
@@ -85,8 +85,8 @@ def checked_plans(
         spec: layout of the scene.
 
     Raises:
-        UserError: plans of another shape, not finite numbers, not one action for each plan and step, or far from the
-            ego, as in a frame with another origin.
+        UserError: plans of another shape, not finite numbers, not one action for each plan and step, no size, other
+            actions than the model names, or far from the ego, as in a frame with another origin.
     """
     plans, count = model.plans(env, horizon_steps), len(model.names)
     source = f"plan model {type(model).__name__}"
@@ -110,6 +110,15 @@ def checked_plans(
             raise UserError(f"{source}: {name} must be finite, got NaN or infinity")
     if count < 1 or len(plans.actions) != count:
         raise UserError(f"{source}: each of its {count} plans needs one action, got {len(plans.actions)}")
+    size = np.asarray(plans.size_m)
+    if size.shape != (2,) or size.dtype.kind not in "fiu" or not (np.isfinite(size) & (size > 0)).all():
+        raise UserError(f"{source}: size_m must be length and width [m], positive numbers, got {short(plans.size_m)}")
+    fixed = getattr(model, "actions", None)  # with which policies that score plans choose
+    if fixed is not None and not _same(fixed, plans.actions):
+        raise UserError(
+            f"{source}: its attribute actions must be those of its plans, in the same order, got {short(fixed, 100)} "
+            f"and plans that begin with {short(plans.actions, 100)}; leave it out where they change"
+        )
     if not 0 <= plans.margin_m < np.inf:
         raise UserError(f"{source}: margin_m must be finite and at least 0, got {plans.margin_m}")
     later = None if plans.later_actions is None else [len(actions) for actions in plans.later_actions]
@@ -118,6 +127,11 @@ def checked_plans(
     if scene is not None and spec is not None:
         _check_begin(plans.states, scene, spec, source)
     return plans
+
+
+def _same(fixed: Any, actions: tuple[Any, ...]) -> bool:
+    """Returns whether these are the actions of plans."""
+    return np.shape(fixed)[:1] == (len(actions),) and all(map(np.array_equal, fixed, actions))
 
 
 def _check_begin(states: Float[np.ndarray, "plans horizon state"], scene: Scene, spec: SceneSpec, source: str) -> None:

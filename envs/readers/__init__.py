@@ -74,9 +74,16 @@ def register_reader(
         success_key: key that says, in an episode's last step, whether the ego has succeeded; None takes "is_success".
 
     Raises:
-        UserError: the class is none, the reader's maker cannot be called, or a key is empty.
+        UserError: the class is none, the reader's maker cannot be called, a key is empty, or one is given for a
+            PettingZoo environment, of which no crashes are counted.
     """
     check_registration(env_class, make_reader, "reader")
+    packages = {kind.__module__.partition(".")[0] for kind in env_class.__mro__}
+    if "pettingzoo" in packages and (crash_key, success_key) != (None, None):
+        raise UserError(
+            f"crash_key and success_key are for environments with one ego, but {env_class.__name__} is PettingZoo's, "
+            "of which results have returns alone; leave them out"
+        )
     register_outcomes(env_class, crash_key, success_key)
     _REGISTERED[env_class] = make_reader
 

@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from envs.arms import Arm, arm_of
 from envs.forecast_wrapper import ForecastWrapper, ObservationLayout, refuse_reader
+from envs.kinds import require_kind
 from envs.observation import ForecastStream, common_value, observe_ended, open_forecaster, require_scenes, scenes_from
 from envs.own_observation import own_part
 from envs.plans import PlanModel
@@ -61,8 +62,8 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         plan_names: names of the candidate plans; none without `what_if`.
 
     Raises:
-        UserError: the environments report no scenes, differ from each other, or do not fit the forecaster; no plan
-            model for `what_if=True`.
+        UserError: no VecEnv, or one with forecasts already; the environments report no scenes, differ from each other,
+            or do not fit the forecaster; no plan model for `what_if=True`.
     """
 
     def __init__(
@@ -81,6 +82,7 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         arm: Arm | None = None,
     ) -> None:
         """Loads the forecaster and extends the observation space."""
+        require_kind(venv, (VecEnv, "a Stable-Baselines3 VecEnv (make_vec_env)"), "VecForecast")
         refuse_reader(reader, "VecForecast")
         space = require_scenes(venv.observation_space, "VecForecast")
         spec = common_value(venv.get_attr("scene_spec"), "scene spec")

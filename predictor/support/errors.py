@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 _WRONG_PATH = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 """Errors that say by themselves what is wrong, where they are not of the operating system."""
@@ -58,6 +59,11 @@ def short(value: object, letters: int = 300) -> str:
     """Returns a value as text of at most this many letters (2 or more), cut in the middle: for names in messages."""
     text = str(value)
     return text if len(text) <= letters else f"{text[: (letters - 1) // 2]}…{text[-(letters // 2) :]}"
+
+
+def some(values: list[Any], most: int = 3) -> str:
+    """Returns the first few of many values as text, and how many more there are: for lists in messages."""
+    return short(values[:most]) + (f" and {len(values) - most:,} more" if len(values) > most else "")
 
 
 def named(error: BaseException) -> str:

@@ -95,7 +95,7 @@ def test_a_copy_that_raises_or_returns_nan_is_named(monkeypatch: pytest.MonkeyPa
         with pytest.raises(EnvironmentFailedError) as caught:
             venv.step(np.zeros(venv.num_envs, dtype=np.int64))
         found.append(str(caught.value))
-    assert found[0] == f"{TAG}, seed 5, step 1: the reward must be a number, got NaN"
+    assert found[0] == f"{TAG}, seed 5, step 1: the reward must be a finite number, got NaN"
     assert found[1].startswith(f"{TAG}, seed 5, step 2: ZeroDivisionError: no mass (")
     venv.close()
 

@@ -66,7 +66,7 @@ def test_crashes_that_are_never_reported_are_unknown_not_zero():
     assert lines[3] == "| silent | 2.00 | 5.0 | not reported | 20.0 |"
     alone = Evaluation("toy-v0", 10, {"silent": [silent]}).markdown()
     assert "0 %" not in alone
-    assert "crashes are not reported: name their key with --crash-key" in alone
+    assert "crashes are not reported: no info has their key; name it, spelt as there, with" in alone
 
 
 def test_the_caption_of_an_ego_explains_its_interval():

@@ -13,8 +13,9 @@ import train_policy
 from agents import evaluate as agents_evaluate
 from agents.task import SELECTION_SEED
 from envs import collect, evaluate
-from envs.supervision import NUMBERS, EnvironmentFailedError, Place, SupervisedEnv
+from envs.supervision import NUMBERS, EnvironmentFailedError, Place, SupervisedEnv, check_numbers
 from predictor.data.store import read_store
+from predictor.support.errors import UserError
 from tests.envs.helpers import run_command
 from tests.envs.misbehaving import NUM_STEPS, Misbehaving, env_id
 
@@ -105,6 +106,16 @@ def test_nan_is_refused_where_it_appears(kind: str):
                 env.step(0)
         else:
             assert np.isfinite(env.step(0)[1])
+
+
+@pytest.mark.parametrize(("number", "name"), [(np.nan, "NaN"), (np.inf, "infinity"), (-np.inf, "infinity")])
+def test_numbers_that_are_not_finite_are_named(number: float, name: str):
+    with pytest.raises(UserError, match=f"the reward must be a finite number, got {name}"):
+        check_numbers(np.zeros(2), number)
+    for seen in (np.array([1, number]), {"a": 1, "b": (np.zeros(1), np.float32(number))}):
+        with pytest.raises(UserError, match=f"the observation must be of finite numbers, got {name}"):
+            check_numbers(seen)
+    check_numbers({"a": np.array([np.finfo(np.float32).max]), "b": "text"}, 1e30)
 
 
 def test_a_copy_of_a_place_counts_for_itself():

@@ -442,3 +442,18 @@ def test_a_good_scene_passes():
 def test_a_bad_scene_is_named(multi: Any, message: str):
     with pytest.raises(UserError, match=message):
         check_multiagent_scene(multi, WORLD, "toy")
+
+
+@pytest.mark.unchecked
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"heading_rad": [0.0]}, r"heading_rad must hold 6 finite numbers, one per agent, got \[0.0\]"),
+        ({"heading_rad": None}, "heading_rad must hold 6 finite numbers, one per agent, got None"),
+        ({"index_of": ["a"]}, r"index_of must be a dict of whole numbers by agents' names, got \['a'\]"),
+        ({"index_of": {"a": "b"}}, r"index_of must be a dict of whole numbers by agents' names, got {'a': 'b'}"),
+    ],
+)
+def test_a_scene_of_wrong_types_is_named(changes: dict[str, Any], message: str):
+    with pytest.raises(UserError, match=f"toy: {message}"):
+        check_multiagent_scene(replace(GOOD, **changes), WORLD, "toy")

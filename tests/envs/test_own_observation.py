@@ -12,6 +12,8 @@ from envs.entries import FORECAST_KEYS, PATH_KEYS, SCENE_KEYS
 from envs.own_observation import (
     ADDED_KEYS,
     carries_forecasts,
+    check_own,
+    check_reward,
     own_entries,
     own_spaces,
     space_without_added,
@@ -159,3 +161,92 @@ def test_arrays_have_an_entry_of_their_own():
     assert without_added(array) is array
     box = gym.spaces.Box(0, 1, (2,))
     assert space_without_added(box) is box and own_spaces(box, "") == {"observation": box}
+
+
+BOX = gym.spaces.Box(-1, 1, (2,), np.float32)
+IMAGE = gym.spaces.Box(0, 255, (2, 2), np.uint8)
+BOTH = gym.spaces.Dict({"place": BOX, "mode": gym.spaces.Discrete(3)})
+
+
+@pytest.mark.parametrize(
+    ("space", "seen"),
+    [
+        (BOX, np.array([1.00001, -1.0])),  # rounding, float64
+        (BOX, [0, 1]),
+        (gym.spaces.Box(-np.inf, np.inf, (2,)), np.array([3, 4])),
+        (IMAGE, np.full((2, 2), 255)),
+        (gym.spaces.Box(0, np.inf, ()), 3.0),
+        (gym.spaces.Discrete(3), np.array([2])),
+        (gym.spaces.MultiBinary(2), np.array([True, False])),
+        (BOTH, {"place": np.zeros(2), "mode": np.int64(1), "further": "kept"}),
+    ],
+)
+def test_what_lies_in_its_space_is_taken(space: gym.Space, seen: Any):
+    check_own(own_spaces(space, "env 'a'"), seen, "env 'a'")
+
+
+@pytest.mark.parametrize(
+    ("space", "seen", "message"),
+    [
+        (
+            BOX,
+            np.array([0.0, 1.5]),
+            r" must lie in its space Box\(-1.0, 1.0, \(2,\), float32\), got 1.5; change the obs",
+        ),
+        (BOX, np.zeros((2, 1)), r"got float64 of the shape \(2, 1\)"),
+        (BOX, np.array(["a", "b"]), r"got <U1 of the shape \(2,\)"),
+        (BOX, np.array([np.nan, 0]), "got nan"),
+        (BOX, [[1.0], [1.0, 2.0]], "got a list"),
+        (IMAGE, np.full((2, 2), 0.5), "got numbers of type float64"),
+        (IMAGE, np.full((2, 2), 256), "got 256"),
+        (gym.spaces.Discrete(3), 3, "got 3"),
+        (gym.spaces.Discrete(3), np.zeros(2, int), r"got \[0 0\]"),
+        (BOTH, {"place": np.full(2, 9.0), "mode": 1}, ", entry 'place', must lie in its space .*got 9.0"),
+        (BOTH, {"place": np.zeros(2)}, r"must have the entries \['mode', 'place'\] of its .*, got \['place'\]; return"),
+        (BOTH, np.zeros(2), r"must have the entries \['mode', 'place'\] of its .*, got \['observation'\]"),
+    ],
+)
+def test_an_observation_outside_of_its_space_is_named(space: gym.Space, seen: Any, message: str):
+    with pytest.raises(UserError, match=f"the own observation of env 'a'.*{message}"):
+        check_own(own_spaces(space, "env 'a'"), seen, "env 'a'")
+
+
+@pytest.mark.parametrize("reward", [None, "much", float("nan"), float("inf"), [1.0, np.nan], {}])
+def test_a_reward_that_is_no_number_is_named(reward: Any):
+    with pytest.raises(UserError, match="the reward of env 'a' must be a finite number, got .*; return a float"):
+        check_reward(reward, "env 'a'")
+
+
+def test_one_ego_is_checked_at_its_first_reset_and_step():
+    class Wrong(Crowd):
+        observation_space = gym.spaces.Box(0, 255, Crowd.observation_space.shape, np.uint8)
+
+    class Silent(Crowd):
+        def step(self, action: Any) -> Any:
+            return *super().step(action)[:1], None, *super().step(action)[2:]
+
+    with pytest.raises(UserError, match="of env 'Wrong' must lie in its space .*uint8.*, got numbers of type float64"):
+        wrapped(Wrong()).reset(seed=0)
+    env = wrapped(Silent())
+    env.reset(seed=0)
+    with pytest.raises(UserError, match="the reward of env 'Silent' must be a finite number, got None"):
+        env.step(PUSH)
+
+
+def test_each_of_many_learners_is_checked_at_the_first_reset_and_step():
+    class Wrong(Swarm):
+        def observation_space(self, agent: str) -> gym.Space:
+            return BOX if agent == "dies" else super().observation_space(agent)
+
+    class Silent(Swarm):
+        def step(self, actions: Any) -> Any:
+            shown, rewards, *others = super().step(actions)
+            return shown, dict.fromkeys(rewards, np.nan), *others
+
+    env = ForecastParallelEnv(Wrong(), "constant-velocity", reader=SwarmReader)
+    with pytest.raises(UserError, match=r"of 'dies' of env 'swarm_v0' must lie in its space .*of the shape \(1,\)"):
+        env.reset(seed=0)
+    env = ForecastParallelEnv(Silent(), "constant-velocity", reader=SwarmReader)
+    env.reset(seed=0)
+    with pytest.raises(UserError, match="the reward of 'stays' of env 'swarm_v0' must be a finite number, got nan"):
+        env.step(dict.fromkeys(env.agents, PUSH))

@@ -1,4 +1,4 @@
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -557,6 +557,83 @@ def test_a_reader_that_breaks_the_contract_is_named():
     env = ForecastParallelEnv(Toy(), "constant-velocity", reader=Careless)
     with pytest.raises(UserError, match="scene reader of env 'toy_v0': agent 'stays' has index 7"):
         env.reset(seed=0)
+
+
+class Renaming(ToyReader):
+    """Says where agents are from some step on, under names of its own."""
+
+    rename: Callable[[Mapping[str, int]], Mapping[Any, int]] = staticmethod(lambda index_of: {})
+    since = 0
+
+    def read(self, env: Any) -> MultiagentScene:
+        scene = super().read(env)
+        return replace(scene, index_of=self.rename(scene.index_of)) if env.unwrapped.t >= self.since else scene
+
+
+NAMES: dict[str, tuple[Any, str]] = {
+    "none": (lambda index_of: {}, r"lacks \['stays', 'dies'\] .*; its names are \[\]"),
+    "numbers": (lambda index_of: dict(enumerate(index_of.values())), r"lacks \['stays', 'dies'\].* are \[0, 1\]"),
+    "one": (
+        lambda index_of: {n: i for n, i in index_of.items() if n != "dies"},
+        r"lacks \['dies'\] .* are \['stays'\]",
+    ),
+}
+
+
+@pytest.mark.unchecked
+@pytest.mark.parametrize("fault", NAMES)
+def test_every_observed_agent_must_be_named_at_the_reset(fault: str):
+    rename, message = NAMES[fault]
+    reader = type("Renamed", (Renaming,), {"rename": staticmethod(rename)})
+    env = ForecastParallelEnv(Toy(), "constant-velocity", reader=lambda env: reader(env, shuffle=False))
+    with pytest.raises(
+        UserError, match=f"scene reader of env 'toy_v0': index_of must have .*{message}; name agents as"
+    ):
+        env.reset(seed=0)
+
+
+def test_an_agent_that_lives_on_must_stay_named_and_one_that_ends_need_not():
+    late = type("Late", (Renaming,), {"since": 2})
+    env = ForecastParallelEnv(Toy(), "constant-velocity", reader=late)
+    env.reset(seed=0)
+    env.step(dict.fromkeys(env.agents, 0))
+    with pytest.raises(UserError, match=r"lacks \['stays', 'dies', 'joins', 'visits'\]"):
+        env.step(dict.fromkeys(env.agents, 0))
+
+    def without_the_dead(index_of: Mapping[str, int]) -> Mapping[str, int]:
+        return {name: index for name, index in index_of.items() if name != "dies"}
+
+    forgets = type("Forgets", (Renaming,), {"since": 3, "rename": staticmethod(without_the_dead)})
+    env = ForecastParallelEnv(Toy(), "constant-velocity", reader=forgets)
+    env.reset(seed=0)
+    for _ in range(3):
+        shown, _, ended, *_ = env.step(dict.fromkeys(env.agents, 0))
+    assert ended["dies"]
+    assert not shown["dies"]["valid"].any()
+    assert shown["stays"]["valid"].any()
+
+
+class BlackDeath(BaseParallelWrapper):
+    """Shows zeros of agents that have gone, which stay in `agents`, as wrappers for fixed numbers of agents do."""
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        shown, infos = self.env.reset(seed=seed, options=options)
+        self.agents = list(shown)
+        return shown, infos
+
+    def step(self, actions: Any) -> Any:
+        shown, *others = self.env.step({agent: actions.get(agent, 0) for agent in self.env.agents})
+        zeros = {agent: np.zeros(self.observation_space(agent).shape, np.float32) for agent in self.agents}
+        return zeros | {agent: shown[agent] for agent in self.agents if agent in shown}, *others
+
+
+def test_a_wrapper_that_shows_the_dead_is_no_fault_of_the_reader():
+    env = ForecastParallelEnv(BlackDeath(Toy()), "constant-velocity", reader=ToyReader)
+    env.reset(seed=0)
+    for _ in range(4):
+        shown, *_ = env.step(dict.fromkeys(env.agents, 0))
+    assert "dies" in shown
+    assert not shown["dies"]["valid"].any()
 
 
 # --- PettingZoo's contracts, on the toy and on everything that is registered ------------------------------------------

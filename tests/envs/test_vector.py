@@ -377,7 +377,7 @@ def differing() -> list[Callable[[], gym.Env]]:
 
 
 def test_envs_with_differing_specs_are_named():
-    expected = r"all environments must have the same scene spec, got .*perception_m=50.0.*perception_m=60.0"
+    expected = r"all environments must have the same scene spec, got perception_m=50.0 and perception_m=60.0$"
     with pytest.raises(UserError, match=expected):
         VecForecast(DummyVecEnv(differing()), "constant-velocity")
     with pytest.raises(UserError, match=expected):

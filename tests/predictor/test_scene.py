@@ -307,3 +307,18 @@ def test_where_there_is_no_slot_the_ego_has_no_edge():
     for one in (lonely, lonely.dense()):
         probs, features = one.ego_edges()
         assert torch.equal(probs, torch.tensor(NO_EDGE).expand(BATCH, AGENTS, 2, 3)) and not features.any()
+
+
+def test_messages_on_many_agents_are_short():
+    many = 300
+    states, ids, valid = np.zeros((many, 4)), np.arange(many), np.ones(many, dtype=np.bool_)
+    with pytest.raises(UserError, match=r"got (\[\[.*nan.*\]\]) and 297 more$") as caught:
+        Scene(states + np.nan, ids, valid).check()
+    assert str(caught.value).count("[nan") == 3
+    with pytest.raises(UserError, match="states must be finite") as one:
+        Scene(np.where(np.arange(many)[:, None] == 7, np.inf, states), ids, valid).check()
+    assert str(one.value).endswith("got [[inf, inf, inf, inf]]")
+    for wrong in (ids * 0, -ids):
+        with pytest.raises(UserError) as caught:
+            Scene(states, wrong, valid).check()
+        assert len(str(caught.value)) < 400

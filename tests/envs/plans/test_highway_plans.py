@@ -194,6 +194,7 @@ def given(
     rewards: np.ndarray | None = None,
     later: Any = None,
     margin_m: float = 0.0,
+    size_m: Any = (5.0, 2.0),
 ) -> Any:
     """What a careless model may return; `Plans` itself refuses such shapes while shapes are checked."""
     return SimpleNamespace(
@@ -204,6 +205,7 @@ def given(
         crashed=None,
         later_actions=later,
         margin_m=margin_m,
+        size_m=size_m,
     )
 
 
@@ -227,6 +229,9 @@ def test_a_registered_model_serves_its_class_and_others_are_refused(monkeypatch:
             r"later_actions need 2 for each of 2 plans, got \[2, 1\]",
         ),
         (given(np.zeros((2, 3, 4)), (0, 1), margin_m=-0.1), "margin_m must be finite and at least 0, got -0.1"),
+        (given(np.zeros((2, 3, 4)), (0, 1), size_m=(np.nan, 2.0)), r"size_m must be .*, got \(nan, 2.0\)"),
+        (given(np.zeros((2, 3, 4)), (0, 1), size_m=(5.0, -2.0)), "size_m must be length and width"),
+        (given(np.zeros((2, 3, 4)), (0, 1), size_m=5.0), "size_m must be length and width .*got 5.0"),
         (given(np.zeros((2, 3, 4)), (0,)), "each of its 2 plans needs one action, got 1"),
         (given(np.zeros((2, 3, 4)), (0, 1), np.zeros((2, 2))), r"rewards need the shape \(2, 3\), got \(2, 2\)"),
     ],
@@ -234,6 +239,21 @@ def test_a_registered_model_serves_its_class_and_others_are_refused(monkeypatch:
 def test_plans_that_do_not_fit_are_refused(found: Any, message: str):
     with pytest.raises(UserError, match=f"plan model TwoPlans: {message}"):
         checked_plans(TwoPlans(found), Blank(), 3, 4)
+
+
+def test_the_order_of_actions_is_that_of_the_plans():
+    class Named(TwoPlans):
+        actions: Any = (1, 0)
+
+    found = Plans(np.zeros((2, 3, 4)), (0, 1))
+    with pytest.raises(UserError, match=r"Named: its attribute actions must be .*, got \(1, 0\) and .*with \(0, 1\)"):
+        checked_plans(Named(found), Blank(), 3, 4)
+    for same in ((0, 1), [0, 1], np.array([0, 1]), None):
+        Named.actions = same
+        assert checked_plans(Named(found), Blank(), 3, 4) is found
+    Named.actions = (0,)
+    with pytest.raises(UserError, match="its attribute actions must be those of its plans"):
+        checked_plans(Named(found), Blank(), 3, 4)
 
 
 def test_actions_without_plans_are_refused():

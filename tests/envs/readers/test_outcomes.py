@@ -13,7 +13,7 @@ from envs.rollouts.world import EgoWorld
 from envs.wrappers import SceneObservation
 from predictor.support.errors import UserError
 from tests.envs.dict_crowd import DictCrowd
-from tests.envs.semantics import Crowd, read_crowd
+from tests.envs.semantics import Crowd, Swarm, SwarmReader, read_crowd
 from tests.envs.testing.test_check_reader import SPEC, FunctionReader
 
 INFO = {"outcome": {"collided": True}, "crashed": False, "outcome.late": 1}
@@ -83,3 +83,8 @@ def test_a_world_knows_crashes_by_the_named_key():
 def test_a_key_is_a_text():
     with pytest.raises(UserError, match="crash_key must be the name of a key of the infos, got"):
         outcome_keys(Crowd(), crash_key="")
+
+
+def test_keys_of_outcomes_are_refused_for_pettingzoo_which_counts_none():
+    with pytest.raises(UserError, match="crash_key and success_key are for .* one ego, but Swarm is PettingZoo's"):
+        register_reader(Swarm, SwarmReader, crash_key="collided")

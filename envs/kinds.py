@@ -1,0 +1,80 @@
+"""Which wrapper serves which kind of environment: one sentence for an environment that was given to another one."""
+
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.wrappers import Autoreset
+
+from envs.forecast_wrapper import ForecastWrapper
+from predictor.support.errors import UserError, short
+
+ForecastKind = tuple[type, str]
+"""Class of the environments that a wrapper takes, and what they are called."""
+SINGLE: ForecastKind = (gym.Env, "one gymnasium environment")
+VECTOR: ForecastKind = (gym.vector.VectorEnv, "a gymnasium vector environment (SyncVectorEnv, gym.make_vec)")
+
+
+def require_kind(env: Any, kind: ForecastKind, wrapper: str) -> None:
+    """Checks that a wrapper is given an environment of its kind, which has no forecasts yet.
+
+    Args:
+        env: what was given.
+        kind: what is required.
+        wrapper: name of the wrapper, for messages.
+
+    Raises:
+        UserError: it is of another kind, for which the message names the wrapper; or it has forecasts already.
+    """
+    wanted, name = kind
+    if not isinstance(env, wanted):
+        raise UserError(f"{wrapper} wraps {name}, got {_described(env)}")
+    inner = _with_forecasts(env)
+    if inner is not None:
+        raise UserError(
+            f"{wrapper} wraps an environment without forecasts, but {inner} inside of it adds them already; leave one "
+            "of both out"
+        )
+
+
+def refuse_autoreset(env: gym.Env, wrapper: str) -> None:
+    """Checks that nothing inside of a wrapper begins episodes in `step`, which no history would notice.
+
+    Raises:
+        UserError: Gymnasium's `Autoreset` does.
+    """
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, Autoreset):
+            raise UserError(
+                f"{wrapper} must see each reset, but Autoreset inside of it begins episodes in step(), so that the "
+                f"history of one would leak into the next; put Autoreset around {wrapper}, or use VectorForecast"
+            )
+        env = env.env
+
+
+def _described(env: Any) -> str:
+    """Returns what was given, and what to do with it."""
+    name = type(env).__name__
+    if isinstance(env, type):
+        return f"the class {env.__name__}; make an environment of it: {env.__name__}(...)"
+    if isinstance(env, str):
+        return f"the text '{short(env, 80)}'; make the environment first, for example with gym.make(...)"
+    packages = {kind.__module__.partition(".")[0] for kind in type(env).__mro__}
+    if isinstance(env, gym.vector.VectorEnv):
+        return f"the gymnasium vector environment {name}; use VectorForecast (envs.vector)"
+    if isinstance(env, gym.Env):
+        return f"the single environment {name}; use ForecastObservation (envs.wrappers)"
+    if "stable_baselines3" in packages:
+        return f"the Stable-Baselines3 environment {name}; use VecForecast (envs.sb3.forecast)"
+    if "pettingzoo" in packages:
+        return f"the PettingZoo environment {name}; use ForecastParallelEnv (envs.parallel)"
+    return f"{name}; derive the environment from that class, or convert it"
+
+
+def _with_forecasts(env: Any) -> str | None:
+    """Returns the name of the wrapper with forecasts in a chain of wrappers, if there is one."""
+    while env is not None:
+        if isinstance(env, ForecastWrapper):
+            return type(env).__name__
+        own = getattr(env, "__dict__", {})
+        env = own.get("env", own.get("venv"))
+    return None
