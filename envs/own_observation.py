@@ -77,9 +77,10 @@ def own_entries(observation: Any) -> dict[str, Any]:
 
 
 def check_own(own: Mapping[str, gym.Space], observation: Any, source: str) -> None:
-    """Checks that an environment's own observation lies in its space, up to rounding and to a safe change of type.
+    """Checks that an environment's own observation fits its space: entries, shapes, and types that keep its values.
 
-    Learners keep observations in arrays of the space's type: floats in a space of integers would be cut to these.
+    Learners keep observations in arrays of the space's type: in one of integers, floats are cut, and numbers beyond
+    its bounds wrap around. Floats beyond the bounds of a space of floats lose nothing, and pass.
 
     Args:
         own: spaces of its entries (`own_spaces`).
@@ -132,10 +133,11 @@ def _fault(space: gym.Space, value: Any) -> str | None:
         return f"a {type(value).__name__}"
     if array.shape != space.shape or array.dtype.kind not in "biuf":
         return f"{array.dtype} of the shape {array.shape}"
-    if np.issubdtype(space.dtype, np.integer) and array.dtype.kind == "f":
+    if not np.issubdtype(space.dtype, np.integer):
+        return "nan" if np.isnan(array).any() else None
+    if array.dtype.kind == "f":
         return f"numbers of type {array.dtype}"
-    slack = 1e-4 * np.maximum(1.0, np.abs(np.where(np.isfinite(array), array, 0.0).astype(np.float64)))
-    outside = ~((array >= space.low - slack) & (array <= space.high + slack))
+    outside = (array < space.low) | (array > space.high)
     return f"{short(array[outside].flat[0], 40)}" if outside.any() else None
 
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from envs.arms import Arm, arm_of
@@ -75,7 +74,7 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
         RecordConstructorArgs.__init__(self, perception_m=perception_m, max_agents=max_agents, reader=reader)
         gym.Wrapper.__init__(self, env)
         own = own_spaces(env.observation_space, f"env '{scene_source(env)}'")
-        self._own_spaces, self._unchecked = own, {"reset", "step", "plans"}
+        self._own_spaces, self._unchecked = own, {"reset", "step"}
         self.reader = _reader_of(env, reader, perception_m, max_agents)
         self._scene: Scene | None = None
         self._plan_model: PlanModel | None = None
@@ -159,18 +158,10 @@ class SceneObservation(RunningCopy, gym.Wrapper[dict[str, Any], Any, Any, Any], 
             played: number of plans that are played in a copy of the simulator, the first ones; None plays all.
 
         Raises:
-            UserError: making the plans moves agents; see `envs.plans.checked_plans` and
-                `envs.plans.playing.with_true_futures`.
+            UserError: see `envs.plans.checked_plans` and `envs.plans.playing.with_true_futures`.
         """
         spec = self.reader.spec
         plans = checked_plans(plan_model, self, horizon_steps, spec.num_features, self.scene, spec)
-        if "plans" in self._unchecked:
-            self._unchecked.remove("plans")
-            if not np.array_equal(self.reader.read(self.env).states, self.scene.states):
-                raise UserError(
-                    f"plan model {type(plan_model).__name__}: plans must leave the environment as it is, but its "
-                    "agents moved; step a copy, copy.deepcopy(env.unwrapped), instead"
-                )
         return plans if played == 0 else with_true_futures(plans, self.env, self.reader, self.scene, played, self._over)
 
     def _observe(self, obs: Any) -> dict[str, Any]:

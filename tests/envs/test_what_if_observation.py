@@ -141,17 +141,3 @@ def test_environments_without_a_plan_model_are_refused():
     env = make_env("highway-fast-v0", config={"action": {"type": "DiscreteAction"}})
     with pytest.raises(UserError, match="plans are known for DiscreteMetaAction and ContinuousAction"):
         ForecastObservation(env, "highway", what_if=True)
-
-
-def test_a_plan_model_that_steps_the_environment_is_named():
-    class Steps:
-        names = ("go",)
-
-        def plans(self, env: gym.Env, horizon_steps: int) -> Plans:
-            env.unwrapped.step(1)
-            ego = env.get_wrapper_attr("scene").states[0]
-            return Plans(np.tile(ego, (1, horizon_steps, 1)), (1,))
-
-    env = wrapped(what_if=Steps())
-    with pytest.raises(UserError, match=r"plan model Steps: plans must leave the environment as it is.* step a copy"):
-        env.reset(seed=0)

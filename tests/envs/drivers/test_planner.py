@@ -153,9 +153,7 @@ def test_names_of_the_planner():
 
 @pytest.mark.parametrize("risk", ["", "much", "1.5", "-0.1", "nan"])
 def test_a_bound_that_is_none_is_refused(risk: str):
-    with pytest.raises(
-        UserError, match=r"planner@RISK needs a largest .* from 0 to 1 \(planner@0.3\), got 'plann"
-    ):
+    with pytest.raises(UserError, match=r"planner@RISK needs a largest .* from 0 to 1 \(planner@0.3\), got 'plann"):
         make_ego_driver(f"planner@{risk}", make_env("highway-fast-v0"), np.random.default_rng(0))
 
 
