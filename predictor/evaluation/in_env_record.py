@@ -63,6 +63,8 @@ class Measurement:
     mixture_coverage: Interval | None = None
     """Smallest and largest share of true coordinates within the central 90 % of the predicted mixture, over the
     steps; None for a checkpoint without scales."""
+    spread_commit: str | None = None
+    """Commit at which `mixture_coverage` was measured, if it was later, after the spread alone was trained."""
     overlap: tuple[float, float] | None = None
     """Share of agents' steps nearer to another agent than the miss threshold, in samples and in truth."""
     controls: dict[str, dict[str, float | None]] | None = None

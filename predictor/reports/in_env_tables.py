@@ -113,7 +113,9 @@ def card_section(measurements: Sequence[Measurement]) -> str:
 
 
 def _commit(measurement: Measurement) -> str:
-    return f"commit {measurement.commit}" if measurement.commit else "commit not recorded"
+    made = f"commit {measurement.commit}" if measurement.commit else "commit not recorded"
+    later = measurement.spread_commit
+    return made + (f" (coverage with spread: {later})" if later else "")
 
 
 def replace_tables(page: str, tables: Mapping[str, str]) -> str:

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from predictor.evaluation.in_env_record import Measurement
-from predictor.reports.in_env_tables import measurement_table, replace_tables, samples_table
+from predictor.reports.in_env_tables import card_section, measurement_table, replace_tables, samples_table
 from predictor.reports.tables import metres
 from predictor.support.errors import UserError
 
@@ -39,6 +39,12 @@ def test_coverage_with_the_spread_of_modes_is_told_where_it_was_measured():
     plain, spread, narrow = samples_table([replace(sampled, mixture_coverage=c) for c in coverages]).splitlines()[2:]
     assert "| 75 to 100 % |" in plain and "| 75 to 100 %; with spread 50 to 88 % |" in spread
     assert "| 75 to 100 %; with spread 99 % |" in narrow
+
+
+def test_a_coverage_that_was_measured_later_has_a_commit_of_its_own():
+    once, later = replace(MEASURED, commit="abc"), replace(MEASURED, commit="abc", spread_commit="def")
+    text = card_section([once, later])
+    assert "`, commit abc\n" in text and text.endswith("`, commit abc (coverage with spread: def)")
 
 
 def test_only_what_stands_between_the_markers_is_replaced():
