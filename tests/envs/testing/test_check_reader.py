@@ -164,6 +164,14 @@ MISTAKES: dict[str, tuple[Any, str]] = {
     "id of the newcomer": (with_ids(lambda ids, _: np.where(ids == 7, 2, ids)), "an id jumps: in step 4 id 2 is "),
     "new ids": (NewIds, "no agent is there in two scenes that follow each other: ids must stay with an agent"),
     "ego not first": (with_rows(lambda scene, _: np.roll(np.arange(len(scene.ids)), 1)), "agent 1 of the scene obeys"),
+    "others relative": (
+        with_states(lambda s: np.vstack([s[:1], s[1:] - s[:1]])),
+        "the others' positions are relative to the ego: where an action moves the ego, they change by as much the other",
+    ),
+    "velocities relative": (
+        with_states(lambda s: np.vstack([s[:1], s[1:] - s[:1] * np.array([0, 0, 1, 1])])),
+        "the others' velocities are relative to the ego",
+    ),
     "ego moves": (
         with_rows(lambda scene, crowd: np.roll(np.arange(len(scene.ids)), crowd.time)),
         "the first agent has id 0 and, from step 1 on, id ",
