@@ -14,6 +14,8 @@ STEP_TOLERANCE = 0.15
 FIT = 0.3
 """Largest median error of positions, as a share of the distance moved, where velocities are said to fit."""
 LEAST_PAIRS = 8
+LASTING = 0.2
+"""Least share of the others' ids that are there after a step, too; where agents are re-identified, some are lost."""
 HINTS = {
     1 / 3.6: "velocities in km/h", 1 / 2.237: "velocities in mph", 100.0: "positions in cm", 1000.0: "positions in mm",
     0.01: "velocities in cm/s", 0.3048: "velocities in feet/s", 3.281: "positions in feet",
@@ -78,6 +80,12 @@ def motion_problems(episodes: Sequence[Episode], spec: SceneSpec) -> list[str]:
     steps = Steps.of(episodes, spec.position_dim)
     if not len(steps.moved):
         return ["no agent is there in two scenes that follow each other: ids must stay with an agent"]
+    share = lasting_share(episodes, spec)
+    if share is not None and share < LASTING:
+        return [
+            f"{share:.0%} of the others' ids are there after a step, too; an id must stay with its agent: give the "
+            "simulator's numbers, or raise gate_m where agents are re-identified (EntityRowsReader, IdentityTracker)"
+        ]
     if not np.abs(steps.moved).max() > 0:
         return ["no position ever changes while the environment steps; does the reader return an old scene?"]
     steps = steps.fast()
@@ -88,6 +96,19 @@ def motion_problems(episodes: Sequence[Episode], spec: SceneSpec) -> list[str]:
     if spec.has_ego and (found := _relative(steps)):
         return [found]
     return _axes(steps, spec) or _step(steps, spec)
+
+
+def lasting_share(episodes: Sequence[Episode], spec: SceneSpec) -> float | None:
+    """Returns the share of the others' ids that are there after a step, too; None of too few steps to say.
+
+    Others are all agents but the ego. As many as the smaller scene has could have stayed.
+    """
+    first = int(spec.has_ego)
+    stayed = could = 0
+    for one, other in (pair for episode in episodes for pair in episode.pairs()):
+        stayed += len(set(one.ids[first:].tolist()) & set(other.ids[first:].tolist()))
+        could += max(min(len(one.ids), len(other.ids)) - first, 0)
+    return stayed / could if could >= LEAST_PAIRS else None
 
 
 def _relative(steps: Steps) -> str:
