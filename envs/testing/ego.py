@@ -1,5 +1,6 @@
-"""Checks by playing an episode twice: the first agent is the one that obeys actions, the others' states are not relative
-to it, and reading changes nothing.
+"""Checks by playing an episode twice: the first agent obeys actions, and reading changes nothing.
+
+By other actions from the same state it shows, too, whether the others' states are relative to the ego's.
 """
 
 import itertools
@@ -62,8 +63,8 @@ def _relative(played: Sequence[Ends], spec: SceneSpec) -> list[str]:
                 opposite += [bool(np.linalg.norm(one[r][part] - other[r][part] + own) < 0.1 * size) for r in rows]
         if len(opposite) >= LEAST_CHANGES and np.mean(opposite) > 0.8:
             return [
-                f"the others' {what} are relative to the ego: where an action moves the ego, they change by as much the "
-                "other way; give all agents in the world frame (EntityRowsReader: relative=True)"
+                f"the others' {what} are relative to the ego: where an action moves the ego, they change by as much "
+                "the other way; give all agents in the world frame (EntityRowsReader: relative=True)"
             ]
     return []
 
