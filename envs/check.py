@@ -67,9 +67,7 @@ def examined(config: CheckConfig) -> Examined:
     env = make_any_env(config.env_id, **arguments_of(config.env_kwargs))
     make_reader: MakeReader | None = None if config.reader is None else load_named(config.reader)
     try:
-        return examine_reader(
-            env, make_reader, episodes=config.episodes, max_steps=config.max_steps, seed=config.seed
-        )
+        return examine_reader(env, make_reader, episodes=config.episodes, max_steps=config.max_steps, seed=config.seed)
     finally:
         env.close()
 

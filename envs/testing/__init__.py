@@ -12,7 +12,7 @@ from typing import Any
 from envs.readers.base import MakeReader
 from envs.testing.ego import ego_problems, replay_problems
 from envs.testing.motion import lasting_share
-from envs.testing.playing import Episode, ReaderProblem, open_reader, play, space_problems
+from envs.testing.playing import Episode, ReaderProblem, open_reader, play, shown_spaces, space_problems
 from envs.testing.recorded import observation_problems, recorded_problems, store_problems
 from predictor.support.errors import UserError
 
@@ -82,7 +82,8 @@ def examine_reader(
             played.append(play(env, opened, seed + number, max_steps))
     except ReaderProblem as error:
         return Examined([str(error)])
-    problems = space_problems(env) + recorded_problems(played, opened.spec) + observation_problems(played)
+    problems = space_problems(env) + recorded_problems(played, opened.spec)
+    problems += observation_problems(played, shown_spaces(env))
     if opened.spec.has_ego:
         problems += ego_problems(env, opened, seed)
     problems += replay_problems(env, opened, seed)

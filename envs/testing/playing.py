@@ -149,6 +149,13 @@ def space_problems(env: Any) -> list[str]:
     return []
 
 
+def shown_spaces(env: Any) -> dict[str, Any]:
+    """Returns the space of each agent's own observation, by its name; of an ego, whose name is empty."""
+    if isinstance(env, ParallelEnv):
+        return {agent: env.observation_space(agent) for agent in env.possible_agents}
+    return {"": env.observation_space}
+
+
 Act = Callable[[int], Any]
 """Takes the number of the step and returns the action."""
 

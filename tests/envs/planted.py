@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from envs.readers import FunctionReader, register_reader
@@ -52,6 +53,38 @@ class Priceless(Walk):
     def step(self, action: Any) -> Any:
         observation, _, *others = super().step(action)
         return observation, float("nan"), *others
+
+
+class Unnamed(Walk):
+    """Gives a text as a reward."""
+
+    def step(self, action: Any) -> Any:
+        observation, _, *others = super().step(action)
+        return observation, "high", *others
+
+
+class Wide(Walk):
+    """Shows more than its space says."""
+
+    observation_space = gym.spaces.Box(-1.5, 1.5, Walk.observation_space.shape, np.float64)
+
+
+class Longer(Walk):
+    """Shows arrays of another shape."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
+
+
+class Keyless(Walk):
+    """Shows an array where its space is a Dict."""
+
+    observation_space = gym.spaces.Dict({"table": Walk.observation_space})
+
+
+class Lower(Walk):
+    """Shows numbers of another type, which is no mistake."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, Walk.observation_space.shape, np.float32)
 
 
 class FastSwarm(Swarm):

@@ -175,7 +175,7 @@ MISTAKES: dict[str, tuple[Any, str]] = {
     "ego not first": (with_rows(lambda scene, _: np.roll(np.arange(len(scene.ids)), 1)), "agent 1 of the scene obeys"),
     "others relative": (
         with_states(lambda s: np.vstack([s[:1], s[1:] - s[:1]])),
-        "the others' positions are relative to the ego: where an action moves the ego, they change by as much the other",
+        "the others' positions are relative to the ego: where an action moves the ego, they change by as much",
     ),
     "velocities relative": (
         with_states(lambda s: np.vstack([s[:1], s[1:] - s[:1] * np.array([0, 0, 1, 1])])),
