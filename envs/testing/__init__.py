@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from envs.readers.base import MakeReader
+from envs.testing.asking import ReaderProblem, check_reset
 from envs.testing.ego import ego_problems, replay_problems
 from envs.testing.motion import lasting_share
-from envs.testing.playing import Episode, ReaderProblem, open_reader, play, shown_spaces, space_problems
+from envs.testing.playing import open_reader, play, shown_spaces, space_problems
 from envs.testing.recorded import observation_problems, recorded_problems, store_problems
 from predictor.support.errors import UserError
 
@@ -76,15 +77,15 @@ def examine_reader(
         UserError: no reader knows the env.
     """
     opened = open_reader(env, reader)
-    played: list[Episode] = []
+    problems: list[str] = []
     try:
-        for number in range(episodes):
-            played.append(play(env, opened, seed + number, max_steps))
+        check_reset(env)
+        played = [play(env, opened, seed + number, max_steps) for number in range(episodes)]
+        problems += space_problems(env) + recorded_problems(played, opened.spec)
+        problems += observation_problems(played, shown_spaces(env))
+        if opened.spec.has_ego:
+            problems += ego_problems(env, opened, seed)
+        problems += replay_problems(env, opened, seed)
     except ReaderProblem as error:
-        return Examined([str(error)])
-    problems = space_problems(env) + recorded_problems(played, opened.spec)
-    problems += observation_problems(played, shown_spaces(env))
-    if opened.spec.has_ego:
-        problems += ego_problems(env, opened, seed)
-    problems += replay_problems(env, opened, seed)
+        return Examined([*problems, str(error)])
     return Examined(problems, lasting_share(played, opened.spec))

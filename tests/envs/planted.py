@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 
 from envs.readers import FunctionReader, register_reader
-from tests.envs.semantics import Swarm, read_crowd
+from tests.envs.semantics import Swarm, SwarmReader, read_crowd
 from tests.envs.testing.test_check_reader import MISTAKES, SPEC, Pushed, SwarmMistaken
 
 READERS = {name.replace(" ", "_"): reader for name, (reader, _) in MISTAKES.items()}
@@ -87,6 +87,66 @@ class Lower(Walk):
     observation_space = gym.spaces.Box(-np.inf, np.inf, Walk.observation_space.shape, np.float32)
 
 
+class Old(Walk):
+    """Returns what gym did before gymnasium."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, reward, terminated or truncated, info
+
+
+class Bare(Walk):
+    """Resets to an observation alone."""
+
+    def reset(self, **options: Any) -> Any:
+        return super().reset(**options)[0]
+
+
+class Silent(Walk):
+    """Gives no info."""
+
+    def step(self, action: Any) -> Any:
+        return *super().step(action)[:4], None
+
+
+class Seedless(Walk):
+    """Takes no seed."""
+
+    def reset(self) -> Any:  # type: ignore[override]
+        return super().reset(seed=0)
+
+
+class Falling(Walk):
+    """Raises in the third step."""
+
+    def step(self, action: Any) -> Any:
+        if self.time == 2:
+            raise RuntimeError("it fell")
+        return super().step(action)
+
+
+class Plural(Walk):
+    """Ends episodes by an array."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, _, truncated, info = super().step(action)
+        return observation, reward, np.zeros(2, bool), truncated, info
+
+
+class FewOptions(Swarm):
+    """PettingZoo environment whose reset takes no options."""
+
+    def reset(self, seed: int | None = None) -> Any:  # type: ignore[override]
+        return super().reset(seed=seed)
+
+
+class NoInfos(Swarm):
+    """PettingZoo environment without infos."""
+
+    def step(self, actions: Any) -> Any:
+        return *super().step(actions)[:4], None
+
+
 class FastSwarm(Swarm):
     """PettingZoo environment whose reader gives km/h."""
 
@@ -94,6 +154,8 @@ class FastSwarm(Swarm):
 
 
 register_reader(Walk, FunctionReader(read_crowd, SPEC))
+register_reader(FewOptions, SwarmReader)
+register_reader(NoInfos, SwarmReader)
 register_reader(FastSwarm, SwarmMistaken)
 
 
