@@ -18,6 +18,8 @@ ALIKE = 1e-9
 CLEAR = 1e-5
 """Least change of the ego's state, in its scale, to which those of the others are compared: far above float32's."""
 LEAST_CHANGES = 4
+SEEN = 1e-3
+"""Largest difference of states of equal seeds: simulators on many threads or a GPU round each time otherwise."""
 
 
 def ego_problems(env: Any, opened: OpenReader, seed: int) -> list[str]:
@@ -119,13 +121,28 @@ def _spread(ends: Sequence[dict[int, Any]], spec: SceneSpec) -> Any:
 
 
 def replay_problems(env: Any, opened: OpenReader, seed: int) -> list[str]:
-    """Returns whether an episode goes on differently when it is read; nothing where seeds do not determine it."""
+    """Returns whether a seed begins other episodes each time, or an episode goes on differently when it is read.
+
+    The latter is not known where seeds do not determine an episode.
+    """
+    first, second = _begun(env, opened, seed), _begun(env, opened, seed)
+    if first.shape != second.shape or not np.allclose(first, second, rtol=0, atol=SEEN):
+        return [
+            f"two resets with seed {seed} begin different episodes, so nothing can be compared or repeated: reset must "
+            "make all its random numbers from its seed (gymnasium: super().reset(seed=seed), then self.np_random)"
+        ]
     unread = [_seen(env, None, seed) for _ in range(2)]
     if unread[0] != unread[1]:
         return []
     if _seen(env, opened, seed) != unread[0]:
         return [f"{opened.name}: reading changes what happens in the environment; a reader must not draw or step"]
     return []
+
+
+def _begun(env: Any, opened: OpenReader, seed: int) -> Any:
+    """Returns the first states of an episode, each feature sorted: the order of the agents is of no matter."""
+    begin(env, opened, seed)
+    return np.sort(opened.read(env).states, axis=0)
 
 
 def _seen(env: Any, opened: OpenReader | None, seed: int) -> list[Any]:

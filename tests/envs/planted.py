@@ -147,6 +147,23 @@ class NoInfos(Swarm):
         return *super().step(actions)[:4], None
 
 
+class Chance(Walk):
+    """Takes a seed and ignores it."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return super().reset(seed=int(np.random.default_rng().integers(1_000_000)))
+
+
+class Trembling(Walk):
+    """Differs from reset to reset by what rounding does, and shows its agents in another order."""
+
+    def reset(self, **options: Any) -> Any:
+        found = super().reset(**options)
+        for walker in self.people:
+            walker.state += np.random.default_rng().normal(scale=1e-6, size=4)
+        return found
+
+
 class FastSwarm(Swarm):
     """PettingZoo environment whose reader gives km/h."""
 

@@ -54,6 +54,7 @@ def test_each_planted_mistake_is_named_in_a_line(mistake: str):
         ("Plural", "step: terminated must be True or False, got array([False, False])"),
         ("FewOptions", "FewOptions.reset must take seed and options, got reset(seed); define reset("),
         ("NoInfos", "step: infos must be a dict, got NoneType"),
+        ("Chance", "two resets with seed 0 begin different episodes, so nothing can be compared or repeated"),
         ("FastSwarm", "velocities in km/h?"),
     ],
 )
@@ -86,7 +87,9 @@ def test_an_agent_without_a_space_is_named():
 ROADS = ("highway-fast-v0", "intersection-v2", "simple_tag_v3")
 
 
-@pytest.mark.parametrize("env_id", [*ROADS, "tests.envs.planted:Walk", "tests.envs.planted:Lower"])
+@pytest.mark.parametrize(
+    "env_id", [*ROADS, "tests.envs.planted:Walk", "tests.envs.planted:Lower", "tests.envs.planted:Trembling"]
+)
 def test_nothing_is_found_where_nothing_is_wrong(env_id: str):
     assert findings(CheckConfig(env_id, episodes=2, max_steps=15)) == []
 
