@@ -93,6 +93,30 @@ class NewOthers(NewIds):
         return replace(scene, ids=np.append(0, scene.ids[1:] + 1))
 
 
+def in_body_frame(scene: Scene, crowd: Any) -> Scene:
+    """Turns each velocity into the frame of its agent, which looks where it walks."""
+    states = scene.states.copy()
+    states[:, 2:] = np.linalg.norm(states[:, 2:], axis=1, keepdims=True) * np.array([1.0, 0.0])
+    return replace(scene, states=states)
+
+
+def with_ghost(scene: Scene, crowd: Any) -> Scene:
+    """Adds a place that nobody takes, with a velocity."""
+    states = np.vstack([scene.states, [30.0, 30.0, 2.0, 0.0]])
+    return Scene(states, np.append(scene.ids, 50), np.append(scene.valid, True), scene.heading_rad)
+
+
+def only(rows: slice, factor: tuple[float, ...]) -> FunctionReader:
+    """Returns a reader of which some agents' states are multiplied."""
+
+    def change(states: np.ndarray) -> np.ndarray:
+        states = states.copy()
+        states[rows] *= np.array(factor)
+        return states
+
+    return with_states(change)
+
+
 class Stale(Reader):
     """Keeps the first scene of an episode."""
 
@@ -181,6 +205,11 @@ MISTAKES: dict[str, tuple[Any, str]] = {
         with_states(lambda s: np.vstack([s[:1], s[1:] - s[:1] * np.array([0, 0, 1, 1])])),
         "the others' velocities are relative to the ego",
     ),
+    "body frame": (changed(in_body_frame), "the ego moves along its velocity turned by heading_rad: velocities are in"),
+    "ghost": (changed(with_ghost), "id 50 never moves, although it has a velocity (2 m/s): what stands has velocity"),
+    "ego without velocity": (only(slice(0, 1), (1, 1, 0, 0)), "the ego moves, but its velocity is always zero"),
+    "ego in pixels": (only(slice(0, 1), (10, 10, 1, 1)), "the ego's positions change by 10 × velocity × dt_s"),
+    "others in km/h": (only(slice(1, None), (1, 1, 3.6, 3.6)), "velocities in km/h?"),
     "ego moves": (
         with_rows(lambda scene, crowd: np.roll(np.arange(len(scene.ids)), crowd.time)),
         "the first agent has id 0 and, from step 1 on, id ",
