@@ -27,6 +27,7 @@ from agents.runs import CONFIG_FILE, load_model, policy_zip, read_config, shippe
 from agents.summaries import EXTREMES
 from agents.task import EVALUATION_SEED, Task, task_of
 from envs.drivers.ego import CONSTANT_ACTIONS, constant_actions, make_ego_driver, named_drivers
+from envs.drivers.planner import is_planner, planner_checkpoint
 from envs.drivers.trained import require_own_view
 from envs.registry import arguments_of
 from envs.sb3.policy_file import Algorithm, algorithm_of, read_policy_note
@@ -225,7 +226,8 @@ def compared_drivers(task: Task, names: Sequence[str] | None = None) -> tuple[st
 
     Args:
         task: task of the policy.
-        names: names of drivers; ("none",) for none, None for every constant action where actions are discrete.
+        names: names of drivers; ("none",) for none, None for every constant action where actions are discrete;
+            "planner" takes the checkpoint of the task, where it names one.
 
     Raises:
         UserError: "none" among others, or see `checked_drivers`.
@@ -234,6 +236,8 @@ def compared_drivers(task: Task, names: Sequence[str] | None = None) -> tuple[st
         return constant_drivers(task)
     if NO_DRIVERS in names and len(names) > 1:
         raise UserError(f"--drivers {NO_DRIVERS} adds no line and stands alone, got {' '.join(names)}")
+    if task.checkpoint is not None:
+        names = [f"{n}:{task.checkpoint}" if is_planner(n) and not planner_checkpoint(n) else n for n in names]
     return () if NO_DRIVERS in names else checked_drivers(task, names)
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from envs.readers import MakeReader
 from envs.registry import arguments_of, make_any_env
-from envs.testing import reader_problems
+from envs.testing import Examined, examine_reader
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, one_line, run_entry_point
@@ -55,15 +55,21 @@ def findings(config: CheckConfig) -> list[str]:
     Raises:
         UserError: no such environment, or no reader knows it.
     """
+    return [one_line(UserError(line)) for line in examined(config).problems]
+
+
+def examined(config: CheckConfig) -> Examined:
+    """Returns what is wrong, and how many ids last from step to step.
+
+    Raises:
+        UserError: no such environment, or no reader knows it.
+    """
     env = make_any_env(config.env_id, **arguments_of(config.env_kwargs))
     make_reader: MakeReader | None = None if config.reader is None else load_named(config.reader)
     try:
-        found = reader_problems(
-            env, make_reader, episodes=config.episodes, max_steps=config.max_steps, seed=config.seed
-        )
+        return examine_reader(env, make_reader, episodes=config.episodes, max_steps=config.max_steps, seed=config.seed)
     finally:
         env.close()
-    return [one_line(UserError(line)) for line in found]
 
 
 def with_option(words: Sequence[str]) -> list[str]:
@@ -75,12 +81,13 @@ def main() -> None:
     """Runs the command."""
     sys.argv[1:] = with_option(sys.argv[1:])
     config = parse(CheckConfig, __doc__)
-    found = findings(config)
-    for line in found:
-        print(line)
-    if found:
+    found = examined(config)
+    for line in found.problems:
+        print(one_line(UserError(line)))
+    if found.problems:
         sys.exit(1)
-    print(f"nothing found in {config.episodes} episodes")
+    lasting = "" if found.lasting is None else f"; {found.lasting:.0%} of the others' ids last from step to step"
+    print(f"nothing found in {config.episodes} episodes{lasting}")
 
 
 if __name__ == "__main__":

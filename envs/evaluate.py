@@ -249,7 +249,8 @@ def evaluate_causes(config: EvaluateConfig, console: Console) -> None:
     """
     drivers = {env_id: config.driver or default_drivers(env_id, config.env_kwargs)[0] for env_id in config.env_ids}
     for env_id, driver in drivers.items():  # raises before hours of work
-        check_can_branch(env_id, "idle" if driver.endswith(".zip") else driver, config.env_kwargs)
+        if config.reactions or config.graph:
+            check_can_branch(env_id, "idle" if driver.endswith(".zip") else driver, config.env_kwargs)
         if config.plans:
             check_has_plans(env_id, config.env_kwargs)
     if config.reactions:

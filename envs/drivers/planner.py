@@ -24,7 +24,7 @@ from envs.plans.contact import contacts
 from envs.plans.playing import as_forecast, with_true_futures
 from envs.readers import reader_for
 from envs.readers.base import SceneReader, show
-from envs.registry import checkpoint_for, entry_for
+from envs.registry import entry_for
 from envs.wrappers import SceneObservation, scene_source
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster
 from predictor.forecaster import Forecaster, has_scale
@@ -121,7 +121,14 @@ def forecaster_for(env: gym.Env, checkpoint: str | None) -> Forecaster:
         wrapped: Forecaster = env.get_wrapper_attr("forecaster")
         return wrapped
     spec = env.get_wrapper_attr("scene_spec") if env.has_wrapper_attr("scene_spec") else reader_for(env).spec
-    return _loaded(checkpoint or checkpoint_for(scene_source(env)), spec, scene_source(env))
+    source = scene_source(env)
+    checkpoint = checkpoint or entry_for(source).checkpoint
+    if checkpoint is None:
+        raise UserError(
+            f"no checkpoint ships for env '{source}': name the planner's forecaster, as planner:CHECKPOINT (a name or "
+            f"a path) or planner:{CONSTANT_VELOCITY}"
+        )
+    return _loaded(checkpoint, spec, source)
 
 
 @functools.lru_cache(maxsize=4)

@@ -24,7 +24,7 @@ import numpy as np
 from highway_env.envs.common.abstract import AbstractEnv
 from jaxtyping import Bool, Float, Int
 
-from envs.rollouts.interventions import body_of, hold_others, intervene, kinds_of
+from envs.rollouts.interventions import body_of, hold_others, intervene, kinds_of, knows_bodies
 from envs.rollouts.world import EgoWorld, World, open_world
 from envs.simulators.copies import running_copy
 from envs.simulators.interventions import Intervention, log_motion, simulator_of
@@ -89,20 +89,22 @@ class BranchPoint:
     Args:
         world: a running world; it is not changed, and must not step before the last branch has been played.
         horizon_steps: number of steps to play.
+        perturbs: whether interventions will be played; other drivers need copies alone.
 
     Raises:
         UserError: the environment cannot be copied or perturbed.
     """
 
-    def __init__(self, world: World, horizon_steps: int) -> None:
+    def __init__(self, world: World, horizon_steps: int, *, perturbs: bool = True) -> None:
         """Plays the plain branch."""
         if horizon_steps < 1:
             raise UserError(f"horizon_steps must be at least 1, got {horizon_steps}")
-        kinds_of(world)
+        if perturbs:
+            kinds_of(world)
         self._world, self._horizon = world, horizon_steps
         self.ids = world.full_scene().ids.copy()
         other = copied(world)
-        self._log = log_motion(other.env)
+        self._log = log_motion(other.env) if perturbs else None
         self.plain, self._streams = _play(other, self.ids, horizon_steps)
 
     def perturbed(self, intervention: Intervention) -> Branches:
@@ -141,6 +143,7 @@ class BranchPoint:
         Raises:
             UserError: the agent does not allow it.
         """
+        assert self._log is not None, "interventions need BranchPoint(perturbs=True)"
         other = copied(self._world)
         hold_others(other, self._log, (intervention.agent, receiver))
         return self._branches(other, intervention)
@@ -208,6 +211,12 @@ def _play(
         note(step + 1, world.perceived(), world.full_scene())
         if ended and not goes_on:
             break
+    return Branch(states, valid, tuple(seen), _crashed(world, ids)), drawn
+
+
+def _crashed(world: World, ids: Int[np.ndarray, " agents"]) -> frozenset[int]:
+    """Returns the agents that have crashed; where the reader knows no bodies, the ego if the infos said so."""
+    if not knows_bodies(world):
+        return frozenset(ids[:1].tolist() if isinstance(world, EgoWorld) and world.crashed else ())
     bodies = ((int(agent), body_of(world, int(agent))) for agent in ids)
-    crashed = frozenset(agent for agent, body in bodies if getattr(body, "crashed", False))
-    return Branch(states, valid, tuple(seen), crashed), drawn
+    return frozenset(agent for agent, body in bodies if getattr(body, "crashed", False))

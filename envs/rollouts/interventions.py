@@ -43,12 +43,17 @@ def kinds_of(world: World) -> tuple[Kind, ...]:
     """
     kinds = kinds_for(world.env)
     reader = _reader(world)
-    if not hasattr(reader, "body_of"):
+    if not knows_bodies(world):
         raise UserError(
             f"{type(reader).__name__} cannot find an agent by its id, so no intervention is possible; give it a method "
             "body_of(env, agent) that returns the simulator's object"
         )
     return kinds
+
+
+def knows_bodies(world: World) -> bool:
+    """Returns whether the world's reader can find the simulator's object of an agent."""
+    return hasattr(_reader(world), "body_of")
 
 
 def interventions_of(world: World) -> dict[int, Intervention]:

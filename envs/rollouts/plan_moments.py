@@ -119,7 +119,7 @@ def moment(
     """
     scene = world.perceived()
     plans = checked_plans(model, world.env, horizon_steps, world.spec.num_features, scene, world.spec)
-    point = BranchPoint(world, horizon_steps)
+    point = BranchPoint(world, horizon_steps, perturbs=False)
     played = [point.plain, *(point.driven(_Script(actions)) for actions in _scripts(plans, model))]
     ego = int(point.ids[0])
     crashed = np.array([ego in branch.crashed for branch in played])

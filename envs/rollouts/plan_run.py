@@ -7,8 +7,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from envs.plans import plan_model_for
+from envs.readers import outcome_keys
 from envs.registry import name_with
+from envs.rollouts.branches import copied
 from envs.rollouts.cluster_pool import episode_pool
+from envs.rollouts.interventions import knows_bodies
 from envs.rollouts.plan_moments import PlanMoment, PlanTask, play_plans
 from envs.rollouts.side_forecasts import fitting_checkpoints
 from envs.rollouts.world import open_world
@@ -111,16 +114,31 @@ class EnvPlans:
 
 
 def check_has_plans(env_id: str, env_kwargs: str = "") -> None:
-    """Checks that the ego of an environment has plans.
+    """Checks that the ego of an environment has plans, and that these can be played and judged.
 
     Raises:
-        UserError: it has none, or the environment is unknown.
+        UserError: it has none, the environment cannot be copied or reports no crashes, or it is unknown.
     """
     world = open_world(env_id, "idle", env_kwargs=env_kwargs)
     try:
         if not world.spec.has_ego:
             raise UserError(f"plans are those of one ego, and {env_id} has several agents; use an env with one ego")
         plan_model_for(world.env)
+        if not knows_bodies(world) and not outcome_keys(world.env).crash:
+            raise UserError(
+                f"{env_id} does not report crashes, with which the risk of a plan is compared; name the key of its "
+                "infos: register_reader(..., crash_key=...)"
+            )
+        world.reset(0)
+        try:
+            copied(world)
+        except UserError:
+            raise
+        except Exception as error:
+            raise UserError(
+                f"plans are played in copies, and copy.deepcopy of {env_id} failed ({type(error).__name__}: {error}); "
+                "make its class copyable (__deepcopy__)"
+            ) from error
     finally:
         world.close()
 

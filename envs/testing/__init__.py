@@ -6,15 +6,18 @@ environment, observations that never change. None of these raises an error by it
 worse, since memory follows ids. `recorded_problems` is the part that needs scenes alone.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 from envs.readers.base import MakeReader
+from envs.testing.asking import ReaderProblem, check_reset
 from envs.testing.ego import ego_problems, replay_problems
-from envs.testing.playing import Episode, ReaderProblem, open_reader, play, space_problems
+from envs.testing.motion import lasting_share
+from envs.testing.playing import open_reader, play, shown_spaces, space_problems
 from envs.testing.recorded import observation_problems, recorded_problems, store_problems
 from predictor.support.errors import UserError
 
-__all__ = ["check_reader", "reader_problems", "recorded_problems", "store_problems"]
+__all__ = ["Examined", "check_reader", "examine_reader", "reader_problems", "recorded_problems", "store_problems"]
 
 
 def check_reader(
@@ -50,14 +53,39 @@ def reader_problems(
     Raises:
         UserError: no reader knows the env.
     """
+    return examine_reader(env, reader, episodes=episodes, max_steps=max_steps, seed=seed).problems
+
+
+@dataclass(frozen=True)
+class Examined:
+    """What was found in episodes with a reader."""
+
+    problems: list[str]
+    """One line for each thing that is wrong."""
+    lasting: float | None = None
+    """Share of the others' ids that are there after a step, too; None of too few steps to say."""
+
+
+def examine_reader(
+    env: Any, reader: MakeReader | None = None, *, episodes: int = 5, max_steps: int = 100, seed: int = 0
+) -> Examined:
+    """Returns what `reader_problems` does, and how many ids last from step to step.
+
+    The arguments are those of `check_reader`.
+
+    Raises:
+        UserError: no reader knows the env.
+    """
     opened = open_reader(env, reader)
-    played: list[Episode] = []
+    problems: list[str] = []
     try:
-        for number in range(episodes):
-            played.append(play(env, opened, seed + number, max_steps))
+        check_reset(env)
+        played = [play(env, opened, seed + number, max_steps) for number in range(episodes)]
+        problems += space_problems(env) + recorded_problems(played, opened.spec)
+        problems += observation_problems(played, shown_spaces(env))
+        if opened.spec.has_ego:
+            problems += ego_problems(env, opened, seed)
+        problems += replay_problems(env, opened, seed)
     except ReaderProblem as error:
-        return [str(error)]
-    problems = space_problems(env) + recorded_problems(played, opened.spec) + observation_problems(played)
-    if opened.spec.has_ego:
-        problems += ego_problems(env, opened, seed)
-    return problems + replay_problems(env, opened, seed)
+        return Examined([*problems, str(error)])
+    return Examined(problems, lasting_share(played, opened.spec))

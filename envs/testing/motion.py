@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from envs.testing.playing import Episode
 from predictor.scene import SceneSpec
@@ -14,6 +14,10 @@ STEP_TOLERANCE = 0.15
 FIT = 0.3
 """Largest median error of positions, as a share of the distance moved, where velocities are said to fit."""
 LEAST_PAIRS = 8
+LASTING = 0.2
+"""Least share of the others' ids that are there after a step, too; where agents are re-identified, some are lost."""
+SMALL = 1e-3
+"""Distance of a step, in scales of positions, that is not told from standing still."""
 HINTS = {
     1 / 3.6: "velocities in km/h", 1 / 2.237: "velocities in mph", 100.0: "positions in cm", 1000.0: "positions in mm",
     0.01: "velocities in cm/s", 0.3048: "velocities in feet/s", 3.281: "positions in feet",
@@ -53,6 +57,10 @@ class Steps:
         speed = np.linalg.norm(self.before + self.after, axis=1)
         length = np.linalg.norm(self.moved, axis=1)
         keep = (speed > 0.1 * np.quantile(speed, 0.9)) | (length > 0.1 * np.quantile(length, 0.9))
+        return self.part(keep)
+
+    def part(self, keep: Bool[np.ndarray, " steps"]) -> "Steps":
+        """Returns some of the steps."""
         return Steps(self.moved[keep], self.before[keep], self.after[keep], self.is_ego[keep])
 
     def velocity(self) -> Float[np.ndarray, "steps axes"]:
@@ -78,16 +86,74 @@ def motion_problems(episodes: Sequence[Episode], spec: SceneSpec) -> list[str]:
     steps = Steps.of(episodes, spec.position_dim)
     if not len(steps.moved):
         return ["no agent is there in two scenes that follow each other: ids must stay with an agent"]
+    share = lasting_share(episodes, spec)
+    if share is not None and share < LASTING:
+        return [
+            f"{share:.0%} of the others' ids are there after a step, too; an id must stay with its agent: give the "
+            "simulator's numbers, or raise gate_m where agents are re-identified (EntityRowsReader, IdentityTracker)"
+        ]
     if not np.abs(steps.moved).max() > 0:
         return ["no position ever changes while the environment steps; does the reader return an old scene?"]
-    steps = steps.fast()
+    whole, steps = steps, steps.fast()
     if not np.abs(steps.before).max(initial=0) > 0:
         return ["all velocities are zero, although positions change; give velocities in m/s"]
     if len(steps.moved) < LEAST_PAIRS:
         return []
     if spec.has_ego and (found := _relative(steps)):
         return [found]
-    return _axes(steps, spec) or _step(steps, spec)
+    return _axes(steps, spec) or _step(steps, spec) or _parts(whole, spec) or _ghosts(episodes, spec)
+
+
+def _parts(steps: Steps, spec: SceneSpec) -> list[str]:
+    """Finds what is wrong with the ego alone or with the others alone, which a median over all agents hides."""
+    if not spec.has_ego:
+        return []
+    ego = steps.part(steps.is_ego > 0)
+    moves = np.linalg.norm(ego.moved, axis=1) > SMALL * min(spec.feature_scales[: spec.position_dim])
+    if moves.sum() >= LEAST_PAIRS and not ego.before.any() and not ego.after.any():
+        return ["the ego moves, but its velocity is always zero; give it in m/s, as that of the others"]
+    for whose, part in (("the ego's ", ego), ("the others' ", steps.part(steps.is_ego == 0))):
+        fast = part.fast() if len(part.moved) else part
+        if len(fast.moved) >= LEAST_PAIRS and (found := _step(fast, spec, tolerance=1.0, whose=whose)):
+            return found
+    return []
+
+
+def _ghosts(episodes: Sequence[Episode], spec: SceneSpec) -> list[str]:
+    """Finds an agent that never moves, although it has a velocity in each step."""
+    axes, least_m = spec.position_dim, SMALL * min(spec.feature_scales[: spec.position_dim])
+    for episode in episodes:
+        states: dict[int, list[Float[np.ndarray, " state"]]] = {}
+        for moment in episode.moments:
+            first = int(spec.has_ego)
+            for number, state in zip(moment.ids[first:].tolist(), moment.states[first:], strict=True):
+                states.setdefault(number, []).append(state)
+        for number, found in states.items():
+            path = np.array(found)
+            speed = np.linalg.norm(path[:, axes : 2 * axes], axis=1)
+            if (
+                len(path) > LEAST_PAIRS
+                and (path[:, :axes] == path[0, :axes]).all()
+                and speed.min() * spec.dt_s > least_m
+            ):
+                return [
+                    f"id {number} never moves, although it has a velocity ({speed[0]:.3g} m/s): what stands has "
+                    "velocity zero, and what is not there is left out"
+                ]
+    return []
+
+
+def lasting_share(episodes: Sequence[Episode], spec: SceneSpec) -> float | None:
+    """Returns the share of the others' ids that are there after a step, too; None of too few steps to say.
+
+    Others are all agents but the ego. As many as the smaller scene has could have stayed.
+    """
+    first = int(spec.has_ego)
+    stayed = could = 0
+    for one, other in (pair for episode in episodes for pair in episode.pairs()):
+        stayed += len(set(one.ids[first:].tolist()) & set(other.ids[first:].tolist()))
+        could += max(min(len(one.ids), len(other.ids)) - first, 0)
+    return stayed / could if could >= LEAST_PAIRS else None
 
 
 def _relative(steps: Steps) -> str:
@@ -121,17 +187,17 @@ def _axes(steps: Steps, spec: SceneSpec) -> list[str]:
     return []
 
 
-def _step(steps: Steps, spec: SceneSpec) -> list[str]:
+def _step(steps: Steps, spec: SceneSpec, tolerance: float = STEP_TOLERANCE, whose: str = "") -> list[str]:
     moved, velocity = steps.moved, steps.velocity()
     share, found_s = misfit(moved, velocity), step_length(moved, velocity)
     if share > FIT:
         return []
     ratio = found_s / spec.dt_s
-    if abs(ratio - 1) <= STEP_TOLERANCE:
+    if 1 / (1 + tolerance) <= ratio <= 1 + tolerance:
         return []
     hint = next((f" ({text}?)" for known, text in HINTS.items() if abs(ratio / known - 1) < 0.05), "")
     return [
-        f"positions change by {ratio:.3g} × velocity × dt_s: either a step lasts {found_s:.3g} s, not dt_s="
+        f"{whose}positions change by {ratio:.3g} × velocity × dt_s: either a step lasts {found_s:.3g} s, not dt_s="
         f"{spec.dt_s:g}, or positions and velocities are in different units{hint}"
     ]
 
@@ -176,6 +242,11 @@ def heading_problems(episodes: Sequence[Episode]) -> list[str]:
     moments = [moment for episode in episodes for moment in episode.moments if len(moment.states)]
     heading = np.array([moment.heading_rad for moment in moments])
     velocity = np.array([moment.states[0, 2:4] for moment in moments])
+    if _in_body_frame(episodes):
+        return [
+            "the ego moves along its velocity turned by heading_rad: velocities are in the frame of each agent; turn "
+            "them into the world frame"
+        ]
     speed = np.linalg.norm(velocity, axis=1)
     keep = speed > 0.2 * max(np.quantile(speed, 0.9), 1e-9)
     if not heading.any() or keep.sum() < LEAST_PAIRS:
@@ -184,11 +255,28 @@ def heading_problems(episodes: Sequence[Episode]) -> list[str]:
     if _apart(heading, course) < 0.3:
         return []
     meant = {
-        "heading_rad is in degrees; give radians": np.deg2rad(heading),
+        "heading_rad is in degrees; give radians": np.deg2rad(heading)
+        if np.abs(heading).max() > 2 * np.pi
+        else heading,
         "heading_rad is mirrored: it must grow from x to y": -heading,
         "heading_rad is counted from the y axis; it is 0 along x and grows towards y": np.pi / 2 - heading,
     }
     return [text for text, angle in meant.items() if _apart(angle, course) < 0.15][:1]
+
+
+def _in_body_frame(episodes: Sequence[Episode]) -> bool:
+    """Returns whether the ego moves along its velocity turned by its heading, and not along its velocity."""
+    found = []
+    for first, second in (pair for episode in episodes for pair in episode.pairs()):
+        if len(first.ids) and len(second.ids) and first.ids[0] == second.ids[0]:
+            found.append([*(second.states[0, :2] - first.states[0, :2]), *first.states[0, 2:4], first.heading_rad])
+    table = np.array(found).reshape(-1, 5)
+    length = np.linalg.norm(table[:, :2], axis=1)
+    table = table[length > 0.2 * max(np.quantile(length, 0.9) if len(length) else 0.0, 1e-9)]
+    if len(table) < LEAST_PAIRS:
+        return False
+    moved, course = np.arctan2(table[:, 1], table[:, 0]), np.arctan2(table[:, 3], table[:, 2])
+    return _apart(course, moved) > 0.5 and _apart(course + table[:, 4], moved) < 0.3
 
 
 def _apart(one: Float[np.ndarray, " moments"], other: Float[np.ndarray, " moments"]) -> float:

@@ -13,15 +13,12 @@ from envs.multiagent_observation import check_multiagent_scene
 from envs.own_observation import require_space
 from envs.readers import FunctionReader, MakeReader, multiagent_reader_for, reader_for
 from envs.readers.base import build_multiagent_reader, build_reader, require_scene, show
+from envs.testing.asking import ReaderProblem, asked_reset, asked_step
 from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError
 
 MAX_LENGTH = 300
 """Largest number of characters of a line that quotes what arrived."""
-
-
-class ReaderProblem(Exception):
-    """Raised when a reader breaks the contract so that nothing else can be checked; the message is one line."""
 
 
 @dataclass(frozen=True)
@@ -149,13 +146,24 @@ def space_problems(env: Any) -> list[str]:
     return []
 
 
+def shown_spaces(env: Any) -> dict[str, Any]:
+    """Returns the space of each agent's own observation, by its name; of an ego, whose name is empty."""
+    if isinstance(env, ParallelEnv):
+        return {agent: env.observation_space(agent) for agent in env.possible_agents}
+    return {"": env.observation_space}
+
+
 Act = Callable[[int], Any]
 """Takes the number of the step and returns the action."""
 
 
 def begin(env: Any, opened: OpenReader | None, seed: int) -> Any:
-    """Resets the environment, and the reader if there is one; returns the observation."""
-    observation, _ = env.reset(seed=seed)
+    """Resets the environment, and the reader if there is one; returns the observation.
+
+    Raises:
+        ReaderProblem: the environment raised, or returned something else.
+    """
+    observation = asked_reset(env, seed)
     if opened is not None:
         opened.reader.reset()
         show(opened.reader, observation)
@@ -163,8 +171,12 @@ def begin(env: Any, opened: OpenReader | None, seed: int) -> Any:
 
 
 def step(env: Any, opened: OpenReader | None, action: Any) -> tuple[Any, Any, bool]:
-    """Steps the environment; returns observation, reward, and whether the episode is over."""
-    observation, reward, terminated, truncated, _ = env.step(action)
+    """Steps the environment; returns observation, reward, and whether the episode is over.
+
+    Raises:
+        ReaderProblem: the environment raised, or returned something else.
+    """
+    observation, reward, terminated, truncated, _ = asked_step(env, action)
     if opened is not None:
         show(opened.reader, observation)
     return observation, reward, not env.agents if isinstance(env, ParallelEnv) else bool(terminated or truncated)
@@ -194,7 +206,7 @@ def play(env: Any, opened: OpenReader, seed: int, max_steps: int) -> Episode:
     """Plays an episode with random actions.
 
     Raises:
-        ReaderProblem: the reader breaks its contract.
+        ReaderProblem: the environment or the reader breaks its contract.
     """
     episode, act = Episode(), random_actions(env, seed)
 

@@ -7,6 +7,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from envs.testing.identity import identity_problems
@@ -14,6 +15,7 @@ from envs.testing.motion import heading_problems, misfit_problems, motion_proble
 from envs.testing.playing import Episode, Moment, frozen
 from predictor.data import store
 from predictor.scene import SceneSpec
+from predictor.support.errors import short
 
 MOST_STATES = 100_000
 """Largest number of agents' states of a recording that is looked at: about a second."""
@@ -67,8 +69,13 @@ def _not_finite(episodes: Sequence[Episode]) -> list[str]:
     return []
 
 
-def observation_problems(episodes: Sequence[Episode]) -> list[str]:
-    """Returns what is wrong with the environment's own observations and rewards, which a policy learns from."""
+def observation_problems(episodes: Sequence[Episode], spaces: Mapping[str, Any]) -> list[str]:
+    """Returns what is wrong with the environment's own observations and rewards, which a policy learns from.
+
+    Args:
+        episodes: what was shown and rewarded.
+        spaces: space of each agent's observations, by its name; of an ego, whose name is empty.
+    """
     for what in ("shown", "rewards"):
         for episode in episodes:
             for time, seen in enumerate(getattr(episode, what), start=int(what == "rewards")):
@@ -78,7 +85,65 @@ def observation_problems(episodes: Sequence[Episode]) -> list[str]:
                     return [
                         f"the environment's own {kind}{whose} is not finite in step {time}: no policy learns from it"
                     ]
-    return _constant(episodes)
+    return _no_numbers(episodes) or _outside(episodes, spaces) or _constant(episodes)
+
+
+def _no_numbers(episodes: Sequence[Episode]) -> list[str]:
+    """Finds a reward that is no number."""
+    for time, agent, reward in (
+        (time, agent, reward)
+        for episode in episodes
+        for time, rewards in enumerate(episode.rewards, start=1)
+        for agent, reward in rewards.items()
+    ):
+        try:
+            found = np.asarray(reward)
+        except ValueError:  # a ragged list
+            found = np.array(None)
+        if found.dtype.kind not in "biuf" or found.size != 1:
+            whose = f" of '{agent}'" if agent else ""
+            return [
+                f"the environment's own reward{whose} must be one number, got {short(repr(reward), 60)} in step {time}"
+            ]
+    return []
+
+
+def _outside(episodes: Sequence[Episode], spaces: Mapping[str, Any]) -> list[str]:
+    """Finds an observation that is not in its space; another type of number is no mistake, it is converted."""
+    for episode in episodes:
+        for time, shown in enumerate(episode.shown):
+            for agent, seen in shown.items():
+                why = _misfit(seen, spaces[agent]) if agent in spaces else f" has no space, named are {list(spaces)}"
+                if why:
+                    whose = f" of '{agent}'" if agent else ""
+                    return [
+                        f"the environment's own observation{whose}{why}, in step {time}: its observation_space must "
+                        "hold all that it shows"
+                    ]
+    return []
+
+
+def _misfit(seen: Any, space: Any) -> str:
+    """Returns what is wrong with a value of a space; empty if nothing is, or it is not known."""
+    if isinstance(space, gym.spaces.Dict):
+        if not isinstance(seen, Mapping) or seen.keys() != space.spaces.keys():
+            got = list(seen) if isinstance(seen, Mapping) else type(seen).__name__
+            return f" must be a dict with {list(space.spaces)}, got {got}"
+        return next((f"['{key}']{why}" for key, value in seen.items() if (why := _misfit(value, space[key]))), "")
+    if isinstance(space, gym.spaces.Box):
+        if np.shape(seen) != space.shape:
+            return f" has the shape {np.shape(seen)}, its space {space.shape}"
+        values, low, high = (np.asarray(part, dtype=np.float64) for part in (seen, space.low, space.high))
+        slack = 1e-5 * (1 + np.abs(values))
+        out = (values < low - slack) | (values > high + slack)
+        if out.any():
+            where = tuple(int(i) for i in np.argwhere(out)[0])
+            return f" has {values[where]:.4g} at {list(where)}, its space is from {low[where]:.4g} to {high[where]:.4g}"
+        return ""
+    if isinstance(space, gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary):
+        inside = space.contains(seen) or space.contains(np.asarray(seen))
+        return "" if inside else f" is {short(repr(seen), 60)}, its space {space}"
+    return ""
 
 
 def _not_finite_in(seen: Any, name: str = "") -> Iterator[str]:

@@ -49,6 +49,12 @@ def test_drivers_that_cannot_drive_are_refused_before_anything_runs():
     assert checked_drivers(Task("simple_tag_v3", "none"), ()) == ()
 
 
+def test_the_planner_takes_the_checkpoint_that_a_run_names():
+    task = Task("highway-fast-v0", "forecast", checkpoint="highway")
+    assert compared_drivers(task, ("planner", "slower")) == ("planner:highway", "slower")
+    assert compared_drivers(Task("highway-fast-v0", "none"), ("planner",)) == ("planner",)
+
+
 def test_constant_actions_stand_for_one_driver_each():
     names = checked_drivers(Task("merge-v1", "none"), ("slower", "constant-actions", "random"))
     assert names == ("slower", "lane-left", "idle", "lane-right", "faster", "random")

@@ -2,10 +2,11 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from envs.readers import FunctionReader, register_reader
-from tests.envs.semantics import Swarm, read_crowd
+from tests.envs.semantics import Swarm, SwarmReader, read_crowd
 from tests.envs.testing.test_check_reader import MISTAKES, SPEC, Pushed, SwarmMistaken
 
 READERS = {name.replace(" ", "_"): reader for name, (reader, _) in MISTAKES.items()}
@@ -54,6 +55,115 @@ class Priceless(Walk):
         return observation, float("nan"), *others
 
 
+class Unnamed(Walk):
+    """Gives a text as a reward."""
+
+    def step(self, action: Any) -> Any:
+        observation, _, *others = super().step(action)
+        return observation, "high", *others
+
+
+class Wide(Walk):
+    """Shows more than its space says."""
+
+    observation_space = gym.spaces.Box(-1.5, 1.5, Walk.observation_space.shape, np.float64)
+
+
+class Longer(Walk):
+    """Shows arrays of another shape."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
+
+
+class Keyless(Walk):
+    """Shows an array where its space is a Dict."""
+
+    observation_space = gym.spaces.Dict({"table": Walk.observation_space})
+
+
+class Lower(Walk):
+    """Shows numbers of another type, which is no mistake."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, Walk.observation_space.shape, np.float32)
+
+
+class Old(Walk):
+    """Returns what gym did before gymnasium."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, reward, terminated or truncated, info
+
+
+class Bare(Walk):
+    """Resets to an observation alone."""
+
+    def reset(self, **options: Any) -> Any:
+        return super().reset(**options)[0]
+
+
+class Silent(Walk):
+    """Gives no info."""
+
+    def step(self, action: Any) -> Any:
+        return *super().step(action)[:4], None
+
+
+class Seedless(Walk):
+    """Takes no seed."""
+
+    def reset(self) -> Any:  # type: ignore[override]
+        return super().reset(seed=0)
+
+
+class Falling(Walk):
+    """Raises in the third step."""
+
+    def step(self, action: Any) -> Any:
+        if self.time == 2:
+            raise RuntimeError("it fell")
+        return super().step(action)
+
+
+class Plural(Walk):
+    """Ends episodes by an array."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, _, truncated, info = super().step(action)
+        return observation, reward, np.zeros(2, bool), truncated, info
+
+
+class FewOptions(Swarm):
+    """PettingZoo environment whose reset takes no options."""
+
+    def reset(self, seed: int | None = None) -> Any:  # type: ignore[override]
+        return super().reset(seed=seed)
+
+
+class NoInfos(Swarm):
+    """PettingZoo environment without infos."""
+
+    def step(self, actions: Any) -> Any:
+        return *super().step(actions)[:4], None
+
+
+class Chance(Walk):
+    """Takes a seed and ignores it."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return super().reset(seed=int(np.random.default_rng().integers(1_000_000)))
+
+
+class Trembling(Walk):
+    """Differs from reset to reset by what rounding does, and shows its agents in another order."""
+
+    def reset(self, **options: Any) -> Any:
+        found = super().reset(**options)
+        for walker in self.people:
+            walker.state += np.random.default_rng().normal(scale=1e-6, size=4)
+        return found
+
+
 class FastSwarm(Swarm):
     """PettingZoo environment whose reader gives km/h."""
 
@@ -61,6 +171,8 @@ class FastSwarm(Swarm):
 
 
 register_reader(Walk, FunctionReader(read_crowd, SPEC))
+register_reader(FewOptions, SwarmReader)
+register_reader(NoInfos, SwarmReader)
 register_reader(FastSwarm, SwarmMistaken)
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -13,6 +14,8 @@ from envs import check
 from envs.check import CheckConfig, findings, with_option
 from envs.collect import CollectConfig, warnings_of
 from envs.testing import store_problems
+from envs.testing.playing import Episode as EpisodeOf
+from envs.testing.recorded import observation_problems
 from predictor.data.store import Episode, StoreInfo
 from predictor.scene import Scene
 from predictor.support.errors import UserError, run_entry_point
@@ -39,6 +42,19 @@ def test_each_planted_mistake_is_named_in_a_line(mistake: str):
         ("Forgetful", "the environment's own observation never changes within an episode, although agents move"),
         ("Broken", "the environment's own observation is not finite in step 3"),
         ("Priceless", "the environment's own reward is not finite in step 1"),
+        ("Unnamed", "the environment's own reward must be one number, got 'high' in step 1"),
+        ("Wide", "its space is from -1.5 to 1.5, in step 0: its observation_space must hold all that it shows"),
+        ("Longer", "the environment's own observation has the shape (8, 7), its space (3,), in step 0"),
+        ("Keyless", "the environment's own observation must be a dict with ['table'], got ndarray, in step 0"),
+        ("Old", "step must return 5 values (observation, reward, terminated, truncated, info), got 4 values"),
+        ("Bare", "reset must return 2 values (observation, info), got ndarray"),
+        ("Silent", "step: info must be a dict, got NoneType"),
+        ("Seedless", "Seedless.reset must take seed and options, got reset(); define reset(self, seed=None, options"),
+        ("Falling", "the environment's step failed with RuntimeError: it fell"),
+        ("Plural", "step: terminated must be True or False, got array([False, False])"),
+        ("FewOptions", "FewOptions.reset must take seed and options, got reset(seed); define reset("),
+        ("NoInfos", "step: infos must be a dict, got NoneType"),
+        ("Chance", "two resets with seed 0 begin different episodes, so nothing can be compared or repeated"),
         ("FastSwarm", "velocities in km/h?"),
     ],
 )
@@ -47,7 +63,33 @@ def test_mistakes_of_the_environment_are_named_too(name: str, sentence: str):
     assert any(sentence in line for line in found), found
 
 
-@pytest.mark.parametrize("env_id", ["highway-fast-v0", "intersection-v2", "simple_tag_v3", "tests.envs.planted:Walk"])
+@pytest.mark.parametrize(
+    ("space", "seen", "sentence"),
+    [
+        (gym.spaces.Discrete(3), 3, " is 3, its space Discrete(3)"),
+        (gym.spaces.Discrete(3), 2, None),
+        (gym.spaces.MultiBinary(2), [0, 1], None),
+        (gym.spaces.Dict({"a": gym.spaces.Discrete(2)}), {"a": 5}, "['a'] is 5, its space Discrete(2)"),
+        (gym.spaces.Box(-1, 1, (2,)), [1.0, -2.0], " has -2 at [1], its space is from -1 to 1"),
+        (gym.spaces.Box(-1, 1, (2,)), [1.000001, -1.0], None),
+    ],
+)
+def test_observations_are_compared_with_their_space(space: gym.Space, seen: Any, sentence: str | None):
+    found = observation_problems([EpisodeOf([], [{"": seen}])], {"": space})
+    assert found == [] if sentence is None else f"own observation{sentence}, in step 0" in found[0]
+
+
+def test_an_agent_without_a_space_is_named():
+    (found,) = observation_problems([EpisodeOf([], [{"second": 0}])], {"first": gym.spaces.Discrete(2)})
+    assert "own observation of 'second' has no space, named are ['first'], in step 0" in found
+
+
+ROADS = ("highway-fast-v0", "intersection-v2", "simple_tag_v3")
+
+
+@pytest.mark.parametrize(
+    "env_id", [*ROADS, "tests.envs.planted:Walk", "tests.envs.planted:Lower", "tests.envs.planted:Trembling"]
+)
 def test_nothing_is_found_where_nothing_is_wrong(env_id: str):
     assert findings(CheckConfig(env_id, episodes=2, max_steps=15)) == []
 
@@ -63,7 +105,7 @@ def test_the_command_ends_with_status_1_if_something_is_wrong(
     assert "not finite" in line
     monkeypatch.setattr(sys, "argv", ["check", "--env-id", "tests.envs.planted:Walk", "--episodes", "2"])
     run_entry_point(check.main)
-    assert capsys.readouterr().out == "nothing found in 2 episodes\n"
+    assert capsys.readouterr().out == "nothing found in 2 episodes; 97% of the others' ids last from step to step\n"
 
 
 @pytest.mark.parametrize(

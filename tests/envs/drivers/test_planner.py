@@ -15,6 +15,7 @@ from envs.drivers.planner import (
     is_planner,
     planner_checkpoint,
     planner_config,
+    planner_driver,
 )
 from envs.plans import Plans
 from envs.readers.entities import EntityRowsReader
@@ -37,6 +38,14 @@ def plans_worth(*rewards: float, crash: float = -1.0) -> Plans:
 def surviving(*risks: float) -> np.ndarray:
     """No collision in the first step, one in the second with these probabilities."""
     return np.stack([np.ones(len(risks)), 1 - np.array(risks)], axis=1)
+
+
+def test_where_no_checkpoint_ships_the_message_names_the_way_to_give_one():
+    env = gym.make("tests.envs.own_plans:Planned-v0")
+    env.reset(seed=0)
+    with pytest.raises(UserError, match="no checkpoint ships for env .*Planned-v0': name the planner's forecaster, as"):
+        planner_driver("planner", env, np.random.default_rng(0))
+    assert planner_driver("planner:constant-velocity", env, np.random.default_rng(0)).plan_model.names == ("up", "down")
 
 
 def test_the_value_counts_rewards_until_a_collision_and_its_reward_then():

@@ -1,8 +1,11 @@
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from envs.evaluate import EvaluateConfig, evaluate_causes
 from envs.rollouts import plan_run
 from envs.rollouts.plan_moments import STRAIGHT, PlanMoment
 from envs.rollouts.plan_run import PlanRun, measure_plans, right_choices, scores_of
@@ -81,6 +84,35 @@ def test_an_environment_is_measured_whatever_the_number_of_workers():
 def test_episodes_without_a_moment_are_an_error():
     with pytest.raises(UserError, match="highway-fast-v0: none of 2 episodes has a step to measure; add --episodes"):
         measure_plans(run(max_steps=2))
+
+
+OWN = "tests.envs.own_plans:Planned-v0"
+
+
+def test_plans_of_an_environment_of_ones_own_are_played():
+    """Its reader knows no bodies and its simulator no interventions: copies and the infos' crashes are enough."""
+    config = EvaluateConfig(
+        (OWN,), checkpoint=("constant-velocity",), episodes=1, driver="idle", max_steps=9, workers=1, horizon_steps=2,
+        plans=True,
+    )  # fmt: skip
+    evaluate_causes(config, Console(quiet=True))
+    measured = measure_plans(replace(run(OWN), max_steps=9))
+    assert measured.plan_names == ("up", "down") and measured.moments > 0
+    assert measured.crashed == [0.0, 1.0]
+    own = measured.scores[STRAIGHT].own
+    assert own.agents > 0 and own.without_m == own.with_m
+
+
+@pytest.mark.parametrize(
+    ("kind", "sentence"),
+    [
+        ("Mute", "Mute-v0 does not report crashes, .*; name the key of its infos: register_reader"),
+        ("Uncopied", r"copy.deepcopy of .*Uncopied-v0 failed \(TypeError: cannot pickle 'Socket' object\); make its"),
+    ],
+)
+def test_own_environments_whose_plans_cannot_be_judged_are_refused_in_a_line(kind: str, sentence: str):
+    with pytest.raises(UserError, match=sentence):
+        measure_plans(run(OWN.replace("Planned", kind)))
 
 
 def test_what_has_no_plans_is_said(monkeypatch: pytest.MonkeyPatch):
