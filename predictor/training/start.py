@@ -48,12 +48,12 @@ def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episo
     info.spec.check_recorded(spec, f"checkpoint '{config.init}'", f"store {address(config.data[0])}")
     spec = replace(spec, feature_scales=info.spec.feature_scales)  # scales are the network's, the rest the data's
     if not config.only_spread:
-        model = build(info.model, spec, info.config, config.horizon_steps)
-        model.load_state_dict(source.state_dict())
-        return model
+        plain = build(info.model, spec, info.config, config.horizon_steps)
+        plain.load_state_dict(source.state_dict())
+        return plain
     if not getattr(info.config, "num_modes", 0):
         raise UserError(f"only_spread needs a checkpoint with modes, and '{config.init}' has none; leave it out")
-    model = build(info.model, spec, replace(info.config, spread_by_type=True), config.horizon_steps)
+    model: Any = build(info.model, spec, replace(info.config, spread_by_type=True), config.horizon_steps)
     of_types = model.self_edges.spread_shift
     model.load_state_dict({"self_edges.spread_shift": of_types, **source.state_dict()})
     model.requires_grad_(False)

@@ -51,7 +51,8 @@ def test_drivers_that_cannot_drive_are_refused_before_anything_runs():
 
 def test_the_planner_takes_the_checkpoint_that_a_run_names():
     task = Task("highway-fast-v0", "forecast", checkpoint="highway")
-    assert compared_drivers(task, ("planner", "slower")) == ("planner:highway", "slower")
+    named = ("planner:highway", "planner@0.3:highway", "planner:merge", "slower")
+    assert compared_drivers(task, ("planner", "planner@0.3", "planner:merge", "slower")) == named
     assert compared_drivers(Task("highway-fast-v0", "none"), ("planner",)) == ("planner",)
 
 
