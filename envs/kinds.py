@@ -5,7 +5,6 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.wrappers import Autoreset
 
-from envs.forecast_wrapper import ForecastWrapper
 from predictor.support.errors import UserError, short
 
 ForecastKind = tuple[type, str]
@@ -15,7 +14,7 @@ VECTOR: ForecastKind = (gym.vector.VectorEnv, "a gymnasium vector environment (S
 
 
 def require_kind(env: Any, kind: ForecastKind, wrapper: str) -> None:
-    """Checks that a wrapper is given an environment of its kind, which has no forecasts yet.
+    """Checks that a wrapper is given an environment of its kind.
 
     Args:
         env: what was given.
@@ -23,17 +22,11 @@ def require_kind(env: Any, kind: ForecastKind, wrapper: str) -> None:
         wrapper: name of the wrapper, for messages.
 
     Raises:
-        UserError: it is of another kind, for which the message names the wrapper; or it has forecasts already.
+        UserError: it is of another kind, for which the message names the wrapper.
     """
     wanted, name = kind
     if not isinstance(env, wanted):
         raise UserError(f"{wrapper} wraps {name}, got {_described(env)}")
-    inner = _with_forecasts(env)
-    if inner is not None:
-        raise UserError(
-            f"{wrapper} wraps an environment without forecasts, but {inner} inside of it adds them already; leave one "
-            "of both out"
-        )
 
 
 def refuse_autoreset(env: gym.Env, wrapper: str) -> None:
@@ -68,13 +61,3 @@ def _described(env: Any) -> str:
     if "pettingzoo" in packages:
         return f"the PettingZoo environment {name}; use ForecastParallelEnv (envs.parallel)"
     return f"{name}; derive the environment from that class, or convert it"
-
-
-def _with_forecasts(env: Any) -> str | None:
-    """Returns the name of the wrapper with forecasts in a chain of wrappers, if there is one."""
-    while env is not None:
-        if isinstance(env, ForecastWrapper):
-            return type(env).__name__
-        own = getattr(env, "__dict__", {})
-        env = own.get("env", own.get("venv"))
-    return None

@@ -249,7 +249,7 @@ def require_indexed(scene: MultiagentScene, agents: Iterable[str], source: str =
     if missing:
         known = short([*scene.index_of], 100)
         raise UserError(
-            f"{source}: index_of must have the index of each living agent that is observed, but lacks "
+            f"{source}: index_of must have the index of each agent that is observed at a reset, but lacks "
             f"{short(missing, 100)} of the environment; its names are {known}; name agents as the environment does"
         )
 

@@ -46,7 +46,7 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     then agent → other), `valid`.
     `envs.entries.ego_entries` gives the shapes. Agents may differ in their own spaces, die and join at any step. An
     agent's last observation has forecasts too; if the reader no longer reports the agent, all its entries are zero,
-    `valid` too. The reader must report each agent that lives. With `flatten=True` an observation is one Box, in the
+    `valid` too. At a reset the reader must report each. With `flatten=True` an observation is one Box, in the
     Dict's key order.
 
     The history is cleared at reset only. After each step, `scene` and `forecast` hold all agents in the world frame.
@@ -180,7 +180,9 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
             self._unchecked.remove("reset")
         self._reader.reset()
         self._last_actions = {}
-        scene, shown = self._read(observations, observations), self._own(observations)
+        inside = getattr(self.env.unwrapped, "agents", observations)  # a wrapper may show agents that are not there yet
+        scene = self._read(observations, [agent for agent in observations if agent in inside])
+        shown = self._own(observations)
         if self._forward is not None:
             self._forward.begin(self._place, scene, shown, seed)
             return shown, infos
@@ -199,24 +201,17 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
                 check_reward(reward, f"'{agent}' of {self._source}")
             self._unchecked.remove("step")
         self._last_actions = dict(actions)
-        ended = {agent for over in (terminations, truncations) for agent in over if over[agent]}
-        scene, shown = self._read(observations, self._living(observations, ended)), self._own(observations)
+        scene, shown = self._read(observations), self._own(observations)
         if self._forward is not None:
             self._forward.go_on(self._place, scene, shown)
         else:
             shown = self._with_views(scene, shown)
         return shown, rewards, terminations, truncations, infos
 
-    def _living(self, observations: Mapping[str, Any], ended: set[str]) -> list[str]:
-        """Returns the observed agents that live on; the simulator knows better than a wrapper that shows the dead."""
-        inside = getattr(self.env.unwrapped, "agents", self.env.agents)
-        living = {*self.env.agents}.intersection(inside) - ended
-        return [agent for agent in observations if agent in living]
-
-    def _read(self, observations: Mapping[str, Any], living: Iterable[str]) -> MultiagentScene:
+    def _read(self, observations: Mapping[str, Any], required: Iterable[str] = ()) -> MultiagentScene:
         source = f"scene reader of {self._source}"
         scene = check_multiagent_scene(self._reader.read(self.env), self._reader.spec, source)
-        require_indexed(scene, living, source)
+        require_indexed(scene, required, source)
         if self.stream.config.arm.shown.true_futures:
             horizon_steps = self.stream.horizon_steps
             xy_m = all_keeping_on(self.env, self._reader, scene.scene, observations, self._last_actions, horizon_steps)

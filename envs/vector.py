@@ -73,7 +73,7 @@ class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):
         plan_names: names of the candidate plans; none without `what_if`.
 
     Raises:
-        UserError: no vector environment, or one with forecasts already; the environments report no scenes, differ from
+        UserError: no vector environment; the environments report no scenes, differ from
             each other, or do not fit the forecaster; no plan model for `what_if=True`; no room for what the arm shows.
     """
 

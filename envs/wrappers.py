@@ -210,7 +210,7 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
         what_if: forecast for these plans, world axes, with an axis of plans; None without `what_if`.
 
     Raises:
-        UserError: not one gymnasium environment, or one with Autoreset or forecasts inside; no reader, or one although
+        UserError: not one gymnasium environment, or one with Autoreset inside; no reader, or one although
             the env is a `SceneObservation`; no checkpoint, or a forecaster of another spec (features, dt); no plan
             model for `what_if=True`; no room for what the arm shows.
     """

@@ -94,6 +94,7 @@ def test_the_guide_has_python_where_it_says():
         "rl-baselines3-zoo",
         "Collect, train, wrap",
         "Install a reader with your package",
+        "Spaces and rewards",
         "What a reader must return",
     }
     assert sum(len(blocks(text, "python")) for text in sections().values()) == GUIDE.read_text().count("```python")

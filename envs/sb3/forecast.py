@@ -62,7 +62,7 @@ class VecForecast(ForecastWrapper, VecEnvWrapper):
         plan_names: names of the candidate plans; none without `what_if`.
 
     Raises:
-        UserError: no VecEnv, or one with forecasts already; the environments report no scenes, differ from each other,
+        UserError: no VecEnv; the environments report no scenes, differ from each other,
             or do not fit the forecaster; no plan model for `what_if=True`.
     """
 

@@ -7,7 +7,7 @@ import gymnasium as gym
 import pytest
 from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import Autoreset, TimeLimit
-from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from envs.parallel import ForecastParallelEnv
 from envs.readers import FunctionReader
@@ -16,7 +16,7 @@ from envs.vector import VectorForecast
 from envs.wrappers import ForecastObservation, SceneObservation
 from predictor.support.errors import UserError
 from tests.envs.dict_crowd import DictCrowd
-from tests.envs.semantics import Crowd, Swarm, SwarmReader, read_crowd
+from tests.envs.semantics import Crowd, Swarm, read_crowd
 from tests.envs.testing.test_check_reader import SPEC
 
 READER = FunctionReader(read_crowd, SPEC)
@@ -42,23 +42,12 @@ WRONG: dict[str, tuple[Any, Callable[[], Any], str]] = {
         ForecastObservation, lambda: DummyVecEnv([scenes]), "the Stable-Baselines3 environment Dummy.*use VecForecast",
     ),
     "nothing": (ForecastObservation, lambda: 3, "got int; derive the environment from that class, or convert it"),
-    "twice": (ForecastObservation, lambda: TimeLimit(with_forecasts(), 9), "but ForecastObservation inside .* adds"),
     "single in vector": (VectorForecast, scenes, r"VectorEnv, .*the single environment .*; use ForecastObservation"),
     "SB3 in vector": (VectorForecast, lambda: DummyVecEnv([scenes]), "Stable-Baselines3 .*; use VecForecast"),
-    "vector twice": (
-        VectorForecast, lambda: VectorForecast(SyncVectorEnv([scenes]), "constant-velocity"), "VectorForecast inside",
-    ),
     "vector in SB3": (VecForecast, lambda: SyncVectorEnv([scenes]), r"VecEnv \(make_vec_env\), .*; use VectorForecast"),
     "single in SB3": (VecForecast, scenes, "the single environment SceneObservation; use ForecastObservation"),
-    "SB3 twice": (
-        VecForecast, lambda: VecMonitor(VecForecast(DummyVecEnv([scenes]), "constant-velocity")), "VecForecast inside",
-    ),
     "single in PettingZoo": (ForecastParallelEnv, Crowd, "a PettingZoo parallel env, .*Crowd; use ForecastObservation"),
     "PettingZoo's class": (ForecastParallelEnv, lambda: Swarm, r"got the class Swarm; make an environment of it"),
-    "PettingZoo twice": (
-        ForecastParallelEnv, lambda: ForecastParallelEnv(Swarm(), "constant-velocity", reader=SwarmReader),
-        "but ForecastParallelEnv inside of it adds them already; leave one of both out",
-    ),
 }  # fmt: skip
 
 

@@ -592,23 +592,18 @@ def test_every_observed_agent_must_be_named_at_the_reset(fault: str):
         env.reset(seed=0)
 
 
-def test_an_agent_that_lives_on_must_stay_named_and_one_that_ends_need_not():
-    late = type("Late", (Renaming,), {"since": 2})
-    env = ForecastParallelEnv(Toy(), "constant-velocity", reader=late)
-    env.reset(seed=0)
-    env.step(dict.fromkeys(env.agents, 0))
-    with pytest.raises(UserError, match=r"lacks \['stays', 'dies', 'joins', 'visits'\]"):
-        env.step(dict.fromkeys(env.agents, 0))
+def test_one_that_is_no_longer_named_has_entries_of_zeros():
+    """As one that an intervention has taken out."""
 
-    def without_the_dead(index_of: Mapping[str, int]) -> Mapping[str, int]:
+    def without_one(index_of: Mapping[str, int]) -> Mapping[str, int]:
         return {name: index for name, index in index_of.items() if name != "dies"}
 
-    forgets = type("Forgets", (Renaming,), {"since": 3, "rename": staticmethod(without_the_dead)})
+    forgets = type("Forgets", (Renaming,), {"since": 2, "rename": staticmethod(without_one)})
     env = ForecastParallelEnv(Toy(), "constant-velocity", reader=forgets)
     env.reset(seed=0)
-    for _ in range(3):
+    for _ in range(2):
         shown, _, ended, *_ = env.step(dict.fromkeys(env.agents, 0))
-    assert ended["dies"]
+    assert not ended["dies"]
     assert not shown["dies"]["valid"].any()
     assert shown["stays"]["valid"].any()
 
