@@ -622,6 +622,23 @@ class BlackDeath(BaseParallelWrapper):
         return zeros | {agent: shown[agent] for agent in self.agents if agent in shown}, *others
 
 
+class ShowsAll(BlackDeath):
+    """Shows zeros of agents that have not come yet, too."""
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        shown, infos = super().reset(seed=seed, options=options)
+        self.agents = list(self.possible_agents)
+        zeros = {agent: np.zeros(self.observation_space(agent).shape, np.float32) for agent in self.agents}
+        return zeros | shown, dict.fromkeys(self.agents, {}) | infos
+
+
+def test_a_wrapper_that_shows_the_dead_from_the_reset_on_is_no_fault_of_the_reader():
+    env = ForecastParallelEnv(ShowsAll(Toy()), "constant-velocity", reader=ToyReader)
+    shown, _ = env.reset(seed=0)
+    assert not shown["joins"]["valid"].any()
+    assert shown["stays"]["valid"].any()
+
+
 def test_a_wrapper_that_shows_the_dead_is_no_fault_of_the_reader():
     env = ForecastParallelEnv(BlackDeath(Toy()), "constant-velocity", reader=ToyReader)
     env.reset(seed=0)
