@@ -115,9 +115,13 @@ def test_a_policy_that_drives_is_in_the_name_by_its_content(cells: Callable[...,
 def test_the_planners_settings_are_in_the_name(cells: Callable[..., list[Cell]], monkeypatch: pytest.MonkeyPatch):
     def names() -> dict[str, str]:
         drivers = '["planner", "planner:oracle", "planner@0.3", "slower"]'
-        return {cell.title: cell.name for cell in cells(env_id=HIGHWAY, seeds="1", arms='["none"]', references=drivers)}
+        made = cells(env_id=HIGHWAY, seeds="1", arms='["none"]', references=drivers)
+        risks.update({cell.line: cell.forecaster["max_risk"] for cell in made if cell.forecaster})
+        return {cell.title: cell.name for cell in made}
 
+    risks: dict[str, float] = {}
     before = names()
+    assert risks == {"planner": 0.05, "planner:oracle": 0.05, "planner@0.3": 0.3}
     assert len(set(before.values())) == len(before)
     monkeypatch.setattr("agents.studies.cells.planner_config", lambda _: PlannerConfig(max_risk=0.7))
     changed = {title for title, name in names().items() if name != before[title]}
