@@ -107,18 +107,23 @@ def check_own(own: Mapping[str, gym.Space], observation: Any, source: str) -> No
             )
 
 
+def as_numbers(value: Any) -> np.ndarray | None:
+    """Returns a value as an array of numbers; None of what is none."""
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError):  # a ragged list, a tensor of another device
+        return None
+    return array if array.dtype.kind in "biuf" else None
+
+
 def check_reward(reward: Any, source: str) -> None:
     """Checks that a reward is a finite number, or several.
 
     Raises:
         UserError: it is not.
     """
-    try:
-        values = np.asarray(reward)
-        fine = values.dtype.kind in "biuf" and bool(np.isfinite(values).all())
-    except (TypeError, ValueError, RuntimeError):
-        fine = False
-    if not fine:
+    values = as_numbers(reward)
+    if values is None or not np.isfinite(values).all():
         raise UserError(f"the reward of {source} must be a finite number, got {short(reward, 60)}; return a float")
 
 

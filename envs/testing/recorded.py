@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from envs.own_observation import as_numbers
 from envs.testing.identity import identity_problems
 from envs.testing.motion import heading_problems, misfit_problems, motion_problems, scale_problems
 from envs.testing.playing import Episode, Moment, frozen
@@ -96,11 +97,8 @@ def _no_numbers(episodes: Sequence[Episode]) -> list[str]:
         for time, rewards in enumerate(episode.rewards, start=1)
         for agent, reward in rewards.items()
     ):
-        try:
-            found = np.asarray(reward)
-        except ValueError:  # a ragged list
-            found = np.array(None)
-        if found.dtype.kind not in "biuf" or found.size != 1:
+        found = as_numbers(reward)
+        if found is None or found.size != 1:
             whose = f" of '{agent}'" if agent else ""
             return [
                 f"the environment's own reward{whose} must be one number, got {short(repr(reward), 60)} in step {time}"
