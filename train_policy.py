@@ -19,7 +19,6 @@ from agents.preset_settings import settings_from_file, settings_from_words
 from agents.presets import Algorithm
 from agents.results import PACKAGES
 from agents.runs import CHECKPOINT_FILE, FORECASTER, POLICY_FILE, check_forecaster, load_model, open_run
-from agents.step_count import check_step_unit
 from agents.task import Backend, Observe, Task
 from agents.training import TrainingPlan, train
 from agents.video import film
@@ -243,8 +242,6 @@ def _run(config: TrainPolicyConfig, console: Console) -> None:
     settings["preset_file"] = config.preset
     for name in ("out", "resume", "num_envs", "driver", "timeout_s"):
         settings.pop(name)
-    if config.resume:
-        check_step_unit(config.folder / CHECKPOINT_FILE, plan.task.is_multiagent)
     if config.resume and not check_forecaster(config.folder, pin):
         console.print(
             f"note: {config.folder} does not say which forecaster it was trained on; it goes on with this one"

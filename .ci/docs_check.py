@@ -26,6 +26,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -266,29 +267,39 @@ def copy_tree(target: Path, root: Path = ROOT) -> None:
             shutil.copy2(root / name, target / name)
 
 
-def check(pages: Sequence[Path], limit_s: float = LIMIT_S) -> Iterator[Result]:
-    """Runs the blocks of pages of this repository, each page in its own copy.
+def check(pages: Sequence[Path], limit_s: float = LIMIT_S, jobs: int = 1) -> Iterator[Result]:
+    """Runs the blocks of pages of this repository, each page in its own copy; yields the results in the pages' order.
+
+    Args:
+        pages: pages.
+        limit_s: longest time of a block [s].
+        jobs: number of pages that run at the same time.
 
     Raises:
         DocsError: a page has a block that cannot be understood.
     """
-    every = {page: blocks_of(page) for page in pages}  # errors of the pages are raised before any block runs
-    for blocks in every.values():
-        if not blocks:
-            continue
-        with tempfile.TemporaryDirectory() as folder:
-            copy_tree(Path(folder))
-            page = Page(Path(folder), limit_s)
-            try:
-                yield from map(page.run, blocks)
-            finally:
-                page.close()
+    every = [blocks_of(page) for page in pages]  # errors of the pages are raised before any block runs
+    with ThreadPoolExecutor(jobs) as pool:
+        for results in pool.map(lambda blocks: _run_page(blocks, limit_s), filter(None, every)):
+            yield from results
+
+
+def _run_page(blocks: Sequence[Block], limit_s: float) -> list[Result]:
+    """Runs the blocks of one page."""
+    with tempfile.TemporaryDirectory() as folder:
+        copy_tree(Path(folder))
+        page = Page(Path(folder), limit_s)
+        try:
+            return [page.run(block) for block in blocks]
+        finally:
+            page.close()
 
 
 def main() -> int:
     """Runs the command; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pages", nargs="*", type=Path, help="pages to check; all of README.md and docs/ if left out")
+    parser.add_argument("--jobs", type=int, default=1, help="number of pages that run at the same time")
     parser.add_argument("--limit-s", type=float, default=LIMIT_S, help="seconds that a block may take")
     arguments = parser.parse_args()
     pages = [page.resolve() for page in arguments.pages] or [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -297,7 +308,7 @@ def main() -> int:
         parser.error(f"pages must be of this repository, {', '.join(outside)} is not")
     results = []
     try:
-        for result in check(pages, arguments.limit_s):
+        for result in check(pages, arguments.limit_s, arguments.jobs):
             print(result, flush=True)
             results.append(result)
     except DocsError as error:

@@ -19,7 +19,8 @@ from agents.task import Task, task_of
 from agents.vec_envs import DrivenEnv
 from envs.drivers.trained import env_for_driver, parallel_env_for_driver
 from envs.sb3 import policy_file
-from envs.sb3.padded_spaces import PaddedObservation, learners_named, own_action, roles_of
+from envs.sb3.acting import ActingPolicy, ActingTeam
+from envs.sb3.padded_spaces import learners_named
 from envs.sb3.policy_file import PolicyNote, read_policy_note
 from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.support.errors import UserError
@@ -44,19 +45,21 @@ class TrainedPolicy:
         """Begins without a state."""
         self.model = model
         self._env = env
-        self._states: dict[str, Any] = {}
+        self._acting = ActingPolicy(model)
         self._episode = -1
 
     def __call__(self, observation: Any) -> Any:
         """Returns the most likely action."""
-        return self._action("", observation)
+        if self._begins():
+            self._acting = ActingPolicy(self.model)
+        return self._acting(observation)
 
-    def _action(self, agent: str, observation: Any) -> Any:
-        if is_recurrent(self.model) and self._episode != _episodes(self._env):
-            self._episode = _episodes(self._env)
-            self._states = {}
-        action, self._states[agent] = self.model.predict(observation, self._states.get(agent), deterministic=True)
-        return action
+    def _begins(self) -> bool:
+        """Returns whether an episode has begun since the latest call, of which a recurrent policy must know."""
+        if not is_recurrent(self.model) or self._episode == (episode := _episodes(self._env)):
+            return False
+        self._episode = episode
+        return True
 
 
 class CountedEpisodes(gym.Wrapper[Any, Any, Any, Any]):
@@ -199,23 +202,10 @@ class _TeamPolicy(TrainedPolicy):
 
     def __init__(self, path: str, model: BaseAlgorithm, env: Any, names: tuple[str, ...]) -> None:
         super().__init__(model, env)
-        learners = learners_named(env.possible_agents, names, f"policy {path}")
-        self._actions = {agent: env.action_space(agent) for agent in learners}
-        spaces = {agent: env.observation_space(agent) for agent in learners}
-        self._padded = PaddedObservation(spaces, roles_of(spaces, self._actions), None)
-        if self._padded.space != model.observation_space:
-            raise UserError(
-                f"policy {path} was trained on {_line(model.observation_space)}, but the env gives "
-                f"{_line(self._padded.space)}"
-            )
+        self._team = ActingTeam(model, env, names, f"policy {path}")
 
     def __call__(self, observation: Any) -> Any:
+        if self._begins():
+            self._team.forget()
         seen = {agent: one for agent, one in observation.items() if agent in self._env.agents}
-        chosen = self._env.drive_others(seen)
-        for agent in (name for name in seen if name in self._actions):
-            chosen[agent] = own_action(self._action(agent, self._padded.one(agent, seen[agent])), self._actions[agent])
-        return chosen
-
-
-def _line(space: Any) -> str:
-    return " ".join(str(space).split())
+        return self._env.drive_others(seen) | self._team(seen)

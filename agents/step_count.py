@@ -6,19 +6,11 @@ in budgets, measurements, checkpoints, the progress bar, TensorBoard and schedul
 """
 
 import math
-import zipfile
-from pathlib import Path
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from envs.sb3.policy_file import read_note
-from predictor.support.errors import UserError
 from predictor.support.progress import WorkShown
-
-_UNIT = "step_unit"
-STEP_UNIT = {_UNIT: "environment"}
-"""Content of a checkpoint's note that says what its steps count."""
 
 
 class CountSteps(BaseCallback):
@@ -75,26 +67,3 @@ class StepProgress(BaseCallback):
         if self._shown is not None:
             self._shown.__exit__(None, None, None)
             self._shown = None
-
-
-def check_step_unit(checkpoint: Path, is_multiagent: bool) -> None:
-    """Checks that the steps of a checkpoint, if there is one, are environment steps.
-
-    Args:
-        checkpoint: path of the model from which a training would go on.
-        is_multiagent: whether several agents may learn; otherwise there is no difference.
-
-    Raises:
-        UserError: it comes from a version that counted the steps of every learner.
-    """
-    if not is_multiagent or not checkpoint.exists():
-        return
-    try:
-        note = read_note(checkpoint)
-    except zipfile.BadZipFile:
-        return  # loading it has the message
-    if note.get(_UNIT) != STEP_UNIT[_UNIT]:
-        raise UserError(
-            f"cannot resume {checkpoint.parent}: it counted the steps of every learner, but steps are environment "
-            "steps now (one step of a copy is one, however many agents learn); start a new run with another --out"
-        )

@@ -28,7 +28,7 @@ from agents.plan_scores import plan_actions
 from agents.preset_settings import changed
 from agents.presets import Algorithm, Preset, preset_for
 from agents.runs import BEST_FILE, CHECKPOINT_FILE, CURVE_FILE, POLICY_FILE, load_model, read_curve, save_model
-from agents.step_count import STEP_UNIT, CountSteps, StepProgress, check_step_unit
+from agents.step_count import CountSteps, StepProgress
 from agents.summaries import mean_of_known, significantly_worse
 from agents.task import SELECTION_SEED, Task
 from agents.vec_envs import EpisodeResult, make_venv
@@ -128,7 +128,7 @@ def train(plan: TrainingPlan, run_dir: Path, progress_bar: bool = True) -> Path:
         model = _resume_or_make(plan, venv, run_dir)
         if model.num_timesteps < plan.steps:
             _learn(plan, model, selection, run_dir, note, progress_bar)
-            save_model(model, run_dir / CHECKPOINT_FILE, STEP_UNIT, note, to_continue=True)
+            save_model(model, run_dir / CHECKPOINT_FILE, note=note, to_continue=True)
     finally:
         venv.close()
         selection.close()
@@ -162,7 +162,7 @@ def _learn(
     )
 
     def extra() -> dict[str, Any]:
-        return STEP_UNIT | {"seconds": select.seconds, "loop_errors": errors.sums()}
+        return {"seconds": select.seconds, "loop_errors": errors.sums()}
 
     save = SaveCheckpoint(checkpoint, plan.checkpoint_every, note, extra, restart)
     callbacks = [CountSteps(plan.num_envs), errors, save, select, *([progress] if progress_bar else [])]
@@ -202,7 +202,6 @@ def _resume_or_make(plan: TrainingPlan, venv: VecEnv, run_dir: Path) -> BaseAlgo
         model = make_model(plan, venv, logs)
         _seed_from_steps(plan, model)
         return model
-    check_step_unit(checkpoint, plan.task.is_multiagent)
     model = load_model(checkpoint, plan.algorithm, venv, plan.device)
     model.tensorboard_log = logs  # the folder may have moved
     _seed_from_steps(plan, model)

@@ -9,14 +9,13 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.summaries import EXTREMES
 from agents.task import EVALUATION_SEED, Task
-from agents.vec_envs import EpisodeResult, MakeCopy, learners_of, make_multiagent_venv, own_observations
+from agents.vec_envs import EpisodeResult, MakeCopy, own_observations
 from envs.own_observation import without_added
 from envs.parallel import ForecastParallelEnv
 from envs.readers import multiagent_reader_for
 from envs.readers.highway import is_highway_env
 from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS
-from envs.sb3.acting import ActingPolicy
-from envs.sb3.agents_as_rows import ParallelVecEnv
+from envs.sb3.acting import ActingPolicy, ActingTeam
 from envs.simulators.envpool import ENV_IDS, HIGHWAY_ENV_OF
 from envs.video.film_forecasts import FilmForecasts, record_pictures, view_of
 from envs.video.highway import record_episode
@@ -45,20 +44,11 @@ def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) ->
         filmed = replace(task, observe="forecast", checkpoint=shown)
     env = MakeCopy(filmed)()
     assert isinstance(env, ForecastParallelEnv)
-    learners = learners_of(task, env)
-    venv = make_multiagent_venv(task, 1).venv  # pads observations as in training
-    assert isinstance(venv, ParallelVecEnv)
-    acting = {agent: ActingPolicy(policy) for agent in learners}
+    team = ActingTeam(policy, env, task.learners, task.env_id)
 
     def act(observations: dict[str, Any]) -> dict[str, Any]:
-        own = own_observations(observations)
-        actions = env.drive_others(own)
-        for agent in observations:
-            if agent in learners:
-                seen = own[agent] if task.observe == "none" else observations[agent]
-                chosen = acting[agent](venv.padded_observation(agent, seen))
-                actions[agent] = venv.own_action(agent, chosen)
-        return actions
+        others: dict[str, Any] = env.drive_others(own_observations(observations))
+        return others | team(observations)
 
     try:
         return record_multiagent_episode(
@@ -66,7 +56,6 @@ def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) ->
         )
     finally:
         env.close()
-        venv.close()
 
 
 def _num_drawn(forecaster: Forecaster) -> int:

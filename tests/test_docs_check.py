@@ -198,6 +198,22 @@ def test_the_command_fails_with_the_block(tmp_path: Path):
     )
 
 
+def test_pages_run_side_by_side_and_are_told_in_their_order(tmp_path: Path):
+    """The first page waits for the second."""
+    repository = tmp_path / "repository"
+    (repository / ".ci").mkdir(parents=True)
+    (repository / "docs").mkdir()
+    (repository / ".ci" / "docs_check.py").write_text(FILE.read_text())
+    began = tmp_path / "began"
+    (repository / "README.md").write_text(f"```bash\nuntil test -e {began}; do sleep 0.1; done\n```\n")
+    (repository / "docs" / "second.md").write_text(f"```bash\ntouch {began}\n```\n")
+    subprocess.run(["git", "init", "-q"], cwd=repository, check=True)
+    command = [sys.executable, ".ci/docs_check.py", "--limit-s", "30", "--jobs", "2"]
+    done = subprocess.run(command, cwd=repository, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done
+    assert done.stdout.index("README.md:1 ") < done.stdout.index("docs/second.md:1 ")
+
+
 def test_a_page_of_another_folder_is_one_clear_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

@@ -16,8 +16,7 @@ import numpy as np
 
 from envs.arms import Arm
 from envs.drivers.all_agents import Driver, make_driver
-from envs.own_observation import carries_forecasts, space_without_added, without_added
-from envs.sb3.padded_spaces import PaddedObservation, learners_named, own_action, roles_of
+from envs.own_observation import carries_forecasts, space_without_added
 from predictor.own_forecasters import is_own
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
@@ -25,7 +24,7 @@ from predictor.support.errors import UserError
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-    from envs.sb3.acting import ActingPolicy
+    from envs.sb3.acting import ActingTeam
     from envs.sb3.policy_file import PolicyNote
 
 EgoDriver = Callable[[Any], Any]
@@ -43,22 +42,18 @@ def trained_driver(path: str, env: Any, rng: np.random.Generator) -> Driver:
     Raises:
         UserError: no such policy, or one that was trained on other observations.
     """
+    from envs.sb3.acting import ActingTeam  # most drivers need no SB3
+
     policy, note = kept_policy(path), note_of(path)
-    learners = learners_named(env.possible_agents, () if note is None else note.learners, path)
-    whole = carries_forecasts(policy.observation_space)
-    spaces = {agent: _seen_space(env.observation_space(agent), whole) for agent in learners}
-    actions = {agent: env.action_space(agent) for agent in learners}
-    padded = PaddedObservation(spaces, roles_of(spaces, actions), None)
-    if padded.space != policy.observation_space:
-        raise UserError(
-            f"policy {path} was trained on {_line(policy.observation_space)}, but the env gives {_line(padded.space)}"
-        )
+    team = ActingTeam(policy, env, () if note is None else note.learners, f"policy {path}")
     if note is not None and is_own(note.driver):
         raise UserError(f"policy {path}: the note names driver '{note.driver}', which imports code; train it anew")
     others = (
-        make_driver(note.driver, env, rng) if note is not None and set(learners) < set(env.possible_agents) else None
+        make_driver(note.driver, env, rng)
+        if note is not None and team.actions.keys() < set(env.possible_agents)
+        else None
     )
-    return partial(_drive, path, {}, env, padded, actions, others)
+    return partial(_drive, env, team, others)
 
 
 def trained_ego(path: str) -> EgoDriver:
@@ -72,41 +67,9 @@ def trained_ego(path: str) -> EgoDriver:
     return ActingPolicy(kept_policy(path))
 
 
-def _drive(
-    path: str,
-    acting: dict[str, "ActingPolicy"],
-    env: Any,
-    padded: PaddedObservation,
-    actions: Mapping[str, gym.Space],
-    others: Driver | None,
-    observations: Mapping[str, Any],
-) -> dict[str, Any]:
-    from envs.sb3.acting import ActingPolicy  # most drivers need no SB3
-
-    policy = kept_policy(path)
-    whole = carries_forecasts(policy.observation_space)
-    for gone in acting.keys() - observations.keys():
-        del acting[gone]  # an agent that comes back remembers nothing
-    chosen = {} if others is None else others({a: s for a, s in observations.items() if a not in actions})
-    for agent in (a for a in observations if a in actions and a in env.agents):
-        act = acting.setdefault(agent, ActingPolicy(policy))
-        action = act(padded.one(agent, _seen(observations[agent], whole)))
-        chosen[agent] = own_action(action, actions[agent])
-    return chosen
-
-
-def _line(space: gym.Space) -> str:
-    return " ".join(str(space).split())
-
-
-def _seen_space(space: gym.Space, sees_forecasts: bool) -> gym.Space:
-    """Returns an agent's observation space with forecasts, or without any."""
-    return space if sees_forecasts else space_without_added(space)
-
-
-def _seen(observation: Mapping[str, Any], sees_forecasts: bool) -> Any:
-    """Returns the observation in the space of `_seen_space`."""
-    return observation if sees_forecasts else without_added(observation)
+def _drive(env: Any, team: "ActingTeam", others: Driver | None, observations: Mapping[str, Any]) -> dict[str, Any]:
+    chosen = {} if others is None else others({a: s for a, s in observations.items() if a not in team.actions})
+    return chosen | team({agent: seen for agent, seen in observations.items() if agent in env.agents})
 
 
 def env_for_driver(env: gym.Env, name: str) -> gym.Env:

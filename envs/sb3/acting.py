@@ -1,11 +1,17 @@
 """Most likely actions of a policy through episodes; a recurrent policy keeps its state until an episode ends."""
 
 import copy
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from jaxtyping import Bool
 from stable_baselines3.common.base_class import BaseAlgorithm
+
+from envs.own_observation import carries_forecasts, space_without_added, without_added
+from envs.sb3.padded_spaces import PaddedObservation, learners_named, own_action, roles_of
+from predictor.support.errors import UserError
 
 
 class ActingPolicy:
@@ -45,3 +51,57 @@ class ActingPolicy:
         copied = ActingPolicy(self._policy)
         copied._state = copy.deepcopy(self._state, memo)
         return copied
+
+
+class ActingTeam:
+    """Policy that acts for all learners of one PettingZoo environment, their observations padded as in training.
+
+    An agent that leaves and comes back remembers nothing. Copies (`copy.deepcopy`) share the policy.
+
+    Args:
+        policy: policy to act with.
+        env: environment whose observations it gets; a policy that was trained without forecasts may get some.
+        names: names or roles of the learners; none stands for all agents.
+        source: name of the policy, for messages.
+
+    Attributes:
+        actions: own action space of each learner, by name.
+
+    Raises:
+        UserError: a name is unknown, or the policy was trained on other observations.
+    """
+
+    def __init__(self, policy: BaseAlgorithm, env: Any, names: Sequence[str], source: str) -> None:
+        """Finds the padded spaces."""
+        wanted: Any = policy.observation_space
+        self._strips = not carries_forecasts(wanted)
+        learners = learners_named(env.possible_agents, names, source)
+        spaces = {agent: self._seen_space(env.observation_space(agent)) for agent in learners}
+        self.actions: dict[str, gym.Space] = {agent: env.action_space(agent) for agent in learners}
+        self._padded = PaddedObservation(spaces, roles_of(spaces, self.actions), None)
+        if self._padded.space != wanted:
+            raise UserError(f"{source} was trained on {_line(wanted)}, but the env gives {_line(self._padded.space)}")
+        self._fresh = ActingPolicy(policy)
+        self._acting: dict[str, ActingPolicy] = {}
+
+    def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns the own action of each learner among the observations of the agents that live."""
+        for gone in self._acting.keys() - observations.keys():
+            del self._acting[gone]
+        chosen = {}
+        for agent in (name for name in observations if name in self.actions):
+            act = self._acting.setdefault(agent, copy.deepcopy(self._fresh))
+            seen = without_added(observations[agent]) if self._strips else observations[agent]
+            chosen[agent] = own_action(act(self._padded.one(agent, seen)), self.actions[agent])
+        return chosen
+
+    def forget(self) -> None:
+        """Begins an episode: nothing is remembered."""
+        self._acting = {}
+
+    def _seen_space(self, space: gym.Space) -> gym.Space:
+        return space_without_added(space) if self._strips else space
+
+
+def _line(space: gym.Space) -> str:
+    return " ".join(str(space).split())

@@ -171,14 +171,6 @@ class ParallelVecEnv(VecEnv):
         infos = [self._info(agent, turn) for agent, turn in zip(self.agents_of_envs, turns, strict=True)]
         return self._observe(), rewards, dones, infos
 
-    def padded_observation(self, agent: str, observation: Any) -> Any:
-        """Returns a learner's own observation in the VecEnv's space: padded, with the indicator."""
-        return self._observation.one(agent, observation)
-
-    def own_action(self, agent: str, action: Any) -> Any:
-        """Returns a learner's own action for one of the VecEnv's space."""
-        return own_action(action, self._own_actions[agent])
-
     def close(self) -> None:
         """Closes all copies."""
         for env in self.envs:

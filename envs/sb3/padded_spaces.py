@@ -1,6 +1,6 @@
 """One space for agents whose own spaces differ: padded observations with the agent's role appended, and cut actions.
 
-Used by `envs.sb3.agents_as_rows` and `envs.drivers.trained`; independent of environments and episodes.
+Used by `envs.sb3.agents_as_rows` and `envs.sb3.acting`; independent of environments and episodes.
 """
 
 from collections.abc import Mapping, Sequence

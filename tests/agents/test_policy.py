@@ -173,6 +173,6 @@ def test_a_recurrent_policy_remembers_its_episode_alone():
         if reset:
             env.reset(seed=0)
         policy(observation)
-        states.append(policy._states[""][0].copy())
+        states.append(policy._acting._state[0].copy())
     assert not np.allclose(states[0], states[1])
     np.testing.assert_array_equal(states[0], states[2])

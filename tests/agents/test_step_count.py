@@ -7,14 +7,10 @@ from typing import Any
 import pytest
 
 from agents.presets import DQNPreset, PPOPreset
-from agents.runs import CHECKPOINT_FILE, CURVE_FILE, load_model, save_model
-from agents.step_count import STEP_UNIT, check_step_unit
+from agents.runs import CHECKPOINT_FILE, CURVE_FILE, load_model
 from agents.task import Task
-from agents.training import SaveCheckpoint, TrainingPlan, make_model, train
-from agents.vec_envs import make_venv
+from agents.training import SaveCheckpoint, TrainingPlan, train
 from envs.sb3.agents_as_rows import ParallelVecEnv
-from envs.sb3.policy_file import read_note
-from predictor.support.errors import UserError
 from predictor.support.progress import WorkShown
 
 TAG = "simple_tag_v3"
@@ -61,19 +57,3 @@ def test_budget_measurements_checkpoints_and_progress_count_steps_of_copies(
     assert [point["steps"] for point in json.loads((tmp_path / CURVE_FILE).read_text())] == [16, 32, 48, 64]
     assert sorted(set(saved)) == [0, 32]
     assert load_model(tmp_path / CHECKPOINT_FILE, algorithm).num_timesteps == 64  # type: ignore[arg-type]
-    assert read_note(tmp_path / CHECKPOINT_FILE).items() >= STEP_UNIT.items()
-
-
-def test_a_checkpoint_that_counted_learners_is_not_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """With one learner too: what it counted cannot be seen."""
-    plan = tiny(monkeypatch, ("adversary",))
-    venv = make_venv(plan.task, COPIES)
-    checkpoint = tmp_path / CHECKPOINT_FILE
-    save_model(make_model(plan, venv), checkpoint, {"seconds": 1.0})
-    venv.close()
-    with pytest.raises(UserError, match=f"cannot resume {tmp_path}: it counted the steps of every learner, but"):
-        train(plan, tmp_path)
-    check_step_unit(checkpoint, is_multiagent=False)  # there is one learner per environment
-    checkpoint.write_text("damaged")
-    check_step_unit(checkpoint, is_multiagent=True)  # loading it says so
-    check_step_unit(tmp_path / "none.zip", is_multiagent=True)
