@@ -20,6 +20,7 @@ from rich.console import Console
 from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, arguments_of, checkpoint_for, name_with
 from envs.rollouts import graph_report, plan_report, reaction_report, report
 from envs.rollouts.branches import check_can_branch
+from envs.rollouts.cause_run import CauseRun
 from envs.rollouts.cluster_pool import PACKAGES, episode_pool
 from envs.rollouts.episode import (
     Case,
@@ -27,7 +28,7 @@ from envs.rollouts.episode import (
     EpisodeTask,
     play,
 )
-from envs.rollouts.graph_run import GraphRun, measure_graph
+from envs.rollouts.graph_run import measure_graph
 from envs.rollouts.plan_run import PlanRun, check_has_plans, measure_plans
 from envs.rollouts.reaction_run import ReactionRun, measure_reactions
 from envs.rollouts.report import EnvAccuracy
@@ -253,38 +254,33 @@ def evaluate_causes(config: EvaluateConfig, console: Console) -> None:
             check_can_branch(env_id, "idle" if driver.endswith(".zip") else driver, config.env_kwargs)
         if config.plans:
             check_has_plans(env_id, config.env_kwargs)
+    shared = [_settings(config, env_id, driver) for env_id, driver in drivers.items()]
     if config.reactions:
-        runs = [_reaction_run(config, env_id, driver) for env_id, driver in drivers.items()]
+        runs = [
+            ReactionRun(
+                **settings | {"episodes": config.most_episodes},
+                perturbations=config.perturbations,
+                horizon_steps=config.horizon_steps,
+                stores=_stores_of(config.data, settings["env_id"], config.env_kwargs),
+            )
+            for settings in shared
+        ]
         _measure_all(config, console, "reactions", runs, measure_reactions, reaction_report)
     if config.graph:
-        edges = [_graph_run(config, env_id, driver) for env_id, driver in drivers.items()]
+        edges = [CauseRun(**settings) for settings in shared]
         _measure_all(config, console, "graph", edges, measure_graph, graph_report)
     if config.plans:
-        plans = [_plan_run(config, env_id, driver) for env_id, driver in drivers.items()]
+        plans = [PlanRun(**settings, horizon_steps=config.horizon_steps) for settings in shared]
         _measure_all(config, console, "plans", plans, measure_plans, plan_report)
 
 
-def _reaction_run(config: EvaluateConfig, env_id: str, driver: str) -> ReactionRun:
-    return ReactionRun(
-        env_id, driver, config.checkpoint or (checkpoint_for(env_id),), config.perturbations, config.most_episodes,
-        config.seed, config.max_steps, config.workers, config.horizon_steps,
-        _stores_of(config.data, env_id, config.env_kwargs), config.timeout_s, config.cluster, config.env_kwargs,
-    )  # fmt: skip
-
-
-def _graph_run(config: EvaluateConfig, env_id: str, driver: str) -> GraphRun:
-    checkpoints = config.checkpoint or (checkpoint_for(env_id),)
-    return GraphRun(
-        env_id, driver, checkpoints, config.episodes, config.seed, config.max_steps, config.workers, config.timeout_s,
-        config.cluster, config.env_kwargs,
-    )  # fmt: skip
-
-
-def _plan_run(config: EvaluateConfig, env_id: str, driver: str) -> PlanRun:
-    return PlanRun(
-        env_id, driver, config.checkpoint or (checkpoint_for(env_id),), config.episodes, config.seed, config.max_steps,
-        config.workers, config.horizon_steps, config.timeout_s, config.cluster, config.env_kwargs,
-    )  # fmt: skip
+def _settings(config: EvaluateConfig, env_id: str, driver: str) -> dict[str, Any]:
+    """Returns what all these measurements share."""
+    return {
+        "env_id": env_id, "driver": driver, "checkpoints": config.checkpoint or (checkpoint_for(env_id),),
+        "episodes": config.episodes, "seed": config.seed, "max_steps": config.max_steps, "workers": config.workers,
+        "timeout_s": config.timeout_s, "cluster": config.cluster, "env_kwargs": config.env_kwargs,
+    }  # fmt: skip
 
 
 def _measure_all(

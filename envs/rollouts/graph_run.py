@@ -8,10 +8,8 @@ import numpy as np
 from envs.registry import name_with
 from envs.rollouts.causal_labels import CausalSettings, settings_for
 from envs.rollouts.causal_scenes import EdgeScene, GraphTask, play_graph
-from envs.rollouts.cluster_pool import episode_pool
+from envs.rollouts.cause_run import CauseRun
 from envs.rollouts.side_forecasts import fitting_checkpoints
-from envs.rollouts.world import open_world
-from envs.supervision import TIMEOUT_S
 from predictor.evaluation.causal_graph import CausalPairs, CausalScores, halves, score_rule
 from predictor.support.errors import UserError
 from predictor.support.progress import track
@@ -20,32 +18,6 @@ MAJORITY, DISTANCE, LEADERS = "the commoner answer", "distance", "the leader"
 """Names of the rules that need no network."""
 EDGE = 0.5
 """Probability above which a model infers an edge."""
-
-
-@dataclass(frozen=True)
-class GraphRun:
-    """Settings of the measurement in one environment."""
-
-    env_id: str
-    """Id of the environment."""
-    driver: str
-    """Name of the driver."""
-    checkpoints: tuple[str, ...]
-    """Checkpoints to measure."""
-    episodes: int
-    """Number of episodes: bounds are fitted on the first half, all else is measured on the second."""
-    seed: int
-    """Seed of the first episode."""
-    max_steps: int
-    """Largest length of an episode [policy steps]."""
-    workers: int
-    """Number of parallel processes."""
-    timeout_s: float = TIMEOUT_S
-    """Largest time between two steps of an episode [s]."""
-    cluster: str | None = None
-    """Address of a Ray cluster that plays in place of this machine."""
-    env_kwargs: str = ""
-    """Arguments of the environment, as the text of a JSON object; empty for none."""
 
 
 @dataclass(frozen=True)
@@ -73,15 +45,16 @@ class EnvGraph:
         return name_with(self.env_id, self.env_kwargs)
 
 
-def measure_graph(run: GraphRun) -> EnvGraph:
+def measure_graph(run: CauseRun) -> EnvGraph:
     """Plays the episodes of one environment and scores all checkpoints and rules on the same pairs.
+
+    Bounds are fitted on the first half of the episodes, all else is measured on the second.
 
     Raises:
         UserError: the environment cannot be perturbed or copied, checkpoints perceive differently, none fits, or no
             label is known.
     """
-    driver = run.driver if not run.driver.endswith(".zip") else "idle"
-    world = open_world(run.env_id, driver, env_kwargs=run.env_kwargs)
+    world = run.open()
     spec, settings = world.spec, settings_for(world)
     world.close()
     fitting, misfits = fitting_checkpoints(run.env_id, run.checkpoints, spec)
@@ -89,7 +62,7 @@ def measure_graph(run: GraphRun) -> EnvGraph:
         GraphTask(run.env_id, run.driver, fitting, run.seed + i, run.max_steps, settings, run.env_kwargs)
         for i in range(run.episodes)
     ]
-    with episode_pool(play_graph, run.workers, run.timeout_s, cluster=run.cluster) as pool:
+    with run.pool(play_graph) as pool:
         episodes = list(track(pool.results(tasks), f"graph {run.env_id}", total=len(tasks)))
     scores = scores_of(episodes, settings.threshold_m)
     if not next(iter(scores.values())).pairs:

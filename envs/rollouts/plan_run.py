@@ -10,44 +10,23 @@ from envs.plans import plan_model_for
 from envs.readers import outcome_keys
 from envs.registry import name_with
 from envs.rollouts.branches import copied
-from envs.rollouts.cluster_pool import episode_pool
+from envs.rollouts.cause_run import CauseRun
 from envs.rollouts.interventions import knows_bodies
 from envs.rollouts.plan_moments import PlanMoment, PlanTask, play_plans
 from envs.rollouts.side_forecasts import fitting_checkpoints
 from envs.rollouts.world import open_world
-from envs.supervision import TIMEOUT_S
 from predictor.checkpoint import load_forecaster
 from predictor.evaluation.standard_errors import Estimate, estimate, quotient
 from predictor.support.errors import UserError
 from predictor.support.progress import track
 
 
-@dataclass(frozen=True)
-class PlanRun:
+@dataclass(frozen=True, kw_only=True)
+class PlanRun(CauseRun):
     """Settings of the measurement in one environment."""
 
-    env_id: str
-    """Id of the environment."""
-    driver: str
-    """Name of the driver."""
-    checkpoints: tuple[str, ...]
-    """Checkpoints to measure."""
-    episodes: int
-    """Number of episodes."""
-    seed: int
-    """Seed of the first episode."""
-    max_steps: int
-    """Largest length of an episode [policy steps]."""
-    workers: int
-    """Number of parallel processes."""
     horizon_steps: int | None = None
     """Number of steps forecast and played; None takes the first checkpoint's."""
-    timeout_s: float = TIMEOUT_S
-    """Largest time between two steps of an episode [s]."""
-    cluster: str | None = None
-    """Address of a Ray cluster that plays in place of this machine."""
-    env_kwargs: str = ""
-    """Arguments of the environment, as the text of a JSON object; empty for none."""
 
 
 @dataclass(frozen=True)
@@ -151,8 +130,7 @@ def measure_plans(run: PlanRun) -> EnvPlans:
             no episode is long enough.
     """
     check_has_plans(run.env_id, run.env_kwargs)
-    driver = run.driver if not run.driver.endswith(".zip") else "idle"
-    world = open_world(run.env_id, driver, env_kwargs=run.env_kwargs)
+    world = run.open()
     spec = world.spec
     world.reset(run.seed)
     names = plan_model_for(world.env).names
@@ -163,7 +141,7 @@ def measure_plans(run: PlanRun) -> EnvPlans:
         PlanTask(run.env_id, run.driver, fitting, run.seed + i, run.max_steps, horizon, run.env_kwargs)
         for i in range(run.episodes)
     ]
-    with episode_pool(play_plans, run.workers, run.timeout_s, cluster=run.cluster) as pool:
+    with run.pool(play_plans) as pool:
         played = pool.results(tasks)
         episodes = [found for found in track(played, f"plans {run.env_id}", total=len(tasks)) if found]
     if not episodes:

@@ -6,49 +6,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from envs.registry import name_with
-from envs.rollouts.cluster_pool import episode_pool
+from envs.rollouts.cause_run import CauseRun
 from envs.rollouts.interventions import kinds_of
 from envs.rollouts.reaction_cells import FALSE_BESIDE, cells_of
 from envs.rollouts.reactions import Perturbation, ReactionTask, play_reactions
 from envs.rollouts.side_forecasts import fitting_checkpoints
-from envs.rollouts.world import open_world
-from envs.supervision import TIMEOUT_S
 from predictor.checkpoint import load_forecaster
 from predictor.evaluation.reactions import Reaction, Shifts, false_reaction, reaction
 from predictor.evaluation.standard_errors import Estimate
 from predictor.support.progress import WorkShown
 
 
-@dataclass(frozen=True)
-class ReactionRun:
+@dataclass(frozen=True, kw_only=True)
+class ReactionRun(CauseRun):
     """Settings of the measurement in one environment."""
 
-    env_id: str
-    """Id of the environment."""
-    driver: str
-    """Name of the driver."""
-    checkpoints: tuple[str, ...]
-    """Checkpoints to measure."""
     perturbations: int
     """Number of perturbations of each cell."""
-    episodes: int
-    """Largest number of episodes."""
-    seed: int
-    """Seed of the first episode."""
-    max_steps: int
-    """Largest length of an episode [policy steps]."""
-    workers: int
-    """Number of parallel processes."""
     horizon_steps: int | None = None
     """Number of steps forecast and played; None takes the first checkpoint's."""
     stores: tuple[str, ...] = ()
     """Stores to fit nearest neighbours to; empty leaves them out."""
-    timeout_s: float = TIMEOUT_S
-    """Largest time between two steps of an episode [s]."""
-    cluster: str | None = None
-    """Address of a Ray cluster that plays in place of this machine."""
-    env_kwargs: str = ""
-    """Arguments of the environment, as the text of a JSON object; empty for none."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +86,7 @@ def measure_reactions(run: ReactionRun) -> EnvReactions:
     Raises:
         UserError: the environment cannot be perturbed or copied, checkpoints perceive differently, or none fits.
     """
-    driver = run.driver if not run.driver.endswith(".zip") else "idle"
-    world = open_world(run.env_id, driver, env_kwargs=run.env_kwargs)
+    world = run.open()
     spec, names = world.spec, [cell.name for cell in cells_of(world)]
     kinds_of(world)
     world.close()
@@ -137,7 +114,7 @@ def _play_until_enough(
     found: dict[str, list[Perturbation]] = {name: [] for name in names}
     played, needed = 0, 0
     with (
-        episode_pool(play_reactions, run.workers, run.timeout_s, cluster=run.cluster) as pool,
+        run.pool(play_reactions) as pool,
         WorkShown(f"reactions {run.env_id}", len(names) * run.perturbations) as shown,
     ):
         while played < run.episodes:

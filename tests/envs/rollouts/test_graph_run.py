@@ -9,7 +9,8 @@ import pytest
 from envs.rollouts import causal_scenes, graph_run
 from envs.rollouts.causal_labels import CausalLabels, CausalSettings
 from envs.rollouts.causal_scenes import EdgeScene
-from envs.rollouts.graph_run import DISTANCE, LEADERS, MAJORITY, GraphRun, measure_graph, scores_of
+from envs.rollouts.cause_run import CauseRun
+from envs.rollouts.graph_run import DISTANCE, LEADERS, MAJORITY, measure_graph, scores_of
 from envs.rollouts.world import World
 from predictor.evaluation.causal_graph import CausalScores
 from predictor.support.errors import UserError
@@ -81,9 +82,9 @@ def test_where_the_simulator_names_no_leaders_there_is_no_such_rule():
     assert LEADERS not in scores_of([[scene(0, leads=False)], [scene(1, leads=False)]], 1.0)
 
 
-def run(checkpoint: str, **changes: Any) -> GraphRun:
+def run(checkpoint: str, **changes: Any) -> CauseRun:
     settings: dict[str, Any] = {"episodes": 3, "seed": 900_000, "max_steps": 9, "workers": 1, **changes}
-    return GraphRun(TAG, "heuristic", (checkpoint,), **settings)
+    return CauseRun(env_id=TAG, driver="heuristic", checkpoints=(checkpoint,), **settings)
 
 
 def quick_labels(world: World, settings: CausalSettings) -> CausalLabels:
@@ -116,4 +117,4 @@ def test_no_label_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 def test_what_cannot_be_perturbed_is_said():
     with pytest.raises(UserError, match="cannot be perturbed"):
-        measure_graph(GraphRun("pursuit_v5", "random", ("constant-velocity",), 2, 0, 5, 1))
+        measure_graph(replace(run("constant-velocity"), env_id="pursuit_v5", driver="random"))

@@ -68,7 +68,10 @@ def test_nothing_to_compare_is_none_and_no_error():
 
 
 def run(env_id: str = "highway-fast-v0", episodes: int = 2, max_steps: int = 6, workers: int = 1) -> PlanRun:
-    return PlanRun(env_id, "idle", ("constant-velocity",), episodes, 900_000, max_steps, workers, 2)
+    return PlanRun(
+        env_id=env_id, driver="idle", checkpoints=("constant-velocity",), episodes=episodes, seed=900_000,
+        max_steps=max_steps, workers=workers, horizon_steps=2,
+    )  # fmt: skip
 
 
 def test_an_environment_is_measured_whatever_the_number_of_workers():

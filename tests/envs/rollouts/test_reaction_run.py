@@ -31,7 +31,7 @@ def run(env_id: str = TAG, *checkpoints: str, **changes: Any) -> ReactionRun:
     settings: dict[str, Any] = {"perturbations": 3, "episodes": 4, "workers": 1, "max_steps": 10, "horizon_steps": 2}
     settings |= changes
     driver = "heuristic" if env_id == TAG else "idle"
-    return ReactionRun(env_id, driver, checkpoints or (STILL,), seed=900_000, **settings)
+    return ReactionRun(env_id=env_id, driver=driver, checkpoints=checkpoints or (STILL,), seed=900_000, **settings)
 
 
 def given(monkeypatch: pytest.MonkeyPatch, *cells: str) -> list[ReactionTask]:
