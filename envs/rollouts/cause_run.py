@@ -2,14 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 from envs.rollouts.cluster_pool import episode_pool
-from envs.rollouts.workers import EpisodePool
+from envs.rollouts.workers import EpisodePool, Result
 from envs.rollouts.world import World, open_world
 from envs.supervision import TIMEOUT_S
-
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, kw_only=True)
