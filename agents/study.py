@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from agents.results import PACKAGES
-from agents.studies.cells import LOG_FILE, Cell, cells_of
+from agents.studies.cells import Cell, cells_of
 from agents.studies.findings import Findings
 from agents.studies.plan import Study, read_study, shipped_studies, study_file
-from agents.studies.pool import run_cells, run_cells_on
+from agents.studies.pool import run_cells
 from agents.studies.progress import Progress
 from agents.studies.report import HEADROOM, PAGE, REPORT, write_headroom, write_report
 from agents.studies.results import RESULT_FILE, Result, read_result, require_tables, write_tables
@@ -24,6 +24,7 @@ from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out, delete_leftovers, write_text
+from predictor.support.jobs import LOG_FILE
 from predictor.support.locks import locked
 from predictor.support.memory import check_processes
 from predictor.support.provenance import commit_at_start, provenance
@@ -157,10 +158,7 @@ def _run_missing(
     with connected(config.cluster if missing else None, PACKAGES) as cluster:
         side_by_side = config.num_processes if cluster is None else cluster.size
         note = _notes(folder, results, failed, Progress(folder, total, len(results), missing, side_by_side))
-        if cluster is None:
-            run_cells(missing, folder / CELLS, config.num_processes, commit_at_start(), note)
-        else:
-            run_cells_on(cluster, missing, folder / CELLS, commit_at_start(), note)
+        run_cells(missing, folder / CELLS, commit_at_start(), note, config.num_processes, cluster)
     return failed
 
 

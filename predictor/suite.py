@@ -4,6 +4,7 @@ Trains each line under each seed (in its own process, resumable, cached by a has
 in both views of docs/protocol.md, and prints the table as Markdown, with JSON and LaTeX beside it.
 """
 
+import contextlib
 import hashlib
 import json
 import os
@@ -31,9 +32,10 @@ from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import write_json, write_text
-from predictor.support.jobs import run_jobs, run_jobs_on
+from predictor.support.jobs import run_tasks
 from predictor.support.locks import locked
 from predictor.support.memory import check_count, check_processes
+from predictor.support.progress import WorkShown
 from predictor.support.provenance import provenance
 from predictor.support.reading import read_object
 from predictor.support.remote import exists
@@ -327,11 +329,17 @@ def run_suite(config: SuiteConfig) -> dict[str, Any]:
 
 
 def _run_missing(config: SuiteConfig, pending: Sequence[Job]) -> dict[str, str]:
-    """Runs jobs here or on a cluster; returns the last line of output of those that failed, by name."""
+    """Runs jobs here or on a cluster; returns why those without a result have none, by name."""
+    failed = dict[str, str]()
     with connected(config.cluster if pending else None, PACKAGES) as cluster:
-        if cluster is None:
-            return run_jobs(config.table, pending, config.num_processes)
-        return run_jobs_on(cluster, config.table, pending, gpus=int(config.device.startswith("cuda")))
+        gpus = int(config.device.startswith("cuda"))
+        jobs = run_tasks(pending, workers=config.num_processes, cluster=cluster, gpus=gpus)
+        with contextlib.closing(jobs) as ended, WorkShown(config.table, len(pending)) as shown:
+            for done, (number, reason) in enumerate(ended, 1):
+                if reason is not None:
+                    failed[pending[number].name] = reason
+                shown.to(done, pending[number].name)
+    return failed
 
 
 def _plot(config: SuiteConfig, results: Sequence[dict[str, Any]], title: str) -> None:

@@ -53,7 +53,6 @@ their names."""
 PATHS = ("checkpoint", "sizes_of")
 """Fields of `Task` with paths of checkpoints, of which the cells' names have hash and sizes instead."""
 RUN_FOLDER = "run"
-LOG_FILE = "log.txt"
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,13 @@
 """The suite: lines are trained and measured once, failures say why, and the table says what was run."""
 
 import json
+import multiprocessing
 import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -269,7 +271,7 @@ def test_suite_runs_what_is_missing_and_nothing_else(data: Path, tmp_path: Path,
     for name in ("table.md", "table.tex", "table.json", "by_step.png"):
         assert (settings.folder / name).exists()
     assert ", one seed;" in drawn[0]
-    monkeypatch.setattr(jobs, "_start", lambda *_: pytest.fail("a finished line was started again"))
+    monkeypatch.setattr(jobs, "_started", lambda *_: pytest.fail("a finished line was started again"))
     again = run_suite(settings)
     assert again["rows"] == content["rows"]
 
@@ -340,16 +342,15 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Lets the suite run its jobs here instead of in processes of their own; returns their names in order."""
     started: list[str] = []
 
-    class Done:
-        exitcode = 0
-
-    def start(job: Any) -> Any:
+    def start(work: Any, job: Any, folder: Path, imports: Any) -> Any:
         started.append(job.name)
-        job.folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         run_line(job.config, job.line)
-        return Done()
+        sentinel, other_end = multiprocessing.Pipe(duplex=False)
+        other_end.close()  # as of a process that ended
+        return SimpleNamespace(exitcode=0, sentinel=sentinel)
 
-    monkeypatch.setattr(jobs, "_start", start)
+    monkeypatch.setattr(jobs, "_started", start)
     return started
 
 

@@ -17,9 +17,10 @@ import pyarrow.parquet as parquet
 import pytest
 
 import agents.study
-from agents.studies.pool import START_METHOD, run_cells
+from agents.studies.pool import run_cells
 from agents.study import StudyConfig, run_study
 from predictor.support.errors import UserError, run_entry_point
+from predictor.support.jobs import SERVED
 from tests.agents.studies.helpers import DEADLY_TOY, SLOW_TOY, TOY, study_path, study_text
 
 LEFT_OUT = re.compile(r"(## Time\n|<h2>Time</h2>).*", re.DOTALL)
@@ -38,7 +39,7 @@ def config(folder: Path, text: str, workers: int = 2) -> StudyConfig:
 def start(folder: Path, text: str) -> Any:
     """Starts the command in a process that is forked from the pool's server, which has imported everything."""
     words = ["--study", str(study_path(folder, text)), "--out", str(folder / "out"), "--workers", "2"]
-    context: Any = multiprocessing.get_context(START_METHOD)
+    context: Any = multiprocessing.get_context(SERVED)
     process = context.Process(target=run_command, args=(words, folder / "errors"))
     process.start()
     return process
@@ -107,7 +108,7 @@ def test_a_study_has_tables_a_report_and_a_log(whole: Path):
 
 def test_finished_cells_are_not_run_again(whole: Path, monkeypatch: pytest.MonkeyPatch):
     before, report = results(whole), reports(whole)
-    monkeypatch.setattr("agents.studies.pool._start", lambda *_: pytest.fail("nothing is missing"))
+    monkeypatch.setattr("predictor.support.jobs._started", lambda *_: pytest.fail("nothing is missing"))
     assert run_study(config(whole, study_text(SLOW_TOY))) == 0
     assert results(whole) == before and reports(whole) == report
 
