@@ -181,8 +181,9 @@ class Page:
     def __init__(self, folder: Path, limit_s: float = LIMIT_S) -> None:
         """Takes the folder to run in; `python` on the path is the interpreter that runs this check."""
         path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-        self.folder, self.limit_s = folder, limit_s
+        self.folder, self.limit_s, self.stopped = folder, limit_s, False
         self.environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"PATH": path}
+        self._bash: subprocess.Popen[str] | None = None
         self._python: subprocess.Popen[str] | None = None
         self._printed = tempfile.TemporaryFile("w+")
 
@@ -199,6 +200,14 @@ class Page:
         tail = "\n".join(error.splitlines()[-TAIL_LINES:])
         return Result(block, time.monotonic() - began, f"{code}{tail}" if error else "")
 
+    def stop(self) -> None:
+        """Ends the block that runs, from another thread; `stopped` tells that no further one is to be run."""
+        self.stopped = True
+        for process in (self._bash, self._python):
+            if process is not None and process.returncode is None:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+
     def close(self) -> None:
         """Ends Python."""
         self._stop_python()
@@ -212,7 +221,7 @@ class Page:
     def _run_bash(self, code: str) -> str:
         with tempfile.NamedTemporaryFile() as exported:
             command = ["bash", "-euo", "pipefail", "-c", f"{code}\nenv -0 > {shlex.quote(exported.name)}"]
-            process = subprocess.Popen(
+            process = self._bash = subprocess.Popen(
                 command, cwd=self.folder, env=self.environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT, text=True, start_new_session=True,
             )  # fmt: skip
@@ -279,18 +288,26 @@ def check(pages: Sequence[Path], limit_s: float = LIMIT_S, jobs: int = 1) -> Ite
         DocsError: a page has a block that cannot be understood.
     """
     every = [blocks_of(page) for page in pages]  # errors of the pages are raised before any block runs
+    opened: list[Page] = []
     with ThreadPoolExecutor(jobs) as pool:
-        for results in pool.map(lambda blocks: _run_page(blocks, limit_s), filter(None, every)):
-            yield from results
+        try:
+            for results in pool.map(lambda blocks: _run_page(blocks, limit_s, opened), filter(None, every)):
+                yield from results
+        except BaseException:  # Ctrl-C, which blocks do not get: they run in sessions of their own
+            pool.shutdown(wait=False, cancel_futures=True)
+            for page in opened:
+                page.stop()
+            raise
 
 
-def _run_page(blocks: Sequence[Block], limit_s: float) -> list[Result]:
-    """Runs the blocks of one page."""
+def _run_page(blocks: Sequence[Block], limit_s: float, opened: list[Page]) -> list[Result]:
+    """Runs the blocks of one page, until it is stopped; adds the page to those that were opened."""
     with tempfile.TemporaryDirectory() as folder:
         copy_tree(Path(folder))
         page = Page(Path(folder), limit_s)
+        opened.append(page)
         try:
-            return [page.run(block) for block in blocks]
+            return [page.run(block) for block in blocks if not page.stopped]
         finally:
             page.close()
 

@@ -9,7 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.summaries import EXTREMES
 from agents.task import EVALUATION_SEED, Task
-from agents.vec_envs import EpisodeResult, MakeCopy, own_observations
+from agents.vec_envs import EpisodeResult, MakeCopy
 from envs.own_observation import without_added
 from envs.parallel import ForecastParallelEnv
 from envs.readers import multiagent_reader_for
@@ -44,13 +44,13 @@ def record_task(task: Task, policy: BaseAlgorithm, seed: int, max_steps: int) ->
         filmed = replace(task, observe="forecast", checkpoint=shown)
     env = MakeCopy(filmed)()
     assert isinstance(env, ForecastParallelEnv)
-    team = ActingTeam(policy, env, task.learners, task.env_id)
-
-    def act(observations: dict[str, Any]) -> dict[str, Any]:
-        others: dict[str, Any] = env.drive_others(own_observations(observations))
-        return others | team(observations)
-
     try:
+        team = ActingTeam(policy, env, task.learners, "the policy")
+
+        def act(observations: dict[str, Any]) -> dict[str, Any]:
+            others: dict[str, Any] = env.drive_others(observations)
+            return others | team(observations)
+
         return record_multiagent_episode(
             env, act, seed=seed, max_steps=max_steps, num_samples=_num_drawn(env.forecaster)
         )

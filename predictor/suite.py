@@ -335,10 +335,10 @@ def _run_missing(config: SuiteConfig, pending: Sequence[Job]) -> dict[str, str]:
         gpus = int(config.device.startswith("cuda"))
         jobs = run_tasks(pending, workers=config.num_processes, cluster=cluster, gpus=gpus)
         with contextlib.closing(jobs) as ended, WorkShown(config.table, len(pending)) as shown:
-            for done, (number, reason) in enumerate(ended, 1):
+            for number, reason in ended:
                 if reason is not None:
                     failed[pending[number].name] = reason
-                shown.to(done, pending[number].name)
+                shown.advance()
     return failed
 
 

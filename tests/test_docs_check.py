@@ -1,6 +1,7 @@
 """The check of the documentation's blocks fails where a block is wrong, with its place and the reason."""
 
 import importlib.util
+import signal
 import subprocess
 import sys
 import time
@@ -212,6 +213,31 @@ def test_pages_run_side_by_side_and_are_told_in_their_order(tmp_path: Path):
     done = subprocess.run(command, cwd=repository, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done
     assert done.stdout.index("README.md:1 ") < done.stdout.index("docs/second.md:1 ")
+
+
+@pytest.mark.parametrize("language", ["bash", "python"])
+def test_ctrl_c_ends_the_blocks_that_run(tmp_path: Path, language: str):
+    repository, began, after = tmp_path / "repository", tmp_path / "began", tmp_path / "after"
+    (repository / ".ci").mkdir(parents=True)
+    (repository / ".ci" / "docs_check.py").write_text(FILE.read_text())
+    block = {
+        "bash": f"touch {began}\nsleep 300",
+        "python": f"import pathlib, time\npathlib.Path('{began}').touch()\ntime.sleep(300)",
+    }[language]
+    page = f"```{language}\n{block}\n```\n\n```bash\ntouch {after}\n```\n"
+    (repository / "README.md").write_text(page)
+    subprocess.run(["git", "init", "-q"], cwd=repository, check=True)
+    running = subprocess.Popen([sys.executable, ".ci/docs_check.py"], cwd=repository, stderr=subprocess.DEVNULL)
+    try:
+        while not began.exists():
+            assert running.poll() is None
+            time.sleep(0.05)
+        running.send_signal(signal.SIGINT)
+        assert running.wait(timeout=120) not in (0, 1)
+    finally:
+        running.kill()
+        running.wait()
+    assert not after.exists()
 
 
 def test_a_page_of_another_folder_is_one_clear_line(

@@ -52,11 +52,6 @@ class _Task:
     commit: str
 
     @property
-    def name(self) -> str:
-        """Name in messages."""
-        return self.cell.title
-
-    @property
     def folder(self) -> Path:
         """Folder of the cell."""
         return self.cells / self.cell.name

@@ -90,9 +90,10 @@ class ActingTeam:
             del self._acting[gone]
         chosen = {}
         for agent in (name for name in observations if name in self.actions):
-            act = self._acting.setdefault(agent, copy.deepcopy(self._fresh))
+            if agent not in self._acting:
+                self._acting[agent] = copy.deepcopy(self._fresh)
             seen = without_added(observations[agent]) if self._strips else observations[agent]
-            chosen[agent] = own_action(act(self._padded.one(agent, seen)), self.actions[agent])
+            chosen[agent] = own_action(self._acting[agent](self._padded.one(agent, seen)), self.actions[agent])
         return chosen
 
     def forget(self) -> None:

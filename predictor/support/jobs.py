@@ -1,8 +1,8 @@
 """Runs tasks side by side, each in a process of its own that prints into a log, here or on the machines of a cluster.
 
 Where modules are named to be imported once, the processes are forked on Linux from a server that has imported them;
-elsewhere they are spawned. A process ends when the command that started it does, however that ends. Its log is locked,
-so that a command that follows a killed one waits for the last of its processes.
+elsewhere they are spawned. A process ends when the command that started it does, however that ends. It locks the folder
+of its task, so that a command that follows a killed one waits for the last of its processes.
 """
 
 import contextlib
@@ -10,7 +10,7 @@ import fcntl
 import multiprocessing
 import sys
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -20,6 +20,7 @@ from predictor.support.cluster import Cluster, Lost, Packed, check_shared
 from predictor.support.errors import run_entry_point
 from predictor.support.locks import LOCK_FILE
 from predictor.support.processes import end, follow_parent, how_it_ended, print_into, start
+from predictor.support.stopping import resumable
 
 SAVING_S = 60.0
 """Time that a task's process gets to save its training when the command is stopped [s]."""
@@ -32,10 +33,6 @@ _POLL_S = 0.5
 @runtime_checkable
 class Task(Protocol):
     """What is to be done; can be pickled."""
-
-    @property
-    def name(self) -> str:
-        """Name in messages."""
 
     @property
     def folder(self) -> Path:
@@ -88,7 +85,7 @@ def _run_here(tasks: Sequence[Task], workers: int, imports: Sequence[str]) -> Ge
             ready = [i for i in waiting if not any(tasks[i].waits_for(tasks[j]) for j in busy)]
             for i in ready[: workers - len(running)]:
                 waiting.remove(i)
-                running[i] = _started(_work_task, tasks[i], tasks[i].folder, imports)
+                running[i] = _started(tasks[i], tasks[i].folder, imports)
             wait([process.sentinel for process in running.values()])
             for i in [i for i, process in running.items() if process.exitcode is not None]:
                 yield i, _reason(tasks[i], running.pop(i).exitcode)
@@ -129,15 +126,11 @@ class _Remote(NamedTuple):
     locked_folder: Path
     packed: Packed
 
-    @classmethod
-    def of(cls, task: Task) -> "_Remote":
-        return cls(task.folder.absolute(), task.locked_folder.absolute(), Packed(task))
-
 
 def _run_alone(remote: _Remote) -> int | None:
     """Does one task in a process beside this process of Ray; returns its exit code."""
     check_shared(remote.locked_folder)
-    process = _started(_work_unpacked, remote, remote.folder)
+    process = _started(remote.packed, remote.folder)
     try:
         while process.exitcode is None:  # a task that is cancelled is not woken out of `join`
             time.sleep(_POLL_S)
@@ -146,34 +139,28 @@ def _run_alone(remote: _Remote) -> int | None:
     return process.exitcode
 
 
-def _started(function: Callable[[Any], None], argument: Any, folder: Path, imports: Sequence[str] = ()) -> BaseProcess:
+def _started(task: Task | Packed, folder: Path, imports: Sequence[str] = ()) -> BaseProcess:
     folder.mkdir(parents=True, exist_ok=True)
     context: Any = multiprocessing.get_context(SERVED if imports else "spawn")
     if imports and SERVED == "forkserver":
         context.set_forkserver_preload(list(imports))
-    process: BaseProcess = context.Process(target=function, args=(argument,))
+    process: BaseProcess = context.Process(target=_work, args=(task, folder))
     start(process)
     return process
 
 
-def _work_task(task: Task) -> None:
-    """Does a task of this machine."""
-    follow_parent()
-    _work(lambda: task, task.folder)
-
-
-def _work_unpacked(remote: _Remote) -> None:
-    """Does a task that was packed."""
-    follow_parent()
-    _work(lambda: remote.packed.unpack(), remote.folder)
-
-
-def _work(opened: Callable[[], Task], folder: Path) -> None:
+def _work(task: Task | Packed, folder: Path) -> None:
     """Does a task in a process of its own; SIGTERM saves what it trains. The log of an earlier try goes on."""
+    follow_parent()
     with (folder / LOG_FILE).open("a", buffering=1) as log, (folder / LOCK_FILE).open("a") as lock:
         print_into(log)
         with contextlib.suppress(OSError):  # a file system without locks
             fcntl.flock(lock, fcntl.LOCK_EX)  # the process of a command or machine that was killed may still be here
-        task = opened()
-        if not task.result.exists():
-            run_entry_point(task.run)
+        opened: Task = task.unpack() if isinstance(task, Packed) else task
+        if not opened.result.exists():
+            run_entry_point(lambda: _run(opened))
+
+
+def _run(task: Task) -> None:
+    with resumable("the same command goes on"):
+        task.run()

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
+from multiprocessing.resource_tracker import ensure_running
 from typing import IO, Any
 
 PATIENCE_S = 5.0
@@ -29,9 +30,18 @@ def stop_with_parent() -> None:
 
 
 def start(process: BaseProcess) -> None:
-    """Starts a process that ignores Ctrl-C from its first instruction on; it calls `follow_parent` itself."""
-    with ctrl_c_ignored():
-        process.start()
+    """Starts a process that ignores Ctrl-C from its first instruction on; it calls `follow_parent` itself.
+
+    A Ctrl-C that comes meanwhile is raised here, and the process is ended.
+    """
+    ensure_running()  # it lets Ctrl-C through when it starts, so not inside
+    try:
+        with ctrl_c_ignored():
+            process.start()
+    except BaseException:
+        if process.pid is not None:
+            end([process])
+        raise
 
 
 @contextmanager
@@ -54,9 +64,11 @@ def end(processes: Sequence[BaseProcess], patience_s: float = PATIENCE_S) -> Non
     for process in processes:
         process.terminate()
     until = time.monotonic() + patience_s
-    for process in processes:
-        process.join(max(0.0, until - time.monotonic()))
-        if process.is_alive():
+    try:
+        for process in processes:
+            process.join(max(0.0, until - time.monotonic()))
+    finally:  # a second Ctrl-C waits no longer
+        for process in processes:
             process.kill()
             process.join()
 

@@ -342,7 +342,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Lets the suite run its jobs here instead of in processes of their own; returns their names in order."""
     started: list[str] = []
 
-    def start(work: Any, job: Any, folder: Path, imports: Any) -> Any:
+    def start(job: Any, folder: Path, imports: Any) -> Any:
         started.append(job.name)
         folder.mkdir(parents=True, exist_ok=True)
         run_line(job.config, job.line)
