@@ -114,6 +114,11 @@ class Task:
             envpool_task_of(self.env_id)
             if importlib.util.find_spec("envpool") is None:
                 raise UserError("backend envpool needs the envpool package; pip install 'dgvae-rl[envpool]'")
+            if self.what_if or self.observe.startswith("oracle"):
+                raise UserError(
+                    f"observe={self.observe} and what_if={self.what_if} do not fit backend envpool, which makes no "
+                    "plans and cannot be copied; leave it out, or take another arm without what_if"
+                )
         if self.checkpoint is not None and self.observe in NO_CHECKPOINT:
             raise UserError(f"checkpoint '{self.checkpoint}' has no effect with observe={self.observe}; leave one out")
         check_at_least(self, 1, "num_samples", "horizon_steps")

@@ -35,6 +35,8 @@ def without_envpool(monkeypatch: pytest.MonkeyPatch) -> None:
         ("highway-mixed-v0", {"backend": "envpool"}, "EnvPool has no copy of 'highway-mixed-v0'; it has highway-v0, "),
         ("nonsense", {"backend": "envpool"}, "EnvPool has no copy of 'nonsense'"),
         (TAG, {"backend": "envpool"}, f"backend envpool has no {TAG}; leave it out"),
+        ("highway-fast-v0", {"backend": "envpool", "observe": "oracle"}, "observe=oracle and what_if=False do not fit"),
+        ("highway-fast-v0", {"backend": "envpool", "what_if": True}, "makes no plans and cannot be copied"),
         ("highway-fast-v0", {"learners": ("adversary",)}, "highway-fast-v0 has one ego; leave them out"),
         (TAG, {"driver": "fast"}, "driver must be one of random, idle, varied, heuristic, mixed, got 'fast'"),
         (TAG, {"observe": "none", "checkpoint": "highway"}, "has no effect with observe=none"),
