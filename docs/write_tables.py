@@ -29,7 +29,7 @@ PAGES = (Path("README.md"), Path("docs/checkpoints.md"), Path("docs/in_env.md"))
 SERVED_BY = CHECKPOINTS | MULTIAGENT_CHECKPOINTS
 """Id → checkpoint that ships for it, in the order of the tables."""
 SAMPLES = 20
-"""Number of samples K of the tables by environment; the transfer matrix has K = 1, the most likely forecast alone."""
+"""Number of samples K of the tables by environment; the transfer matrix has K = 1, the single forecast alone."""
 
 FIRST = ("highway-fast-v0", "merge-v1", "roundabout-v1", "intersection-v2", "racetrack-v1", "simple_tag_v3")
 """Ids of the table of README.md: one of each kind."""

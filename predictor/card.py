@@ -83,8 +83,8 @@ def write_card(config: CardConfig) -> Path:
             f"{', '.join(dict.fromkeys(info.sources))}; forecasts {info.horizon_steps} steps of {info.spec.dt_s:g} s. "
             f"Sees at most {info.spec.max_agents} agents ({ego}) within {info.spec.perception_m:g} m.",
             "## Accuracy in the live environment",
-            f"Held-out seeds from {first_seed:,}; {left_out}. minADE₁ is the most likely forecast (K = 1); neighbours: "
-            "memoryless nearest neighbours on the training data. Intervals: bootstrap over episodes.",
+            f"Held-out seeds from {first_seed:,}; {left_out}. minADE₁ is the error of the single forecast (K = 1); "
+            "neighbours: memoryless nearest neighbours on the training data. Intervals: bootstrap over episodes.",
             f"<!-- table: accuracy -->\n\n{card_section(measured)}\n\n<!-- end -->",
             "## Data",
             stores,

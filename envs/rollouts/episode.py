@@ -83,7 +83,7 @@ class Case:
     """One forecast with its history and future, world coordinates [m]."""
 
     error_m: float
-    """Mean displacement of the most likely forecast."""
+    """Mean displacement of the single forecast."""
     seed: int
     """Seed of the episode."""
     step: int

@@ -3,7 +3,7 @@
 At random steps the world is branched (`envs.rollouts.branches`): one agent loses speed at once, or is taken out. The
 true shift is where a receiver is in that branch, minus where it is in the plain one. The predicted shift is the
 difference of two forecasts of one forecaster, whose history is the same up to the last step: one of the scene as it
-is, one of the scene as perturbed. Each is the single most likely forecast. The world goes on as if nothing had been
+is, one of the scene as perturbed. Each is the single forecast. The world goes on as if nothing had been
 asked. `predictor.evaluation.reactions` makes numbers of the shifts.
 
 Whether two cars touch turns on centimetres, and a crash is then a shift of tens of metres: perturbations of which the

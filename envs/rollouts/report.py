@@ -34,7 +34,7 @@ class EnvAccuracy:
     dt_s: float
     """Time step [s]."""
     model: Accuracy
-    """Accuracy of the most likely forecast (K = 1)."""
+    """Accuracy of the single forecast (K = 1)."""
     model_samples: Accuracy
     """Accuracy of the best of K forecasts."""
     constant_velocity: Accuracy

@@ -41,11 +41,11 @@ class Measurement:
     constant_velocity_fde_m: float | None = None
     """FDE of constant velocity [m]."""
     min_ade_m: float | None = None
-    """ADE of the most likely forecast (K = 1) [m]."""
+    """ADE of the single forecast (K = 1) [m]."""
     min_ade_interval_m: Interval | None = None
     """95 % bootstrap interval of `min_ade_m` over episodes [m]."""
     min_fde_m: float | None = None
-    """FDE of the most likely forecast [m]."""
+    """FDE of the single forecast [m]."""
     best_of_k_m: float | None = None
     """minADE of the best of K samples [m]."""
     best_of_k_interval_m: Interval | None = None

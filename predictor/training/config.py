@@ -6,6 +6,7 @@ from typing import ClassVar, Literal
 
 import torch
 
+from predictor.checkpoint import read_info, resolve
 from predictor.models import ModelName
 from predictor.support.config_checks import MOST_THREADS, check_at_least, check_at_most, check_choices, check_positive
 from predictor.support.errors import UserError
@@ -20,6 +21,8 @@ OF_THE_DGVAE = ("input_changes", "fit_inputs", "edge_geometry")
 """Options of the dG-VAE's inputs, without effect on other models."""
 OF_THE_NETWORK = ("preset", "set", *OF_THE_DGVAE)
 """Options that make the network; a checkpoint to start from has them already."""
+HORIZON_STEPS = 5
+"""Number of steps forecast where neither the command nor a checkpoint says it."""
 SMALLER = "pass a smaller --batch-size, or a shorter --horizon-steps"
 BEFORE_THEY_EXISTED = dict.fromkeys(OF_THE_DGVAE, False)
 """Values of options in runs that began before the option existed, where today's default is another one."""
@@ -83,8 +86,9 @@ class TrainConfig:
     val_history_steps: int = 1
     """Smallest number of observed steps of a window for model selection; if equal to `history_steps`, whole sequences
     are cut as in the tables."""
-    horizon_steps: int = 5
-    """Number of steps forecast in training, and the default horizon of the checkpoint."""
+    horizon_steps: int = 0
+    """Number of steps forecast in training, and the default horizon of the checkpoint; 0 takes 5, or with `init` as
+    many as that checkpoint forecasts."""
     curriculum_steps: int = 0
     """Number of optimiser steps over which the forecast grows from 1 step to `horizon_steps`; 0: at once."""
     one_step_weight: float = 0.2
@@ -145,12 +149,15 @@ class TrainConfig:
     """Whether to continue a run that was stopped; finished runs stay as they are."""
 
     def __post_init__(self) -> None:
-        """Checks choices and ranges; replaces `device="auto"` by the chosen device.
+        """Checks choices and ranges; replaces `device="auto"` by the chosen device, and a horizon of 0 by its value.
 
         Raises:
-            UserError: a value is out of range, or the device does not exist.
+            UserError: a value is out of range, the device does not exist, or the checkpoint of `init` cannot be read.
         """
         check_choices(self)
+        if self.horizon_steps == 0:
+            steps = read_info(resolve(self.init)).horizon_steps if self.init else HORIZON_STEPS
+            object.__setattr__(self, "horizon_steps", steps)
         check_at_least(
             self, 1, "steps", "batch_size", "history_steps", "horizon_steps", "eval_every", "patience", "val_windows"
         )

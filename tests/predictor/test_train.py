@@ -641,6 +641,15 @@ def test_options_without_effect_do_not_stop_a_run(tiny: None, circles: Path, tmp
     assert state(tmp_path / "run")["step"] == 7
 
 
+def test_the_horizon_is_that_of_the_checkpoint_unless_given(tiny: None, circles: Path, tmp_path: Path):
+    assert TrainConfig((circles,), tmp_path).horizon_steps == 5
+    first = str(train(config(circles, tmp_path / "first", steps=2, horizon_steps=3)))
+    assert TrainConfig((circles,), tmp_path, init=first).horizon_steps == 3
+    assert TrainConfig((circles,), tmp_path, init=first, horizon_steps=2).horizon_steps == 2
+    with pytest.raises(UserError, match="nowhere"):
+        TrainConfig((circles,), tmp_path, init="nowhere")
+
+
 def test_foreign_folder_is_not_written_into(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], circles: Path, tmp_path: Path
 ):

@@ -92,7 +92,7 @@ def test_samples_scatter_around_constant_velocity_as_fitted():
     belief = observe(noisy, states)
     samples = noisy.rollout(belief, 4, 4001, torch.Generator().manual_seed(0)).states
     exact = straight.rollout(belief, 4).states
-    assert torch.equal(samples[:, :1], exact)  # sample 0 is the most likely forecast
+    assert torch.equal(samples[:, :1], exact)  # sample 0 is the single forecast
     offsets = (samples - exact)[:, 1:]
     spread_m = 0.3 * torch.tensor([0.5, 1.0, 1.5, 2.0]) ** 1.5
     torch.testing.assert_close(offsets[..., :2].std((0, 1, 2)), spread_m[:, None].expand(4, 2), rtol=0.02, atol=0)
