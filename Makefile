@@ -77,7 +77,7 @@ docs: .venv/.site ## build the site into build/site: runs the tutorials, fails o
 	.venv/bin/python -m docs.check_links build/site
 
 docs-check: .venv/.tools ## run every command and every block of README.md and docs/ as written, in a copy of the tree
-	.venv/bin/python .ci/docs_check.py --jobs $(TEST_JOBS) --limit-s 600
+	.venv/bin/python .ci/docs_check.py --jobs $(TEST_JOBS)
 
 install-check: ## build the wheel and try EXTRAS, each in a fresh environment: five minutes and 2 GB each
 	$(PYTHON) .ci/install_check.py --only $(EXTRAS)

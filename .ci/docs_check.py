@@ -31,7 +31,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LIMIT_S = 300.0
+LIMIT_S = 600.0
 """Longest time of a block [s]; longer ones need a short form."""
 TAIL_LINES = 25
 OTHER_LANGUAGES = ("text", "json", "toml", "yaml", "bibtex", "mermaid", "markdown", "diff", "make", "csv")

@@ -333,12 +333,21 @@ def _run_missing(config: SuiteConfig, pending: Sequence[Job]) -> dict[str, str]:
     failed = dict[str, str]()
     with connected(config.cluster if pending else None, PACKAGES) as cluster:
         gpus = int(config.device.startswith("cuda"))
-        jobs = run_tasks(pending, workers=config.num_processes, cluster=cluster, gpus=gpus)
-        with contextlib.closing(jobs) as ended, WorkShown(config.table, len(pending)) as shown:
-            for number, reason in ended:
-                if reason is not None:
-                    failed[pending[number].name] = reason
-                shown.advance()
+        running, done = list[str](), 0
+        with WorkShown(config.table, len(pending)) as shown:
+
+            def begun(number: int) -> None:
+                running.append(pending[number].name)
+                shown.to(done, ", ".join(running))
+
+            jobs = run_tasks(pending, workers=config.num_processes, cluster=cluster, gpus=gpus, on_start=begun)
+            with contextlib.closing(jobs) as ended:
+                for number, reason in ended:
+                    name, done = pending[number].name, done + 1
+                    if reason is not None:
+                        failed[name] = reason
+                    running = [one for one in running if one != name]
+                    shown.to(done, ", ".join(running))
     return failed
 
 

@@ -29,6 +29,17 @@ def results(folder: Path, text: str, limit_s: float = 60.0) -> Sequence[Any]:
         page.close()
 
 
+def repository(folder: Path, **pages: str) -> Path:
+    """Returns a repository with the command and some pages; `README` is its README.md, others are in docs/."""
+    (folder / ".ci").mkdir(parents=True)
+    (folder / ".ci" / "docs_check.py").write_text(FILE.read_text())
+    (folder / "docs").mkdir()
+    for name, text in pages.items():
+        (folder / ("README.md" if name == "README" else f"docs/{name}.md")).write_text(text)
+    subprocess.run(["git", "init", "-q"], cwd=folder, check=True)
+    return folder
+
+
 def test_blocks_build_on_each_other_across_languages(tmp_path: Path):
     text = """
 ~~~bash
@@ -183,10 +194,7 @@ def test_every_page_of_this_repository_is_understood():
 
 def test_the_command_fails_with_the_block(tmp_path: Path):
     """Runs it like `make docs-check`, on a repository of its own: status 1, and the place of the block."""
-    (tmp_path / ".ci").mkdir()
-    (tmp_path / ".ci" / "docs_check.py").write_text(FILE.read_text())
-    (tmp_path / "README.md").write_text("```bash\ntest -f README.md && touch left\n```\n")
-    subprocess.run(["git", "init", "-q"], cwd=tmp_path, check=True)
+    repository(tmp_path, README="```bash\ntest -f README.md && touch left\n```\n")
     command = [sys.executable, ".ci/docs_check.py"]
     good = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert good.returncode == 0 and "1 blocks in" in good.stdout and "0 failed" in good.stdout, good
@@ -201,33 +209,25 @@ def test_the_command_fails_with_the_block(tmp_path: Path):
 
 def test_pages_run_side_by_side_and_are_told_in_their_order(tmp_path: Path):
     """The first page waits for the second."""
-    repository = tmp_path / "repository"
-    (repository / ".ci").mkdir(parents=True)
-    (repository / "docs").mkdir()
-    (repository / ".ci" / "docs_check.py").write_text(FILE.read_text())
     began = tmp_path / "began"
-    (repository / "README.md").write_text(f"```bash\nuntil test -e {began}; do sleep 0.1; done\n```\n")
-    (repository / "docs" / "second.md").write_text(f"```bash\ntouch {began}\n```\n")
-    subprocess.run(["git", "init", "-q"], cwd=repository, check=True)
+    first, second = f"```bash\nuntil test -e {began}; do sleep 0.1; done\n```\n", f"```bash\ntouch {began}\n```\n"
+    place = repository(tmp_path / "repository", README=first, second=second)
     command = [sys.executable, ".ci/docs_check.py", "--limit-s", "30", "--jobs", "2"]
-    done = subprocess.run(command, cwd=repository, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done
     assert done.stdout.index("README.md:1 ") < done.stdout.index("docs/second.md:1 ")
 
 
 @pytest.mark.parametrize("language", ["bash", "python"])
 def test_ctrl_c_ends_the_blocks_that_run(tmp_path: Path, language: str):
-    repository, began, after = tmp_path / "repository", tmp_path / "began", tmp_path / "after"
-    (repository / ".ci").mkdir(parents=True)
-    (repository / ".ci" / "docs_check.py").write_text(FILE.read_text())
+    began, after = tmp_path / "began", tmp_path / "after"
     block = {
         "bash": f"touch {began}\nsleep 300",
         "python": f"import pathlib, time\npathlib.Path('{began}').touch()\ntime.sleep(300)",
     }[language]
     page = f"```{language}\n{block}\n```\n\n```bash\ntouch {after}\n```\n"
-    (repository / "README.md").write_text(page)
-    subprocess.run(["git", "init", "-q"], cwd=repository, check=True)
-    running = subprocess.Popen([sys.executable, ".ci/docs_check.py"], cwd=repository, stderr=subprocess.DEVNULL)
+    place = repository(tmp_path / "repository", README=page)
+    running = subprocess.Popen([sys.executable, ".ci/docs_check.py"], cwd=place, stderr=subprocess.DEVNULL)
     try:
         while not began.exists():
             assert running.poll() is None

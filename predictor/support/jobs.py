@@ -10,7 +10,7 @@ import fcntl
 import multiprocessing
 import sys
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -60,6 +60,7 @@ def run_tasks(
     cluster: Cluster | None = None,
     gpus: int = 0,
     imports: Sequence[str] = (),
+    on_start: Callable[[int], None] = lambda number: None,
 ) -> Generator[tuple[int, str | None]]:
     """Runs tasks; yields the number of each that ended, and why it has no result, or None. Closing it ends what runs.
 
@@ -70,14 +71,17 @@ def run_tasks(
             when all others have ended.
         gpus: number of GPUs of each task on a cluster.
         imports: names of modules that this machine's processes import together, once.
+        on_start: called with the number of each task that starts on this machine.
 
     Raises:
         UserError: a machine of the cluster does not see the folder, or has other versions.
     """
-    return _run_here(tasks, workers, imports) if cluster is None else _run_on(cluster, tasks, gpus)
+    return _run_here(tasks, workers, imports, on_start) if cluster is None else _run_on(cluster, tasks, gpus)
 
 
-def _run_here(tasks: Sequence[Task], workers: int, imports: Sequence[str]) -> Generator[tuple[int, str | None]]:
+def _run_here(
+    tasks: Sequence[Task], workers: int, imports: Sequence[str], on_start: Callable[[int], None]
+) -> Generator[tuple[int, str | None]]:
     waiting, running = list(range(len(tasks))), dict[int, BaseProcess]()
     try:
         while waiting or running:
@@ -86,6 +90,7 @@ def _run_here(tasks: Sequence[Task], workers: int, imports: Sequence[str]) -> Ge
             for i in ready[: workers - len(running)]:
                 waiting.remove(i)
                 running[i] = _started(tasks[i], tasks[i].folder, imports)
+                on_start(i)
             wait([process.sentinel for process in running.values()])
             for i in [i for i, process in running.items() if process.exitcode is not None]:
                 yield i, _reason(tasks[i], running.pop(i).exitcode)

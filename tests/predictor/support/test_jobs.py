@@ -1,6 +1,6 @@
 """Tasks in processes of their own: each ends once, in an order that fits, and none stays behind."""
 
-import contextlib
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -13,22 +13,24 @@ from typing import Any
 import pytest
 
 from predictor.support.errors import UserError
-from predictor.support.jobs import run_tasks
+from predictor.support.jobs import LOG_FILE, run_tasks
+from predictor.support.processes import end
 
 SCRIPT = """
 import sys
+from multiprocessing.resource_tracker import ensure_running
 from pathlib import Path
 
-from tests.predictor.support.test_jobs import Sleeper, tracker_runs
+from tests.predictor.support.test_jobs import Sleeper
 from predictor.support.errors import run_entry_point
 from predictor.support.jobs import run_tasks
 
 folder = Path(sys.argv[1])
 if sys.argv[2] == "again":
-    tracker_runs()
+    ensure_running()  # as after any other process
 (folder / "began").touch()
-tasks = [Sleeper(folder / "task")]
-run_entry_point(lambda: print(list(run_tasks(tasks, workers=1, imports=["tests.predictor.support.slow_import"]))))
+tasks, imports = [Sleeper(folder / "task")], ["tests.predictor.support.slow_import"] if sys.argv[2] != "late" else []
+run_entry_point(lambda: print(list(run_tasks(tasks, workers=1, imports=imports))))
 """
 
 
@@ -66,14 +68,8 @@ class Sleeper(Toy):
     """Task that takes minutes."""
 
     def run(self) -> None:
+        (self.locked_folder / "runs").touch()
         time.sleep(300)
-
-
-def tracker_runs() -> None:
-    """Starts what multiprocessing keeps beside a process that has started another one."""
-    from multiprocessing.resource_tracker import ensure_running
-
-    ensure_running()
 
 
 def test_each_task_ends_with_its_reason(tmp_path: Path):
@@ -90,25 +86,59 @@ def test_each_task_ends_with_its_reason(tmp_path: Path):
 
 def test_tasks_wait_for_those_that_they_need(tmp_path: Path):
     tasks = [Toy(tmp_path / "last", ("first", "second")), Toy(tmp_path / "first"), Toy(tmp_path / "second", ("first",))]
-    ended = list(run_tasks(tasks, workers=3))
-    assert ended == [(1, None), (2, None), (0, None)]
+    started: list[int] = []
+    ended = list(run_tasks(tasks, workers=3, on_start=started.append))
+    assert ended == [(1, None), (2, None), (0, None)] and started == [1, 2, 0]
     assert all(task.result.read_text() == "[]" for task in tasks)
 
 
 @pytest.mark.parametrize("when", ["first", "again"])
 def test_ctrl_c_while_a_process_starts_ends_it(tmp_path: Path, when: str):
     """The server imports for seconds first; a Ctrl-C in that time was lost, or left the process behind."""
-    command = [sys.executable, "-c", SCRIPT, str(tmp_path), when]
-    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    assert stopped(tmp_path, when, "began", signal.SIGINT, after_s=1.0) == 130
+
+
+def test_the_log_of_a_task_that_was_stopped_says_that_it_goes_on(tmp_path: Path):
+    assert stopped(tmp_path, "late", "runs", signal.SIGTERM) == 143
+    assert (tmp_path / "task" / LOG_FILE).read_text() == "stopped: the same command goes on\n"
+
+
+def stopped(folder: Path, when: str, begun: str, number: signal.Signals, after_s: float = 0.0) -> int:
+    """Returns the exit status of a command that a signal stops once a file is there."""
+    running = subprocess.Popen([sys.executable, "-c", SCRIPT, str(folder), when], stderr=subprocess.PIPE, text=True)
     try:
-        while not (tmp_path / "began").exists():
+        while not (folder / begun).exists():
             assert running.poll() is None
             time.sleep(0.05)
-        time.sleep(1.0)
-        running.send_signal(signal.SIGINT)
+        time.sleep(after_s)
+        running.send_signal(number)
         _, said = running.communicate(timeout=120)
     finally:
-        with contextlib.suppress(ProcessLookupError):
-            running.kill()
+        running.kill()
         running.wait()
-    assert running.returncode == 130 and said.startswith("stopped: "), said
+    assert said.startswith("stopped: "), said
+    return running.returncode
+
+
+def test_a_second_ctrl_c_kills_what_does_not_end(tmp_path: Path):
+    process = multiprocessing.get_context("spawn").Process(target=stay, args=(tmp_path / "stays",))
+    process.start()
+    while not (tmp_path / "stays").exists():
+        assert process.is_alive()
+        time.sleep(0.05)
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.alarm(1)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            end([process], patience_s=300.0)
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+    assert process.exitcode == -signal.SIGKILL
+
+
+def stay(began: Path) -> None:
+    """Ignores that it is asked to end."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    began.touch()
+    time.sleep(300)
