@@ -192,10 +192,11 @@ def frozen(seen: Any) -> Any:
 
 
 def random_actions(env: Any, seed: int) -> Act:
-    """Returns random actions, equal for equal seeds."""
+    """Returns random actions, equal for equal seeds, also where a reset makes new spaces (highway-env)."""
     if not isinstance(env, ParallelEnv):
-        env.action_space.seed(seed)
-        return lambda _: env.action_space.sample()
+        space = env.action_space
+        space.seed(seed)
+        return lambda _: space.sample()
     spaces = {agent: env.action_space(agent) for agent in env.possible_agents}
     for number, space in enumerate(spaces.values()):
         space.seed(seed + number)

@@ -17,6 +17,7 @@ ARGUED: tuple[tuple[str, str, str], ...] = (
         "silent",
         "0 has a meaning, which --help says: none, all, the default, or no weight; a seed may be 0",
     ),
+    (r"predictor\.train: --horizon-steps '0'", "silent", "0 takes the default, or the horizon of `--init`"),
     (
         r".*: --(extra-columns|memory-steps|neighbours) '--'",
         "silent",

@@ -15,6 +15,7 @@ from envs.drivers.sampled_actions import uniform_action
 from envs.own_observation import own_spaces
 from envs.readers.base import Reader
 from envs.readers.function import FunctionReader
+from envs.readers.highway import HighwayReader
 from envs.registry import make_env
 from envs.testing import check_reader, examine_reader, reader_problems
 from predictor.scene import Scene, SceneSpec
@@ -253,6 +254,23 @@ def test_nothing_is_found_on_other_roads(env_id: str):
         if env_id == "parking-v0":
             env = gym.wrappers.FlattenObservation(env)
         assert reader_problems(env, reader, episodes=2, max_steps=40) == []
+
+
+class Drawing(HighwayReader):
+    """Uses up random numbers of the road, with which traffic is made."""
+
+    def read_all(self, env: gym.Env) -> Scene:
+        env.unwrapped.np_random.random()
+        return super().read_all(env)
+
+
+def test_a_reader_that_draws_is_found_where_a_reset_makes_new_spaces():
+    """highway-env makes its action space anew at each reset: a seed of the old one must determine the actions."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        env = make_env("intersection-v2")
+        problems = reader_problems(env, Drawing, episodes=1, max_steps=20)
+    assert any("reading changes what happens" in line for line in problems), problems
 
 
 def test_ids_of_which_some_are_lost_are_no_mistake():
