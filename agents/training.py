@@ -174,7 +174,7 @@ def _learn(
             reset_num_timesteps=model.num_timesteps == 0,
             log_interval=log_interval(plan.algorithm),
         )
-    except ValueError:
+    except ValueError:  # SB3's own, of a distribution that is none
         check_finite(model)
         raise
     finally:
@@ -338,7 +338,12 @@ class SelectBest(BaseCallback):
             self._measure()
 
     def _measure(self) -> None:
-        """Plays the seeds, keeps the model unless it is worse, and adds a point to the curve."""
+        """Plays the seeds, keeps the model unless it is worse, and adds a point to the curve.
+
+        Raises:
+            DivergedError: the weights are not finite; algorithms that learn values go on with those unnoticed.
+        """
+        check_finite(self.model)
         self._measured_at, self._learned_s = self.num_timesteps, self.seconds
         results = self._arena.play(self.model, self._seeds)
         mean, scalars = float(np.mean([r.episode_return for r in results])), self._scalars()

@@ -117,9 +117,7 @@ def _training(name: str, info: CheckpointInfo) -> str:
 
 def _trained(made: Mapping[str, Any]) -> str:
     result = made["result"]
-    reached = f"minADE {result['val_min_ade_m']:.3f} m"
-    if "val_energy_m" in result:
-        reached = f"energy score {result['val_energy_m']:.3f} m, ADE {result['val_ade_m']:.3f} m"
+    reached = f"energy score {result['val_energy_m']:.3f} m, ADE {result['val_ade_m']:.3f} m"
     versions = ", ".join(f"{k} {v}" for k, v in made["versions"].items())
     return (
         f"`{made['command']}`\n\nSeed {made['train_config']['seed']}, commit {made['commit']}, {versions}. Best "

@@ -235,10 +235,10 @@ def read_info(path: Path) -> CheckpointInfo:
         raise UserError(f"{path} is not a predictor checkpoint (config.json has no format '{FORMAT}')")
     version_of(content, VERSION, f"checkpoint {path}")
     content.pop("version")
-    for key in ("std_m", "sources", "provenance"):
+    for key in ("model", "std_m", "sources", "provenance"):
         if key not in content:
             raise UserError(f"{file}: key '{key}' is missing")
-    model = converted(content.get("model", "dgvae"), str, f"{file}: model")  # once there was one model only
+    model = converted(content["model"], str, f"{file}: model")
     if model not in KINDS:
         raise UserError(f"{file}: model: no model '{short(model, 80)}'; there are {', '.join(KINDS)}")
     config = config_from_json(model, content.pop("config", None), f"{file}: config")

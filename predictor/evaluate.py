@@ -177,7 +177,7 @@ def _plot(
     batch = windows.batch(chosen[:200])
     device = torch.device("cpu" if isinstance(model, ConstantVelocity) else config.device)
     outcome: Outcome = run_window_batch(
-        model, batch.to(device), horizon, min(config.num_samples, 10), torch.Generator(device)
+        model, batch.to(device), horizon, min(config.num_samples, 10), torch.Generator(device).manual_seed(config.seed)
     )
     busiest = torch.argsort(outcome.valid.cpu().all(-1).sum(-1), descending=True)[:4].tolist()
     figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")

@@ -30,6 +30,7 @@ from agents.studies.results import RESULT_FILE, Result, write_result
 from agents.task import EVALUATION_SEED, Task
 from agents.training import TrainingPlan, train
 from envs.drivers.all_agents import make_driver
+from envs.drivers.content import content_of
 from envs.drivers.ego import make_ego_driver, named_drivers
 from envs.drivers.planner import ORACLE, is_planner, planner_checkpoint, planner_config
 from envs.drivers.trained import require_own_view
@@ -248,9 +249,13 @@ def _trainings(study: Study, scenario: Scenario, arm: StudyArm, where: str) -> l
 
 
 def _driver_pin(name: str, task: Task) -> dict[str, Any] | None:
-    """Returns what the planner's forecasts come from, and its settings; a policy's hash; None for other drivers."""
-    if name.endswith(".zip"):
-        return {"sha256": _hash_of(Path(name))}
+    """Returns what determines a driver beside its name; None for one that its name determines.
+
+    That is the hash of a policy's zip or of the module of a driver of one's own, or what the planner's forecasts come
+    from and its settings.
+    """
+    if name.endswith(".zip") or is_own(name):
+        return {"sha256": content_of(name)}
     if not is_planner(name):
         return None
     settings = asdict(planner_config(name))

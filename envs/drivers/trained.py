@@ -100,13 +100,20 @@ def parallel_env_for_driver(env: Any, driver: str) -> Any:
     """Returns a PettingZoo env, in the wrapper that a policy with a note on its forecaster was trained with.
 
     Raises:
-        UserError: the policy was trained on another forecaster, or with plans.
+        UserError: the policy was trained on another forecaster, with plans, or on true futures beside agents that a
+            driver moves.
     """
     options = wrapper_options(driver) if sees_forecasts(driver) else {}
     if not options:
         return env
     if "what_if" in options:
         raise UserError(f"policy {driver} was trained with plans of one ego, which PettingZoo environments do not have")
+    note = note_of(driver)
+    if options["arm"].shown.true_futures and note is not None and note.learners:
+        raise UserError(
+            f"policy {driver} was trained on arm '{options['arm'].name}' beside agents that do not learn, whose true "
+            "futures follow from their driver: only agents.evaluate can play it"
+        )
     from envs.parallel import ForecastParallelEnv  # most drivers need no wrapper
 
     seen = ForecastParallelEnv(env, **options)

@@ -169,7 +169,7 @@ def _kept_controls(
     seen = replace(model.spec, has_ego=spec.has_ego)  # where no agent is the ego, the first is not taken for it
     return {
         RESIDUAL: fit_residual(model, training_windows(paths, seen, horizon_steps), horizon_steps),
-        NEIGHBOURS: fit_from_stores(paths, spec, horizon_steps, k=max(K, samples - 1)),
+        NEIGHBOURS: fit_from_stores(paths, spec, horizon_steps, source, k=max(K, samples - 1)),
         NOISY: fit_noise(windows, horizon_steps),
     }
 

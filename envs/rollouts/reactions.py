@@ -227,14 +227,14 @@ def _swerved(branches: Branches, receiver: int) -> bool:
 
 
 @functools.lru_cache(maxsize=2)
-def _kept_neighbours(stores: tuple[str, ...], spec: SceneSpec, horizon_steps: int) -> NearestNeighbour:
-    return fit_from_stores([Path(store) for store in stores], spec, horizon_steps)
+def _kept_neighbours(stores: tuple[str, ...], spec: SceneSpec, horizon_steps: int, env_id: str) -> NearestNeighbour:
+    return fit_from_stores([Path(store) for store in stores], spec, horizon_steps, f"env '{env_id}'")
 
 
 def _forecasters(task: ReactionTask, spec: SceneSpec) -> dict[str, SideForecaster]:
     """Returns new forecasters for an episode, by name."""
     found = checkpoint_forecasters(task.checkpoints, spec, task.env_id)
     if task.stores:
-        found[NEIGHBOURS] = _kept_neighbours(task.stores, spec, task.horizon_steps)
+        found[NEIGHBOURS] = _kept_neighbours(task.stores, spec, task.horizon_steps, task.env_id)
     found[STRAIGHT] = ConstantVelocity(spec)
     return {name: SideForecaster(forecaster, spec, task.horizon_steps) for name, forecaster in found.items()}

@@ -191,7 +191,7 @@ def read_policy_note(path: Path) -> PolicyNote | None:
         if key not in content:
             raise UserError(f"{where}: key '{key}' is missing; save the policy again")
     pin = content[FORECASTER]
-    others = {key: value for key, value in content.items() if key not in (FORECASTER, _ALGORITHM_KEY)}
+    others = {key: value for key, value in content.items() if key != FORECASTER}
     forecaster = None if pin is None else ForecasterPin.from_json(pin, f"{where}: {FORECASTER}")
     return from_table(PolicyNote, others, where, {"forecaster": forecaster})
 

@@ -215,9 +215,9 @@ class _LaneChange(_Override):
         if not isinstance(vehicle, ControlledVehicle):
             raise UserError(f"{name} is steered by its policy itself and cannot be sent to another lane; brake it")
         start, end, lane = vehicle.target_lane_index
-        aside = (start, end, lane + (1 if side == "right" else -1))
+        aside = (start, end, -1 if lane is None else lane + (1 if side == "right" else -1))
         lanes = vehicle.road.network.graph[start][end]
-        inside = lane is not None and 0 <= aside[2] < len(lanes)
+        inside = 0 <= aside[2] < len(lanes)
         if not inside or not vehicle.road.network.get_lane(aside).is_reachable_from(vehicle.position):
             raise UserError(f"{name} has no lane on its {side}; choose the other side, or another agent")
         self._aside = aside

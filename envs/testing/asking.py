@@ -30,6 +30,10 @@ def check_reset(env: Any) -> None:
     inner = env
     while isinstance(inner, gym.Wrapper | BaseParallelWrapper):
         inner = inner.env
+    if isinstance(inner, ParallelEnv) and not hasattr(inner, "possible_agents"):
+        raise ReaderProblem(
+            f"{type(inner).__name__} has no possible_agents; set it to the names of all agents that may ever be there"
+        )
     try:
         takes = inspect.signature(inner.reset)
     except (TypeError, ValueError):  # written in C

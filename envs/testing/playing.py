@@ -200,7 +200,17 @@ def random_actions(env: Any, seed: int) -> Act:
     spaces = {agent: env.action_space(agent) for agent in env.possible_agents}
     for number, space in enumerate(spaces.values()):
         space.seed(seed + number)
-    return lambda _: {agent: spaces[agent].sample() for agent in env.agents}
+
+    def act(_: int) -> dict[str, Any]:
+        unknown = [agent for agent in env.agents if agent not in spaces]
+        if unknown:
+            raise ReaderProblem(
+                f"agent '{unknown[0]}' is alive, but possible_agents has {list(spaces)} alone: it must name all agents "
+                "that may ever be there"
+            )
+        return {agent: spaces[agent].sample() for agent in env.agents}
+
+    return act
 
 
 def play(env: Any, opened: OpenReader, seed: int, max_steps: int) -> Episode:

@@ -95,6 +95,8 @@ class PartialStore:
         """Takes what the next step of the recording brought: no episode, and why."""
         self.skipped[seed] = reason
         self._added += 1
+        if time.monotonic() - self._written_at >= self._part_s:
+            self._write_part()
 
     def finish(self, info: StoreInfo, overwrite: bool = False) -> list[Episode]:
         """Writes the store, deletes the parts, and returns all episodes; its provenance names the seeds without one.
@@ -102,7 +104,8 @@ class PartialStore:
         Raises:
             UserError: all seeds were skipped, none has an episode; or as `predictor.data.store.write_store`.
         """
-        episodes = [episode for part in self._parts() for episode in read_store(part).episodes] + self._new
+        written = (read_store(part).episodes for part in self._parts() if any(part.iterdir()))
+        episodes = [episode for found in written for episode in found] + self._new
         if not episodes and not self.skipped:
             raise UserError("no agent could be perturbed in any episode, so there are no branches; raise --max-steps")
         if self.skipped:
@@ -141,14 +144,18 @@ class PartialStore:
 
     def _write_part(self) -> None:
         self._written_at = time.monotonic()
-        if not self._new or self._info is None:
+        if not self._added or (not self._new and not self.skipped):
             return
         self.folder.mkdir(parents=True, exist_ok=True)
         write_json(self.folder / SETTINGS, self._settings)
         part = self.folder / f"{self.num_done:08d}+{self._added}"
         if self.skipped:
             write_json(_reasons(part), self.skipped)  # counts once the part is there
-        write_store(part, self._info, self._new)
+        if self._new:
+            assert self._info is not None
+            write_store(part, self._info, self._new)
+        else:  # steps without an episode
+            part.mkdir()
         self.num_done += self._added
         self._new, self._added = [], 0
 

@@ -180,12 +180,12 @@ def read_header(path: Path, format: str) -> StoreHeader:
 
 
 def check_digest(path: Path, attributes: Mapping[str, Any]) -> None:
-    """Checks the checksum of a store's attributes; older stores have none.
+    """Checks the checksum of a store's attributes.
 
     Raises:
         UserError: the attributes are not those that were written.
     """
-    if attributes.get(DIGEST, digest_of(attributes)) != digest_of(attributes):
+    if attributes.get(DIGEST) != digest_of(attributes):
         raise UserError(f"{path / METADATA} is damaged (its checksum does not fit); copy or collect it anew")
 
 
@@ -208,7 +208,7 @@ def read_arrays(path: Path, header: StoreHeader) -> dict[str, np.ndarray]:
     """
     try:
         group = open_group(path, mode="r", zarr_format=3, use_consolidated=False)
-        return {name: _read(path, name, group[name], DIGEST in header.attributes) for name in header.shapes}
+        return {name: _read(path, name, group[name]) for name in header.shapes}
     except UserError:
         raise
     except _BAD as error:
@@ -216,11 +216,9 @@ def read_arrays(path: Path, header: StoreHeader) -> dict[str, np.ndarray]:
         raise UserError(f"{short(path)} is not a readable episode store ({reason}); collect it anew") from error
 
 
-def _read(path: Path, name: str, stored: Any, has_checksums: bool) -> np.ndarray:
-    """Reads one array; of small ones, older stores leave out chunks of zeros."""
-    if has_checksums or name not in ("ids", "starts", "seeds", "label_starts"):
-        if stored.nchunks_initialized != stored.nchunks:  # Zarr reads what is missing as zeros
-            raise UserError(f"{path}: chunks of '{name}' are missing; copy or collect it anew")
+def _read(path: Path, name: str, stored: Any) -> np.ndarray:
+    if stored.nchunks_initialized != stored.nchunks:  # Zarr reads what is missing as zeros
+        raise UserError(f"{path}: chunks of '{name}' are missing; copy or collect it anew")
     _check_chunks(path, name, stored)
     try:
         return np.asarray(stored)

@@ -146,13 +146,13 @@ def _measurement(result: dict[str, Any], config: dict[str, Any], made: dict[str,
     one, straight = result["model"], result["constant_velocity"]
     short = (result.get("histories") or {}).get("1") or {}
     controls = result.get("controls") or {}
-    near = controls.get("nearest neighbours") or result.get("nearest_neighbours") or {}
+    near = controls.get("nearest neighbours") or {}
     median_ms, p95_ms = result.get("latency_median_ms"), result.get("latency_p95_ms")
     return Measurement(
         env_id=" ".join(filter(None, (result["env_id"], result.get("env_kwargs")))),
-        driver=result.get("driver") or config["ego"],
+        driver=result["driver"],
         episodes=config["episodes"],
-        samples=config["num_samples"] if "num_samples" in config else config["samples"],  # its name until version 0.1
+        samples=config["num_samples"],
         command=made["command"],
         commit=made.get("commit") or "",
         constant_velocity_ade_m=straight["min_ade_m"],
@@ -178,8 +178,6 @@ def _of_samples(result: dict[str, Any]) -> dict[str, Any]:
     many = result["model_samples"]
     intervals = many.get("intervals") or {}
     found: dict[str, Any] = {"best_of_k_m": many["min_ade_m"]}
-    if many.get("energy_m") is None:
-        return found  # written before version 0.2
     for name, key in (("best_of_k", "min_ade_m"), ("joint_best_of_k", "min_joint_ade_m"), ("energy", "energy_m")):
         found[f"{name}_m"] = many[key]
         found[f"{name}_interval_m"] = _frozen(intervals.get(key))

@@ -36,7 +36,6 @@ def read_state(path: Path, model: nn.Module, device: torch.device) -> dict[str, 
         raise _damaged(path, " ".join(str(error).split())) from error
     if not isinstance(state, dict):
         raise _damaged(path, f"it must hold a dict, got {type(state).__name__}")
-    state.setdefault("validated", state.get("step"))  # older states tell of no validation that is still to come
     kinds = {"model": dict, "optimizer": dict, "step": int, "best": float, "stale": int, "validated": int}
     for name, kind in kinds.items():
         value = state.get(name)

@@ -11,7 +11,7 @@ import torch
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
-from agents.algorithms import check_finite, even_batches
+from agents.algorithms import DivergedError, check_finite, even_batches
 from agents.arena import EgoArena
 from agents.features import ForecastAttention
 from agents.presets import (
@@ -430,6 +430,14 @@ def test_a_crash_that_is_reported_only_when_it_happens_is_a_share_of_all_episode
     reported = [True, None, None, None]
     results = [EpisodeResult(i, 1.0, 1, crashed, float("nan")) for i, crashed in enumerate(reported)]
     assert driving_scalars(results)["crash_rate"] == 0.25
+
+
+def test_an_algorithm_that_goes_on_with_weights_that_are_no_numbers_is_stopped(tmp_path: Path):
+    """DQN has no distribution that would refuse them."""
+    sizes = {"steps": 64, "num_envs": 1, "selections": 2, "selection_episodes": 1, "selection_envs": 1}
+    wild = {"learning_rate": 1e30, "learning_starts": 4, "train_freq": 4, "net_arch": (8,), "batch_size": 4}
+    with pytest.raises(DivergedError, match="the policy's weights are not finite"):
+        train(plan(task=Task(TOY, "none"), algorithm="dqn", settings=wild, in_process=True, **sizes), tmp_path)
 
 
 def test_a_diverged_policy_is_named_in_one_line():

@@ -50,6 +50,17 @@ def test_what_determines_a_result_is_in_the_name(cells: Callable[..., list[Cell]
     assert not set(before.values()) & {cell.name for cell in cells()}
 
 
+def test_the_code_of_a_driver_of_ones_own_is_in_the_name(
+    cells: Callable[..., list[Cell]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.syspath_prepend(tmp_path)
+    module, names = tmp_path / "my_study_driver.py", []
+    for action in (0, 1):
+        module.write_text(f"def drive(env, rng):\n    return lambda observation: {action}\n")
+        names.append(next(c.name for c in cells(references='["own:my_study_driver:drive"]') if "own" in c.line))
+    assert names[0] != names[1]
+
+
 def test_only_what_concerns_a_cell_is_in_its_name(cells: Callable[..., list[Cell]]):
     """So that cells which are finished stay."""
     none, zeros = cells(env_id=HIGHWAY, seeds="1", arms='["none", "zeros"]', references="[]")

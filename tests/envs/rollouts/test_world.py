@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 import torch
 
+from envs.drivers import trained
 from envs.readers import FunctionReader
 from envs.readers.highway_labels import LEADER
 from envs.rollouts.world import EgoWorld, MultiagentWorld, World, default_drivers, open_world
+from envs.sb3.policy_file import ForecasterPin, PolicyNote
 from envs.wrappers import ForecastObservation, SceneObservation
+from predictor.checkpoint import CONSTANT_VELOCITY
 from predictor.scene import Scene, SceneSpec
 from predictor.support.errors import UserError
 from tests.envs.evaluation import TAG, save_tag
@@ -152,6 +155,18 @@ def assert_same_nested(found: Any, expected: Any) -> None:
 def test_what_does_not_go_together_is_named(env_id: str, driver: str, checkpoint: str | None, message: str):
     with pytest.raises(UserError, match=f"^{message}"):
         open_world(env_id, driver, checkpoint)
+
+
+def test_true_futures_beside_agents_that_a_driver_moves_are_refused(monkeypatch: pytest.MonkeyPatch):
+    """They follow from that driver, which the environment alone does not have."""
+    pin = ForecasterPin(CONSTANT_VELOCITY, None, 10, 1, 6, None, arm="oracle")
+    monkeypatch.setattr(trained, "sees_forecasts", lambda driver: True)
+    for learners, refused in ((("adversary",), True), ((), False)):
+        note = PolicyNote(pin, learners, env_id=TAG)
+        monkeypatch.setattr(trained, "note_of", lambda path, note=note: note)
+        message = "was trained on arm 'oracle' beside agents that do not learn" if refused else "no policy at"
+        with pytest.raises(UserError, match=message):
+            open_world(TAG, "absent.zip")
 
 
 @pytest.mark.parametrize(

@@ -296,6 +296,26 @@ def test_many_agents_are_checked_too():
         check_reader(Swarm())
 
 
+class Stranger(Swarm):
+    """An agent that `possible_agents` does not name lives on."""
+
+    def reset(self, **options: Any) -> Any:
+        found = super().reset(**options)
+        self.agents = [*self.agents, "stranger"]
+        return found
+
+
+def test_an_agent_that_is_not_named_is_found():
+    problems = reader_problems(Stranger(), SwarmReader)
+    assert any("agent 'stranger' is alive, but possible_agents has [" in line for line in problems), problems
+
+
+def test_names_of_agents_are_needed():
+    swarm = Swarm()
+    del swarm.possible_agents
+    assert any("Swarm has no possible_agents; set it" in line for line in reader_problems(swarm, SwarmReader))
+
+
 def test_without_a_reader_there_is_nothing_to_check():
     with pytest.raises(UserError, match="no scene reader"):
         check_reader(gym.make("CartPole-v1"))

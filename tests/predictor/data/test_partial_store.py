@@ -107,6 +107,22 @@ def test_unfinished_files_of_other_stores_stay(tmp_path: Path):
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names[1:])
 
 
+@pytest.mark.parametrize("part_s", [0.0, 1e6])
+def test_skipped_seeds_at_the_end_of_a_stopped_recording_are_kept(tmp_path: Path, part_s: float):
+    """Each may have cost the whole time that a seed is given."""
+    first, *_ = episodes()
+    with pytest.raises(KeyboardInterrupt), PartialStore(tmp_path / "store", SETTINGS_A, part_s=part_s) as partial:
+        partial.skip(0, "it hangs")
+        partial.add(INFO, first)
+        partial.skip(2, "it dies")
+        partial.skip(3, "it hangs")
+        raise KeyboardInterrupt
+    with PartialStore(tmp_path / "store", SETTINGS_A) as partial:
+        assert partial.num_done == 4 and partial.skipped == {0: "it hangs", 2: "it dies", 3: "it hangs"}
+        assert len(partial.finish(INFO)) == 1
+    assert read_store(tmp_path / "store").info.provenance["skipped"]["episodes"] == 3
+
+
 def test_a_seed_was_skipped_only_if_its_part_is_there(tmp_path: Path):
     """The episode of a seed that failed by chance may be recorded by the next attempt."""
     first, second, *_ = episodes()

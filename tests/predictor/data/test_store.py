@@ -455,17 +455,21 @@ def test_the_damaged_chunk_of_many_is_named(tmp_path: Path):
         read_store(tmp_path / "store")
 
 
-def test_a_store_without_checksums_still_loads(tmp_path: Path):
-    """As versions before wrote it: no crc32c, no hash, and no chunks of arrays that are all zero."""
+def test_a_store_without_its_checksum_is_refused(tmp_path: Path):
     write_store(tmp_path / "store", INFO, [episode(1), episode(2)])
-    old = zarr.open_group(tmp_path / "old", mode="w")
-    new = zarr.open_group(tmp_path / "store", mode="r")
-    for name in ("states", "valid", "ids", "starts", "seeds"):
-        values = np.asarray(new[name])
-        old.create_array(name, data=values * (name != "seeds"))
-    old.attrs.update({key: value for key, value in new.attrs.items() if key not in ("sha256", "causal_threshold_m")})
-    assert not (tmp_path / "old" / "seeds" / "c").exists()
-    assert_equal(read_store(tmp_path / "old").episodes[1], replace(episode(2), seed=0))
+    metadata = tmp_path / "store" / "zarr.json"
+    content = json.loads(metadata.read_text())
+    del content["attributes"]["sha256"]
+    metadata.write_text(json.dumps(content))
+    with pytest.raises(UserError, match="zarr.json is damaged"):
+        read_store(tmp_path / "store")
+
+
+def test_missing_chunks_of_small_arrays_are_no_zeros(tmp_path: Path):
+    write_store(tmp_path / "store", INFO, [episode(1), episode(2)])
+    shutil.rmtree(tmp_path / "store" / "seeds" / "c")
+    with pytest.raises(UserError, match="chunks of 'seeds' are missing"):
+        read_store(tmp_path / "store")
 
 
 def zeros(size: int) -> bytes:
