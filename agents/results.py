@@ -183,7 +183,7 @@ def read_evaluation(file: Path) -> Evaluation:
         UserError: there is no such file, or it is damaged.
     """
     content = read_object(file)
-    for key in ("env_id", "first_seed", "episodes"):
+    for key in ("env_id", "first_seed", "has_ego", "episodes"):
         if key not in content:
             raise UserError(f"{file}: key '{key}' is missing; evaluate the policy again")
     episodes = converted(content["episodes"], dict[str, tuple[dict[str, Any], ...]], f"{file}: episodes")
@@ -199,10 +199,8 @@ def read_evaluation(file: Path) -> Evaluation:
         results[name] = [from_table(EpisodeResult, one, f"{file}: episodes.{short(name, 40)}") for one in cleaned]
     if not results:
         raise UserError(f"{file} has no episodes; evaluate the policy again")
-    first = next(iter(results.values()))
-    has_ego = content.get("has_ego", any(e.action_counts or not math.isnan(e.mean_speed_mps) for e in first))
-    values: dict[str, Any] = {name: content[name] for name in ("env_id", "first_seed", "env_kwargs") if name in content}
-    values["has_ego"] = has_ego
+    names = ("env_id", "first_seed", "env_kwargs", "has_ego")
+    values: dict[str, Any] = {name: content[name] for name in names if name in content}
     return from_table(Evaluation, values, str(file), {"results": results})
 
 

@@ -92,8 +92,6 @@ class SuiteConfig:
     """Ray cluster that runs the lines, each on one CPU (and one GPU with --device cuda): auto (the one that runs on
     this machine) or HOST:PORT of its head; --data and --out have to be on a file system that all machines share
     (docs/scale.md). None runs them here."""
-    only_line: str = ""
-    """Key of a line to run in this process, without a table."""
 
     def __post_init__(self) -> None:
         """Checks choices and ranges; `device="auto"` becomes the device that is taken.
@@ -108,7 +106,7 @@ class SuiteConfig:
         check_processes(self.workers, "workers")
         check_address(self.cluster)
         keys = [line.key for line in TABLES[self.table].lines]
-        for key in (*self.lines, *filter(None, [self.only_line])):
+        for key in self.lines:
             if key not in keys:
                 raise UserError(f"table '{self.table}' has no line '{key}'; there are {', '.join(keys)}")
         object.__setattr__(self, "device", resolve_device(self.device))
@@ -365,10 +363,6 @@ def main() -> None:
     """Entry point."""
     config = parse(SuiteConfig, __doc__)
     tune(config.device)
-    if config.only_line:
-        config.check_stores()
-        run_line(config, line_of(config.table, config.only_line))
-        return
     content = run_suite(config)
     print((config.folder / "table.md").read_text())
     print(f"written to {config.folder}: table.md, table.json, table.tex, by_step.png")

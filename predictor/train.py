@@ -34,7 +34,7 @@ from predictor.support.reading import as_object, read_object
 from predictor.support.remote import address
 from predictor.support.runtime import tune
 from predictor.support.stopping import deferred_stops, resumable
-from predictor.training.config import BEFORE_THEY_EXISTED, TrainConfig
+from predictor.training.config import TrainConfig
 from predictor.training.curve import CURVE_FILE, KEYS, add_point
 from predictor.training.processes import ALONE, Group, LostProcessError, joined
 from predictor.training.trainer import LOG_EVERY, Trainer, load_data
@@ -248,14 +248,13 @@ def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
     content = read_object(config_file)
     before = as_object(content.get("config"), f"{config_file}: config")
     now = _comparable(config)
-    # of fields that did not exist when the run began
-    defaults = {f.name: f.default for f in fields(TrainConfig)} | BEFORE_THEY_EXISTED
+    defaults = {f.name: f.default for f in fields(TrainConfig)}  # of fields that are newer than the run
     old = {name: before.get(name, defaults[name]) for name in now}
     for name, value in old.items():
         if not isinstance(value, float | int if isinstance(now[name], float) else type(now[name])):
             kind = type(now[name]).__name__
             raise UserError(f"{config_file}: config.{name} must be of type {kind}, got {short(repr(value), 80)}")
-    known = as_object(content.get("stores", {}), f"{config_file}: stores")  # runs of older versions have none
+    known = as_object(content.get("stores"), f"{config_file}: stores")
     stores = {name: [known.get(str(path)) for path in old[name]] for name in ("data", "val_data")}
     moved = [name for name, contents in stores.items() if _are(getattr(config, name), contents)]
     free = ("steps", "out", *config.without_effect, *moved)

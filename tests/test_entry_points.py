@@ -47,7 +47,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     ],
     "predictor.suite": [
         ("--table springs --data absent", "no store at absent/springs/train; make the stores of this table with"),
-        ("--table springs --data absent --only-line mlp", "no store at absent/springs/train"),
+        ("--table springs --data absent --lines mlp", "no store at absent/springs/train"),
         ("--table spring", "invalid choice 'spring' for argument '--table'"),
         ("--table springs --workers -1", "workers must not be negative, got -1"),
         ("--table springs --cluster head", "cluster must be auto or HOST:PORT (as in 10.0.0.1:6379), got 'head'"),

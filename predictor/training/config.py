@@ -24,8 +24,6 @@ OF_THE_NETWORK = ("preset", "set", *OF_THE_DGVAE)
 HORIZON_STEPS = 5
 """Number of steps forecast where neither the command nor a checkpoint says it."""
 SMALLER = "pass a smaller --batch-size, or a shorter --horizon-steps"
-BEFORE_THEY_EXISTED = dict.fromkeys(OF_THE_DGVAE, False)
-"""Values of options in runs that began before the option existed, where today's default is another one."""
 
 
 @dataclass(frozen=True)

@@ -156,13 +156,17 @@ def test_accuracy_is_shown_with_the_worst_forecasts(tmp_path: Path):
         page_of(run, accuracy=(measured,))
 
 
+BEGUN = {"env_id": "x", "first_seed": 0, "has_ego": True}
+"""Beginning of a summary."""
+
+
 @pytest.mark.parametrize(
     ("name", "content", "sentence"),
     [
-        ("summary.json", {"env_id": "x", "first_seed": 0}, "key 'episodes' is missing"),
-        ("summary.json", {"env_id": "x", "first_seed": 0, "episodes": {}}, "has no episodes"),
-        ("summary.json", {"env_id": "x", "first_seed": 0, "episodes": {"p": []}}, "episodes.p has no episode"),
-        ("summary.json", {"env_id": 3, "first_seed": 0, "episodes": {"p": [{"seed": 1}]}}, "key 'episode_return' is"),
+        ("summary.json", BEGUN, "key 'episodes' is missing"),
+        ("summary.json", {**BEGUN, "episodes": {}}, "has no episodes"),
+        ("summary.json", {**BEGUN, "episodes": {"p": []}}, "episodes.p has no episode"),
+        ("summary.json", {**BEGUN, "env_id": 3, "episodes": {"p": [{"seed": 1}]}}, "key 'episode_return' is"),
         ("curve.json", [{"steps": 3}], "key 'return' is missing"),
         ("config.json", {"config": {"steps": 3}}, "is the config of neither train_policy.py nor predictor.train"),
         ("config.json", {"config": RUN, "provenance": [3]}, "provenance must be a JSON object, got 3"),

@@ -214,7 +214,6 @@ NAMES: dict[str, tuple[str, ...]] = {
     ),
     "init": ("absent", "fifo", "file", "empty", "hihgway", LONG),
     "lines": ("moon", "", LONG),
-    "only_line": ("moon", LONG),
     "set": (
         "",
         "=",

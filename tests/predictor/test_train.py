@@ -606,21 +606,6 @@ def test_the_options_that_a_message_names_continue_a_run_whose_defaults_have_cha
     assert state(tmp_path / "run")["step"] == 3
 
 
-@pytest.mark.parametrize("option", ["input_changes", "fit_inputs", "edge_geometry"])
-def test_a_run_begun_before_an_option_existed_goes_on_without_it(
-    tiny: None, circles: Path, tmp_path: Path, option: str
-):
-    """Its network has no such inputs, whatever the default is today."""
-    settings = config(circles, tmp_path / "run", **{option: False})
-    train(replace(settings, steps=2))
-    forget(tmp_path / "run", option)
-    message = f"cannot resume: {option} was False and is now True; .* with --no-{option.replace('_', '-')}$"
-    with pytest.raises(UserError, match=message):
-        train(replace(settings, resume=True, **{option: True}))
-    train(replace(settings, resume=True))
-    assert state(tmp_path / "run")["step"] == 7
-
-
 def forget(out: Path, option: str) -> None:
     """Removes an option from what a run folder says, as if it had not existed when the run began."""
     recorded = json.loads((out / "config.json").read_text())
