@@ -113,6 +113,9 @@ class CollectConfig:
     steps before, and what follows. 0 records whole episodes."""
     branch_history_steps: int = 10
     """Largest number of steps before the moment of a branch."""
+    twins: bool = False
+    """Whether each branch is followed by its twin: the same moment without the intervention, for training on how far an
+    intervention moves agents (`predictor.train --shift-weight`)."""
 
     def __post_init__(self) -> None:
         """Checks ranges.
@@ -135,6 +138,8 @@ class CollectConfig:
             raise UserError("perturb_kinds needs perturb above 0, got 0; pass --perturb, for example 0.2")
         if self.branches and (self.perturb or self.causal_labels):
             raise UserError("branches are of undisturbed episodes and have causal labels; leave out the other options")
+        if self.twins and not self.branches:
+            raise UserError("twins needs branches above 0, got 0; pass --branches 4")
         labelled = self.causal_labels or self.branches
         if not labelled and (self.causal_horizon_s is not None or self.causal_threshold_m is not None):
             raise UserError("causal_horizon_s and causal_threshold_m need causal_labels or branches above 0, got 0")
@@ -211,6 +216,7 @@ def recording_of(config: CollectConfig) -> Recording:
         causal=causal if config.causal_labels or config.branches else None,
         branches=config.branches,
         branch_history_steps=config.branch_history_steps,
+        twins=config.twins,
     )
 
 
@@ -298,7 +304,7 @@ def _info(config: CollectConfig, seed: int) -> StoreInfo:
     if recording.causal is not None:
         made["causal_labels"] = {"every": config.causal_labels, "tried": TRIED} | asdict(recording.causal)
     if config.branches:
-        made["branches"] = {"of_each": config.branches} | asdict(branch_mix_for(world))
+        made["branches"] = {"of_each": config.branches, "twins": config.twins} | asdict(branch_mix_for(world))
     return StoreInfo(
         world.spec,
         config.env_id,

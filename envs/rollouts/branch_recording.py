@@ -4,6 +4,8 @@ Each branch is an episode of its own: undisturbed steps, then the moment at whic
 once, then what all agents make of it. So nothing that happens after the moment is unforeseeable, which cannot be said
 of an episode that is perturbed again and again. The same moment without the intervention gives the causal labels of the
 perturbed agent. All draws are a function of the episode's seed alone.
+
+With `twins`, each branch is followed by what happens without the intervention (`predictor.data.twins` finds them).
 """
 
 from collections.abc import Sequence
@@ -11,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from envs.rollouts.branches import Branches, BranchPoint, copied
+from envs.rollouts.branches import Branch, Branches, BranchPoint, copied
 from envs.rollouts.causal_labels import CausalSettings, direct_shift_m, farthest, senders_of
 from envs.rollouts.interventions import kinds_of
 from envs.rollouts.world import World
@@ -61,6 +63,8 @@ class BranchRecording:
     """Distribution of interventions."""
     causal: CausalSettings
     """Which agents are perturbed, and how their causal labels are measured."""
+    twins: bool = False
+    """Whether each branch is followed by its twin, an episode of the same agents without the intervention."""
 
 
 def branch_mix_for(world: World) -> BranchMix:
@@ -73,7 +77,9 @@ def branch_mix_for(world: World) -> BranchMix:
 
 
 def record_branches(world: World, seed: int, label: str, max_steps: int, settings: BranchRecording) -> list[Episode]:
-    """Plays the episode of a seed and returns its branches; fewer than asked for if no agent can be perturbed.
+    """Plays the episode of a seed and returns its branches, each with its twin if asked for.
+
+    There are fewer than asked for if no agent can be perturbed.
 
     Args:
         world: world to play; it is reset.
@@ -90,9 +96,7 @@ def record_branches(world: World, seed: int, label: str, max_steps: int, setting
     found = []
     for step, moment in moments:
         before = scenes[max(0, step - settings.history_steps) : step]
-        episode = _branch(moment, before, settings, rng)
-        if episode is not None:
-            found.append(replace(episode, label=label, seed=seed))
+        found += [replace(e, label=label, seed=seed) for e in _branch(moment, before, settings, rng)]
     return found
 
 
@@ -117,15 +121,15 @@ def _play(
 
 def _branch(
     moment: World, before: Sequence[Scene], settings: BranchRecording, rng: np.random.Generator
-) -> Episode | None:
-    """Returns a branch of a moment; None if no agent can be perturbed."""
+) -> list[Episode]:
+    """Returns a branch of a moment, and its twin if asked for; nothing if no agent can be perturbed."""
     horizon = max(1, round(settings.mix.horizon_s / moment.spec.dt_s))
     point = BranchPoint(moment, horizon)
     labelled = min(horizon, max(1, round(settings.causal.horizon_s / moment.spec.dt_s)))
     seen = set(before[-1].ids[before[-1].valid].tolist())
     senders = [agent for agent in senders_of(moment, settings.causal) if agent in seen]
     if not senders:  # nobody who is there for more than this moment
-        return None
+        return []
     for attempt in range(TRIES):
         sender = _sender(senders, int(point.ids[0]) if moment.spec.has_ego else None, rng)
         found = _perturbed(point, sender, horizon, settings.mix, rng)
@@ -134,8 +138,10 @@ def _branch(
         moved_m = farthest(found, settings.causal.threshold_m, labelled)
         moved_m[point.ids == sender] = 0
         if np.nanmax(moved_m, initial=0.0) > settings.causal.threshold_m or attempt == TRIES - 1:
-            return _episode(point, found, before, settings.causal.threshold_m, labelled, moment.spec.has_ego)
-    return None
+            has_ego = moment.spec.has_ego
+            episode = _episode(point, found, before, settings.causal.threshold_m, labelled, has_ego)
+            return _with_twin(episode, found, before, has_ego) if settings.twins else [episode]
+    return []
 
 
 def _sender(senders: Sequence[int], ego: int | None, rng: np.random.Generator) -> int:
@@ -172,13 +178,7 @@ def _episode(
     point: BranchPoint, found: Branches, before: Sequence[Scene], threshold_m: float, labelled: int, has_ego: bool
 ) -> Episode:
     """Returns the episode of a branch, with the mark and the causal labels of the perturbed agent."""
-    after = [
-        Scene(states, found.ids, valid)
-        for states, valid in zip(found.perturbed.states, found.perturbed.valid, strict=True)
-    ]
-    while not after[-1].valid.any():  # the environment could not go on
-        after.pop()
-    episode = Episode.from_scenes([*before, *after])
+    episode = Episode.from_scenes([*before, *_scenes(found.ids, found.perturbed)])
     sender = found.intervention.agent
     column = {int(agent): i for i, agent in enumerate(episode.ids)}
     now = len(before)
@@ -192,3 +192,52 @@ def _episode(
     if has_ego:
         shift_m[:, 0] = np.nan  # its future is the policy's choice
     return replace(episode, perturbed=perturbed, causal_shift_m=shift_m)
+
+
+def _with_twin(episode: Episode, found: Branches, before: Sequence[Scene], has_ego: bool) -> list[Episode]:
+    """Returns a branch and its twin, with equal columns.
+
+    Agents that crash in one of the two are absent from the twin after the moment, the ego apart: whether two cars touch
+    turns on centimetres, and the difference of the two futures is then no reaction.
+    """
+    plain = _scenes(found.ids, found.plain)
+    crashed = found.plain.crashed | found.perturbed.crashed
+    if has_ego:
+        crashed -= {int(found.ids[0])}
+    kept = [replace(scene, valid=scene.valid & ~np.isin(scene.ids, list(crashed))) for scene in plain[1:]]
+    twin = Episode.from_scenes([*before, plain[0], *kept])
+    ids = list(dict.fromkeys([*episode.ids.tolist(), *twin.ids.tolist()]))
+    unmarked = replace(
+        twin,
+        perturbed=np.zeros(twin.valid.shape, dtype=np.int8),
+        causal_shift_m=np.full((*twin.valid.shape, len(twin.ids)), np.nan, dtype=np.float32),
+    )
+    return [_with_columns(episode, ids), _with_columns(unmarked, ids)]
+
+
+def _scenes(ids: np.ndarray, branch: Branch) -> list[Scene]:
+    """Returns the scenes of a branch, up to the last one that has an agent."""
+    scenes = [Scene(states, ids, valid) for states, valid in zip(branch.states, branch.valid, strict=True)]
+    while not scenes[-1].valid.any():  # the environment could not go on
+        scenes.pop()
+    return scenes
+
+
+def _with_columns(episode: Episode, ids: Sequence[int]) -> Episode:
+    """Returns the episode with a column for each id; agents that it lacks are absent."""
+    assert episode.perturbed is not None and episode.causal_shift_m is not None
+    place = [list(ids).index(agent) for agent in episode.ids.tolist()]
+    steps, count = len(episode.states), len(ids)
+    states = np.zeros((steps, count, episode.states.shape[2]), dtype=episode.states.dtype)
+    valid, perturbed = np.zeros((steps, count), dtype=np.bool_), np.zeros((steps, count), dtype=np.int8)
+    shift_m = np.full((steps, count, count), np.nan, dtype=np.float32)
+    states[:, place], valid[:, place], perturbed[:, place] = episode.states, episode.valid, episode.perturbed
+    shift_m[np.ix_(range(steps), place, place)] = episode.causal_shift_m
+    return replace(
+        episode,
+        states=states,
+        valid=valid,
+        ids=np.array(ids, dtype=np.int64),
+        perturbed=perturbed,
+        causal_shift_m=shift_m,
+    )

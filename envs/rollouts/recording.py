@@ -41,6 +41,8 @@ class Recording:
     """Number of branches recorded in place of the episode."""
     branch_history_steps: int = 10
     """Largest number of steps before the moment of a branch."""
+    twins: bool = False
+    """Whether each branch is followed by its twin, without the intervention."""
 
 
 def record_all(world: World, seed: int, label: str, settings: Recording) -> list[Episode]:
@@ -58,7 +60,9 @@ def record_all(world: World, seed: int, label: str, settings: Recording) -> list
     if not settings.branches:
         return [record(world, seed, label, settings)]
     assert settings.causal is not None
-    branches = BranchRecording(settings.branches, settings.branch_history_steps, branch_mix_for(world), settings.causal)
+    branches = BranchRecording(
+        settings.branches, settings.branch_history_steps, branch_mix_for(world), settings.causal, settings.twins
+    )
     return record_branches(world, seed, label, settings.max_steps, branches)
 
 

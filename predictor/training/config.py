@@ -112,6 +112,9 @@ class TrainConfig:
     reaction_weight: float = 0.0
     """Additional weight of agents that are about to react to an intervention: the roll-out's errors of an agent count
     1 + this times the strength of its causal edge; needs `causal_edges`."""
+    shift_weight: float = 0.0
+    """Weight of the error of shifts: how far an intervention moves agents, beside how far it moves their forecasts;
+    needs a store of branches with twins (`envs.collect --branches 4 --twins`) and one process."""
     variance: float = 5e-5
     """Fixed variance of the likelihood, in scaled units (σ in the paper)."""
     likelihood: Likelihood = "laplace"
@@ -165,9 +168,11 @@ class TrainConfig:
         check_at_least(
             self, 0, "one_step_weight", "rollout_weight", "kl_weight", "seed", "threads", "curriculum_steps",
             "kl_warmup_steps", "energy_weight", "joint_energy_weight", "edge_cost", "label_weight", "type_label_weight",
-            "min_history_steps", "max_episodes", "reaction_weight",
+            "min_history_steps", "max_episodes", "reaction_weight", "shift_weight",
         )  # fmt: skip
         check_at_most(self, MOST_THREADS, "threads")
+        if self.shift_weight and not self.rollout_weight:
+            raise UserError("shift_weight compares roll-outs, and rollout_weight is 0; leave one of them out")
         if self.one_step_weight == self.rollout_weight == 0:
             raise UserError("one_step_weight and rollout_weight are both 0; nothing would be learned")
         given = [name for name in OF_THE_NETWORK if getattr(self, name) != getattr(type(self), name)]

@@ -46,6 +46,29 @@ def test_a_branch_is_the_episode_up_to_its_moment(branches: list[Episode]):
         np.testing.assert_array_equal(branch.states[step + 1, others], now[others])
 
 
+def test_a_twin_is_the_same_moment_without_the_intervention(branches: list[Episode]):
+    world = open_world(ROAD, "idle")
+    both = record_branches(world, 5, "idle", 9, replace(ON_ROAD, twins=True))
+    whole = record(world, 5, "idle", Recording(9, labels=False))
+    assert len(both) == 2 * len(branches)
+    for branch, twin, alone in zip(both[::2], both[1::2], branches, strict=True):
+        step, agent = moment_of(branch)
+        columns = [branch.ids.tolist().index(i) for i in alone.ids]
+        np.testing.assert_array_equal(branch.states[:, columns], alone.states)
+        np.testing.assert_array_equal(branch.causal_shift_m[:, columns][:, :, columns], alone.causal_shift_m)  # type: ignore[index]
+        np.testing.assert_array_equal(branch.ids, twin.ids)
+        assert twin.perturbed is not None and not twin.perturbed.any() and np.isnan(twin.causal_shift_m).all()
+        np.testing.assert_array_equal(twin.states[: step + 1], branch.states[: step + 1])
+        begin = next(i for i in range(len(whole.states)) if (whole.states[i, 0] == twin.states[0, 0]).all())
+        known = [whole.ids.tolist().index(i) for i in twin.ids]
+        span = min(len(twin.states), len(whole.states) - begin)
+        expected = np.where(twin.valid[:span, :, None], whole.states[begin : begin + span][:, known], 0)
+        np.testing.assert_allclose(twin.states[:span], expected, atol=1e-4)
+        assert (
+            twin.valid[: step + 2].sum() == branch.valid[: step + 1].sum() + whole.valid[begin + step + 1, known].sum()
+        )
+
+
 def test_at_the_moment_one_agent_is_slower_faster_or_gone(branches: list[Episode]):
     for branch in branches:
         step, agent = moment_of(branch)
@@ -110,10 +133,10 @@ def test_who_has_just_appeared_is_not_perturbed():
     assert len(near) == 4
     for agent in near:
         before = replace(now, valid=now.ids == agent)
-        branch = _branch(world, [before], ON_ROAD, np.random.default_rng(agent))
-        assert branch is not None and branch.ids[moment_of(branch)[1]] == agent
+        (branch,) = _branch(world, [before], ON_ROAD, np.random.default_rng(agent))
+        assert branch.ids[moment_of(branch)[1]] == agent
     nobody = replace(now, valid=np.zeros_like(now.valid))
-    assert _branch(world, [nobody], ON_ROAD, np.random.default_rng(0)) is None
+    assert _branch(world, [nobody], ON_ROAD, np.random.default_rng(0)) == []
 
 
 def test_branches_are_a_function_of_the_seed(branches: list[Episode]):

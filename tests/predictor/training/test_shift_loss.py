@@ -1,0 +1,58 @@
+"""The loss on shifts: zero where forecasts move as the truth does, whatever both forecasts have in common."""
+
+import numpy as np
+import pytest
+import torch
+
+from predictor.data.twins import Pairs, Twins
+from predictor.forecaster import Futures, WindowOutput
+from predictor.training.mode_loss import unit
+from predictor.training.shift_loss import LARGE, shift_loss
+from tests.predictor.data.test_twins import HISTORY, HORIZON, twins_of
+from tests.predictor.helpers import spec
+
+SCALES = torch.tensor(spec(has_ego=True).feature_scales)
+
+
+@pytest.fixture
+def pairs() -> Pairs:
+    episodes = [episode for seed in range(2) for episode in twins_of(seed, 3.0)]
+    return Twins(episodes, spec(has_ego=True), HISTORY, HORIZON).batch(np.arange(2))
+
+
+def output(states: torch.Tensor, modes: int = 0) -> WindowOutput:
+    """An output whose single forecast, and whose modes' mean, is `states`."""
+    nothing = states.new_zeros(len(states), HISTORY, *states.shape[1:2], 4)
+    if not modes:
+        return WindowOutput(nothing, states)
+    apart = torch.arange(float(modes))[:, None, None, None] - (modes - 1) / 2
+    probs = torch.full((len(states), modes, states.shape[1]), 1 / modes)
+    return WindowOutput(nothing, states, modes=Futures(states[:, None] + apart, probs))
+
+
+def loss(pairs: Pairs, predicted_m: torch.Tensor, modes: int = 0) -> float:
+    """The loss of forecasts that differ by `predicted_m` and are both far from the truth."""
+    before = torch.randn(*pairs.counted.shape, 4, generator=torch.Generator().manual_seed(0)) * 20
+    after = before.clone()
+    after[..., :2] += predicted_m
+    return float(shift_loss(output(after, modes), output(before, modes), pairs, SCALES, 2, 5e-5))
+
+
+@pytest.mark.parametrize("modes", [0, 3])
+def test_it_is_zero_for_the_true_shift_alone(pairs: Pairs, modes: int):
+    true_m = pairs.true_shift(2)
+    assert loss(pairs, true_m, modes) == pytest.approx(0, abs=1e-3)
+    assert 0 < loss(pairs, 0.5 * true_m, modes) < loss(pairs, 0 * true_m, modes) < loss(pairs, -true_m, modes)
+
+
+def test_a_large_error_counts_by_its_size(pairs: Pairs):
+    """Every moved step is wrong by 30 m: each counts nearly in full, in the unit of the likelihood."""
+    wrong_m = pairs.true_shift(2) + torch.where(pairs.true_shift(2).norm(dim=-1, keepdim=True) > 0, 300.0, 0.0)
+    error = float(2**0.5 * 300.0 / SCALES[0])
+    expected = unit(5e-5) * LARGE * ((1 + (error / LARGE) ** 2) ** 0.5 - 1)
+    assert loss(pairs, wrong_m) == pytest.approx(expected, rel=1e-3)
+
+
+def test_what_does_not_count_has_no_effect(pairs: Pairs):
+    wild_m = torch.where(pairs.counted[..., None], pairs.true_shift(2), torch.inf)
+    assert loss(pairs, wild_m) == pytest.approx(0, abs=1e-3)
