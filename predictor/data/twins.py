@@ -31,7 +31,7 @@ class Pairs:
     branches: WindowBatch
     """Windows whose last observed step is the moment, with the intervention."""
     twins: WindowBatch
-    """The same without it."""
+    """Windows of the same moments without it."""
     counted: Bool[Tensor, "batch agents horizon"]
     """Whether both have the agent; never of the ego, nor of the agent that was perturbed."""
 

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.data.store import Episode, EpisodeStore, read_store, with_causal_edges
-from predictor.data.twins import Twins
 from predictor.data.windows import WindowBatch, Windows, siblings, split_episodes
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import run_windows
@@ -40,7 +39,7 @@ from predictor.training.cuda_graph import (
 from predictor.training.objective import window_loss
 from predictor.training.processes import ALONE, Group, keep_rows_of_dropout
 from predictor.training.saved_state import read_state
-from predictor.training.shift_loss import shift_loss
+from predictor.training.shift_loss import Shifts
 from predictor.training.start import initial_model
 
 VALIDATION_DRAWS = 5
@@ -63,21 +62,6 @@ class TrainingData:
     """Windows of each store for model selection."""
     train_episodes: list[Episode]
     """All training episodes."""
-
-    def twins(self, config: TrainConfig) -> Twins | None:
-        """Returns the branches that have twins, among the training episodes; None if shifts have no weight.
-
-        Raises:
-            UserError: shifts have a weight, and there are none.
-        """
-        if not config.shift_weight:
-            return None
-        found = Twins(self.train_episodes, self.spec, config.history_steps, config.horizon_steps)
-        if not len(found):
-            raise UserError(
-                "shift_weight needs branches with twins, got none; collect a store with --branches 4 --twins"
-            )
-        return found
 
 
 def load_data(config: TrainConfig) -> TrainingData:
@@ -175,13 +159,11 @@ class Trainer:
         self.noise = torch.Generator(device=self.device)
         self._drawn: TrainingNoise = self.noise
         rows = group.rows(config.batch_size)
-        twins = data.twins(config)
-        if twins is not None:
-            if group.connected:
-                raise UserError("shift_weight needs one process; train on one device, or without it")
-            config = replace(config, capture="off")  # a recorded step would hold the first pairs
+        self._shifts = Shifts.of(config, data.train_episodes, data.spec, group.connected)
+        if group.connected or self._shifts is not None:
+            # a recorded step would hold the messages between processes, or the first pairs
+            config = replace(config, capture="off")
         if group.connected:
-            config = replace(config, capture="off")  # a recorded step would hold the messages between processes
             self._drawn = NoiseOfRows(self.noise, rows, config.batch_size)
             keep_rows_of_dropout(self.model, rows, config.batch_size)
         source = open_batches(config, data.train, self.device, self.model.config, rows)
@@ -192,7 +174,6 @@ class Trainer:
         self._recorded: dict[Any, CapturedStep] = {}
         self.optimizer = self._adam(capturable=source.capture)
         self._scales = torch.tensor(self.model.spec.feature_scales, device=self.device)
-        self._twins = twins
         self._kl_scale = torch.ones((), device=self.device)
         self._finite = torch.ones((), dtype=torch.bool, device=self.device)
         self._finite_until = 0
@@ -276,8 +257,8 @@ class Trainer:
             exact = output.float()
             sums = {"total": self.group.total} if self.group.connected else {}
             loss, terms = window_loss(self.model, batch, exact, self.config, self._kl_scale, self._scales, **sums)
-            if self._twins is not None and rollout_steps:
-                shift = self._shift_loss(self._twins, rollout_steps, more)
+            if self._shifts is not None and rollout_steps:
+                shift = self._shifts.loss(self.model, self.step, rollout_steps, self._scales, **more)
                 loss, terms = loss + self.config.shift_weight * shift, terms | {"shift": shift.detach()}
             self.optimizer.zero_grad(set_to_none=True)
             (weight * loss).backward()
@@ -290,21 +271,6 @@ class Trainer:
         self.optimizer.step()
         self._finite.logical_and_(torch.isfinite(found["loss"]))
         return {"grad_norm": norm, **found}
-
-    def _shift_loss(self, twins: Twins, rollout_steps: int, more: dict[str, int]) -> Tensor:
-        """Computes the loss on the shifts of as many pairs as half a batch has windows; they depend on (seed, step)."""
-        rng = np.random.default_rng([self.config.seed, 5, self.step])
-        drawn = twins.draw(max(1, self.config.batch_size // 2), rng)
-        pairs, seed, outputs = twins.batch(drawn).to(self.device), int(rng.integers(2**62)), []
-        noise = torch.Generator(device=self.device)
-        for side in (pairs.branches, pairs.twins):
-            torch.manual_seed(seed)  # both have equal noise
-            noise.manual_seed(seed)
-            with precision("bfloat16" if self.config.precision == "bfloat16" else "float32", self.device.type):
-                output = self.model.window(side.states, side.valid, side.last_observed, rollout_steps, noise, **more)
-            outputs.append(output.float())
-        axes = self.model.spec.position_dim
-        return shift_loss(outputs[0], outputs[1], pairs, self._scales, axes, self.config.variance)
 
     def _replayed(
         self, recorder: Recorder, batch: WindowBatch, rollout_steps: int, num_modes: int
