@@ -22,6 +22,7 @@ MOVED = 0.01
 """Shift from which on an agent counts as moved, in units of the position's scale."""
 MOVED_WEIGHT = 4.0
 """How much likelier a pair is drawn in which somebody is moved."""
+_AT_ONCE = 256
 
 
 @dataclass(frozen=True)
@@ -67,8 +68,8 @@ class Twins:
             self._branches, self._twins = (
                 Windows(side, spec, history_steps, horizon_steps) for side in map(list, zip(*pairs, strict=True))
             )
-        moved = np.array([self._moves(number) for number in range(len(pairs))], dtype=np.bool_)
-        weight = np.where(moved, MOVED_WEIGHT, 1.0)
+        numbers = np.array_split(np.arange(len(pairs)), 1 + len(pairs) // _AT_ONCE)
+        weight = np.where(np.concatenate([self._moves(part) for part in numbers]), MOVED_WEIGHT, 1.0)
         self._share = weight / weight.sum() if len(weight) else weight
 
     def __len__(self) -> int:
@@ -102,11 +103,13 @@ class Twins:
             known = known & (torch.arange(agents) > 0)
         return Pairs(branches, twins, both & known[..., None])
 
-    def _moves(self, number: int) -> bool:
-        """Returns whether an agent is moved in a pair."""
-        pair, axes = self.batch(np.array([number])), self._spec.position_dim
-        scale = torch.tensor(self._spec.feature_scales[:axes])
-        return bool(((pair.true_shift(axes) / scale).norm(dim=-1) > MOVED).any())
+    def _moves(self, indices: Int[np.ndarray, " batch"]) -> Bool[np.ndarray, " batch"]:
+        """Returns in which pairs an agent is moved."""
+        if not len(indices):
+            return np.zeros(0, dtype=np.bool_)
+        axes = self._spec.position_dim
+        shift = self.batch(indices).true_shift(axes) / torch.tensor(self._spec.feature_scales[:axes])
+        return (shift.norm(dim=-1) > MOVED).flatten(1).any(1).numpy()
 
 
 def _are_twins(branch: Episode, other: Episode) -> bool:
