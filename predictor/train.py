@@ -7,6 +7,7 @@ a spread like the truth's, whereas one-step errors reward neither.
 """
 
 import io
+import math
 import os
 import shlex
 import signal
@@ -188,8 +189,9 @@ def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, 
     errors = {name: getattr(accuracy, name) for name in KEYS[:-1]} | {KEYS[-1]: trainer.baseline_m}
     add_point(trainer.config.out / CURVE_FILE, {"step": trainer.step} | errors)
     score = trainer.score(accuracy)
-    if score < trainer.best:
-        trainer.best, trainer.stale = score, 0
+    better = score < trainer.best
+    trainer.best, trainer.stale = (score, 0) if better else (trainer.best, trainer.stale + 1)
+    if better or (trainer.config.keep == "last" and math.isfinite(score)):
         result = {
             "step": trainer.step,
             "val_energy_m": accuracy.energy_m,
@@ -217,8 +219,6 @@ def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, 
                 provenance=told,
             )
         save_checkpoint(trainer.config.out / BEST_OF_RUN, trainer.model, info)
-    else:
-        trainer.stale += 1
     name, unit = ("negative log-likelihood", "nats") if trainer.config.only_spread else ("energy score", "m")
     return (
         f"step {trainer.step:,}: {name} {score:.3f} {unit} (best {trainer.best:.3f}), "
@@ -290,7 +290,7 @@ def main() -> None:
             config = group.together(lambda: parse(TrainConfig, __doc__))
         checkpoint = train(config, group)
         if group.leads:
-            print(f"best checkpoint: {checkpoint}")
+            print(f"{config.keep} checkpoint: {checkpoint}")
 
 
 if __name__ == "__main__":

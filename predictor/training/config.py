@@ -17,6 +17,7 @@ Likelihood = Literal["gaussian", "laplace"]
 TrainPrecision = Literal["float32", "tf32", "bfloat16"]
 DataDevice = Literal["auto", "cpu", "device"]
 Capture = Literal["auto", "off"]
+Keep = Literal["best", "last"]
 OF_THE_DGVAE = ("input_changes", "fit_inputs", "edge_geometry")
 """Options of the dG-VAE's inputs, without effect on other models."""
 OF_THE_NETWORK = ("preset", "set", *OF_THE_DGVAE)
@@ -132,6 +133,10 @@ class TrainConfig:
     """Number of optimiser steps between validations, at which the training state is saved too."""
     patience: int = 8
     """Number of validations without a better energy score after which training stops."""
+    keep: Keep = "best"
+    """Weights of the checkpoint: those with the lowest energy score on held-out episodes, or, with "last", the latest
+    that were validated, for what that score does not see (`shift_weight`, `type_label_weight`); all steps are done
+    then."""
     seed: int = 0
     """Random seed for initial weights, split, order and noise."""
     device: str = "cpu"

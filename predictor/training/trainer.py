@@ -180,8 +180,9 @@ class Trainer:
 
     @property
     def finished(self) -> bool:
-        """Whether all steps are done, or `patience` validations brought no progress."""
-        return self.step >= self.config.steps or self.stale >= self.config.patience
+        """Whether all steps are done, or `patience` validations brought no progress and the best weights are kept."""
+        patient = self.config.keep == "last" or self.stale < self.config.patience
+        return self.step >= self.config.steps or not patient
 
     @property
     def due(self) -> bool:

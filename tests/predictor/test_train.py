@@ -634,6 +634,18 @@ def test_shifts_are_learned_from_branches_and_their_twins(tiny: None, reactions:
     assert [float(again.train_step()["shift"]) for _ in range(3)] == shifts[3:6]
 
 
+@pytest.mark.parametrize("keep", ["best", "last"])
+def test_the_best_or_the_last_weights_are_kept(
+    tiny: None, circles: Path, tmp_path: Path, keep: str, monkeypatch: pytest.MonkeyPatch
+):
+    """Each validation is worse than the one before: the first one's weights, or all steps and the last one's."""
+    monkeypatch.setattr(Trainer, "score", lambda trainer, accuracy: float(trainer.step))
+    train(config(circles, tmp_path / "run", keep=keep, patience=2))
+    _, info = load_checkpoint(tmp_path / "run")
+    assert info.provenance["result"]["step"] == {"best": 2, "last": 7}[keep]
+    assert state(tmp_path / "run")["step"] == {"best": 6, "last": 7}[keep]
+
+
 def test_shifts_need_twins(tiny: None, circles: Path, tmp_path: Path):
     with pytest.raises(UserError, match="shift_weight needs branches with twins, got none; collect a store with --br"):
         train(config(circles, tmp_path / "run", shift_weight=3.0))
