@@ -110,15 +110,20 @@ class PartialStore:
             raise UserError("no agent could be perturbed in any episode, so there are no branches; raise --max-steps")
         if self.skipped:
             if not episodes:
+                self._forget()  # so that the next attempt plays them
                 first = next(iter(self.skipped.values()))
                 raise UserError(f"all {len(self.skipped)} episodes failed, the first so: {first}")
             named = {str(seed): reason for seed, reason in sorted(self.skipped.items())}
             info = replace(info, provenance=info.provenance | {"skipped": {"episodes": len(named), "reasons": named}})
         write_store(self._path, info, episodes, overwrite)
-        self._new = []
+        self._forget()
+        return episodes
+
+    def _forget(self) -> None:
+        """Deletes the parts, and keeps nothing that would be written."""
+        self._new, self._added = [], 0
         if self.folder.exists():
             delete_folder(self.folder)
-        return episodes
 
     def _parts(self) -> list[Path]:
         return sorted(part for part in self.folder.glob("*+*") if part.is_dir())

@@ -90,7 +90,8 @@ def _restore(folder: Path) -> None:
 
 
 def _predictor_run(folder: Path) -> None:
-    write_json(folder / "run" / "config.json", {"config": _comparable(_small(Path("zoo"))), "provenance": {}})
+    content = {"config": _comparable(_small(Path("zoo"))), "stores": {}, "provenance": {}}
+    write_json(folder / "run" / "config.json", content)
 
 
 RUN = {

@@ -16,14 +16,21 @@ from tests.predictor.helpers import circling_episode, model, spec, write_circles
 ROW = {
     "checkpoint": "toy",
     "env_id": "toy-v0",
+    "driver": "idle",
     "model": {"min_ade_m": 1.254, "min_fde_m": 2.5},
-    "model_samples": {"min_ade_m": 0.75},
+    "model_samples": {
+        "min_ade_m": 0.75,
+        "min_joint_ade_m": 0.875,
+        "energy_m": 0.5,
+        "overlap": 0.125,
+        "true_overlap": 0.0,
+    },
     "constant_velocity": {"min_ade_m": 5.0, "min_fde_m": 9.0},
     "reduction": 0.75,
     "reduction_interval": [0.5, 0.875],
 }
 RESULTS = {
-    "config": {"seed": 10000, "episodes": 40, "ego": "idle", "samples": 20},
+    "config": {"seed": 10000, "episodes": 40, "num_samples": 20},
     "provenance": {"command": "python -m envs.evaluate --all"},
 }
 MADE = {
@@ -31,7 +38,7 @@ MADE = {
     "commit": "abc",
     "versions": {"torch": "2.13.0"},
     "train_config": {"seed": 3},
-    "result": {"step": 500, "val_min_ade_m": 0.5, "val_constant_velocity_ade_m": 1.5},
+    "result": {"step": 500, "val_energy_m": 0.5, "val_ade_m": 0.75, "val_constant_velocity_ade_m": 1.5},
 }
 
 
@@ -50,7 +57,8 @@ def test_card_says_what_the_files_say(config: CardConfig):
     assert path == config.checkpoint / "README.md"
     assert text.startswith("# Predictor checkpoint `toy`\n")
     assert [line for line in text.splitlines() if line.startswith("| toy-v0")] == [
-        "| toy-v0 | idle | 40 | 20 | 1.25 / 2.50 | 0.750 | – | 5.00 / 9.00 | 75 % (50 to 88) |"
+        "| toy-v0 | idle | 40 | 20 | 1.25 / 2.50 | 0.750 | – | 5.00 / 9.00 | 75 % (50 to 88) |",
+        "| toy-v0 | 20 | dG-VAE | 0.750 | 0.875 | 0.500 | – | 12.5 (0.0) % |",
     ]
     (measured,) = read_record(config.checkpoint)
     assert (measured.env_id, measured.min_ade_m, measured.below_cv_interval) == ("toy-v0", 1.254, (0.5, 0.875))
@@ -61,7 +69,7 @@ def test_card_says_what_the_files_say(config: CardConfig):
         "* toy-v0: `python -m envs.evaluate --all`, commit not recorded",
         "`python -m predictor.train --data a`",
         "Seed 3, commit abc, torch 2.13.0.",
-        "step 500: minADE 0.500 m against 1.500 m of constant velocity",
+        "step 500: energy score 0.500 m, ADE 0.750 m against 1.500 m of constant velocity",
     ):
         assert fact in text
 

@@ -33,11 +33,6 @@ INFO = CheckpointInfo(
     sources=("toy-v0", "toy-v1"),
     provenance={"command": "python -m predictor.train", "result": {"step": 3}},
 )
-# What the config of a checkpoint did not say before version 0.2; all of it was off.
-NEWER_FIELDS = (
-    "change_scales", "forget_bias", "innovation_rounds", "innovation_dim", "static_dim", "pair_matching", "substeps",
-    "gated_messages", "hard_samples", "zero_start",
-)  # fmt: skip
 
 
 def made(seed: int = 0) -> DGVAE:
@@ -370,15 +365,6 @@ def test_every_model_comes_back_and_forecasts_the_same(tmp_path: Path, kind: str
     assert torch.equal(*forecasts)
     assert torch.equal(beliefs[0].edge_probs, beliefs[1].edge_probs)
     assert torch.equal(beliefs[0].edge_features, beliefs[1].edge_features)
-
-
-def test_checkpoints_from_before_there_were_other_models_are_dgvaes(path: Path):
-    edit(path, lambda c: c.pop("model"))
-    edit(path, lambda c: [c["config"].pop(name) for name in NEWER_FIELDS])
-    loaded, info = load_checkpoint(path)
-    assert info == INFO
-    assert isinstance(loaded, DGVAE)
-    assert_holds(path, made())
 
 
 def test_a_model_is_not_saved_under_another_ones_name(tmp_path: Path):

@@ -166,3 +166,15 @@ def test_a_recording_without_any_episode_says_why(tmp_path: Path):
         with pytest.raises(UserError, match="no agent could be perturbed in any episode.*raise --max-steps"):
             partial.finish(INFO)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recording_of_which_all_seeds_were_skipped_keeps_nothing(tmp_path: Path):
+    """The next attempt plays them, perhaps in an environment that was mended."""
+    with (
+        pytest.raises(UserError, match="all 2 episodes failed, the first so: it hangs"),
+        PartialStore(tmp_path / "store", SETTINGS_A, part_s=0.0) as partial,
+    ):
+        partial.skip(0, "it hangs")
+        partial.skip(1, "it dies")
+        partial.finish(INFO)
+    assert list(tmp_path.iterdir()) == []

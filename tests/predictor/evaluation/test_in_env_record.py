@@ -39,21 +39,23 @@ def test_everything_that_accuracy_json_says_of_a_checkpoint_is_taken_over():
         "by_step_m": [0.5, 2.0],
         "intervals": {"min_ade_m": [0.5, 1.5]},
     }
+    many = {"min_ade_m": 0.75, "min_joint_ade_m": 0.875, "energy_m": 0.5, "overlap": 0.125, "true_overlap": 0.0}
     result = {
         "env_id": "toy-v0", "checkpoint": "toy", "driver": "varied", "dt_s": 0.5, "model": one,
-        "model_samples": {"min_ade_m": 0.75}, "constant_velocity": {"min_ade_m": 4.0, "min_fde_m": 8.0},
-        "nearest_neighbours": {"min_ade_m": 3.0}, "histories": {"1": one | {"min_ade_m": 1.75}},
+        "model_samples": many, "constant_velocity": {"min_ade_m": 4.0, "min_fde_m": 8.0},
+        "histories": {"1": one | {"min_ade_m": 1.75}},
         "reduction": 0.75, "reduction_interval": [0.5, 0.875], "latency_median_ms": 3.0, "latency_p95_ms": 9.0,
     }  # fmt: skip
     content = {
-        "config": {"episodes": 6, "samples": 20, "ego": None},
+        "config": {"episodes": 6, "num_samples": 20},
         "results": [result, result | {"checkpoint": "other"}],
         "provenance": {"command": "python -m envs.evaluate", "commit": "abc"},
     }
     (found,) = measurements_of(json.loads(json.dumps(content)), "toy")
     assert found == Measurement(
         "toy-v0", "varied", 6, 20, "python -m envs.evaluate", "abc", 4.0, 8.0, 1.0, (0.5, 1.5), 2.0, 0.75,
-        one_step_m=1.75, one_step_interval_m=(0.5, 1.5), neighbours_m=3.0, below_cv=0.75,
+        joint_best_of_k_m=0.875, energy_m=0.5, overlap=(0.125, 0.0),
+        one_step_m=1.75, one_step_interval_m=(0.5, 1.5), below_cv=0.75,
         below_cv_interval=(0.5, 0.875), latency_ms=(3.0, 9.0), forecasts=7, horizon_steps=2, dt_s=0.5,
     )  # fmt: skip
 
