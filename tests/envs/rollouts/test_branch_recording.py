@@ -1,4 +1,5 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -6,12 +7,15 @@ import pytest
 from envs.collect import CollectConfig, collect
 from envs.rollouts.branch_recording import IN_ARENAS as ARENA_MIX
 from envs.rollouts.branch_recording import ON_ROADS as ROAD_MIX
-from envs.rollouts.branch_recording import BranchRecording, _branch, _play, _sender, record_branches
+from envs.rollouts.branch_recording import BranchRecording, _branch, _play, _sender, _with_twin, record_branches
+from envs.rollouts.branches import Branch, Branches
 from envs.rollouts.causal_labels import IN_ARENAS, ON_ROADS, senders_of
 from envs.rollouts.recording import Recording, record
 from envs.rollouts.world import open_world
+from envs.simulators.interventions import Intervention
 from predictor.data.store import PERTURBATIONS, Episode
 from predictor.data.windows import Windows
+from predictor.scene import Scene
 from predictor.support.errors import UserError
 
 ROAD, TAG = "highway-fast-v0", "simple_tag_v3"
@@ -67,6 +71,28 @@ def test_a_twin_is_the_same_moment_without_the_intervention(branches: list[Episo
         assert (
             twin.valid[: step + 2].sum() == branch.valid[: step + 1].sum() + whole.valid[begin + step + 1, known].sum()
         )
+
+
+def test_a_twin_has_the_columns_of_its_branch_and_nobody_who_crashes():
+    """Agent 7 crashes in the branch, as does the ego, which stays; agent 9 is in the twin alone."""
+    ids = np.array([0, 7, 8, 9])
+    states, everybody = np.ones((4, 4, 4)), np.ones((4, 4), dtype=np.bool_)
+    there = everybody.copy()
+    there[:, 3] = False
+    plain, perturbed = Branch(states, everybody, ()), Branch(states, there, (), frozenset({0, 7}))
+    found = Branches(Intervention(8, "brake", 0, 5.0, at_once=True), ids, plain, perturbed)
+    before = [Scene(states[0, :3], ids[:3], everybody[0, :3])] * 2
+    alone = Episode.from_scenes([*before, *(Scene(states[0], ids, there[0]) for _ in range(4))])
+    unknown = np.full((*alone.valid.shape, 3), np.nan, dtype=np.float32)
+    alone = replace(alone, perturbed=np.zeros(alone.valid.shape, dtype=np.int8), causal_shift_m=unknown)
+    branch, twin = _with_twin(alone, found, before, has_ego=True)
+    assert branch.ids.tolist() == twin.ids.tolist() == [0, 7, 8, 9]
+    assert branch.valid.sum(0).tolist() == [6, 6, 6, 0] and twin.valid.sum(0).tolist() == [6, 3, 6, 4]
+
+
+def test_twins_need_branches(tmp_path: Path):
+    with pytest.raises(UserError, match="twins needs branches above 0, got 0; pass --branches 4"):
+        CollectConfig(TAG, tmp_path / "s", 2, ("idle",), twins=True)
 
 
 def test_at_the_moment_one_agent_is_slower_faster_or_gone(branches: list[Episode]):

@@ -1,13 +1,17 @@
 """The loss on shifts: zero where forecasts move as the truth does, whatever both forecasts have in common."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from predictor.data.twins import Pairs, Twins
 from predictor.forecaster import Futures, WindowOutput
+from predictor.support.errors import UserError
+from predictor.training.config import TrainConfig
 from predictor.training.mode_loss import unit
-from predictor.training.shift_loss import LARGE, shift_loss
+from predictor.training.shift_loss import LARGE, Shifts, shift_loss
 from tests.predictor.data.test_twins import HISTORY, HORIZON, twins_of
 from tests.predictor.helpers import spec
 
@@ -56,3 +60,11 @@ def test_a_large_error_counts_by_its_size(pairs: Pairs):
 def test_what_does_not_count_has_no_effect(pairs: Pairs):
     wild_m = torch.where(pairs.counted[..., None], pairs.true_shift(2), torch.inf)
     assert loss(pairs, wild_m) == pytest.approx(0, abs=1e-3)
+
+
+def test_several_processes_do_not_share_pairs(tmp_path: Path):
+    config = TrainConfig((tmp_path / "data",), tmp_path / "run", shift_weight=1.0, history_steps=HISTORY)
+    episodes = list(twins_of(0, 3.0))
+    assert Shifts.of(config, episodes, spec(has_ego=True), several_processes=False) is not None
+    with pytest.raises(UserError, match="shift_weight needs one process; train on one device, or set it to 0"):
+        Shifts.of(config, episodes, spec(has_ego=True), several_processes=True)
