@@ -80,14 +80,9 @@ class Twins:
         """Draws pairs, those in which somebody is moved `MOVED_WEIGHT` times as often."""
         return rng.choice(len(self), count, p=self._share)
 
-    def batch(self, indices: Int[np.ndarray, " batch"], history_steps: int | None = None) -> Pairs:
-        """Cuts the given pairs.
-
-        Args:
-            indices: numbers of the pairs.
-            history_steps: a shorter history than the longest one.
-        """
-        history = history_steps or self._history
+    def batch(self, indices: Int[np.ndarray, " batch"]) -> Pairs:
+        """Cuts the pairs of the given numbers."""
+        history = self._history
         episode = torch.from_numpy(indices)
         now = self._now[episode]
         casts = self._branches.cast(episode, now, history)

@@ -1,5 +1,6 @@
 """The loss on shifts: zero where forecasts move as the truth does, whatever both forecasts have in common."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,13 +8,14 @@ import pytest
 import torch
 
 from predictor.data.twins import Pairs, Twins
+from predictor.dgvae.model import DGVAE
 from predictor.forecaster import Futures, WindowOutput
 from predictor.support.errors import UserError
 from predictor.training.config import TrainConfig
 from predictor.training.mode_loss import unit
 from predictor.training.shift_loss import LARGE, Shifts, shift_loss
 from tests.predictor.data.test_twins import HISTORY, HORIZON, twins_of
-from tests.predictor.helpers import spec
+from tests.predictor.helpers import PLURAL, spec
 
 SCALES = torch.tensor(spec(has_ego=True).feature_scales)
 
@@ -68,3 +70,14 @@ def test_several_processes_do_not_share_pairs(tmp_path: Path):
     assert Shifts.of(config, episodes, spec(has_ego=True), several_processes=False) is not None
     with pytest.raises(UserError, match="shift_weight needs one process; train on one device, or set it to 0"):
         Shifts.of(config, episodes, spec(has_ego=True), several_processes=True)
+
+
+def test_both_windows_of_a_pair_have_equal_noise(tmp_path: Path):
+    """Where an intervention changes nothing, forecasts of drawn edges do not differ either."""
+    config = TrainConfig((tmp_path / "data",), tmp_path / "run", shift_weight=1.0, history_steps=HISTORY)
+    branch, twin = twins_of(0, 0.0)
+    same = replace(twin, perturbed=branch.perturbed)
+    shifts = Shifts.of(config, [same, twin], spec(has_ego=True), several_processes=False)
+    assert shifts is not None
+    network = DGVAE(spec(has_ego=True), PLURAL, 2).train()
+    assert shifts.loss(network, 0, 2, SCALES, num_modes=2).item() == 0
