@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
 from envs.rollouts.episode import EDGES, MODEL, NEIGHBOURS, NOISY, RESIDUAL, STRAIGHT, Episode, memory_key
 from envs.rollouts.report import BEFORE_CRASH_S, EnvAccuracy
@@ -14,6 +13,7 @@ from predictor.evaluation.accuracy import Accuracy, Tally, fitted_std_m
 from predictor.evaluation.displacement import MISS_THRESHOLD_M, min_ade
 from predictor.evaluation.graph_accuracy import GraphAccuracy, GraphTally
 from predictor.evaluation.outcomes import Outcome
+from predictor.evaluation.standard_errors import Estimate, estimate, quotient
 from predictor.graph import pair_mask
 from predictor.own_forecasters import is_own
 from predictor.reports.tables import MODEL_NAMES
@@ -126,13 +126,5 @@ def _reduction(model: Sequence[Outcome], baseline: Sequence[Outcome]) -> tuple[f
         for j, outcome in enumerate(outcomes):
             error, _ = min_ade(outcome.forecast, outcome.future, outcome.valid)
             sums[i, j] = float(error[outcome.valid.all(-1)].sum())
-    draws = np.random.default_rng(0).integers(len(sums), size=(2000, len(sums)))
-    totals = sums[draws].sum(axis=1)
-    low, high = np.percentile(_relative(totals), [2.5, 97.5])
-    return float(_relative(sums.sum(axis=0))), (float(low), float(high))
-
-
-def _relative(totals: Float[np.ndarray, "*draws 2"]) -> Float[np.ndarray, "*draws"]:
-    """Returns 1 − first / second; 0 where second is 0."""
-    first, second = totals[..., 0], totals[..., 1]
-    return np.where(second > 0, 1 - first / np.where(second > 0, second, 1.0), 0.0)
+    found = estimate(sums, lambda totals: 1 - quotient(totals[:, 0], totals[:, 1])) or Estimate(0.0, None)
+    return found.value, found.interval or (found.value, found.value)
