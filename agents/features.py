@@ -88,8 +88,8 @@ class ForecastAttention(BaseFeaturesExtractor):
 
     Args:
         observation_space: Dict space with the environment's own keys (`observation`, or those of its Dict, which are
-            flattened) and some of `agents`, `forecast`, `mode_probs`,
-            `xy_scale`, `edge_probs`, `edge_features`, `what_if_gap`, `what_if_contact`, `what_if_risk`, `valid`.
+            flattened) and some of `agents`, `forecast`, `ego_path`, `closest`, `mode_probs`, `xy_scale`, `edge_probs`,
+            `edge_features`, `what_if_gap`, `what_if_contact`, `what_if_risk`, `valid`.
         config: sizes and scales.
     """
 

@@ -32,13 +32,15 @@ _HIDDEN = 32
 
 
 def plan_actions(task: Task) -> tuple[int, ...] | None:
-    """Returns the action with which each plan begins; None if that is not the same action in every state.
+    """Returns the action with which each plan begins; None if actions are not numbers, or differ between states.
 
     Args:
         task: task whose observation has room for what-if forecasts.
     """
     env = task.make(disable_env_checker=True)
     env.close()
+    if not isinstance(env.action_space, gym.spaces.Discrete):
+        return None
     actions: tuple[int, ...] | None = getattr(plan_model_for(env), "actions", None)
     return actions
 

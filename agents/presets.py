@@ -260,4 +260,7 @@ def preset_for(env_id: str, algorithm: Algorithm, backend: Backend = "gymnasium"
             preset = replace(preset, **asdict(_ENVPOOL_PPO))
     if is_foreign_id(env_id):
         return replace(preset, gamma=_UNKNOWN_GAMMA)
-    return replace(preset, gamma=_FIVE_HZ_GAMMA) if env_id.startswith("racetrack") else preset
+    if is_multiagent_id(env_id):
+        return replace(preset, gamma=_MULTIAGENT.gamma)
+    is_racetrack = env_id.removeprefix("envpool/").lower().startswith("racetrack")
+    return replace(preset, gamma=_FIVE_HZ_GAMMA) if is_racetrack else preset

@@ -43,8 +43,8 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
     Observation of an agent: Dict with `observation` (its own, untouched; of a Dict, its entries under their own names)
     and, for the other agents sorted by distance from it, `agents` (relative current states), `forecast` (future
     positions in its frame [m]; a samples axis when num_samples > 1), `edge_probs` and `edge_features` (other → agent,
-    then agent → other), `valid`.
-    `envs.entries.ego_entries` gives the shapes. Agents may differ in their own spaces, die and join at any step. An
+    then agent → other), `closest` (how close each comes, and when), `ego_path`, `valid`; with samples `mode_probs` and
+    `xy_scale`. `envs.entries` gives the shapes. Agents may differ in their own spaces, die and join at any step. An
     agent's last observation has forecasts too; if the reader no longer reports the agent, all its entries are zero,
     `valid` too. At a reset the reader must report each. With `flatten=True` an observation is one Box, in the
     Dict's key order.

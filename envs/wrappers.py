@@ -179,8 +179,8 @@ class ForecastObservation(ForecastWrapper, RunningCopy, gym.Wrapper[Any, Any, An
     Observation: Dict with `observation` (the env's own, untouched; of a Dict, its entries under their own names)
     and, for the other agents sorted by distance, `agents` (relative current states), `forecast` (future positions in
     the ego's frame [m]; a samples axis when num_samples > 1), `edge_probs` and `edge_features` (agent → ego, then
-    ego → agent), `valid`.
-    `envs.entries.ego_entries` gives the shapes. With `flatten=True` it is one Box, in the Dict's key order.
+    ego → agent), `closest` (how close each comes, and when), `ego_path`, `valid`; with samples `mode_probs` and
+    `xy_scale`. `envs.entries` gives the shapes. With `flatten=True` it is one Box, in the Dict's key order.
 
     The history is cleared at reset. After each step, `scene` holds the observed scene in the world frame,
     `forecast` its forecast: along the world's axes, relative to the ego's position.

@@ -158,7 +158,7 @@ def _whole(content: dict[str, Any], kinds: Sequence[str]) -> Grid:
         for heading, key in WHOLE.values():
             columns.append(heading if kind == "test" else f"{kind} {heading}")
             keys.append(key if kind == "test" else f"{kind}_{key}")
-    ood = " / OOD" if "ood" in kinds else ""
+    ood = " / OOD minADE / OOD minFDE" if "ood" in kinds else ""
     lines = []
     for row in content["rows"]:
         cells = [_length(row, kind, "whole_sequence", name) for kind in kinds for name in WHOLE]

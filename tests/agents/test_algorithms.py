@@ -181,6 +181,8 @@ def test_values_out_of_range_are_named(make: Any, message: str):
 def test_presets_of_new_algorithms_follow_the_environment():
     assert preset_for("racetrack-v1", "tqc").gamma == 0.9 and preset_for("merge-v1", "tqc") == TQCPreset()
     assert preset_for("racetrack-v1", "recurrent-ppo") == RecurrentPPOPreset(gamma=0.9)
+    assert preset_for("envpool/Racetrack-v0", "ppo").gamma == 0.9 and preset_for("envpool/Merge-v0", "ppo").gamma == 0.8
+    assert preset_for("simple_tag_v3", "a2c").gamma == preset_for("intersection-multi-agent-v2", "dqn").gamma == 0.95
     particles = preset_for("simple_tag_v3", "recurrent-ppo")
     assert isinstance(particles, RecurrentPPOPreset)
     assert asdict(preset_for("simple_tag_v3", "ppo")).items() <= asdict(particles).items()

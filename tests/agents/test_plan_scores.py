@@ -1,4 +1,5 @@
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -8,6 +9,7 @@ import torch
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from agents import plan_scores
 from agents.features import ForecastAttention
 from agents.plan_scores import SUMMARY, PlanAttention, PlanScores, PlanValues, plan_actions
 from agents.task import Task
@@ -213,6 +215,11 @@ def test_actions_of_plans_are_those_that_the_planner_takes():
         "IDLE", "SLOWER", "FASTER", "LANE_LEFT", "LANE_RIGHT"
     ]  # fmt: skip
     assert plan_actions(Task("racetrack-v1", "constant-velocity", what_if=True)) is None, "continuous controls"
+
+
+def test_policies_do_not_score_plans_of_continuous_actions(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(plan_scores, "plan_model_for", lambda env: SimpleNamespace(actions=(np.zeros(2), np.ones(2))))
+    assert plan_actions(Task("racetrack-v1", "constant-velocity", what_if=True)) is None
 
 
 @pytest.mark.parametrize(
