@@ -117,10 +117,11 @@ def _training(name: str, info: CheckpointInfo) -> str:
 
 def _trained(made: Mapping[str, Any]) -> str:
     result = made["result"]
+    chosen = "Last" if made["train_config"].get("keep") == "last" else "Best"
     reached = f"energy score {result['val_energy_m']:.3f} m, ADE {result['val_ade_m']:.3f} m"
     versions = ", ".join(f"{k} {v}" for k, v in made["versions"].items())
     return (
-        f"`{made['command']}`\n\nSeed {made['train_config']['seed']}, commit {made['commit']}, {versions}. Best "
+        f"`{made['command']}`\n\nSeed {made['train_config']['seed']}, commit {made['commit']}, {versions}. {chosen} "
         f"validation at step {result['step']}: {reached} against "
         f"{result['val_constant_velocity_ade_m']:.3f} m of constant velocity. Equal seeds give equal weights on "
         "the same CPU and torch."

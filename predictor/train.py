@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch.utils.tensorboard import SummaryWriter
 
-from predictor.checkpoint import BEST_OF_RUN, CheckpointInfo, load_checkpoint, save_checkpoint
+from predictor.checkpoint import BEST_OF_RUN, CheckpointInfo, load_checkpoint, read_info, save_checkpoint
 from predictor.data.store import content_id
 from predictor.support.command_line import parse
 from predictor.support.errors import UserError, run_entry_point, short
@@ -76,6 +76,7 @@ def _train(config: TrainConfig, group: Group, state_file: Path, config_file: Pat
         stack.callback(trainer.close)
         group.from_leader(lambda: _take_folder(stack, config, config_file))
         if config.resume and group.from_leader(state_file.exists):
+            group.from_leader(lambda: _check_same_network(trainer))
             trainer.restore(state_file)
         if not group.leads:
             _follow(trainer)
@@ -268,6 +269,18 @@ def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
             raise UserError(
                 f"cannot resume: {address(path)} is another store than the run began with; choose another --out"
             )
+
+
+def _check_same_network(trainer: Trainer) -> None:
+    """Raises if the checkpoint of `init` has other sizes or scales than when the run began."""
+    kept, model = trainer.config.out / BEST_OF_RUN, trainer.model
+    if not trainer.config.init or not kept.exists():
+        return
+    info = read_info(kept)
+    if (info.config, info.spec.feature_scales) != (model.config, model.spec.feature_scales):
+        raise UserError(
+            f"cannot resume: '{trainer.config.init}' has another network than when the run began; choose another --out"
+        )
 
 
 def _are(stores: Sequence[Path], contents: Sequence[Any]) -> bool:

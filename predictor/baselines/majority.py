@@ -11,6 +11,7 @@ from torch import Tensor
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.data.store import Episode
 from predictor.forecaster import Belief, Memory
+from predictor.graph import pair_mask
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 
@@ -47,8 +48,9 @@ class MajorityGraph(ConstantVelocity):
     def observe(
         self, memory: Memory, states: Float[Tensor, "batch agents state"], valid: Bool[Tensor, "batch agents"]
     ) -> tuple[Memory, Belief]:
-        """Returns the states as belief; every pair has the one type."""
+        """Returns the states as belief; every pair of two present agents has the one type."""
         memory, belief = super().observe(memory, states, valid)
-        probs = torch.zeros_like(belief.edge_probs)
-        probs[..., self.edge_type] = 1.0
+        one_type = torch.zeros_like(belief.edge_probs)
+        one_type[..., self.edge_type] = 1.0
+        probs = torch.where(pair_mask(valid)[..., None], one_type, belief.edge_probs)
         return memory, replace(belief, edge_probs=probs)

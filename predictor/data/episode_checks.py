@@ -1,10 +1,12 @@
-"""Checks of an episode before it is written: types and shapes of its arrays, its ids, sizes of its states."""
+"""Checks of an episode before it is written: types, shapes and values of its arrays, and its ids."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from predictor.scene import LARGEST, SceneSpec
+from predictor.support.config_checks import MOST_PARTS
 from predictor.support.errors import UserError, short
 
 
@@ -48,11 +50,37 @@ def check_episode(episode: Any, spec: SceneSpec, where: str) -> None:
         if labels.dtype.kind not in kinds or labels.ndim != axes or labels.shape[1:3] != (len(ids), len(ids)):
             wanted = f"{'integers' if 'i' in kinds else 'floating point'} for each pair of the {len(ids)} agents"
             raise UserError(f"{where}: {name} of an episode must be {wanted}, got {labels.dtype} {labels.shape}")
+        check_label_values(name, labels, where)
     marks = getattr(episode, "perturbed", None)
     if marks is not None and (marks.dtype.kind not in "iu" or marks.shape != valid.shape):
         raise UserError(
             f"{where}: perturbed of an episode must be integers of shape {valid.shape}, got {marks.dtype} {marks.shape}"
         )
+
+
+def check_label_values(name: str, labels: np.ndarray, where: str) -> None:
+    """Raises a `UserError` if a label of pairs is out of range: types, attributes, or causal shifts [m]."""
+    if name == "edge_types":
+        fine, wanted = (labels >= -1) & (labels < MOST_PARTS), f"lie between -1 and {MOST_PARTS - 1}"
+    elif name == "edge_attributes":
+        fine, wanted = np.isfinite(labels), "be finite"
+    else:
+        fine, wanted = (
+            np.isnan(labels) | (labels >= 0) & (labels <= LARGEST),
+            f"lie between 0 and {LARGEST:g}, or be NaN",
+        )
+    if not fine.all():
+        raise UserError(f"{where}: '{name}' must {wanted}, got {labels[~fine][0]}; collect it anew")
+
+
+def check_widths(attributes: Sequence[np.ndarray], names: Sequence[str], where: str) -> None:
+    """Raises a `UserError` if episodes have other numbers of edge attributes than names, or than each other."""
+    widths = sorted({labels.shape[3] for labels in attributes})
+    if widths != [len(names)] if names else (len(widths) > 1 or not widths[0]):
+        wanted = (
+            f"the {len(names)} of edge_attribute_names" if names else "one number of them, at least 1, in all episodes"
+        )
+        raise UserError(f"{where}: edge_attributes need {wanted}, got {', '.join(map(str, widths))}")
 
 
 def check_finite(episode: Any, where: str) -> None:

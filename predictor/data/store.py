@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from predictor.data.episode_checks import check_episode, check_finite
+from predictor.data.episode_checks import check_episode, check_finite, check_label_values, check_widths
 from predictor.data.store_files import (
     CONTENT,
     DIGEST,
@@ -154,6 +154,8 @@ def _write(path: Path, info: StoreInfo, episodes: Sequence[Episode]) -> None:
     if any(marked) and not all(marked):
         raise UserError(f"{address(path)}: either all episodes have perturbed or none, got both")
     columns = max(e.states.shape[1] for e in episodes)
+    if not columns:
+        raise UserError(f"{address(path)}: a store needs at least one agent, got none")
     lengths = np.array([len(e.states) for e in episodes])
     starts = np.concatenate([[0], np.cumsum(lengths)])
     states = np.zeros((starts[-1], columns, info.spec.num_features), dtype=np.float32)
@@ -167,6 +169,7 @@ def _write(path: Path, info: StoreInfo, episodes: Sequence[Episode]) -> None:
         if episode.perturbed is not None:
             perturbed[steps, : episode.states.shape[1]] = episode.perturbed
         ids[i, : len(episode.ids)] = episode.ids
+    labels = _padded_labels(episodes, columns, info.edge_attribute_names, str(path))
     with new_folder(path) as partial:
         group = open_group(partial, mode="w")
         chunk = max(1, min(len(states), 4096))
@@ -176,7 +179,7 @@ def _write(path: Path, info: StoreInfo, episodes: Sequence[Episode]) -> None:
         if any(marked):
             arrays.write("perturbed", perturbed, chunks=(chunk, columns))
         small = {"ids": ids, "starts": starts, "seeds": np.array([e.seed for e in episodes], dtype=np.int64)}
-        for name, data in (small | _padded_labels(episodes, columns, str(path))).items():
+        for name, data in (small | labels).items():
             arrays.write(name, data)
         attributes = {
             "format": FORMAT,
@@ -304,7 +307,7 @@ def _checked_labels(path: Path, header: StoreHeader, info: StoreInfo) -> tuple[s
 
 
 def _check_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Checks the values of the arrays that say where episodes begin and who is in them."""
+    """Checks the values of the arrays that say where episodes begin and who is in them, and of labels."""
     last = {"starts": len(arrays["states"]), "label_starts": 0}
     last["label_starts"] = next((len(arrays[name]) for name in _FILL if name in arrays), 0)
     for name in ("starts", "label_starts"):
@@ -315,10 +318,8 @@ def _check_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
         labelled, steps = np.diff(arrays["label_starts"]), np.diff(arrays["starts"])
         if ((labelled != 1) & (labelled != steps)).any():
             raise UserError(f"{path}: an episode's edges need one step or every step; collect it anew")
-    if "edge_types" in arrays and (arrays["edge_types"] < _FILL["edge_types"]).any():
-        raise UserError(f"{path}: 'edge_types' must be at least {_FILL['edge_types']:.0f}; collect it anew")
-    if "edge_attributes" in arrays and not np.isfinite(arrays["edge_attributes"]).all():
-        raise UserError(f"{path}: 'edge_attributes' must be finite; collect it anew")
+    for name in _FILL.keys() & arrays.keys():
+        check_label_values(name, arrays[name], str(path))
     for i, ids in enumerate(arrays["ids"]):
         live = ids[ids != PADDING_ID]
         if (live < 0).any() or len(np.unique(live)) < len(live):
@@ -328,7 +329,9 @@ def _check_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
         raise UserError(f"{path}: 'perturbed' must lie between 0 and {len(PERTURBATIONS) - 1}; collect it anew")
 
 
-def _padded_labels(episodes: Sequence[Episode], columns: int, where: str) -> dict[str, np.ndarray]:
+def _padded_labels(
+    episodes: Sequence[Episode], columns: int, names: Sequence[str], where: str
+) -> dict[str, np.ndarray]:
     """Returns the edge labels of all episodes end to end, and where each episode begins; empty without labels."""
     given = {name: [getattr(e, name) for e in episodes] for name in _FILL}
     given = {name: labels for name, labels in given.items() if any(x is not None for x in labels)}
@@ -345,7 +348,9 @@ def _padded_labels(episodes: Sequence[Episode], columns: int, where: str) -> dic
         starts = np.concatenate([[0], np.cumsum(lengths)])
         if not np.array_equal(padded.setdefault("label_starts", starts), starts):
             raise UserError(f"{where}: edge_types and edge_attributes need equal numbers of steps in each episode")
-        joined = np.full((starts[-1], columns, columns, *labels[0].shape[3:]), _FILL[name], labels[0].dtype)
+        if name == "edge_attributes":
+            check_widths(labels, names, where)
+        joined = np.full((starts[-1], columns, columns, *labels[0].shape[3:]), _FILL[name], np.result_type(*labels))
         for label, begin in zip(labels, starts[:-1], strict=True):
             joined[begin : begin + len(label), : label.shape[1], : label.shape[2]] = label
         padded[name] = joined

@@ -2,8 +2,7 @@
 
 Zarr reads whatever a group declares: other formats, whose arrays may be pickles, sizes of any height, pipes. So a store
 is Zarr's format 3, has only arrays that a store has, of their types and codecs, and fits into memory, and so does what
-each chunk unpacks to. New stores carry a CRC-32C of every chunk (Zarr's codec crc32c) and a SHA-256 of their
-attributes; older ones have neither.
+each chunk unpacks to. Stores carry a CRC-32C of every chunk (Zarr's codec crc32c) and a SHA-256 of their attributes.
 """
 
 import hashlib

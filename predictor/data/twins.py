@@ -108,10 +108,12 @@ class Twins:
 
 
 def _are_twins(branch: Episode, other: Episode) -> bool:
-    """Returns whether the second episode is the twin of the first one."""
+    """Returns whether the second episode is the twin of the first one, and both go on after the moment."""
     if branch.perturbed is None or other.perturbed is None or (branch.seed, branch.label) != (other.seed, other.label):
         return False
-    return bool(branch.perturbed.any() and not other.perturbed.any()) and np.array_equal(branch.ids, other.ids)
+    if not branch.perturbed.any() or other.perturbed.any() or not np.array_equal(branch.ids, other.ids):
+        return False
+    return int(np.argwhere(branch.perturbed)[0, 0]) + 1 < min(len(branch.states), len(other.states))
 
 
 def _future(batch: WindowBatch, values: Tensor, steps: int) -> Tensor:

@@ -114,6 +114,8 @@ def dci(
     0: it would be noise, and noise in a single dimension looks perfectly disentangled. If informativeness is low, the
     other two have little meaning.
 
+    Halves are of points: where points of one episode are alike, the held-out half is not new.
+
     Args:
         features: features of the points, such as pairs.
         factors: known attributes of the points.

@@ -170,7 +170,9 @@ def coverage(
     large. The distance of the truth to the samples' mean is compared with the `share`-quantile of the samples'
     distances. For few draws, a draw's distance is to the mean of the *other* draws, since the mean does not include
     the truth either (K/(K−1) times the distance to the mean of all), and the quantile is the value of rank share·(K+1),
-    linear between ranks (Hyndman & Fan 1996, type 6: unbiased coverage). Modes with probabilities are no draws but the
+    linear between ranks (Hyndman & Fan 1996, type 6: unbiased coverage). Forecasters deliver the single forecast as
+    sample 0, which is nearer to the mean than a draw: with it the mean is 0.886 for 9 samples of the truth's spread,
+    0.895 for 20. Modes with probabilities are no draws but the
     distribution itself: the mean is weighted, and the truth is inside if less than `share` of the probability is nearer
     to the mean.
 
@@ -234,7 +236,7 @@ def overlap(
     distance_m: float,
     mode_probs: Float[Tensor, "batch samples agents"] | None = None,
 ) -> tuple[Float[Tensor, "batch agents"], Bool[Tensor, "batch agents"]]:
-    """Computes the share of an agent's steps at which another agent of the same sample is nearer than `distance_m`.
+    """Computes the share of an agent's steps at which another valid agent of its sample is nearer than `distance_m`.
 
     Args:
         positions: sampled positions [m].

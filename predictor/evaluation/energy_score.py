@@ -3,6 +3,7 @@
 It is the expected distance of a sample to the truth, minus half the expected distance between two samples. Its mean is
 lowest if the samples have the distribution of the truth (Gneiting & Raftery 2007), whereas best-of-K errors are lowest
 for samples that spread more, and single errors for samples that do not spread. For a single sample it is the distance.
+Modes with probabilities are a distribution; K draws are taken for one, whose best spread is a little below the truth's.
 """
 
 from collections.abc import Callable

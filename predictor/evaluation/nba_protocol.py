@@ -27,7 +27,7 @@ from predictor.data.windows import Windows
 from predictor.evaluation import displacement as metrics
 from predictor.evaluation.accuracy import fitted_std_m
 from predictor.evaluation.energy_score import energy_score
-from predictor.evaluation.outcomes import Outcome, run_window_batch
+from predictor.evaluation.outcomes import Outcome, noise_of_windows, run_window_batch
 from predictor.evaluation.standard_errors import batch_interval
 from predictor.forecaster import Forecaster
 from predictor.support.errors import UserError
@@ -127,12 +127,12 @@ def player_outcomes(
     label: str = "",
 ) -> Iterator[tuple[Int[np.ndarray, " batch"], Outcome]]:
     """Yields the episode of each window, and forecasts and truth in which players alone are valid; keeps nothing."""
-    generator, ball = torch.Generator(device).manual_seed(seed), FEATURES.index("is_ball")
+    ball = FEATURES.index("is_ball")
     begins = range(0, len(indices), batch_size)
     for begin in track(begins, label) if label else begins:
         chosen = indices[begin : begin + batch_size]
         batch = windows.batch(chosen).to(torch.device(device))
-        outcome = run_window_batch(forecaster, batch, HORIZON_STEPS, num_samples, generator)
+        outcome = run_window_batch(forecaster, batch, HORIZON_STEPS, num_samples, noise_of_windows(chosen, seed))
         is_player = batch.states[:, HISTORY_STEPS - 1, :, ball] < 0.5
         yield windows.index[chosen, 0], replace(outcome, valid=outcome.valid & is_player[..., None])
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from predictor.data.windows import WindowBatch, Windows
 from predictor.forecaster import Belief, Forecaster
+from predictor.noise import Noise
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ def run_window_batch(
     batch: WindowBatch,
     horizon_steps: int,
     num_samples: int = 1,
-    generator: torch.Generator | None = None,
+    generator: Noise | None = None,
     keep_beliefs: bool = False,
 ) -> Outcome:
     """Streams the history of each window, forecasts, and returns forecast and truth; the ego is left out.
@@ -93,7 +94,7 @@ def run_window_batch(
         batch: windows with at least `horizon_steps` steps (padding included) after `last_observed`.
         horizon_steps: number of steps of the free run.
         num_samples: number of samples K.
-        generator: random generator of the samples.
+        generator: source of the noise of samples.
         keep_beliefs: whether to return the graph at the last observed step, and the true one if the data has it.
     """
     belief: Belief | None = None
@@ -109,7 +110,7 @@ def run_sequence_batch(
     batch: WindowBatch,
     horizon_steps: int,
     num_samples: int = 1,
-    generator: torch.Generator | None = None,
+    generator: Noise | None = None,
     keep_beliefs: bool = False,
 ) -> Outcome:
     """Predicts every step but the first: one step ahead from true states while observing, then the free run.
@@ -168,13 +169,18 @@ def run_windows(
     Nothing is kept between batches; `predictor.evaluation.accuracy.summarise` consumes the iterator. A forecaster with
     an ego gets an absent one before the agents of windows that have none, as in live scenes (`Scene.behind_absent`).
     """
-    generator = torch.Generator(device=device).manual_seed(seed)
     run = run_sequence_batch if whole_sequence else run_window_batch
     for begin in range(0, len(indices), batch_size):
-        batch = windows.batch(indices[begin : begin + batch_size]).to(torch.device(device))
+        chosen = indices[begin : begin + batch_size]
+        batch = windows.batch(chosen).to(torch.device(device))
         if forecaster.spec.has_ego and not windows.spec.has_ego:
             batch = batch.behind_absent()
-        yield run(forecaster, batch, horizon_steps, num_samples, generator, keep_beliefs)
+        yield run(forecaster, batch, horizon_steps, num_samples, noise_of_windows(chosen, seed), keep_beliefs)
+
+
+def noise_of_windows(indices: Int[np.ndarray, " some"], seed: int) -> list[np.random.Generator]:
+    """Returns a generator for each window, so that its samples do not depend on what else is in its batch."""
+    return [np.random.default_rng([seed, int(index)]) for index in indices]
 
 
 def _observed(forecaster: Forecaster, batch: WindowBatch) -> Iterator[tuple[Int[Tensor, " batch"], Belief]]:
@@ -198,7 +204,7 @@ def _free_run(
     belief: Belief,
     horizon_steps: int,
     num_samples: int,
-    generator: torch.Generator | None,
+    generator: Noise | None,
     keep_beliefs: bool,
 ) -> Outcome:
     axes = forecaster.spec.position_dim

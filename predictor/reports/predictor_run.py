@@ -1,8 +1,9 @@
 """Report of a predictor's training: what it reached, its curves, accuracy, card and settings."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,6 +24,7 @@ _REACHED = {
     "val_energy_m": "energy score [m]", "val_ade_m": "ADE₁ [m]", "val_fde_m": "FDE₁ [m]", "val_min_ade_m": "minADE [m]",
     "val_min_fde_m": "minFDE [m]", "val_constant_velocity_ade_m": "constant velocity ADE [m]",
 }  # fmt: skip
+_NLL = "negative log-likelihood"
 
 
 def predictor_blocks(run: Path, accuracies: Sequence[Path]) -> list[Block]:
@@ -43,10 +45,10 @@ def predictor_blocks(run: Path, accuracies: Sequence[Path]) -> list[Block]:
     info = read_info(run / BEST_OF_RUN)
     name = MODEL_NAMES.get(info.model, info.model)
     headline = short(f"{name}, trained on {', '.join(info.sources) or 'unnamed data'}", 200)
-    blocks: list[Block] = [Heading(headline, 1), Paragraph(_summary(info, name)), *_reached(info)]
+    blocks: list[Block] = [Heading(headline, 1), Paragraph(_summary(info, name)), *_reached(info, config)]
     curve = read_curve(run / CURVE_FILE)
     if curve:
-        told = "Measured on held-out episodes during training; the checkpoint is the one with the lowest energy score."
+        told = f"Measured on held-out episodes during training; the checkpoint is {_chosen(config)}."
         svg, png = files_of(*drawn(curve))
         blocks += [Heading("Learning curves"), Picture("curves.svg", svg, told, png)]
     else:
@@ -86,14 +88,26 @@ def _summary(info: CheckpointInfo, name: str) -> str:
     )
 
 
-def _reached(info: CheckpointInfo) -> list[Block]:
-    """Returns the table of the best validation."""
-    where = "config.json of the checkpoint: provenance.result"
-    result = as_object(info.provenance.get("result", {}), where)
+def _chosen(config: Mapping[str, Any]) -> str:
+    """Returns which of the validated weights the checkpoint has."""
+    if config.get("keep") == "last":
+        return "the last one"
+    return f"the one with the lowest {_NLL if config.get('only_spread') else 'energy score'}"
+
+
+def _reached(info: CheckpointInfo, config: Mapping[str, Any]) -> list[Block]:
+    """Returns the table of the validation of the checkpoint."""
+    where, made, columns = "config.json of the checkpoint: provenance", info.provenance, _REACHED
+    if config.get("only_spread"):
+        made, columns = (
+            as_object(made.get("spread", {}), f"{where}.spread"),
+            {**_REACHED, "val_mixture_nll": f"{_NLL} [nats]"},
+        )
+    result = as_object(made.get("result", {}), f"{where}.result")
     if not result:
         return []
     step, samples = (converted(result.get(key), int | None, f"{where}.{key}") for key in ("step", "val_samples"))
-    found = [converted(result.get(key), float | None, f"{where}.{key}") for key in _REACHED]
+    found = [converted(result.get(key), float | None, f"{where}.{key}") for key in columns]
     cells = [NOTHING if value is None else f"{value:.3f}" for value in found]
-    told = f"The checkpoint is of step {step}; held-out episodes, {samples} samples."
-    return [Heading("Best validation"), Table(["step", *_REACHED.values()], [[str(step), *cells]]), Paragraph(told)]
+    told = f"The checkpoint is of step {step}, {_chosen(config)}; held-out episodes, {samples} samples."
+    return [Heading("Validation"), Table(["step", *columns.values()], [[str(step), *cells]]), Paragraph(told)]

@@ -146,7 +146,8 @@ class TrainConfig:
     multiply; "bfloat16" rounds inputs and results to 7 (autocast). Weights, memories and losses stay float32."""
     data_device: DataDevice = "auto"
     """Processor that cuts windows: the CPU, or the training device, which then holds all the data. "auto" takes the
-    device if that is CUDA and the data fits into half of its free memory."""
+    device if that is CUDA and the data fits into half of its free memory. "device" pads windows to one width, so
+    that equal seeds draw other noise than with "cpu"."""
     capture: Capture = "auto"
     """Launch of steps: "auto" records them as CUDA graphs where that is possible, "off" launches each kernel."""
     threads: int = 0
@@ -178,6 +179,10 @@ class TrainConfig:
         check_at_most(self, MOST_THREADS, "threads")
         if self.shift_weight and not self.rollout_weight:
             raise UserError("shift_weight compares roll-outs, and rollout_weight is 0; leave one of them out")
+        if self.only_spread and not self.rollout_weight:
+            raise UserError(
+                "only_spread trains the spread of roll-outs, and rollout_weight is 0; leave one of them out"
+            )
         if self.one_step_weight == self.rollout_weight == 0:
             raise UserError("one_step_weight and rollout_weight are both 0; nothing would be learned")
         given = [name for name in OF_THE_NETWORK if getattr(self, name) != getattr(type(self), name)]

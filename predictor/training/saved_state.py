@@ -64,11 +64,17 @@ def _check_moments(path: Path, optimizer: dict[Any, Any], model: nn.Module) -> N
     if not isinstance(moments, dict) or not isinstance(groups, list) or not all(isinstance(g, dict) for g in groups):
         raise _damaged(path, "'optimizer' must have a dict 'state' and a list 'param_groups'")
     for place, entry in moments.items():
-        if not isinstance(entry, dict) or not set(_MOMENTS) <= entry.keys() or not 0 <= place < len(parameters):
+        if not isinstance(entry, dict) or not set(_MOMENTS) <= entry.keys() or not _is_place(place, parameters):
             raise _damaged(path, f"'optimizer' must hold {', '.join(_MOMENTS)} of each weight")
         for name in _MOMENTS[1:]:
             if not isinstance(entry[name], Tensor) or entry[name].shape != parameters[place].shape:
                 raise _damaged(path, f"'optimizer' has a moment {name} of another shape than its weight")
+            if not bool(torch.isfinite(entry[name]).all()):
+                raise _damaged(path, f"'optimizer' has a moment {name} that is not finite")
+
+
+def _is_place(place: Any, parameters: list[nn.Parameter]) -> bool:
+    return isinstance(place, int) and 0 <= place < len(parameters)
 
 
 def _damaged(path: Path, reason: str) -> UserError:

@@ -4,6 +4,7 @@ import torch
 
 from predictor.baselines.majority import MajorityGraph
 from predictor.data.store import Episode
+from predictor.graph import pair_mask
 from predictor.support.errors import UserError
 from tests.predictor.helpers import random_states, spec
 
@@ -26,8 +27,11 @@ def test_every_pair_has_the_most_frequent_type_of_two_agents():
     forecaster = MajorityGraph.fit(spec(), 5, [MOSTLY_2, HALF_UNKNOWN])
     assert (forecaster.edge_type, forecaster.num_edge_types) == (2, 3)
     states = random_states(0, 2, 4, 4)
-    _, belief = forecaster.observe(forecaster.empty_memory(2, 4), states, torch.ones(2, 4).bool())
-    assert torch.equal(belief.edge_probs, torch.tensor([0.0, 0.0, 1.0]).expand(2, 4, 4, 3))
+    valid = torch.tensor([[True] * 4, [True, True, False, True]])
+    _, belief = forecaster.observe(forecaster.empty_memory(2, 4), states, valid)
+    pairs = pair_mask(valid)
+    assert torch.equal(belief.edge_probs[pairs], torch.tensor([0.0, 0.0, 1.0]).expand(18, 3))
+    assert torch.equal(belief.edge_probs[~pairs], torch.tensor([1.0, 0.0, 0.0]).expand(14, 3)), "no pair, no edge"
 
 
 @pytest.mark.parametrize(

@@ -234,8 +234,8 @@ def test_non_finite_states_are_refused_with_their_place(tmp_path: Path, value: f
     ("name", "place", "value", "message"),
     [
         ("label_starts", 1, 3, "an episode's edges need one step or every step"),
-        ("edge_types", (5, 0, 1), -7, "'edge_types' must be at least -1"),
-        ("edge_attributes", (0, 0, 1, 0), np.nan, "'edge_attributes' must be finite"),
+        ("edge_types", (5, 0, 1), -7, "'edge_types' must lie between -1 and 1023, got -7"),
+        ("edge_attributes", (0, 0, 1, 0), np.nan, "'edge_attributes' must be finite, got nan"),
     ],
 )
 def test_labels_of_edges_that_fit_no_episode_are_refused(
@@ -585,6 +585,14 @@ def test_a_stop_while_zarr_starts_its_event_loop_is_one_line(tmp_path: Path):
         ({"perturbed": np.zeros((1, 3), np.int8)}, r"perturbed .* integers of shape \(4, 3\), got int8 \(1, 3\)"),
         ({"perturbed": np.zeros((4, 3))}, r"perturbed .* integers of shape \(4, 3\), got float64 \(4, 3\)"),
         ({"perturbed": np.full((4, 3), 99)}, "perturbed must lie between 0 and 6"),
+        ({"edge_types": np.full((1, 3, 3), -2)}, "'edge_types' must lie between -1 and 1023, got -2"),
+        ({"edge_attributes": np.full((1, 3, 3, 1), np.inf)}, "'edge_attributes' must be finite, got inf"),
+        (
+            {"causal_shift_m": np.full((1, 3, 3), -1.0)},
+            "'causal_shift_m' must lie between 0 and 1e.30, or be NaN, got -1",
+        ),
+        ({"causal_shift_m": np.full((1, 3, 3), np.inf)}, "'causal_shift_m' must lie between .* got inf"),
+        ({"edge_attributes": np.zeros((1, 3, 3, 0))}, "edge_attributes need .* got 0"),
     ],
 )
 def test_labels_and_marks_of_another_kind_are_not_written(changes: dict[str, Any], message: str, tmp_path: Path):
@@ -592,6 +600,27 @@ def test_labels_and_marks_of_another_kind_are_not_written(changes: dict[str, Any
     with pytest.raises(UserError, match=message):
         write_store(tmp_path / "store", INFO, [replace(episode(1), **changes)])
     assert not (tmp_path / "store").exists()
+
+
+def test_attributes_fit_their_names_and_types_of_episodes_are_kept(tmp_path: Path):
+    wide, narrow = (replace(episode(1), edge_attributes=np.zeros((1, 3, 3, width))) for width in (2, 1))
+    with pytest.raises(
+        UserError, match="edge_attributes need one number of them, at least 1, in all episodes, got 1, 2"
+    ):
+        write_store(tmp_path / "store", replace(INFO, edge_attribute_names=()), [narrow, wide])
+    with pytest.raises(UserError, match="edge_attributes need the 1 of edge_attribute_names, got 2"):
+        write_store(tmp_path / "store", replace(INFO, edge_attribute_names=("a",)), [wide])
+    few, many = (replace(episode(1), edge_types=np.full((1, 3, 3), n, kind)) for n, kind in ((1, np.int8), (300, int)))
+    write_store(tmp_path / "store", INFO, [few, many])
+    types = [found.edge_types for found in read_store(tmp_path / "store").episodes]
+    assert [int(t.max()) for t in types if t is not None] == [1, 300]
+
+
+@pytest.mark.unchecked
+def test_a_store_without_agents_is_not_written(tmp_path: Path):
+    nobody = Episode(np.zeros((6, 0, 4), np.float32), np.zeros((6, 0), bool), np.zeros(0, np.int64), 0)
+    with pytest.raises(UserError, match="a store needs at least one agent, got none"):
+        write_store(tmp_path / "store", INFO, [nobody])
 
 
 def test_the_hash_of_a_store_is_that_of_what_it_holds(tmp_path: Path):

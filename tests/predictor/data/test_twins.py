@@ -70,6 +70,14 @@ def test_other_neighbours_are_no_twins(case: str):
     assert len(Twins([branch, twin, *episodes], spec(has_ego=True), HISTORY, HORIZON)) == 1
 
 
+def test_a_branch_that_ends_at_the_moment_is_no_twin():
+    """A mark of a file from elsewhere may stand anywhere."""
+    branch, twin = twins_of(0, 3.0)
+    marks = np.zeros_like(twin.perturbed)
+    marks[-1, BRAKED] = PERTURBATIONS.index("brake")
+    assert len(Twins([replace(branch, perturbed=marks), twin], spec(has_ego=True), HISTORY, HORIZON)) == 0
+
+
 def test_pairs_that_move_somebody_are_drawn_more_often():
     drawn = made(5.0, 0.0).draw(20_000, np.random.default_rng(0))
     assert np.mean(drawn == 0) == pytest.approx(MOVED_WEIGHT / (1 + MOVED_WEIGHT), abs=0.02)

@@ -57,6 +57,13 @@ def test_averaged_edges_are_the_mean_over_senders(variant: str):
             averaged[receiver, senders], averaged[receiver, senders[:1]].expand(len(senders), -1)
         )
         torch.testing.assert_close(averaged[receiver, senders].sum(-1), torch.ones(len(senders)))
+    first = states()[:, :1]
+    before_first, after_first = (forecast(m, first)[0].dense() for m in (model, EdgeAblation(model, "averaged")))
+    for receiver in range(3):
+        present = before_first.edge_probs[0, receiver, :, 0] < 1
+        for name in ("edge_probs", "edge_features"):
+            found, whole = (getattr(belief, name)[0, receiver] for belief in (after_first, before_first))
+            torch.testing.assert_close(found[present], whole[present].mean(0).expand_as(found[present]))
     # the first step's edges come from equal memories, so their mean is kept; senders differed
     assert probs[0, 1:3].std(0).max() > 1e-3
     assert (before[1].states - after[1].states).abs().max() > 1e-4

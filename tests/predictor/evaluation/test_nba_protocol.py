@@ -190,9 +190,11 @@ def test_a_joint_sample_is_the_same_for_all_players(tmp_path: Path):
     assert (found.ade_ft, found.fde_ft) == pytest.approx((mean, 0.4 * 6.0), abs=1e-4)
 
 
-def test_batches_make_no_difference(tmp_path: Path):
+@pytest.mark.parametrize("samples", [1, 3])
+def test_batches_make_no_difference(tmp_path: Path, samples: int):
     windows, _ = walks(tmp_path, (20, 31, 24))
-    one, many = (errors(ConstantVelocity(windows.spec), windows, batch_size=size) for size in (1, 64))
+    forecaster = fitted_noise(windows, np.arange(len(windows)))
+    one, many = (errors(forecaster, windows, samples, batch_size=size) for size in (1, 64))
     assert one.min_ade_ft == pytest.approx(many.min_ade_ft)
     for name, limits in many.intervals.items():
         assert one.intervals[name] == pytest.approx(limits)

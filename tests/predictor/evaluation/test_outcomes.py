@@ -122,6 +122,17 @@ def test_tail_of_the_sequence_is_the_window():
     assert whole.valid[:, 1:, :3].any()
 
 
+def test_samples_of_a_window_do_not_depend_on_its_batch():
+    forecaster, cut = model(frame=ROAD), windows()
+    indices = np.arange(len(cut))
+    (together,) = run_windows(forecaster, cut, indices, 3, num_samples=4, seed=5)
+    alone = [out for i in indices for out in run_windows(forecaster, cut, indices[i : i + 1], 3, num_samples=4, seed=5)]
+    for number, one in enumerate(alone):
+        agents = one.forecast.shape[2]
+        torch.testing.assert_close(one.forecast[0], together.forecast[number, :, :agents], rtol=1e-5, atol=1e-5)
+    assert float((together.forecast[0, 1] - together.forecast[0, 2]).abs().max()) > 1e-3
+
+
 def test_the_spread_of_a_model_with_modes_is_that_of_each_step_of_the_sequence():
     forecaster, cut = any_model("dgvae-plural"), windows()
     indices = np.arange(len(cut))

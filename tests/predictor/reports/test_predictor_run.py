@@ -8,6 +8,7 @@ from predictor.reports.document import PNG, Picture, as_html
 from predictor.reports.predictor_run import predictor_blocks
 from predictor.support.errors import UserError
 from predictor.support.files import write_json
+from predictor.support.reading import read_object
 from predictor.train import train
 from predictor.training.config import TrainConfig
 from predictor.training.curve import CURVE_FILE, add_point, read_curve
@@ -34,7 +35,8 @@ def test_the_page_has_curves_of_every_validation(tmp_path: Path):
     page = as_html("x", blocks)
     for shown in (
         "dG-VAE, trained on",
-        "<h2>Best validation</h2>",
+        "<h2>Validation</h2>",
+        "the checkpoint is the one with the lowest energy score.",
         "&lt;card&gt;",
         "<td>steps</td><td>4</td>",
         "commit",
@@ -42,6 +44,10 @@ def test_the_page_has_curves_of_every_validation(tmp_path: Path):
         assert shown in page, shown
     (picture,) = (block for block in blocks if isinstance(block, Picture))
     assert picture.png.startswith(PNG) and "constant velocity" in picture.svg and "training steps" in picture.svg
+    changed = read_object(run / "config.json")
+    changed["config"]["keep"] = "last"
+    write_json(run / "config.json", changed)
+    assert "the checkpoint is the last one." in as_html("x", predictor_blocks(run, []))
     (run / CURVE_FILE).unlink()
     assert "No curve.json: the run is older" in as_html("x", predictor_blocks(run, []))
     (run / "checkpoint").rename(tmp_path / "elsewhere")

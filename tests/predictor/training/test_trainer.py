@@ -11,10 +11,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from predictor.checkpoint import load_checkpoint
+from predictor.checkpoint import load_checkpoint, save_checkpoint
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.dgvae.config import PRESETS
-from predictor.models import name_of
+from predictor.models import build, name_of
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from predictor.support.errors import UserError
 from predictor.train import train
@@ -483,12 +483,27 @@ def test_the_spread_alone_may_be_trained(circles: Path, tmp_path: Path):
     assert torch.equal(again.model.self_edges.spread_shift, new.self_edges.spread_shift)
 
 
-def test_only_the_spread_needs_a_checkpoint_that_has_one(circles: Path, tmp_path: Path):
+def test_only_the_spread_needs_roll_outs_and_a_checkpoint_that_has_one(circles: Path, tmp_path: Path):
+    with pytest.raises(UserError, match="only_spread trains the spread of roll-outs, and rollout_weight is 0"):
+        config(circles, tmp_path / "second", init="anywhere", only_spread=True, rollout_weight=0.0, horizon_steps=2)
     with pytest.raises(UserError, match="only_spread needs the checkpoint whose spread it trains; pass --init"):
         config(circles, tmp_path / "second", only_spread=True)
     train(config(circles, tmp_path / "first"))
     with pytest.raises(UserError, match="only_spread needs a checkpoint with modes, and '.*first' has none"):
         made(config(circles, tmp_path / "second", init=str(tmp_path / "first"), only_spread=True))
+
+
+def test_a_run_does_not_go_on_from_a_checkpoint_that_was_trained_anew(circles: Path, tmp_path: Path):
+    """Its weights would be under scales that they were not trained with."""
+    train(config(circles, tmp_path / "first"))
+    begun = config(circles, tmp_path / "second", init=str(tmp_path / "first"), steps=4, eval_every=2)
+    train(replace(begun, steps=2))
+    kept = load_checkpoint(tmp_path / "first" / "checkpoint")
+    other = replace(kept[1].config, delta_scales=tuple(2 * s for s in kept[1].config.delta_scales))
+    model = build(kept[1].model, kept[1].spec, other, kept[1].horizon_steps)
+    save_checkpoint(tmp_path / "first" / "checkpoint", model, replace(kept[1], config=other))
+    with pytest.raises(UserError, match="cannot resume: '.*first' has another network than when the run began"):
+        train(replace(begun, resume=True))
 
 
 def test_a_start_takes_the_frame_and_range_of_the_data(circles: Path, tmp_path: Path):
