@@ -17,18 +17,18 @@ from rich.console import Console
 from agents.evaluate import constant_drivers, evaluate_with_progress, show
 from agents.preset_settings import settings_from_file, settings_from_words
 from agents.presets import Algorithm
-from agents.results import PACKAGES
+from agents.results import MOST_EPISODES, PACKAGES
 from agents.runs import CHECKPOINT_FILE, FORECASTER, POLICY_FILE, check_forecaster, load_model, open_run
 from agents.task import Backend, Observe, Task
 from agents.training import TrainingPlan, train
 from agents.video import film
 from envs.readers.mpe import MPE_IDS
-from envs.registry import entry_for, envpool_task_of
+from envs.registry import entry_for, envpool_task_of, is_multiagent_id
 from envs.simulators.envpool import begins_alike
 from envs.supervision import TIMEOUT_S
 from predictor.support.command_line import parse
-from predictor.support.config_checks import check_at_least, check_choices, check_positive
-from predictor.support.errors import run_entry_point
+from predictor.support.config_checks import check_at_least, check_at_most, check_choices, check_positive
+from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out
 from predictor.support.locks import locked
 from predictor.support.memory import ENV_BYTES, PROCESS_BYTES, check_count
@@ -158,6 +158,12 @@ class TrainPolicyConfig:
         check_at_least(
             self, 1, "steps", "num_envs", "selections", "selection_episodes", "checkpoint_every", "eval_episodes"
         )
+        check_at_most(self.sizes, MOST_EPISODES, "eval_episodes")
+        for name in ("num_samples", "horizon_steps"):
+            if self.observe == "none" and getattr(self, name) != getattr(type(self), name):
+                raise UserError(f"{name} has no effect with observe=none; leave one out")
+        if self.driver != type(self).driver and not is_multiagent_id(self.env_id):
+            raise UserError(f"driver drives the other agents of PettingZoo, {self.env_id} has one ego; leave it out")
         for name in ("eval_episodes", "selection_episodes"):
             check_count(getattr(self.sizes, name), name)
         plan = self.plan

@@ -112,10 +112,10 @@ def new_model(
 def even_batches(rollout: int, most: int) -> int:
     """Returns the largest batch of at most `most` samples that divides a rollout into equal ones.
 
-    Where that is less than half of `most`, the last batch is a smaller one instead.
+    Where that is less than half of `most`, or 1, the last batch is a smaller one instead.
     """
     even = next(rollout // count for count in range(-(-rollout // most), rollout + 1) if rollout % count == 0)
-    return even if 2 * even >= most else min(rollout, most)
+    return even if even > 1 and 2 * even >= most else min(rollout, most)
 
 
 class DivergedError(UserError):

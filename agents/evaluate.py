@@ -22,7 +22,7 @@ from agents.arena import EgoArena, open_arena
 from agents.episode_file import NO_PYARROW, has_pyarrow
 from agents.hub import local_policy
 from agents.policy import task_of_policy
-from agents.results import Evaluation
+from agents.results import MOST_EPISODES, Evaluation
 from agents.runs import CONFIG_FILE, load_model, policy_zip, read_config, shipped_policies
 from agents.summaries import EXTREMES
 from agents.task import EVALUATION_SEED, Task, task_of
@@ -33,7 +33,7 @@ from envs.registry import arguments_of
 from envs.sb3.policy_file import Algorithm, algorithm_of, read_policy_note
 from envs.supervision import TIMEOUT_S
 from predictor.support.command_line import parse
-from predictor.support.config_checks import check_at_least, check_positive
+from predictor.support.config_checks import check_at_least, check_at_most, check_positive
 from predictor.support.errors import UserError, run_entry_point
 from predictor.support.files import check_out
 from predictor.support.hub import is_hub
@@ -155,6 +155,7 @@ class EvaluateConfig:
             UserError: a value is out of range, or the device is not available.
         """
         check_at_least(self, 1, "episodes", "num_envs")
+        check_at_most(self, MOST_EPISODES, "episodes")
         check_positive(self, "timeout_s")
         check_count(self.episodes, "episodes")
         check_processes(min(self.num_envs, self.episodes), "num_envs")
@@ -296,7 +297,7 @@ def _trained(config: EvaluateConfig, policy: Path) -> _Trained:
         algorithm, task = run["algorithm"], task_of(run, config.device, config.env_id, config.checkpoint)
     else:
         algorithm, task = algorithm_of(zipped), task_of_policy(zipped, config.device)
-    if config.checkpoint not in (None, task.checkpoint):
+    if config.checkpoint not in (None, task.checkpoint, task.sizes_of):
         raise UserError(
             f"policy {policy} was trained on forecaster {task.checkpoint}, got --checkpoint {config.checkpoint}; leave "
             "it out"

@@ -81,7 +81,7 @@ def changed(preset: Preset, settings: Mapping[str, Any], where: str) -> Preset:
 
 
 def write_preset(path: Path, preset: Preset, comments: Sequence[str] = ()) -> None:
-    """Writes all hyperparameters of a preset as TOML, for `settings_from_file`.
+    """Writes the hyperparameters of a preset as TOML, for `settings_from_file`; those that are None are left out.
 
     Args:
         path: path of the file.

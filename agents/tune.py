@@ -27,6 +27,8 @@ from agents.search_space import search_space
 from agents.task import SELECTION_SEED, TUNING_SEED, Observe, Task
 from agents.training import TrainingPlan, train
 from envs.registry import entry_for
+from predictor.checkpoint import CONSTANT_VELOCITY
+from predictor.own_forecasters import is_own
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_choices
 from predictor.support.errors import UserError, one_line, run_entry_point, short
@@ -117,7 +119,15 @@ class TuneConfig:
             number: number of the training in its trial, from 0.
         """
         learners = entry_for(self.env_id).learners
-        task = Task(self.env_id, ARM, self.checkpoint, learners=learners, env_kwargs=self.env_kwargs)
+        has_sizes = self.checkpoint is not None and self.checkpoint != CONSTANT_VELOCITY and not is_own(self.checkpoint)
+        task = Task(
+            self.env_id,
+            ARM,
+            self.checkpoint,
+            learners=learners,
+            env_kwargs=self.env_kwargs,
+            sizes_of=self.checkpoint if has_sizes else None,
+        )
         return TrainingPlan(
             task,
             self.algorithm,
@@ -152,6 +162,7 @@ def tune(config: TuneConfig) -> Path:
         study = open_study(folder / STUDY_FILE)
         for trial in study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,)):
             study.tell(trial.number, state=optuna.trial.TrialState.FAIL)  # of a start that was killed: drawn again
+        _write_best(config, study, plan.preset)  # a kill may have come between a trial's end and this
         for index in range(len(_ended(study)), config.trials):
             _run_trial(config, study, index, plan.preset)
             _write_best(config, study, plan.preset)

@@ -8,13 +8,13 @@ from typing import Any, Protocol, runtime_checkable
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.summaries import EXTREMES
-from agents.task import EVALUATION_SEED, Task
+from agents.task import EVALUATION_SEED, NO_CHECKPOINT, Task
 from agents.vec_envs import EpisodeResult, MakeCopy
 from envs.own_observation import without_added
 from envs.parallel import ForecastParallelEnv
 from envs.readers import multiagent_reader_for
 from envs.readers.highway import is_highway_env
-from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS
+from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS, entry_for
 from envs.sb3.acting import ActingPolicy, ActingTeam
 from envs.simulators.envpool import ENV_IDS, HIGHWAY_ENV_OF
 from envs.video.film_forecasts import FilmForecasts, record_pictures, view_of
@@ -113,6 +113,17 @@ def film(
     return path
 
 
+def _in_highway_env(task: Task) -> Task:
+    """Returns the task in highway-env's environment; checkpoint and sizes stay those of EnvPool's id."""
+    shipped = entry_for(task.env_id).checkpoint
+    return replace(
+        task,
+        env_id=HIGHWAY_ENV_OF[ENV_IDS[task.env_id]],
+        checkpoint=None if task.observe in NO_CHECKPOINT else task.checkpoint or shipped,
+        sizes_of=task.sizes_of if task.observe in ("none", "forecast") else task.sizes_of or shipped,
+    )
+
+
 def recorded(
     task: Task, model: BaseAlgorithm, seed: int = EVALUATION_SEED, max_steps: int | None = None
 ) -> Recorded | None:
@@ -124,7 +135,7 @@ def recorded(
     if task.is_multiagent:
         return record_task(task, model, seed, max_steps)
     if task.env_id in ENV_IDS and not task.make_kwargs:
-        task = replace(task, env_id=HIGHWAY_ENV_OF[ENV_IDS[task.env_id]])
+        task = _in_highway_env(task)
     plain = task.make()
     highway, drawn = is_highway_env(plain), view_of(plain) is not None
     plain.close()

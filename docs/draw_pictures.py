@@ -170,7 +170,7 @@ def draw_calibration(path: Path) -> None:
     ax.axvspan(80, 97, color=GREY, alpha=0.15, lw=0)
     ax.axvline(90, color=BLACK, lw=0.8, ls=":", label="calibrated: 90 %")
     for place, (spread, controls) in enumerate(measured.values()):
-        shares = {name: controls[name]["coverage"] for name in names if name in controls}
+        shares = {name: controls[name].coverage for name in names if name in controls}
         ax.plot(
             100 * np.array(spread), [place, place], color=BLUE, lw=5, solid_capstyle="butt",
             label=None if place else "dG-VAE, least to most of the steps",

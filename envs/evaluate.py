@@ -53,6 +53,16 @@ GALLERY_CASES = 6
 """Number of worst forecasts that are drawn, at most one per episode."""
 
 
+USED_BY = {
+    **dict.fromkeys(("num_samples", "memory_steps", "edge_ablations", "miss_m"), {"accuracy"}),
+    **dict.fromkeys(("perturbations", "most_episodes"), {"reactions"}),
+    "episodes": {"accuracy", "graph", "plans"},
+    "data": {"accuracy", "reactions"},
+    "horizon_steps": {"accuracy", "reactions", "plans"},
+}
+"""Options that only some measurements use."""
+
+
 @dataclass(frozen=True)
 class EvaluateConfig:
     """Measures forecasts in running environments, through the deployed wrapper, beside constant velocity."""
@@ -144,6 +154,10 @@ class EvaluateConfig:
         if len(set(self.env_ids)) < len(self.env_ids):
             raise UserError(f"each of --env-ids is given once, got {', '.join(self.env_ids)}; leave one out")
         names_of(self.checkpoint)
+        asked = {name for name in ("reactions", "graph", "plans") if getattr(self, name)} or {"accuracy"}
+        for name, measurements in USED_BY.items():
+            if getattr(self, name) != getattr(type(self), name) and not asked & measurements:
+                raise UserError(f"{name} has no effect on {' and '.join(sorted(asked))}; leave it out")
 
 
 def evaluate_env(config: EvaluateConfig, env_id: str, checkpoint: str | None = None) -> tuple[EnvAccuracy, list[Case]]:

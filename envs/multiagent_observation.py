@@ -145,24 +145,6 @@ def _batch(scenes: Sequence[MultiagentScene]) -> SceneBatch:
     return SceneBatch.stack([one.scene for one in scenes])
 
 
-def agent_entries(
-    scene: MultiagentScene, forecast: Forecast, view: SceneSpec, uncertainty: bool = False
-) -> AgentEntries:
-    """Returns each agent's forecast entries, cut from one forecast; `envs.entries.ego_entries` gives the shapes.
-
-    Args:
-        scene: scene that was forecast.
-        forecast: forecast of it, a batch of one, agents as in the scene, world coordinates.
-        view: spec whose `perception_m` and `max_agents` bound an agent's view.
-        uncertainty: whether probabilities and standard deviations of the samples are among the entries.
-
-    Returns:
-        The entries of each agent in `scene.index_of`, by name.
-    """
-    [entries] = view_entries([scene], forecast, view, uncertainty)
-    return entries
-
-
 def view_entries(
     scenes: Sequence[MultiagentScene],
     forecast: Forecast,
@@ -170,9 +152,14 @@ def view_entries(
     uncertainty: bool = False,
     fill: Callable[[Entries], Entries] | None = None,
 ) -> list[AgentEntries]:
-    """Returns `agent_entries` for each of several scenes, whose forecasts are one batch.
+    """Returns each agent's forecast entries, by scene and name; `envs.entries.ego_entries` gives the shapes.
 
-    `fill` changes the entries of all views at once.
+    Args:
+        scenes: scenes that were forecast; entries are those of each agent in their `index_of`.
+        forecast: forecasts of them, one batch, agents as in the scenes, world coordinates.
+        view: spec whose `perception_m` and `max_agents` bound an agent's view.
+        uncertainty: whether probabilities and standard deviations of the samples are among the entries.
+        fill: function that changes the entries of all views at once.
     """
     named = [(env, name) for env, one in enumerate(scenes) for name in one.index_of]
     entries: list[AgentEntries] = [{} for _ in scenes]

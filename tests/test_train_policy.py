@@ -27,7 +27,7 @@ from agents.task import Backend
 from agents.training import SaveCheckpoint, TrainingPlan
 from envs.sb3.policy_file import NOTE_ENTRY, read_note, read_policy_note
 from envs.video.highway import record_episode
-from predictor.support.errors import run_entry_point
+from predictor.support.errors import UserError, run_entry_point
 from tests.agents.helpers import TOY
 
 # SB3 silences this warning at import, pytest makes it an error again.
@@ -564,3 +564,17 @@ def test_evaluating_no_run_is_one_clear_line(
         run_entry_point(evaluate.main)
     assert exit_.value.code == 2
     assert "holds no training run" in error_line(capsys)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"observe": "none", "num_samples": 6}, "num_samples has no effect with observe=none; leave one out"),
+        ({"observe": "none", "horizon_steps": 3}, "horizon_steps has no effect with observe=none; leave one out"),
+        ({"driver": "mixed"}, "driver drives the other agents of PettingZoo, merge-v1 has one ego; leave it out"),
+        ({"eval_episodes": 20_000}, "eval_episodes must be at most 10,000, got 20000"),
+    ],
+)
+def test_an_option_without_effect_is_refused(options: dict[str, Any], message: str):
+    with pytest.raises(UserError, match=f"^{message}$"):
+        train_policy.TrainPolicyConfig("merge-v1", **options)

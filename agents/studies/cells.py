@@ -22,6 +22,7 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.arena import open_arena
+from agents.evaluate import checked_drivers
 from agents.presets import Algorithm, Preset
 from agents.results import PACKAGES
 from agents.runs import CURVE_FILE, FORECASTER, load_model, open_run, read_curve
@@ -31,9 +32,7 @@ from agents.task import EVALUATION_SEED, Task
 from agents.training import TrainingPlan, train
 from envs.drivers.all_agents import make_driver
 from envs.drivers.content import content_of
-from envs.drivers.ego import make_ego_driver, named_drivers
 from envs.drivers.planner import ORACLE, is_planner, planner_checkpoint, planner_config
-from envs.drivers.trained import require_own_view
 from envs.registry import checkpoint_for
 from envs.sb3.algorithms import CONTRIB
 from predictor.checkpoint import CONSTANT_VELOCITY, WEIGHTS, resolve
@@ -164,7 +163,8 @@ def run_cell(cell: Cell, folder: Path, commit: str) -> Result:
     trained_s, curve = 0.0, list[dict[str, Any]]()
     if cell.plan is not None:
         run = folder / RUN_FOLDER
-        free = (FORECASTER, "device", *PATHS)  # the folder's name has the forecaster's hash and sizes
+        # the folder's name has the forecaster's hash and sizes, and the preset with its settings
+        free = (FORECASTER, "device", "settings", *PATHS)
         open_run(run, _run_config(cell), made, resume=True, free=free)
         policy = load_model(train(cell.plan, run), cell.plan.algorithm, device=cell.plan.device)
         curve = read_curve(run / CURVE_FILE)
@@ -206,12 +206,7 @@ def _drivers(study: Study, scenario: Scenario, where: str) -> list[Cell]:
                 make_driver(name, many, np.random.default_rng(0))
             many.close()
         else:
-            env = task.make(disable_env_checker=True)
-            names = named_drivers(names, env)
-            for name in names:
-                require_own_view(env, name)
-                make_ego_driver(name, env, np.random.default_rng(0))
-            env.close()
+            names = checked_drivers(task, names)
         return [Cell(scenario.name, name, task, None, study.episodes, _driver_pin(name, task)) for name in names]
     except UserError as error:
         raise UserError(f"{place}: {error}") from error

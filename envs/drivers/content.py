@@ -10,7 +10,7 @@ from predictor.own_forecasters import PREFIX, is_own
 
 
 def content_of(driver: str) -> str | None:
-    """Returns the SHA-256 of a policy's zip, of the module of a driver of one's own, or of a planner's weights.
+    """Returns the SHA-256 of a policy's zip, a planner's weights, or the module of one's own driver or forecaster.
 
     None for drivers that are named, not read from a file.
     """
@@ -24,10 +24,9 @@ def content_of(driver: str) -> str | None:
 def _file_of(driver: str) -> Path | None:
     if driver.endswith(".zip"):
         return Path(driver)
-    if is_own(driver):
-        module, colon, _ = driver.removeprefix(PREFIX).partition(":")
+    planned = planner_checkpoint(driver) if is_planner(driver) else ""
+    if is_own(driver) or is_own(planned):
+        module, colon, _ = (planned or driver).removeprefix(PREFIX).partition(":")
         found = importlib.util.find_spec(module) if colon else None
         return None if found is None or found.origin is None else Path(found.origin)
-    if is_planner(driver) and (checkpoint := planner_checkpoint(driver)) not in ("", ORACLE, CONSTANT_VELOCITY):
-        return resolve(checkpoint) / WEIGHTS
-    return None
+    return None if planned in ("", ORACLE, CONSTANT_VELOCITY) else resolve(planned) / WEIGHTS

@@ -15,6 +15,7 @@ from pettingzoo.utils import BaseParallelWrapper
 from envs.plans.playing import followed
 from envs.readers.base import MultiagentReader
 from envs.simulators.copies import RunningCopy, running_copy
+from envs.simulators.interventions import simulator_of
 from predictor.scene import Scene
 
 
@@ -48,7 +49,7 @@ def all_keeping_on(
         UserError: the environment cannot be copied.
     """
     copied: Any = _Copyable(env)
-    copied, reader = running_copy((copied, reader), env.unwrapped)
+    copied, reader = running_copy((copied, reader), simulator_of(env))
     drive_others = getattr(copied, "drive_others", _nobody)
 
     def moments(seen: Mapping[str, Any]) -> Iterator[Scene | None]:

@@ -19,6 +19,7 @@ from envs.rollouts.interventions import kinds_of
 from envs.rollouts.world import World
 from envs.seeding import branch_rng
 from envs.simulators.interventions import Intervention, Kind
+from envs.supervision import EnvironmentFailedError
 from predictor.data.store import PERTURBATIONS, Episode
 from predictor.scene import Scene
 from predictor.support.errors import UserError
@@ -130,18 +131,22 @@ def _branch(
     senders = [agent for agent in senders_of(moment, settings.causal) if agent in seen]
     if not senders:  # nobody who is there for more than this moment
         return []
-    for attempt in range(TRIES):
+    kept: Branches | None = None
+    for _ in range(TRIES):
         sender = _sender(senders, int(point.ids[0]) if moment.spec.has_ego else None, rng)
         found = _perturbed(point, sender, horizon, settings.mix, rng)
         if found is None:
             continue
+        kept = found
         moved_m = farthest(found, settings.causal.threshold_m, labelled)
         moved_m[point.ids == sender] = 0
-        if np.nanmax(moved_m, initial=0.0) > settings.causal.threshold_m or attempt == TRIES - 1:
-            has_ego = moment.spec.has_ego
-            episode = _episode(point, found, before, settings.causal.threshold_m, labelled, has_ego)
-            return _with_twin(episode, found, before, has_ego) if settings.twins else [episode]
-    return []
+        if np.nanmax(moved_m, initial=0.0) > settings.causal.threshold_m:
+            break
+    if kept is None:
+        return []
+    has_ego = moment.spec.has_ego
+    episode = _episode(point, kept, before, settings.causal.threshold_m, labelled, has_ego)
+    return _with_twin(episode, kept, before, has_ego) if settings.twins else [episode]
 
 
 def _sender(senders: Sequence[int], ego: int | None, rng: np.random.Generator) -> int:
@@ -161,6 +166,8 @@ def _perturbed(
     for kind in rng.choice(kinds, len(kinds), replace=False, p=shares / shares.sum()):
         try:
             return point.perturbed(_drawn(sender, kind, horizon, mix, rng))
+        except EnvironmentFailedError:
+            raise
         except UserError:
             continue  # an ego that cannot be taken out, a vehicle at rest
     return None

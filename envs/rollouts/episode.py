@@ -113,7 +113,7 @@ class Episode:
     edge_types: list[Int[np.ndarray, "agents agents"]] = field(default_factory=list)
     """True edge types, -1 where unknown; empty where the simulator has none."""
     crashed: bool = False
-    """Whether the ego is reported to have crashed; the episode then ends with the crash."""
+    """Whether the episode ended with a crash of the ego."""
     worst: Case | None = None
     """Worst forecast of the model among those with a whole future."""
 
@@ -138,13 +138,14 @@ def play(task: EpisodeTask) -> Episode:
         _note_edges(episode, world, scene, truths[-1])
         if step == task.max_steps:
             break
+        crashed_before = isinstance(world, EgoWorld) and bool(world.crashed)
         ended = world.step()
         truths.append(world.full_scene())
         if ended:
+            episode.crashed = isinstance(world, EgoWorld) and bool(world.crashed) and not crashed_before
             break
     future, valid = futures(scenes, truths, task.horizon_steps, world.spec)
     episode.outcomes = {key: _outcome(found, future, valid) for key, found in forecasts.items()}
-    episode.crashed = isinstance(world, EgoWorld) and bool(world.crashed)
     episode.worst = _worst(episode.outcomes, scenes, task.seed, world.spec.has_ego)
     return episode
 

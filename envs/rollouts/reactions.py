@@ -26,6 +26,7 @@ from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters,
 from envs.rollouts.world import World
 from envs.seeding import reaction_rng
 from envs.simulators.interventions import Intervention
+from envs.supervision import EnvironmentFailedError
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.baselines.nearest_neighbour import NearestNeighbour, fit_from_stores
 from predictor.scene import Scene, SceneSpec
@@ -175,6 +176,8 @@ class Moment:
         if intervention not in self._tried:
             try:
                 self._tried[intervention] = self._point.perturbed(intervention)
+            except EnvironmentFailedError:
+                raise
             except UserError:  # one that does not act by itself
                 self._tried[intervention] = None
         return self._tried[intervention]

@@ -64,7 +64,7 @@ def summarise_episodes(
     straight = line("constant velocity", outcomes[STRAIGHT], fitted_std_m(outcomes[STRAIGHT]))
     reduction, interval = _reduction(first, outcomes[STRAIGHT])
     pairs = [first, outcomes[STRAIGHT]]
-    last = round(BEFORE_CRASH_S / spec.dt_s) + 1  # the scene of the crash is one, whose forecasts nothing follows
+    last = max(1, round(BEFORE_CRASH_S / spec.dt_s))  # the scene of the crash is none: no forecast follows it
     crashes = [[o.last_windows(last) for o, e in zip(p, episodes, strict=True) if e.crashed] for p in pairs]
     to_the_end, before_crash = (
         (line(name, own, (), partial=True), line("constant velocity", straight_ahead, (), partial=True))

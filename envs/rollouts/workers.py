@@ -24,6 +24,7 @@ from predictor.support.processes import end, follow_parent, how_it_ended, start
 OnError = Literal["stop", "skip"]
 """What an episode that fails does: it stops the command, or is left out."""
 _POLL_S = 1.0
+_DYING_S = 5.0
 _START_S = 600.0
 """Time that a process gets to import what it needs on a busy machine [s]."""
 
@@ -173,7 +174,8 @@ class EpisodePool(Generic[Result]):
             try:
                 content = pickle.loads(worker.pipe.recv_bytes()) if worker.pipe.poll() else None
             except (EOFError, OSError):
-                worker.process.join()
+                worker.process.join(_DYING_S)
+                end([worker.process])  # a thread of the environment may keep it alive
                 reason = how_it_ended(worker.process.exitcode)
             else:
                 if isinstance(content, _Ready):

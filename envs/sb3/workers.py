@@ -112,7 +112,8 @@ class _WatchedRemote:
                 raise EnvironmentFailedError(f"{self._where()}: no answer for {patience_s:g} s; {hint}")
             answer = self._pipe.recv()
         except (EOFError, OSError) as error:
-            self._process.join()
+            self._process.join(CLOSE_S)
+            end([self._process])  # a thread of the environment may keep it alive
             raise EnvironmentFailedError(f"{self._where()}: {how_it_ended(self._process.exitcode)}") from error
         if isinstance(answer, _Failure):
             raise EnvironmentFailedError(answer.text)

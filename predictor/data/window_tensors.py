@@ -234,8 +234,8 @@ def _pick(values: Tensor, entry: Tensor) -> Tensor:
 
 def _flat_labels(labels: Sequence[np.ndarray | None], unknown: int) -> FlatLabels | None:
     given = [label for label in labels if label is not None]
-    if len(given) < len(labels):
-        return None
+    if len(given) < len(labels) or len({label.shape[3:] for label in given}) > 1:
+        return None  # stores whose attributes mean something else
     first = _starts(np.array([np.prod(label.shape[:3]) for label in given], dtype=np.int64))
     fixed = np.array([len(label) == 1 for label in given])
     values = _end_to_end([label.reshape(-1, *label.shape[3:]) for label in given], unknown)

@@ -21,6 +21,20 @@ Interval = tuple[float, float]
 
 
 @dataclass(frozen=True)
+class Control:
+    """What a control reached with as many samples."""
+
+    best_of_k_m: float
+    """Best of K [m]."""
+    joint_best_of_k_m: float
+    """Best of K scenes, all agents together [m]."""
+    energy_m: float
+    """Energy score [m]."""
+    coverage: float | None
+    """Share of truths within the central 90 % of the samples, all steps together."""
+
+
+@dataclass(frozen=True)
 class Measurement:
     """Accuracy in one environment, with one driver and one number of samples; None where it was not measured."""
 
@@ -67,8 +81,8 @@ class Measurement:
     """Commit at which `mixture_coverage` was measured, if it was later, after the spread alone was trained."""
     overlap: tuple[float, float] | None = None
     """Share of agents' steps nearer to another agent than the miss threshold, in samples and in truth."""
-    controls: dict[str, dict[str, float | None]] | None = None
-    """Figures of each control at the same K, by its name: best_of_k_m, joint_best_of_k_m, energy_m, coverage."""
+    controls: dict[str, Control] | None = None
+    """Figures of each control at the same K, by its name."""
     one_step_m: float | None = None
     """ADE (K = 1) with a memory of one step [m]."""
     one_step_interval_m: Interval | None = None
@@ -186,12 +200,12 @@ def _of_samples(result: dict[str, Any]) -> dict[str, Any]:
         found[figure] = (min(covered), max(covered)) if covered else None
     found["overlap"] = (many["overlap"], many["true_overlap"])
     found["controls"] = {
-        key: {
-            "best_of_k_m": one["min_ade_m"],
-            "joint_best_of_k_m": one["min_joint_ade_m"],
-            "energy_m": one["energy_m"],
-            "coverage": (one["statistics"].get("coverage") or {}).get("mean"),
-        }
+        key: Control(
+            one["min_ade_m"],
+            one["min_joint_ade_m"],
+            one["energy_m"],
+            (one["statistics"].get("coverage") or {}).get("mean"),
+        )
         for key, one in (result.get("controls") or {}).items()
     } or None
     return found

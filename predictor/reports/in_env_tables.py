@@ -96,8 +96,8 @@ def samples_table(measurements: Sequence[Measurement]) -> str:
             ]
         )
         for name, control in (m.controls or {}).items():
-            figures = [metres(control[key]) for key in ("best_of_k_m", "joint_best_of_k_m", "energy_m")]
-            share = control["coverage"]
+            figures = map(metres, (control.best_of_k_m, control.joint_best_of_k_m, control.energy_m))
+            share = control.coverage
             lines.append(
                 [m.env_id, str(m.samples), name, *figures, "–" if share is None else f"{100 * share:.0f} %", "–"]
             )

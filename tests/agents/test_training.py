@@ -261,7 +261,8 @@ def test_same_seed_same_policy(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize(
-    ("rollout", "most", "batch"), [(4800, 480, 480), (75, 480, 75), (600, 480, 300), (1600, 480, 400), (7, 4, 4)]
+    ("rollout", "most", "batch"),
+    [(4800, 480, 480), (75, 480, 75), (600, 480, 300), (1600, 480, 400), (7, 4, 4), (3, 2, 2)],
 )
 def test_batches_divide_a_rollout(rollout: int, most: int, batch: int):
     assert even_batches(rollout, most) == batch

@@ -83,6 +83,26 @@ def test_the_best_trial_is_written_for_train_policy(tmp_path: Path, capsys: pyte
     assert f"return {other:.3f}" in lines[1]
 
 
+@pytest.mark.usefixtures("toy")
+def test_a_kill_before_the_best_is_written_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with monkeypatch.context() as patch:
+        values = iter([1.0, 5.0])
+        patch.setattr(command, "_measure", lambda *_: next(values))
+        write = command._write_best
+        patch.setattr(
+            command, "_write_best", lambda c, study, preset: len(command._ended(study)) < 2 and write(c, study, preset)
+        )
+        best = tune(config(tmp_path / "tuned"))
+    assert "mean return 1.000" in best.read_text()
+    assert "trial 2, the best of 2: mean return 5.000" in tune(config(tmp_path / "tuned")).read_text()
+
+
+def test_zeros_have_the_sizes_of_the_checkpoint_that_is_named():
+    task = TuneConfig(**HIGHWAY, checkpoint="exit").plan({}, 0).task
+    assert (task.observe, task.sizes_of) == ("zeros", "exit")
+    assert TuneConfig(**HIGHWAY).plan({}, 0).task.sizes_of is None
+
+
 def test_policies_are_shown_zeros():
     assert TuneConfig(**HIGHWAY).plan({}, 0).task.observe == "zeros"
     assert TuneConfig("simple_tag_v3").plan({}, 0).task.learners == ("adversary",)

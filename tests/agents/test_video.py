@@ -7,7 +7,7 @@ from stable_baselines3 import PPO
 from agents.arena import MultiagentArena
 from agents.task import Task
 from agents.vec_envs import EpisodeResult
-from agents.video import film, film_extremes, record_task
+from agents.video import _in_highway_env, film, film_extremes, record_task
 from tests.agents.helpers import TOY, Meadow, policy_for
 
 SPREAD, TAG = "simple_spread_v3", "simple_tag_v3"
@@ -37,6 +37,16 @@ def test_an_environment_without_reader_is_not_filmed():
 def test_the_film_is_of_the_environment_with_its_arguments(monkeypatch: pytest.MonkeyPatch):
     task = Task(f"{__name__}:grown", "none", env_kwargs='{"legs": 6}')
     assert record_task(task, policy_for(task), 0, max_steps=5) is None
+
+
+@pytest.mark.parametrize(
+    ("observe", "checkpoint", "sizes"),
+    [("none", None, None), ("constant-velocity", None, "exit"), ("zeros", "exit", "exit"), ("forecast", "exit", None)],
+)
+def test_films_of_envpools_ids_keep_their_forecaster(observe: Any, checkpoint: str | None, sizes: str | None):
+    """exit-v0, of which EnvPool's Exit-v0 is a copy, has no checkpoint in the list; exit-v1 has."""
+    shown = _in_highway_env(Task("envpool/Exit-v0", observe))
+    assert (shown.env_id, shown.checkpoint, shown.sizes_of) == ("exit-v0", checkpoint, sizes)
 
 
 def grown(legs: int, **kwargs: Any) -> Meadow:

@@ -13,7 +13,9 @@ import torch
 from highway_env.vehicle.behavior import IDMVehicle
 from stable_baselines3 import PPO
 
+from envs.multiagent_observation import AgentEntries, view_entries
 from envs.observation import ForecastStream
+from envs.readers.base import MultiagentScene
 from envs.readers.highway import HighwayReader
 from envs.registry import make_env
 from envs.sb3.policy_file import PolicyNote, pin_forecaster, write_note
@@ -224,3 +226,9 @@ class NamedReader:
         valid = np.zeros(self.spec.max_agents, dtype=np.bool_)
         ids[0], valid[0] = 0, True
         return Scene(states, ids, valid)
+
+
+def agent_entries(scene: MultiagentScene, forecast: Forecast, view: SceneSpec) -> AgentEntries:
+    """Returns each agent's forecast entries of one scene."""
+    [entries] = view_entries([scene], forecast, view)
+    return entries

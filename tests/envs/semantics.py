@@ -20,7 +20,7 @@ import torch
 from pettingzoo import ParallelEnv
 
 from envs.entries import FORECAST_KEYS, PATH_KEYS, ego_entries, path_entries
-from envs.multiagent_observation import MultiagentStream, agent_entries
+from envs.multiagent_observation import MultiagentStream
 from envs.observation import ForecastStream
 from envs.parallel import ForecastParallelEnv
 from envs.readers import multiagent_reader_for, reader_for
@@ -35,7 +35,7 @@ from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.dgvae import DGVAE
 from predictor.dgvae import model as dgvae
 from predictor.scene import Forecast, Scene, SceneBatch, SceneSpec
-from tests.envs.helpers import HORIZON, SIZES
+from tests.envs.helpers import HORIZON, SIZES, agent_entries
 
 Views = dict[str, dict[str, Any]]
 Bodies = list[tuple[Hashable, tuple[float, ...]]]

@@ -116,8 +116,8 @@ def steps_of(errors_m: list[float], known: list[int], crashed: bool) -> Episode:
 
 
 def test_forecasts_that_pass_the_end_count_up_to_it_and_the_last_before_a_crash_alone():
-    """HORIZON whole forecasts of 1 m, then one with a single step left, 4 m off, and one with none."""
-    errors, known = [1.0] * HORIZON + [4.0, 9.0], [HORIZON] * HORIZON + [1, 0]
+    """HORIZON whole forecasts of 1 m, then one with a single step left, 4 m off; none of the scene of the crash."""
+    errors, known = [1.0] * HORIZON + [4.0], [HORIZON] * HORIZON + [1]
     episodes = [steps_of(errors, known, crashed) for crashed in (True, False)]
     found = summarise_episodes("here", STILL, "idle", replace(HIGHWAY_SPEC, dt_s=2.5), episodes)  # 5 s: two steps
     assert found.model.min_ade_m == 1.0 and found.model.agents == 2 * HORIZON

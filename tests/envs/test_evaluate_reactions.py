@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,6 +13,7 @@ from envs.rollouts.causal_labels import IN_ARENAS
 from envs.rollouts.graph_run import DISTANCE, MAJORITY
 from envs.rollouts.reaction_cells import ELSEWHERE
 from envs.rollouts.reactions import STRAIGHT
+from predictor.support.errors import UserError
 from tests.envs.evaluation import TAG, forget, no_processes, read_json, save_tag
 from tests.envs.helpers import run_command
 
@@ -87,6 +89,8 @@ ERRORS = {
     "no-store": (["--data", "nowhere"], "nowhere is not an episode store (it has no zarr.json)"),
     "no-copies-for-a-graph": (["--graph", "--env-ids", "pursuit_v5"], "raw_env cannot be perturbed"),
     "no-plans": (["--plans", "--env-ids", TAG], "plans are those of one ego, and simple_tag_v3 has several"),
+    "no-effect-of-memory": (["--memory-steps", "5"], "memory_steps has no effect on reactions; leave it out"),
+    "no-effect-of-episodes": (["--episodes", "7"], "episodes has no effect on reactions; leave it out"),
     "no-checkpoint": (["--checkpoint", "nowhere"], "no checkpoint 'nowhere'"),
 }
 
@@ -102,3 +106,19 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert (code, len(errors)) == (2, 1)
     assert errors[0].startswith(f"error: {message}")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"perturbations": 3}, "perturbations has no effect on accuracy; leave it out"),
+        ({"graph": True, "horizon_steps": 3}, "horizon_steps has no effect on graph; leave it out"),
+        (
+            {"graph": True, "plans": True, "data": (Path("nowhere"),)},
+            "data has no effect on graph and plans; leave it out",
+        ),
+    ],
+)
+def test_an_option_that_nothing_uses_is_refused(options: dict[str, Any], message: str):
+    with pytest.raises(UserError, match=f"^{message}$"):
+        evaluate.EvaluateConfig((TAG,), **options)

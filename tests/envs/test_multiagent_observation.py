@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs.entries import FORECAST_KEYS, PATH_KEYS
-from envs.multiagent_observation import MultiagentStream, agent_entries, check_multiagent_scene
+from envs.multiagent_observation import MultiagentStream, check_multiagent_scene
 from envs.readers.base import MultiagentScene
 from envs.scene_stream import ForecastConfig
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.scene import KINEMATIC_FEATURES_3D, PADDING_ID, Forecast, Scene, SceneSpec
 from predictor.support.errors import UserError
-from tests.envs.helpers import HORIZON, TOLERANCE, assert_same, largest_difference, tiny_model
+from tests.envs.helpers import HORIZON, TOLERANCE, agent_entries, assert_same, largest_difference, tiny_model
 
 WORLD = SceneSpec(dt_s=0.5, has_ego=False, perception_m=60.0, max_agents=6)
 CENTROID = replace(WORLD, frame=("centroid", "centroid"))
@@ -140,7 +140,7 @@ def straight(multi: MultiagentScene, spec: SceneSpec = WORLD, horizon: int = 2) 
     return MultiagentStream(ConstantVelocity(spec, horizon), spec, ForecastConfig()).observe(multi)
 
 
-# --- agent_entries: one forecast, each agent's own view ---------------------------------------------------------------
+# --- view_entries: one forecast, each agent's own view ---------------------------------------------------------------
 
 
 @settings(max_examples=60)

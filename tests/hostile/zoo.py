@@ -350,6 +350,7 @@ VALUES: dict[str, list[tuple[str, Any, str]]] = {
         ("measurements.0.min_ade_interval_m", [1.0], "min_ade_interval_m"),
         ("measurements.0.min_ade_interval_m", "ab", "min_ade_interval_m"),
         ("measurements.0.controls", 5, "controls"),
+        ("measurements.0.controls", {"x": {}}, "best_of_k_m"),
     ],
     "sportvu": [
         ("events", 5, "events"),

@@ -20,6 +20,7 @@ def test_other_code_or_weights_under_one_name_are_another_driver(tmp_path: Path,
     files = {
         str(tmp_path / "policy.zip"): tmp_path / "policy.zip",
         "own:a_driver_of_mine:drive": tmp_path / "a_driver_of_mine.py",
+        "planner:own:a_forecaster_of_mine:make": tmp_path / "a_forecaster_of_mine.py",
         f"planner:{checkpoint}": checkpoint / "model.safetensors",
         f"planner@0.3:{checkpoint}": checkpoint / "model.safetensors",
     }

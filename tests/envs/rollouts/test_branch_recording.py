@@ -1,18 +1,29 @@
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from envs.collect import CollectConfig, collect
+from envs.rollouts import branch_recording
 from envs.rollouts.branch_recording import IN_ARENAS as ARENA_MIX
 from envs.rollouts.branch_recording import ON_ROADS as ROAD_MIX
-from envs.rollouts.branch_recording import BranchRecording, _branch, _play, _sender, _with_twin, record_branches
-from envs.rollouts.branches import Branch, Branches
+from envs.rollouts.branch_recording import (
+    BranchRecording,
+    _branch,
+    _perturbed,
+    _play,
+    _sender,
+    _with_twin,
+    record_branches,
+)
+from envs.rollouts.branches import Branch, Branches, BranchPoint
 from envs.rollouts.causal_labels import IN_ARENAS, ON_ROADS, senders_of
 from envs.rollouts.recording import Recording, record
 from envs.rollouts.world import open_world
 from envs.simulators.interventions import Intervention
+from envs.supervision import EnvironmentFailedError
 from predictor.data.store import PERTURBATIONS, Episode
 from predictor.data.windows import Windows
 from predictor.scene import Scene
@@ -163,6 +174,33 @@ def test_who_has_just_appeared_is_not_perturbed():
         assert branch.ids[moment_of(branch)[1]] == agent
     nobody = replace(now, valid=np.zeros_like(now.valid))
     assert _branch(world, [nobody], ON_ROAD, np.random.default_rng(0)) == []
+
+
+def test_a_simulator_that_fails_in_a_branch_is_no_agent_that_allows_nothing(monkeypatch: pytest.MonkeyPatch):
+    def fails(point: BranchPoint, intervention: Intervention) -> Branches:
+        raise EnvironmentFailedError("it raised")
+
+    monkeypatch.setattr(BranchPoint, "perturbed", fails)
+    with pytest.raises(EnvironmentFailedError, match="it raised"):
+        _perturbed(BranchPoint.__new__(BranchPoint), 1, 3, ROAD_MIX, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("gives", [(True, False, False), (True, True, False)])
+def test_the_last_intervention_that_is_possible_is_kept(monkeypatch: pytest.MonkeyPatch, gives: tuple[bool, ...]):
+    """Also where none of them moves anybody, and later ones are not possible."""
+    world = open_world(ROAD, "idle")
+    world.reset(5)
+    played, found, possible = branch_recording._perturbed, [], iter(gives)
+
+    def perturbed(*arguments: Any) -> Any:
+        found.append(played(*arguments) if next(possible) else None)
+        return found[-1]
+
+    monkeypatch.setattr(branch_recording, "_perturbed", perturbed)
+    monkeypatch.setattr(branch_recording, "farthest", lambda branches, *_: np.zeros(len(branches.ids)))
+    (branch,) = _branch(world, [world.full_scene()], ON_ROAD, np.random.default_rng(0))
+    last = [one for one in found if one is not None][-1]
+    assert len(found) == 3 and branch.ids[moment_of(branch)[1]] == last.intervention.agent
 
 
 def test_branches_are_a_function_of_the_seed(branches: list[Episode]):

@@ -3,7 +3,14 @@ from pathlib import Path
 
 import pytest
 
-from predictor.evaluation.in_env_record import FILE_NAME, Measurement, measurements_of, read_record, update_record
+from predictor.evaluation.in_env_record import (
+    FILE_NAME,
+    Control,
+    Measurement,
+    measurements_of,
+    read_record,
+    update_record,
+)
 from predictor.support.errors import UserError
 
 FIRST = Measurement("toy-v0", "varied", 50, 20, "python -m envs.evaluate", "abc", 5.0, 9.0, 1.25, (1.0, 1.5), 2.5)
@@ -83,8 +90,7 @@ def test_samples_and_controls_are_taken_over():
     assert (found.energy_m, found.energy_interval_m, found.coverage) == (0.625, (0.5, 1.0), (0.75, 1.0))
     assert found.mixture_coverage == (0.5, 0.875)
     assert found.overlap == (0.125, 0.0) and found.neighbours_m == 3.0
-    figures = {"best_of_k_m": 0.5, "joint_best_of_k_m": 0.75, "energy_m": 0.625}
     assert found.controls == {
-        "nearest neighbours": figures | {"coverage": None},
-        "constant velocity + noise": figures | {"coverage": 0.875},
+        "nearest neighbours": Control(0.5, 0.75, 0.625, None),
+        "constant velocity + noise": Control(0.5, 0.75, 0.625, 0.875),
     }
