@@ -158,7 +158,6 @@ class TrainPolicyConfig:
         check_at_least(
             self, 1, "steps", "num_envs", "selections", "selection_episodes", "checkpoint_every", "eval_episodes"
         )
-        check_at_most(self.sizes, MOST_EPISODES, "eval_episodes")
         for name in ("num_samples", "horizon_steps"):
             if self.observe == "none" and getattr(self, name) != getattr(type(self), name):
                 raise UserError(f"{name} has no effect with observe=none; leave one out")
@@ -166,6 +165,7 @@ class TrainPolicyConfig:
             raise UserError(f"driver drives the other agents of PettingZoo, {self.env_id} has one ego; leave it out")
         for name in ("eval_episodes", "selection_episodes"):
             check_count(getattr(self.sizes, name), name)
+        check_at_most(self.sizes, MOST_EPISODES, "eval_episodes")
         plan = self.plan
         here = self.backend == "envpool" or plan.task.is_multiagent or plan.num_envs == 1
         check_count(plan.num_envs, "num_envs", ENV_BYTES if here else PROCESS_BYTES)

@@ -155,10 +155,10 @@ class EvaluateConfig:
             UserError: a value is out of range, or the device is not available.
         """
         check_at_least(self, 1, "episodes", "num_envs")
-        check_at_most(self, MOST_EPISODES, "episodes")
         check_positive(self, "timeout_s")
         check_count(self.episodes, "episodes")
         check_processes(min(self.num_envs, self.episodes), "num_envs")
+        check_at_most(self, MOST_EPISODES, "episodes")
         if (self.run_dir is None) == (self.policy is None):
             raise UserError("give either --run-dir (a training run) or --policy (a driver such as planner)")
         if self.policy is not None and self.env_id is None:

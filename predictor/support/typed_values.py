@@ -107,5 +107,7 @@ def _one_of(value: Any, kinds: list[Any], where: str) -> Any:
         try:
             return converted(value, kind, where)
         except UserError as error:
+            if len(kinds) == 1:
+                raise
             wanted.append(str(error).removeprefix(f"{where} must be ").rpartition(", got ")[0])
     raise UserError(f"{where} must be {' or '.join(wanted)}, got {_shown(value)}")
