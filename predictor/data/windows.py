@@ -132,11 +132,10 @@ class Windows:
         Raises:
             UserError: the ego is missing at an observed step.
         """
-        history = history_steps or self.history_steps
         episode, now = (torch.from_numpy(column) for column in self.index[indices].T.copy())
+        history = min(history_steps or self.history_steps, int(now.max()) + 1)
         casts = self.cast(episode, now, history)
-        agents = int(casts.size.max())
-        time = min(history, int(now.max()) + 1) + self.horizon_steps
+        agents, time = int(casts.size.max()), history + self.horizon_steps
         return window_batch(cut(self.flat, episode, now, casts, history, self.horizon_steps, time, agents))
 
     def cast(self, episode: Int[Tensor, " batch"], now: Int[Tensor, " batch"], history_steps: int) -> Casts:

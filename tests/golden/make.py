@@ -16,7 +16,7 @@ import torch
 from predictor.checkpoint import CheckpointInfo, load_checkpoint, save_checkpoint
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.data.windows import Windows
-from predictor.evaluation.outcomes import run_windows
+from predictor.evaluation.outcomes import run_window_batch
 from tests.predictor.helpers import any_model, circling_episode, spec
 
 HERE = Path(__file__).parent
@@ -52,7 +52,8 @@ def forecasts(folder: Path, name: str) -> list[list[float]]:
     store = read_store(folder / "store")
     windows = Windows(store.episodes, store.info.spec, HISTORY_STEPS, HORIZON_STEPS)
     with torch.no_grad():
-        (outcome,) = run_windows(model, windows, np.arange(len(windows)), HORIZON_STEPS, NUM_SAMPLES)
+        generator = torch.Generator().manual_seed(0)
+        outcome = run_window_batch(model, windows.batch(np.arange(len(windows))), HORIZON_STEPS, NUM_SAMPLES, generator)
     shown = outcome.forecast * outcome.valid.any(-1)[:, None, :, None, None]  # of agents that are there
     found: list[list[float]] = shown.flatten(1).double().tolist()
     return found
