@@ -32,10 +32,9 @@ from agents.task import EVALUATION_SEED, Task
 from agents.training import TrainingPlan, train
 from envs.drivers.all_agents import make_driver
 from envs.drivers.content import content_of
-from envs.drivers.planner import ORACLE, is_planner, planner_checkpoint, planner_config
+from envs.drivers.planner import is_planner, planner_checkpoint, planner_config
 from envs.registry import checkpoint_for
 from envs.sb3.algorithms import CONTRIB
-from predictor.checkpoint import CONSTANT_VELOCITY, WEIGHTS, resolve
 from predictor.own_forecasters import is_own
 from predictor.support.errors import UserError
 from predictor.support.provenance import provenance
@@ -255,14 +254,7 @@ def _driver_pin(name: str, task: Task) -> dict[str, Any] | None:
         return None
     settings = asdict(planner_config(name))
     checkpoint = planner_checkpoint(name) or checkpoint_for(task.env_id)
-    if checkpoint in (CONSTANT_VELOCITY, ORACLE) or is_own(checkpoint):
-        return {"sha256": checkpoint, **settings}
-    return {"sha256": _hash_of(resolve(checkpoint) / WEIGHTS), **settings}
-
-
-def _hash_of(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return {"sha256": content_of(f"planner:{checkpoint}") or checkpoint, **settings}
 
 
 def _run_config(cell: Cell) -> dict[str, Any]:
