@@ -10,11 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from envs.drivers.planner import MODES
 from envs.plans import PlanModel, checked_plans, plan_model_for
 from envs.plans.base import Plans
 from envs.plans.contact import contacts
 from envs.rollouts.branches import Branch, BranchPoint
 from envs.rollouts.moving import moving_agents
+from envs.rollouts.reactions import STRAIGHT
 from envs.rollouts.side_forecasts import SideForecaster, checkpoint_forecasters, kept_world
 from envs.rollouts.world import World
 from envs.seeding import plan_rng
@@ -27,9 +29,6 @@ EVERY = 5
 """Number of steps from one at which plans are played to the next."""
 FIRST_STEP = 3
 """First such step; forecasters have seen the motion by then."""
-MODES = 20
-"""Number of futures of a forecaster with modes, as the planner takes; others have their single forecast."""
-STRAIGHT = "constant velocity"
 
 
 @dataclass(frozen=True)
