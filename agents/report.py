@@ -48,7 +48,8 @@ def write_report(config: ReportConfig) -> Path:
             takes = "--accuracy takes the --out of envs.evaluate or predictor.evaluate"
             raise UserError(f"no {ACCURACY_FILE} in {folder}; {takes}")
     blocks_of = policy_blocks if is_policy_run(run) else predictor_blocks
-    blocks = blocks_of(run, [run, run / "accuracy", *config.accuracy])
+    folders = dict.fromkeys(folder.resolve() for folder in (run, run / "accuracy", *config.accuracy))
+    blocks = blocks_of(run, list(folders))
     for block in blocks:
         if isinstance(block, Picture):
             write_bytes(run / Path(block.file).with_suffix(".png"), block.png)

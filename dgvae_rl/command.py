@@ -82,14 +82,19 @@ def run(words: Sequence[str]) -> None:
         meant = f"; did you mean {near[0]}?" if near else f"; there are {', '.join(COMMANDS)}"
         raise CommandLineError(f"dgvae has no command '{name}'{meant}")
     sys.argv = [f"dgvae {name}", *options]
-    try:
-        main = importlib.import_module(f"dgvae_rl.{command.module}").main
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.partition(".")[0] in (*OWN, "dgvae_rl"):
-            raise
-        extra = f"'dgvae-rl[{command.extra}]'" if command.extra else "dgvae-rl"
-        raise CommandLineError(f"dgvae {name} needs {error.name}; install it with pip install {extra}") from error
-    importlib.import_module("dgvae_rl.predictor.support.errors").run_entry_point(main)
+
+    def imported() -> None:
+        try:
+            main = importlib.import_module(f"dgvae_rl.{command.module}").main
+        except ModuleNotFoundError as error:
+            if error.name is None or error.name.partition(".")[0] in (*OWN, "dgvae_rl"):
+                raise
+            extra = f"'dgvae-rl[{command.extra}]'" if command.extra else "dgvae-rl"
+            raise CommandLineError(f"dgvae {name} needs {error.name}; install it with pip install {extra}") from error
+        main()
+
+    # Ctrl-C is one line also while the command is imported
+    importlib.import_module("dgvae_rl.predictor.support.errors").run_entry_point(imported)
 
 
 def main() -> None:

@@ -29,9 +29,11 @@ from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.checkpoint import PRETRAINED, load_checkpoint, shipped
 from predictor.evaluation.in_env_record import read_record
 from predictor.reports.looks import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, STYLE, looks_of
+from predictor.reports.plots import save_figure
 from predictor.scene import Scene
 from predictor.support.command_line import parse
 from predictor.support.errors import UserError, run_entry_point
+from predictor.support.files import new_file
 
 DOCS = Path(__file__).resolve().parent
 ROAD = "highway-fast-v0"
@@ -105,7 +107,8 @@ def draw_seen(path: Path) -> None:
     observation, _ = env.reset(seed=FILMED.seed)
     for _ in range(FILMED.step):
         observation, *_ = env.step(planner(observation))
-    draw_observation(observation, y_down=True).save(path)
+    with new_file(path) as partial:
+        draw_observation(observation, y_down=True).save(partial, format="PNG")
     env.close()
 
 
@@ -127,8 +130,7 @@ def draw_braking_leader(path: Path) -> None:
     ahead.axhline(0, color=GREY, lw=1.2, label="constant velocity, in both cases")
     ahead.set(xlabel="time ahead [s]", ylabel="follower ahead of\nconstant velocity [m]")
     ahead.legend(fontsize=9, loc="lower left")
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+    save_figure(figure, path, 130)
 
 
 def draw_causal_graph(path: Path) -> None:
@@ -155,8 +157,7 @@ def draw_causal_graph(path: Path) -> None:
         _plot_edges(ax, scene, edges)
         ax.set_title(title, fontsize=10, loc="left")
     axes[1].set_xlabel("x [m]")
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+    save_figure(figure, path, 130)
 
 
 @rc_context(STYLE)
@@ -184,8 +185,7 @@ def draw_calibration(path: Path) -> None:
     ax.set(xlabel="truths within the central 90 % of 20 samples [%]", xlim=(50, 100))
     ax.invert_yaxis()
     figure.legend(loc="outside lower center", ncols=3, fontsize=9)
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+    save_figure(figure, path, 130)
 
 
 def _at(moment: Moment, is_seen: bool = True) -> tuple[World, dict[str, SideForecaster]]:

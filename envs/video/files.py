@@ -58,8 +58,9 @@ def write_video(path: str | Path, pictures: Iterable[UInt8[np.ndarray, "height w
                 for number, picture in enumerate(chain([first], rest), start=1):
                     _check_size(path, number, picture, first)
                     writer.send(np.ascontiguousarray(picture))
-    except OSError as error:
-        if error.errno not in (None, errno.ENOENT):  # of the pipe to ffmpeg, or of the file that it did not write
+    except (OSError, RuntimeError) as error:  # RuntimeError: imageio finds no ffmpeg
+        # of the pipe to ffmpeg, or of the file that it did not write
+        if isinstance(error, OSError) and error.errno not in (None, errno.ENOENT):
             raise
         raise UserError(
             f"ffmpeg must write the video {path}, but it is missing or it failed; repair it with pip install "
@@ -79,18 +80,20 @@ def _check_size(path: Path, number: int, picture: np.ndarray, first: np.ndarray)
 
 def write_picture(path: str | Path, picture: UInt8[np.ndarray, "height width 3"]) -> None:
     """Writes a picture as PNG."""
-    Image.fromarray(picture).save(path, format="PNG")
+    with new_file(Path(path)) as partial:
+        Image.fromarray(picture).save(partial, format="PNG")
 
 
 def still_of(film: Path) -> bytes:
-    """Returns a picture of an MP4 file as JPEG, from two seconds after its start; nothing of one that has none there.
+    """Returns a picture of an MP4 file as JPEG, from two seconds after its start; nothing without one, or ffmpeg.
 
     The file may come from a stranger: it is read as MP4 alone, which names no other file, and for `STILL_LIMIT_S`.
     """
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-protocol_whitelist", "file,pipe"]
+    command = ["-v", "error", "-nostdin", "-protocol_whitelist", "file,pipe"]
     command += ["-ss", "2", "-f", "mov", "-i", f"file:{film}", "-frames:v", "1", "-an"]
     command += ["-vf", f"scale='min({STILL_PX},iw)':-2", "-f", "image2pipe", "-c:v", "mjpeg", "-q:v", "4", "pipe:1"]
     try:
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), *command]
         return subprocess.run(command, capture_output=True, timeout=STILL_LIMIT_S, check=False).stdout
-    except subprocess.TimeoutExpired:
+    except (subprocess.TimeoutExpired, OSError, RuntimeError):  # RuntimeError: imageio finds no ffmpeg
         return b""

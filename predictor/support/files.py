@@ -63,6 +63,7 @@ def new_folder(path: Path) -> Iterator[Path]:
             partial.mkdir()
             yield partial
         return
+    path = Path(os.path.realpath(path))  # what a link leads to is replaced, not the link
     with scratch_folder(path) as partial:
         with disk_errors_of(path):
             yield partial
@@ -155,7 +156,7 @@ def delete_leftovers(folder: Path, name: str = "") -> None:
     """Deletes the unfinished files that a killed process left in a folder, those of the file `name` if given."""
     pattern = f".{glob.escape(name)}.{'[0-9a-f]' * _CODE}.partial*" if name else ".*.partial*"
     for leftover in folder.glob(pattern):
-        if leftover.is_dir():
+        if leftover.is_dir() and not leftover.is_symlink():
             shutil.rmtree(leftover, ignore_errors=True)
         else:
             leftover.unlink(missing_ok=True)

@@ -139,6 +139,7 @@ def _library() -> Any:
     if importlib.util.find_spec("huggingface_hub") is None:
         raise UserError("names that begin with hub: need the package huggingface_hub; pip install 'dgvae-rl[hub]'")
     import huggingface_hub
+    import huggingface_hub.errors  # which the package does not load by itself
 
     return huggingface_hub
 
@@ -174,6 +175,8 @@ def _errors_of(wanted: HubName, hub: Any, pushed: str = "") -> Iterator[None]:
         raise UserError(
             f"there is no {where}, or you may not read it; check the name, or log in with hf auth"
         ) from error
+    except known.HFValidationError as error:
+        raise UserError(f"'{wanted}' is no name of a repository on a hub ({_reason(error)}); check it") from error
     except known.HfHubHTTPError as error:
         status = error.response.status_code
         if status in (401, 403):

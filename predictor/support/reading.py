@@ -162,11 +162,13 @@ def read_toml(path: Path, most_bytes: int = MIB) -> dict[str, Any]:
     """
     text = read_text(path, most_bytes)
     try:
-        return tomllib.loads(text)
+        content = tomllib.loads(text)
     except RecursionError as error:
         raise UserError(f"{short(path)} is not valid TOML: it is nested too deeply") from error
     except ValueError as error:  # a TOMLDecodeError, or an integer of thousands of digits
         raise UserError(f"{short(path)} is not valid TOML: {error}") from error
+    _check_values(content, short(path), finite=False)
+    return content
 
 
 def parse_json(text: str | bytes, where: str, finite: bool = False) -> Any:

@@ -101,6 +101,8 @@ def test_models_have_the_values_of_their_preset(algorithm: Algorithm):
         if name in ("n_quantiles", "train_freq", *preset.of_policy):
             continue
         assert getattr(model, name) == value, name
+    if "train_freq" in asdict(preset):
+        assert model.train_freq.frequency == asdict(preset)["train_freq"]
     layers = [tuple(part.weight.shape)[0] for part in model.policy.modules() if isinstance(part, torch.nn.Linear)]
     assert set(preset.net_arch) <= set(layers)
 

@@ -297,3 +297,10 @@ def test_heads_must_divide_width():
     assert AttentionConfig(width=8, heads=4).width == 8
     with pytest.raises(UserError, match="multiple of heads"):
         AttentionConfig(width=6, heads=4)
+
+
+@pytest.mark.parametrize("scale", ["near_m", "far_m", "speed_mps"])
+@pytest.mark.parametrize("value", [0.0, -1.0])
+def test_scales_must_be_positive(scale: str, value: float):
+    with pytest.raises(UserError, match="scales must be positive, got "):
+        AttentionConfig(**{scale: value})

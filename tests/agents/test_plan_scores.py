@@ -170,6 +170,11 @@ def test_absent_agents_are_far_away():
     torch.testing.assert_close(summary[..., 2], gap / 50)
     torch.testing.assert_close(summary[..., 3], contact)
     torch.testing.assert_close(summary[..., 5], 1.0 - free.float())
+    unsure = {**shown, "what_if_risk": torch.zeros_like(shown["what_if_risk"])}
+    unsure["what_if_risk"][:, 0], unsure["what_if_risk"][:, 1] = 0.3, 0.5
+    likely = extractor(unsure)[:, -PLANS * SUMMARY :].unflatten(1, (PLANS, SUMMARY))
+    torch.testing.assert_close(likely[..., 4], torch.full_like(likely[..., 4], 0.5), msg="the largest risk")
+    torch.testing.assert_close(likely[..., 5], torch.full_like(likely[..., 5], 0.65), msg="that of any contact")
     nobody = {**shown, "valid": torch.zeros_like(shown["valid"])}
     alone = extractor(nobody)[:, -PLANS * SUMMARY :].unflatten(1, (PLANS, SUMMARY))
     assert (alone[..., :2] > 0.99).all() and (alone[..., 2] == 2).all() and (alone[..., 3] == 1).all()

@@ -148,6 +148,7 @@ def test_accuracy_is_shown_with_the_worst_forecasts(tmp_path: Path):
     (measured / "merge-v1.merge.worst.png").write_bytes(PNG + b"rest")
     (measured / "other.png").write_bytes(PNG)
     page = page_of(run, accuracy=(measured,))
+    assert page_of(run, accuracy=(measured, measured / ".." / "accuracy")) == page, "each folder once"
     assert "merge-v1, driven varied:" in page and page.count("The worst forecasts, at most one per episode") == 2
     assert "<td>dG-VAE</td><td>6</td><td>0.5</td><td>1</td><td>0.25</td><td>–</td><td>–</td><td>1,234</td>" in page
     assert page.count("data:image/png") == 1

@@ -66,6 +66,11 @@ def test_hyperparameters_that_older_runs_lack_have_changed_nothing(tmp_path: Pat
     open_run(tmp_path, CONFIG | {"preset": {"gamma": 0.8, "vf_coef": 0.5}}, MADE, resume=True)
 
 
+def test_a_setting_that_older_runs_lack_is_no_difference(tmp_path: Path):
+    open_run(tmp_path, CONFIG, MADE, resume=False)
+    open_run(tmp_path, CONFIG | {"new_field": 1}, MADE, resume=True)
+
+
 def test_a_hyperparameter_that_only_a_newer_run_has_is_named(tmp_path: Path):
     open_run(tmp_path, CONFIG | {"preset": {"gamma": 0.8, "clip": None}}, MADE, resume=False)
     with pytest.raises(UserError, match="preset.clip was None, now 'not there'; pass"):

@@ -40,7 +40,7 @@ from agents.training import (
 from agents.vec_envs import EpisodeResult, SeededEpisodes, make_venv
 from envs.rollouts.loop_errors import LoopErrors
 from envs.sb3.algorithms import algorithm_class
-from envs.sb3.policy_file import read_note
+from envs.sb3.policy_file import read_note, read_policy_note
 from predictor.support.errors import UserError
 from tests.agents.helpers import STEERING
 from tests.agents.studies.helpers import TOY, Corridor
@@ -201,7 +201,9 @@ def test_seeds_of_training_selection_and_evaluation_are_apart():
         plan(seed=SELECTION_SEED)
 
 
-@pytest.mark.parametrize("field", ["steps", "num_envs", "selections", "selection_episodes", "checkpoint_every"])
+@pytest.mark.parametrize(
+    "field", ["steps", "num_envs", "selections", "selection_episodes", "selection_envs", "checkpoint_every"]
+)
 def test_numbers_below_one_are_refused(field: str):
     assert getattr(plan(**{field: 1}), field) == 1
     with pytest.raises(UserError, match=f"{field} must be at least 1, got 0"):
@@ -384,6 +386,7 @@ def test_a_run_at_its_end_without_its_best_model_keeps_the_last(tmp_path: Path):
     (tmp_path / "best_model.zip").unlink()
     (tmp_path / "policy.zip").unlink()
     assert train(training, tmp_path) == tmp_path / "policy.zip"
+    assert read_policy_note(tmp_path / "policy.zip") == training.task.note
     last, kept = (load_model(tmp_path / name, "ppo").policy.state_dict() for name in ("checkpoint.zip", "policy.zip"))
     for name, weights in last.items():
         assert torch.equal(weights, kept[name]), name

@@ -77,11 +77,15 @@ def test_the_text_names_the_leader_at_equal_k(title: str):
     """Which row is best in the horizon-only table, and what the bold first sentence below says of it."""
     section = next(part for part in RESULTS.split("\n## ") if part.startswith(title))
     horizon = lines_with_k(section)[0]
-    error = {line[""]: float(line["minADE"].split()[0]) for line in horizon if line["K"] == str(NUM_SAMPLES)}
+    error = {
+        line[""].replace("*", ""): float(line["minADE"].split()[0])
+        for line in horizon
+        if line["K"] == str(NUM_SAMPLES) and "(limit)" not in line[""]  # least squares knows the law
+    }
     leader = min(error, key=lambda name: error[name])
     claim = section.split("### What it says")[1].strip().split("**")[1].lower()
     assert "lead" in claim
-    assert leader != "nearest neighbours" or leader in claim
+    assert leader.lower() in claim
     assert (CONTROL in claim) == (leader == CONTROL), f"{leader} leads, but: {claim}"
 
 

@@ -12,7 +12,10 @@ import pytest
 from agents.studies.results import Result, read_result
 
 ROOT = Path(__file__).resolve().parents[2]
-VERDICT = " ".join((ROOT / "docs" / "verdict.md").read_text().split())
+PAGE = (ROOT / "docs" / "verdict.md").read_text()
+VERDICT = " ".join(PAGE.split())
+NAMES = {"none": "none: the", "forecast": "dg-vae", "constant-velocity": "constant velocity"}
+"""Words of the first cell of an arm's row, where they are not its name."""
 ARCHIVES = sorted((ROOT / "docs" / "studies").glob("*.tar.xz"))
 
 
@@ -48,3 +51,11 @@ def test_the_page_has_the_returns_of_all_runs(archive: Path, tmp_path: Path):
             printed = [", ".join(f"{value:.{digits}f}" for value in returns).replace("-", "−") for digits in (1, 2)]
             whole = "|".join(re.escape(text) for text in printed)  # a cell of a table, or in brackets
             assert re.search(rf"(\| |\()({whole})( \||\))", VERDICT), f"{scenario}, {arm}: {printed}"
+            rows = [
+                [cell.strip().replace("*", "") for cell in line.strip("|").split("|")] for line in PAGE.splitlines()
+            ]
+            rows = [row for row in rows if len(row) > 2 and row[1] in printed]
+            mean = {f"{np.mean(returns):.{digits}f}".replace("-", "−") for digits in (1, 2)}
+            for row in rows:  # arms that drive alike have equal rows
+                assert row[2].split(" (")[0] in mean, f"{scenario}, {arm}: {row[2]}, not {mean}"
+            assert not rows or any(NAMES.get(arm, arm) in row[0].lower() for row in rows), f"{scenario}, {arm}: {rows}"

@@ -436,3 +436,11 @@ def test_reader_that_breaks_the_contract_is_named(fault: str):
     env = SceneObservation(gym.make("CartPole-v1"), reader=lambda env: BadReader(fault))
     with pytest.raises(UserError, match=f"scene reader of 'CartPole-v1': {fault}"):
         env.reset(seed=0)
+
+
+@pytest.mark.parametrize("bound", [{"perception_m": 40.0}, {"max_agents": 4}])
+def test_bounds_that_the_scenes_below_do_not_have_are_refused(bound: dict[str, Any]):
+    scenes = SceneObservation(gym.make("highway-fast-v0"), perception_m=60.0, max_agents=6)
+    with pytest.raises(UserError, match=r"do not fit the SceneObservation below .60, 6.; give them to that wrapper"):
+        ForecastObservation(scenes, "constant-velocity", **bound)
+    ForecastObservation(scenes, "constant-velocity", perception_m=60.0, max_agents=6)

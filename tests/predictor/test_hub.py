@@ -1,6 +1,9 @@
 """Checkpoints on a hub: pushed, found by name wherever a checkpoint is taken, and one sentence for what fails."""
 
 import importlib.util
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -45,6 +48,22 @@ def test_what_is_pushed_is_loaded_by_its_name(hub: Hub):
     assert load_forecaster("hub:me/merge", info.spec, "env").horizon_steps == info.horizon_steps
     folder = resolve("hub:me/merge")
     assert name_of_folder("hub:me/merge") == name_of_folder(folder) == "merge", "its name in tables"
+
+
+def test_a_download_in_a_fresh_process_says_what_is_wrong(tmp_path: Path):
+    """The library loads some of its modules only once something else was asked for."""
+    nowhere = {"HF_ENDPOINT": "http://127.0.0.1:9", "HF_HUB_CACHE": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", "from predictor import from_hub; from_hub('owner/name')"],
+        env=os.environ | nowhere, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert "UserError: cannot reach http://127.0.0.1:9 for hub:owner/name" in done.stderr, done.stderr[-500:]
+
+
+@pytest.mark.parametrize("name", ["hub:owner/name.git", "hub:-a/b", "hub:a--b/c"])
+def test_a_name_that_no_repository_may_have_is_one_sentence(hub: Hub, name: str):
+    with pytest.raises(UserError, match=f"'{name}' is no name of a repository on a hub"):
+        resolve(name)
 
 
 def test_a_checkpoint_without_a_card_gets_a_short_one(hub: Hub, tmp_path: Path):

@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from envs.rollouts.causal_labels import ON_ROADS, CausalLabels, causal_labels, senders_of, with_causal_labels
+from envs.rollouts.branches import Branches
+from envs.rollouts.causal_labels import ON_ROADS, CausalLabels, causal_labels, farthest, senders_of, with_causal_labels
 from envs.rollouts.interventions import intervene
 from envs.rollouts.world import open_world
 from envs.simulators.interventions import Intervention
@@ -67,8 +68,21 @@ def test_agents_of_an_arena_have_labels_and_landmarks_send_nothing():
     assert types[0, 3] == 1  # a hunter depends on its prey
 
 
+@pytest.mark.parametrize(("moved_m", "expected"), [(0.5, np.nan), (3.0, 3.0)])
+def test_what_leaves_is_unknown_unless_it_moved(moved_m: float, expected: float):
+    """Agent 0 stays, agent 1 is gone at the last step."""
+    shift = np.zeros((4, 2, 2))
+    shift[1:3, 1, 0] = moved_m
+    valid = np.ones((4, 2), dtype=np.bool_)
+    valid[3, 1] = False
+    found = Branches.__new__(Branches)
+    object.__setattr__(found, "shift", lambda: (shift, valid))
+    np.testing.assert_array_equal(farthest(found, 1.0), [0.0, expected])
+    np.testing.assert_array_equal(farthest(found, 1.0, steps=2), [0.0, moved_m])
+
+
 @pytest.mark.parametrize("horizon_s", [1.0, 4.0])
-def test_what_leaves_is_unknown_unless_it_moved(horizon_s: float):
+def test_what_stays_is_known(horizon_s: float):
     world = road_world((0.0, 4.0), (25.0, 4.0), ego_m=(0.0, 12.0))
     labels = causal_labels(world, replace(SETTINGS, horizon_s=horizon_s))
     assert not np.isnan(labels.shift_m[1, 2])

@@ -6,7 +6,7 @@ import pytest
 from envs.rollouts.interventions import interventions_of
 from envs.rollouts.perturbations import ON_ROADS, Perturber, check_kinds
 from envs.rollouts.world import open_world
-from envs.seeding import driver_rng, label_rng, perturbation_rng
+from envs.seeding import branch_rng, driver_rng, label_rng, perturbation_rng, plan_rng, reaction_rng
 from predictor.support.errors import UserError
 from tests.envs.interventions import assert_same_scenes, played
 
@@ -75,8 +75,8 @@ def test_interventions_follow_from_the_seed_alone():
 
 def test_streams_are_independent():
     draws = [rng.random(4).tolist() for rng in (perturbation_rng(5), label_rng(5), driver_rng(5), driver_rng(5, 1))]
-    draws.append(np.random.default_rng(5).random(4).tolist())
-    assert len({tuple(draw) for draw in draws}) == 5
+    draws += [rng.random(4).tolist() for rng in (branch_rng(5), reaction_rng(5), plan_rng(5), np.random.default_rng(5))]
+    assert len({tuple(draw) for draw in draws}) == 8
     assert perturbation_rng(5).random() == draws[0][0] != perturbation_rng(6).random()
 
 

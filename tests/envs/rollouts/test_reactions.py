@@ -10,12 +10,13 @@ import torch
 
 from envs.rollouts import branches as rollout_branches
 from envs.rollouts import reactions
-from envs.rollouts.branches import Branch, Branches
+from envs.rollouts.branches import Branch, Branches, BranchPoint
 from envs.rollouts.reaction_cells import BYSTANDER_CELL, ELSEWHERE, LEADER_CELL, NEAR_CELL, ON_LANES, Cell
 from envs.rollouts.reactions import NEIGHBOURS, STRAIGHT, Moment, Perturbation, ReactionTask, play_reactions
 from envs.rollouts.side_forecasts import SideForecaster, kept_world
 from envs.rollouts.world import World, open_world
 from envs.simulators.interventions import Intervention
+from envs.supervision import EnvironmentFailedError
 from predictor.baselines.constant_velocity import ConstantVelocity
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.evaluation.reactions import Reaction, Shifts, reaction
@@ -251,6 +252,18 @@ def test_a_moment_without_a_pair_costs_no_branch(branches: list[tuple[Branch, An
     asked = moment(world, {})
     assert all(asked.perturbed(cell, np.random.default_rng(0)) is None for cell in ON_LANES)
     assert branches == []
+
+
+def test_a_simulator_that_fails_ends_the_measurement(monkeypatch: pytest.MonkeyPatch):
+    """It is no agent that allows no intervention."""
+
+    def fails(point: BranchPoint, intervention: Intervention) -> Branches:
+        raise EnvironmentFailedError("it raised")
+
+    monkeypatch.setattr(BranchPoint, "perturbed", fails)
+    monkeypatch.setattr(reactions, "SHARE", 1.0)
+    with pytest.raises(EnvironmentFailedError, match="it raised"):
+        play_reactions(task(TAG, ("constant-velocity",)))
 
 
 def test_no_more_is_tried_than_allowed(branches: list[tuple[Branch, Any]], monkeypatch: pytest.MonkeyPatch):

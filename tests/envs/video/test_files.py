@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from envs.video import files
 from envs.video.files import write_picture, write_video
 from predictor.support.errors import UserError
 
@@ -24,6 +25,20 @@ def test_files_are_named_by_strings_or_paths(kind: type, tmp_path: Path):
 def test_a_video_without_pictures_is_refused(tmp_path: Path):
     with pytest.raises(UserError, match="needs at least one picture, got none; play at least one step"):
         write_video(tmp_path / "x.mp4", [], fps=4)
+
+
+def test_without_any_ffmpeg_there_is_no_still_and_a_film_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def none() -> str:
+        raise RuntimeError("No ffmpeg exe could be found")
+
+    monkeypatch.setattr(files.imageio_ffmpeg, "get_ffmpeg_exe", none)
+    monkeypatch.setattr("imageio_ffmpeg._io.get_ffmpeg_exe", none)
+    assert files.still_of(tmp_path / "x.mp4") == b""
+    with pytest.raises(UserError, match="x.mp4, but it is missing or it failed; repair it with pip install"):
+        write_video(tmp_path / "x.mp4", [PICTURE] * 3, fps=4)
+    assert not list(tmp_path.iterdir())
 
 
 def test_pictures_of_another_size_are_refused(tmp_path: Path):

@@ -85,6 +85,7 @@ def test_forecasts_and_truth_are_in_the_picture(recording: Recording):
     colors = recording.draw(2).reshape(-1, 3)
     style = recording.style
     assert (colors == style.forecast_color).all(-1).sum() > 50
+    assert (colors == style.truth_color).all(-1).sum() > 50
 
 
 def test_forecast_starts_where_the_agent_was_and_stays_there(recording: Recording):

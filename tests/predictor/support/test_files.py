@@ -61,6 +61,15 @@ def test_a_folder_replaces_the_old_one_with_all_it_held(tmp_path: Path):
     assert names(tmp_path / "deep") == ["x"] and names(tmp_path / "deep" / "x") == ["new"]
 
 
+def test_a_folder_behind_a_link_is_replaced_where_it_is(tmp_path: Path):
+    (tmp_path / "disk" / "store").mkdir(parents=True)
+    (tmp_path / "store").symlink_to(tmp_path / "disk" / "store")
+    with new_folder(tmp_path / "store") as partial:
+        (partial / "new").touch()
+    assert (tmp_path / "store").is_symlink() and names(tmp_path) == ["disk", "store"]
+    assert names(tmp_path / "disk") == ["store"] and names(tmp_path / "disk" / "store") == ["new"]
+
+
 def test_a_failed_folder_leaves_the_old_one_alone(tmp_path: Path):
     with new_folder(tmp_path / "x") as partial:
         (partial / "old").touch()
