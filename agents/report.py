@@ -48,8 +48,10 @@ def write_report(config: ReportConfig) -> Path:
             takes = "--accuracy takes the --out of envs.evaluate or predictor.evaluate"
             raise UserError(f"no {ACCURACY_FILE} in {folder}; {takes}")
     blocks_of = policy_blocks if is_policy_run(run) else predictor_blocks
-    folders = dict.fromkeys(folder.resolve() for folder in (run, run / "accuracy", *config.accuracy))
-    blocks = blocks_of(run, list(folders))
+    once: dict[Path, Path] = {}
+    for folder in (run, run / "accuracy", *config.accuracy):
+        once.setdefault(folder.resolve(), folder)
+    blocks = blocks_of(run, list(once.values()))
     for block in blocks:
         if isinstance(block, Picture):
             write_bytes(run / Path(block.file).with_suffix(".png"), block.png)
