@@ -19,7 +19,7 @@ from rich.table import Table
 from envs.readers.envpool import PoolIdentity, PoolReader, envpool_spec
 from envs.readers.highway import HighwayReader
 from envs.registry import make_env
-from envs.simulators.envpool import HIGHWAY_ENV_OF, make_pool
+from envs.simulators.envpool import known_tasks, make_pool
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least
 from predictor.support.errors import UserError, run_entry_point
@@ -29,8 +29,8 @@ from predictor.support.errors import UserError, run_entry_point
 class IdentityConfig:
     """Counts kept and lost identities of EnvPool's vehicles."""
 
-    task_ids: tuple[str, ...] = tuple(HIGHWAY_ENV_OF)
-    """EnvPool tasks to drive."""
+    task_ids: tuple[str, ...] = known_tasks()
+    """EnvPool tasks to drive, by default all that the installed release has."""
     vehicle_steps: int = 100_000
     """Number of pairs of a vehicle and a step to count per task, without the ego."""
     num_envs: int = 32

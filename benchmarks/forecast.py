@@ -83,7 +83,7 @@ def _case(preset: str, case: Case, meter: Meter) -> list[Line]:
     frozen = work.rollout(case.horizon, case.samples, case.batch, frozen=True)
     seen, rolled = timings["observe"], timings["roll-out"]
 
-    def line(name: str, flop: float, base: Timing | None = None) -> Line:
+    def line(name: str, flop: float | None, base: Timing | None = None) -> Line:
         return timed_line(
             "forecast", name, what, timings[name], flop=flop, base=base, ratio_to=EVOLVING if base else ""
         )
@@ -93,7 +93,7 @@ def _case(preset: str, case: Case, meter: Meter) -> list[Line]:
         line("observe", look),
         line("roll-out", run_on),
         line("roll-out, frozen graph", frozen, rolled),
-        line("observe and roll-out, half of the agents there", 0.0),
+        line("observe and roll-out, half of the agents there", None),
         rate_line(
             "forecast", "observe + roll-out", what, seen.plus(rolled), forecasts, "agent-forecasts/s",
             flop=look + run_on,

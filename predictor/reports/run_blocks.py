@@ -106,10 +106,16 @@ def _cells(line: Mapping[str, Any], where: str) -> list[str]:
 
 
 def _pictures(folder: Path) -> Iterator[Block]:
-    for file in sorted(folder.glob("*.png"))[:MOST_PICTURES]:
-        caption = next((text for end, text in _CAPTIONS.items() if file.stem.endswith(end)), None)
-        if caption is not None:
-            yield Photo(picture_in(file), caption)
+    captions = {
+        file: text
+        for file in sorted(folder.glob("*.png"))
+        for end, text in _CAPTIONS.items()
+        if file.stem.endswith(end)
+    }
+    for file, caption in list(captions.items())[:MOST_PICTURES]:
+        yield Photo(picture_in(file), caption)
+    if len(captions) > MOST_PICTURES:
+        yield Paragraph(f"{len(captions) - MOST_PICTURES} more pictures are in the folder.")
 
 
 def picture_in(file: Path) -> bytes:

@@ -157,6 +157,20 @@ def test_accuracy_is_shown_with_the_worst_forecasts(tmp_path: Path):
         page_of(run, accuracy=(measured,))
 
 
+def test_what_is_not_shown_is_counted(tmp_path: Path):
+    run, measured = a_run(tmp_path), tmp_path / "accuracy"
+    line = {"name": "dG-VAE", "num_samples": 6, "ade_m": 0.5, "fde_m": 1.0, "min_ade_m": 0.25, "agents": 1234}
+    write_json(measured / "accuracy.json", {"results": [{
+        "env_id": "merge-v1", "driver": "varied", "model": line, "model_samples": line, "constant_velocity": line,
+    }]})  # fmt: skip
+    for number in range(20):
+        (measured / f"a{number:02}.png").write_bytes(PNG)
+    for number in range(14):
+        (measured / f"id-{number:02}.worst.png").write_bytes(PNG)
+    page = page_of(run, accuracy=(measured,))
+    assert page.count("data:image/png") == 12 and "2 more pictures are in the folder." in page
+
+
 BEGUN = {"env_id": "x", "first_seed": 0, "has_ego": True}
 """Beginning of a summary."""
 
