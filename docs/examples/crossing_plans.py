@@ -19,4 +19,4 @@ class CrossingPlans:
         v = np.clip(vy + push[:, None] * DT_S * np.arange(1, horizon_steps + 1), -2.0, 2.0)
         states = np.stack([np.full_like(v, x), y + np.cumsum(v * DT_S, axis=1), 0 * v, v], axis=-1)
         actions = tuple(np.array([-vx, p], dtype=np.float32).clip(-1, 1) for p in push)
-        return Plans(states, actions, v * DT_S, np.full_like(v, -10.0), size_m=(0.5, 0.5))
+        return Plans(states, actions, rewards=v * DT_S, crash_rewards=np.full_like(v, -10.0), size_m=(0.5, 0.5))

@@ -238,7 +238,7 @@ def test_presets():
     particles = preset_for("simple_tag_v3", "ppo")
     assert (particles.gamma, particles.n_steps) == (0.95, 25)  # type: ignore[union-attr]
     assert preset_for("intersection-multi-agent-v2", "ppo").n_steps == 100  # type: ignore[union-attr]
-    assert preset_for("simple_tag_v3", "dqn") == DQNPreset()
+    assert preset_for("simple_tag_v3", "dqn") == DQNPreset(gamma=0.95)
     envpool = preset_for("highway-fast-v0", "ppo", "envpool")
     assert (envpool.gamma, envpool.batch_size) == (0.8, 512)
     assert preset_for("racetrack-v1", "ppo", "envpool").gamma == 0.9

@@ -115,7 +115,14 @@ def test_data_of_another_environment_is_no_data_of_this_one(measured: dict[str, 
     assert np.isfinite(measured["results"][0]["reduction"])
 
 
-@pytest.mark.parametrize("measured_by", [["--graph"], ["--plans"], ["--reactions", "--perturbations", "1"]])
+@pytest.mark.parametrize(
+    "measured_by",
+    [
+        ["--graph", "--episodes", "3"],
+        ["--plans", "--episodes", "3", "--horizon-steps", "2"],
+        ["--reactions", "--perturbations", "1", "--most-episodes", "2", "--horizon-steps", "2"],
+    ],
+)
 def test_causes_are_measured_in_the_changed_environment(
     measured_by: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ):
@@ -129,8 +136,8 @@ def test_causes_are_measured_in_the_changed_environment(
     side_forecasts.kept_world.cache_clear()
     monkeypatch.setattr(EpisodePool, "results", lambda self, tasks: map(self._play, tasks))
     monkeypatch.setattr(side_forecasts, "open_world", opened)
-    base = ["--env-ids", ROAD, "--checkpoint", "constant-velocity", "--episodes", "3", "--workers", "1"]
-    base += ["--driver", "slower", "--max-steps", "12", "--horizon-steps", "2", "--most-episodes", "2"]
+    base = ["--env-ids", ROAD, "--checkpoint", "constant-velocity", "--workers", "1"]
+    base += ["--driver", "slower", "--max-steps", "12"]
     crowded = '{"config": {"vehicles_count": 8, "vehicles_density": 1.5}}'
     arguments = [*base, *measured_by, "--env-kwargs", crowded, "--out", str(tmp_path)]
     code, errors, printed = run_command(evaluate.main, arguments, monkeypatch, capsys)
