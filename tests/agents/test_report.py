@@ -139,12 +139,17 @@ def test_a_run_that_goes_on_is_shown_as_far_as_it_is(tmp_path: Path):
     assert "Not evaluated yet" in page and "<svg" not in page and not (run / "curves.png").exists()
 
 
-def test_accuracy_is_shown_with_the_worst_forecasts(tmp_path: Path):
-    run, measured = a_run(tmp_path), tmp_path / "accuracy"
+def a_measurement(tmp_path: Path) -> Path:
+    """Returns the folder of an accuracy.json with one result."""
     line = {"name": "dG-VAE", "num_samples": 6, "ade_m": 0.5, "fde_m": 1.0, "min_ade_m": 0.25, "agents": 1234}
-    write_json(measured / "accuracy.json", {"results": [{
+    write_json(tmp_path / "accuracy" / "accuracy.json", {"results": [{
         "env_id": "merge-v1", "driver": "varied", "model": line, "model_samples": line, "constant_velocity": line,
     }]})  # fmt: skip
+    return tmp_path / "accuracy"
+
+
+def test_accuracy_is_shown_with_the_worst_forecasts(tmp_path: Path):
+    run, measured = a_run(tmp_path), a_measurement(tmp_path)
     (measured / "merge-v1.merge.worst.png").write_bytes(PNG + b"rest")
     (measured / "other.png").write_bytes(PNG)
     page = page_of(run, accuracy=(measured,))
@@ -158,11 +163,7 @@ def test_accuracy_is_shown_with_the_worst_forecasts(tmp_path: Path):
 
 
 def test_what_is_not_shown_is_counted(tmp_path: Path):
-    run, measured = a_run(tmp_path), tmp_path / "accuracy"
-    line = {"name": "dG-VAE", "num_samples": 6, "ade_m": 0.5, "fde_m": 1.0, "min_ade_m": 0.25, "agents": 1234}
-    write_json(measured / "accuracy.json", {"results": [{
-        "env_id": "merge-v1", "driver": "varied", "model": line, "model_samples": line, "constant_velocity": line,
-    }]})  # fmt: skip
+    run, measured = a_run(tmp_path), a_measurement(tmp_path)
     for number in range(20):
         (measured / f"a{number:02}.png").write_bytes(PNG)
     for number in range(14):
