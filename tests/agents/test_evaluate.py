@@ -115,3 +115,8 @@ def test_the_policy_runs_on_the_device_that_is_asked_for(monkeypatch: pytest.Mon
     trained = evaluate._trained(EvaluateConfig(run_dir=policy, device="cuda", out=tmp_path), policy)
     assert trained.model() is model
     assert (trained.task.device, asked) == ("cuda", ["cuda"])
+
+
+def test_no_more_episodes_are_played_than_can_be_read():
+    with pytest.raises(UserError, match="episodes must be at most 10,000, got 20000"):
+        EvaluateConfig(Path("run"), episodes=20_000)

@@ -280,6 +280,14 @@ def test_windows_without_labels_have_none():
     assert (batch.edge_types, batch.edge_attributes) == (None, None)
 
 
+def test_attributes_of_stores_that_mean_something_else_are_dropped():
+    wide = with_labels(random_episode(0, 6, 3), 1)
+    assert wide.edge_attributes is not None
+    narrow = replace(wide, edge_attributes=np.concatenate([wide.edge_attributes] * 2, axis=-1))
+    found = Windows([wide, narrow], spec(), 3, 2).batch(np.arange(2))
+    assert found.edge_attributes is None and found.edge_types is not None
+
+
 def test_labels_move_with_the_batch():
     batch = only(Windows([with_labels(along_x([0.0] * 3, [1.0] * 3), 1)], spec(), 2, 1), 1).to(torch.device("cpu"))
     assert batch.edge_types is not None and batch.edge_types.shape == (1, 3, 2, 2)
