@@ -85,7 +85,7 @@ install-check: ## build the wheel and try EXTRAS, each in a fresh environment: f
 bench: .venv/.tools ## measure the speed of everything: one table, and runs/benchmarks.json
 	.venv/bin/python -m benchmarks
 
-bench-check: .venv/.tools ## a quick run, compared with the committed baseline by ratios; fails if anything got slower
+bench-check: .venv/.tools ## a quick run, compared with the committed baseline by ratios; fails if anything got slower or costs more than promised
 	.venv/bin/python -m benchmarks --quick --baseline benchmarks/baseline.json
 
 clean: ## remove .venv, builds and caches; keep runs and data

@@ -81,6 +81,8 @@ class Comparison:
     """Keys of the baseline that were not measured although their section ran."""
     new: tuple[str, ...]
     """Keys that the baseline does not have."""
+    broken: tuple[Line, ...] = ()
+    """Lines above what is promised of them (`Compared.at_most`), in the baseline or not."""
 
     @property
     def slower(self) -> list[Change]:
@@ -92,20 +94,33 @@ class Comparison:
         """Lines that got faster, the best first."""
         return sorted((c for c in self.changes if c.faster), key=lambda change: change.slowdown)
 
+    @property
+    def failing(self) -> list[str]:
+        """Keys of the lines that got slower or are above what is promised."""
+        return list(dict.fromkeys([change.key for change in self.slower] + [line.key for line in self.broken]))
+
     def report(self) -> list[str]:
         """Returns the comparison as lines of text."""
-        parts = [f"SLOWER  {change.text()}" for change in self.slower]
+        parts = [
+            f"BROKEN  {line.compared.value:.2f} of {line.ratio_to}, promised {line.compared.at_most:.2f}: {line.key}"
+            for line in self.broken
+            if line.compared is not None
+        ]
+        parts += [f"SLOWER  {change.text()}" for change in self.slower]
         parts += [f"faster  {change.text()}" for change in self.faster]
         parts += [f"missing {key}" for key in self.missing] + [f"new     {key}" for key in self.new]
         counts = f"{len(self.changes)} lines compared: {len(self.slower)} slower, {len(self.faster)} faster"
-        return [*parts, f"{counts}, {len(self.missing)} missing, {len(self.new)} new"]
+        promises = f", {len(self.broken)} above a promise" if self.broken else ""
+        return [*parts, f"{counts}, {len(self.missing)} missing, {len(self.new)} new{promises}"]
 
 
 def write_baseline(
     path: Path, settings: Settings, lines: Sequence[Line], machine: str, made: Mapping[str, Any]
 ) -> None:
-    """Writes the comparable numbers of a run; the file is replaced atomically."""
+    """Writes the comparable numbers of a run, without what is promised of them; the file is replaced atomically."""
     compared = {line.key: asdict(line.compared) for line in lines if line.compared is not None}
+    for values in compared.values():
+        del values["at_most"]
     path.parent.mkdir(parents=True, exist_ok=True)
     head = {"format": FORMAT, "version": VERSION, "mode": settings.mode, "threads": settings.threads}
     write_json(path, head | {"processor": machine, "provenance": made, "lines": compared})
@@ -135,7 +150,7 @@ def read_baseline(path: Path, settings: Settings) -> Baseline:
     return baseline
 
 
-def compare(baseline: Baseline, lines: Iterable[Line], sections: Sequence[str], machine: str) -> Comparison:
+def compare(baseline: Baseline, lines: Sequence[Line], sections: Sequence[str], machine: str) -> Comparison:
     """Compares a run's lines with the baseline's.
 
     Args:
@@ -154,7 +169,8 @@ def compare(baseline: Baseline, lines: Iterable[Line], sections: Sequence[str], 
             changes.append(Change(key, before, measured.value, tolerance))
     expected = [key for key in baseline.lines if key.split(" | ")[0] in sections]
     missing = tuple(key for key in expected if key not in now)
-    return Comparison(tuple(changes), missing, tuple(key for key in now if key not in baseline.lines))
+    broken = tuple(line for line in lines if line.compared is not None and line.compared.broken)
+    return Comparison(tuple(changes), missing, tuple(key for key in now if key not in baseline.lines), broken)
 
 
 def better_of(lines: Sequence[Line], again: Iterable[Line], keys: Iterable[str]) -> list[Line]:

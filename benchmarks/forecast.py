@@ -39,13 +39,16 @@ CASES: dict[str, tuple[Case, ...]] = {
     ),
 }
 EVOLVING = "evolving graph, float32"
-ONE, SIX = "one forecast, plural", "six futures, plural"
+ONE, SIX, PLANS = "one forecast, plural", "six futures, plural", "one forecast for each of five plans, plural"
 """Names of the lines of a model with modes, each a step of streaming: observe and roll out."""
 WITHOUT_MODES = "one forecast without modes"
+NUM_PLANS = 5
+PROMISED = {ONE: 1.2, SIX: 2.0, PLANS: 2.5}
+"""Largest ratio of each line to its base for a single scene; larger batches share the cost of calls."""
 
 
 def run(settings: Settings) -> list[Line]:
-    """Measures both presets at every shape, and what modes cost."""
+    """Measures both presets at every shape, and what modes and plans cost."""
     meter, cases = Meter.of(settings), CASES[settings.mode]
     lines = [line for preset in SIZES for case in cases for line in _case(preset, case, meter)]
     shapes = dict.fromkeys(case._replace(samples=1) for case in cases)
@@ -53,25 +56,35 @@ def run(settings: Settings) -> list[Line]:
 
 
 def _modes(case: Case, meter: Meter) -> list[Line]:
-    """Measures a step of streaming with one forecast and with six, beside the step of a model without modes."""
+    """Measures a step of streaming with one forecast, with six, and with one for each of five plans of the ego.
+
+    One forecast stands beside the step of a model without modes, the others beside one forecast.
+    """
     states, valid = scenes(case.batch, case.agents)
+    single, plural = (forecaster(sized(name), road(case.agents), case.horizon) for name in ("fast", "plural"))
+    plans = states[:, None, None, 0].expand(-1, NUM_PLANS, case.horizon, -1).contiguous()
     steps = {
-        name: inference(
-            partial(_step, forecaster(sized(preset), road(case.agents), case.horizon), states, valid, samples)
-        )
-        for name, preset, samples in ((WITHOUT_MODES, "fast", 1), (ONE, "plural", 1), (SIX, "plural", 6))
+        WITHOUT_MODES: partial(_step, single, states, valid, 1),
+        ONE: partial(_step, plural, states, valid, 1),
+        SIX: partial(_step, plural, states, valid, 6),
+        PLANS: partial(_planned_step, plural, states, valid, plans),
     }
-    timings = meter.measure(steps)
+    timings = meter.measure({name: inference(step) for name, step in steps.items()})
     return [
         timed_line("forecast", name, case._asdict() | {"samples": samples}, timings[name], base=timings[base],
-                   ratio_to=base)
-        for name, base, samples in ((ONE, WITHOUT_MODES, 1), (SIX, ONE, 6))
+                   ratio_to=base, at_most=PROMISED[name] if case.batch == 1 else None)
+        for name, base, samples in ((ONE, WITHOUT_MODES, 1), (SIX, ONE, 6), (PLANS, ONE, 1))
     ]  # fmt: skip
 
 
 def _step(model: DGVAE, states: Tensor, valid: Tensor, samples: int) -> Any:
     _, belief = model.observe(model.empty_memory(*valid.shape), states, valid)
     return model.rollout(belief, model.horizon_steps, samples).states
+
+
+def _planned_step(model: DGVAE, states: Tensor, valid: Tensor, plans: Tensor) -> Any:
+    _, belief = model.observe(model.empty_memory(*valid.shape), states, valid)
+    return model.rollout_plans(belief, plans).states
 
 
 def _case(preset: str, case: Case, meter: Meter) -> list[Line]:

@@ -25,6 +25,13 @@ class Compared:
     """Direction that is faster."""
     tolerance: float = TOLERANCE
     """Factor by which the number may get worse."""
+    at_most: float | None = None
+    """Largest value that the project promises, whatever the baseline has; None if it promises none."""
+
+    @property
+    def broken(self) -> bool:
+        """Whether the number is above what is promised."""
+        return self.at_most is not None and self.value > self.at_most
 
     def slowdown(self, now: float) -> float:
         """Returns the factor by which `now` is slower; below 1 it is faster."""

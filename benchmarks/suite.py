@@ -59,9 +59,9 @@ def _run(section: str, settings: Settings) -> list[Line]:
 def settle(
     settings: Settings, baseline: Baseline, lines: list[Line], began: Callable[[str], None]
 ) -> tuple[list[Line], Comparison]:
-    """Compares with a baseline; lines that look slower are measured once more, and the better result counts."""
+    """Compares with a baseline; lines that fail are measured once more, and the better result counts."""
     comparison = compare(baseline, lines, settings.sections, processor())
-    failing = [change.key for change in comparison.slower]
+    failing = comparison.failing
     if failing:
         sections = [s for s in settings.sections if any(key.startswith(f"{s} | ") for key in failing)]
         again = measure(settings, sections, lambda name: began(f"{name}, once more"))

@@ -186,9 +186,18 @@ def timed_line(
     base: Timing | None = None,
     ratio_to: str = "",
     tolerance: float = TOLERANCE,
+    at_most: float | None = None,
 ) -> Line:
-    """Returns a line with the milliseconds of a call."""
+    """Returns a line with the milliseconds of a call.
+
+    With `at_most`, the largest promised ratio to `base`, that ratio is what a later run is compared with.
+    """
     ms = 1e3 * timing.seconds
+    ratio = None if base is None else float(np.median(timing.seconds / base.seconds))
+    compared = Compared(timing.equivalents, timing.yardstick.kind, "lower", tolerance)
+    if at_most is not None:
+        assert ratio is not None, "a promised ratio needs its base"
+        compared = Compared(ratio, "ratio", "lower", tolerance, at_most)
     return Line(
         section,
         name,
@@ -196,12 +205,12 @@ def timed_line(
         float(np.median(ms)),
         "ms",
         quartiles(ms),
-        ratio=None if base is None else float(np.median(timing.seconds / base.seconds)),
+        ratio=ratio,
         ratio_to=ratio_to,
         flop=flop,
         flops_per_s=None if flop is None else flop / timing.median,
         matmul_share=None if flop is None else timing.matmul_share(flop),
-        compared=Compared(timing.equivalents, timing.yardstick.kind, "lower", tolerance),
+        compared=compared,
     )
 
 

@@ -13,10 +13,16 @@ HERE = "a processor"
 
 
 def line(
-    value: float, name: str = "step", kind: Kind = "ratio", better: Better = "lower", tolerance: float = 1.5
+    value: float,
+    name: str = "step",
+    kind: Kind = "ratio",
+    better: Better = "lower",
+    tolerance: float = 1.5,
+    at_most: float | None = None,
 ) -> Line:
     """Returns a line of section "data" whose compared number is `value`."""
-    return Line("data", name, {"agents": 5}, value, "ms", compared=Compared(value, kind, better, tolerance))
+    compared = Compared(value, kind, better, tolerance, at_most)
+    return Line("data", name, {"agents": 5}, value, "ms", ratio_to="one" if at_most else "", compared=compared)
 
 
 def baseline(*lines: Line) -> Baseline:

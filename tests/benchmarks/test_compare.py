@@ -66,6 +66,20 @@ def test_a_skipped_line_is_missing():
     assert compare(baseline(before), [gone], ("data",), HERE).missing == (before.key,)
 
 
+def test_what_costs_more_than_is_promised_fails_whatever_the_baseline_has():
+    within, above = (line(value, name, at_most=2.0) for value, name in ((2.0, "within"), (2.01, "above")))
+    for before in (baseline(within, above), baseline()):
+        comparison = compare(before, [within, above], ("data",), HERE)
+        assert comparison.broken == (above,) and comparison.failing == [above.key] and not comparison.slower
+        assert comparison.report()[0] == "BROKEN  2.01 of one, promised 2.00: data | above | agents 5"
+        assert comparison.report()[-1].endswith(", 1 above a promise")
+
+
+def test_a_line_that_fails_twice_over_is_measured_again_once():
+    both = line(4.0, at_most=2.0)
+    assert compare(baseline(line(1.0)), [both], ("data",), HERE).failing == [both.key]
+
+
 def test_the_tolerance_is_the_baselines():
     assert held(line(1.0, tolerance=1.1), line(1.2, tolerance=9.0)).slower
 

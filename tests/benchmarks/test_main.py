@@ -55,13 +55,13 @@ def test_a_section_from_the_command_line_to_the_table_and_the_file(
     assert processor() in shown.out and "1 torch threads" in shown.out and "quick run" in shown.out
     lines = shown.out.splitlines()
     assert lines[2].startswith("section")
-    assert sum(line.startswith("forecast") for line in lines) == 12
+    assert sum(line.startswith("forecast") for line in lines) == 13
     assert "forecast …" in shown.err
     result = json.loads(out.read_text())
     assert result["machine"] == processor() and result["threads"] == 1 and result["mode"] == "quick"
     assert result["keeps_freed_memory"] is False
     assert {"commit", "versions"} <= set(result["provenance"])
-    assert len(result["lines"]) == 12
+    assert len(result["lines"]) == 13
     assert result["lines"][0]["key"] == "forecast | observe | preset fast, batch 1, agents 3, horizon 2, samples 1"
     assert result["lines"][0]["flop"] > 0
     assert [path.name for path in out.parent.iterdir()] == ["benchmarks.json"]  # no half-written file
@@ -79,6 +79,19 @@ def test_what_got_slower_is_measured_twice_reported_and_fails(
     assert "SLOWER  3.00× slower (1 → 3, tolerance 1.50×): data | step | agents 5" in shown
     assert "2 lines compared: 1 slower, 0 faster, 0 missing, 0 new" in shown
     assert "measured twice" in shown and "another processor" not in shown
+
+
+def test_a_broken_promise_is_measured_twice_and_fails_without_being_slower(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    path = write(tmp_path / "baseline.json", [line(2.1, at_most=2.0)], machine=processor())
+    arguments = ("--only", "data", "--baseline", str(path), "--out", str(tmp_path / "out.json"))
+    for again, status in ((2.2, 1), (1.9, 0)):
+        ran = serve(monkeypatch, [line(2.1, at_most=2.0)], [line(again, at_most=2.0)])
+        assert call(monkeypatch, *arguments) == status and ran == ["data", "data"]
+        shown = capsys.readouterr().out
+        assert ("BROKEN  2.10 of one, promised 2.00: data | step | agents 5" in shown) == bool(status)
+        assert "1 lines compared: 0 slower" in shown
 
 
 def test_noise_that_a_second_measurement_takes_away_does_not_fail(

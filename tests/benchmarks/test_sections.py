@@ -49,10 +49,35 @@ def test_modes_are_measured_beside_one_forecast_and_a_model_without(monkeypatch:
         return rollout(self, belief, steps, samples, *rest)
 
     monkeypatch.setattr(forecast.DGVAE, "rollout", watched)
-    one, six = (r for r in forecast.run(QUICK) if "plural" in r.name)
+    one, six, plans = (r for r in forecast.run(QUICK) if "plural" in r.name)
     assert (one.ratio_to, six.ratio_to) == (forecast.WITHOUT_MODES, forecast.ONE) and one.what["samples"] == 1
     assert (one.ratio or 0) > 0 and (six.ratio or 0) > 0 and six.what == case._asdict() | {"samples": 6}
+    assert plans.ratio_to == forecast.ONE and (plans.ratio or 0) > 0 and plans.what == case._asdict()
     assert {(0, 1), (20, 1), (20, 6)} <= set(shown)
+
+
+def test_the_cost_of_modes_and_plans_is_promised_for_a_single_scene(monkeypatch: pytest.MonkeyPatch):
+    cases = forecast.Case(1, 3, 4, 1), forecast.Case(2, 3, 4, 1)
+    monkeypatch.setattr(forecast, "CASES", {"quick": cases})
+    lines = [r for r in forecast.run(QUICK) if "plural" in r.name]
+    promised = {(r.name, r.compared.at_most) for r in lines if r.compared and r.compared.at_most is not None}
+    assert promised == {(forecast.ONE, 1.2), (forecast.SIX, 2.0), (forecast.PLANS, 2.5)}
+    assert all(r.what["batch"] == 1 and r.compared.value == r.ratio for r in lines if r.compared and r.compared.at_most)
+
+
+def test_five_plans_are_rolled_out_at_once(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(forecast, "CASES", {"quick": (forecast.Case(2, 3, 4, 1),)})
+    shapes: set[tuple[int, ...]] = set()
+    rollout_plans = forecast.DGVAE.rollout_plans
+
+    def watched(self: forecast.DGVAE, belief: Any, plans: Any, *rest: Any) -> Any:
+        futures = rollout_plans(self, belief, plans, *rest)
+        shapes.add((*plans.shape, *futures.states.shape))
+        return futures
+
+    monkeypatch.setattr(forecast.DGVAE, "rollout_plans", watched)
+    forecast.run(QUICK)
+    assert shapes == {(2, 5, 4, 4, 2, 5, 1, 3, 4, 4)}
 
 
 def test_streaming_keeps_each_history_near_its_mark(monkeypatch: pytest.MonkeyPatch):
