@@ -83,18 +83,14 @@ def run(words: Sequence[str]) -> None:
         raise CommandLineError(f"dgvae has no command '{name}'{meant}")
     sys.argv = [f"dgvae {name}", *options]
 
-    def imported() -> None:
-        try:
-            main = importlib.import_module(f"dgvae_rl.{command.module}").main
-        except ModuleNotFoundError as error:
-            if error.name is None or error.name.partition(".")[0] in (*OWN, "dgvae_rl"):
-                raise
-            extra = f"'dgvae-rl[{command.extra}]'" if command.extra else "dgvae-rl"
-            raise CommandLineError(f"dgvae {name} needs {error.name}; install it with pip install {extra}") from error
-        main()
-
-    # Ctrl-C is one line also while the command is imported
-    importlib.import_module("dgvae_rl.predictor.support.errors").run_entry_point(imported)
+    try:
+        main = importlib.import_module(f"dgvae_rl.{command.module}").main
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.partition(".")[0] in (*OWN, "dgvae_rl"):
+            raise
+        extra = f"'dgvae-rl[{command.extra}]'" if command.extra else "dgvae-rl"
+        raise CommandLineError(f"dgvae {name} needs {error.name}; install it with pip install {extra}") from error
+    main()
 
 
 def main() -> None:
@@ -102,7 +98,8 @@ def main() -> None:
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
     try:
-        run(sys.argv[1:])
+        # Ctrl-C is one line also while the command is imported
+        importlib.import_module("dgvae_rl.predictor.support.errors").run_entry_point(lambda: run(sys.argv[1:]))
     except CommandLineError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

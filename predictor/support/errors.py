@@ -6,6 +6,7 @@ is told by `predictor.support.stopping.resumable`.
 
 import errno
 import os
+import select
 import signal
 import sys
 import threading
@@ -83,10 +84,11 @@ def one_line(error: BaseException) -> str:
 def run_entry_point(main: Callable[[], None]) -> None:
     """Runs `main`; prints user errors, full disks, Ctrl-C and SIGTERM in one line on stderr and exits.
 
-    Exit status: 2 after an error, 130 after Ctrl-C, 143 after SIGTERM.
+    Exit status: 2 after an error, 130 after Ctrl-C, 143 after SIGTERM; 141 and no line where whatever read the
+    output has left (`| head`).
     """
     try:
-        with _terminable():
+        with _until_reader_leaves(), _terminable():
             main()
     except UserError as error:
         _leave("error", one_line(error), error, 2)
@@ -135,6 +137,34 @@ def _advice(error: BaseException | None) -> str | None:
             return one_line(Exception(notes[0]))
         error = error.__context__
     return None
+
+
+@contextmanager
+def _until_reader_leaves() -> Iterator[None]:
+    """Exits without a word if the output is a pipe that nobody reads any more; other broken pipes are raised."""
+    try:
+        try:
+            yield
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()  # not at the interpreter's end, which prints an error
+    except BrokenPipeError:
+        if not _reader_left():
+            raise
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), sys.stdout.fileno())
+        sys.exit(128 + signal.SIGPIPE)
+
+
+def _reader_left() -> bool:
+    """Returns whether the standard output is a pipe whose other end is closed."""
+    try:
+        number = sys.stdout.fileno()
+    except (OSError, ValueError):  # not a file, or a closed one
+        return False
+    pipe = select.poll()
+    pipe.register(number, select.POLLOUT)
+    return any(event & select.POLLERR for _, event in pipe.poll(0))
 
 
 @contextmanager

@@ -55,10 +55,32 @@ def test_what_a_user_can_cause_is_one_line(
     assert capsys.readouterr() == ("", line)
 
 
-@pytest.mark.parametrize("error", [ValueError("a bug"), ProtocolError("a bug"), ZeroDivisionError()])
+@pytest.mark.parametrize(
+    "error", [ValueError("a bug"), ProtocolError("a bug"), ZeroDivisionError(), BrokenPipeError("of a process")]
+)
 def test_bugs_keep_their_traceback(error: Exception):
     with pytest.raises(type(error)):
         run_entry_point(raises(error))
+
+
+@pytest.mark.parametrize("buffered", [True, False])
+@pytest.mark.parametrize("ends", ["", "; sys.exit(0)"])
+def test_a_reader_that_leaves_ends_a_command_without_a_word(buffered: bool, ends: str):
+    said = f"import sys\ndef main(): print('to nobody'){ends}\n"
+    reader, writer = os.pipe()
+    os.close(reader)
+    ended = subprocess.run(
+        [sys.executable, "-c", f"{said}from predictor.support.errors import run_entry_point as run; run(main)"],
+        stdout=writer, stderr=subprocess.PIPE, env=os.environ | {"PYTHONUNBUFFERED": "" if buffered else "1"},
+    )  # fmt: skip
+    os.close(writer)
+    assert (ended.returncode, ended.stderr) == (141, b"")
+
+
+def test_a_broken_pipe_of_another_process_is_raised_while_the_output_is_read():
+    said = "from predictor.support.errors import run_entry_point\ndef main(): raise BrokenPipeError('of a process')\n"
+    ended = subprocess.run([sys.executable, "-c", f"{said}run_entry_point(main)"], capture_output=True, text=True)
+    assert ended.returncode == 1 and "BrokenPipeError: of a process" in ended.stderr
 
 
 def test_good_runs_end_as_they_are():
