@@ -23,7 +23,6 @@ from predictor.graph import pair_mask
 from predictor.layers.state_codec import Residual
 from predictor.scene import SceneSpec
 from predictor.support.config_checks import MOST_PARTS, check_at_most
-from predictor.support.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -95,27 +94,6 @@ class IMMA(UnrolledForecaster):
         inputs, kinds = self.codec.num_inputs, config.num_layers
         self.layers = nn.ModuleList(AttentionLayer(config, inputs) for _ in range(kinds))
         self.decoder = HiddenDecoder(inputs, config.decoder_dim, config.message_dim, kinds, spec.num_features)
-        self._layer_weights: Tensor
-        self.register_buffer("_layer_weights", torch.ones(kinds), persistent=False)
-
-    def train_layer(self, layer: int | None, weight: float = 1.0) -> None:
-        """Sets a stage of the paper's Progressive Layer Training, which adds layers one by one, the last one first.
-
-        Args:
-            layer: index of the added layer: those before it send no messages, the encoders of those after it are not
-                trained. None ends the stages: every layer sends messages and is trained.
-            weight: factor on the added layer's attention, raised from 0 to 1 during its stage.
-
-        Raises:
-            UserError: there is no such layer.
-        """
-        if layer is not None and not 0 <= layer < self.config.num_layers:
-            raise UserError(f"layer must be from 0 to {self.config.num_layers - 1}, or None; got {layer}")
-        self._layer_weights.fill_(1.0)
-        if layer is not None:
-            self._layer_weights[:layer], self._layer_weights[layer] = 0.0, weight
-        for index, encoder in enumerate(self.layers):
-            encoder.requires_grad_(layer is None or index <= layer)
 
     # --- Functions of a model -----------------------------------------------------------------------------------
 
@@ -162,7 +140,7 @@ class IMMA(UnrolledForecaster):
         nodes: Tensors,
     ) -> Tensors:
         """Updates agents by the sum of all layers' messages; within a layer attention sums to one."""
-        return (self.decoder.step(inputs, valid, weights * self._layer_weights, nodes[0]),)
+        return (self.decoder.step(inputs, valid, weights, nodes[0]),)
 
     def change(
         self, inputs: Float[Tensor, "*batch agents inputs"], valid: Bool[Tensor, "*batch agents"], nodes: Tensors

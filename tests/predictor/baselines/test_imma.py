@@ -7,14 +7,12 @@ from torch import Tensor
 
 from predictor.baselines.imma import IMMA, masked_attention
 from predictor.graph import pair_mask
-from predictor.support.errors import UserError
 from tests.predictor.baselines import loops
 from tests.predictor.baselines.helpers import (
     AGENTS,
     BATCH,
     HORIZON,
     TIME,
-    TOLERANCE,
     fresh,
     last,
     presence,
@@ -138,35 +136,8 @@ def gradients(forecaster: IMMA) -> list[bool]:
     return [any(p.grad is not None and bool(p.grad.any()) for p in layer.parameters()) for layer in forecaster.layers]
 
 
-def test_layers_are_added_one_by_one():
-    forecaster = fresh("imma-dynamic")
-    assert gradients(forecaster) == [True, True, True]
-    for layer, expected in ((2, [False, False, True]), (1, [False, True, False]), (0, [True, False, False])):
-        forecaster.train_layer(layer)
-        assert gradients(forecaster) == expected
-    forecaster.train_layer(None)
-    assert gradients(forecaster) == [True, True, True]
-
-
-def test_weight_of_an_added_layer_is_raised_from_0_to_1():
-    forecaster = fresh("imma").requires_grad_(False)
-    states, valid = random_states(0, BATCH, TIME, AGENTS, 4), torch.ones(BATCH, TIME, AGENTS).bool()
-
-    def forecast(layer: int | None, weight: float) -> Tensor:
-        forecaster.train_layer(layer, weight)
-        return forecaster.rollout(last(forecaster, states, valid), HORIZON).states
-
-    everything = forecast(None, 1.0)
-    torch.testing.assert_close(forecast(0, 1.0), everything, **TOLERANCE)
-    torch.testing.assert_close(forecast(0, 0.0), forecast(1, 1.0), **TOLERANCE)
-    assert not torch.allclose(forecast(0, 0.5), everything, atol=1e-4)
-    assert "_layer_weights" not in forecaster.state_dict()  # a trained model uses all layers
-
-
-@pytest.mark.parametrize("layer", [-1, 2])
-def test_layers_that_do_not_exist(layer: int):
-    with pytest.raises(UserError, match=f"layer must be from 0 to 1, or None; got {layer}"):
-        fresh("imma").train_layer(layer)
+def test_every_layer_is_trained():
+    assert gradients(fresh("imma-dynamic")) == [True, True, True]
 
 
 def test_overfits_one_batch():
