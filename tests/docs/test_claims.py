@@ -199,3 +199,16 @@ def test_the_paper_is_named_linked_and_cited():
     ):
         assert part in README
     assert "@article{" in README and "Dax, Victoria M." in README
+
+
+def test_each_card_says_how_it_reacts_by_figures_of_the_page_on_reactions():
+    measured = " ".join((ROOT / "docs" / "reactions.md").read_text().split()).replace("*", "")
+    cards = sorted((ROOT / "predictor" / "pretrained").glob("*/README.md"))
+    scored = 0
+    for card in cards:
+        section = card.read_text().split("\n## Reactions and graph\n")[1].split("\n## ")[0]
+        figures = re.findall(r"−?\d\.\d\d \(−?\d\.\d\d to \d\.\d\d\)", section)
+        assert figures or section.strip().startswith("Not measured."), card
+        assert all(figure in measured for figure in figures), card
+        scored += bool(figures)
+    assert scored == 10
