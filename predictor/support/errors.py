@@ -36,6 +36,10 @@ _WRONG_NAMES = {
 """Errors of the operating system for paths that do not fit, and what is wrong with them."""
 
 
+_UNREAD = 128 + signal.SIGPIPE
+"""Exit status where nobody reads the output, as of other commands."""
+
+
 class UserError(ValueError):
     """Raised for bad input; the message names what was required, what was given and what to do."""
 
@@ -141,30 +145,53 @@ def _advice(error: BaseException | None) -> str | None:
 
 @contextmanager
 def _until_reader_leaves() -> Iterator[None]:
-    """Exits without a word if the output is a pipe that nobody reads any more; other broken pipes are raised."""
+    """Exits without a word if the output is a pipe that nobody reads any more; what else ends the block is kept."""
     try:
-        try:
-            yield
-        finally:
-            if sys.stdout is not None:
-                sys.stdout.flush()  # not at the interpreter's end, which prints an error
+        yield
     except BrokenPipeError:
         if not _reader_left():
             raise
-        with open(os.devnull, "w") as nowhere:
-            os.dup2(nowhere.fileno(), sys.stdout.fileno())
-        sys.exit(128 + signal.SIGPIPE)
+        _discard()
+        sys.exit(_UNREAD)
+    except SystemExit as end:
+        # rich exits with 1 where it finds that nobody reads
+        if (not _flush() and not end.code) or isinstance(end.__context__, BrokenPipeError):
+            sys.exit(_UNREAD)
+        raise
+    except BaseException:
+        _flush()
+        raise
+    if not _flush():
+        sys.exit(_UNREAD)
+
+
+def _flush() -> bool:
+    """Flushes the output, not only at the interpreter's end, which prints an error; returns whether it is read."""
+    if sys.stdout is None or sys.stdout.closed:
+        return True
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _discard()
+        return False
+    return True
+
+
+def _discard() -> None:
+    """Lets what is still written to the output go nowhere."""
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 
 def _reader_left() -> bool:
-    """Returns whether the standard output is a pipe whose other end is closed."""
+    """Returns whether the standard output is a pipe or a socket whose other end is closed."""
     try:
         number = sys.stdout.fileno()
-    except (OSError, ValueError):  # not a file, or a closed one
+    except (AttributeError, OSError, ValueError):  # there is none, it is not a file, or a closed one
         return False
     pipe = select.poll()
     pipe.register(number, select.POLLOUT)
-    return any(event & select.POLLERR for _, event in pipe.poll(0))
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in pipe.poll(0))
 
 
 @contextmanager

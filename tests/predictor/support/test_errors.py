@@ -63,18 +63,49 @@ def test_bugs_keep_their_traceback(error: Exception):
         run_entry_point(raises(error))
 
 
-@pytest.mark.parametrize("buffered", [True, False])
-@pytest.mark.parametrize("ends", ["", "; sys.exit(0)"])
-def test_a_reader_that_leaves_ends_a_command_without_a_word(buffered: bool, ends: str):
-    said = f"import sys\ndef main(): print('to nobody'){ends}\n"
+def unread(main: str, buffered: bool = True) -> tuple[int, str]:
+    """Exit status and errors of a command whose output nobody reads."""
     reader, writer = os.pipe()
     os.close(reader)
+    said = (
+        f"import sys\nfrom predictor.support.errors import *\nfrom rich.console import Console\ndef main():\n {main}\n"
+    )
     ended = subprocess.run(
-        [sys.executable, "-c", f"{said}from predictor.support.errors import run_entry_point as run; run(main)"],
-        stdout=writer, stderr=subprocess.PIPE, env=os.environ | {"PYTHONUNBUFFERED": "" if buffered else "1"},
+        [sys.executable, "-c", f"{said}run_entry_point(main)"], stdout=writer, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONUNBUFFERED": "" if buffered else "1"},
     )  # fmt: skip
     os.close(writer)
-    assert (ended.returncode, ended.stderr) == (141, b"")
+    return ended.returncode, ended.stderr
+
+
+@pytest.mark.parametrize("buffered", [True, False])
+@pytest.mark.parametrize("main", ["print('x')", "print('x'); sys.exit(0)", "Console().print('x')"])
+def test_a_reader_that_leaves_ends_a_command_without_a_word(buffered: bool, main: str):
+    assert unread(main, buffered) == (141, "")
+
+
+@pytest.mark.parametrize(
+    ("end", "status", "line"),
+    [
+        ("raise UserError('steps must be at least 1')", 2, "error: steps must be at least 1\n"),
+        ("sys.exit(1)", 1, ""),
+        ("raise KeyboardInterrupt", 130, "stopped: what was not written yet is lost; the same command begins anew\n"),
+    ],
+)
+def test_what_else_ends_a_command_is_told_where_nobody_reads_its_output(end: str, status: int, line: str):
+    assert unread(f"print('to nobody'); {end}") == (status, line)
+
+
+def test_a_bug_keeps_its_traceback_where_nobody_reads_the_output():
+    status, errors = unread("print('to nobody'); {}['key']")
+    assert status == 1 and errors.endswith("KeyError: 'key'\n")
+
+
+@pytest.mark.parametrize("closed", ["sys.stdout = None", "sys.stdout.close()"])
+def test_an_output_that_is_closed_changes_no_end(closed: str):
+    assert unread(f"{closed}; raise UserError('no')") == (2, "error: no\n")
+    status, errors = unread(f"{closed}; raise BrokenPipeError('of a process')")
+    assert status == 1 and errors.endswith("BrokenPipeError: of a process\n")
 
 
 def test_a_broken_pipe_of_another_process_is_raised_while_the_output_is_read():
