@@ -32,6 +32,7 @@ from envs.drivers.trained import require_own_view
 from envs.registry import arguments_of
 from envs.sb3.policy_file import Algorithm, algorithm_of, read_policy_note
 from envs.supervision import TIMEOUT_S
+from predictor.own_forecasters import is_own
 from predictor.support.command_line import parse
 from predictor.support.config_checks import check_at_least, check_at_most, check_positive
 from predictor.support.errors import UserError, run_entry_point
@@ -39,6 +40,7 @@ from predictor.support.files import check_out
 from predictor.support.hub import is_hub
 from predictor.support.memory import check_count, check_processes
 from predictor.support.progress import WorkShown
+from predictor.support.remote import is_remote
 from predictor.support.runtime import keep_freed_memory, resolve_device
 
 NO_DRIVERS = "none"
@@ -297,7 +299,10 @@ def _trained(config: EvaluateConfig, policy: Path) -> _Trained:
         algorithm, task = run["algorithm"], task_of(run, config.device, config.env_id, config.checkpoint)
     else:
         algorithm, task = algorithm_of(zipped), task_of_policy(zipped, config.device)
-    if config.checkpoint not in (None, task.checkpoint, task.sizes_of):
+    named = {None, task.checkpoint}
+    if task.sizes_of and (is_own(task.sizes_of) or is_remote(task.sizes_of)):  # `task_of` wants it named to trust it
+        named.add(task.sizes_of)
+    if config.checkpoint not in named:
         raise UserError(
             f"policy {policy} was trained on forecaster {task.checkpoint}, got --checkpoint {config.checkpoint}; leave "
             "it out"

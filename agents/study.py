@@ -31,7 +31,7 @@ from predictor.support.provenance import commit_at_start, provenance
 from predictor.support.stopping import resumable
 
 CELLS = "cells"
-STUDY_FILE = "study.toml"
+STUDY_FILE, EARLIER_FILE = "study.toml", "study.before.toml"
 FAILED = 1
 """Exit status if a cell failed."""
 
@@ -91,6 +91,7 @@ def run_study(config: StudyConfig) -> int:
     with locked(folder, "study"):
         delete_leftovers(folder)
         results = _results_of(folder, cells)
+        _keep_earlier(folder, text)
         write_text(folder / STUDY_FILE, text)
         failed = _run_missing(config, folder, chosen, results, len(cells))
         done = [results[cell.name] for cell in cells if cell.name in results]
@@ -138,6 +139,14 @@ def _check_folder(folder: Path) -> None:
         found = [path.name for path in folder.iterdir() if not path.name.startswith(".")]
         if found:
             raise UserError(f"{folder} holds {found[0]} but no study ({STUDY_FILE}); choose another --out")
+
+
+def _keep_earlier(folder: Path, text: str) -> None:
+    """Keeps the file of an earlier run of the folder, if it was another one, and says so."""
+    earlier = folder / STUDY_FILE
+    if earlier.exists() and (before := earlier.read_text(encoding="utf-8")) != text:
+        write_text(folder / EARLIER_FILE, before)
+        print(f"{earlier} was of another study or an earlier version; kept as {EARLIER_FILE}", file=sys.stderr)
 
 
 def _results_of(folder: Path, cells: Sequence[Cell]) -> dict[str, Result]:

@@ -4,6 +4,7 @@
 Those seeds are disjoint from training and from the final evaluation, so selection does not bias the final numbers.
 """
 
+import contextlib
 import math
 import time
 import zipfile
@@ -119,24 +120,27 @@ def train(plan: TrainingPlan, run_dir: Path, progress_bar: bool = True) -> Path:
     Returns:
         Path of the final policy, `run_dir/policy.zip`.
     """
+    policy = run_dir / POLICY_FILE
+    if policy.exists() and not (run_dir / CHECKPOINT_FILE).exists():
+        return policy  # made at the end, when the checkpoint is needed no more
     note = plan.task.note  # loads the forecaster, which draws random numbers: before the model is seeded
     venv = make_venv(plan.task, plan.num_envs, in_process=plan.in_process or None, shaping=plan.shaping)
     # a process may have but one simulator of someone else's, and that is the one that trains
     beside = True if plan.in_process else False if ":" in plan.task.env_id else None
-    selection = open_arena(plan.task, min(plan.selection_envs, plan.selection_episodes), beside)
-    try:
+    with contextlib.ExitStack() as opened:
+        opened.callback(venv.close)
+        selection = open_arena(plan.task, min(plan.selection_envs, plan.selection_episodes), beside)
+        opened.callback(selection.close)
         model = _resume_or_make(plan, venv, run_dir)
-        if model.num_timesteps < plan.steps:
+        learns = model.num_timesteps < plan.steps
+        if learns:
             _learn(plan, model, selection, run_dir, note, progress_bar)
             save_model(model, run_dir / CHECKPOINT_FILE, note=note, to_continue=True)
-    finally:
-        venv.close()
-        selection.close()
     if (run_dir / BEST_FILE).exists():
-        copy_file(run_dir / BEST_FILE, run_dir / POLICY_FILE)
-    else:  # it was damaged, and removed as the message says; the last model stands for it
-        save_model(model, run_dir / POLICY_FILE, note=note)
-    return run_dir / POLICY_FILE
+        copy_file(run_dir / BEST_FILE, policy)
+    elif learns or not policy.exists():  # it was damaged, and removed as the message says; the last model stands for it
+        save_model(model, policy, note=note)
+    return policy
 
 
 def _learn(

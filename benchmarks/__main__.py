@@ -44,15 +44,15 @@ def main() -> None:
     if baseline is not None:
         lines, comparison = settle(settings, baseline, lines, say)
     result = report(settings, lines, keeps_memory, began)
+    settings.out.parent.mkdir(parents=True, exist_ok=True)
+    write_json(settings.out, result)
+    if settings.write_baseline is not None:
+        write_baseline(settings.write_baseline, settings, lines, processor(), result["provenance"])
     kept = "kept" if keeps_memory else "returned to the system"
     versions = ", ".join(f"{name} {version}" for name, version in result["provenance"]["versions"].items())
     print(f"{result['machine']}; {settings.threads} torch threads; freed memory is {kept}; {settings.mode} run")
     print(f"commit {result['provenance']['commit']}; {versions}")
     console.print(rich_table(lines)) if console.is_terminal else print(plain(lines))
-    settings.out.parent.mkdir(parents=True, exist_ok=True)
-    write_json(settings.out, result)
-    if settings.write_baseline is not None:
-        write_baseline(settings.write_baseline, settings, lines, processor(), result["provenance"])
     if comparison is not None and baseline is not None:
         if baseline.processor != processor():
             print(f"the baseline is of another processor ({baseline.processor}): wider tolerances for equivalents")

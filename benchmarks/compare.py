@@ -164,13 +164,14 @@ def compare(baseline: Baseline, lines: Sequence[Line], sections: Sequence[str], 
     changes = []
     for key, before in baseline.lines.items():
         measured = now.get(key)
-        if measured is not None:
+        if measured is not None and measured.kind == before.kind:
             tolerance = before.tolerance * (1.0 if before.kind == "ratio" else widened)
             changes.append(Change(key, before, measured.value, tolerance))
     expected = [key for key in baseline.lines if key.split(" | ")[0] in sections]
-    missing = tuple(key for key in expected if key not in now)
+    compared = {change.key for change in changes}
+    missing = tuple(key for key in expected if key not in compared)
     broken = tuple(line for line in lines if line.compared is not None and line.compared.broken)
-    return Comparison(tuple(changes), missing, tuple(key for key in now if key not in baseline.lines), broken)
+    return Comparison(tuple(changes), missing, tuple(key for key in now if key not in compared), broken)
 
 
 def better_of(lines: Sequence[Line], again: Iterable[Line], keys: Iterable[str]) -> list[Line]:

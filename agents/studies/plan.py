@@ -13,7 +13,7 @@ from agents.preset_settings import settings_from_table
 from agents.presets import Algorithm
 from agents.task import NO_CHECKPOINT, SELECTION_SEED, Observe, Task
 from envs.drivers.ego import CONSTANT_ACTIONS
-from envs.drivers.planner import PLANNER, PLANNER_ORACLE
+from envs.drivers.planner import PLANNER, is_planner
 from envs.registry import entry_for
 from envs.sb3.algorithms import algorithm_named
 from predictor.own_forecasters import is_own
@@ -163,9 +163,9 @@ class Study:
             UserError: floor or ceiling is neither an arm of the study nor something that a policy can be shown.
         """
         arms = tuple(self._arm_called(name, key) for key, name in (("floor", self.floor), ("ceiling", self.ceiling)))
-        wanted = (PLANNER, PLANNER_ORACLE, CONSTANT_ACTIONS)
         scenarios = tuple(
-            replace(s, references=tuple(name for name in wanted if name in s.references)) for s in self.scenarios
+            replace(s, references=tuple(n for n in s.references if is_planner(n) or n == CONSTANT_ACTIONS))
+            for s in self.scenarios
         )
         return replace(self, arms=arms, scenarios=scenarios, rivals=None)
 

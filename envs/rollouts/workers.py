@@ -12,7 +12,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
 from typing import Any, Generic, Literal, Protocol, TypeVar, runtime_checkable
@@ -24,6 +24,8 @@ from predictor.support.processes import end, follow_parent, how_it_ended, start
 OnError = Literal["stop", "skip"]
 """What an episode that fails does: it stops the command, or is left out."""
 _POLL_S = 1.0
+_MOMENT_S = 2.0
+"""Longest time between two looks at a worker that counts; more, and this process itself was paused."""
 _DYING_S = 5.0
 _START_S = 600.0
 """Time that a process gets to import what it needs on a busy machine [s]."""
@@ -66,14 +68,22 @@ class _Worker:
     number: int | None = None
     ready: bool = False
     moves: int = -1
-    moved_s: float = 0.0
+    waited_s: float = 0.0
+    asked_s: float = field(default_factory=time.monotonic)
+
+    def wait_anew(self) -> None:
+        """Counts the time without a step from now on."""
+        self.waited_s, self.asked_s = 0.0, time.monotonic()
 
     def is_late(self, timeout_s: float) -> bool:
-        """Returns whether no step was made for too long."""
-        now = time.monotonic()
+        """Returns whether no step was made for too long; a pause of the whole command counts for a moment."""
         if self.moves != self.place.moves:
-            self.moves, self.moved_s = self.place.moves, now
-        return now - self.moved_s > (timeout_s if self.ready else max(timeout_s, _START_S))
+            self.moves = self.place.moves
+            self.wait_anew()
+        now = time.monotonic()
+        self.waited_s += min(now - self.asked_s, _MOMENT_S)
+        self.asked_s = now
+        return self.waited_s > (timeout_s if self.ready else max(timeout_s, _START_S))
 
 
 class EpisodePool(Generic[Result]):
@@ -158,7 +168,7 @@ class EpisodePool(Generic[Result]):
             if worker.number is None and waiting:
                 worker.number = waiting.popleft()
                 worker.place.clear()
-                worker.moved_s = time.monotonic()
+                worker.wait_anew()
                 try:
                     worker.pipe.send(tasks[worker.number])
                 except OSError:
@@ -179,7 +189,8 @@ class EpisodePool(Generic[Result]):
                 reason = how_it_ended(worker.process.exitcode)
             else:
                 if isinstance(content, _Ready):
-                    worker.ready, worker.moved_s = True, time.monotonic()
+                    worker.ready = True
+                    worker.wait_anew()
                     continue
                 if content is not None:
                     number, worker.number = worker.number, None
@@ -214,7 +225,7 @@ def _started(play: Callable[[Any], Any]) -> _Worker:
     ours, theirs = context.Pipe()
     numbers: Any = context.RawArray("q", NUMBERS)
     process = context.Process(target=_work, args=(play, theirs, numbers), daemon=True)
-    worker = _Worker(process, ours, Place(numbers), moved_s=time.monotonic())
+    worker = _Worker(process, ours, Place(numbers))
     start(process)
     theirs.close()
     return worker

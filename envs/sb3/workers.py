@@ -4,7 +4,9 @@
 leaves its processes if this one is killed.
 """
 
+import math
 import multiprocessing
+import time
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from typing import Any
@@ -66,9 +68,14 @@ class WorkerVecEnv(SubprocVecEnv):
         self.closed = True
         in_order = not self.waiting and all(remote.is_in_order for remote in self.remotes)
         if in_order and all(remote.send_if_possible(("close", None)) for remote in self.remotes):
-            for process in self.processes:
-                process.join(CLOSE_S)
-        end(self.processes)
+            deadline_s = time.monotonic() + CLOSE_S
+            try:
+                for process in self.processes:
+                    process.join(max(deadline_s - time.monotonic(), 0.0))
+            finally:
+                end(self.processes)
+        else:
+            end(self.processes)
         for remote in self.remotes:
             remote.close()
 
@@ -107,7 +114,7 @@ class _WatchedRemote:
         in_order, self.is_in_order = self.is_in_order, False
         patience_s = self._timeout_s if self._has_answered else max(self._timeout_s, TIMEOUT_S)
         try:
-            if not self._pipe.poll(patience_s):
+            if not _comes(self._pipe, patience_s):
                 hint = "it hangs, or --timeout-s is too short"
                 raise EnvironmentFailedError(f"{self._where()}: no answer for {patience_s:g} s; {hint}")
             answer = self._pipe.recv()
@@ -125,6 +132,12 @@ class _WatchedRemote:
 
     def _where(self) -> str:
         return f"{self._name}, {self._place}"
+
+
+def _comes(pipe: Connection, patience_s: float) -> bool:
+    """Returns whether an answer comes in time; a pause of the whole command counts for a second at most."""
+    waits = math.ceil(patience_s)
+    return any(pipe.poll(min(1.0, patience_s - second)) for second in range(waits))
 
 
 def _work(remote: Connection, parent_remote: Connection, make: Any, env_id: str, numbers: Any) -> None:

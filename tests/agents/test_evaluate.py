@@ -1,5 +1,6 @@
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from stable_baselines3 import PPO
@@ -47,6 +48,31 @@ def test_drivers_that_cannot_drive_are_refused_before_anything_runs():
     with pytest.raises(UserError, match=r"highway-fast.zip sees forecasts, .* measure it with --run-dir"):
         checked_drivers(Task("highway-fast-v0", "none"), (str(SHIPPED / "highway-fast.zip"),))
     assert checked_drivers(Task("simple_tag_v3", "none"), ()) == ()
+
+
+@pytest.mark.parametrize(
+    ("sizes_of", "named", "accepted"),
+    [
+        ("exit", "exit", False),  # it would be measured with `highway` all the same
+        ("own:module:forecaster", "own:module:forecaster", True),
+        ("s3://bucket/sizes", "s3://bucket/sizes", True),
+        ("exit", "highway", True),
+        (None, "exit", False),
+    ],
+)
+def test_only_what_has_to_be_trusted_may_be_named_beside_the_policy_s_forecaster(
+    sizes_of: str | None, named: str, accepted: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    task = SimpleNamespace(checkpoint="highway", sizes_of=sizes_of, env_id="highway-fast-v0")
+    for name, value in (("policy_zip", tmp_path / "policy.zip"), ("local_policy", tmp_path), ("algorithm_of", "ppo"),
+                        ("task_of_policy", task), ("replace", task)):  # fmt: skip
+        monkeypatch.setattr(evaluate, name, lambda *given, value=value, **more: value)
+    config = EvaluateConfig(run_dir=tmp_path, checkpoint=named)
+    if accepted:
+        assert evaluate._trained(config, tmp_path).task is task
+        return
+    with pytest.raises(UserError, match=f"was trained on forecaster highway, got --checkpoint {named}; leave it out"):
+        evaluate._trained(config, tmp_path)
 
 
 def test_the_planner_takes_the_checkpoint_that_a_run_names():

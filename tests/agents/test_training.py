@@ -392,6 +392,21 @@ def test_a_run_at_its_end_without_its_best_model_keeps_the_last(tmp_path: Path):
         assert torch.equal(weights, kept[name]), name
 
 
+@pytest.mark.parametrize("gone", [("checkpoint.zip",), ("best_model.zip",), ("checkpoint.zip", "best_model.zip")])
+def test_a_finished_run_keeps_its_policy_whatever_else_is_deleted(gone: tuple[str, ...], tmp_path: Path):
+    """A checkpoint with a replay buffer is large, and the best model a copy of the policy."""
+    training = plan(task=Task(TOY, "none"), in_process=True, num_envs=1, selections=1, selection_episodes=1, steps=8,
+                    settings={"n_steps": 8, "batch_size": 8})  # fmt: skip
+    train(training, tmp_path)
+    for name in gone:
+        (tmp_path / name).unlink()
+    (tmp_path / "policy.zip").write_bytes(b"the one that was measured")
+    curve = (tmp_path / "curve.json").read_bytes()
+    assert train(training, tmp_path) == tmp_path / "policy.zip"
+    assert (tmp_path / "policy.zip").read_bytes() == b"the one that was measured"
+    assert (tmp_path / "curve.json").read_bytes() == curve
+
+
 def test_errors_in_the_loop_cover_all_steps_since_the_last_measurement(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Also those before a checkpoint, where environments start anew, and before a stop."""
     preset = PPOPreset(n_steps=8, batch_size=8, n_epochs=1, net_arch=(8,))

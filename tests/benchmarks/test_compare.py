@@ -80,6 +80,12 @@ def test_a_line_that_fails_twice_over_is_measured_again_once():
     assert compare(baseline(line(1.0)), [both], ("data",), HERE).failing == [both.key]
 
 
+def test_numbers_of_two_kinds_are_not_compared():
+    before, now = line(0.5, kind="matmul"), line(1.1, kind="ratio")
+    comparison = held(before, now)
+    assert not comparison.changes and comparison.missing == comparison.new == (now.key,)
+
+
 def test_the_tolerance_is_the_baselines():
     assert held(line(1.0, tolerance=1.1), line(1.2, tolerance=9.0)).slower
 

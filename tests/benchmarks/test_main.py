@@ -67,6 +67,20 @@ def test_a_section_from_the_command_line_to_the_table_and_the_file(
     assert [path.name for path in out.parent.iterdir()] == ["benchmarks.json"]  # no half-written file
 
 
+def test_results_are_written_before_the_table_is_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Whoever reads the table may leave in the middle."""
+
+    def left(lines: Sequence[Line]) -> str:
+        raise BrokenPipeError
+
+    serve(monkeypatch, [line(1.0)])
+    monkeypatch.setattr(entry, "plain", left)
+    out, made = tmp_path / "out.json", tmp_path / "baseline.json"
+    with pytest.raises(BrokenPipeError):
+        call(monkeypatch, "--out", str(out), "--write-baseline", str(made))
+    assert out.exists() and made.exists()
+
+
 def test_what_got_slower_is_measured_twice_reported_and_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):

@@ -145,9 +145,10 @@ def test_an_unknown_study_is_named():
 
 
 def test_headroom_has_floor_and_ceiling_alone(tmp_path: Path):
-    text = study_text(floor='"none"', ceiling='"forecast"', references='["random", "planner"]')
+    text = study_text(floor='"none"', ceiling='"forecast"', references='["random", "planner@0.3", "slower", "planner"]')
     study = read_study(study_path(tmp_path, text)).headroom_only()
-    assert study.arm_names == ("none", "forecast") and study.scenarios[0].references == ("planner",)
+    assert study.arm_names == ("none", "forecast")
+    assert study.scenarios[0].references == ("planner@0.3", "planner")
     text = study_text(floor='"ground"', ceiling='"forecast"')
     with pytest.raises(UserError, match="floor must be an arm of the study or one of .*, got 'ground'"):
         read_study(study_path(tmp_path, text)).headroom_only()

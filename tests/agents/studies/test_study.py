@@ -261,6 +261,18 @@ def test_a_part_of_a_study_is_run_and_the_rest_later(tmp_path: Path):
         run_study(replace(part, seeds=3))
 
 
+def test_the_file_of_another_study_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    agents.study._keep_earlier(tmp_path, "first")
+    (tmp_path / "study.toml").write_text("first")
+    agents.study._keep_earlier(tmp_path, "first")
+    assert not (tmp_path / "study.before.toml").exists() and capsys.readouterr().err == ""
+    agents.study._keep_earlier(tmp_path, "second")
+    assert (tmp_path / "study.before.toml").read_text() == "first"
+    assert capsys.readouterr().err == (
+        f"{tmp_path}/study.toml was of another study or an earlier version; kept as study.before.toml\n"
+    )
+
+
 def test_a_folder_with_something_else_is_refused(tmp_path: Path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("mine")

@@ -4,13 +4,15 @@ import multiprocessing
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from envs import collect
 from envs.collect import CollectConfig
+from envs.rollouts import workers
 from envs.rollouts.workers import EpisodePool, Failed
-from envs.supervision import EnvironmentFailedError
+from envs.supervision import NUMBERS, EnvironmentFailedError, Place
 from predictor.support.errors import UserError
 from tests.envs.misbehaving import AT_STEP, NUM_STEPS, env_id
 
@@ -55,6 +57,22 @@ def test_other_episodes_go_on_beside_those_that_fail():
             assert result.reason.startswith(f"{env_id(kind)}, seed {task.seed}, {REASONS[kind]}"), result.reason
             assert "\n" not in result.reason
     assert not multiprocessing.active_children()
+
+
+def test_a_pause_of_the_whole_command_is_not_the_episode_s(monkeypatch: pytest.MonkeyPatch):
+    clock, place = [0.0], Place([0] * NUMBERS)
+    monkeypatch.setattr(workers, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    worker = workers._Worker(None, None, place, ready=True, moves=place.moves, asked_s=0.0)
+
+    def late_after(seconds: float) -> bool:
+        clock[0] += seconds
+        return worker.is_late(3.0)
+
+    assert [late_after(s) for s in (1.0, 3600.0, 0.0, 0.5)] == [False, False, False, True]
+    worker.wait_anew()
+    assert [late_after(s) for s in (1.0, 1.0, 1.0, 1.0)] == [False, False, False, True]
+    worker.moves -= 1  # the episode has moved since
+    assert not late_after(1.0)
 
 
 def test_an_episode_that_fails_stops_the_others():

@@ -2,12 +2,15 @@
 
 import multiprocessing
 import time
+from types import SimpleNamespace
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from envs.sb3 import workers
 from envs.sb3.workers import WorkerVecEnv
 from envs.supervision import EnvironmentFailedError, SupervisedEnv
 from tests.envs.misbehaving import NUM_STEPS, env_id
@@ -51,6 +54,48 @@ def test_an_environment_that_misbehaves_is_named_and_the_others_end(kind: str, c
 def test_an_environment_that_cannot_be_made_is_named():
     with pytest.raises(EnvironmentFailedError, match=r"^toy-v0, before its first reset: NameNotFound: "):
         WorkerVecEnv([Make("Unknown")], "toy-v0")
+    assert not multiprocessing.active_children()
+
+
+class Quiet:
+    """A pipe through which nothing comes, or only after some looks at it."""
+
+    def __init__(self, looks: float = float("inf")) -> None:
+        self.left, self.waited = looks, list[float]()
+
+    def poll(self, timeout_s: float) -> bool:
+        self.waited.append(timeout_s)
+        self.left -= 1
+        return self.left < 0
+
+
+def test_an_answer_is_waited_for_in_steps_so_that_a_pause_costs_one_of_them():
+    pipe = Quiet()
+    assert not workers._comes(pipe, 2.5)
+    assert pipe.waited == [1.0, 1.0, 0.5]
+    assert workers._comes(Quiet(looks=1), 2.5) and not workers._comes(Quiet(looks=3), 2.5)
+
+
+class Slow:
+    """A process that takes all the time that it gets to end."""
+
+    def __init__(self, process: Any, clock: list[float]) -> None:
+        self._process, self._clock = process, clock
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._process, name)
+
+    def join(self, timeout_s: float | None = None) -> None:
+        self._clock.append(self._clock[-1] + (timeout_s or 0.0))
+        self._process.join()
+
+
+def test_all_processes_together_get_the_time_to_close(monkeypatch: pytest.MonkeyPatch):
+    venv, clock = WorkerVecEnv([Make("Fine")] * 3, "toy-v0"), [100.0]
+    venv.processes = [Slow(process, clock) for process in venv.processes]
+    monkeypatch.setattr(workers, "time", SimpleNamespace(monotonic=lambda: clock[-1]))
+    venv.close()
+    assert clock[:4] == [100.0, *[100.0 + workers.CLOSE_S] * 3]  # before they are killed
     assert not multiprocessing.active_children()
 
 
