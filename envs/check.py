@@ -49,15 +49,6 @@ class CheckConfig:
         check_count(self.episodes * self.max_steps, "episodes times max_steps")
 
 
-def findings(config: CheckConfig) -> list[str]:
-    """Returns what is wrong, one line for each thing; empty if nothing was found.
-
-    Raises:
-        UserError: no such environment, or no reader knows it.
-    """
-    return [one_line(UserError(line)) for line in examined(config).problems]
-
-
 def examined(config: CheckConfig) -> Examined:
     """Returns what is wrong, and how many ids last from step to step.
 

@@ -6,7 +6,6 @@ starts from one step. `envs.sb3.forecast` serves Stable-Baselines3, which this m
 """
 
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +34,6 @@ from envs.scene_stream import ForecastConfig
 from predictor.forecaster import Forecaster
 from predictor.scene import SceneBatch, SceneSpec
 from predictor.support.errors import UserError
-
-
-def __getattr__(name: str) -> Any:
-    """Returns `VecForecast` of `envs.sb3.forecast`, which is imported, with Stable-Baselines3, when it is asked for."""
-    if name == "VecForecast":
-        return import_module(f"{__package__}.sb3.forecast").VecForecast
-    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
 
 
 class VectorForecast(ForecastWrapper, gym.vector.VectorWrapper):

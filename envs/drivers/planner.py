@@ -38,8 +38,6 @@ PLANNER = "planner"
 `planner@RISK:CHECKPOINT` both."""
 ORACLE = "oracle"
 """Name in the place of a checkpoint: the planner gets the true futures, an upper bound for measurements."""
-PLANNER_ORACLE = f"{PLANNER}:{ORACLE}"
-"""Name of the planner with true futures."""
 MODES = 20
 """Number of futures of a forecaster with modes; others give the planner their single forecast."""
 EQUAL = 1e-6

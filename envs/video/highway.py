@@ -153,7 +153,6 @@ def record_episode(
     seed: int = 0,
     max_steps: int | None = None,
     num_samples: int = 1,
-    style: OverlayStyle | None = None,
 ) -> Recording:
     """Plays one episode and records it for drawing.
 
@@ -164,7 +163,6 @@ def record_episode(
         seed: seed of the reset.
         max_steps: largest number of policy steps.
         num_samples: number of futures drawn for each agent, whatever the policy sees; the likelier, the more opaque.
-        style: colours and widths of the drawing.
 
     Raises:
         UserError: not a highway-env environment, or one that cannot be rendered to arrays.
@@ -173,7 +171,7 @@ def record_episode(
         raise UserError(f"videos need a highway-env environment, got {env.unwrapped.__class__.__name__}")
     if env.render_mode != "rgb_array":
         raise UserError(f"videos need an env made with render_mode='rgb_array', got {env.render_mode!r}")
-    recorder = _Recorder(env, num_samples, style or OverlayStyle())
+    recorder = _Recorder(env, num_samples, OverlayStyle())
     try:
         obs, _ = env.reset(seed=seed)
         recorder.begin()

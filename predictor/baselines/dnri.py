@@ -197,17 +197,7 @@ class DNRI(UnrolledForecaster):
         expected = super().rollout(belief, horizon_steps)
         if num_samples == 1:
             return expected
-        now: Internal = belief.internal
-        draws = num_samples - 1
-        noise = noise_of_pairs(generator, pair_mask(belief.valid), draws, horizon_steps, self.num_edge_types)
-
-        def repeat(*tensors: Tensor) -> Tensors:
-            return tuple(t.repeat_interleave(draws, dim=0) for t in tensors)
-
-        states, valid, scores = repeat(belief.states, belief.valid, now.scores)
-        memory, before, draw = repeat(*now.pairs), repeat(*now.before), self.drawn(noise)
-        futures = self._branch(states, valid, memory, scores, before, horizon_steps, draw)
-        drawn = futures.unflatten(0, (len(belief.states), draws))
+        drawn = self._drawn_futures(belief, horizon_steps, num_samples - 1, generator)
         return Futures(torch.cat([expected.states, drawn], dim=1))
 
     def rollout_plans(
@@ -221,19 +211,32 @@ class DNRI(UnrolledForecaster):
         expected = super().rollout_plans(belief, plans)
         if num_samples == 1:
             return expected
+        drawn = self._drawn_futures(belief, plans.shape[2], num_samples - 1, generator, plans)
+        drawn = drawn.unflatten(1, (num_samples - 1, plans.shape[1])).transpose(1, 2)
+        return Futures(torch.cat([expected.states, drawn], dim=2))
+
+    def _drawn_futures(
+        self,
+        belief: Belief,
+        horizon_steps: int,
+        draws: int,
+        generator: Noise | None,
+        plans: Float[Tensor, "batch plans horizon state"] | None = None,
+    ) -> Float[Tensor, "batch branches agents horizon state"]:
+        """Rolls out with drawn edge types; branches are the draws, and within each of them the plans."""
         now: Internal = belief.internal
-        draws, (count, horizon_steps) = num_samples - 1, plans.shape[1:3]
         noise = noise_of_pairs(generator, pair_mask(belief.valid), draws, horizon_steps, self.num_edge_types)
-        rules = (self.drawn(noise), self.drawn(RepeatedNoise(noise, *repeat_scenes(count))))
+        later = None if plans is None else self.drawn(RepeatedNoise(noise, *repeat_scenes(plans.shape[1])))
 
         def repeat(*tensors: Tensor) -> Tensors:
             return tuple(t.repeat_interleave(draws, dim=0) for t in tensors)
 
-        states, valid, scores, plans = repeat(belief.states, belief.valid, now.scores, plans)
-        memory, before = repeat(*now.pairs), repeat(*now.before)
-        futures = self._branch(states, valid, memory, scores, before, horizon_steps, *rules, plans)
-        drawn = futures.unflatten(0, (len(belief.states), draws, count)).transpose(1, 2)
-        return Futures(torch.cat([expected.states, drawn], dim=2))
+        states, valid, scores = repeat(belief.states, belief.valid, now.scores)
+        if plans is not None:
+            (plans,) = repeat(plans)
+        memory, before, rule = repeat(*now.pairs), repeat(*now.before), self.drawn(noise)
+        futures = self._branch(states, valid, memory, scores, before, horizon_steps, rule, later, plans)
+        return futures.unflatten(0, (len(belief.states), -1))
 
     # --- Training -----------------------------------------------------------------------------------------------
 

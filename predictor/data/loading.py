@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
 from predictor.data.store_files import check_new_store
 from predictor.scene import LARGEST
@@ -26,8 +26,6 @@ LARGEST_WHOLE = 10**15 - 1
 """Largest whole number that is read; float64 holds all up to it."""
 NO_LIMIT_M = 1e6
 """Perception range of scenes without an ego [m]."""
-
-Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)

@@ -229,16 +229,6 @@ def stream_of(split: str, seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(int(np.random.default_rng([seed, stream]).integers(2**62)))
 
 
-def energy(
-    couplings: Float[Tensor, "count agents agents"], states: Float[Tensor, "count frames agents 4"]
-) -> Float[Tensor, "count frames"]:
-    """Computes kinetic plus elastic energy of springs [J at unit mass]."""
-    kinetic = 0.5 * states[..., 2:].square().sum((-1, -2))
-    distance = states[..., None, :2] - states[..., None, :, :2]
-    elastic = 0.25 * (couplings.double()[:, None] * distance.square().sum(-1)).sum((-1, -2))
-    return kinetic + elastic
-
-
 def charge_force(
     physics: Physics, couplings: Float[Tensor, "count agents agents"], positions: Float[Tensor, "count agents 2"]
 ) -> Float[Tensor, "count agents 2"]:

@@ -125,8 +125,6 @@ class CausalScores:
     """Expected calibration error; None for a score that is no probability."""
     bins: tuple[Bin, ...] = ()
     """Calibration by bin."""
-    mean_score: float = 0.0
-    """Mean score."""
     spread_between_senders: float | None = None
     """Spread of a receiver's scores over its senders."""
     curve: tuple[tuple[float, float], ...] = ()
@@ -176,7 +174,6 @@ def score_rule(
         strength=_ranked(lambda weights: spearman(score, pairs.shift_m, weights), pairs),
         calibration_error=_calibration_error(score, pairs) if probability else None,
         bins=_bins(score, pairs.exists) if probability else (),
-        mean_score=float(score.mean()),
         spread_between_senders=_spread(score, pairs),
         curve=_curve(score, pairs.exists),
     )

@@ -89,7 +89,7 @@ print(type(env).__module__)
 from dgvae_rl import ForecastParallelEnv
 ForecastParallelEnv(env).reset(seed=0)
 print(type(make_env("highway-mixed-v0").unwrapped).__module__)
-from dgvae_rl.envs.vector import VecForecast
+from dgvae_rl.envs.sb3.forecast import VecForecast
 from dgvae_rl.envs.simulators.envpool import register_envpool_ids
 register_envpool_ids()
 print(gym.spec("envpool/HighwayFast-v0").entry_point)

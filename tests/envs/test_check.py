@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from envs import check
-from envs.check import CheckConfig, findings, with_option
+from envs.check import CheckConfig, examined, with_option
 from envs.collect import CollectConfig, warnings_of
 from envs.testing import store_problems
 from envs.testing.playing import Episode as EpisodeOf
 from envs.testing.recorded import observation_problems
 from predictor.data.store import Episode, StoreInfo
 from predictor.scene import Scene
-from predictor.support.errors import UserError, run_entry_point
+from predictor.support.errors import UserError, one_line, run_entry_point
 from tests.envs.semantics import read_crowd
 from tests.envs.testing.test_check_reader import MISTAKES, SPEC, Pushed, by_distance
 
@@ -28,10 +28,15 @@ PLANTED = (
 )
 
 
+def problems_of(config: CheckConfig) -> list[str]:
+    """What is wrong, one line for each thing, as the command prints it."""
+    return [one_line(UserError(line)) for line in examined(config).problems]
+
+
 @pytest.mark.parametrize("mistake", PLANTED)
 def test_each_planted_mistake_is_named_in_a_line(mistake: str):
     config = CheckConfig("tests.envs.planted:Walk", f"tests.envs.planted:{mistake.replace(' ', '_')}")
-    found = findings(config)
+    found = problems_of(config)
     assert any(MISTAKES[mistake][1] in line for line in found), found
     assert all("\n" not in line for line in found)
 
@@ -59,7 +64,7 @@ def test_each_planted_mistake_is_named_in_a_line(mistake: str):
     ],
 )
 def test_mistakes_of_the_environment_are_named_too(name: str, sentence: str):
-    found = findings(CheckConfig(f"tests.envs.planted:{name}"))
+    found = problems_of(CheckConfig(f"tests.envs.planted:{name}"))
     assert any(sentence in line for line in found), found
 
 
@@ -91,7 +96,7 @@ ROADS = ("highway-fast-v0", "intersection-v2", "simple_tag_v3")
     "env_id", [*ROADS, "tests.envs.planted:Walk", "tests.envs.planted:Lower", "tests.envs.planted:Trembling"]
 )
 def test_nothing_is_found_where_nothing_is_wrong(env_id: str):
-    assert findings(CheckConfig(env_id, episodes=2, max_steps=15)) == []
+    assert problems_of(CheckConfig(env_id, episodes=2, max_steps=15)) == []
 
 
 def test_the_command_ends_with_status_1_if_something_is_wrong(
@@ -121,7 +126,7 @@ def test_the_command_ends_with_status_1_if_something_is_wrong(
 )
 def test_bad_values_end_in_one_line(config: dict[str, Any], sentence: str):
     with pytest.raises(UserError, match=sentence):
-        findings(CheckConfig(**config))
+        problems_of(CheckConfig(**config))
 
 
 def test_the_environment_may_come_first():

@@ -12,7 +12,6 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
-import envs.vector
 from envs.entries import FORECAST_KEYS, PATH_KEYS
 from envs.registry import make_env
 from envs.sb3.forecast import VecForecast
@@ -490,12 +489,6 @@ def test_samples_of_an_env_are_those_of_its_environment_alone(maker: str, highwa
         for i, env in enumerate(alone):
             own, _, terminated, truncated, _ = env.step(int(ACTIONS[t, i]))
             assert_same(one_of(obs, i), env.reset()[0] if terminated or truncated else own, 1e-3)
-
-
-def test_the_old_import_of_vec_forecast_still_works():
-    assert envs.vector.VecForecast is VecForecast
-    with pytest.raises(AttributeError, match="module 'envs.vector' has no attribute 'Nothing'"):
-        _ = envs.vector.Nothing
 
 
 WITHOUT_SB3 = """

@@ -5,6 +5,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
+from jaxtyping import Float
+from torch import Tensor
 
 from predictor.data.store import EpisodeStore, read_store
 from predictor.support.errors import run_entry_point
@@ -79,3 +81,13 @@ def possession(frames: int, players: Sequence[int], feet: Callable[[int, int], t
             x, y = feet(entity, t)
             lines.append(f"{12 * t} {entity} {x:.6f} {y:.6f} {'BALL' if entity == -1 else 'PLAYER'}")
     return "\n".join(lines)  # no end of line after the last, as published
+
+
+def energy(
+    couplings: Float[Tensor, "count agents agents"], states: Float[Tensor, "count frames agents 4"]
+) -> Float[Tensor, "count frames"]:
+    """Computes kinetic plus elastic energy of springs [J at unit mass]."""
+    kinetic = 0.5 * states[..., 2:].square().sum((-1, -2))
+    distance = states[..., None, :2] - states[..., None, :, :2]
+    elastic = 0.25 * (couplings.double()[:, None] * distance.square().sum(-1)).sum((-1, -2))
+    return kinetic + elastic

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from predictor.data.nri import NRIConfig, make_nri, make_nri_episodes, nri_physics
-from predictor.data.springs import charge_force, draw_charges, draw_start, energy, simulate
+from predictor.data.springs import charge_force, draw_charges, draw_start, simulate
 from predictor.data.store import read_store
+from tests.predictor.data.helpers import energy
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 

@@ -18,7 +18,6 @@ from predictor.data.springs import (
     draw_charges,
     draw_springs,
     draw_start,
-    energy,
     make,
     make_episodes,
     simulate,
@@ -28,6 +27,7 @@ from predictor.data.store import PERTURBATIONS, read_store
 from predictor.support.errors import UserError, run_entry_point
 from predictor.training.config import TrainConfig
 from predictor.training.trainer import Trainer, load_data
+from tests.predictor.data.helpers import energy
 
 OPEN = Physics(num_agents=2, box_m=1e6, dt_s=0.1, frames=61, substeps=50)  # no walls
 
