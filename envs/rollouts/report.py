@@ -39,10 +39,10 @@ class EnvAccuracy:
     """Accuracy of the best of K forecasts."""
     constant_velocity: Accuracy
     """Accuracy of constant velocity on the same scenes."""
-    reduction: float
-    """1 − minADE(K = 1) / ADE of constant velocity."""
-    reduction_interval: tuple[float, float]
-    """95 % bootstrap interval of the reduction over episodes."""
+    reduction: float | None
+    """1 − minADE(K = 1) / ADE of constant velocity; None where that has no error, or no whole horizon was there."""
+    reduction_interval: tuple[float, float] | None
+    """95 % bootstrap interval of the reduction over episodes; None for a single one."""
     controls: dict[str, Accuracy] = field(default_factory=dict)
     """Accuracy of controls with as many samples, fitted to recorded data, by key; empty without such data."""
     histories: dict[int, Accuracy] = field(default_factory=dict)
@@ -168,12 +168,12 @@ def _matrix(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], 
     envs = list(dict.fromkeys([r.env_id for r in results] + [env for env, _ in misfits]))
     cells = {env: dict.fromkeys(names, "–") for env in envs}
     for r in results:
-        cells[r.env_id][r.checkpoint] = f"{metres(r.model.min_ade_m)} ({100 * r.reduction:.0f} %)"
+        cells[r.env_id][r.checkpoint] = f"{metres(r.model.min_ade_m)} ({_percent(r.reduction)})"
     return cells
 
 
 def _cells(result: "EnvAccuracy") -> list[str]:
-    low, high = result.reduction_interval
+    interval = result.reduction_interval
     one, many, straight, near = (
         result.model, result.model_samples, result.constant_velocity, result.nearest_neighbours,
     )  # fmt: skip
@@ -184,9 +184,13 @@ def _cells(result: "EnvAccuracy") -> list[str]:
         metres(many.energy_m), "–" if covered is None else f"{100 * covered.mean:.0f} %",
         "–" if noisy is None else metres(noisy.min_ade_m), "–" if near is None else metres(near.ade_m),
         f"{metres(straight.min_ade_m)} / {metres(straight.min_fde_m)}",
-        f"{100 * result.reduction:.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %", str(one.agents),
+        _percent(result.reduction), "–" if interval is None else " to ".join(map(_percent, interval)), str(one.agents),
         f"{result.latency_median_ms:.1f}",
     ]  # fmt: skip
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None else f"{100 * share:.0f} %"
 
 
 @matplotlib.rc_context(STYLE)

@@ -62,7 +62,7 @@ def summarise_episodes(
 
     # The spread of the baselines is fitted on these very errors, in their favour: they have no validation data.
     straight = line("constant velocity", outcomes[STRAIGHT], fitted_std_m(outcomes[STRAIGHT]))
-    reduction, interval = _reduction(first, outcomes[STRAIGHT])
+    reduction = _reduction(first, outcomes[STRAIGHT])
     pairs = [first, outcomes[STRAIGHT]]
     last = max(1, round(BEFORE_CRASH_S / spec.dt_s))  # the scene of the crash is none: no forecast follows it
     crashes = [[o.last_windows(last) for o, e in zip(p, episodes, strict=True) if e.crashed] for p in pairs]
@@ -81,8 +81,8 @@ def summarise_episodes(
         line(name, first, std_m),
         line(name, outcomes[MODEL], std_m),
         straight,
-        reduction,
-        interval,
+        None if reduction is None else reduction.value,
+        None if reduction is None else reduction.interval,
         {key: line(key, outcomes[key], fitted_std_m(outcomes[key])) for key in CONTROLS if key in outcomes},
         {n: line(f"{name}, {n} step{'s' * (n > 1)} of history", outcomes[memory_key(n)], std_m) for n in histories},
         _graph(episodes) if learned else None,
@@ -119,12 +119,11 @@ def _graph(episodes: Sequence[Episode]) -> GraphAccuracy | None:
     return tally.results()
 
 
-def _reduction(model: Sequence[Outcome], baseline: Sequence[Outcome]) -> tuple[float, tuple[float, float]]:
-    """Returns the relative reduction of ADE and its 95 % interval, by a bootstrap over paired episodes."""
+def _reduction(model: Sequence[Outcome], baseline: Sequence[Outcome]) -> Estimate | None:
+    """Returns the relative reduction of ADE, by a bootstrap over paired episodes; None without an error to reduce."""
     sums = np.zeros((len(model), 2))
     for i, outcomes in enumerate(zip(model, baseline, strict=True)):
         for j, outcome in enumerate(outcomes):
             error, _ = min_ade(outcome.forecast, outcome.future, outcome.valid)
             sums[i, j] = float(error[outcome.valid.all(-1)].sum())
-    found = estimate(sums, lambda totals: 1 - quotient(totals[:, 0], totals[:, 1])) or Estimate(0.0, None)
-    return found.value, found.interval or (found.value, found.value)
+    return estimate(sums, lambda totals: 1 - quotient(totals[:, 0], totals[:, 1]))

@@ -16,8 +16,9 @@ from predictor.scene import SceneSpec
 
 MOST_WINDOWS = 2000
 """Largest number of windows to which a control is fitted; of more, this many are drawn."""
-HISTORY_STEPS = 10
-"""Number of observed steps of these windows."""
+HISTORY_STEPS = 100
+"""Largest number of observed steps of these windows, about as many as a forecaster remembers: with a shorter history it
+errs more, and the noise would be wider than that of its forecasts in an episode."""
 
 
 def training_windows(stores: Sequence[Path], spec: SceneSpec, horizon_steps: int) -> Windows:

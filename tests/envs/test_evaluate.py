@@ -24,6 +24,7 @@ from envs.supervision import EnvironmentFailedError
 from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.data.store import StoreInfo, write_store
 from predictor.evaluation.outcomes import Outcome
+from predictor.evaluation.standard_errors import Estimate
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 from tests.envs.evaluation import TAG, forget, no_processes, read_json, save_tag, tag_spec
@@ -59,17 +60,33 @@ def outcome(error_m: float, agents: int = 2) -> Outcome:
     return Outcome(forecast, torch.zeros(1, agents, HORIZON, 2), torch.ones(1, agents, HORIZON, dtype=torch.bool))
 
 
+def reduced(model: list[Outcome], baseline: list[Outcome]) -> Estimate:
+    found = _reduction(model, baseline)
+    assert found is not None
+    return found
+
+
 def test_reduction_closed_form():
-    assert _reduction([outcome(1.0)] * 3, [outcome(4.0)] * 3) == (0.75, pytest.approx((0.75, 0.75)))
-    assert _reduction([outcome(6.0)] * 3, [outcome(4.0)] * 3)[0] == pytest.approx(-0.5)
+    assert _reduction([outcome(1.0)] * 3, [outcome(4.0)] * 3) == Estimate(0.75, (0.75, 0.75))
+    assert reduced([outcome(6.0)] * 3, [outcome(4.0)] * 3).value == pytest.approx(-0.5)
     # 2 agents at 1 of 4 m, 6 agents at 3 of 4 m: (2 + 18) / 32 is left
-    value, (low, high) = _reduction([outcome(1.0), outcome(3.0, 6)], [outcome(4.0), outcome(4.0, 6)])
-    assert value == pytest.approx(0.375)
-    assert (low, high) == pytest.approx((0.25, 0.75))
+    found = reduced([outcome(1.0), outcome(3.0, 6)], [outcome(4.0), outcome(4.0, 6)])
+    assert found.value == pytest.approx(0.375)
+    assert found.interval == pytest.approx((0.25, 0.75))
 
 
-def test_nothing_to_improve_on_is_no_improvement():
-    assert _reduction([outcome(1.0)] * 2, [outcome(0.0)] * 2) == (0.0, (0.0, 0.0))
+def test_one_episode_has_no_interval_and_no_error_no_reduction():
+    assert _reduction([outcome(1.0)], [outcome(4.0)]) == Estimate(0.75, None)
+    assert _reduction([outcome(1.0)] * 2, [outcome(0.0)] * 2) is None
+
+
+@pytest.mark.parametrize(("errors_m", "shown"), [([1.0], "50 %, –"), ([1.0, 3.0], "50 %, 50 % to 50 %"), ([0.0], "–, –")])
+def test_the_table_says_what_is_not_defined(errors_m: list[float], shown: str):
+    result = summary(HIGHWAY_SPEC, errors_m, [[0.1]] * len(errors_m))
+    cells = report._cells(result)
+    assert ", ".join(cells[-4:-2]) == shown and len(cells) == len(report.HEADS)
+    ((cell,),) = (line.values() for line in report._matrix([result], {}).values())
+    assert cell.endswith(f"({shown.split(',')[0]})")
 
 
 def summary(spec: SceneSpec, errors_m: list[float], latencies_s: list[list[float]], **changes: Any) -> EnvAccuracy:
