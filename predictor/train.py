@@ -71,6 +71,12 @@ def _train(config: TrainConfig, group: Group, state_file: Path, config_file: Pat
             f"no validation episode has {config.horizon_steps} steps of future, so no checkpoint could be chosen; "
             "lower --horizon-steps or collect longer episodes"
         )
+    if not math.isfinite(group.from_leader(lambda: trainer.baseline_m)):
+        trainer.close()
+        raise UserError(
+            f"no agent of the validation windows is there for all {config.horizon_steps} steps of future, so no "
+            "checkpoint could be chosen; lower --horizon-steps or use longer tracks"
+        )
     made = provenance(("torch", "numpy", "zarr", "safetensors"))
     with ExitStack() as stack:
         stack.callback(trainer.close)
@@ -171,6 +177,7 @@ def _run(trainer: Trainer, state_file: Path, made: dict[str, Any]) -> None:
             seen = trainer.read(terms)
             seen["steps_per_s"] = (trainer.step - since) / (time.perf_counter() - began)
             if trainer.due:
+                trainer.save(state_file)  # a kill during the validation, for want of memory say, loses no step
                 progress.say(_validate_and_save(trainer, writer, made))
                 trainer.save(state_file)
                 trainer.share_progress()
@@ -180,6 +187,11 @@ def _run(trainer: Trainer, state_file: Path, made: dict[str, Any]) -> None:
             shown = next((f"{k} {seen[k]:.3g}" for k in ("nll_rollout", "nll_one_step") if k in seen), "")
             progress.to(trainer.step, shown)
             began, since = time.perf_counter(), trainer.step
+        if trainer.step < config.steps:
+            progress.say(
+                f"stopped at step {trainer.step:,} of {config.steps:,}: {trainer.stale} validations without a better "
+                "score; with --resume and a larger --patience it goes on"
+            )
 
 
 def _validate_and_save(trainer: Trainer, writer: SummaryWriter, made: dict[str, Any]) -> str:
@@ -258,7 +270,7 @@ def _check_run_folder(config: TrainConfig, config_file: Path) -> None:
     known = as_object(content.get("stores"), f"{config_file}: stores")
     stores = {name: [known.get(str(path)) for path in old[name]] for name in ("data", "val_data")}
     moved = [name for name, contents in stores.items() if _are(getattr(config, name), contents)]
-    free = ("steps", "out", *config.without_effect, *moved)
+    free = ("steps", "patience", "out", *config.without_effect, *moved)
     changed = [name for name in now if old[name] != now[name] and name not in free]
     if changed:
         differences = ", ".join(f"{name} was {old[name]} and is now {now[name]}" for name in changed)

@@ -10,6 +10,9 @@ from predictor.graph import pair_mask
 from predictor.layers.state_codec import Residual, StateCodec, drift
 from predictor.scene import SceneSpec
 
+_MOST_PAIRS = 10_000_000
+"""Largest number of pairs of agents, over steps, whose distances are computed at once."""
+
 
 def typical_change(episodes: Sequence[Episode], spec: SceneSpec, residual: Residual) -> tuple[float, ...]:
     """Computes the root mean square of the change that the decoder predicts in one step, per feature [SI]."""
@@ -41,15 +44,17 @@ def typical_neighbour(episodes: Sequence[Episode], spec: SceneSpec) -> tuple[flo
     """
     axes, distances, speeds = spec.position_dim, [], []
     for episode in episodes:
-        states, valid = torch.from_numpy(episode.states), torch.from_numpy(episode.valid)
-        place = states[..., :axes]
-        apart = torch.cdist(place, place, compute_mode="donot_use_mm_for_euclid_dist")
-        found = apart.masked_fill(~pair_mask(valid), torch.inf).min(-1)
-        velocity = states[..., axes : 2 * axes]
-        other = velocity.gather(1, found.indices[..., None].expand_as(velocity))
-        near = found.values < torch.inf
-        distances.append(found.values[near])
-        speeds.append(torch.linalg.vector_norm(other - velocity, dim=-1)[near])
+        steps = max(1, _MOST_PAIRS // max(1, len(episode.ids)) ** 2)  # a whole recording has thousands of ids
+        whole = torch.from_numpy(episode.states), torch.from_numpy(episode.valid)
+        for states, valid in zip(*(t.split(steps) for t in whole), strict=True):
+            place = states[..., :axes]
+            apart = torch.cdist(place, place, compute_mode="donot_use_mm_for_euclid_dist")
+            found = apart.masked_fill(~pair_mask(valid), torch.inf).min(-1)
+            velocity = states[..., axes : 2 * axes]
+            other = velocity.gather(1, found.indices[..., None].expand_as(velocity))
+            near = found.values < torch.inf
+            distances.append(found.values[near])
+            speeds.append(torch.linalg.vector_norm(other - velocity, dim=-1)[near])
     if not sum(len(d) for d in distances):
         return ()
     return tuple(max(float(torch.cat(found).median()), 1e-2) for found in (distances, speeds))

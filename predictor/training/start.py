@@ -38,7 +38,7 @@ def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episo
     Raises:
         UserError: as `model_config`; or the checkpoint cannot be read, is of another model, or its scenes have other
             features, or an ego where the data's have none, or none where the data's have one; or only its spread
-            shall be trained, and it has none.
+            shall be trained, and it has none, or another horizon.
     """
     if not config.init:
         return build(config.model, spec, model_config(config, spec, episodes), config.horizon_steps)
@@ -53,7 +53,13 @@ def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episo
         return plain
     if not getattr(info.config, "num_modes", 0):
         raise UserError(f"only_spread needs a checkpoint with modes, and '{config.init}' has none; leave it out")
-    model: Any = build(info.model, spec, replace(info.config, spread_by_type=True), config.horizon_steps)
+    if config.horizon_steps != info.horizon_steps:
+        raise UserError(
+            f"only_spread keeps the horizon of '{config.init}', {info.horizon_steps} steps, got horizon_steps="
+            f"{config.horizon_steps}; leave it out"
+        )
+    # the checkpoint keeps its scenes, too: their frame is that of the forecasts around which the spread lies
+    model: Any = build(info.model, info.spec, replace(info.config, spread_by_type=True), config.horizon_steps)
     of_types = model.self_edges.spread_shift
     model.load_state_dict({"self_edges.spread_shift": of_types, **source.state_dict()})
     model.requires_grad_(False)

@@ -44,6 +44,8 @@ from predictor.training.start import initial_model
 
 VALIDATION_DRAWS = 5
 """Number of samples for model selection, of models without modes."""
+VALIDATION_PAIRS = 1_000_000
+"""Largest number of pairs of agents, over windows and samples, in one forward of a validation; limits the memory."""
 LOG_EVERY = 25
 """Number of steps between two points of the training curves; on a CUDA device also between readings of results."""
 
@@ -87,22 +89,32 @@ def load_data(config: TrainConfig) -> TrainingData:
         train = [_windows(config, e, spec, validation=False) for e in chosen[:cut]]
         val = [_windows(config, e, spec, validation=True) for e in chosen[cut:]]
         return TrainingData(spec, sources, train, val, [e for part in chosen[:cut] for e in part])
-    train, val, episodes = [], [], []
-    for path, store in zip(config.data, stores, strict=True):
+    train, val, episodes, splits = [], [], [], []
+    for store in stores:
         group = siblings(store.episodes)
         parts = split_episodes(int(group[-1]) + 1, config.val_fraction, config.seed)
-        kept, held_out = (np.flatnonzero(np.isin(group, part)).tolist() for part in parts)
-        kept = kept[: config.max_episodes or None]
+        splits.append([np.flatnonzero(np.isin(group, part)).tolist() for part in parts])
+    # a store of branches may have the seeds of another store: what is held out in one is not trained on in another
+    taken = {_key(store, i) for store, (_, held_out) in zip(stores, splits, strict=True) for i in held_out}
+    for path, store, (kept, held_out) in zip(config.data, stores, splits, strict=True):
+        mine = {_key(store, i) for i in held_out}
+        kept = [i for i in kept if _key(store, i) not in taken - mine][: config.max_episodes or None]
         if not kept or not held_out:
             raise UserError(
                 f"{address(path)}: {len(store.episodes)} episodes split into {len(kept)} for training and "
                 f"{len(held_out)} for validation; both need at least one, so collect more"
             )
-        mine = [store.episodes[i] for i in kept]
-        train.append(_windows(config, mine, spec, validation=False))
+        chosen_here = [store.episodes[i] for i in kept]
+        train.append(_windows(config, chosen_here, spec, validation=False))
         val.append(_windows(config, [store.episodes[i] for i in held_out], spec, validation=True))
-        episodes += mine
+        episodes += chosen_here
     return TrainingData(spec, sources, train, val, episodes)
+
+
+def _key(store: EpisodeStore, number: int) -> tuple[str, int, str]:
+    """Returns what says which episode of which simulator it is, branches of it included."""
+    episode = store.episodes[number]
+    return store.info.source, episode.seed, episode.label
 
 
 def _check_labels(config: TrainConfig, stores: Sequence[EpisodeStore]) -> None:
@@ -201,7 +213,7 @@ class Trainer:
             Loss, gradient norm and the objective's terms, on the device; a later step may overwrite them.
 
         Raises:
-            UserError: the loss is not finite (on a CUDA device, `read` raises this).
+            UserError: the loss or its gradient is not finite (on a CUDA device, `read` raises this).
         """
         now = self.plan(self.step)
         batch = self.batches.batch(now)
@@ -258,19 +270,22 @@ class Trainer:
             exact = output.float()
             sums = {"total": self.group.total} if self.group.connected else {}
             loss, terms = window_loss(self.model, batch, exact, self.config, self._kl_scale, self._scales, **sums)
+            loss = weight * loss
             if self._shifts is not None and rollout_steps:
                 shift = self._shifts.loss(self.model, self.step, rollout_steps, self._scales, **more)
                 loss, terms = loss + self.config.shift_weight * shift, terms | {"shift": shift.detach()}
             self.optimizer.zero_grad(set_to_none=True)
-            (weight * loss).backward()
+            loss.backward()
         found = {"loss": loss.detach(), **terms}
         if self.group.connected:
             found = self.group.add_gradients(list(self.model.parameters()), found)
         if self._checks_each_loss and not torch.isfinite(found["loss"]):
             raise UserError(f"the loss is {float(found['loss'])} at step {self.step}; lower --lr or check the data")
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.clip_norm)
+        if self._checks_each_loss and not torch.isfinite(norm):
+            raise UserError(f"the gradient is {float(norm)} at step {self.step}; lower --lr or check the data")
         self.optimizer.step()
-        self._finite.logical_and_(torch.isfinite(found["loss"]))
+        self._finite.logical_and_(torch.isfinite(found["loss"]) & torch.isfinite(norm))
         return {"grad_norm": norm, **found}
 
     def _replayed(
@@ -325,8 +340,10 @@ class Trainer:
         self.model.eval()
         self.validated = self.step
         samples = self.num_modes if self.num_modes > 1 else VALIDATION_DRAWS
+        most = max(1, min(256, VALIDATION_PAIRS // (self.data.spec.max_agents**2 * samples)))
         outcomes = [o for w, i in self._val_indices() for o in run_windows(
-            self.model, w, i, self.config.horizon_steps, samples, device=str(self.device))]  # fmt: skip
+            self.model, w, i, self.config.horizon_steps, samples, batch_size=most, device=str(self.device)
+        )]  # fmt: skip
         return summarise(self.config.model, outcomes), fitted_std_m(outcomes)
 
     def save(self, path: Path) -> None:

@@ -376,6 +376,57 @@ def test_resumed_run_remembers_its_best(tiny: None, circles: Path, tmp_path: Pat
     assert load_checkpoint(out)[1].provenance["result"]["step"] == 1
 
 
+def test_a_run_that_stopped_early_says_so_and_goes_on_with_more_patience(
+    tiny: None, circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    validate = Trainer.validate
+
+    def never_better(trainer: Trainer) -> Any:
+        accuracy, std_m = validate(trainer)
+        return replace(accuracy, energy_m=1.0), std_m
+
+    monkeypatch.setattr(Trainer, "validate", never_better)
+    settings = config(circles, tmp_path / "run", steps=20, eval_every=1, patience=2)
+    train(settings)
+    why = "stopped at step 3 of 20: 2 validations without a better score; with --resume and a larger --patience it goes"
+    assert why in " ".join(capsys.readouterr().out.split())
+    train(replace(settings, resume=True, steps=30))
+    assert state(tmp_path / "run")["step"] == 3 and "stopped at step 3 of 30" in capsys.readouterr().out
+    train(replace(settings, resume=True, steps=30, patience=4))
+    assert state(tmp_path / "run")["step"] == 5
+
+
+def test_a_kill_during_a_validation_loses_no_step(tiny: None, circles: Path, tmp_path: Path):
+    """It takes the most memory, and begins after many steps."""
+
+    def killed(trainer: Trainer) -> Any:
+        raise MemoryError
+
+    settings = config(circles, tmp_path / "run", steps=4, eval_every=2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Trainer, "validate", killed)
+        with pytest.raises(MemoryError):
+            train(settings)
+    assert state(tmp_path / "run")["step"] == 2 and state(tmp_path / "run")["validated"] == 0
+    whole = load_checkpoint(train(replace(settings, out=tmp_path / "whole")))[0]
+    resumed = load_checkpoint(train(replace(settings, resume=True)))[0]
+    assert all(torch.equal(a, b) for a, b in zip(whole.parameters(), resumed.parameters(), strict=True))
+
+
+def test_tracks_shorter_than_the_horizon_are_refused_before_a_step(tiny: None, tmp_path: Path):
+    """The episodes are long enough, but nobody stays for the whole horizon."""
+    episodes = []
+    for seed in range(6):
+        whole = circling_episode(seed, steps=9)
+        there = np.arange(9)[:, None] // 3 == np.arange(3)
+        episodes.append(replace(whole, states=np.repeat(whole.states[:, :1], 3, axis=1) * there[..., None],
+                                valid=there, ids=np.arange(3)))  # fmt: skip
+    write_store(tmp_path / "data", StoreInfo(spec(has_ego=False), "short tracks"), episodes)
+    with pytest.raises(UserError, match="no agent of the validation windows is there for all 4 steps of future"):
+        train(config(tmp_path / "data", tmp_path / "run", horizon_steps=4))
+    assert not (tmp_path / "run" / "train_state.pt").exists()
+
+
 # --- kill -9 ----------------------------------------------------------------------------------------------------------
 
 KILLED = """

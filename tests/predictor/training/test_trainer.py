@@ -18,6 +18,7 @@ from predictor.models import build, name_of
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
 from predictor.support.errors import UserError
 from predictor.train import train
+from predictor.training import fitted_scales
 from predictor.training import trainer as trainer_module
 from predictor.training.config import TrainConfig
 from predictor.training.fitted_scales import typical_change, typical_neighbour, typical_spread
@@ -491,6 +492,72 @@ def test_only_the_spread_needs_roll_outs_and_a_checkpoint_that_has_one(circles: 
     train(config(circles, tmp_path / "first"))
     with pytest.raises(UserError, match="only_spread needs a checkpoint with modes, and '.*first' has none"):
         made(config(circles, tmp_path / "second", init=str(tmp_path / "first"), only_spread=True))
+
+
+def test_the_spread_keeps_the_horizon_and_the_scenes_of_its_checkpoint(circles: Path, tmp_path: Path):
+    modes = ("num_modes=3", "rollout_graph=frozen")
+    _, info = load_checkpoint(train(config(circles, tmp_path / "first", set=modes)))
+    only_spread = config(circles, tmp_path / "second", init=str(tmp_path / "first"), only_spread=True)
+    with pytest.raises(UserError, match="only_spread keeps the horizon of '.*first', 2 steps, got horizon_steps=1"):
+        made(replace(only_spread, horizon_steps=1))
+    framed = replace(spec(), frame=("centroid", "centroid"))
+    write_store(tmp_path / "framed", StoreInfo(framed, "circles"), [circling_episode(i) for i in range(6)])
+    assert made(replace(only_spread, data=(tmp_path / "framed",))).model.spec == info.spec
+
+
+def test_an_episode_held_out_in_one_store_is_not_trained_on_in_another(tmp_path: Path):
+    """Plain episodes and branches of the same seeds, and a store that counts twice."""
+    info = StoreInfo(spec(), "circles")
+    write_store(tmp_path / "plain", info, [circling_episode(i) for i in range(10)])
+    write_store(tmp_path / "branches", info, [circling_episode(i, steps=12) for i in range(8)])
+    write_store(tmp_path / "other", StoreInfo(spec(), "elsewhere"), [circling_episode(i) for i in range(10)])
+    names = ("plain", "branches", "plain", "other")
+    data = load_data(replace(config(tmp_path, tmp_path / "run"), data=tuple(tmp_path / name for name in names)))
+    counts = [len(windows.flat.steps) for windows in data.val]
+    assert counts == [3, 3, 3, 3]
+    alone = [load_data(config(tmp_path / name, tmp_path / "run")) for name in names]
+    held_out = [
+        set(range(n)) - {e.seed for e in one.train_episodes} for n, one in zip((10, 8, 10, 10), alone, strict=True)
+    ]
+    trained = [len(windows.flat.steps) for windows in data.train]
+    left = [len(set(range(n)) - held_out[0] - held_out[1]) for n in (10, 8, 10)]
+    assert trained == [*left, 7] and held_out[0] != held_out[1] and trained[0] < 7
+
+
+@pytest.mark.parametrize("pairs", [1, 10_000_000])
+def test_neighbours_are_found_in_parts(pairs: int, monkeypatch: pytest.MonkeyPatch):
+    episodes = [circling_episode(i, agents=4) for i in range(2)]
+    whole = typical_neighbour(episodes, spec())
+    monkeypatch.setattr(fitted_scales, "_MOST_PAIRS", pairs)
+    assert typical_neighbour(episodes, spec()) == whole
+
+
+def test_a_validation_forwards_as_many_windows_as_its_pairs_allow(
+    circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    trainer, sizes = made(config(circles, tmp_path / "run", val_windows=10)), list[int]()
+    observe, agents = trainer.model.observe, trainer.data.spec.max_agents
+    whole, _ = trainer.validate()
+
+    def watched(memory: Any, states: Tensor, valid: Tensor) -> Any:
+        sizes.append(len(states))
+        return observe(memory, states, valid)
+
+    monkeypatch.setattr(trainer.model, "observe", watched)
+    monkeypatch.setattr(trainer_module, "VALIDATION_PAIRS", 3 * agents**2 * trainer_module.VALIDATION_DRAWS)
+    parts, _ = trainer.validate()
+    assert max(sizes) == 3 and parts.ade_m == pytest.approx(whole.ade_m) and parts.agents == whole.agents
+
+
+def test_a_gradient_that_is_not_finite_changes_no_weight(
+    circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    trainer = made(config(circles, tmp_path / "run"))
+    before = {name: value.clone() for name, value in trainer.model.state_dict().items()}
+    monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", lambda *given: torch.tensor(torch.nan))
+    with pytest.raises(UserError, match="the gradient is nan at step 0; lower --lr or check the data"):
+        trainer.train_step()
+    assert all(torch.equal(value, before[name]) for name, value in trainer.model.state_dict().items())
 
 
 def test_a_run_does_not_go_on_from_a_checkpoint_that_was_trained_anew(circles: Path, tmp_path: Path):
