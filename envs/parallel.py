@@ -144,6 +144,11 @@ class ForecastParallelEnv(ForecastWrapper, RunningCopy, BaseParallelWrapper):
             raise ProtocolError("there is no forecast yet; call reset() first")
         return forecast
 
+    @property
+    def observation_spaces(self) -> dict[str, gym.Space]:
+        """Space of each agent's observation, by its name."""
+        return {agent: self.observation_space(agent) for agent in self.possible_agents}
+
     def observation_space(self, agent: str) -> gym.Space:
         """Returns the space of the agent's own observation and the forecast entries, the same object at each call.
 

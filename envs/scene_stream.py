@@ -12,9 +12,9 @@ from torch import Tensor
 
 from envs.arms import Arm
 from predictor.forecaster import Forecaster
-from predictor.online import MAX_ROWS, OnlineForecaster
+from predictor.online import MAX_ROWS, Chosen, OnlineForecaster
 from predictor.scene import Forecast, SceneBatch
-from predictor.scene_checks import MOST_STEPS
+from predictor.scene_checks import MOST_STEPS, chosen_envs
 from predictor.support.config_checks import check_at_least, check_at_most, check_types
 from predictor.support.memory import check_count
 from predictor.support.runtime import resolve_device
@@ -149,12 +149,13 @@ class SceneStream:
             if own is not None:
                 self._noise.restart(env, own)
 
-    def reset(self, envs: Int[np.ndarray, " some"] | None = None) -> None:
+    def reset(self, envs: Chosen | None = None) -> None:
         """Forgets the history of some environments (all, if None)."""
         self._online.reset(envs)
 
-    def take(self, scenes: SceneBatch, envs: Int[np.ndarray, " some"] | None = None) -> Forecast:
+    def take(self, scenes: SceneBatch, envs: Chosen | None = None) -> Forecast:
         """Takes in one scene for each environment (of `envs`, if given); returns their forecasts."""
+        envs = None if envs is None else chosen_envs(envs, len(self._noise))
         self._online.observe(self._given(scenes), envs)
         forecast = self._forecast_for(self._noise.of(np.arange(len(self._noise)) if envs is None else envs))
         if envs is None:
@@ -179,6 +180,7 @@ class SceneStream:
             successors: scene that opens the next episode of each of `ended`.
             seeds: seed of the noise of each next episode; None, or none at all, goes on with the noise of before.
         """
+        ended = chosen_envs(ended, len(self._noise))
         self._online.observe_boundary(self._given(scenes), ended, self._given(successors))
         forecast = self._forecast_for(self._noise.over(ended, seeds))
         kept = np.arange(len(scenes))

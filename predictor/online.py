@@ -22,11 +22,13 @@ from predictor.forecaster import Belief, Forecaster, Memory, check_empty, check_
 from predictor.graph import NO_AGENT
 from predictor.noise import Noise
 from predictor.scene import PADDING_ID, Forecast, SceneBatch
-from predictor.scene_checks import check_batch, check_ids, check_request, check_states
+from predictor.scene_checks import check_batch, check_ids, check_request, check_states, chosen_envs
 from predictor.support.errors import ProtocolError, UserError
 from predictor.support.runtime import resolve_device
 from predictor.what_if import check_plans, rollout_plans
 
+Chosen = Int[np.ndarray, " some"] | Bool[np.ndarray, " envs"]
+"""Some of the environments: their indices, or a mask."""
 MAX_ROWS = 1024
 """Largest number of scenes in one call of a forecaster."""
 
@@ -81,10 +83,14 @@ class OnlineForecaster:
         twin._ids = self._ids.copy()
         return twin
 
-    def reset(self, envs: Int[np.ndarray, " some"] | None = None) -> None:
-        """Clears the history of some environments (all, if None); the others keep theirs."""
+    def reset(self, envs: Chosen | None = None) -> None:
+        """Clears the history of some environments (all, if None); the others keep theirs.
+
+        Raises:
+            UserError: an environment that is not there, or one twice.
+        """
         use_one_thread_after_fork()
-        chosen = np.arange(len(self._ids)) if envs is None else np.asarray(envs, dtype=np.int64)
+        chosen = np.arange(len(self._ids)) if envs is None else chosen_envs(envs, len(self._ids))
         if not len(chosen):
             return
         self._beliefs = []  # a forecast of what is forgotten would have no meaning
@@ -94,18 +100,20 @@ class OnlineForecaster:
         self._memory = self._memory.replace_envs(index, fresh)
 
     @torch.inference_mode()
-    def observe(self, scenes: SceneBatch, envs: Int[np.ndarray, " some"] | None = None) -> None:
+    def observe(self, scenes: SceneBatch, envs: Chosen | None = None) -> None:
         """Observes one scene per environment, or one for each of `envs`; the next `forecast` has as many entries.
 
         Raises:
-            UserError: the batch has another shape or type, states that are not finite, or an id twice in a scene.
+            UserError: the batch has another shape or type, states that are not finite, or an id twice in a scene; an
+                environment that is not there, or one twice.
         """
         use_one_thread_after_fork()
+        envs = None if envs is None else chosen_envs(envs, len(self._ids))
         self._check(scenes, len(self._ids) if envs is None else len(envs))
         if envs is None:
             self._memory, self._ids = self._take(scenes, self._ids, self._memory)
             return
-        index = torch.from_numpy(np.asarray(envs, dtype=np.int64)).to(self.device)
+        index = torch.from_numpy(envs).to(self.device)
         memory, self._ids[envs] = self._take(scenes, self._ids[envs], self._memory.select(index))
         self._memory = self._memory.replace_envs(index, memory)
 
@@ -118,8 +126,8 @@ class OnlineForecaster:
         has `len(scenes) + len(ended)` entries, the successors last.
         """
         use_one_thread_after_fork()
-        ended = np.asarray(ended, dtype=np.int64)
         envs = len(self._ids)
+        ended = chosen_envs(ended, envs)
         self._check(scenes, envs)
         self._check(successors, len(ended))
         fresh = self._fresh.select(torch.zeros(len(ended), dtype=torch.long, device=self.device))
@@ -204,7 +212,8 @@ class OnlineForecaster:
         if plans is not None:  # the axis of plans
             ego_now, absent = ego_now[:, None], absent[:, None]
         xy = (futures.states[..., :axes] - ego_now).masked_fill(absent, 0.0)
-        if not xy.isfinite().all():
+        rest = (t for t in (futures.mode_probs, futures.scale) if t is not None)
+        if not (xy.isfinite().all() and all(t.isfinite().all() for t in rest)):
             raise UserError("the forecaster forecasts numbers that are not finite; its weights are damaged or diverged")
         missing = self._ids.shape[1] - belief.valid.shape[1]
         senders = belief.senders

@@ -245,7 +245,7 @@ class SceneBatch:
         """Stacks scenes of equal size."""
         return SceneBatch(
             np.stack([s.states for s in scenes]),
-            np.stack([s.ids for s in scenes]),
+            np.stack([np.asarray(s.ids, dtype=np.int64) for s in scenes]),
             np.stack([s.valid for s in scenes]),
             np.array([s.heading_rad for s in scenes], dtype=np.float64),
         )

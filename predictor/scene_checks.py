@@ -1,10 +1,12 @@
 """Checks of batches of scenes and of what is asked of a forecast, cheap enough for every step."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from predictor.scene import PADDING_ID, SceneBatch
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, short
 from predictor.support.memory import check_memory
 
 MOST_STEPS = 100_000
@@ -83,3 +85,20 @@ def check_request(horizon_steps: object, num_samples: object, values_each: int) 
         raise UserError(f"horizon_steps must be at most {MOST_STEPS:,}, got {horizon_steps:,}")
     needed = 4 * int(horizon_steps) * int(num_samples) * values_each
     check_memory(needed, f"a forecast with num_samples={num_samples:,}", "ask for fewer samples or steps")
+
+
+def chosen_envs(envs: Any, count: int) -> Int[np.ndarray, " some"]:
+    """Returns the indices of some of `count` environments, of a mask too.
+
+    Raises:
+        UserError: a mask of another size, an index that is not there, or one twice.
+    """
+    given = np.asarray(envs)
+    if given.dtype == np.bool_:
+        if given.shape != (count,):
+            raise UserError(f"a mask of environments needs the shape ({count},), got {given.shape}")
+        return np.flatnonzero(given)
+    chosen = given.astype(np.int64)
+    if ((chosen < 0) | (chosen >= count)).any() or len(np.unique(chosen)) != len(chosen):
+        raise UserError(f"envs must be different numbers from 0 to {count - 1}, got {short(given.tolist())}")
+    return chosen

@@ -1,6 +1,8 @@
 """Interface of plan models, and what they return."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from numbers import Real
+from types import SimpleNamespace
 from typing import Any, Protocol, cast, runtime_checkable
 
 import gymnasium as gym
@@ -88,10 +90,11 @@ def checked_plans(
         UserError: plans of another shape, not finite numbers, not one action for each plan and step, no size, other
             actions than the model names, or far from the ego, as in a frame with another origin.
     """
-    plans, count = model.plans(env, horizon_steps), len(model.names)
+    proposed, count = model.plans(env, horizon_steps), len(model.names)
     source = f"plan model {type(model).__name__}"
-    if not hasattr(plans, "states") or not hasattr(plans, "actions"):
-        raise UserError(f"{source}: plans must give Plans (envs.plans), got {type(plans).__name__}")
+    if not hasattr(proposed, "states") or not hasattr(proposed, "actions"):
+        raise UserError(f"{source}: plans must give Plans (envs.plans), got {type(proposed).__name__}")
+    plans = _with_arrays(proposed, source)
     wanted = {
         "states": (count, horizon_steps, num_features),
         "rewards": (count, horizon_steps),
@@ -108,6 +111,8 @@ def checked_plans(
             raise UserError(f"{source}: {name} must be numbers, got {np.asarray(values).dtype}")
         if not np.isfinite(values).all():
             raise UserError(f"{source}: {name} must be finite, got NaN or infinity")
+    if plans.crashed is not None and plans.crashed.dtype != np.bool_:
+        raise UserError(f"{source}: crashed must be true or false (dtype bool), got {plans.crashed.dtype}")
     if count < 1 or len(plans.actions) != count:
         raise UserError(f"{source}: each of its {count} plans needs one action, got {len(plans.actions)}")
     size = np.asarray(plans.size_m)
@@ -119,14 +124,37 @@ def checked_plans(
             f"{source}: its attribute actions must be those of its plans, in the same order, got {short(fixed, 100)} "
             f"and plans that begin with {short(plans.actions, 100)}; leave it out where they change"
         )
-    if not 0 <= plans.margin_m < np.inf:
+    if not isinstance(plans.margin_m, Real) or not 0 <= float(plans.margin_m) < np.inf:
         raise UserError(f"{source}: margin_m must be finite and at least 0, got {plans.margin_m}")
-    later = None if plans.later_actions is None else [len(actions) for actions in plans.later_actions]
-    if later not in (None, [horizon_steps - 1] * count):
-        raise UserError(f"{source}: later_actions need {horizon_steps - 1} for each of {count} plans, got {later}")
+    later = None if plans.later_actions is None else [np.shape(actions)[:1] for actions in plans.later_actions]
+    if later not in (None, [(horizon_steps - 1,)] * count):
+        counts = [int(np.prod(size)) for size in later or ()]
+        raise UserError(f"{source}: later_actions need {horizon_steps - 1} for each of {count} plans, got {counts}")
     if scene is not None and spec is not None:
         _check_begin(plans.states, scene, spec, source)
-    return plans
+    return Plans(**vars(plans))
+
+
+def _with_arrays(plans: Any, source: str) -> SimpleNamespace:
+    """Returns the fields of `Plans` with arrays where a model gave lists, and tuples of actions; no shape is checked.
+
+    Raises:
+        UserError: rows of unequal length, or actions that cannot be counted.
+    """
+    given: dict[str, Any] = {field.name: getattr(plans, field.name, field.default) for field in fields(Plans)}
+    for name in ("states", "rewards", "crash_rewards", "crashed"):
+        if given[name] is not None:
+            try:
+                given[name] = np.asarray(given[name])
+            except ValueError as error:
+                raise UserError(f"{source}: {name} must be an array: {error}") from error
+    for name in ("actions", "later_actions"):
+        if given[name] is not None or name == "actions":
+            try:
+                given[name] = tuple(given[name])
+            except TypeError as error:
+                raise UserError(f"{source}: {name} must be one for each plan, got {short(given[name], 100)}") from error
+    return SimpleNamespace(**given)
 
 
 def _same(fixed: Any, actions: tuple[Any, ...]) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from envs.plans.base import PlanModel, Plans, checked_model
-from predictor.support.errors import UserError
+from predictor.support.errors import UserError, short
 
 PLANS_INFO = "ego_plans"
 """Key of an info that carries the plans of its environment."""
@@ -128,7 +128,7 @@ def ask_for_plans(
     except AttributeError as error:
         raise UserError(
             f"{wrapper} with what_if or an oracle needs environments that make plans, in SceneObservation; "
-            f"{type(source).__name__} has none (EnvPool has no plan model): leave what_if out"
+            f"{type(source).__name__} has none (EnvPool has no plan model): leave what_if out ({short(error)})"
         ) from error
     for answer in answers:
         if isinstance(answer, UserError):

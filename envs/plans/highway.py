@@ -141,6 +141,11 @@ class _Alone:
         self._env: Any = object.__new__(type(env))
         self._env.__dict__.update(env.__dict__)
         self._env.road, self._env.controlled_vehicles = self.road, [self.ego]
+        for name in ("observation_type", "observation_type_parking"):  # which parking's reward looks through
+            if name in vars(env):
+                looks = copy.copy(getattr(env, name))
+                looks.env, looks.observer_vehicle = self._env, self.ego
+                setattr(self._env, name, looks)
         self.action_type: Any = copy.copy(env.action_type)
         self.action_type.env, self.action_type.controlled_vehicle = self._env, self.ego
         if type(self.ego) in _MOVE_WITHOUT_LANE:

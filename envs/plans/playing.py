@@ -109,12 +109,22 @@ def _played(
             if ended:
                 yield None
                 continue
+            if goes_on:
+                _go_on(env)
             observation, _, terminated, truncated, _ = env.step(action)
             show(reader, observation)
             ended = bool(terminated or truncated) and not goes_on
             yield reader.read_all(env)
 
     return followed(scene, reader.spec.dt_s, moments())
+
+
+def _go_on(env: gym.Env) -> None:
+    """Lets wrappers that count an episode's end (Stable-Baselines3's `Monitor`) step on."""
+    while isinstance(env, gym.Wrapper):
+        if "needs_reset" in vars(env):
+            env.needs_reset = False  # type: ignore[attr-defined]
+        env = env.env
 
 
 def _leave_undrawn(copy: Any) -> None:

@@ -315,10 +315,15 @@ def pad_multiagent_scene(
         source: name of the reader, for messages.
 
     Raises:
-        UserError: more agents than `max_agents`, or `full` breaks the contract of a scene.
+        UserError: more agents than `max_agents`, absent ones, another number of headings, or `full` breaks the
+            contract of a scene.
     """
     full.check(source, spec)
     count = len(full.ids)
+    if not full.valid.all():
+        raise UserError(f"{source}: a full scene holds only agents that are there, {int((~full.valid).sum())} are not")
+    if np.shape(heading_rad) != (count,):
+        raise UserError(f"{source}: {count} agents need as many headings, got shape {np.shape(heading_rad)}")
     if count > spec.max_agents:
         raise UserError(f"{source}: {count} agents do not fit max_agents={spec.max_agents}; raise max_agents")
     if count == spec.max_agents:

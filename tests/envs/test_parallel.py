@@ -697,3 +697,25 @@ def test_registered_envs_run_with_a_dgvae(env_id: str, tmp_path: Path):
     check_episodes_repeat(lambda: ForecastParallelEnv(short_env(env_id), path, num_samples=2))
     last = play(ForecastParallelEnv(short_env(env_id), path))[-1]
     assert all(observation["valid"].any() and observation["forecast"].any() for observation in last.values())
+
+
+@pytest.mark.parametrize(
+    ("valid", "headings", "message"),
+    [
+        ([True, False], 2, "a full scene holds only agents that are there, 1 are not"),
+        ([True, True], 3, r"2 agents need as many headings, got shape \(3,\)"),
+    ],
+)
+def test_a_scene_that_is_not_full_is_not_padded(valid: list[bool], headings: int, message: str):
+    full = Scene(np.zeros((2, 4)), np.arange(2), np.array(valid))
+    with pytest.raises(UserError, match=f"Mine: {message}"):
+        pad_multiagent_scene(full, {"a": 0}, np.zeros(headings), WORLD, "Mine")
+
+
+def test_every_space_is_the_agent_s_with_forecasts():
+    env = ForecastParallelEnv(make_multiagent_env("simple_tag_v3"), "constant-velocity")
+    spaces = env.observation_spaces
+    assert spaces == {agent: env.observation_space(agent) for agent in env.possible_agents}
+    observations, _ = env.reset(seed=0)
+    assert all(spaces[agent].contains(shown) for agent, shown in observations.items())
+    env.close()

@@ -197,6 +197,10 @@ def test_a_forecaster_that_gives_something_else_is_named_in_a_line():
         (lambda futures: Futures(futures.states[:, :0]), "was asked for 1 samples of 5 steps and gave 0 of 5"),
         (lambda futures: futures.states, "rollout of a forecaster must return Futures, got Tensor"),
         (lambda futures: Futures(futures.states * torch.nan), "forecasts numbers that are not finite; its weights are"),
+        (
+            lambda futures: Futures(futures.states, torch.full(futures.states.shape[:3], torch.nan)),
+            "forecasts numbers that are not finite; its weights are",
+        ),
     ):
         forecaster = Odd(spec())
         forecaster.change = change
@@ -262,6 +266,35 @@ def test_reset_of_one_env_changes_that_env_only(forecaster: DGVAE):
     assert_same(envs_of(ours, [0, 2]), envs_of(expected, [0, 2]), tolerance=1e-6)
     assert_same(envs_of(ours, [1]), after(forecaster, then))
     assert differ(ours, expected, env=1) > 1e-2
+
+
+def test_a_mask_chooses_the_environments_that_it_marks(forecaster: DGVAE):
+    scenes = batch(*(scene(states_of(seed, 0, 1), AGENTS) for seed in range(ENVS)))
+    mask = np.arange(ENVS) == ENVS - 1
+    shown = []
+    for chosen in (mask, np.flatnonzero(mask)):
+        stream = online(forecaster, ENVS)
+        stream.observe(scenes)
+        stream.reset(chosen)
+        stream.observe(scenes[np.flatnonzero(mask)], chosen)
+        stream.observe(scenes)
+        shown.append(stream.forecast().xy)
+    assert torch.equal(*shown)
+
+
+@pytest.mark.parametrize(
+    ("envs", "message"),
+    [
+        (np.array([True]), rf"a mask of environments needs the shape \({ENVS},\), got \(1,\)"),
+        (np.array([ENVS]), rf"envs must be different numbers from 0 to {ENVS - 1}, got \[{ENVS}\]"),
+        (np.array([-1]), r"envs must be different numbers from 0 to .*, got \[-1\]"),
+        (np.array([0, 0]), r"envs must be different numbers from 0 to .*, got \[0, 0\]"),
+    ],
+)
+def test_environments_that_are_not_there_are_refused(forecaster: DGVAE, envs: np.ndarray, message: str):
+    stream = online(forecaster, ENVS)
+    with pytest.raises(UserError, match=message):
+        stream.reset(envs)
 
 
 def test_reset_of_all_envs(forecaster: DGVAE):

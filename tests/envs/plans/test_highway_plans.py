@@ -189,12 +189,13 @@ class TwoPlans:
 
 
 def given(
-    states: np.ndarray,
-    actions: tuple[int, ...],
+    states: Any,
+    actions: Any,
     rewards: np.ndarray | None = None,
     later: Any = None,
-    margin_m: float = 0.0,
+    margin_m: Any = 0.0,
     size_m: Any = (5.0, 2.0),
+    crashed: Any = None,
 ) -> Any:
     """What a careless model may return; `Plans` itself refuses such shapes while shapes are checked."""
     return SimpleNamespace(
@@ -202,7 +203,7 @@ def given(
         actions=actions,
         rewards=rewards,
         crash_rewards=None,
-        crashed=None,
+        crashed=crashed,
         later_actions=later,
         margin_m=margin_m,
         size_m=size_m,
@@ -234,11 +235,38 @@ def test_a_registered_model_serves_its_class_and_others_are_refused(monkeypatch:
         (given(np.zeros((2, 3, 4)), (0, 1), size_m=5.0), "size_m must be length and width .*got 5.0"),
         (given(np.zeros((2, 3, 4)), (0,)), "each of its 2 plans needs one action, got 1"),
         (given(np.zeros((2, 3, 4)), (0, 1), np.zeros((2, 2))), r"rewards need the shape \(2, 3\), got \(2, 2\)"),
+        (given(np.zeros((2, 3, 4)), (0, 1), margin_m=None), "margin_m must be finite and at least 0, got None"),
+        (given(np.zeros((2, 3, 4)), None), "actions must be one for each plan, got None"),
+        (given(np.zeros((2, 3, 4)), (0, 1), later=5), "later_actions must be one for each plan, got 5"),
+        (given(np.zeros((2, 3, 4)), (0, 1), later=(1, 2)), r"later_actions need 2 for each of 2 plans, got \[1, 1\]"),
+        (given([[[0.0] * 4] * 3, [[0.0] * 4] * 2], (0, 1)), "states must be an array: "),
+        (
+            given(np.zeros((2, 3, 4)), (0, 1), crashed=np.zeros((2, 3), np.int64)),
+            "crashed must be .* bool.*, got int64",
+        ),
     ],
 )
 def test_plans_that_do_not_fit_are_refused(found: Any, message: str):
     with pytest.raises(UserError, match=f"plan model TwoPlans: {message}"):
         checked_plans(TwoPlans(found), Blank(), 3, 4)
+
+
+def test_lists_are_arrays():
+    plans = checked_plans(TwoPlans(given([[[0.0] * 4] * 3] * 2, [0, 1], crashed=[[False] * 3] * 2)), Blank(), 3, 4)
+    assert isinstance(plans, Plans) and plans.actions == (0, 1)
+    assert isinstance(plans.states, np.ndarray) and plans.crashed is not None and plans.crashed.dtype == np.bool_
+
+
+def test_rewards_of_parking_are_those_of_the_plan():
+    """Its reward looks through an observation that knows the environment."""
+    env = make_env("parking-v0")
+    env.reset(seed=10)
+    plans = HighwayPlans(env).plans(env, 4)
+    assert plans.rewards is not None and np.ptp(plans.rewards, axis=1).max() > 0.005
+    best = int(np.argmax(np.abs(plans.rewards[:, 0] - plans.rewards[:, 0].mean())))
+    _, reward, *_ = env.step(plans.actions[best])
+    assert reward == pytest.approx(plans.rewards[best, 0], abs=1e-6)
+    env.close()
 
 
 def test_the_order_of_actions_is_that_of_the_plans():
@@ -250,7 +278,7 @@ def test_the_order_of_actions_is_that_of_the_plans():
         checked_plans(Named(found), Blank(), 3, 4)
     for same in ((0, 1), [0, 1], np.array([0, 1]), None):
         Named.actions = same
-        assert checked_plans(Named(found), Blank(), 3, 4) is found
+        assert checked_plans(Named(found), Blank(), 3, 4).actions == found.actions
     Named.actions = (0,)
     with pytest.raises(UserError, match="its attribute actions must be those of its plans"):
         checked_plans(Named(found), Blank(), 3, 4)

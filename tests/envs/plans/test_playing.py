@@ -1,5 +1,6 @@
 """True futures: what a copy of the simulator does is what then happens."""
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.utils import EzPickle
 from highway_env.envs.common.observation import LidarObservation, OccupancyGridObservation
+from stable_baselines3.common.env_util import make_vec_env
 
 from envs import ForecastObservation, make_env
 from envs.arms import Arm
@@ -48,6 +50,26 @@ def test_the_oracle_is_what_then_happens(env_id: str, plan: int):
             break
     assert moved > 3
     env.close()
+
+
+def test_a_wrapper_that_counts_the_end_of_an_episode_lets_copies_go_on():
+    """Stable-Baselines3's Monitor refuses steps after the end, and highway-env's copies are played past it."""
+    venv = VecForecast(
+        make_vec_env("highway-fast-v0", 1, wrapper_class=SceneObservation, seed=0), "constant-velocity",
+        arm=Arm("oracle"),
+    )  # fmt: skip
+    venv.reset()
+    for _ in range(6):
+        observation = venv.step(np.array([3]))[0]
+    assert np.isfinite(observation["forecast"]).all()
+    venv.close()
+
+
+def test_an_environment_that_cannot_be_copied_is_a_sentence(tmp_path: Path):
+    venv = make_vec_env("highway-fast-v0", 1, wrapper_class=SceneObservation, monitor_dir=str(tmp_path))
+    with pytest.raises(UserError, match="the environment cannot be copied, which .* need: cannot pickle"):
+        VecForecast(venv, "constant-velocity", arm=Arm("oracle")).reset()
+    venv.close()
 
 
 def test_plans_have_different_futures_of_the_others():
