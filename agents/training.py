@@ -112,6 +112,8 @@ class TrainingPlan:
 def train(plan: TrainingPlan, run_dir: Path, progress_bar: bool = True) -> Path:
     """Trains until `plan.steps`, from the checkpoint in `run_dir` if there is one.
 
+    A run that has its policy but no checkpoint any more is finished: nothing is trained.
+
     Args:
         plan: settings of the training.
         run_dir: folder of the run, which exists.

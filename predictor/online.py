@@ -212,8 +212,12 @@ class OnlineForecaster:
         if plans is not None:  # the axis of plans
             ego_now, absent = ego_now[:, None], absent[:, None]
         xy = (futures.states[..., :axes] - ego_now).masked_fill(absent, 0.0)
-        rest = (t for t in (futures.mode_probs, futures.scale) if t is not None)
-        if not (xy.isfinite().all() and all(t.isfinite().all() for t in rest)):
+        finite = xy.isfinite().all()
+        for rest in (futures.mode_probs, futures.scale):
+            if rest is not None:
+                shape = (*absent.shape[: absent.ndim - 2], *(1,) * (rest.ndim - absent.ndim + 2))
+                finite = finite & (rest.isfinite() | absent.reshape(shape)).all()
+        if not finite:
             raise UserError("the forecaster forecasts numbers that are not finite; its weights are damaged or diverged")
         missing = self._ids.shape[1] - belief.valid.shape[1]
         senders = belief.senders

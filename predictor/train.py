@@ -75,7 +75,7 @@ def _train(config: TrainConfig, group: Group, state_file: Path, config_file: Pat
         trainer.close()
         raise UserError(
             f"no agent of the validation windows is there for all {config.horizon_steps} steps of future, so no "
-            "checkpoint could be chosen; lower --horizon-steps or use longer tracks"
+            "checkpoint could be chosen; lower --horizon-steps, draw more with --val-windows, or use longer tracks"
         )
     made = provenance(("torch", "numpy", "zarr", "safetensors"))
     with ExitStack() as stack:

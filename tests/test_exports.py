@@ -84,15 +84,3 @@ print(observation["forecast"].shape)
     done = run_without(NO_GYMNASIUM_WRAPPER_NEEDS, code)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("(")
-
-
-def test_the_old_place_of_vec_forecast_is_an_alias():
-    """`envs.vector` itself still needs no SB3."""
-    from envs import VecForecast, vector
-    from envs.sb3 import forecast
-
-    assert vector.VecForecast is VecForecast is forecast.VecForecast
-    with pytest.raises(AttributeError, match="module 'envs.vector' has no attribute 'NoSuchName'"):
-        vector.NoSuchName  # noqa: B018
-    done = run_without(("stable_baselines3",), "import envs.vector\nenvs.vector.VecForecast")
-    assert "stable_baselines3" in done.stderr.splitlines()[-1]

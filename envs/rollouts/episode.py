@@ -166,7 +166,7 @@ def _kept_controls(
     """Returns the controls that are fitted to recorded data, by key; sample 0 of the neighbours is their mean."""
     paths = [Path(store) for store in stores]
     model = kept_forecaster(checkpoint, spec, source)
-    windows = training_windows(paths, spec, horizon_steps)
+    windows = training_windows(paths, spec, horizon_steps, history_steps=1)  # constant velocity remembers nothing
     seen = replace(model.spec, has_ego=spec.has_ego)  # where no agent is the ego, the first is not taken for it
     return {
         RESIDUAL: fit_residual(model, training_windows(paths, seen, horizon_steps), horizon_steps),

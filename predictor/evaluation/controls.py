@@ -21,10 +21,12 @@ HISTORY_STEPS = 100
 errs more, and the noise would be wider than that of its forecasts in an episode."""
 
 
-def training_windows(stores: Sequence[Path], spec: SceneSpec, horizon_steps: int) -> Windows:
+def training_windows(
+    stores: Sequence[Path], spec: SceneSpec, horizon_steps: int, history_steps: int = HISTORY_STEPS
+) -> Windows:
     """Returns windows of recorded episodes whose future is known over the whole horizon."""
     episodes: list[Episode] = [episode for store in stores for episode in read_store(store).episodes]
-    return Windows(episodes, spec, HISTORY_STEPS, horizon_steps, min_future_steps=horizon_steps)
+    return Windows(episodes, spec, history_steps, horizon_steps, min_future_steps=horizon_steps)
 
 
 def fit_noise(

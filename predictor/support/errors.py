@@ -4,6 +4,7 @@ Signals end a command in one line, too: Ctrl-C with status 130, SIGTERM with sta
 is told by `predictor.support.stopping.resumable`.
 """
 
+import contextlib
 import errno
 import os
 import select
@@ -159,7 +160,8 @@ def _until_reader_leaves() -> Iterator[None]:
             sys.exit(_UNREAD)
         raise
     except BaseException:
-        _flush()
+        with contextlib.suppress(OSError):  # a full disk; what ends the block says more
+            _flush()
         raise
     if not _flush():
         sys.exit(_UNREAD)

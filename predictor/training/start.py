@@ -56,7 +56,7 @@ def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episo
     if config.horizon_steps != info.horizon_steps:
         raise UserError(
             f"only_spread keeps the horizon of '{config.init}', {info.horizon_steps} steps, got horizon_steps="
-            f"{config.horizon_steps}; leave it out"
+            f"{config.horizon_steps}; leave --horizon-steps out"
         )
     # the checkpoint keeps its scenes, too: their frame is that of the forecasts around which the spread lies
     model: Any = build(info.model, info.spec, replace(info.config, spread_by_type=True), config.horizon_steps)

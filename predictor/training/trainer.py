@@ -95,10 +95,10 @@ def load_data(config: TrainConfig) -> TrainingData:
         parts = split_episodes(int(group[-1]) + 1, config.val_fraction, config.seed)
         splits.append([np.flatnonzero(np.isin(group, part)).tolist() for part in parts])
     # a store of branches may have the seeds of another store: what is held out in one is not trained on in another
-    taken = {_key(store, i) for store, (_, held_out) in zip(stores, splits, strict=True) for i in held_out}
-    for path, store, (kept, held_out) in zip(config.data, stores, splits, strict=True):
-        mine = {_key(store, i) for i in held_out}
-        kept = [i for i in kept if _key(store, i) not in taken - mine][: config.max_episodes or None]
+    held = [{_played(store, i) for i in held_out} for store, (_, held_out) in zip(stores, splits, strict=True)]
+    for path, store, mine, (kept, held_out) in zip(config.data, stores, held, splits, strict=True):
+        elsewhere = set[Any]().union(*held) - mine - {None}
+        kept = [i for i in kept if _played(store, i) not in elsewhere][: config.max_episodes or None]
         if not kept or not held_out:
             raise UserError(
                 f"{address(path)}: {len(store.episodes)} episodes split into {len(kept)} for training and "
@@ -111,10 +111,10 @@ def load_data(config: TrainConfig) -> TrainingData:
     return TrainingData(spec, sources, train, val, episodes)
 
 
-def _key(store: EpisodeStore, number: int) -> tuple[str, int, str]:
-    """Returns what says which episode of which simulator it is, branches of it included."""
+def _played(store: EpisodeStore, number: int) -> tuple[str, int, str] | None:
+    """Returns which episode of which environment it is, as are its branches; None where seeds only number episodes."""
     episode = store.episodes[number]
-    return store.info.source, episode.seed, episode.label
+    return (store.info.source, episode.seed, episode.label) if "seed" in store.info.provenance else None
 
 
 def _check_labels(config: TrainConfig, stores: Sequence[EpisodeStore]) -> None:
@@ -246,13 +246,14 @@ class Trainer:
         """Returns the terms of the latest step as numbers; waits for the device.
 
         Raises:
-            UserError: the loss was not finite in a step since the last reading.
+            UserError: the loss or its gradient was not finite in a step since the last reading.
         """
         first, self._finite_until = self._finite_until, self.step
         finite, *values = torch.stack([self._finite, *terms.values()]).tolist()
         if not finite:
             raise UserError(
-                f"the loss was not finite in some step from {first} to {self.step - 1}; lower --lr or check the data"
+                f"the loss or its gradient was not finite in some step from {first} to {self.step - 1}; lower --lr or "
+                "check the data"
             )
         return dict(zip(terms, values, strict=True))
 
@@ -340,10 +341,9 @@ class Trainer:
         self.model.eval()
         self.validated = self.step
         samples = self.num_modes if self.num_modes > 1 else VALIDATION_DRAWS
-        most = max(1, min(256, VALIDATION_PAIRS // (self.data.spec.max_agents**2 * samples)))
         outcomes = [o for w, i in self._val_indices() for o in run_windows(
-            self.model, w, i, self.config.horizon_steps, samples, batch_size=most, device=str(self.device)
-        )]  # fmt: skip
+            self.model, w, i, self.config.horizon_steps, samples, batch_size=_per_forward(w, i, samples),
+            device=str(self.device))]  # fmt: skip
         return summarise(self.config.model, outcomes), fitted_std_m(outcomes)
 
     def save(self, path: Path) -> None:
@@ -391,3 +391,10 @@ class Trainer:
         share = max(1, self.config.val_windows // len(self.data.val))
         rng = np.random.default_rng([self.config.seed, 2])
         return [(w, rng.permutation(len(w))[:share]) for w in self.data.val]
+
+
+def _per_forward(windows: Windows, indices: np.ndarray, samples: int) -> int:
+    """Returns the number of windows in one forward of a validation, by the largest of them."""
+    episode, now = (torch.from_numpy(column) for column in windows.index[indices].T.copy())
+    agents = int(windows.cast(episode, now, windows.history_steps).size.max())
+    return max(1, min(256, VALIDATION_PAIRS // (agents**2 * samples)))

@@ -17,6 +17,15 @@ ONE_GRAPH = {
     "simple_v3", "simple_spread_v3", "simple_reference_v3", "simple_speaker_listener_v4",
 }  # fmt: skip
 """Ids whose checkpoint gives every edge the same probability."""
+FEW = {
+    "racetrack-oval-v1",
+    "racetrack-large-v1",
+    "simple_v3",
+    "simple_adversary_v3",
+    "simple_push_v3",
+    "simple_speaker_listener_v4",
+}
+"""Ids with one or two others, who stay far away or on one side: more of the squashed distances are near 1 or -1."""
 LONG = {"racetrack-large-v1": 60}
 """Steps of an episode, where the ego begins alone."""
 
@@ -62,9 +71,9 @@ def test_no_entry_is_constant_or_only_saturated(env_id: str):
     inputs = extractor._token_inputs(present)
     saturated = ((inputs.abs() > 0.99) & (inputs.abs() <= 1.0)).float().mean(0)
     assert inputs.abs().max() < 10
-    # beside the tanh of each distance stands the distance itself
-    assert (saturated > 0.9).float().mean() < 0.25
-    assert (inputs.std(0) > 1e-3).float().mean() > 0.85
+    most_saturated, least_moving = (0.25, 0.85) if env_id in FEW else (0.1, 0.9)
+    assert (saturated > 0.9).float().mean() < most_saturated
+    assert (inputs.std(0) > 1e-3).float().mean() > least_moving
 
 
 def test_the_ego_s_own_path_takes_forecasts_out_of_saturation():

@@ -261,15 +261,20 @@ def test_a_part_of_a_study_is_run_and_the_rest_later(tmp_path: Path):
         run_study(replace(part, seeds=3))
 
 
-def test_the_file_of_another_study_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    agents.study._keep_earlier(tmp_path, "first")
-    (tmp_path / "study.toml").write_text("first")
-    agents.study._keep_earlier(tmp_path, "first")
-    assert not (tmp_path / "study.before.toml").exists() and capsys.readouterr().err == ""
-    agents.study._keep_earlier(tmp_path, "second")
-    assert (tmp_path / "study.before.toml").read_text() == "first"
-    assert capsys.readouterr().err == (
-        f"{tmp_path}/study.toml was of another study or an earlier version; kept as study.before.toml\n"
+def test_the_file_of_another_study_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(agents.study, "_run_missing", lambda *given: [])
+    monkeypatch.setattr(agents.study, "_write", lambda *given: None)
+    first, second = study_text(steps="64"), study_text(steps="65")
+    out = tmp_path / "out"
+    for _ in range(2):
+        assert run_study(config(tmp_path, first)) == 0
+        assert not (out / "study.before.toml").exists() and "kept as" not in capsys.readouterr().err
+    assert run_study(config(tmp_path, second)) == 0
+    assert [(out / name).read_text() for name in ("study.before.toml", "study.toml")] == [first, second]
+    assert f"{out}/study.toml was of another study or an earlier version; kept as study.before.toml" in (
+        capsys.readouterr().err
     )
 
 

@@ -507,21 +507,23 @@ def test_the_spread_keeps_the_horizon_and_the_scenes_of_its_checkpoint(circles: 
 
 def test_an_episode_held_out_in_one_store_is_not_trained_on_in_another(tmp_path: Path):
     """Plain episodes and branches of the same seeds, and a store that counts twice."""
-    info = StoreInfo(spec(), "circles")
+    info = StoreInfo(spec(), "circles", provenance={"seed": 0})
     write_store(tmp_path / "plain", info, [circling_episode(i) for i in range(10)])
     write_store(tmp_path / "branches", info, [circling_episode(i, steps=12) for i in range(8)])
-    write_store(tmp_path / "other", StoreInfo(spec(), "elsewhere"), [circling_episode(i) for i in range(10)])
-    names = ("plain", "branches", "plain", "other")
+    for name, source, made_by in (("other", "elsewhere", {"seed": 0}), ("numbered", "circles", {})):
+        info = StoreInfo(spec(), source, provenance=made_by)  # of the last, seeds only number the episodes
+        write_store(tmp_path / name, info, [circling_episode(i) for i in range(10)])
+    names = ("plain", "branches", "plain", "other", "numbered")
     data = load_data(replace(config(tmp_path, tmp_path / "run"), data=tuple(tmp_path / name for name in names)))
     counts = [len(windows.flat.steps) for windows in data.val]
-    assert counts == [3, 3, 3, 3]
+    assert counts == [3, 3, 3, 3, 3]
     alone = [load_data(config(tmp_path / name, tmp_path / "run")) for name in names]
     held_out = [
-        set(range(n)) - {e.seed for e in one.train_episodes} for n, one in zip((10, 8, 10, 10), alone, strict=True)
+        set(range(n)) - {e.seed for e in one.train_episodes} for n, one in zip((10, 8, 10, 10, 10), alone, strict=True)
     ]
     trained = [len(windows.flat.steps) for windows in data.train]
     left = [len(set(range(n)) - held_out[0] - held_out[1]) for n in (10, 8, 10)]
-    assert trained == [*left, 7] and held_out[0] != held_out[1] and trained[0] < 7
+    assert trained == [*left, 7, 7] and held_out[0] != held_out[1] and trained[0] < 7
 
 
 @pytest.mark.parametrize("pairs", [1, 10_000_000])
@@ -536,7 +538,7 @@ def test_a_validation_forwards_as_many_windows_as_its_pairs_allow(
     circles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     trainer, sizes = made(config(circles, tmp_path / "run", val_windows=10)), list[int]()
-    observe, agents = trainer.model.observe, trainer.data.spec.max_agents
+    observe, agents = trainer.model.observe, 2
     whole, _ = trainer.validate()
 
     def watched(memory: Any, states: Tensor, valid: Tensor) -> Any:
