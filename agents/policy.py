@@ -18,6 +18,7 @@ from agents.runs import CONFIG_FILE, policy_zip, read_config
 from agents.task import Task, task_of
 from agents.vec_envs import DrivenEnv
 from envs.drivers.trained import env_for_driver, parallel_env_for_driver
+from envs.own_observation import carries_forecasts
 from envs.sb3 import policy_file
 from envs.sb3.acting import ActingPolicy, ActingTeam
 from envs.sb3.padded_spaces import learners_named
@@ -141,6 +142,21 @@ def load_policy(
         return _of_many_agents(str(zipped), model, env, note or PolicyNote())
     env = env_for_driver(CountedEpisodes(env) if is_recurrent(model) else env, str(zipped))
     return LoadedPolicy(TrainedPolicy(model, env), env)
+
+
+def require_as_trained(zipped: Path, model: BaseAlgorithm, task: Task) -> None:
+    """Checks that a task shows a policy what it was trained on.
+
+    Raises:
+        UserError: another forecaster, other options of the forecasts, or forecasts where it saw none.
+    """
+    note, now = read_policy_note(zipped), task.note
+    if note is not None and note.forecaster is not None and now.forecaster is not None:
+        note.forecaster.check(now.forecaster, f"policy {zipped}")
+    sees, shown = carries_forecasts(model.observation_space), task.observe != "none"
+    if sees != shown:
+        kind = "sees forecasts" if sees else "sees no forecasts"
+        raise UserError(f"policy {zipped} {kind}, but its run's config says observe={task.observe}; copy both together")
 
 
 def task_of_policy(path: str | Path, device: str = "cpu", sized: bool = True) -> Task:

@@ -101,6 +101,8 @@ def policy_zip(path: str | Path) -> Path:
     path = Path(path)
     check_place(path)
     if path.is_file():
+        if path.suffix != ".zip":
+            raise UserError(f"a policy is a .zip file, got {path}; give it that ending")
         return path
     if not path.is_dir():
         if str(path) in shipped_policies():

@@ -50,9 +50,11 @@ class Chase(BaseParallelWrapper):
         return observations, rewards, terminated, truncated, infos
 
     def _distances(self) -> dict[str, float]:
-        """Returns the distance of each predator to the nearest prey [m]."""
+        """Returns the distance of each predator to the nearest prey [m]; nothing where there is none."""
         bodies = self.env.unwrapped.world.agents
         prey = [body.state.p_pos for body in bodies if not body.adversary]
+        if not prey:
+            return {}
         return {
             body.name: min(float(np.linalg.norm(place - body.state.p_pos)) for place in prey)
             for body in bodies

@@ -178,6 +178,7 @@ def open_study(file: Path) -> "Study":
         UserError: the file is no regular one, or holds no study.
     """
     import optuna
+    from sqlalchemy import URL
     from sqlalchemy.exc import DatabaseError
     from sqlalchemy.pool import NullPool
 
@@ -186,7 +187,8 @@ def open_study(file: Path) -> "Study":
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
         # Without a pool each connection is closed after its use; Python 3.13 warns of those that nobody closes.
-        storage = optuna.storages.RDBStorage(f"sqlite:///{file}", engine_kwargs={"poolclass": NullPool})
+        address = URL.create("sqlite", database=str(file)).render_as_string()
+        storage = optuna.storages.RDBStorage(address, engine_kwargs={"poolclass": NullPool})
         return optuna.create_study(storage=storage, study_name="tuning", direction="maximize", load_if_exists=True)
     except (DatabaseError, optuna.exceptions.OptunaError, RuntimeError, ValueError) as error:
         if isinstance(error.__cause__, OSError) or "disk is full" in str(error) or "disk I/O" in str(error):

@@ -177,8 +177,11 @@ def film_extremes(
         folder: folder of the videos.
 
     Returns:
-        Seed, return and file of each film; empty if the environment cannot be drawn.
+        Seed, return and file of each film; empty if the environment cannot be drawn, and for EnvPool's ids, whose
+        episodes highway-env, which draws, does not have.
     """
+    if task.env_id in ENV_IDS:
+        return {}
     by_return = sorted(episodes, key=lambda episode: episode.episode_return)
     places = dict(zip(EXTREMES, (-1, (len(by_return) - 1) // 2, 0), strict=True))
     films: dict[str, dict[str, Any]] = {}

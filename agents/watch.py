@@ -13,7 +13,7 @@ from rich.console import Console
 from tyro.conf import Positional
 
 from agents.hub import local_policy
-from agents.policy import load_policy, task_of_policy
+from agents.policy import load_policy, require_as_trained, task_of_policy
 from agents.runs import SHIPPED, policy_zip
 from agents.task import EVALUATION_SEED
 from envs.sb3 import policy_file
@@ -74,6 +74,7 @@ def write_film(config: WatchConfig) -> Path:
     out = config.out or beside / f"watch-{config.seed}.mp4"
     check_out(out.parent)
     model = policy_file.load_policy(zipped, device=config.device)
+    require_as_trained(zipped, model, task)
     shown = film(task, model, out, config.seed, config.max_steps)
     if shown is None:
         raise UserError(
@@ -96,7 +97,9 @@ def play_in_window(config: WatchConfig) -> int:
 
     path = local_policy(config.policy, config.trust_pickle)
     task = task_of_policy(path, config.device)
-    model = policy_file.load_policy(policy_zip(path), device=config.device)
+    zipped = policy_zip(path)
+    model = policy_file.load_policy(zipped, device=config.device)
+    require_as_trained(zipped, model, task)
     recording = recorded(task, model, config.seed, config.max_steps)
     if recording is None:
         return _play_in_own_window(config, path)

@@ -5,6 +5,7 @@ Learners, the driver of the others and the forecaster are read from the note ins
 """
 
 import functools
+import os
 import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -165,9 +166,21 @@ def sees_forecasts(name: str) -> bool:
     return name.endswith(".zip") and carries_forecasts(kept_policy(name).observation_space)
 
 
-@functools.cache
 def kept_policy(path: str) -> "BaseAlgorithm":
-    """Returns the policy of a zip, loaded once per process; raises the errors of `envs.sb3.policy_file.load_policy`."""
+    """Returns the policy of a zip, loaded once per process unless the file is replaced.
+
+    Raises:
+        UserError: see `envs.sb3.policy_file.load_policy`.
+    """
+    try:
+        found = os.stat(path)
+    except OSError:  # which loading it tells
+        return _loaded(path, 0, 0)
+    return _loaded(path, found.st_mtime_ns, found.st_size)
+
+
+@functools.lru_cache(maxsize=16)
+def _loaded(path: str, changed_ns: int, size: int) -> "BaseAlgorithm":
     from envs.sb3.policy_file import load_policy  # most drivers need no SB3
 
     return load_policy(Path(path))

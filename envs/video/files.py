@@ -3,6 +3,7 @@
 import errno
 import io
 import subprocess
+import tempfile
 from collections.abc import Iterable
 from contextlib import closing
 from itertools import chain
@@ -48,6 +49,7 @@ def write_video(path: str | Path, pictures: Iterable[UInt8[np.ndarray, "height w
     first = next(rest, None)
     if first is None:
         raise UserError(f"the video {path} needs at least one picture, got none; play at least one step")
+    _try_to_write(path)
     try:
         with new_file(path) as partial:
             writer = imageio_ffmpeg.write_frames(
@@ -66,6 +68,13 @@ def write_video(path: str | Path, pictures: Iterable[UInt8[np.ndarray, "height w
             f"ffmpeg must write the video {path}, but it is missing or it failed; repair it with pip install "
             "--force-reinstall imageio-ffmpeg, or unset IMAGEIO_FFMPEG_EXE"
         ) from error
+
+
+def _try_to_write(path: Path) -> None:
+    """Raises the system's error if a file cannot be made there, which ffmpeg would only fail of."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}."):
+        pass
 
 
 def _check_size(path: Path, number: int, picture: np.ndarray, first: np.ndarray) -> None:

@@ -79,7 +79,10 @@ def converted(value: Any, kind: Any, where: str) -> Any:
     if dataclasses.is_dataclass(kind):
         return from_table(cast(type, kind), value, where)
     if kind is float and type(value) is int:
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError as error:
+            raise UserError(f"{where} must be a number of at most 308 digits, got one of {len(str(value))}") from error
     if type(value) is not kind:
         raise UserError(f"{where} must be {_WORDS.get(kind, str(kind))}, got {_shown(value)}")
     return value

@@ -76,3 +76,12 @@ def test_a_plan_says_whether_rewards_are_shaped(shaping: bool, tmp_path: Any, mo
     monkeypatch.setattr("agents.training.make_venv", note)
     with pytest.raises(Made, match=str(shaping)):
         train(TrainingPlan(Task(TAG, "none"), "ppo", 1, 1, 0, shaping=shaping), tmp_path)
+
+
+def test_without_prey_nothing_is_added():
+    task = Task(TAG, "none", env_kwargs='{"num_good": 0, "num_adversaries": 2}')
+    env = Chase(task.make())
+    env.reset(seed=0)
+    _, rewards, *_ = env.step({agent: 1 for agent in env.agents})
+    assert len(rewards) == 2
+    env.close()

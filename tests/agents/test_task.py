@@ -241,8 +241,11 @@ def test_arguments_of_a_run_name_no_foreign_class(foreign: str):
     kwargs = {"config": {"other_vehicles_type": f"{foreign}.Road"}}
     with pytest.raises(UserError, match=rf"name '{foreign}.Road', which the environment could import"):
         task_of(RUN | {"env_kwargs": json.dumps(kwargs)})
+    for near in (f"{foreign}.Road and more", f"{foreign}.Road-", f"{foreign}:Road!", f" {foreign}.Road"):
+        with pytest.raises(UserError, match="which the environment could import"):
+            task_of(RUN | {"env_kwargs": json.dumps({"config": {"other_vehicles_type": near}})})
     assert foreign not in sys.modules
-    own = {"config": {"other_vehicles_type": "highway_env.vehicle.behavior.IDMVehicle", "note": "0.5 of all. Done"}}
+    own = {"config": {"other_vehicles_type": "highway_env.vehicle.behavior.IDMVehicle", "note": "half of all"}}
     assert task_of(RUN | {"env_kwargs": json.dumps(own)}).make_kwargs == own
 
 

@@ -92,3 +92,9 @@ def test_what_cannot_be_drawn_has_no_films(tmp_path: Path):
     toy = Task(TOY, "none")
     assert film_extremes(toy, policy_for(toy), played(1.0, 2.0, 3.0), tmp_path) == {}
     assert not list(tmp_path.iterdir())
+
+
+def test_episodes_of_envpool_have_no_films_for_highway_env_does_not_have_them(tmp_path: Path):
+    task = Task("envpool/HighwayFast-v0", "none")
+    assert film_extremes(task, policy_for(Task(TOY, "none")), played(1.0, 2.0), tmp_path) == {}
+    assert not list(tmp_path.iterdir())

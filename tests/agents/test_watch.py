@@ -97,3 +97,24 @@ def test_without_a_screen_there_is_no_window(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("pygame.display.get_driver", lambda: "offscreen")
     with pytest.raises(UserError, match="cannot open a window: there is no screen; leave out --window"):
         play([np.zeros((8, 8, 3), np.uint8)], 10.0, "film")
+
+
+def test_a_policy_is_not_filmed_on_another_forecaster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path, _ = saved(tmp_path, Task(FAST, "constant-velocity", env_kwargs=FEW))
+    other = Task(FAST, "constant-velocity", env_kwargs=FEW, horizon_steps=3)
+    monkeypatch.setattr("agents.watch.task_of_policy", lambda *given: other)
+    for shown in (write_film, play_in_window):
+        with pytest.raises(UserError, match="was trained on forecasts with horizon_steps=5, but gets horizon_steps=3"):
+            shown(WatchConfig(path, out=tmp_path / "film.mp4"))
+    monkeypatch.setattr("agents.watch.task_of_policy", lambda *given: Task(FAST, "none", env_kwargs=FEW))
+    with pytest.raises(UserError, match="sees forecasts, but its run's config says observe=none; copy both together"):
+        write_film(WatchConfig(path, out=tmp_path / "film.mp4"))
+    assert not (tmp_path / "film.mp4").exists()
+
+
+def test_a_policy_is_a_zip(tmp_path: Path):
+    """Drivers tell policies from other names by it."""
+    path, _ = saved(tmp_path, Task(FAST, "none", env_kwargs=FEW))
+    path.rename(tmp_path / "mine.policy")
+    with pytest.raises(UserError, match="a policy is a .zip file, got .*mine.policy; give it that ending"):
+        load_policy(tmp_path / "mine.policy")

@@ -10,7 +10,7 @@ from stable_baselines3 import PPO
 from agents.arena import MultiagentArena
 from agents.runs import save_model
 from agents.task import Task
-from envs.drivers.trained import trained_driver
+from envs.drivers.trained import kept_policy, trained_driver
 from envs.parallel import ForecastParallelEnv
 from envs.rollouts.own_view import own_view
 from envs.rollouts.world import EgoWorld, MultiagentWorld, World, open_world
@@ -180,3 +180,14 @@ def test_a_stray_zip_is_one_clear_line(tmp_path: Path):
         MultiagentWorld(forecast_env(), str(tmp_path / "stray.zip"))
     with pytest.raises(UserError, match="no policy at absent.zip"):
         MultiagentWorld(forecast_env(), "absent.zip")
+
+
+def test_a_policy_that_was_replaced_is_loaded_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path, loaded = tmp_path / "policy.zip", list[bytes]()
+    monkeypatch.setattr(
+        "envs.sb3.policy_file.load_policy", lambda file: loaded.append(file.read_bytes()) or len(loaded)
+    )
+    path.write_bytes(b"first")
+    assert kept_policy(str(path)) == kept_policy(str(path)) == 1
+    path.write_bytes(b"second")
+    assert kept_policy(str(path)) == 2 and loaded == [b"first", b"second"]

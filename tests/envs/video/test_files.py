@@ -1,5 +1,6 @@
 import gc
 from pathlib import Path
+from typing import Any
 
 import imageio_ffmpeg
 import numpy as np
@@ -60,3 +61,15 @@ def test_an_ffmpeg_that_fails_is_named(script: str | None, tmp_path: Path, monke
         write_video(tmp_path / "films" / "x.mp4", [PICTURE] * 40, fps=4)
     assert not list((tmp_path / "films").iterdir())
     gc.collect()
+
+
+def test_a_folder_that_takes_no_file_is_told_before_ffmpeg_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def started(*given: Any, **more: Any) -> Any:
+        raise AssertionError("ffmpeg was started")
+
+    monkeypatch.setattr("imageio_ffmpeg.write_frames", started)
+    with pytest.raises(FileNotFoundError):
+        write_video("/proc/nowhere/film.mp4", [np.zeros((4, 4, 3), np.uint8)], 5)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="file"):
+        write_video(tmp_path / "file" / "film.mp4", [np.zeros((4, 4, 3), np.uint8)], 5)
