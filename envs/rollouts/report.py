@@ -173,7 +173,6 @@ def _matrix(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], 
 
 
 def _cells(result: "EnvAccuracy") -> list[str]:
-    interval = result.reduction_interval
     one, many, straight, near = (
         result.model, result.model_samples, result.constant_velocity, result.nearest_neighbours,
     )  # fmt: skip
@@ -184,13 +183,17 @@ def _cells(result: "EnvAccuracy") -> list[str]:
         metres(many.energy_m), "–" if covered is None else f"{100 * covered.mean:.0f} %",
         "–" if noisy is None else metres(noisy.min_ade_m), "–" if near is None else metres(near.ade_m),
         f"{metres(straight.min_ade_m)} / {metres(straight.min_fde_m)}",
-        _percent(result.reduction), "–" if interval is None else " to ".join(map(_percent, interval)), str(one.agents),
+        _percent(result.reduction), _range(result.reduction_interval), str(one.agents),
         f"{result.latency_median_ms:.1f}",
     ]  # fmt: skip
 
 
 def _percent(share: float | None) -> str:
     return "–" if share is None else f"{100 * share:.0f} %"
+
+
+def _range(interval: tuple[float, float] | None) -> str:
+    return "–" if interval is None else f"{100 * interval[0]:.0f} to {100 * interval[1]:.0f} %"
 
 
 @matplotlib.rc_context(STYLE)

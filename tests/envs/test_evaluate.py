@@ -80,9 +80,7 @@ def test_one_episode_has_no_interval_and_no_error_no_reduction():
     assert _reduction([outcome(1.0)] * 2, [outcome(0.0)] * 2) is None
 
 
-@pytest.mark.parametrize(
-    ("errors_m", "shown"), [([1.0], "50 %, –"), ([1.0, 3.0], "50 %, 50 % to 50 %"), ([0.0], "–, –")]
-)
+@pytest.mark.parametrize(("errors_m", "shown"), [([1.0], "50 %, –"), ([1.0, 3.0], "50 %, 50 to 50 %"), ([0.0], "–, –")])
 def test_the_table_says_what_is_not_defined(errors_m: list[float], shown: str):
     result = summary(HIGHWAY_SPEC, errors_m, [[0.1]] * len(errors_m))
     cells = report._cells(result)

@@ -62,7 +62,8 @@ def test_other_episodes_go_on_beside_those_that_fail():
 def test_a_pause_of_the_whole_command_is_not_the_episode_s(monkeypatch: pytest.MonkeyPatch):
     clock, place = [0.0], Place([0] * NUMBERS)
     monkeypatch.setattr(workers, "time", SimpleNamespace(monotonic=lambda: clock[0]))
-    worker = workers._Worker(None, None, place, ready=True, moves=place.moves, asked_s=0.0)
+    ours, theirs = multiprocessing.Pipe()
+    worker = workers._Worker(None, ours, place, ready=True, moves=place.moves, asked_s=0.0)
 
     def late_after(seconds: float) -> bool:
         clock[0] += seconds
@@ -73,6 +74,8 @@ def test_a_pause_of_the_whole_command_is_not_the_episode_s(monkeypatch: pytest.M
     assert [late_after(s) for s in (1.0, 1.0, 1.0, 1.0)] == [False, False, False, True]
     worker.moves -= 1  # the episode has moved since
     assert not late_after(1.0)
+    ours.close()
+    theirs.close()
 
 
 def test_an_episode_that_fails_stops_the_others():

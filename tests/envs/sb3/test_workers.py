@@ -2,6 +2,7 @@
 
 import multiprocessing
 import time
+from multiprocessing.connection import Connection
 from types import SimpleNamespace
 from typing import Any
 
@@ -57,13 +58,14 @@ def test_an_environment_that_cannot_be_made_is_named():
     assert not multiprocessing.active_children()
 
 
-class Quiet:
+class Quiet(Connection):
     """A pipe through which nothing comes, or only after some looks at it."""
 
     def __init__(self, looks: float = float("inf")) -> None:
+        self._handle = None  # of no file
         self.left, self.waited = looks, list[float]()
 
-    def poll(self, timeout_s: float) -> bool:
+    def poll(self, timeout_s: float = 0.0) -> bool:
         self.waited.append(timeout_s)
         self.left -= 1
         return self.left < 0
@@ -76,23 +78,19 @@ def test_an_answer_is_waited_for_in_steps_so_that_a_pause_costs_one_of_them():
     assert workers._comes(Quiet(looks=1), 2.5) and not workers._comes(Quiet(looks=3), 2.5)
 
 
-class Slow:
-    """A process that takes all the time that it gets to end."""
-
-    def __init__(self, process: Any, clock: list[float]) -> None:
-        self._process, self._clock = process, clock
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._process, name)
-
-    def join(self, timeout_s: float | None = None) -> None:
-        self._clock.append(self._clock[-1] + (timeout_s or 0.0))
-        self._process.join()
-
-
 def test_all_processes_together_get_the_time_to_close(monkeypatch: pytest.MonkeyPatch):
+    """Each takes all the time that it gets."""
     venv, clock = WorkerVecEnv([Make("Fine")] * 3, "toy-v0"), [100.0]
-    venv.processes = [Slow(process, clock) for process in venv.processes]
+
+    def slow(join: Any) -> Any:
+        def joining(timeout_s: float | None = None) -> None:
+            clock.append(clock[-1] + (timeout_s or 0.0))
+            join()
+
+        return joining
+
+    for process in venv.processes:
+        monkeypatch.setattr(process, "join", slow(process.join))
     monkeypatch.setattr(workers, "time", SimpleNamespace(monotonic=lambda: clock[-1]))
     venv.close()
     assert clock[:4] == [100.0, *[100.0 + workers.CLOSE_S] * 3]  # before they are killed
