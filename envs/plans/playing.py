@@ -5,6 +5,7 @@ do in it exactly what they will do if the ego takes the plan's actions. It is th
 bring, for measurements; an agent in the world has no such copy. Of several learners: `envs.plans.keeping_on`.
 """
 
+import pickle
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -97,7 +98,13 @@ def _played(
     env: gym.Env, reader: SceneReader, scene: Scene, actions: tuple[Any, ...], over: bool
 ) -> Float[np.ndarray, "agents horizon 2"]:
     """Returns where each agent of the scene goes while the ego takes these actions."""
-    copied, reader = running_copy((_Copyable(env), reader), env.unwrapped)
+    try:
+        copied, reader = running_copy((_Copyable(env), reader), env.unwrapped)
+    except (TypeError, pickle.PicklingError) as error:  # an open file, a lock
+        raise UserError(
+            f"the environment cannot be copied, which true futures need: {error}; leave out the wrapper that holds it, "
+            "or put it outside"
+        ) from error
     env = copied.env
     goes_on = isinstance(env.unwrapped, AbstractEnv)  # highway-env simulates on after the end of an episode
     if goes_on and isinstance(reader, HighwayReader):  # which reads no observations

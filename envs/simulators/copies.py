@@ -7,13 +7,10 @@ or for EnvPool a `UserError`.
 """
 
 import copy
-import pickle
 from typing import Any, TypeVar
 
 from gymnasium.utils import EzPickle
 from highway_env.envs.common.abstract import AbstractEnv
-
-from predictor.support.errors import UserError
 
 Owner = TypeVar("Owner")
 
@@ -57,15 +54,9 @@ def running_copy(owner: Owner, simulator: Any) -> Owner:
         simulator: its simulator; of highway-env the road network is shared, as no step changes it.
 
     Raises:
-        UserError: the simulator (EnvPool) or a wrapper (one that writes a file) cannot be copied.
+        UserError: the simulator cannot be copied (EnvPool).
     """
     memo: dict[int, Any] = {}
     if isinstance(simulator, AbstractEnv) and simulator.road is not None:
         memo[id(simulator.road.network)] = simulator.road.network
-    try:
-        return copy.deepcopy(owner, memo)
-    except (TypeError, pickle.PicklingError) as error:  # an open file, a lock
-        raise UserError(
-            f"the environment cannot be copied, which plans that are played and true futures need: {error}; leave out "
-            "the wrapper that holds it, or put it outside"
-        ) from error
+    return copy.deepcopy(owner, memo)

@@ -1,6 +1,5 @@
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from stable_baselines3 import PPO
@@ -63,7 +62,8 @@ def test_drivers_that_cannot_drive_are_refused_before_anything_runs():
 def test_only_what_has_to_be_trusted_may_be_named_beside_the_policy_s_forecaster(
     sizes_of: str | None, named: str, accepted: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
-    task = SimpleNamespace(checkpoint="highway", sizes_of=sizes_of, env_id="highway-fast-v0")
+    task = Task("highway-fast-v0", "forecast", checkpoint="highway")
+    object.__setattr__(task, "sizes_of", sizes_of)  # none of these is there
     for name, value in (("policy_zip", tmp_path / "policy.zip"), ("local_policy", tmp_path), ("algorithm_of", "ppo"),
                         ("task_of_policy", task), ("replace", task)):  # fmt: skip
         monkeypatch.setattr(evaluate, name, lambda *given, value=value, **more: value)

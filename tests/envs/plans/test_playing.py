@@ -67,7 +67,7 @@ def test_a_wrapper_that_counts_the_end_of_an_episode_lets_copies_go_on():
 
 def test_an_environment_that_cannot_be_copied_is_a_sentence(tmp_path: Path):
     venv = make_vec_env("highway-fast-v0", 1, wrapper_class=SceneObservation, monitor_dir=str(tmp_path))
-    with pytest.raises(UserError, match="the environment cannot be copied, which .* need: cannot pickle"):
+    with pytest.raises(UserError, match="the environment cannot be copied, which true futures need: cannot pickle"):
         VecForecast(venv, "constant-velocity", arm=Arm("oracle")).reset()
     venv.close()
 

@@ -319,9 +319,9 @@ def test_the_residual_of_a_model_with_an_ego_is_fitted_to_recordings_without_one
     made = task(env_id=crossing, driver="varied", checkpoint=checkpoint, horizon_steps=1, stores=(str(store),))
     cut, original = list[bool](), episodes.training_windows
 
-    def noted(stores: Any, spec: SceneSpec, horizon_steps: int) -> Any:
+    def noted(stores: Any, spec: SceneSpec, horizon_steps: int, **history: Any) -> Any:
         cut.append(spec.has_ego)
-        return original(stores, spec, horizon_steps)
+        return original(stores, spec, horizon_steps, **history)
 
     monkeypatch.setattr(episodes, "training_windows", noted)
     outcomes = play(made).outcomes

@@ -257,7 +257,7 @@ def test_losses_that_are_not_finite_are_found_when_the_numbers_are_read(
     terms = dict.fromkeys(trainer.train_step(), torch.zeros(()))  # later losses may look as they like
     with pytest.raises(UserError) as error:
         trainer.read(terms)
-    message = "the loss was not finite in some step from 1 to 3; lower --lr or check the data"
+    message = "the loss or its gradient was not finite in some step from 1 to 3; lower --lr or check the data"
     assert str(error.value) == message
 
 
