@@ -210,6 +210,18 @@ def test_a_forecaster_that_gives_something_else_is_named_in_a_line():
             stream.forecast(5)
 
 
+def test_what_is_said_of_absent_agents_may_be_anything():
+    class Odd(ConstantVelocity):
+        def rollout(self, belief: Any, *arguments: Any, **named: Any) -> Futures:
+            states = super().rollout(belief, *arguments, **named).states
+            probs = torch.where(belief.valid[:, None], 1.0, torch.nan).expand(states.shape[:3])
+            return Futures(states, probs)
+
+    stream = online(Odd(spec()))
+    stream.observe(batch(scene(states_of(0, 0, 3, 7), AGENTS, [0, PADDING_ID, 7, 3])))
+    assert not stream.forecast(5).valid[0, 1]
+
+
 def test_history_follows_the_id_when_places_are_sorted_anew(forecaster: DGVAE):
     first, second = states_of(0, 0, 3, 7), states_of(1, 0, 3, 7)
     kept = after(forecaster, scene(first, AGENTS), scene(second, AGENTS))

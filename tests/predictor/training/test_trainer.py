@@ -560,6 +560,10 @@ def test_a_gradient_that_is_not_finite_changes_no_weight(
     with pytest.raises(UserError, match="the gradient is nan at step 0; lower --lr or check the data"):
         trainer.train_step()
     assert all(torch.equal(value, before[name]) for name, value in trainer.model.state_dict().items())
+    trainer._checks_each_loss = False  # as on a CUDA device
+    terms = dict.fromkeys(trainer.train_step(), torch.zeros(()))
+    with pytest.raises(UserError, match="the loss or its gradient was not finite in some step from 0 to 0"):
+        trainer.read(terms)
 
 
 def test_a_run_does_not_go_on_from_a_checkpoint_that_was_trained_anew(circles: Path, tmp_path: Path):
