@@ -57,3 +57,8 @@ def test_bad_files_are_one_clear_line(text: str, message: str, tmp_path: Path):
         settings_from_file("ppo", Path(f"{file}x"))
     with pytest.raises(UserError, match=f"^{tmp_path} cannot be read: it is a folder"):
         settings_from_file("ppo", tmp_path)
+
+
+def test_an_integer_too_long_for_a_number_is_one_line():
+    with pytest.raises(UserError, match="gamma must be a number of at most 308 digits, got one of 401"):
+        settings_from_words("ppo", ["gamma=1" + "0" * 400])

@@ -277,3 +277,11 @@ def test_the_first_trial_is_the_preset_also_where_rollouts_have_odd_sizes(
     tune(config)
     assert drawn[0]["batch_size"] == 480
     assert drawn[0] == {name: asdict(odd)[name] for name in drawn[0]}
+
+
+def test_any_folder_may_hold_a_tuning(tmp_path: Path):
+    """A question mark begins the options of an address, and %20 is a blank there."""
+    folder = tmp_path / "really? 100%20sure"
+    folder.mkdir()
+    open_study(folder / "tuning.db")
+    assert [path.name for path in folder.iterdir()] == ["tuning.db"]
