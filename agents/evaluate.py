@@ -21,7 +21,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from agents.arena import EgoArena, open_arena
 from agents.episode_file import NO_PYARROW, has_pyarrow
 from agents.hub import local_policy
-from agents.policy import task_of_policy
+from agents.policy import require_forecaster_of, task_of_policy
 from agents.results import MOST_EPISODES, Evaluation
 from agents.runs import CONFIG_FILE, load_model, policy_zip, read_config, shipped_policies
 from agents.summaries import EXTREMES
@@ -320,12 +320,9 @@ def _of_run(config: EvaluateConfig, trained: _Trained) -> tuple[Evaluation, dict
     task.check()
     drivers = compared_drivers(task, config.drivers)
     model = trained.model()
-    note, now = read_policy_note(trained.zipped), task.note
-    if note is None:
-        if now.forecaster is not None:
-            Console(stderr=True).print(NOT_PINNED.format(trained.zipped))
-    elif note.forecaster is not None and now.forecaster is not None:
-        note.forecaster.check(now.forecaster, f"policy {trained.zipped}")
+    if read_policy_note(trained.zipped) is None and task.note.forecaster is not None:
+        Console(stderr=True).print(NOT_PINNED.format(trained.zipped))
+    require_forecaster_of(trained.zipped, task)
     name = f"{trained.algorithm} ({task.observe})"
     evaluation = evaluate_with_progress(task, model, name, config.episodes, config.num_envs, config.seed, drivers)
     return evaluation, {"algorithm": trained.algorithm, "observe": task.observe}

@@ -144,15 +144,24 @@ def load_policy(
     return LoadedPolicy(TrainedPolicy(model, env), env)
 
 
-def require_as_trained(zipped: Path, model: BaseAlgorithm, task: Task) -> None:
-    """Checks that a task shows a policy what it was trained on.
+def require_forecaster_of(zipped: Path, task: Task) -> None:
+    """Checks that a task has the forecaster that a policy was trained on; one that notes none may have any.
 
     Raises:
-        UserError: another forecaster, other options of the forecasts, or forecasts where it saw none.
+        UserError: another forecaster, or other options of the forecasts.
     """
     note, now = read_policy_note(zipped), task.note
     if note is not None and note.forecaster is not None and now.forecaster is not None:
         note.forecaster.check(now.forecaster, f"policy {zipped}")
+
+
+def require_as_trained(zipped: Path, model: BaseAlgorithm, task: Task) -> None:
+    """Checks that a task shows a policy what it was trained on.
+
+    Raises:
+        UserError: as `require_forecaster_of`; or forecasts where it saw none, or none where it saw them.
+    """
+    require_forecaster_of(zipped, task)
     sees, shown = carries_forecasts(model.observation_space), task.observe != "none"
     if sees != shown:
         kind = "sees forecasts" if sees else "sees no forecasts"
