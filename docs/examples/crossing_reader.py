@@ -10,7 +10,7 @@ from predictor.scene import Scene, SceneSpec
 
 
 def read_crossing(env: gym.Env) -> Scene:
-    """The robot, then the walkers; they have numbers, so that nobody has to be recognised."""
+    """The robot, then the walkers; they have numbers, so that no agent has to be recognised."""
     world = env.unwrapped
     states = np.vstack([world.robot, world.walkers])
     return Scene(states, np.append(0, world.numbers + 1), np.ones(len(states), dtype=bool))
