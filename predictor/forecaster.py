@@ -275,9 +275,14 @@ def check_observed(given: Any, states: Float[Tensor, "batch agents state"], fore
 
 
 def check_futures(
-    given: Any, steps: int, num_samples: int, observed: Float[Tensor, "batch agents state"], axes: int
+    given: Any,
+    steps: int,
+    num_samples: int,
+    observed: Float[Tensor, "batch agents state"],
+    axes: int,
+    plans: int | None = None,
 ) -> None:
-    """Checks what a forecaster's `rollout` returned.
+    """Checks what a forecaster's `rollout` returned, or its `rollout_plans`.
 
     Args:
         given: what it returned.
@@ -285,24 +290,26 @@ def check_futures(
         num_samples: number of samples that it was asked for.
         observed: states that it went on from.
         axes: number of axes of a position.
+        plans: number of plans of each scene that it was asked for, an axis after the batch; None for `rollout`.
 
     Raises:
         UserError: it is no `Futures`, or has other sizes than it was asked for.
     """
+    name = "rollout" if plans is None else "rollout_plans"
     if not isinstance(given, Futures):
-        raise UserError(f"rollout of a forecaster must return Futures, got {type(given).__name__}")
-    if given.states.ndim == 5 and (given.states.shape[1] != num_samples or given.states.shape[-2] != steps):
+        raise UserError(f"{name} of a forecaster must return Futures, got {type(given).__name__}")
+    sizes = tuple(given.states.shape)
+    if plans is None and len(sizes) == 5 and (sizes[1], sizes[3]) != (num_samples, steps):
         raise UserError(
-            f"the forecaster was asked for {num_samples} samples of {steps} steps and gave {given.states.shape[1]} of "
-            f"{given.states.shape[-2]}"
+            f"the forecaster was asked for {num_samples} samples of {steps} steps and gave {sizes[1]} of {sizes[3]}"
         )
     batch, agents, features = observed.shape
-    each = (batch, num_samples, agents)
-    _check_shape("rollout of a forecaster: states", given.states, (*each, steps, features))
+    each = (batch, num_samples, agents) if plans is None else (batch, plans, num_samples, agents)
+    _check_shape(f"{name} of a forecaster: states", given.states, (*each, steps, features))
     if given.mode_probs is not None:
-        _check_shape("rollout of a forecaster: mode_probs", given.mode_probs, each)
+        _check_shape(f"{name} of a forecaster: mode_probs", given.mode_probs, each)
     if given.scale is not None:
-        _check_shape("rollout of a forecaster: scale", given.scale, (*each, steps, axes))
+        _check_shape(f"{name} of a forecaster: scale", given.scale, (*each, steps, axes))
 
 
 def _check_shape(what: str, given: Any, shape: tuple[int, ...]) -> None:

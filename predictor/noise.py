@@ -18,6 +18,18 @@ Noise = torch.Generator | Sequence[np.random.Generator]
 """Source of the samples' noise: one generator for a whole batch, or one for each of its scenes."""
 
 
+def check_noise(noise: object) -> None:
+    """Raises a `UserError` if something is no source of noise."""
+    each = list(noise) if isinstance(noise, Sequence) else None
+    if each is not None and all(isinstance(one, np.random.Generator) for one in each):
+        return
+    if noise is not None and not isinstance(noise, torch.Generator):
+        got = type(noise if each is None else next(n for n in each if not isinstance(n, np.random.Generator))).__name__
+        raise UserError(
+            f"generator must be one torch.Generator, or a list of numpy.random.Generator, one for each scene, got {got}"
+        )
+
+
 class PairNoise:
     """Uniform numbers in [0, 1) for the present pairs of each scene, sample and step of one roll-out.
 

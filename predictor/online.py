@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from predictor.forecaster import Belief, Forecaster, Memory, check_empty, check_futures, check_observed
 from predictor.graph import NO_AGENT
-from predictor.noise import Noise
+from predictor.noise import Noise, check_noise
 from predictor.scene import PADDING_ID, Forecast, SceneBatch
 from predictor.scene_checks import check_batch, check_ids, check_request, check_states, chosen_envs
 from predictor.support.errors import ProtocolError, UserError
@@ -64,7 +64,14 @@ class OnlineForecaster:
     def __init__(
         self, forecaster: Forecaster, envs: int, agents: int, device: str = "cpu", max_rows: int = MAX_ROWS
     ) -> None:
-        """Starts with empty memory for every environment."""
+        """Starts with empty memory for every environment.
+
+        Raises:
+            UserError: a number of environments, agents or scenes that is no whole number from 1 on.
+        """
+        for name, number in (("envs", envs), ("agents", agents), ("max_rows", max_rows)):
+            if not isinstance(number, int | np.integer) or number < 1:
+                raise UserError(f"{name} must be a whole number of at least 1, got {number!r}")
         use_one_thread_after_fork()
         self.forecaster, self._max_rows = forecaster, max_rows
         self.device = torch.device(resolve_device(device))
@@ -155,14 +162,15 @@ class OnlineForecaster:
         Args:
             horizon_steps: number of steps; None takes the forecaster's.
             num_samples: number of futures per agent.
-            generator: source of the samples' noise; one for all scenes of the latest observation, or one for each.
+            generator: source of the samples' noise: one of torch for all scenes of the latest observation, or a list of
+                NumPy's, one for each.
             ego_plan: plans of the ego, (scenes, plans, steps, features): its state at each step, in the world frame and
                 the spec's units. The ego follows them, the others react; the forecast has an axis for the plans.
 
         Raises:
             ProtocolError: nothing was observed yet.
-            UserError: steps or samples are no whole numbers from 1 on; the spec has no ego, the ego is absent, or the
-                plans are of another shape or not finite.
+            UserError: steps or samples are no whole numbers from 1 on; another kind of generator; the spec has no ego,
+                the ego is absent, or the plans are of another shape or not finite.
         """
         use_one_thread_after_fork()
         if not self._beliefs:
@@ -170,7 +178,10 @@ class OnlineForecaster:
         steps = self.forecaster.horizon_steps if horizon_steps is None else horizon_steps
         agents = sum(belief.valid.shape[0] * belief.valid.shape[1] for belief in self._beliefs)
         check_request(steps, num_samples, agents * len(self._ego_axes))
+        check_noise(generator)
         plans = None if ego_plan is None else self._local_plans(ego_plan, steps)
+        if plans is not None:
+            check_request(steps, num_samples, agents * len(self._ego_axes) * plans.shape[1])
         if len(self._beliefs) == 1:
             return self._forecast_part(self._beliefs[0], steps, num_samples, generator, plans)
         scenes = sum(len(belief.valid) for belief in self._beliefs)
@@ -278,7 +289,7 @@ class OnlineForecaster:
         """Observes scenes whose agents stand in the first `agents` columns."""
         valid = scenes.valid[:, :agents]
         ids = np.where(scenes.valid, scenes.ids, PADDING_ID)
-        if agents < ids.shape[1] or not np.array_equal(old_ids, ids):
+        if agents < ids.shape[1] or not np.array_equal(old_ids, ids) or (ids[scenes.valid] < 0).any():
             check_ids(ids, scenes.valid)
             source, known = _match(old_ids, ids[:, :agents])
             memory = memory.reorder(torch.from_numpy(source).to(self.device), torch.from_numpy(known).to(self.device))

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from predictor.scene import PADDING_ID, SceneBatch
+from predictor.scene import LARGEST, PADDING_ID, SceneBatch
 from predictor.support.errors import UserError, short
 from predictor.support.memory import check_memory
 
@@ -37,14 +37,15 @@ def check_batch(scenes: SceneBatch, envs: int, agents: int, features: int) -> No
 
 
 def check_states(states: Float[np.ndarray, "envs agents state"]) -> None:
-    """Checks that the states of all agents are finite; those of absent agents must be zeros here.
+    """Checks that the states of all agents are finite, in float32 too; those of absent agents must be zeros here.
 
     Raises:
         UserError: some are not.
     """
-    if not np.isfinite(states).all():
-        scene, agent, _ = np.argwhere(~np.isfinite(states))[0].tolist()
-        raise UserError(f"states must be finite, got {states[scene, agent].tolist()} (scene {scene}, agent {agent})")
+    if not (np.abs(states) <= LARGEST).all():
+        scene, agent, _ = np.argwhere(~(np.abs(states) <= LARGEST))[0].tolist()
+        wanted = f"at most {LARGEST:g} in size" if np.isfinite(states).all() else "finite"
+        raise UserError(f"states must be {wanted}, got {states[scene, agent].tolist()} (scene {scene}, agent {agent})")
 
 
 def check_ids(ids: Int[np.ndarray, "envs agents"], valid: Bool[np.ndarray, "envs agents"]) -> None:
@@ -91,9 +92,11 @@ def chosen_envs(envs: Any, count: int) -> Int[np.ndarray, " some"]:
     """Returns the indices of some of `count` environments, of a mask too.
 
     Raises:
-        UserError: a mask of another size, an index that is not there, or one twice.
+        UserError: no list of whole numbers, a mask of another size, an index that is not there, or one twice.
     """
     given = np.asarray(envs)
+    if given.ndim != 1 or given.dtype.kind not in "biu" and given.size:
+        raise UserError(f"envs must be a list of whole numbers, or a mask, got {short(envs)}")
     if given.dtype == np.bool_:
         if given.shape != (count,):
             raise UserError(f"a mask of environments needs the shape ({count},), got {given.shape}")

@@ -8,22 +8,18 @@ How good the forecasts are is not asked; `predictor.evaluate` and `envs.evaluate
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
-from predictor.forecaster import Belief, Forecaster, Futures, Memory, require_forecaster
-from predictor.noise import Noise
-from predictor.scene import SceneSpec
+from predictor.forecaster import Belief, Futures, Memory, check_futures, require_forecaster
+from predictor.forecaster_trial import AGENTS, SAMPLES, SCENES, STEPS, Trial
 from predictor.support.errors import UserError
+from predictor.what_if import ReactiveForecaster
 
-SCENES, AGENTS, STEPS, SAMPLES = 3, 4, 6, 3
-TOLERANCE = 1e-3
-"""Largest difference of forecasts that are equal but for rounding, in units of `SceneSpec.feature_scales`."""
 SLOWEST, FASTEST = 0.4, 2.5
 """Range of the first forecast step, as a multiple of velocity times `dt_s`; unit mistakes (3.6, 100) are outside."""
 
@@ -51,7 +47,7 @@ def check_forecaster(forecaster: Any, *, device: str = "cpu", seed: int = 0) -> 
 def forecaster_problems(forecaster: Any, *, device: str = "cpu", seed: int = 0) -> list[str]:
     """Returns what is wrong with a forecaster, one line for each thing; empty if nothing was found."""
     try:
-        trial = _Trial(require_forecaster(forecaster), device, seed)
+        trial = Trial(require_forecaster(forecaster), device, seed)
     except UserError as error:
         return [str(error)]
     problems: list[str] = []
@@ -64,7 +60,7 @@ def forecaster_problems(forecaster: Any, *, device: str = "cpu", seed: int = 0) 
     return problems
 
 
-def _run(check: "Callable[[_Trial], Iterator[str]]", trial: "_Trial") -> list[str]:
+def _run(check: Callable[[Trial], Iterator[str]], trial: Trial) -> list[str]:
     """Returns what a check finds; an error of the forecaster's own is a finding."""
     try:
         return list(check(trial))
@@ -73,78 +69,17 @@ def _run(check: "Callable[[_Trial], Iterator[str]]", trial: "_Trial") -> list[st
         return [f"{check.__name__.strip('_').replace('_', ' ')}: failed with {type(error).__name__}: {reason}"]
 
 
-@dataclass
-class _Trial:
-    """A forecaster and the motion that it is shown."""
-
-    forecaster: Forecaster
-    device: str
-    seed: int
-    states: Float[Tensor, "scenes time agents state"] = field(init=False)
-    """Agents on straight lines, in the axes that the forecaster gets: relative to the ego where its frame says so."""
-    valid: Bool[Tensor, "scenes agents"] = field(init=False)
-    """Which agents are there; the last one of the second scene is not."""
-
-    def __post_init__(self) -> None:
-        spec, rng = self.spec, np.random.default_rng(self.seed)
-        axes, scales = spec.position_dim, np.array(spec.feature_scales)
-        states = np.zeros((SCENES, STEPS, AGENTS, spec.num_features))
-        start = rng.uniform(-0.4, 0.4, (SCENES, 1, AGENTS, axes)) * scales[:axes]
-        speed = rng.uniform(0.4, 0.8, (SCENES, 1, AGENTS, axes)) * rng.choice([-1, 1], (SCENES, 1, AGENTS, axes))
-        velocity = speed * scales[axes : 2 * axes]
-        time_s = spec.dt_s * np.arange(STEPS)[None, :, None, None]
-        states[..., :axes], states[..., axes : 2 * axes] = start + velocity * time_s, velocity
-        states[..., 2 * axes :] = rng.integers(0, 2, (SCENES, 1, AGENTS, spec.num_features - 2 * axes))
-        ego_axes = np.array([frame == "ego" for frame in spec.frame])
-        states[..., :axes] -= states[:, :, :1, :axes] * ego_axes
-        valid = np.ones((SCENES, AGENTS), dtype=np.bool_)
-        valid[1, -1] = False
-        states[1, :, -1] = 0.0
-        self.states = torch.from_numpy(states.astype(np.float32)).to(self.device)
-        self.valid = torch.from_numpy(valid).to(self.device)
-
-    @property
-    def spec(self) -> SceneSpec:
-        return self.forecaster.spec
-
-    @property
-    def horizon(self) -> int:
-        return min(5, self.forecaster.horizon_steps)
-
-    def observed(self, states: Tensor | None = None, valid: Tensor | None = None) -> tuple[Memory, Belief]:
-        """Shows the forecaster a history, step by step."""
-        states, valid = (self.states if states is None else states), (self.valid if valid is None else valid)
-        memory = self.forecaster.empty_memory(states.shape[0], states.shape[2])
-        for step in range(states.shape[1]):
-            memory, belief = self.forecaster.observe(memory, states[:, step].clone(), valid)
-        return memory, belief
-
-    def single(self, belief: Belief) -> Float[Tensor, "scenes agents horizon state"]:
-        """Returns the single forecast, zeros for absent agents."""
-        futures = self.forecaster.rollout(belief, self.horizon)
-        return futures.states[:, 0] * belief.valid[:, :, None, None]
-
-    def differ(self, one: Tensor, other: Tensor) -> bool:
-        """Returns whether two forecasts differ by more than rounding."""
-        scales = torch.tensor(self.spec.feature_scales, device=one.device)
-        return bool(((one - other).abs() / scales).max() > TOLERANCE)
-
-    def noise(self, scenes: int = SCENES, first: int = 0) -> Noise:
-        """Returns a generator for each scene; scene i has the same one whatever the others are."""
-        return [np.random.default_rng((self.seed, first + i)) for i in range(scenes)]
-
-
 # --- Layout -----------------------------------------------------------------------------------------------------------
 
 
-def _sizes(trial: _Trial) -> Iterator[str]:
+def _sizes(trial: Trial) -> Iterator[str]:
     for name, least in (("horizon_steps", 1), ("num_edge_types", 1), ("edge_feature_dim", 0)):
         value = getattr(trial.forecaster, name)
         if not isinstance(value, int | np.integer) or value < least:
             yield f"{name} must be a whole number of at least {least}, got {value!r}"
 
 
-def _empty_memory(trial: _Trial) -> Iterator[str]:
+def _empty_memory(trial: Trial) -> Iterator[str]:
     memory: Any = trial.forecaster.empty_memory(SCENES, AGENTS)
     if not isinstance(memory, Memory):
         yield f"empty_memory must return a Memory, got {type(memory).__name__}"
@@ -159,7 +94,7 @@ def _empty_memory(trial: _Trial) -> Iterator[str]:
                 yield f"empty_memory: {kind} must be zero, which stands for an agent that was never seen"
 
 
-def _observe(trial: _Trial) -> Iterator[str]:
+def _observe(trial: Trial) -> Iterator[str]:
     before = trial.forecaster.empty_memory(SCENES, AGENTS)
     result: Any = trial.forecaster.observe(before, trial.states[:, 0].clone(), trial.valid)
     if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Belief)):
@@ -176,7 +111,7 @@ def _observe(trial: _Trial) -> Iterator[str]:
     yield from _edges(trial, belief)
 
 
-def _edges(trial: _Trial, belief: Belief) -> Iterator[str]:
+def _edges(trial: Trial, belief: Belief) -> Iterator[str]:
     sizes = {"edge_probs": trial.forecaster.num_edge_types, "edge_features": trial.forecaster.edge_feature_dim}
     slots = AGENTS if belief.senders is None else belief.senders.shape[-1]
     for name, size in sizes.items():
@@ -189,7 +124,7 @@ def _edges(trial: _Trial, belief: Belief) -> Iterator[str]:
             yield "observe: belief.edge_probs must be probabilities that sum to 1 over the types of each pair"
 
 
-def _rollout(trial: _Trial) -> Iterator[str]:
+def _rollout(trial: Trial) -> Iterator[str]:
     _, belief = trial.observed()
     for samples, steps in ((1, trial.horizon), (SAMPLES, trial.horizon), (SAMPLES, 1)):
         futures: Any = trial.forecaster.rollout(belief, steps, samples, trial.noise())
@@ -212,7 +147,7 @@ def _rollout(trial: _Trial) -> Iterator[str]:
             return
 
 
-def _probabilities(futures: Futures, wanted: tuple[int, ...], trial: _Trial) -> Iterator[str]:
+def _probabilities(futures: Futures, wanted: tuple[int, ...], trial: Trial) -> Iterator[str]:
     probs, scale = futures.mode_probs, futures.scale
     if probs is not None and tuple(probs.shape) != wanted[:3]:
         yield f"rollout: mode_probs must have the shape {wanted[:3]}, got {tuple(probs.shape)}"
@@ -228,7 +163,7 @@ def _probabilities(futures: Futures, wanted: tuple[int, ...], trial: _Trial) -> 
 # --- Meaning ----------------------------------------------------------------------------------------------------------
 
 
-def _first_step(trial: _Trial) -> Iterator[str]:
+def _first_step(trial: Trial) -> Iterator[str]:
     """Straight motion goes on for a step, by and large: its sign and its size are those of velocity times dt_s."""
     axes = trial.spec.position_dim
     _, belief = trial.observed()
@@ -254,13 +189,13 @@ def _first_step(trial: _Trial) -> Iterator[str]:
             )
 
 
-def _repeats(trial: _Trial) -> Iterator[str]:
+def _repeats(trial: Trial) -> Iterator[str]:
     _, belief = trial.observed()
     if trial.differ(trial.single(belief), trial.single(belief)):
         yield "rollout: the single forecast differs from call to call; is the network in training mode (call eval())?"
 
 
-def _arguments_stay(trial: _Trial) -> Iterator[str]:
+def _arguments_stay(trial: Trial) -> Iterator[str]:
     memory, _ = trial.observed(trial.states[:, :2])
     states, valid = trial.states[:, 2].clone(), trial.valid.clone()
     kept = [tensor.clone() for tensor in (*memory.nodes, *memory.pairs)]
@@ -275,7 +210,7 @@ def _arguments_stay(trial: _Trial) -> Iterator[str]:
         yield "rollout writes into the belief; copy belief.states before changing them"
 
 
-def _no_peeking(trial: _Trial) -> Iterator[str]:
+def _no_peeking(trial: Trial) -> Iterator[str]:
     """A forecast from a belief stays what it was, whatever is observed later or elsewhere."""
     memory, belief = trial.observed(trial.states[:, :3])
     before = trial.single(belief)
@@ -296,7 +231,7 @@ def _no_peeking(trial: _Trial) -> Iterator[str]:
         )
 
 
-def _window_does_not_peek(trial: _Trial) -> Iterator[str]:
+def _window_does_not_peek(trial: Trial) -> Iterator[str]:
     window: Any = getattr(trial.forecaster, "window", None)
     if window is None:
         return
@@ -316,7 +251,7 @@ def _window_does_not_peek(trial: _Trial) -> Iterator[str]:
             yield f"window: {name} changes with the states after last_observed; only the posterior may see the future"
 
 
-def _scenes_are_independent(trial: _Trial) -> Iterator[str]:
+def _scenes_are_independent(trial: Trial) -> Iterator[str]:
     together = trial.single(trial.observed()[1])
     for scene in range(SCENES):
         alone = trial.single(trial.observed(trial.states[[scene]], trial.valid[[scene]])[1])
@@ -325,7 +260,7 @@ def _scenes_are_independent(trial: _Trial) -> Iterator[str]:
             return
 
 
-def _order_of_agents(trial: _Trial) -> Iterator[str]:
+def _order_of_agents(trial: Trial) -> Iterator[str]:
     """Agents stand in another order from the middle of the history on, and their memory moves with them."""
     first = 1 if trial.spec.has_ego else 0
     order = torch.tensor([*range(first), *reversed(range(first, AGENTS))], device=trial.device)
@@ -342,7 +277,7 @@ def _order_of_agents(trial: _Trial) -> Iterator[str]:
         yield "memory: the past of an agent stays at its old place when agents are re-sorted (Memory.reorder)"
 
 
-def _absent_agents(trial: _Trial) -> Iterator[str]:
+def _absent_agents(trial: Trial) -> Iterator[str]:
     room = 2
     states = torch.cat([trial.states, trial.states.new_zeros(SCENES, STEPS, room, trial.spec.num_features)], 2)
     valid = torch.cat([trial.valid, trial.valid.new_zeros(SCENES, room)], 1)
@@ -355,7 +290,7 @@ def _of_samples(valid: Bool[Tensor, "scenes agents"]) -> Bool[Tensor, "scenes sa
     return valid[:, None].expand(-1, SAMPLES, -1)
 
 
-def _noise(trial: _Trial) -> Iterator[str]:
+def _noise(trial: Trial) -> Iterator[str]:
     _, belief = trial.observed()
     before = torch.get_rng_state(), np.random.get_state()[1].copy()  # type: ignore[index]  # noqa: NPY002
     one, two = (trial.forecaster.rollout(belief, trial.horizon, SAMPLES, trial.noise()).states for _ in range(2))
@@ -377,7 +312,7 @@ def _noise(trial: _Trial) -> Iterator[str]:
             return
 
 
-def _place_does_not_matter(trial: _Trial) -> Iterator[str]:
+def _place_does_not_matter(trial: Trial) -> Iterator[str]:
     """On "centroid" axes all agents may stand elsewhere."""
     axes = torch.tensor([frame == "centroid" for frame in trial.spec.frame], device=trial.device)
     if not bool(axes.any()):
@@ -392,8 +327,30 @@ def _place_does_not_matter(trial: _Trial) -> Iterator[str]:
         yield "rollout: spec.frame says 'centroid', but the forecast changes when all agents stand elsewhere"
 
 
+def _plans(trial: Trial) -> Iterator[str]:
+    """Two plans of the ego that part in the middle of the horizon: the others may differ from the next step on."""
+    if not trial.spec.has_ego or not isinstance(trial.forecaster, ReactiveForecaster):
+        return
+    _, belief = trial.observed()
+    axes, part = trial.spec.position_dim, trial.horizon // 2
+    plans = belief.states[:, None, :1].expand(-1, 2, trial.horizon, -1).clone()
+    plans[:, 1, part:, :axes] += torch.tensor(trial.spec.feature_scales[:axes], device=trial.device)
+    futures: Any = trial.forecaster.rollout_plans(belief, plans, SAMPLES, trial.noise())
+    try:
+        check_futures(futures, trial.horizon, SAMPLES, belief.states, axes, plans=2)
+    except UserError as error:
+        yield str(error).partition(";")[0]
+        return
+    there = _of_samples(trial.valid[:, 1:])
+    one, two = (futures.states[:, plan, :, 1:][there] for plan in range(2))
+    if not bool(torch.cat([one, two]).isfinite().all()):
+        yield "rollout_plans: states of agents that are there must be finite, got not-a-number or infinity"
+    elif trial.differ(one[:, : part + 1], two[:, : part + 1]):
+        yield "rollout_plans: others react to a plan too early; their step i may depend on its steps before i alone"
+
+
 _LAYOUT = (_sizes, _empty_memory, _observe, _rollout)
 _MEANING = (
     _first_step, _arguments_stay, _repeats, _no_peeking, _window_does_not_peek, _scenes_are_independent,
-    _order_of_agents, _absent_agents, _noise, _place_does_not_matter,
+    _order_of_agents, _absent_agents, _noise, _place_does_not_matter, _plans,
 )  # fmt: skip

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from predictor.forecaster import Belief, Forecaster, Futures
+from predictor.forecaster import Belief, Forecaster, Futures, check_futures
 from predictor.noise import Noise
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
@@ -65,7 +65,8 @@ def rollout_plans(
         Futures with an axis of plans after the batch.
 
     Raises:
-        UserError: the spec has no ego, the ego is absent, or the plans are of another shape or not finite.
+        UserError: the spec has no ego, the ego is absent, or the plans are of another shape or not finite; what the
+            forecaster returns has other sizes.
     """
     check_plans(forecaster.spec, belief.valid[:, 0], tuple(plans.shape), bool(plans.isfinite().all()), plans.shape[-2])
     kept = [forecaster.spec.feature_names.index(name) for name in forecaster.spec.constant_features]
@@ -75,6 +76,8 @@ def rollout_plans(
     horizon_steps = plans.shape[2]
     if isinstance(forecaster, ReactiveForecaster):
         futures = forecaster.rollout_plans(belief, plans, num_samples, generator)
+        axes = forecaster.spec.position_dim
+        check_futures(futures, horizon_steps, num_samples, belief.states, axes, plans.shape[1])
     else:
         futures = _for_all(forecaster.rollout(belief, horizon_steps, num_samples, generator), plans.shape[1])
     states = with_ego(futures.states.transpose(-3, -2), plans[:, :, None]).transpose(-3, -2)

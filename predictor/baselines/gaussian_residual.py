@@ -48,9 +48,11 @@ class GaussianResidual:
         """Fits the covariance to errors of the single forecast on training data.
 
         Raises:
-            UserError: there are fewer errors than coordinates.
+            UserError: there are fewer errors than coordinates, or some are not finite.
         """
         flat = errors_m.reshape(len(errors_m), -1).astype(np.float64)
+        if not np.isfinite(flat).all():
+            raise UserError("the single forecast has errors that are not finite; its weights are damaged or diverged")
         if len(flat) <= flat.shape[1]:
             raise UserError(f"a covariance of {flat.shape[1]} coordinates needs more examples, got {len(flat)}")
         return cls(forecaster, flat.T @ flat / len(flat))

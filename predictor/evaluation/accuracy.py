@@ -16,6 +16,7 @@ from predictor.evaluation import displacement as metrics
 from predictor.evaluation.energy_score import energy_score
 from predictor.evaluation.outcomes import Outcome
 from predictor.evaluation.standard_errors import NUM_SUBSETS, Statistic, batch_interval, ratio_statistics
+from predictor.support.errors import UserError
 
 OPTIONAL = ("coverage", "mixture_nll", "mixture_coverage")
 """Names of quantities that are left out, not NaN, if they could not be measured."""
@@ -119,8 +120,12 @@ class Tally:
 
         Raises:
             ValueError: the number of samples, steps or axes differs from that of earlier batches.
+            UserError: a forecast that counts is not finite.
         """
         _, samples, _, horizon, axes = outcome.forecast.shape
+        counted = outcome.valid.any(dim=-1)[:, None, :, None, None]
+        if not bool((outcome.forecast.isfinite() | ~counted).all()):
+            raise UserError("the forecaster forecasts numbers that are not finite; its weights are damaged or diverged")
         shape = (samples, horizon, axes)
         if self._shape not in (None, shape):
             raise ValueError(

@@ -2,6 +2,7 @@ import io
 import json
 import math
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,8 @@ from predictor.checkpoint import CheckpointInfo, save_checkpoint
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.dgvae import DGVAE
 from predictor.evaluate import EvaluateConfig, evaluate
-from predictor.evaluation.accuracy import Accuracy, summarise
+from predictor.evaluation.accuracy import Accuracy
+from predictor.evaluation.outcomes import Outcome
 from predictor.evaluation.standard_errors import Statistic
 from predictor.reports.tables import accuracy_table, markdown_table
 from predictor.scene import KINEMATIC_FEATURES_3D, SceneSpec
@@ -205,12 +207,28 @@ def test_the_first_agent_of_a_recording_without_an_ego_is_not_taken_for_it(
         evaluate(EvaluateConfig(str(checkpoint), tmp_path / "equals"))
 
 
-def test_forecasts_that_are_not_finite_are_no_result(data: Path, checkpoint: Path, tmp_path: Path, monkeypatch: Any):
-    def diverged(*arguments: Any, **named: Any) -> Accuracy:
-        return replace(summarise(*arguments, **named), min_ade_m=math.nan)
+def test_likelihood_and_standard_error_of_constant_velocity_with_noise_are_of_one_forecaster(
+    data: Path, checkpoint: Path
+):
+    one = evaluate(EvaluateConfig(str(checkpoint), data, num_samples=1))[-1]
+    drawn = evaluate(EvaluateConfig(str(checkpoint), data, num_samples=3))[-1]
+    assert drawn.name == "constant velocity + noise" and drawn.nll == one.nll
+    assert drawn.step_errors["nll"] == one.step_errors["nll"]
 
-    monkeypatch.setattr(evaluation, "summarise", diverged)
-    with pytest.raises(UserError, match="forecasts numbers that are not finite; its training diverged"):
+
+def test_forecasts_that_are_not_finite_are_no_result(data: Path, checkpoint: Path, tmp_path: Path, monkeypatch: Any):
+    measured = evaluation.run_windows
+
+    def diverged(forecaster: Any, *arguments: Any, **named: Any) -> Iterator[Outcome]:
+        for outcome in measured(forecaster, *arguments, **named):
+            if isinstance(forecaster, DGVAE):
+                forecast = outcome.forecast.clone()
+                forecast[0, 1] = math.nan  # one sample of one window: the mean of the others would look well
+                outcome = replace(outcome, forecast=forecast)
+            yield outcome
+
+    monkeypatch.setattr(evaluation, "run_windows", diverged)
+    with pytest.raises(UserError, match="forecasts numbers that are not finite; its weights are damaged or diverged"):
         evaluate(EvaluateConfig(str(checkpoint), data, out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 

@@ -27,6 +27,8 @@ from tests.predictor.helpers import ROAD, batch, model, random_states, scene, sp
 ENVS, AGENTS, EGO = 3, 4, 0
 OTHERS = (3, 7, 11, 20)  # more than fit in a scene beside the ego
 History = list[Scene]
+TYPES = "Type-check error"
+"""Begins what `make test-shapes` says of an argument of another type, before the code that is tested sees it."""
 
 
 def assert_same(ours: Forecast, expected: Forecast, tolerance: float = 1e-5) -> None:
@@ -301,12 +303,55 @@ def test_a_mask_chooses_the_environments_that_it_marks(forecaster: DGVAE):
         (np.array([ENVS]), rf"envs must be different numbers from 0 to {ENVS - 1}, got \[{ENVS}\]"),
         (np.array([-1]), r"envs must be different numbers from 0 to .*, got \[-1\]"),
         (np.array([0, 0]), r"envs must be different numbers from 0 to .*, got \[0, 0\]"),
+        (0, "envs must be a list of whole numbers, or a mask, got 0"),
+        (np.array([0.7]), "envs must be a list of whole numbers, or a mask, got "),
+        (["a"], r"envs must be a list of whole numbers, or a mask, got \['a'\]"),
+        ([[0]], r"envs must be a list of whole numbers, or a mask, got \[\[0\]\]"),
     ],
 )
-def test_environments_that_are_not_there_are_refused(forecaster: DGVAE, envs: np.ndarray, message: str):
+def test_environments_that_are_not_there_are_refused(forecaster: DGVAE, envs: Any, message: str):
     stream = online(forecaster, ENVS)
-    with pytest.raises(UserError, match=message):
+    with pytest.raises(Exception, match=f"{message}|{TYPES}"):
         stream.reset(envs)
+
+
+@pytest.mark.parametrize("wrong", [{"envs": -1}, {"agents": 0}, {"max_rows": 0}])
+def test_numbers_of_scenes_and_agents_are_whole(wrong: dict[str, Any]):
+    (name, number), *_ = wrong.items()
+    with pytest.raises(UserError, match=f"{name} must be a whole number of at least 1, got {number}"):
+        OnlineForecaster(ConstantVelocity(spec()), **{"envs": 1, "agents": 3} | wrong)
+
+
+def test_an_agent_without_an_id_is_refused_from_the_first_scene_on(forecaster: DGVAE):
+    nameless = scene(states_of(0, 0, 3), AGENTS)
+    nameless = Scene(
+        nameless.states, np.full(AGENTS, PADDING_ID), nameless.valid
+    )  # as none were before the first scene
+    with pytest.raises(UserError, match="ids of valid agents must be non-negative, got -1"):
+        online(forecaster).observe(batch(nameless))
+
+
+def test_a_state_beyond_float32_is_refused_and_the_history_stays(forecaster: DGVAE):
+    good = scene(states_of(0, 0, 3), AGENTS)
+    far = Scene(good.states.copy(), good.ids, good.valid)
+    far.states[1, 0] = 1e39
+    one, other = online(forecaster), online(forecaster)
+    for stream in (one, other):
+        stream.observe(batch(good))
+    with pytest.raises(UserError, match=r"states must be at most 1e\+30 in size, got .*agent 1"):
+        one.observe(batch(far))
+    for stream in (one, other):
+        stream.observe(batch(scene(states_of(1, 0, 3), AGENTS)))
+    assert_same(one.forecast(), other.forecast())
+
+
+@pytest.mark.parametrize("wrong", [0, np.random.default_rng(0), [torch.Generator()], "seed"])
+def test_another_kind_of_generator_is_refused(forecaster: DGVAE, wrong: Any):
+    stream = online(forecaster)
+    stream.observe(batch(scene(states_of(0, 0, 3), AGENTS)))
+    needed = "generator must be one torch.Generator, or a list of numpy.random.Generator"
+    with pytest.raises(Exception, match=f"{needed}|{TYPES}"):
+        stream.forecast(num_samples=3, generator=wrong)
 
 
 def test_reset_of_all_envs(forecaster: DGVAE):

@@ -307,6 +307,45 @@ def test_a_frame_that_is_not_kept_is_found():
     assert "spec.frame says 'centroid', but the forecast changes" in "".join(forecaster_problems(Somewhere()))
 
 
+class Reacts(Smooth):
+    """Others follow the ego's plan by a step later."""
+
+    spec = SceneSpec(dt_s=0.5, frame=WORLD, has_ego=True)
+    late = 1
+
+    def rollout_plans(self, belief: Belief, plans: Tensor, num_samples: int = 1, generator: Any = None) -> Futures:
+        states = self.rollout(belief, plans.shape[2], num_samples, generator).states
+        states = states[:, None].repeat(1, plans.shape[1], 1, 1, 1, 1)
+        seen = (plans - belief.states[:, None, :1])[:, :, None, None]
+        states[..., self.late :, :2] += 0.1 * seen[..., : plans.shape[2] - self.late, :2]
+        return Futures(states)
+
+
+def test_a_reaction_one_step_later_is_right():
+    assert forecaster_problems(Reacts()) == []
+
+
+def test_mistakes_with_plans_are_found():
+    class TooEarly(Reacts):
+        late = 0
+
+    class Transposed(Reacts):
+        def rollout_plans(self, *arguments: Any, **named: Any) -> Futures:
+            return Futures(super().rollout_plans(*arguments, **named).states.transpose(1, 2))
+
+    class Broken(Reacts):
+        def rollout_plans(self, *arguments: Any, **named: Any) -> Futures:
+            return Futures(super().rollout_plans(*arguments, **named).states * np.nan)
+
+    assert forecaster_problems(TooEarly()) == [
+        "rollout_plans: others react to a plan too early; their step i may depend on its steps before i alone"
+    ]
+    assert forecaster_problems(Transposed()) == [
+        "rollout_plans of a forecaster: states must have the shape (3, 2, 3, 4, 4, 4), got (3, 3, 2, 4, 4, 4)"
+    ]
+    assert "rollout_plans: states of agents that are there must be finite" in forecaster_problems(Broken())[0]
+
+
 @pytest.mark.parametrize("name", ["roundabout", "simple-tag", "racetrack"])
 def test_shipped_checkpoints_pass(name: str):
     assert forecaster_problems(load_checkpoint(name)[0]) == []

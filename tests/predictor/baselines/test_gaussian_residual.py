@@ -159,6 +159,14 @@ def test_a_covariance_needs_more_examples_than_coordinates():
     assert GaussianResidual.fit(straight, np.zeros((7, HORIZON, AXES))).horizon_steps == HORIZON
 
 
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_an_error_that_is_not_finite_is_refused(wrong: float):
+    errors = np.random.default_rng(0).normal(size=(50, HORIZON, AXES))
+    errors[7, 0, 1] = wrong
+    with pytest.raises(UserError, match="the single forecast has errors that are not finite"):
+        GaussianResidual.fit(ConstantVelocity(LAYOUT), errors)
+
+
 def test_errors_of_zero_are_no_reason_to_fail():
     """Agents that stand, all of them: the root of a covariance of zeros."""
     control = GaussianResidual.fit(ConstantVelocity(LAYOUT), np.zeros((7, HORIZON, AXES)))
