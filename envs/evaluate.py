@@ -146,7 +146,7 @@ class EvaluateConfig:
         for name in ("episodes", "num_samples"):
             check_count(getattr(self, name), name)
         check_count(self.num_samples * (self.horizon_steps or 1), "horizon_steps times num_samples")
-        check_processes(min(self.workers, self.episodes), "workers")
+        check_processes(min(self.workers, self.most_episodes if self.reactions else self.episodes), "workers")
         check_address(self.cluster)
         check_positive(self, "miss_m", "timeout_s")
         if arguments_of(self.env_kwargs) and len(self.env_ids) != 1:

@@ -51,12 +51,18 @@ class Place:
             self._numbers[_SEED], self._numbers[_EPISODE] = seed, 0
         self._numbers[_EPISODE] += 1
         self._numbers[_STEP] = 0
-        self._numbers[_MOVES] += 1
+        self._tick()
 
     def move(self) -> None:
         """Notes that a step begins; steps count from 1."""
         self._numbers[_STEP] += 1
+        self._tick()
+
+    def _tick(self) -> None:
+        """Counts a move; that of a copy (a branch that is played) also where another process looks for a hang."""
         self._numbers[_MOVES] += 1
+        if _shared is not None and _shared is not self._numbers:
+            _shared[_MOVES] += 1
 
     def clear(self) -> None:
         """Notes that nothing is played yet."""

@@ -30,6 +30,8 @@ FREE = 0.6
 """Probability that a driver is free after its speed has changed; otherwise it holds the speed for a while."""
 EGO_SHARE = 0.3
 """Probability that the ego is the one that is perturbed, if others are possible too: policies ask what they cause."""
+AT_REST = 0.25
+"""Share of the least loss of speed below which an agent's speed is too low for it to brake."""
 TRIES = 3
 """Largest number of interventions that are tried until one moves another agent; the last one is kept in any case."""
 
@@ -132,9 +134,11 @@ def _branch(
     if not senders:  # nobody who is there for more than this moment
         return []
     kept: Branches | None = None
+    axes = moment.spec.position_dim
     for _ in range(TRIES):
         sender = _sender(senders, int(point.ids[0]) if moment.spec.has_ego else None, rng)
-        found = _perturbed(point, sender, horizon, settings.mix, rng)
+        velocity = point.plain.states[0, point.ids == sender, axes : 2 * axes]
+        found = _perturbed(point, sender, float(np.linalg.norm(velocity)), horizon, settings.mix, rng)
         if found is None:
             continue
         kept = found
@@ -158,18 +162,21 @@ def _sender(senders: Sequence[int], ego: int | None, rng: np.random.Generator) -
 
 
 def _perturbed(
-    point: BranchPoint, sender: int, horizon: int, mix: BranchMix, rng: np.random.Generator
+    point: BranchPoint, sender: int, speed_mps: float, horizon: int, mix: BranchMix, rng: np.random.Generator
 ) -> Branches | None:
-    """Plays a random intervention on an agent; None if it allows none."""
+    """Plays a random intervention on an agent of this speed; None if it allows none."""
     kinds = list(SHARES)
     shares = np.array([SHARES[kind] for kind in kinds])
     for kind in rng.choice(kinds, len(kinds), replace=False, p=shares / shares.sum()):
         try:
-            return point.perturbed(_drawn(sender, kind, horizon, mix, rng))
+            drawn = _drawn(sender, kind, horizon, mix, rng)
+            if kind == "brake" and speed_mps < AT_REST * mix.brake_mps[0]:
+                continue  # nothing would change
+            return point.perturbed(drawn)
         except EnvironmentFailedError:
             raise
         except UserError:
-            continue  # an ego that cannot be taken out, a vehicle at rest
+            continue  # an ego that cannot be taken out
     return None
 
 

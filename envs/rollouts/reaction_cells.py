@@ -14,15 +14,17 @@ from jaxtyping import Float
 from envs.readers.highway import is_highway_env
 from envs.readers.highway_labels import LEADER, NO_EDGE, SceneLabels
 from envs.rollouts.causal_labels import settings_for
-from envs.rollouts.interventions import body_of, interventions_of
+from envs.rollouts.interventions import body_of, interventions_of, kinds_of
 from envs.rollouts.moving import moving_agents
 from envs.rollouts.world import EgoWorld, World
+from envs.simulators.highway_interventions import CHANGE_MPS
 from envs.simulators.interventions import Intervention, Kind
 
 STILL_M = 0.1
 """True shift below which a receiver on a road counts as not moved [m]."""
 STILL_SHARE = 0.1
-"""Share of the threshold below which a receiver elsewhere counts as not moved."""
+"""Share of the threshold below which a receiver elsewhere counts as not moved, and of the scale of velocities below
+which a sender counts as at rest where braking takes all its speed."""
 
 Role = Literal["leader", "ego", "aside", "any"]
 Pair = tuple[int, int]
@@ -89,16 +91,19 @@ def pairs_of(cell: Cell, world: World) -> list[Pair]:
     """Returns all pairs of receiver and sender that a cell allows now, before anything is tried.
 
     Both are perceived and within the distance of the causal labels (`CausalSettings.near_m`); no receiver is the ego,
-    whose future is its policy's choice; senders that brake are not near rest already.
+    whose future is its policy's choice; senders that brake lose at least half of what they are asked to lose, and are
+    not near rest already where that is all their speed.
     """
     scene, spec = world.perceived(), world.spec
     settings, labels = settings_for(world), world.labels()
     place = {int(agent): i for i, agent in enumerate(world.full_scene().ids)}
     moving = [int(i) for i in np.flatnonzero(moving_agents(scene, spec))]
     busy = interventions_of(world)
+    speeds = np.linalg.norm(scene.states[:, spec.position_dim : 2 * spec.position_dim], axis=-1)
+    slowest = _least_speed(cell, world)
     found = []
     for sender in moving:
-        if _is_too_slow(cell, scene.states[sender], spec.position_dim) or int(scene.ids[sender]) in busy:
+        if speeds[sender] < slowest or int(scene.ids[sender]) in busy:
             continue
         is_ego = spec.has_ego and sender == 0
         if is_ego != (cell.role == "ego"):
@@ -113,11 +118,13 @@ def pairs_of(cell: Cell, world: World) -> list[Pair]:
     return found
 
 
-def _is_too_slow(cell: Cell, state: Float[np.ndarray, " state"], axes: int) -> bool:
-    """Returns whether a sender would lose less than half of the speed that it is asked to lose."""
-    if cell.kind != "brake" or cell.change_mps is None:
-        return False
-    return float(np.linalg.norm(state[axes : 2 * axes])) < cell.change_mps / 2
+def _least_speed(cell: Cell, world: World) -> float:
+    """Returns the speed [m/s] below which a sender's braking would be next to nothing."""
+    if cell.kind != "brake":
+        return 0.0
+    if cell.change_mps is not None or "left" in kinds_of(world):
+        return (cell.change_mps or CHANGE_MPS["brake"]) / 2
+    return STILL_SHARE * world.spec.feature_scales[world.spec.position_dim]
 
 
 def _fits(role: Role, world: World, pair: Pair, labels: SceneLabels | None, place: dict[int, int]) -> bool:

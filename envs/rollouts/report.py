@@ -96,24 +96,20 @@ def title(result: "EnvAccuracy") -> str:
 
 def remarks(result: "EnvAccuracy") -> str:
     """Returns the remarks under the table: intervals, graph, latency."""
-    low, high = result.model.intervals.get("min_ade_m", (np.nan, np.nan))
-    lines = [f"minADE (K = 1) {result.model.min_ade_m:.3f} m, 95 % over episodes {low:.3f} to {high:.3f}"]
+    lines = [f"minADE (K = 1) {result.model.min_ade_m:.3f} m, 95 % over episodes {_interval(result.model)}"]
     for steps, line in result.histories.items():
-        low, high = line.intervals.get("min_ade_m", (np.nan, np.nan))
-        lines.append(f"… with {steps} step(s) of history {line.min_ade_m:.3f} m, {low:.3f} to {high:.3f}")
+        lines.append(f"… with {steps} step(s) of history {line.min_ade_m:.3f} m, {_interval(line)}")
     for key, line in result.edges.items():
-        low, high = line.intervals.get("min_ade_m", (np.nan, np.nan))
         more = 100 * (line.min_ade_m / result.model.min_ade_m - 1)
-        lines.append(f"… with {key} {line.min_ade_m:.3f} m ({more:+.0f} %), {low:.3f} to {high:.3f}")
+        lines.append(f"… with {key} {line.min_ade_m:.3f} m ({more:+.0f} %), {_interval(line)}")
     for key, pair in (
         ("counting forecasts that pass the episode's end up to it", result.to_the_end),
         (f"the same in the last {BEFORE_CRASH_S:g} s before a crash", result.before_crash),
     ):
         if pair is not None:
             own, straight = pair
-            low, high = own.intervals.get("min_ade_m", (np.nan, np.nan))
             lines.append(
-                f"{key}: minADE {own.min_ade_m:.3f} m, {low:.3f} to {high:.3f}, constant velocity "
+                f"{key}: minADE {own.min_ade_m:.3f} m, {_interval(own)}, constant velocity "
                 f"{straight.min_ade_m:.3f} m, {own.agents} forecasts"
             )
     if covered := result.model_samples.mixture_coverage:
@@ -133,11 +129,16 @@ def remarks(result: "EnvAccuracy") -> str:
     return "\n".join(lines)
 
 
+def _interval(accuracy: Accuracy) -> str:
+    found = accuracy.intervals.get("min_ade_m")
+    return "–" if found is None else f"{found[0]:.3f} to {found[1]:.3f}"
+
+
 def overview(results: Sequence["EnvAccuracy"]) -> FittedTable:
     """Returns a table with one line per result."""
     several = len({result.env_id for result in results}) < len(results)
     heads = [textwrap.fill(head, 12) for head in HEADS]
-    return FittedTable("in-env accuracy, held-out seeds", heads, [_cells(r) for r in results], kept=1 + several)
+    return FittedTable("in-env accuracy", heads, [_cells(r) for r in results], kept=1 + several)
 
 
 def markdown(results: Sequence["EnvAccuracy"], misfits: Mapping[tuple[str, str], str]) -> str:

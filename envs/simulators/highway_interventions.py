@@ -18,8 +18,8 @@ from envs.simulators.held_agents import HeldAgents, MotionLog
 from envs.simulators.intervention import Intervention
 from predictor.support.errors import UserError
 
-MOTION = ("position", "heading", "speed", "lane", "lane_index", "target_lane_index", "action", "crashed")
-"""Attributes of a vehicle that make up its motion in a frame."""
+MOTION = ("position", "heading", "speed", "lane", "lane_index", "target_lane_index", "route", "action", "crashed")
+"""Attributes of a vehicle that make up its motion in a frame; others foresee it along its route."""
 CHANGE_MPS = {"brake": 8.0, "accelerate": 5.0}
 """Changes of speed where an intervention names none; 8 m/s is the larger one of docs/datasets/env.md's measurements."""
 RATE_MPS2 = {"brake": 6.0, "accelerate": 3.0}
@@ -41,6 +41,8 @@ def intervene_on_road(env: AbstractEnv, vehicle: Vehicle, intervention: Interven
             would be taken out although a policy drives it.
     """
     name = f"agent {intervention.agent}"
+    if (standing := env.road.__dict__.get("act")) is not None:
+        standing.end_finished()
     if intervention.agent in road_interventions(env):
         raise UserError(f"{name} is under an intervention already; let it end, or choose another agent")
     if intervention.kind == "remove":
@@ -99,7 +101,7 @@ class RoadInterventions:
 
     def __call__(self) -> None:
         """Lets all drivers decide, then overrides; ends what is over, and leaves the road when all is."""
-        self.running = [one for one in self.running if one.frames > 0 or not one.end()]
+        self.end_finished()
         for one in self.running:
             one.before()
         if self.held is None:
@@ -116,6 +118,10 @@ class RoadInterventions:
             self.log.note(self.road.vehicles)
         if not self.running and self.log is None and self.held is None:
             del self.road.act
+
+    def end_finished(self) -> None:
+        """Gives back the vehicles of interventions that are over."""
+        self.running = [one for one in self.running if one.frames > 0 or not one.end()]
 
 
 class _Override:

@@ -160,7 +160,7 @@ def score_rule(
     score, pairs = score[test].astype(np.float64), pairs.where(test)
     if not len(pairs):
         return CausalScores(0, 0, 0.0, bound)
-    decisions = _decisions(score, pairs, bound)
+    decisions = {} if bound is None else _decisions(score, pairs, bound)
     return CausalScores(
         len(pairs),
         len(np.unique(pairs.episode)),

@@ -87,7 +87,9 @@ def _tables(file: Path) -> Iterator[Block]:
         if "rows" in result:  # of predictor.evaluate
             title, lines = str(result.get("source")), result["rows"]
         else:
-            title = f"{result.get('env_id')}, driven {result.get('driver')}"
+            title = (
+                f"{result.get('env_id')} {result.get('env_kwargs') or ''}".strip() + f", driven {result.get('driver')}"
+            )
             controls = as_object(result.get("controls") or {}, where)
             lines = [result.get(name) for name in ("model", "model_samples", "constant_velocity")] + [
                 *controls.values()

@@ -12,7 +12,7 @@ import pytest
 import train_policy
 from agents import evaluate as agents_evaluate
 from agents.task import SELECTION_SEED
-from envs import collect, evaluate
+from envs import collect, evaluate, supervision
 from envs.supervision import NUMBERS, EnvironmentFailedError, Place, SupervisedEnv, check_numbers
 from predictor.data.store import read_store
 from predictor.support.errors import UserError
@@ -126,6 +126,18 @@ def test_a_copy_of_a_place_counts_for_itself():
     for other in (copy.deepcopy(place), pickle.loads(pickle.dumps(place))):
         other.move()
         assert (str(other), str(place)) == ("seed 7, step 1", "seed 7, its reset")
+
+
+def test_who_looks_for_a_hang_sees_that_a_copy_moves(monkeypatch: pytest.MonkeyPatch):
+    """A process that plays branches is not hanging, however long they take."""
+    monkeypatch.setattr(supervision, "_shared", None)
+    place = supervision.share(multiprocessing.get_context("spawn").RawArray("q", NUMBERS))
+    place.begin(7)
+    before, other = place.moves, copy.deepcopy(place)
+    other.move()
+    assert place.moves == before + 1 and str(place) == "seed 7, its reset"
+    place.move()
+    assert place.moves == before + 2
 
 
 def test_a_place_says_where_an_episode_is():

@@ -182,7 +182,24 @@ def test_a_simulator_that_fails_in_a_branch_is_no_agent_that_allows_nothing(monk
 
     monkeypatch.setattr(BranchPoint, "perturbed", fails)
     with pytest.raises(EnvironmentFailedError, match="it raised"):
-        _perturbed(BranchPoint.__new__(BranchPoint), 1, 3, ROAD_MIX, np.random.default_rng(0))
+        _perturbed(BranchPoint.__new__(BranchPoint), 1, 20.0, 3, ROAD_MIX, np.random.default_rng(0))
+
+
+def test_who_stands_does_not_brake(monkeypatch: pytest.MonkeyPatch):
+    def tried(speed_mps: float) -> set[str]:
+        kinds: set[str] = set()
+
+        def refuses(point: BranchPoint, intervention: Intervention) -> Branches:
+            kinds.add(intervention.kind)
+            raise UserError("not this one")
+
+        monkeypatch.setattr(BranchPoint, "perturbed", refuses)
+        for seed in range(9):
+            rng = np.random.default_rng(seed)
+            assert _perturbed(BranchPoint.__new__(BranchPoint), 1, speed_mps, 3, ROAD_MIX, rng) is None
+        return kinds
+
+    assert tried(0.4) == {"accelerate", "remove"} and tried(0.6) == {"brake", "accelerate", "remove"}
 
 
 @pytest.mark.parametrize("gives", [(True, False, False), (True, True, False)])

@@ -58,6 +58,22 @@ def test_what_reaches_an_agent_through_another_is_not_direct(kind: Kind):
     assert middle[5, 2, 0] == pytest.approx(whole[5, 2, 0])
 
 
+@pytest.mark.parametrize(("env_id", "seed"), [("intersection-v2", 900_006), ("intersection-multi-agent-v2", 900_003)])
+def test_an_intervention_that_does_nothing_moves_no_one_directly(env_id: str, seed: int):
+    """Vehicles that are held lead the others to foresee the same of them as without it: their routes go on."""
+    world = open_world(env_id, "varied")
+    world.reset(seed)
+    farthest = []
+    for _ in range(4):
+        played(world, 2)
+        point = BranchPoint(world, 3)
+        others = [int(agent) for agent in point.ids if not world.spec.has_ego or agent != point.ids[0]]
+        for sender, receiver in zip(others[:6], others[1:7], strict=False):
+            nothing = Intervention(sender, "brake", 0, change_mps=1e-12, at_once=True)
+            farthest.append(np.abs(point.direct(nothing, receiver).shift()[0]).max())
+    assert len(farthest) > 10 and max(farthest) < 1e-5
+
+
 def test_in_an_arena_others_are_held_too():
     world = open_world("simple_tag_v3", "heuristic")
     world.reset(2)

@@ -96,6 +96,22 @@ def test_in_an_arena_all_agents_but_obstacles_are_tried():
             assert ((receiver, sender) in found) == (apart <= 1.5)
 
 
+def test_who_stands_in_an_arena_does_not_brake():
+    world = open_world("simple_tag_v3", "heuristic")
+    world.reset(2)
+    senders = {sender for _, sender in pairs_of(NEAR_CELL, world)}
+    assert senders == set()  # at the start of an episode all stand
+    played(world, 3)
+    assert {sender for _, sender in pairs_of(NEAR_CELL, world)} == {0, 1, 2, 3}
+    assert {sender for _, sender in pairs_of(ELSEWHERE[2], open_at_start())} == {0, 1, 2, 3}  # but may be taken out
+
+
+def open_at_start() -> World:
+    world = open_world("simple_tag_v3", "heuristic")
+    world.reset(2)
+    return world
+
+
 def shift(length_m: float) -> np.ndarray:
     """A shift that is longest in the middle of the horizon."""
     return np.array([[0.0, 0.0], [length_m, 0.0], [0.5 * length_m, 0.0]])

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envs.rollouts.interventions import intervene, interventions_of
+from envs.rollouts.interventions import body_of, intervene, interventions_of
 from envs.rollouts.world import EgoWorld, World, open_world
 from envs.simulators.highway_interventions import RATE_MPS2
 from envs.simulators.intervention import Intervention, Kind
@@ -132,6 +132,19 @@ def test_a_driver_begins_no_lane_change_meanwhile_and_may_again_afterwards(kind:
     assert not driver.enable_lane_change
     played(world, 3)
     assert driver.enable_lane_change
+
+
+def test_two_interventions_in_a_row_give_the_vehicle_back_as_it_was():
+    world = road_world(*CARS)
+    vehicle = body_of(world, 2)
+    vehicle.enable_lane_change = True
+    intervene(world, Intervention(2, "brake", 1, change_mps=4.0))
+    played(world, 1)
+    intervene(world, Intervention(2, "accelerate", 2, change_mps=4.0))
+    played(world, 1)
+    assert not vehicle.enable_lane_change  # the second one is in force
+    played(world, 2)
+    assert vehicle.enable_lane_change
 
 
 def test_an_ego_that_steers_itself_keeps_its_own_acceleration_for_later():

@@ -102,6 +102,14 @@ def test_all_is_measured_on_the_second_half_and_the_bound_fitted_on_the_first():
     assert (own.bound, value(own.f1), value(own.fitted)) == (5.0, 1.0, pytest.approx(0.8))
 
 
+def test_a_rule_without_a_bound_decides_nothing():
+    """No edge in the first half, so none could be fitted; its order of the pairs is scored all the same."""
+    exists = [False] * 4 + [True, True, False, False]
+    found = score_rule(np.arange(8.0)[::-1].copy(), pairs(exists, [0] * 4 + [1] * 4), None)
+    assert found.bound is None and value(found.auc) == 1.0
+    assert found.f1 is None and found.accuracy is None and found.recall is None and found.precision is None
+
+
 def test_halves_are_whole_episodes():
     first, second = halves(pairs([True] * 6, [4, 4, 7, 7, 7, 9]))
     assert first.tolist() == [True, True, False, False, False, False]
