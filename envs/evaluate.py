@@ -36,7 +36,7 @@ from envs.rollouts.summary import summarise_episodes
 from envs.rollouts.world import default_drivers, open_world
 from envs.supervision import TIMEOUT_S, EnvironmentFailedError
 from predictor.checkpoint import CONSTANT_VELOCITY, load_forecaster, names_of, require_known, resolve
-from predictor.data.store import read_info_of
+from predictor.data.store import read_info_of, read_store
 from predictor.own_forecasters import is_own
 from predictor.reports.tables import accuracy_table
 from predictor.support.cluster import check_address
@@ -226,6 +226,17 @@ def _stores_of(roots: Sequence[Path], env_id: str, env_kwargs: str = "") -> tupl
     return tuple(found)
 
 
+def _check_unseen(stores: Sequence[str], seed: int, episodes: int) -> None:
+    """Raises a `UserError` if a store has an episode of a seed that is evaluated."""
+    for store in stores:
+        both = {e.seed for e in read_store(Path(store)).episodes} & set(range(seed, seed + episodes))
+        if both:
+            raise UserError(
+                f"data: {store} has episodes of {len(both)} of the seeds that are evaluated (the first: {min(both)}); "
+                "its controls would know the answers; give another --seed, or another store"
+            )
+
+
 def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy], dict[tuple[str, str], str]]:
     """Evaluates all checkpoints in all environments; writes each one's files under `config.out`.
 
@@ -235,7 +246,8 @@ def evaluate(config: EvaluateConfig, console: Console) -> tuple[list[EnvAccuracy
     results: list[EnvAccuracy] = []
     misfits: dict[tuple[str, str], str] = {}
     for env_id in config.env_ids:
-        _stores_of(config.data, env_id, config.env_kwargs)  # an error for all checkpoints is no misfit of one
+        # an error for all checkpoints is no misfit of one
+        _check_unseen(_stores_of(config.data, env_id, config.env_kwargs), config.seed, config.episodes)
         for checkpoint in config.checkpoint or (None,):
             try:
                 result, cases = evaluate_env(config, env_id, checkpoint)
@@ -270,6 +282,9 @@ def evaluate_causes(config: EvaluateConfig, console: Console) -> None:
             check_has_plans(env_id, config.env_kwargs)
     shared = [_settings(config, env_id, driver) for env_id, driver in drivers.items()]
     if config.reactions:
+        for env_id in drivers:
+            stores = _stores_of(config.data, env_id, config.env_kwargs)
+            _check_unseen(stores, config.seed, config.most_episodes)
         runs = [
             ReactionRun(
                 **settings | {"episodes": config.most_episodes},

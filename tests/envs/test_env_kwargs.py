@@ -164,3 +164,19 @@ def test_plans_that_the_changed_environment_lacks_are_missed_before_hours_of_wor
     arguments = ["--env-ids", ROAD, "--driver", "random", "--graph", "--plans", "--env-kwargs", steered]
     code, errors, _ = run_command(evaluate.main, arguments, monkeypatch, capsys)
     assert code == 2 and "plan" in errors[0]
+
+
+@pytest.mark.parametrize("measurement", [[], ["--reactions"]])
+def test_controls_are_not_fitted_to_the_episodes_that_are_evaluated(
+    measured: dict[str, Any],
+    measurement: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    few = measured["folder"] / "few"
+    (first, *_) = read_store(few).episodes
+    words = ["evaluate", "--env-ids", ROAD, "--env-kwargs", FEW, "--checkpoint", "constant-velocity", *measurement]
+    monkeypatch.setattr("sys.argv", [*words, "--data", str(few), "--seed", str(first.seed), "--workers", "1"])
+    said = rf"few has episodes of 2 of the seeds that are evaluated \(the first: {first.seed}\)"
+    with pytest.raises(UserError, match=said):
+        evaluate.main()
