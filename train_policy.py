@@ -183,7 +183,7 @@ class TrainPolicyConfig:
         task = Task(
             self.env_id, self.observe, self.checkpoint, self.device, self.backend, tuple(learners), self.driver,
             self.num_samples, self.horizon_steps, self.perception_m, self.what_if, self.env_kwargs, self.timeout_s,
-            self.crash_key, self.success_key, self.sizes_of,
+            crash_key=self.crash_key, success_key=self.success_key, sizes_of=self.sizes_of,
         )  # fmt: skip
         return TrainingPlan(
             task,

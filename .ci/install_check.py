@@ -144,7 +144,8 @@ EXTRAS: dict[str, Extra] = {
         (
             "\nimport os\n\nos.environ['HF_ENDPOINT'] = 'http://127.0.0.1:9'\n"
             "from predictor import UserError, from_hub\n"
-            "try:\n    from_hub('owner/name')\nexcept UserError as error:\n    assert 'cannot reach' in str(error)\n",
+            "try:\n    from_hub('owner/name')\nexcept UserError as error:\n    assert 'cannot reach' in str(error)\n"
+            "else:\n    raise SystemExit('reached a hub that is not there')\n",
         ),
         absent=("gymnasium", "stable_baselines3"),
     ),

@@ -360,6 +360,17 @@ def test_sizes_by_default(env_id: str, backend: Literal["gymnasium", "envpool"],
     assert train_policy.TrainPolicyConfig(env_id, backend=backend, **asdict(given)).sizes == given
 
 
+def test_options_reach_the_task():
+    given = {
+        "timeout_s": 7.0,
+        "crash_key": "outcome.hit",
+        "success_key": "outcome.goal",
+        "env_kwargs": '{"config": {}}',
+    }
+    task = train_policy.TrainPolicyConfig("highway-fast-v0", **given).plan.task
+    assert {name: getattr(task, name) for name in given} == given
+
+
 @pytest.mark.parametrize(
     ("env_id", "asked", "learners"),
     [

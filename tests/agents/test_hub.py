@@ -78,10 +78,21 @@ def test_a_policy_of_a_hub_is_measured_by_those_who_trust_it(
     assert summaries[0]["policies"] == summaries[1]["policies"]
     assert json.loads(summaries[0]["env_kwargs"]) == json.loads(FEW)
     alone = '{"config": {"vehicles_count": 0, "duration": 3}}'
-    evaluated("--run-dir", str(path), "--out", str(tmp_path / "c"), "--env-kwargs", alone, "--crash-key", "nothing")
+    words = ["--env-kwargs", alone, "--crash-key", "nothing", "--seed", "77"]
+    evaluated("--run-dir", str(path), "--out", str(tmp_path / "c"), *words)
     changed = json.loads((tmp_path / "c" / "summary.json").read_text())
+    assert changed["first_seed"] == 77 != summaries[0]["first_seed"]
     assert json.loads(changed["env_kwargs"]) == json.loads(alone)
     assert changed["policies"][0]["length_mean"] == 3 and changed["policies"][0]["crash_rate"] is None
+
+
+@pytest.mark.parametrize("what", ["merge", "policy"])
+def test_what_is_pushed_as_private_stays_private(what: str, hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = what if what == "merge" else str(saved(tmp_path, Task(FAST, "none", env_kwargs=FEW))[0])
+    for name, words in (("me/secret", ["--private"]), ("me/open", [])):
+        monkeypatch.setattr(sys, "argv", ["push", path, name, *words])
+        run_entry_point(main)
+    assert hub.private == {"me/secret"}
 
 
 def test_a_predictor_is_no_policy(hub: Hub):

@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 
@@ -45,6 +46,15 @@ def test_what_cannot_be_drawn_is_one_sentence(
     assert error.count("\n") == 1 and not list(tmp_path.glob("*.mp4"))
     with pytest.raises(UserError, match="cannot make multiagent env .* with {'render_mode': 'human'}"):
         play_in_window(WatchConfig(tmp_path / "policy.zip", window=True))
+
+
+def test_a_film_is_as_long_as_asked(tmp_path: Path):
+    path, _ = saved(tmp_path, Task(FAST, "none", env_kwargs=FEW))
+    lengths = []
+    for steps in (1, 2):
+        film = write_film(WatchConfig(path, seed=5, out=tmp_path / f"{steps}.mp4", max_steps=steps))
+        lengths.append(imageio_ffmpeg.count_frames_and_secs(film)[0])
+    assert 0 < lengths[0] < lengths[1]
 
 
 @pytest.mark.parametrize("observe", ["none", "constant-velocity"])

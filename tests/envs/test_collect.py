@@ -1,3 +1,4 @@
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -222,6 +223,21 @@ def test_many_learners_are_recorded_without_labels(
     still = store.episodes[0].states[0, :, landmark] == 1
     moved = np.ptp(store.episodes[0].states[..., :2], axis=0).max(-1)
     assert (moved[still] == 0).all() and (moved[~still] > 0).all()
+
+
+def test_options_reach_the_recording_and_its_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    settings = CollectConfig(
+        TAG, tmp_path / "s", workers=2, timeout_s=7.0, branches=2, branch_history_steps=4, causal_senders=3,
+        causal_threshold_m=0.2, causal_horizon_s=0.7,
+    )  # fmt: skip
+    made = collect.recording_of(settings)
+    assert made.causal is not None and (made.branches, made.branch_history_steps) == (2, 4)
+    assert (made.causal.senders, made.causal.threshold_m, made.causal.horizon_s) == (3, 0.2, 0.7)
+    asked: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(collect, "episode_pool", lambda *given: asked.append(given) or nullcontext())
+    with collect.open_pool(settings):
+        pass
+    assert [given[1:4] for given in asked] == [(2, 7.0, "stop")]
 
 
 ERRORS = {

@@ -27,8 +27,6 @@ from tests.predictor.helpers import ROAD, batch, model, random_states, scene, sp
 ENVS, AGENTS, EGO = 3, 4, 0
 OTHERS = (3, 7, 11, 20)  # more than fit in a scene beside the ego
 History = list[Scene]
-TYPES = "Type-check error"
-"""Begins what `make test-shapes` says of an argument of another type, before the code that is tested sees it."""
 
 
 def assert_same(ours: Forecast, expected: Forecast, tolerance: float = 1e-5) -> None:
@@ -296,6 +294,7 @@ def test_a_mask_chooses_the_environments_that_it_marks(forecaster: DGVAE):
     assert torch.equal(*shown)
 
 
+@pytest.mark.unchecked
 @pytest.mark.parametrize(
     ("envs", "message"),
     [
@@ -311,7 +310,7 @@ def test_a_mask_chooses_the_environments_that_it_marks(forecaster: DGVAE):
 )
 def test_environments_that_are_not_there_are_refused(forecaster: DGVAE, envs: Any, message: str):
     stream = online(forecaster, ENVS)
-    with pytest.raises(Exception, match=f"{message}|{TYPES}"):
+    with pytest.raises(UserError, match=message):
         stream.reset(envs)
 
 
@@ -345,12 +344,13 @@ def test_a_state_beyond_float32_is_refused_and_the_history_stays(forecaster: DGV
     assert_same(one.forecast(), other.forecast())
 
 
+@pytest.mark.unchecked
 @pytest.mark.parametrize("wrong", [0, np.random.default_rng(0), [torch.Generator()], "seed"])
 def test_another_kind_of_generator_is_refused(forecaster: DGVAE, wrong: Any):
     stream = online(forecaster)
     stream.observe(batch(scene(states_of(0, 0, 3), AGENTS)))
     needed = "generator must be one torch.Generator, or a list of numpy.random.Generator"
-    with pytest.raises(Exception, match=f"{needed}|{TYPES}"):
+    with pytest.raises(UserError, match=needed):
         stream.forecast(num_samples=3, generator=wrong)
 
 

@@ -59,6 +59,15 @@ def fitted_config(settings: TrainConfig, data: TrainingData) -> Any:
     return model_config(settings, data.spec, data.train_episodes)
 
 
+def test_gradients_are_clipped_to_the_norm_that_was_asked_for(tmp_path: Path):
+    data = write_circles(tmp_path / "data", episodes=3, steps=6)
+    trainer = made(config(data, tmp_path / "out", clip_norm=1e-3))
+    before = float(trainer.train_step()["grad_norm"])
+    gradients = [p.grad for p in trainer.model.parameters() if p.grad is not None]
+    after = float(torch.stack([gradient.norm() for gradient in gradients]).norm())
+    assert before > 0.01 and after == pytest.approx(1e-3, rel=1e-2)
+
+
 # --- Every kind of model ----------------------------------------------------------------------------------------------
 
 
