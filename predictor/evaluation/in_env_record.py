@@ -6,7 +6,7 @@ the record. The cards and the tables of README.md and docs/in_env.md are written
 
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -147,9 +147,9 @@ def read_record(folder: Path) -> list[Measurement]:
 
 
 def update_record(folder: Path, found: Sequence[Measurement]) -> list[Measurement]:
-    """Puts measurements into `in_env.json`, in place of those with the same key; returns all."""
+    """Puts measurements into `in_env.json`, in place of those with the same key, with their remarks; returns all."""
     new = {measurement.key: measurement for measurement in found}
-    kept = [new.pop(old.key, old) for old in read_record(folder)]
+    kept = [replace(new.pop(old.key), note=old.note) if old.key in new else old for old in read_record(folder)]
     everything = [*kept, *new.values()]
     entries = [{k: v for k, v in asdict(m).items() if v is not None and (k, v) != ("note", "")} for m in everything]
     write_json(folder / FILE_NAME, {"measurements": entries})

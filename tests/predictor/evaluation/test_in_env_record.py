@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,12 @@ def test_a_later_measurement_replaces_the_one_of_the_same_env_driver_and_k(tmp_p
     others = [Measurement("toy-v0", "idle", 50, 20, "", "", 3.0), Measurement("toy-v0", "varied", 6, 1, "", "", 3.0)]
     update_record(tmp_path, [FIRST, *others])
     assert update_record(tmp_path, [again]) == read_record(tmp_path) == [again, *others]
+
+
+def test_a_later_measurement_keeps_the_remark_of_the_one_that_it_replaces(tmp_path: Path):
+    again = replace(FIRST, commit="def", min_ade_m=4.0)
+    update_record(tmp_path, [replace(FIRST, note="retrained after a first look")])
+    assert update_record(tmp_path, [again]) == [replace(again, note="retrained after a first look")]
 
 
 def test_a_folder_without_a_record_has_no_measurements(tmp_path: Path):
