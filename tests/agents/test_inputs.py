@@ -13,7 +13,7 @@ from envs.drivers.ego import make_ego_driver
 from envs.registry import CHECKPOINTS, MULTIAGENT_CHECKPOINTS
 
 ONE_GRAPH = {
-    "roundabout-v1", "racetrack-v1", "racetrack-oval-v1", "racetrack-large-v1",
+    "racetrack-v1", "racetrack-oval-v1", "racetrack-large-v1",
     "simple_v3", "simple_spread_v3", "simple_reference_v3", "simple_speaker_listener_v4",
 }  # fmt: skip
 """Ids whose checkpoint gives every edge the same probability."""
@@ -26,6 +26,8 @@ FEW = {
     "simple_speaker_listener_v4",
 }
 """Ids with one or two others, who stay far away or on one side: more of the squashed distances are near 1 or -1."""
+LARGEST = {"roundabout-v1": 25}
+"""Bound of the largest input where it is not 10: edge features have no scale, and those of this checkpoint reach 20."""
 LONG = {"racetrack-large-v1": 60}
 """Steps of an episode, where the ego begins alone."""
 
@@ -70,7 +72,7 @@ def test_no_entry_is_constant_or_only_saturated(env_id: str):
     present[EGO_PATH] = observations[EGO_PATH][env]
     inputs = extractor._token_inputs(present)
     saturated = ((inputs.abs() > 0.99) & (inputs.abs() <= 1.0)).float().mean(0)
-    assert inputs.abs().max() < 10
+    assert inputs.abs().max() < LARGEST.get(env_id, 10)
     most_saturated, least_moving = (0.25, 0.85) if env_id in FEW else (0.1, 0.9)
     assert (saturated > 0.9).float().mean() < most_saturated
     assert (inputs.std(0) > 1e-3).float().mean() > least_moving
