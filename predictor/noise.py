@@ -20,13 +20,17 @@ Noise = torch.Generator | Sequence[np.random.Generator]
 
 def check_noise(noise: object) -> None:
     """Raises a `UserError` if something is no source of noise."""
-    each = list(noise) if isinstance(noise, Sequence) else None
-    if each is not None and all(isinstance(one, np.random.Generator) for one in each):
+    if noise is None or isinstance(noise, torch.Generator):
         return
-    if noise is not None and not isinstance(noise, torch.Generator):
-        got = type(noise if each is None else next(n for n in each if not isinstance(n, np.random.Generator))).__name__
+    wrong: list[type] = []
+    if isinstance(noise, str | bytes) or not isinstance(noise, Sequence):
+        wrong = [type(noise)]
+    elif isinstance(noise, list | tuple):  # a sequence of another kind may make its generators when they are asked for
+        wrong = [kind for kind in set(map(type, noise)) if not issubclass(kind, np.random.Generator)]
+    if wrong:
         raise UserError(
-            f"generator must be one torch.Generator, or a list of numpy.random.Generator, one for each scene, got {got}"
+            "generator must be one torch.Generator, or a list of numpy.random.Generator, one for each scene, got "
+            f"{wrong[0].__name__}"
         )
 
 
