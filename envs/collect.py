@@ -143,11 +143,10 @@ class CollectConfig:
         labelled = self.causal_labels or self.branches
         if not labelled and (self.causal_horizon_s is not None or self.causal_threshold_m is not None):
             raise UserError("causal_horizon_s and causal_threshold_m need causal_labels or branches above 0, got 0")
-        needs = {"causal_senders": "causal_labels or branches", "branch_history_steps": "branches"}
-        for name, needed in needs.items():
-            without = not (labelled if name == "causal_senders" else self.branches)
-            if without and getattr(self, name) != getattr(type(self), name):
-                raise UserError(f"{name} needs {needed} above 0, got 0; leave it out")
+        if not labelled and self.causal_senders != type(self).causal_senders:
+            raise UserError("causal_senders needs causal_labels or branches above 0, got 0; leave it out")
+        if not self.branches and self.branch_history_steps != type(self).branch_history_steps:
+            raise UserError("branch_history_steps needs branches above 0, got 0; leave it out")
 
     @property
     def drivers(self) -> tuple[str, ...]:

@@ -82,6 +82,16 @@ def test_plans_are_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap
     assert list(result["scores"]) == [STRAIGHT] and result["moments"] >= 1 and result["horizon_steps"] == 2
 
 
+@pytest.mark.parametrize(("options", "processes"), [({}, 50), ({"reactions": True}, 300)])
+def test_as_many_processes_are_checked_as_may_start(
+    options: dict[str, Any], processes: int, monkeypatch: pytest.MonkeyPatch
+):
+    asked: list[int] = []
+    monkeypatch.setattr(evaluate, "check_processes", lambda count, name: asked.append(count))
+    evaluate.EvaluateConfig(("highway-fast-v0",), episodes=50, workers=300, **options)
+    assert asked == [processes]
+
+
 ERRORS = {
     "no-copies": (["--env-ids", TAG, "pursuit_v5"], "raw_env cannot be perturbed; use an environment of highway-env"),
     "zero": (["--perturbations", "0"], "perturbations must be at least 1, got 0"),

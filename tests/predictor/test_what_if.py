@@ -20,6 +20,7 @@ from predictor.dgvae import DGVAE
 from predictor.forecaster import Belief, Futures
 from predictor.online import OnlineForecaster
 from predictor.scene import Scene
+from predictor.support import memory
 from predictor.support.errors import UserError
 from predictor.what_if import rollout_plans, with_ego
 from tests.predictor.helpers import (
@@ -350,6 +351,28 @@ def test_plans_that_do_not_fit_are_refused(kind: str, plan: np.ndarray, message:
     online.observe(batch(world(0.0)))
     with pytest.raises(UserError, match=message):
         online.forecast(HORIZON, ego_plan=plan)
+
+
+def test_what_a_forecaster_gives_for_plans_has_the_sizes_that_were_asked_for(monkeypatch: pytest.MonkeyPatch):
+    online = OnlineForecaster(made("dgvae"), 1, 4)
+    online.observe(batch(world(0.0)))
+    given = DGVAE.rollout_plans
+
+    def too_short(*arguments: Any, **named: Any) -> Futures:
+        return Futures(given(*arguments, **named).states[..., :-1, :])
+
+    monkeypatch.setattr(DGVAE, "rollout_plans", too_short)
+    with pytest.raises(UserError, match="rollout_plans of a forecaster: states must have the shape"):
+        online.forecast(HORIZON, ego_plan=np.zeros((1, 2, HORIZON, 4)))
+
+
+def test_plans_count_where_a_forecast_would_not_fit_into_the_memory(monkeypatch: pytest.MonkeyPatch):
+    online = OnlineForecaster(made("dgvae"), 1, 4)
+    online.observe(batch(world(0.0)))
+    monkeypatch.setattr(memory, "memory_bytes", lambda: 50_000)
+    online.forecast(HORIZON, ego_plan=np.zeros((1, 2, HORIZON, 4)))
+    with pytest.raises(UserError, match="a forecast with num_samples=1"):
+        online.forecast(HORIZON, ego_plan=np.zeros((1, 2000, HORIZON, 4)))
 
 
 def test_a_plan_needs_an_ego():
