@@ -72,6 +72,12 @@ def cells_of(line: str) -> list[str]:
     return [cell.strip() for cell in line.strip("|").split("|")]
 
 
+def test_a_single_episode_has_no_interval():
+    one = replace(accuracy("dG-VAE", 1.0), intervals={})
+    lines = report.remarks(replace(result(), model=one, histories={1: one}, edges={"edges cut": one})).splitlines()
+    assert [line.rpartition(" ")[2] for line in lines[:3]] == ["–"] * 3 and "nan" not in "".join(lines)
+
+
 def test_markdown_has_an_overview_and_a_table_per_environment():
     lines = report.markdown([full(), result("spread")], {}).splitlines()
     assert cells_of(lines[0]) == list(report.HEADS)
