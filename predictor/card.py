@@ -13,7 +13,7 @@ from predictor.checkpoint import WEIGHTS, CheckpointInfo, load_checkpoint, name_
 from predictor.data.store import EpisodeStore, read_store
 from predictor.evaluation.in_env_record import measurements_of, update_record
 from predictor.forecaster import has_scale
-from predictor.reports.in_env_tables import card_section
+from predictor.reports.in_env_tables import PLURAL, card_section
 from predictor.reports.tables import MODEL_NAMES
 from predictor.support.command_line import parse
 from predictor.support.errors import UserError, run_entry_point
@@ -74,18 +74,19 @@ def write_card(config: CardConfig) -> Path:
     left_out = "the ego itself is not counted" if info.spec.has_ego else "what never moves is not counted"
     plural = has_scale(model)
     kind, parameters = MODEL_NAMES.get(info.model, info.model), sum(p.numel() for p in model.parameters())
-    kind = f"Plural {kind}" if plural else kind
+    kind = PLURAL if plural else kind
     size_kb = (folder / WEIGHTS).stat().st_size / 1000
     text = "\n\n".join(
         [
             f"# Predictor checkpoint `{name}`",
-            f"{kind}, {parameters:,} parameters, {size_kb:.0f} kB of safetensors. Trained on recorded "
-            f"{', '.join(dict.fromkeys(info.sources))}; forecasts {info.horizon_steps} steps of {info.spec.dt_s:g} s. "
-            f"Sees at most {info.spec.max_agents} agents ({ego}) within {info.spec.perception_m:g} m.",
+            f"{kind.replace('plural', 'Plural')}, {parameters:,} parameters, {size_kb:.0f} kB of safetensors. "
+            f"Trained on recorded {', '.join(dict.fromkeys(info.sources))}; forecasts {info.horizon_steps} steps of "
+            f"{info.spec.dt_s:g} s. Sees at most {info.spec.max_agents} agents ({ego}) within "
+            f"{info.spec.perception_m:g} m.",
             "## Accuracy in the live environment",
             f"Held-out seeds from {first_seed:,}; {left_out}. minADE₁ is the error of the single forecast (K = 1); "
             "neighbours: memoryless nearest neighbours on the training data. Intervals: bootstrap over episodes.",
-            f"<!-- table: accuracy -->\n\n{card_section(measured)}\n\n<!-- end -->",
+            f"<!-- table: accuracy -->\n\n{card_section(measured, kind)}\n\n<!-- end -->",
             "## Data",
             stores,
             "## Training",

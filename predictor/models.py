@@ -120,7 +120,16 @@ def configure(name: str, preset: str, overrides: Sequence[str] = (), **fitted: A
     if name != "dgvae" and preset != "paper":
         widths = {f.name: getattr(base, f.name) for f in dataclasses.fields(cls) if f.name.endswith("_dim")}
         base = dataclasses.replace(base, **{k: max(1, v // 2) for k, v in widths.items()})
-    return dataclasses.replace(base, **{**fitted, **dict(_parse(cls, text) for text in overrides)})
+    return changed(dataclasses.replace(base, **fitted), overrides)
+
+
+def changed(config: Any, overrides: Sequence[str]) -> Any:
+    """Returns a config with fields changed by texts such as "static_dim=1".
+
+    Raises:
+        UserError: an unknown field, or a value that does not fit it.
+    """
+    return dataclasses.replace(config, **dict(_parse(type(config), text) for text in overrides))
 
 
 def _parse(cls: type, text: str) -> tuple[str, Any]:

@@ -8,7 +8,7 @@ Within an episode an agent keeps its column from its first step to its last, so 
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +67,8 @@ class Episode:
     """Known properties of each edge (a spring's constant), named in `StoreInfo`; one step if they never change."""
     causal_shift_m: Float[np.ndarray, "label_time agents agents"] | None = None
     """Farthest that an intervention on the sender moves the receiver within the labels' horizon [m], receiver first;
-    NaN where unknown: at all steps and for all senders that were not tried. `causal_types` makes edge types of it."""
+    NaN where unknown: at all steps and for all senders that were not tried. `predictor.data.causal_edges` makes edges
+    of it."""
     perturbed: Int[np.ndarray, "time agents"] | None = None
     """What is done to each agent from this step to the next, an index in `PERTURBATIONS`; None if nothing ever is."""
 
@@ -364,36 +365,3 @@ def _labels_of(
         return {}
     steps = slice(starts[episode], starts[episode + 1])
     return {name: labels[steps][:, present][:, :, present] for name, labels in edge_labels.items()}
-
-
-def causal_types(shift_m: Float[np.ndarray, "*pairs"], threshold_m: float) -> Int[np.ndarray, "*pairs"]:
-    """Returns edge types of causal labels: 1 where the shift exceeds the threshold, else 0, -1 where it is unknown."""
-    return np.where(np.isnan(shift_m), -1, shift_m > threshold_m).astype(np.int8)
-
-
-def with_causal_edges(store: EpisodeStore, threshold_m: float | None = None) -> EpisodeStore:
-    """Returns the store with causal edges in place of its edge labels, for training and scores on them.
-
-    `edge_types` are those of `causal_types`; the one attribute of an edge is its strength, `causal_strength`. In a
-    store without causal labels all edges are unknown.
-
-    Args:
-        store: a store.
-        threshold_m: shift above which an edge counts [m]; None takes the store's.
-    """
-    given = store.info.causal_threshold_m if threshold_m is None else threshold_m
-    episodes = []
-    for episode in store.episodes:
-        shift_m = episode.causal_shift_m
-        if shift_m is None or given is None:
-            shift_m = np.full((1, len(episode.ids), len(episode.ids)), np.nan, dtype=np.float32)
-        types = causal_types(shift_m, given or np.inf)
-        strength = causal_strength(shift_m, given or np.inf)[..., None]
-        episodes.append(replace(episode, edge_types=types, edge_attributes=strength))
-    info = replace(store.info, edge_attribute_names=("causal_strength",), causal_threshold_m=given)
-    return EpisodeStore(info, episodes)
-
-
-def causal_strength(shift_m: Float[np.ndarray, "*pairs"], threshold_m: float) -> Float[np.ndarray, "*pairs"]:
-    """Returns the strength of causal edges, log(1 + shift / threshold); 0 where unknown."""
-    return np.log1p(np.nan_to_num(shift_m) / threshold_m).astype(np.float32)

@@ -4,6 +4,10 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
 from predictor.layers.state_codec import Residual
 from predictor.support.config_checks import (
     MOST_PARTS,
@@ -60,6 +64,12 @@ class DGVAEConfig:
     """Number of corrections of pair memories at each encoder step (`predictor.dgvae.innovation`); paper: 0."""
     innovation_dim: int = 32
     """Width of these corrections."""
+    feature_labels: tuple[str, ...] = ()
+    """Edge attributes that restricted labelling taught to the first feature dimensions, in their order."""
+    label_means: tuple[float, ...] = ()
+    """Mean of each of these attributes over the data, in its unit; a dimension is the attribute less this mean ..."""
+    label_scales: tuple[float, ...] = ()
+    """... over this standard deviation. Both are empty where a dimension is the attribute itself."""
     static_dim: int = 0
     """Number of first feature dimensions that pair matching averages over time (paper: 16); 0 is off."""
     pair_matching: Literal["window", "causal"] = "causal"
@@ -104,7 +114,7 @@ class DGVAEConfig:
             "edge_feature_dim", "num_neighbours",
         )  # fmt: skip
         check_at_most(self, MOST_PARTS, "num_modes", "num_edge_types", "innovation_rounds", "substeps")
-        check_scale_values(self, "delta_scales", "input_scales", "change_scales")
+        check_scale_values(self, "delta_scales", "input_scales", "change_scales", "label_scales")
         if not math.isfinite(self.forget_bias):
             raise UserError(f"forget_bias must be finite, got {self.forget_bias}")
         if self.num_neighbours and self.needs_reverse_pairs:
@@ -114,6 +124,18 @@ class DGVAEConfig:
             raise UserError(
                 f"static_dim must be at most edge_feature_dim ({self.edge_feature_dim}), got {self.static_dim}"
             )
+        if len(self.feature_labels) > self.edge_feature_dim:
+            raise UserError(
+                f"feature_labels needs an edge feature for each of {', '.join(self.feature_labels)}, got "
+                f"edge_feature_dim={self.edge_feature_dim}"
+            )
+        if not {len(self.label_means), len(self.label_scales)} <= {0, len(self.feature_labels)}:
+            raise UserError(
+                f"label_means and label_scales need one number for each of {len(self.feature_labels)} feature_labels, "
+                f"or none, got {len(self.label_means)} and {len(self.label_scales)}"
+            )
+        if len(self.label_means) != len(self.label_scales) or not all(map(math.isfinite, self.label_means)):
+            raise UserError(f"label_means needs as many finite numbers as label_scales, got {self.label_means}")
         if self.num_edge_types < 2:
             raise UserError(f"num_edge_types must be at least 2 (the first is 'no edge'), got {self.num_edge_types}")
         scales = self.geometry_scales
@@ -121,6 +143,21 @@ class DGVAEConfig:
             raise UserError(f"geometry_scales needs a distance [m] and a speed [m/s], both positive, got {scales}")
         if not 0 < self.temperature < float("inf") or not 0 <= self.dropout < 1:
             raise UserError(f"need 0 < temperature < inf and 0 <= dropout < 1, got {self.temperature}, {self.dropout}")
+
+    def in_units(self, attributes: Float[Tensor, "*pairs attributes"]) -> Float[Tensor, "*pairs attributes"]:
+        """Returns edge attributes in the units of the feature dimensions that learn them."""
+        if not self.label_scales:
+            return attributes
+        of_each = enumerate(zip(self.label_means, self.label_scales, strict=True))
+        return torch.stack([(attributes[..., i] - mean) / scale for i, (mean, scale) in of_each], dim=-1)
+
+    def with_units(self, features: Float[Tensor, "*pairs dims"]) -> Float[Tensor, "*pairs dims"]:
+        """Returns edge features whose first dimensions are their attributes, in the attributes' units."""
+        if not self.label_scales:
+            return features
+        first = len(self.label_scales)
+        means, scales = (features.new_tensor(of_each) for of_each in (self.label_means, self.label_scales))
+        return torch.cat([features[..., :first] * scales + means, features[..., first:]], dim=-1)
 
     @property
     def needs_reverse_pairs(self) -> bool:

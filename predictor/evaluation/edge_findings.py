@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
 from predictor.data.windows import WindowBatch, Windows
+from predictor.dgvae.config import DGVAEConfig
 from predictor.evaluation.edge_scores import (
     Disentanglement,
     FactorScore,
@@ -107,7 +109,10 @@ class Findings:
 
 @torch.inference_mode()
 def infer_edges(forecaster: Forecaster, batch: WindowBatch) -> InferredEdges:
-    """Streams histories of equal length and keeps edge features and probabilities of each step."""
+    """Streams histories of equal length and keeps edge features and probabilities of each step.
+
+    Features that learned an attribute are in its unit.
+    """
     memory = forecaster.empty_memory(batch.states.shape[0], batch.states.shape[2])
     beliefs: list[Belief] = []
     for step in range(int(batch.last_observed[0]) + 1):
@@ -115,10 +120,15 @@ def infer_edges(forecaster: Forecaster, batch: WindowBatch) -> InferredEdges:
         memory, belief = forecaster.observe(memory, batch.states[:, step] * valid[..., None], valid)
         beliefs.append(belief.dense())
     return InferredEdges(
-        torch.stack([b.edge_features for b in beliefs], dim=1).cpu().numpy(),
+        _with_units(forecaster, torch.stack([b.edge_features for b in beliefs], dim=1)).cpu().numpy(),
         torch.stack([b.edge_probs for b in beliefs], dim=1).cpu().numpy(),
         pair_mask(batch.valid[:, : len(beliefs)]).cpu().numpy(),
     )
+
+
+def _with_units(forecaster: Any, features: Tensor) -> Tensor:
+    config = getattr(forecaster, "config", None)
+    return config.with_units(features) if isinstance(config, DGVAEConfig) else features
 
 
 def labelled_pairs(
@@ -193,44 +203,60 @@ def measure(
         graph=tally.results() if accuracies and not np.isnan(accuracies).all() else None,
         stillness=whole.results(),
         stillness_late=late.results(),
-        **_scores(pairs_of_batches, names, seed),
+        **_scores(pairs_of_batches, names, getattr(getattr(forecaster, "config", None), "feature_labels", ()), seed),
     )
     return findings, np.array(accuracies)
 
 
-def _scores(batches: Sequence[LabelledPairs], names: Sequence[str], seed: int) -> dict[str, Any]:
-    """Computes the part of `Findings` that needs labels."""
+def _scores(
+    batches: Sequence[LabelledPairs], names: Sequence[str], learned: Sequence[str], seed: int
+) -> dict[str, Any]:
+    """Computes the part of `Findings` that needs labels.
+
+    Args:
+        batches: pairs whose truth is known.
+        names: names of their attributes.
+        learned: attributes that the first dimensions learned, in their order; none given, those of the data.
+        seed: random seed of shuffles and halves.
+    """
     if not sum(len(b.group) for b in batches):
         return {"edges": None, "separation": None, "attributes": [], "disentanglement": None, "reading": None}
     every = LabelledPairs.concatenate(batches)
     edges, relation, apart = every, None, None
     if every.exists is not None:
         exists = every.exists.astype(np.float64)
-        relation = score_factor("edge exists", every.features, exists, every.group, every.distance_m, seed=seed)
+        leads = _learned_by("leader", learned)
+        relation = score_factor("edge exists", every.features, exists, every.group, every.distance_m, leads, seed)
         apart = separation(every.features, every.edge_prob, every.exists)
         edges = every.where(every.exists)
     edges = edges.where(np.isfinite(edges.attributes).all(axis=1))
     count = edges.attributes.shape[1]
     titles = [names[i] if i < len(names) else f"attribute {i}" for i in range(count)]
+    dimensions = [_learned_by(title, learned) if learned else i for i, title in enumerate(titles)]
     attributes = [
-        score_factor(title, edges.features, edges.attributes[:, i], edges.group, edges.distance_m, i, seed)
-        for i, title in enumerate(titles)
+        score_factor(title, edges.features, edges.attributes[:, i], edges.group, edges.distance_m, dimension, seed)
+        for i, (title, dimension) in enumerate(zip(titles, dimensions, strict=True))
     ]
     return {
         "edges": relation,
         "separation": apart,
         "attributes": attributes,
         "disentanglement": disentanglement(edges.features, edges.attributes, seed) if count else None,
-        "reading": _reading(attributes[0], edges) if count else None,
+        "reading": _reading(attributes[0], edges, dimensions[0]) if count else None,
     }
 
 
-def _reading(score: FactorScore, edges: LabelledPairs) -> Reading | None:
-    """Returns dimension 0 unchanged if it explains the attribute, else the best dimension with a fitted line."""
+def _learned_by(name: str, learned: Sequence[str]) -> int | None:
+    """Returns the dimension that learned an attribute; None if none did."""
+    return learned.index(name) if name in learned else None
+
+
+def _reading(score: FactorScore, edges: LabelledPairs, labelled: int | None) -> Reading | None:
+    """Returns the labelled dimension unchanged if it explains the attribute, else the best one with a fitted line."""
     if score.dimension is None or score.correlation is None:
         return None
-    if score.direct_r2 is not None and score.direct_r2 > 0:
-        return Reading(0)
+    if labelled is not None and score.direct_r2 is not None and score.direct_r2 > 0:
+        return Reading(labelled)
     feature, attribute = edges.features[:, score.dimension].astype(np.float64), edges.attributes[:, 0]
     slope = score.correlation * float(attribute.std() / max(feature.std(), 1e-300))
     return Reading(score.dimension, slope, float(attribute.mean() - slope * feature.mean()))

@@ -17,6 +17,10 @@ MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 Column = Callable[[Measurement], str]
 
 
+PLURAL = "plural dG-VAE"
+"""Name of a model whose samples are modes, as all that ship are."""
+
+
 def _per_cent(value: float | None, interval: Interval | None) -> str:
     if value is None:
         return "–"
@@ -73,8 +77,8 @@ SAMPLES_HEADINGS = (
 )  # fmt: skip
 
 
-def samples_table(measurements: Sequence[Measurement]) -> str:
-    """Returns a Markdown table of what K samples are worth: the model's line, then those of its controls."""
+def samples_table(measurements: Sequence[Measurement], model: str = PLURAL) -> str:
+    """Returns a Markdown table of what K samples are worth: the line of `model`, then those of its controls."""
     lines = []
     for m in measurements:
         if m.energy_m is None:
@@ -87,7 +91,7 @@ def samples_table(measurements: Sequence[Measurement]) -> str:
             [
                 m.env_id,
                 str(m.samples),
-                "dG-VAE",
+                model,
                 metres(m.best_of_k_m, m.best_of_k_interval_m),
                 metres(m.joint_best_of_k_m, m.joint_best_of_k_interval_m),
                 metres(m.energy_m, m.energy_interval_m),
@@ -104,11 +108,11 @@ def samples_table(measurements: Sequence[Measurement]) -> str:
     return table(SAMPLES_HEADINGS, lines, "-r-r")
 
 
-def card_section(measurements: Sequence[Measurement]) -> str:
-    """Returns the table of a checkpoint's card, and the command and commit of each line."""
+def card_section(measurements: Sequence[Measurement], model: str = PLURAL) -> str:
+    """Returns the table of a checkpoint's card, whose model has this name, and the command and commit of each line."""
     commands = "\n".join(f"* {m.env_id}: `{m.command}`, {_commit(m)}" for m in measurements)
     sampled = [m for m in measurements if m.energy_m is not None]
-    several = f"\n\n{samples_table(sampled)}" if sampled else ""
+    several = f"\n\n{samples_table(sampled, model)}" if sampled else ""
     return f"{measurement_table(measurements)}{several}\n\n{commands}"
 
 

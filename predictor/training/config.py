@@ -20,7 +20,7 @@ Capture = Literal["auto", "off"]
 Keep = Literal["best", "last"]
 OF_THE_DGVAE = ("input_changes", "fit_inputs", "edge_geometry")
 """Options of the dG-VAE's inputs, without effect on other models."""
-OF_THE_NETWORK = ("preset", "set", *OF_THE_DGVAE)
+OF_THE_NETWORK = ("preset", *OF_THE_DGVAE)
 """Options that make the network; a checkpoint to start from has them already."""
 HORIZON_STEPS = 5
 """Number of steps forecast where neither the command nor a checkpoint says it."""
@@ -52,11 +52,12 @@ class TrainConfig:
     `--no-input-changes --no-fit-inputs --no-edge-geometry` as well. Other models have their published sizes with
     "paper", and half of them otherwise."""
     set: tuple[str, ...] = ()
-    """Fields of the network's config to change, as field=value: --set hidden_dim=64 static_dim=16."""
+    """Fields of the network's config to change, as field=value: --set hidden_dim=64 static_dim=16. With `init`, those
+    that leave the weights' shapes as they are (static_dim, dropout)."""
     init: str = ""
     """Checkpoint to start from: a shipped name, a folder or a run folder. Network and scales are the checkpoint's, so
-    leave out the options of the network; frame and range of perception are the data's. Empty starts from random
-    weights."""
+    leave out the options of the network, but for `set`; frame and range of perception are the data's. Empty starts from
+    random weights."""
     only_spread: bool = False
     """Whether to train the spread of the modes alone (`Forecast.xy_scale`): the forecasts of `init` and their
     probabilities stay as they are, and the likelihood of the mixture selects the checkpoint."""

@@ -60,6 +60,26 @@ def typical_neighbour(episodes: Sequence[Episode], spec: SceneSpec) -> tuple[flo
     return tuple(max(float(torch.cat(found).median()), 1e-2) for found in (distances, speeds))
 
 
+def typical_labels(episodes: Sequence[Episode], count: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Computes mean and standard deviation of each edge attribute over the pairs where it is known.
+
+    Args:
+        episodes: episodes with edge attributes, NaN where unknown.
+        count: number of attributes.
+
+    Returns:
+        Both for each attribute; 0 and 1 for one that is known nowhere or never varies.
+    """
+    means, scales = [], []
+    for column in range(count):
+        parts = [e.edge_attributes[..., column].ravel() for e in episodes if e.edge_attributes is not None]
+        known = np.concatenate([part[np.isfinite(part)] for part in parts] or [np.zeros(0)]).astype(np.float64)
+        spread = float(known.std()) if len(known) else 0.0
+        means.append(float(known.mean()) if spread > 0 else 0.0)
+        scales.append(spread if spread > 0 else 1.0)
+    return tuple(means), tuple(scales)
+
+
 def _in_frame(episode: Episode, spec: SceneSpec) -> np.ndarray:
     codec = StateCodec(spec)
     inputs = codec.inputs(torch.from_numpy(episode.states), torch.from_numpy(episode.valid))[..., : spec.num_features]

@@ -1,13 +1,14 @@
 """Training objective: likelihoods of one step and of a roll-out, KL to the prior, labels, cost of edges."""
 
 import math
-from typing import get_args
+from typing import Any, get_args
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
+from predictor.data.causal_edges import STRENGTH
 from predictor.data.windows import WindowBatch
 from predictor.evaluation.graph_accuracy import edge_entropy
 from predictor.forecaster import Futures, TrainableForecaster, WindowOutput
@@ -117,7 +118,7 @@ def window_loss(
             loss = loss + extra
             terms |= mode_terms
     if output.prior_logits is not None:
-        extra, graph_terms = _graph_loss(batch, output, config, kl_scale, total)
+        extra, graph_terms = _graph_loss(model, batch, output, config, kl_scale, total)
         loss = loss + extra
         terms |= graph_terms
     return loss, {k: v.detach() for k, v in terms.items()}
@@ -130,7 +131,7 @@ def reaction_weights(batch: WindowBatch, weight: float, total: Total = of_one_pr
     one that was taken out, the edges are those of the step before.
 
     Args:
-        batch: windows; the first edge attribute is the strength, where there is one.
+        batch: windows; their edges are causal ones, if they have any attributes.
         weight: weight of a strength of 1; 0 gives 1 for all.
         total: sums over all processes.
     """
@@ -144,7 +145,7 @@ def reaction_weights(batch: WindowBatch, weight: float, total: Total = of_one_pr
     strength = torch.zeros_like(factors)
     for step, senders in ((batch.last_observed, visible), (before, gone)):
         is_edge = (batch.edge_types[rows, step] > 0) & senders[:, None]
-        found = torch.where(is_edge, batch.edge_attributes[rows, step][..., 0], 0.0)
+        found = torch.where(is_edge, batch.edge_attributes[rows, step][..., STRENGTH], 0.0)
         strength = torch.maximum(strength, found.amax(-1))
     factors = factors + weight * strength
     return factors / total(masked_mean(factors, visible, total))
@@ -168,7 +169,12 @@ def _mode_loss(
 
 
 def _graph_loss(
-    batch: WindowBatch, output: WindowOutput, config: TrainConfig, kl_scale: float | Tensor, total: Total
+    model: Any,
+    batch: WindowBatch,
+    output: WindowOutput,
+    config: TrainConfig,
+    kl_scale: float | Tensor,
+    total: Total,
 ) -> tuple[Tensor, Terms]:
     assert output.prior_logits is not None and output.posterior_logits is not None
     prior, posterior = output.prior_logits, output.posterior_logits
@@ -201,8 +207,11 @@ def _graph_loss(
                 f"restricted labelling of {batch.edge_attributes.shape[-1]} attributes needs as many edge features, "
                 f"got {output.features.shape[-1]}; raise edge_feature_dim or set label_weight to 0"
             )
-        with_edge = pairs if batch.edge_types is None else pairs & (batch.edge_types > 0)
-        label = restricted_labelling(output.features, batch.edge_attributes, with_edge, total)
+        # causal attributes say themselves where they are known, others are known on edges
+        labelled = pairs
+        if batch.edge_types is not None and not config.causal_edges:
+            labelled = pairs & (batch.edge_types > 0)
+        label = restricted_labelling(output.features, model.config.in_units(batch.edge_attributes), labelled, total)
         loss = loss + config.label_weight * label
         terms["label"] = label
     return loss, terms
@@ -221,12 +230,16 @@ def restricted_labelling(
 ) -> Float[Tensor, ""]:
     """Computes the mean squared error of the first feature dimensions against known edge attributes.
 
+    Each attribute has a mean of its own, so that those that few pairs have count as much.
+
     Args:
         features: edge features from the past; as many of the first dimensions are used as there are attributes.
-        attributes: true values; arbitrary where not labelled.
-        labelled: mask of pairs with an edge whose attributes are known.
+        attributes: true values; NaN where one is unknown, arbitrary where a pair has no label.
+        labelled: mask of pairs whose attributes are known.
         total: sums counts over all processes.
     """
+    known = labelled[..., None] & ~attributes.isnan()
     # masked before it is squared: the gradient of an infinite error is NaN, also times zero
-    error = torch.where(labelled[..., None], features[..., : attributes.shape[-1]] - attributes, 0.0)
-    return masked_mean(error.square().mean(-1), labelled, total)
+    error = torch.where(known, features[..., : attributes.shape[-1]] - attributes, 0.0).square()
+    means = [masked_mean(error[..., i], known[..., i], total) for i in range(attributes.shape[-1])]
+    return torch.stack(means).mean()

@@ -4,14 +4,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from torch import nn
+
 from predictor.checkpoint import load_checkpoint
+from predictor.data.causal_edges import CAUSAL_ATTRIBUTES
 from predictor.data.store import Episode
-from predictor.models import build, configure
+from predictor.models import build, changed, configure
 from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 from predictor.support.remote import address
 from predictor.training.config import TrainConfig
-from predictor.training.fitted_scales import typical_change, typical_neighbour, typical_spread
+from predictor.training.fitted_scales import typical_change, typical_labels, typical_neighbour, typical_spread
 
 
 def model_config(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episode]) -> Any:
@@ -29,16 +32,25 @@ def model_config(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episod
             fitted["input_scales"] = typical_spread(episodes, spec)
         if config.edge_geometry:
             fitted["geometry_scales"] = typical_neighbour(episodes, spec)
+        fitted |= _labels(config, episodes)
     return configure(config.model, config.preset, config.set, **fitted)
+
+
+def _labels(config: TrainConfig, episodes: Sequence[Episode]) -> dict[str, Any]:
+    """Returns fields of the network's config that say which attributes its first feature dimensions learn."""
+    if not (config.label_weight and config.causal_edges):
+        return {}
+    means, scales = typical_labels(episodes, len(CAUSAL_ATTRIBUTES))
+    return {"feature_labels": CAUSAL_ATTRIBUTES, "label_means": means, "label_scales": scales}
 
 
 def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episode]) -> Any:
     """Builds the model with random weights, or with those of the checkpoint to start from, for the data's scenes.
 
     Raises:
-        UserError: as `model_config`; or the checkpoint cannot be read, is of another model, or its scenes have other
-            features, or an ego where the data's have none, or none where the data's have one; or only its spread
-            shall be trained, and it has none, or another horizon.
+        UserError: as `model_config`; or the checkpoint cannot be read, is of another model or network, or its scenes
+            have other features, or an ego where the data's have none, or none where the data's have one; or only its
+            spread shall be trained, and it has none, or another horizon.
     """
     if not config.init:
         return build(config.model, spec, model_config(config, spec, episodes), config.horizon_steps)
@@ -48,8 +60,9 @@ def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episo
     info.spec.check_recorded(spec, f"checkpoint '{config.init}'", f"store {address(config.data[0])}")
     spec = replace(spec, feature_scales=info.spec.feature_scales)  # scales are the network's, the rest the data's
     if not config.only_spread:
-        plain = build(info.model, spec, info.config, config.horizon_steps)
-        plain.load_state_dict(source.state_dict())
+        network = changed(replace(info.config, **_labels(config, episodes)), config.set)
+        plain = build(info.model, spec, network, config.horizon_steps)
+        _fill(plain, source, config)
         return plain
     if not getattr(info.config, "num_modes", 0):
         raise UserError(f"only_spread needs a checkpoint with modes, and '{config.init}' has none; leave it out")
@@ -66,3 +79,20 @@ def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episo
     model.self_edges.spread.requires_grad_(True)
     of_types.requires_grad_(True)
     return model
+
+
+def _fill(model: nn.Module, source: nn.Module, config: TrainConfig) -> None:
+    """Gives the model the weights of the checkpoint.
+
+    Raises:
+        UserError: --set made another network.
+    """
+    wanted, given = (
+        {name: tuple(weight.shape) for name, weight in network.state_dict().items()} for network in (model, source)
+    )
+    if wanted != given:
+        raise UserError(
+            f"--set {' '.join(config.set)} needs other weights than checkpoint '{config.init}' has; change only fields "
+            "that leave their shapes, such as static_dim, or leave --init out"
+        )
+    model.load_state_dict(source.state_dict())

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from predictor.baselines.constant_velocity import ConstantVelocity
-from predictor.data.store import Episode, EpisodeStore, read_store, with_causal_edges
+from predictor.data.causal_edges import with_causal_edges
+from predictor.data.store import Episode, EpisodeStore, read_store
 from predictor.data.windows import WindowBatch, Windows, siblings, split_episodes
 from predictor.evaluation.accuracy import Accuracy, fitted_std_m, summarise
 from predictor.evaluation.outcomes import run_windows
@@ -163,10 +164,8 @@ class Trainer:
             torch.cuda.set_device(self.device)
         torch.manual_seed(config.seed)
         self.model: Any = initial_model(config, data.spec, data.train_episodes).to(self.device)
-        self.step = 0
+        self.step, self.validated, self.stale = 0, 0, 0
         self.best = math.inf
-        self.stale = 0
-        self.validated = 0
         self.baseline_m = self._baseline() if group.leads else math.nan
         self.noise = torch.Generator(device=self.device)
         self._drawn: TrainingNoise = self.noise

@@ -21,6 +21,7 @@ from predictor.data.springs import Physics, SpringsConfig, make_episodes, spring
 from predictor.data.store import Episode, StoreInfo, read_store, write_store
 from predictor.data.windows import Windows
 from predictor.dgvae import DGVAE
+from predictor.dgvae.config import DGVAEConfig
 from predictor.evaluation.edge_findings import infer_edges, labelled_pairs, measure
 from predictor.evaluation.edge_scores import (
     StillnessTally,
@@ -334,6 +335,28 @@ def test_a_feature_in_another_unit_is_read_with_a_line():
     found, _ = measure(Inches(), windows, [np.arange(len(windows))], ("distance_m",))
     assert found.reading is not None and found.attributes[0].correlation == pytest.approx(-1.0)
     assert (found.reading.slope, found.reading.offset) == pytest.approx((-0.0254, 5 * 0.0254), rel=1e-3)
+
+
+def test_a_feature_that_learned_an_attribute_is_read_in_its_unit():
+    """The second dimension learned the distance less 4 m, over 2 m; the first one what the data does not have."""
+
+    class Labelled(DistanceModel):
+        config = DGVAEConfig(
+            feature_labels=("time_gap_s", "distance_m"), label_means=(7.0, 4.0), label_scales=(3.0, 2.0)
+        )
+
+        def observe(self, memory: Memory, states: torch.Tensor, valid: torch.Tensor) -> tuple[Memory, Belief]:
+            memory, belief = super().observe(memory, states, valid)
+            distance = (belief.edge_features[..., :1] - 4) / 2
+            return memory, replace(belief, edge_features=torch.cat([torch.zeros_like(distance), distance], dim=-1))
+
+    windows = labelled_windows()
+    found, _ = measure(Labelled(), windows, [np.arange(len(windows))], ("distance_m",))
+    assert found.attributes[0].direct_r2 == pytest.approx(1.0)
+    assert found.reading is not None and (found.reading.dimension, found.reading.slope) == (1, 1.0)
+    unknown, _ = measure(Labelled(), windows, [np.arange(len(windows))], ("headway_m",))
+    assert unknown.attributes[0].direct_r2 is None
+    assert unknown.reading is not None and (unknown.reading.dimension, unknown.reading.slope) == (1, pytest.approx(1.0))
 
 
 # --- Pictures ---------------------------------------------------------------------------------------------------------

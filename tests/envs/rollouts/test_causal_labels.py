@@ -8,7 +8,8 @@ from envs.rollouts.causal_labels import ON_ROADS, CausalLabels, causal_labels, f
 from envs.rollouts.interventions import intervene
 from envs.rollouts.world import open_world
 from envs.simulators.interventions import Intervention
-from predictor.data.store import Episode, causal_types
+from predictor.data.causal_edges import causal_types
+from predictor.data.store import Episode
 from tests.envs.interventions import assert_same_scenes, played, road_world
 
 SETTINGS = replace(ON_ROADS, horizon_s=5.0, threshold_m=0.5)

@@ -23,7 +23,6 @@ from predictor.data.store import (
     content_id,
     read_info_of,
     read_store,
-    with_causal_edges,
     write_store,
 )
 from predictor.data.store_files import METADATA, digest_of
@@ -391,30 +390,6 @@ def test_causal_labels_and_marks_come_back_as_they_were(tmp_path: Path):
         np.testing.assert_array_equal(found.perturbed, expected.perturbed)
     group = zarr.open_group(tmp_path / "s", mode="r")
     assert np.isnan(np.asarray(group["causal_shift_m"])[:4, 3:]).all()  # padding is unknown, too
-
-
-def test_causal_edges_are_unknown_wherever_nothing_was_tried(tmp_path: Path):
-    write_store(tmp_path / "s", StoreInfo(spec(), "circle", causal_threshold_m=0.75), [shifted_episode(0, 4)])
-    store = read_store(tmp_path / "s")
-    (episode,) = with_causal_edges(store).episodes
-    assert episode.edge_types is not None and episode.edge_attributes is not None
-    assert episode.edge_types[1, :, 0].tolist() == [-1, 0, 1, 1]
-    assert (episode.edge_types[[0, 2, 3]] == -1).all() and (episode.edge_types[1, :, 1:] == -1).all()
-    strength = np.log1p(np.array([0.0, 0.5, 1.0, 1.5]) / 0.75)
-    np.testing.assert_allclose(episode.edge_attributes[1, :, 0, 0], strength, rtol=1e-6)
-    assert np.isfinite(episode.edge_attributes).all()
-    (strict,) = with_causal_edges(store, threshold_m=1.2).episodes
-    assert strict.edge_types is not None and strict.edge_types[1, :, 0].tolist() == [-1, 0, 0, 1]
-    assert with_causal_edges(store).info.edge_attribute_names == ("causal_strength",)
-
-
-def test_all_edges_are_unknown_in_a_store_without_causal_labels(tmp_path: Path):
-    write_store(tmp_path / "s", StoreInfo(spec(), "circle"), [circling_episode(0, steps=4)])
-    store = read_store(tmp_path / "s")
-    assert (store.episodes[0].causal_shift_m, store.episodes[0].perturbed) == (None, None)
-    (episode,) = with_causal_edges(store).episodes
-    assert episode.edge_types is not None and (episode.edge_types == -1).all()
-    assert episode.edge_attributes is not None and not episode.edge_attributes.any()
 
 
 def test_marks_are_for_all_episodes_or_for_none(tmp_path: Path):

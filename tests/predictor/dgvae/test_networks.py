@@ -191,6 +191,13 @@ def test_hard_samples_are_one_hot_and_pass_the_soft_gradient():
         ({"substeps": -1}, "substeps must not be negative, got -1"),
         ({"edge_feature_dim": -1}, "edge_feature_dim must not be negative, got -1"),
         ({"static_dim": 33}, r"static_dim must be at most edge_feature_dim \(32\), got 33"),
+        (
+            {"feature_labels": ("a", "b"), "edge_feature_dim": 1},
+            "feature_labels needs an edge feature for each of a, b, got",
+        ),
+        ({"feature_labels": ("a",), "label_means": (1.0, 2.0), "label_scales": (1.0, 2.0)}, "one number for each of 1"),
+        ({"feature_labels": ("a",), "label_means": (1.0,)}, "label_means needs as many finite numbers as label_scales"),
+        ({"feature_labels": ("a",), "label_means": (1.0,), "label_scales": (0.0,)}, "label_scales must be positive"),
     ],
 )
 def test_config_refuses(fields: Mapping[str, Any], message: str):

@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from predictor.data.causal_edges import CAUSAL_ATTRIBUTES, STRENGTH
 from predictor.data.windows import WindowBatch
 from predictor.forecaster import WindowOutput
 from predictor.support.errors import UserError
@@ -238,6 +239,29 @@ def test_attributes_without_types_count_for_every_pair():
     assert ours["label"] == pytest.approx(4 / 4)
 
 
+def test_causal_attributes_count_wherever_they_are_known():
+    """Also without an edge. An attribute counts by its own pairs: errors 3 (two pairs), 1 (one), none, 2 (two)."""
+    features = per_pair([[0.0] * 4] * 2, [[0.0] * 4] * 2)
+    unknown = math.nan
+    first = [[3.0, 1.0, unknown, unknown], [unknown, unknown, unknown, 2.0]]
+    attributes = per_pair(first, [[3.0, unknown, unknown, 2.0], [unknown] * 4])
+    config = replace(SILENT, label_weight=0.5, causal_edges=True)
+    ours = terms(config, batch(TYPES, attributes), output(features=features))
+    assert ours["label"] == pytest.approx((9 + 1 + 0 + 4) / 4)
+    nothing = terms(config, batch(TYPES, torch.full_like(attributes, unknown)), output(features=features))
+    assert nothing["label"] == 0.0
+
+
+def test_dimensions_learn_attributes_less_their_mean_over_their_spread():
+    network = model(horizon_steps=2)
+    labels = {"feature_labels": ("time_gap_s", "leader"), "label_means": (3.0, 0.5), "label_scales": (2.0, 0.25)}
+    network.config = replace(network.config, edge_feature_dim=2, **labels)
+    features, attributes = per_pair([[0.0, 0.0]] * 2, [[0.0, 0.0]] * 2), per_pair([[7.0, 1.0]] * 2, [[3.0, 0.5]] * 2)
+    config = replace(SILENT, label_weight=1.0, causal_edges=True)
+    _, parts = window_loss(network, batch(TYPES, attributes), output(features=features), config)
+    assert parts["label"].item() == pytest.approx((4 / 2 + 4 / 2) / 2)
+
+
 def test_labels_of_a_model_without_features_have_no_term():
     attributes = per_pair([[1.0], [1.0]], [[1.0], [1.0]])
     assert "label" not in terms(replace(SILENT, label_weight=1.0), batch(TYPES, attributes), output(features=None))
@@ -247,13 +271,13 @@ def test_agents_that_react_weigh_more():
     """Agent 1 has a causal edge of strength 2 from agent 0 at step 1; the other way is known to have none."""
     types = torch.full((1, 3, 2, 2), -1, dtype=torch.int8)
     types[0, 1, 1, 0], types[0, 1, 0, 1] = 1, 0
-    strength = torch.zeros(1, 3, 2, 2, 1)
-    strength[0, 1, 1, 0], strength[0, 1, 0, 1] = 2.0, 0.5
+    attributes = torch.full((1, 3, 2, 2, len(CAUSAL_ATTRIBUTES)), math.nan)  # unknown, as are all but the strengths
+    attributes[0, 1, 1, 0, STRENGTH], attributes[0, 1, 0, 1, STRENGTH] = 2.0, 0.5
     rollout = torch.zeros(1, 2, 1, 4)
     rollout[0, 0, 0, 0] = 10.0  # agent 0 is 1 wrong in scaled units, agent 1 is 2 wrong
     rollout[0, 1, 0, 0] = 20.0
     for now, weights in ((1, (1 / 4, 7 / 4)), (0, (1.0, 1.0))):  # 1 and 1 + 3 · 2, over their mean; not yet labelled
-        windows = replace(batch(types.tolist(), strength, now), valid=torch.ones(1, 3, 2).bool())
+        windows = replace(batch(types.tolist(), attributes, now), valid=torch.ones(1, 3, 2).bool())
         out = output()._replace(rollout=rollout)
         config = replace(SILENT, likelihood="laplace", causal_edges=True, reaction_weight=3.0)
         assert terms(config, windows, out)["nll_rollout"] == pytest.approx((weights[0] * 2 + weights[1] * 4) / 2)
@@ -265,11 +289,11 @@ def test_agents_that_react_weigh_more():
 def test_agents_that_react_to_one_that_is_gone_weigh_more(gone_at: int, weights: tuple[float, float]):
     """Agent 2 has an edge of strength 2 to agent 1 at step 0, and is not there from a step on; step 1 is the last."""
     types = torch.full((1, 3, 3, 3), -1, dtype=torch.int8)
-    strength = torch.zeros(1, 3, 3, 3, 1)
-    types[0, 0, 1, 2], strength[0, 0, 1, 2] = 1, 2.0
+    attributes = torch.full((1, 3, 3, 3, len(CAUSAL_ATTRIBUTES)), math.nan)
+    types[0, 0, 1, 2], attributes[0, 0, 1, 2, STRENGTH] = 1, 2.0
     valid = torch.ones(1, 3, 3).bool()
     valid[0, gone_at:, 2] = False
-    windows = WindowBatch(torch.zeros(1, 3, 3, 4), valid, torch.tensor([1]), types, strength)
+    windows = WindowBatch(torch.zeros(1, 3, 3, 4), valid, torch.tensor([1]), types, attributes)
     assert reaction_weights(windows, 3.0)[0, :2].tolist() == pytest.approx(weights)
 
 

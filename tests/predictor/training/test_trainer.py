@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from predictor.checkpoint import load_checkpoint, save_checkpoint
+from predictor.data.causal_edges import CAUSAL_ATTRIBUTES
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.dgvae.config import PRESETS
 from predictor.models import build, name_of
@@ -615,6 +616,58 @@ def test_a_start_with_another_ego_is_named(circles: Path, tmp_path: Path):
         load_data(config(circles, tmp_path / "second", val_data=(tmp_path / "equals",)))
 
 
+def write_followers(path: Path) -> Path:
+    """Circles with causal labels (an intervention on agent 0 moves agent 1 by 2 m); agent 0 leads agent 1."""
+    episodes = []
+    for i in range(6):
+        plain = circling_episode(i)
+        steps, agents = plain.valid.shape
+        types = np.tile(-np.eye(agents, dtype=np.int8), (steps, 1, 1))
+        shift_m = np.full((steps, agents, agents), np.nan, dtype=np.float32)
+        attributes = np.zeros((steps, agents, agents, 2), dtype=np.float32)
+        types[:, 1, 0], shift_m[:, 1, 0], attributes[:, 1, 0] = 1, 2.0, (20.0 + i, 1.0)
+        episodes.append(replace(plain, edge_types=types, edge_attributes=attributes, causal_shift_m=shift_m))
+    names = ("desired_speed_mps", "time_gap_s")
+    info = StoreInfo(spec(), "circles", edge_attribute_names=names, causal_threshold_m=1.0)
+    write_store(path, info, episodes)
+    return path
+
+
+LABELS: dict[str, Any] = {"causal_edges": True, "label_weight": 1.0}
+
+
+@pytest.mark.parametrize("init", [False, True])
+def test_features_learn_what_is_known_of_edges_in_units_of_its_spread(tmp_path: Path, init: bool):
+    """From random weights and from a checkpoint that learned none."""
+    data, changes = write_followers(tmp_path / "followers"), dict(LABELS)
+    if init:
+        changes["init"] = str(train(config(data, tmp_path / "first", causal_edges=True)))
+    trainer = made(config(data, tmp_path / "second", **changes))
+    learned = trainer.model.config
+    assert learned.feature_labels == CAUSAL_ATTRIBUTES
+    speeds = [e.edge_attributes[..., 0] for e in trainer.data.train_episodes if e.edge_attributes is not None]
+    known = np.concatenate([speed[np.isfinite(speed)] for speed in speeds]).astype(np.float64)
+    assert learned.label_means == pytest.approx((known.mean(), 0, 1 / 2, 0)) and known.std() > 0
+    assert learned.label_scales == pytest.approx((known.std(), 1, 0.5, 1))
+    assert "label" in trainer.train_step()
+    plain = made(config(data, tmp_path / "third", causal_edges=True))
+    assert not plain.model.config.feature_labels and "label" not in plain.train_step()
+
+
+def test_a_run_with_labels_goes_on_where_it_stopped(tmp_path: Path):
+    data = write_followers(tmp_path / "followers")
+    first = str(train(config(data, tmp_path / "first", causal_edges=True)))
+    whole = config(data, tmp_path / "whole", init=first, steps=4, set=("static_dim=1",), **LABELS)
+    train(whole)
+    stopped = replace(whole, out=tmp_path / "stopped")
+    train(replace(stopped, steps=2))
+    train(replace(stopped, resume=True))
+    ours, theirs = (load_checkpoint(tmp_path / name)[0].state_dict() for name in ("stopped", "whole"))
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    kept = load_checkpoint(tmp_path / "stopped")[1].config
+    assert kept.static_dim == 1 and kept.feature_labels == CAUSAL_ATTRIBUTES
+
+
 def test_what_began_well_is_kept_if_training_makes_it_worse(circles: Path, tmp_path: Path):
     first = train(config(circles, tmp_path / "first", steps=30, lr=1e-2))
     harmed = train(config(circles, tmp_path / "second", init=str(first), lr=200.0))
@@ -626,7 +679,8 @@ def test_what_began_well_is_kept_if_training_makes_it_worse(circles: Path, tmp_p
     ("changes", "message"),
     [
         ({"fit_inputs": False}, "init takes the network of 'RUN'; leave out fit_inputs"),
-        ({"preset": "paper", "set": ("rnn_dim=3",)}, "leave out preset, set"),
+        ({"preset": "paper", "set": ("rnn_dim=3",)}, "leave out preset$"),
+        ({"set": ("rnn_dim=3",)}, "--set rnn_dim=3 needs other weights than checkpoint 'RUN' has; change only"),
         ({"model": "lstm"}, "is of model dgvae; pass --model dgvae"),
         ({"init": "nowhere"}, "nowhere"),
     ],
