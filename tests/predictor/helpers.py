@@ -58,7 +58,7 @@ PLURAL = replace(
     static_dim=2,
     geometry_scales=(2.0, 1.5),
 )
-SIZES = {"fast": FAST_LIKE, "paper": PAPER_LIKE, "rich": RICH}
+SIZES = {"fast": FAST_LIKE, "paper": PAPER_LIKE, "rich": RICH, "plural": PLURAL}
 # Every kind of trainable forecaster: its name in `predictor.models`, and a small config.
 EVERY_MODEL: dict[str, tuple[str, Any]] = {
     "dgvae": ("dgvae", FAST_LIKE),
@@ -104,7 +104,7 @@ def enlarge(network: Any) -> None:
 
 @cache
 def model(
-    size: Literal["fast", "paper", "rich"] = "fast",
+    size: Literal["fast", "paper", "rich", "plural"] = "fast",
     num_edge_types: int = 2,
     residual: Literal["state", "constant_velocity", "trapezoid"] | None = None,
     frame: tuple[AxisFrame, AxisFrame] = WORLD,

@@ -173,7 +173,10 @@ def everything(forecaster: DGVAE, states: Tensor, valid: Tensor) -> dict[str, Te
     now = torch.full((len(states),), states.shape[1] - 2)
     window = window_without_noise(forecaster, states, valid, now)
     belief = last(forecaster, states, valid)
-    return {
+    samples = max(1, forecaster.config.num_modes)
+    futures = forecaster.rollout(belief, 3, samples)
+    modes = {"mode_probs": futures.mode_probs, "mode_scale": futures.scale} if samples > 1 else {}
+    return modes | {
         "prior": window.prior_logits,
         "posterior": window.posterior_logits,
         "features": window.features,
@@ -181,14 +184,21 @@ def everything(forecaster: DGVAE, states: Tensor, valid: Tensor) -> dict[str, Te
         "rollout": window.rollout[:, None],
         "streamed_probs": belief.edge_probs[:, None],
         "streamed_features": belief.edge_features[:, None],
-        "streamed": forecaster.rollout(belief, 3).states,
+        "streamed": futures.states,
     }
+
+
+def presence_of(forecaster: DGVAE, valid: Tensor) -> dict[str, Tensor]:
+    """Whether an agent is there, for each output that says nothing of one that is not."""
+    modes = valid[:, [-1]].expand(-1, max(1, forecaster.config.num_modes), -1)
+    streamed = {name: modes for name in ("streamed", "mode_probs", "mode_scale")}
+    return {"one_step": valid, "rollout": valid[:, [-2]], **streamed}
 
 
 PAIRWISE = {"prior", "posterior", "features", "streamed_probs", "streamed_features"}
 
 
-@pytest.mark.parametrize("size", ["fast", "rich"])
+@pytest.mark.parametrize("size", ["fast", "rich", "plural"])
 @pytest.mark.parametrize(
     "frame", [("world", "world"), ROAD, ("centroid", "centroid")], ids=["world", "road", "centroid"]
 )
@@ -202,15 +212,15 @@ def test_padding_is_invisible(size: Any, frame: Any, valid: Tensor, seed: int, p
     padded_states = torch.where(padded_valid[..., None], garbage.clone(), garbage)
     padded_states[:, :, :AGENTS][valid] = states[valid]
     plain, padded = everything(forecaster, states, valid), everything(forecaster, padded_states, padded_valid)
-    present = {"one_step": valid, "rollout": valid[:, [-2]], "streamed": valid[:, [-1]]}
+    present = presence_of(forecaster, valid)
     for name, expected in plain.items():
         ours = padded[name][:, :, :AGENTS, :AGENTS] if name in PAIRWISE else padded[name][:, :, :AGENTS]
-        if name in present:  # an absent agent has no state to speak of
+        if name in present:
             ours, expected = ours[present[name]], expected[present[name]]
         torch.testing.assert_close(ours, expected, **EXACT, msg=lambda m, n=name: f"{n}: {m}")
 
 
-@pytest.mark.parametrize("size", ["fast", "rich"])
+@pytest.mark.parametrize("size", ["fast", "rich", "plural"])
 @settings(max_examples=12)
 @given(valid=presence(ego=False), seed=seeds, order=st.permutations(range(AGENTS)))
 def test_permuting_agents_permutes_outputs(size: Any, valid: Tensor, seed: int, order: list[int]):
@@ -227,9 +237,15 @@ def check_permutation(forecaster: DGVAE, valid: Tensor, seed: int, order: list[i
     states = random_states(seed, BATCH, TIME, AGENTS, 4).double()
     plain = everything(forecaster, states, valid)
     permuted = everything(forecaster, states[:, :, order], valid[:, :, order])
+    present = presence_of(forecaster, valid[:, :, order])
     for name, values in plain.items():
-        expected = values[:, :, order][:, :, :, order] if name in PAIRWISE else values[:, :, order]
-        torch.testing.assert_close(permuted[name], expected, **EXACT, msg=lambda m, n=name: f"{n}: {m}")
+        ours, expected = (
+            permuted[name],
+            values[:, :, order][:, :, :, order] if name in PAIRWISE else values[:, :, order],
+        )
+        if name in present:
+            ours, expected = ours[present[name]], expected[present[name]]
+        torch.testing.assert_close(ours, expected, **EXACT, msg=lambda m, n=name: f"{n}: {m}")
 
 
 def test_the_ego_is_not_like_the_others():
