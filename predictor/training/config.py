@@ -58,6 +58,9 @@ class TrainConfig:
     """Checkpoint to start from: a shipped name, a folder or a run folder. Network and scales are the checkpoint's, so
     leave out the options of the network, but for `set`; frame and range of perception are the data's. Empty starts from
     random weights."""
+    refit_scales: bool = False
+    """Whether the scales of `init` are fitted to the data anew, for data that spread otherwise than those it was
+    trained on; the weights change along, so that forecasts stay the same but for the geometry of edges."""
     only_spread: bool = False
     """Whether to train the spread of the modes alone (`Forecast.xy_scale`): the forecasts of `init` and their
     probabilities stay as they are, and the likelihood of the mixture selects the checkpoint."""
@@ -189,6 +192,10 @@ class TrainConfig:
         given = [name for name in OF_THE_NETWORK if getattr(self, name) != getattr(type(self), name)]
         if self.init and given:
             raise UserError(f"init takes the network of '{self.init}'; leave out {', '.join(given)}")
+        if self.refit_scales and (not self.init or self.only_spread or self.model != "dgvae"):
+            raise UserError(
+                "refit_scales needs a dG-VAE to start from, and not only_spread; pass --init, or leave it out"
+            )
         if self.only_spread and not self.init:
             raise UserError("only_spread needs the checkpoint whose spread it trains; pass --init, or leave it out")
         unknown = [name for name in self._of_graphs if getattr(self, name)]

@@ -15,6 +15,7 @@ from predictor.support.errors import UserError
 from predictor.support.remote import address
 from predictor.training.config import TrainConfig
 from predictor.training.fitted_scales import typical_change, typical_labels, typical_neighbour, typical_spread
+from predictor.training.rescaling import SCALES, rescaled
 
 
 def model_config(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episode]) -> Any:
@@ -60,7 +61,10 @@ def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episo
     info.spec.check_recorded(spec, f"checkpoint '{config.init}'", f"store {address(config.data[0])}")
     spec = replace(spec, feature_scales=info.spec.feature_scales)  # scales are the network's, the rest the data's
     if not config.only_spread:
-        network = changed(replace(info.config, **_labels(config, episodes)), config.set)
+        if config.refit_scales:
+            fitted = model_config(replace(config, set=(f"residual={info.config.residual}",)), spec, episodes)
+            source = rescaled(source, info.model, {name: getattr(fitted, name) for name in SCALES}, info.horizon_steps)
+        network = changed(replace(source.config, **_labels(config, episodes)), config.set)
         plain = build(info.model, spec, network, config.horizon_steps)
         _fill(plain, source, config)
         return plain
