@@ -48,6 +48,8 @@ class SceneLabels:
     """
     edge_attributes: Float[np.ndarray, "agents agents attributes"]
     """float32, named in `ATTRIBUTE_NAMES`; zeros without a leader edge."""
+    ahead: int | None = None
+    """Index of the vehicle next ahead of the only ego on its lane; None if there is none, or several egos."""
 
 
 def read_labels(env: gym.Env) -> SceneLabels:
@@ -72,7 +74,10 @@ def read_labels(env: gym.Env) -> SceneLabels:
                 driver = vehicle.TIME_WANTED, headway_m, desired_speed_mps(vehicle), driver_kind(vehicle)
                 attributes[receiver, index[leader]] = time_gap_s, *driver
     np.fill_diagonal(types, UNKNOWN)
-    return SceneLabels(types, attributes)
+    ahead = None
+    if len(controlled) == 1:
+        ahead = index.get(controlled[0].road.neighbour_vehicles(controlled[0], controlled[0].lane_index)[0])
+    return SceneLabels(types, attributes, ahead)
 
 
 def leaders_of(vehicle: IDMVehicle) -> dict[RoadObject, float]:

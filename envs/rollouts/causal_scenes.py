@@ -4,9 +4,13 @@ At every fifth step, from a random one on, copies of the simulator say whose fut
 is taken out (`envs.rollouts.causal_labels`). Beside each known label stand each checkpoint's probability of an edge,
 the distance, and whether the simulator says that the receiver follows the sender. Pairs of which one agent is not
 perceived have no inferred edge and are left out, and so are landmarks.
+
+What the ego does is its policy's choice, so no label says who influences it. On roads its edges stand beside the
+vehicle ahead on its lane.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -58,6 +62,12 @@ class EdgeScene:
     """Whether the simulator says that the receiver follows the sender; None where it says nothing."""
     edge_prob: dict[str, Float[np.ndarray, " pairs"]]
     """Probability of an edge of any type, by checkpoint."""
+    ahead: Bool[np.ndarray, " others"] | None = None
+    """Whether each other perceived agent is the one ahead of the ego on its lane; None without lanes or an only ego."""
+    distance_to_ego_m: Float[np.ndarray, " others"] | None = None
+    """Distance of these agents from the ego [m]."""
+    prob_to_ego: dict[str, Float[np.ndarray, " others"]] = field(default_factory=dict)
+    """Probability of an edge from each of these agents to the ego, by checkpoint."""
 
 
 def play_graph(task: GraphTask) -> list[EdgeScene]:
@@ -95,10 +105,20 @@ def labelled_scene(world: World, forecasters: dict[str, SideForecaster], setting
     at = place[receiver], place[sender]
     positions = scene.states[:, : world.spec.position_dim]
     probs = {name: forecaster.forecast().edge_probs[0].cpu().numpy() for name, forecaster in forecasters.items()}
+    to_ego: dict[str, Any] = {}
+    if leaders is not None and world.spec.has_ego:
+        others = np.flatnonzero(moving[1:]) + 1
+        ahead = None if leaders.ahead is None else labels.ids[leaders.ahead]
+        to_ego = {
+            "ahead": np.array([int(agent) == ahead for agent in scene.ids[others]], dtype=np.bool_),
+            "distance_to_ego_m": np.linalg.norm(positions[others] - positions[0], axis=-1),
+            "prob_to_ego": {name: (1 - one[0, others, 0]).astype(np.float64) for name, one in probs.items()},
+        }
     return EdgeScene(
         labels.shift_m[receiver, sender].astype(np.float64),
         np.asarray(labels.ids, dtype=np.int64)[receiver],
         np.linalg.norm(positions[at[0]] - positions[at[1]], axis=-1),
         None if leaders is None else leaders.edge_types[receiver, sender] == LEADER,
         {name: (1 - one[at[0], at[1], 0]).astype(np.float64) for name, one in probs.items()},
+        **to_ego,
     )

@@ -1,6 +1,6 @@
 """Reports of `envs.evaluate --graph`: a table for a terminal and a page, precision against recall, calibration."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -8,6 +8,7 @@ from typing import Any
 import matplotlib
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from rich.console import Group
 from rich.table import Table
 
 from envs.rollouts.graph_run import DISTANCE, LEADERS, MAJORITY, EnvGraph
@@ -36,19 +37,35 @@ def title(result: EnvGraph) -> str:
     )
 
 
+def title_to_ego(result: EnvGraph) -> str:
+    """Returns the title of the table of edges to the ego; empty without any."""
+    if not result.to_ego:
+        return ""
+    first = next(iter(result.to_ego.values()))
+    return (
+        f"{result.env}, edges to the ego against the vehicle ahead on its lane: {first.pairs} pairs, "
+        f"{100 * first.share:.0f} % are ahead"
+    )
+
+
 def remarks(result: EnvGraph) -> list[str]:
     """Returns which checkpoints were left out, and why."""
     return [f"left out: {name}: {why}" for name, why in result.misfits.items()]
 
 
-def shown(result: EnvGraph) -> Table:
-    """Returns the table of one environment for a terminal."""
-    lines = Table(title=title(result))
-    for i, heading in enumerate(HEADS):
-        lines.add_column(heading, justify="right" if i else "left", no_wrap=heading.endswith("(95 %)"))
-    for cells in _lines(result):
-        lines.add_row(*cells)
-    return lines
+def shown(result: EnvGraph) -> Group:
+    """Returns the tables of one environment for a terminal."""
+    tables = []
+    for heading, scores in ((title(result), result.scores), (title_to_ego(result), result.to_ego)):
+        if not scores:
+            continue
+        lines = Table(title=heading)
+        for i, column in enumerate(HEADS):
+            lines.add_column(column, justify="right" if i else "left", no_wrap=column.endswith("(95 %)"))
+        for cells in _lines(scores):
+            lines.add_row(*cells)
+        tables.append(lines)
+    return Group(*tables)
 
 
 def markdown(results: Sequence[EnvGraph]) -> str:
@@ -56,13 +73,15 @@ def markdown(results: Sequence[EnvGraph]) -> str:
     parts = []
     for result in results:
         notes = "".join(f"\n* {remark}" for remark in remarks(result))
-        parts.append(f"### {title(result)}\n\n{table(HEADS, _lines(result))}\n{notes}\n")
+        parts.append(f"### {title(result)}\n\n{table(HEADS, _lines(result.scores))}\n{notes}\n")
+        if result.to_ego:
+            parts.append(f"#### {title_to_ego(result)}\n\n{table(HEADS, _lines(result.to_ego))}\n")
     return "\n".join(parts)
 
 
-def _lines(result: EnvGraph) -> list[list[str]]:
+def _lines(scores: Mapping[str, CausalScores]) -> list[list[str]]:
     lines = []
-    for name, found in result.scores.items():
+    for name, found in scores.items():
         spread = found.spread_between_senders
         lines.append(
             [

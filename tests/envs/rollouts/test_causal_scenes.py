@@ -63,6 +63,19 @@ def test_pairs_stand_beside_their_own_probability_distance_and_leader():
     assert found.leads is not None
     assert {(r, s) for r, s, leads in zip(receivers, senders, found.leads, strict=True) if leads} == {(1, 2), (2, 3)}
     assert found.shift_m[found.leads].min() > 1.0 > found.shift_m[~found.leads].max()
+    assert found.ahead is not None and found.distance_to_ego_m is not None
+    assert np.round(100 * found.prob_to_ego["ids"]).tolist() == [1, 4, 2, 3]  # receiver 0, the ego; nearest first
+    assert found.ahead.tolist() == [False, True, False, False]  # on its lane is agent 4 alone
+    expected = [np.linalg.norm(places[agent] - places[0]) for agent in (1, 4, 2, 3)]
+    np.testing.assert_allclose(found.distance_to_ego_m, expected, rtol=1e-5)
+
+
+def test_nobody_is_ahead_of_an_ego_that_leads():
+    world = road_world((0.0, 12.0), (30.0, 4.0), ego_m=(25.0, 12.0))
+    forecaster = ByIds()
+    forecaster.observe(world.perceived())
+    found = labelled_scene(world, {"ids": forecaster}, ON_ROADS)
+    assert found.ahead is not None and len(found.ahead) and not found.ahead.any()
 
 
 def test_who_is_not_perceived_is_left_out():

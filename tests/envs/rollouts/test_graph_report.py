@@ -49,6 +49,18 @@ def test_the_terminal_has_the_same_cells():
     assert "0.67 (0.67 to 0.67)" in text.getvalue() and "calibration" in text.getvalue()
 
 
+def test_edges_to_the_ego_have_a_table_of_their_own():
+    result = replace(RESULT, to_ego=SCORES)
+    lines = markdown([result]).splitlines()
+    begin = lines.index(
+        "#### merge-v1, edges to the ego against the vehicle ahead on its lane: 40 pairs, 25 % are ahead"
+    )
+    assert lines[begin + 4].startswith("| ours | 1.00 |") and "edges to the ego" not in markdown([RESULT])
+    text = StringIO()
+    Console(file=text, width=200).print(shown(result))
+    assert text.getvalue().count("0.67 (0.67 to 0.67)") == 4 and "against the vehicle ahead" in text.getvalue()
+
+
 def test_json_has_the_bins():
     found = as_json(RESULT)["scores"]["ours"]
     assert len(found["bins"]) == 10 and sum(one["pairs"] for one in found["bins"]) == 40
