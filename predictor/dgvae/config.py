@@ -65,7 +65,8 @@ class DGVAEConfig:
     innovation_dim: int = 32
     """Width of these corrections."""
     feature_labels: tuple[str, ...] = ()
-    """Edge attributes that restricted labelling taught to the first feature dimensions, in their order."""
+    """Edge attributes that restricted labelling taught to the first feature dimensions, in their order; "" for a
+    dimension whose attribute no pair of the data had."""
     label_means: tuple[float, ...] = ()
     """Mean of each of these attributes over the data, in its unit; a dimension is the attribute less this mean ..."""
     label_scales: tuple[float, ...] = ()

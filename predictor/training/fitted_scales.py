@@ -10,6 +10,8 @@ from predictor.graph import pair_mask
 from predictor.layers.state_codec import Residual, StateCodec, drift
 from predictor.scene import SceneSpec
 
+_FLAT = 1e-6
+"""Standard deviation, as a share of the mean or of 1, below which an attribute never varies."""
 _MOST_PAIRS = 10_000_000
 """Largest number of pairs of agents, over steps, whose distances are computed at once."""
 
@@ -60,24 +62,21 @@ def typical_neighbour(episodes: Sequence[Episode], spec: SceneSpec) -> tuple[flo
     return tuple(max(float(torch.cat(found).median()), 1e-2) for found in (distances, speeds))
 
 
-def typical_labels(episodes: Sequence[Episode], count: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Computes mean and standard deviation of each edge attribute over the pairs where it is known.
+def typical_label(episodes: Sequence[Episode], column: int) -> tuple[float, float] | None:
+    """Computes mean and standard deviation of an edge attribute over the pairs where it is known.
 
     Args:
         episodes: episodes with edge attributes, NaN where unknown.
-        count: number of attributes.
+        column: column of the attribute.
 
     Returns:
-        Both for each attribute; 0 and 1 for one that is known nowhere or never varies.
+        Both; None if it is known nowhere or never varies.
     """
-    means, scales = [], []
-    for column in range(count):
-        parts = [e.edge_attributes[..., column].ravel() for e in episodes if e.edge_attributes is not None]
-        known = np.concatenate([part[np.isfinite(part)] for part in parts] or [np.zeros(0)]).astype(np.float64)
-        spread = float(known.std()) if len(known) else 0.0
-        means.append(float(known.mean()) if spread > 0 else 0.0)
-        scales.append(spread if spread > 0 else 1.0)
-    return tuple(means), tuple(scales)
+    parts = [e.edge_attributes[..., column].ravel() for e in episodes if e.edge_attributes is not None]
+    known = np.concatenate([part[np.isfinite(part)] for part in parts] or [np.zeros(0)]).astype(np.float64)
+    if not len(known) or known.std() <= _FLAT * max(1.0, abs(known.mean())):
+        return None
+    return float(known.mean()), float(known.std())
 
 
 def _in_frame(episode: Episode, spec: SceneSpec) -> np.ndarray:

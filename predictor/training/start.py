@@ -14,7 +14,7 @@ from predictor.scene import SceneSpec
 from predictor.support.errors import UserError
 from predictor.support.remote import address
 from predictor.training.config import TrainConfig
-from predictor.training.fitted_scales import typical_change, typical_labels, typical_neighbour, typical_spread
+from predictor.training.fitted_scales import typical_change, typical_label, typical_neighbour, typical_spread
 from predictor.training.rescaling import SCALES, rescaled
 
 
@@ -41,8 +41,10 @@ def _labels(config: TrainConfig, episodes: Sequence[Episode]) -> dict[str, Any]:
     """Returns fields of the network's config that say which attributes its first feature dimensions learn."""
     if not (config.label_weight and config.causal_edges):
         return {}
-    means, scales = typical_labels(episodes, len(CAUSAL_ATTRIBUTES))
-    return {"feature_labels": CAUSAL_ATTRIBUTES, "label_means": means, "label_scales": scales}
+    found = [typical_label(episodes, column) for column in range(len(CAUSAL_ATTRIBUTES))]
+    names = (name if label else "" for name, label in zip(CAUSAL_ATTRIBUTES, found, strict=True))
+    means, scales = zip(*(label or (0.0, 1.0) for label in found), strict=True)
+    return {"feature_labels": tuple(names), "label_means": means, "label_scales": scales}
 
 
 def initial_model(config: TrainConfig, spec: SceneSpec, episodes: Sequence[Episode]) -> Any:

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from predictor.checkpoint import load_checkpoint, save_checkpoint
-from predictor.data.causal_edges import CAUSAL_ATTRIBUTES
 from predictor.data.store import Episode, StoreInfo, write_store
 from predictor.dgvae.config import PRESETS
 from predictor.models import build, name_of
@@ -644,7 +643,7 @@ def test_features_learn_what_is_known_of_edges_in_units_of_its_spread(tmp_path: 
         changes["init"] = str(train(config(data, tmp_path / "first", causal_edges=True)))
     trainer = made(config(data, tmp_path / "second", **changes))
     learned = trainer.model.config
-    assert learned.feature_labels == CAUSAL_ATTRIBUTES
+    assert learned.feature_labels == ("desired_speed_mps", "", "leader", "")  # the others never vary here
     speeds = [e.edge_attributes[..., 0] for e in trainer.data.train_episodes if e.edge_attributes is not None]
     known = np.concatenate([speed[np.isfinite(speed)] for speed in speeds]).astype(np.float64)
     assert learned.label_means == pytest.approx((known.mean(), 0, 1 / 2, 0)) and known.std() > 0
@@ -665,7 +664,7 @@ def test_a_run_with_labels_goes_on_where_it_stopped(tmp_path: Path):
     ours, theirs = (load_checkpoint(tmp_path / name)[0].state_dict() for name in ("stopped", "whole"))
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
     kept = load_checkpoint(tmp_path / "stopped")[1].config
-    assert kept.static_dim == 1 and kept.feature_labels == CAUSAL_ATTRIBUTES
+    assert kept.static_dim == 1 and kept.feature_labels == ("desired_speed_mps", "", "leader", "")
 
 
 def test_what_began_well_is_kept_if_training_makes_it_worse(circles: Path, tmp_path: Path):
