@@ -50,20 +50,18 @@ def with_causal_edges(store: EpisodeStore, threshold_m: float | None = None) -> 
 
 def _with_causal_edges(episode: Episode, threshold_m: float | None, columns: list[int] | None) -> Episode:
     """Returns an episode with causal edges; `columns` are those of the drivers' attributes, None without any."""
-    types, given = episode.edge_types, episode.edge_attributes
-    led = types is not None and given is not None and columns is not None
-    shift_m = episode.causal_shift_m if threshold_m is not None else None
-    steps = max(len(shift_m) if shift_m is not None else 1, len(types) if types is not None and led else 1)
+    types = None if columns is None else episode.edge_types
+    shift_m = None if threshold_m is None else episode.causal_shift_m
+    steps = max(1 if labels is None else len(labels) for labels in (types, shift_m))
     pairs = (steps, len(episode.ids), len(episode.ids))
-    shift_m = np.full(pairs, np.nan, dtype=np.float32) if shift_m is None else np.broadcast_to(shift_m, pairs)
+    shift_m = np.broadcast_to(np.float32(np.nan) if shift_m is None else shift_m, pairs)
     attributes = np.full((*pairs, len(CAUSAL_ATTRIBUTES)), np.nan, dtype=np.float32)
     attributes[..., STRENGTH] = causal_strength(shift_m, threshold_m or np.inf)
-    if types is not None and given is not None and columns is not None:
-        is_leader = np.broadcast_to(types > 0, pairs)
-        attributes[..., CAUSAL_ATTRIBUTES.index("leader")] = np.where(types < 0, np.nan, is_leader)
+    if types is not None and columns is not None and episode.edge_attributes is not None:
+        attributes[..., CAUSAL_ATTRIBUTES.index("leader")] = np.where(types < 0, np.nan, types > 0)
         for name, column in zip(DRIVER_ATTRIBUTES, columns, strict=True):
-            attributes[..., CAUSAL_ATTRIBUTES.index(name)] = np.where(is_leader, given[..., column], np.nan)
-        # a driver that yields wishes to stand: what it wishes on a free road is not recorded then
-        speed = attributes[..., CAUSAL_ATTRIBUTES.index("desired_speed_mps")]
-        speed[speed <= 0] = np.nan
+            of_driver = np.where(types > 0, episode.edge_attributes[..., column], np.nan)
+            if name == "desired_speed_mps":  # 0 while a driver yields: what it wishes on a free road is not recorded
+                of_driver[of_driver <= 0] = np.nan
+            attributes[..., CAUSAL_ATTRIBUTES.index(name)] = of_driver
     return replace(episode, edge_types=causal_types(shift_m, threshold_m or np.inf), edge_attributes=attributes)
