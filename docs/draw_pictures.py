@@ -174,7 +174,7 @@ def draw_calibration(path: Path) -> None:
         shares = {name: controls[name].coverage for name in names if name in controls}
         ax.plot(
             100 * np.array(spread), [place, place], color=BLUE, lw=5, solid_capstyle="butt",
-            label=None if place else "dG-VAE, least to most of the steps",
+            label=None if place else "plural dG-VAE, least to most of the steps",
         )  # fmt: skip
         for (name, share), marker in zip(shares.items(), "sD^", strict=False):
             ax.plot(
