@@ -39,7 +39,7 @@ class EnvGraph:
     env_kwargs: str = ""
     """Arguments of the environment, as the text of a JSON object; empty for none."""
     to_ego: dict[str, CausalScores] = field(default_factory=dict)
-    """The same scores of edges to the ego, of which the vehicle ahead on its lane is the true one; empty elsewhere."""
+    """Scores of edges to the ego, of which that from the vehicle ahead on its lane is the true one; empty elsewhere."""
 
     @property
     def env(self) -> str:

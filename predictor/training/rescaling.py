@@ -1,4 +1,4 @@
-"""The same network with scales of other data: its forecasts stay, its weights get the size that they train well at.
+"""Gives a network the scales of other data: its forecasts stay, its weights get the size that they train well at.
 
 A network that is trained on from another road's checkpoint sees positions divided by that road's length and width, so
 that its inputs may be dozens of units large, or a hundredth of one. Every scale but those of the edges' geometry
