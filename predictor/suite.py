@@ -54,7 +54,7 @@ MIN_HISTORY_STEPS = 8
 """Smallest number of observed steps of a training window, where the table's burn-in is not shorter."""
 ADDED = {
     "precision": "float32", "causal_edges": False, "reaction_weight": 0.0, "init": "", "only_spread": False,
-    "shift_weight": 0.0, "keep": "best",
+    "shift_weight": 0.0, "keep": "best", "refit_scales": False,
 }  # fmt: skip
 """Options that came after the first lines were trained, with the values that change nothing."""
 PACKAGES = ("torch", "numpy", "zarr")
