@@ -6,6 +6,10 @@ through others: a sender's follower brakes, and so its follower brakes. So each 
 held to what they do without the intervention. The label is the farthest direct shift within the horizon [m]; of
 receivers below the threshold already, the whole shift. Where a sender was not tried, the label is unknown.
 
+What the ego does is its policy's choice, which no intervention in one episode tells apart from a habit. The labels of
+what reaches the ego are therefore those of a driver of the simulator in its place (`envs.simulators.stand_in`): each
+intervention is played once more with that driver, all others held to what they do beside it.
+
 Edges are thus what one agent does to another at once. Chains follow from them, as in a model whose messages pass edge
 by edge; labels that contained the chains would grow with the horizon and with the density of traffic.
 """
@@ -21,6 +25,7 @@ from envs.rollouts.branches import Branches, BranchPoint, copied
 from envs.rollouts.interventions import intervene, interventions_of, kinds_of
 from envs.rollouts.world import World
 from envs.simulators.interventions import Intervention, Kind
+from envs.simulators.stand_in import seat_driver
 from predictor.data.store import Episode
 from predictor.support.errors import UserError
 
@@ -64,7 +69,8 @@ class CausalLabels:
     ids: Sequence[int]
     """Agents, in the order of `World.full_scene`."""
     shift_m: Float[np.ndarray, "agents agents"]
-    """float32, receiver first: farthest direct shift by an intervention on the sender [m]; NaN where unknown."""
+    """float32, receiver first: farthest direct shift by an intervention on the sender [m]; NaN where unknown. The row
+    of an ego is that of a driver in its place."""
 
 
 def causal_labels(world: World, settings: CausalSettings) -> CausalLabels:
@@ -86,7 +92,7 @@ def causal_labels(world: World, settings: CausalSettings) -> CausalLabels:
         found = direct_shift_m(point, point.perturbed(intervention), settings.threshold_m)
         shift_m[:, column] = np.fmax(shift_m[:, column], found)
     if world.spec.has_ego:
-        shift_m[0] = np.nan  # its future is the policy's choice
+        shift_m[0] = shift_in_place_of_ego_m(world, ids, tried, settings.threshold_m)
     np.fill_diagonal(shift_m, np.nan)
     return CausalLabels(ids, shift_m)
 
@@ -109,6 +115,31 @@ def direct_shift_m(
             alone = point.direct(found.intervention, int(point.ids[receiver]))
             whole_m[receiver] = farthest(alone, threshold_m, steps)[receiver]
     return whole_m
+
+
+def shift_in_place_of_ego_m(
+    world: World, ids: Sequence[int], tried: Sequence[Intervention], threshold_m: float
+) -> Float[np.ndarray, " agents"]:
+    """Computes how far interventions on each agent move a driver of the simulator in the ego's place, directly [m].
+
+    NaN for agents that are not tried, and everywhere where no such driver can take the place.
+
+    Args:
+        world: a running world with one ego; it is not changed.
+        ids: agents, the ego first.
+        tried: interventions of equal duration, which is the horizon.
+        threshold_m: shift above which one counts that cannot be followed to the end [m].
+    """
+    shift_m = np.full(len(ids), np.nan)
+    of_others = [intervention for intervention in tried if intervention.agent != ids[0]]
+    beside = copied(world)
+    if not of_others or not seat_driver(beside.env):
+        return shift_m
+    point = BranchPoint(beside, of_others[0].steps)
+    for intervention in of_others:
+        column = ids.index(intervention.agent)
+        shift_m[column] = np.fmax(shift_m[column], farthest(point.direct(intervention, ids[0]), threshold_m)[0])
+    return shift_m
 
 
 def farthest(found: Branches, threshold_m: float, steps: int | None = None) -> Float[np.ndarray, " agents"]:

@@ -1,0 +1,41 @@
+"""A driver of highway-env's traffic in the ego's place: whom would whoever sits there react to?"""
+
+from typing import Any
+
+from highway_env.envs.common.abstract import AbstractEnv
+from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.controller import MDPVehicle
+
+from envs.simulators.interventions import simulator_of
+
+
+class StandIn(IDMVehicle):
+    """IDM driver in the ego's place, with what observations and rewards ask of an ego."""
+
+    index_to_speed = MDPVehicle.index_to_speed
+    speed_to_index = MDPVehicle.speed_to_index
+
+
+def seat_driver(env: Any) -> bool:
+    """Lets an IDM driver drive the only ego on from now on; returns False, without a change, where that is impossible.
+
+    It keeps the ego's route and lane, and wishes to drive at the limit of its lane (without one, at the present speed).
+    The policy's actions have no effect any more, and rules of a crossing bind it. The ego stays the same object: ids,
+    observations and interventions find it as before.
+
+    Args:
+        env: environment, in wrappers or not; a copy, since nothing takes the driver out again.
+    """
+    simulator = simulator_of(env)
+    if not isinstance(simulator, AbstractEnv) or len(simulator.controlled_vehicles) != 1:
+        return False
+    ego = simulator.controlled_vehicles[0]
+    if ego.lane is None:
+        return False
+    driver = StandIn(
+        ego.road, ego.position, ego.heading, ego.speed, getattr(ego, "target_lane_index", None),
+        ego.lane.speed_limit, getattr(ego, "route", None),
+    )  # fmt: skip
+    ego.__dict__ = {**vars(driver), **vars(ego), "target_speed": driver.target_speed}
+    ego.__class__ = StandIn
+    return True
