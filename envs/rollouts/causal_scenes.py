@@ -5,12 +5,11 @@ is taken out (`envs.rollouts.causal_labels`). Beside each known label stand each
 the distance, and whether the simulator says that the receiver follows the sender. Pairs of which one agent is not
 perceived have no inferred edge and are left out, and so are landmarks.
 
-What the ego does is its policy's choice, so no label says who influences it. On roads its edges stand beside the
-vehicle ahead on its lane.
+Pairs whose receiver is the ego are kept apart: their labels are those of a driver in its place, and what leads it is
+the vehicle next ahead on its lane.
 """
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -59,15 +58,12 @@ class EdgeScene:
     distance_m: Float[np.ndarray, " pairs"]
     """Distance of the two agents [m]."""
     leads: Bool[np.ndarray, " pairs"] | None
-    """Whether the simulator says that the receiver follows the sender; None where it says nothing."""
+    """Whether the simulator says that the receiver follows the sender, or drives next behind it if it is the ego; None
+    where it says nothing."""
     edge_prob: dict[str, Float[np.ndarray, " pairs"]]
     """Probability of an edge of any type, by checkpoint."""
-    ahead: Bool[np.ndarray, " others"] | None = None
-    """Whether each other perceived agent is the one ahead of the ego on its lane; None without lanes or an only ego."""
-    distance_to_ego_m: Float[np.ndarray, " others"] | None = None
-    """Distance of these agents from the ego [m]."""
-    prob_to_ego: dict[str, Float[np.ndarray, " others"]] = field(default_factory=dict)
-    """Probability of an edge from each of these agents to the ego, by checkpoint."""
+    to_ego: "EdgeScene | None" = None
+    """The same of pairs whose receiver is the ego; None without an ego."""
 
 
 def play_graph(task: GraphTask) -> list[EdgeScene]:
@@ -96,29 +92,32 @@ def labelled_scene(world: World, forecasters: dict[str, SideForecaster], setting
         forecasters: forecasters that have observed the present scene.
         settings: how labels are measured.
     """
-    scene, labels, leaders = world.perceived(), causal_labels(world, settings), world.labels()
+    scene, labels, lanes = world.perceived(), causal_labels(world, settings), world.labels()
+    ids = np.asarray(labels.ids, dtype=np.int64)
+    leads = None
+    if lanes is not None:
+        leads = lanes.edge_types == LEADER
+        if world.spec.has_ego:
+            leads[0] = np.arange(len(ids)) == (-1 if lanes.ahead is None else lanes.ahead)
     moving = moving_agents(scene, world.spec)
     seen = {int(agent): i for i, agent in enumerate(scene.ids) if moving[i]}
     place = np.array([seen.get(agent, -1) for agent in labels.ids], dtype=np.int64)
     known = np.isfinite(labels.shift_m) & (place[:, None] >= 0) & (place >= 0)
-    receiver, sender = np.nonzero(known)
-    at = place[receiver], place[sender]
     positions = scene.states[:, : world.spec.position_dim]
     probs = {name: forecaster.forecast().edge_probs[0].cpu().numpy() for name, forecaster in forecasters.items()}
-    to_ego: dict[str, Any] = {}
-    if leaders is not None and world.spec.has_ego:
-        others = np.flatnonzero(moving[1:]) + 1
-        ahead = None if leaders.ahead is None else labels.ids[leaders.ahead]
-        to_ego = {
-            "ahead": np.array([int(agent) == ahead for agent in scene.ids[others]], dtype=np.bool_),
-            "distance_to_ego_m": np.linalg.norm(positions[others] - positions[0], axis=-1),
-            "prob_to_ego": {name: (1 - one[0, others, 0]).astype(np.float64) for name, one in probs.items()},
-        }
-    return EdgeScene(
-        labels.shift_m[receiver, sender].astype(np.float64),
-        np.asarray(labels.ids, dtype=np.int64)[receiver],
-        np.linalg.norm(positions[at[0]] - positions[at[1]], axis=-1),
-        None if leaders is None else leaders.edge_types[receiver, sender] == LEADER,
-        {name: (1 - one[at[0], at[1], 0]).astype(np.float64) for name, one in probs.items()},
-        **to_ego,
-    )
+
+    def pairs(receivers: slice) -> EdgeScene:
+        receiver, sender = np.nonzero(known[receivers])
+        receiver += receivers.start
+        at = place[receiver], place[sender]
+        return EdgeScene(
+            labels.shift_m[receiver, sender].astype(np.float64),
+            ids[receiver],
+            np.linalg.norm(positions[at[0]] - positions[at[1]], axis=-1),
+            None if leads is None else leads[receiver, sender],
+            {name: (1 - one[at[0], at[1], 0]).astype(np.float64) for name, one in probs.items()},
+        )
+
+    if not world.spec.has_ego:
+        return pairs(slice(0, None))
+    return replace(pairs(slice(1, None)), to_ego=pairs(slice(0, 1)))

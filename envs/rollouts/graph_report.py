@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from rich.console import Group
 from rich.table import Table
 
-from envs.rollouts.graph_run import DISTANCE, LEADERS, MAJORITY, EnvGraph
+from envs.rollouts.graph_run import AHEAD, DISTANCE, LEADERS, MAJORITY, EnvGraph
 from predictor.evaluation.causal_graph import CausalScores
 from predictor.evaluation.standard_errors import Estimate
 from predictor.reports.looks import BLACK, GREY, STYLE, YELLOW, looks_of
@@ -24,7 +24,7 @@ HEADS = (
     "AUC (95 %)", "average precision", "calibration error", "r with shift (95 %)", "spread over senders",
 )  # fmt: skip
 """Columns of the table."""
-RULES = {DISTANCE: YELLOW, LEADERS: BLACK, MAJORITY: GREY}
+RULES = {DISTANCE: YELLOW, LEADERS: BLACK, AHEAD: BLACK, MAJORITY: GREY}
 """Colors of the rules that need no network."""
 
 
@@ -43,8 +43,8 @@ def title_to_ego(result: EnvGraph) -> str:
         return ""
     first = next(iter(result.to_ego.values()))
     return (
-        f"{result.env}, edges to the ego against the vehicle ahead on its lane: {first.pairs} pairs, "
-        f"{100 * first.share:.0f} % are ahead"
+        f"{result.env}, edges to the ego, as a driver in its place would have them: {first.pairs} pairs, "
+        f"{100 * first.share:.0f} % are edges"
     )
 
 

@@ -1,6 +1,6 @@
 """Measures inferred edges against causal labels in one environment, beside rules that need no network."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +14,7 @@ from predictor.evaluation.causal_graph import CausalPairs, CausalScores, halves,
 from predictor.support.errors import UserError
 from predictor.support.progress import track
 
-MAJORITY, DISTANCE, LEADERS = "the commoner answer", "distance", "the leader"
+MAJORITY, DISTANCE, LEADERS, AHEAD = "the commoner answer", "distance", "the leader", "the vehicle ahead"
 """Names of the rules that need no network."""
 EDGE = 0.5
 """Probability above which a model infers an edge."""
@@ -39,7 +39,7 @@ class EnvGraph:
     env_kwargs: str = ""
     """Arguments of the environment, as the text of a JSON object; empty for none."""
     to_ego: dict[str, CausalScores] = field(default_factory=dict)
-    """Scores of edges to the ego, of which that from the vehicle ahead on its lane is the true one; empty elsewhere."""
+    """Scores of edges to the ego, against labels of a driver in its place; empty without any."""
 
     @property
     def env(self) -> str:
@@ -69,13 +69,15 @@ def measure_graph(run: CauseRun) -> EnvGraph:
     scores = scores_of(episodes, settings.threshold_m)
     if not next(iter(scores.values())).pairs:
         raise UserError(f"{run.env_id}: no causal label is known in {run.episodes} episodes; add --episodes")
-    to_ego = scores_to_ego(episodes)
+    to_ego = scores_to_ego(episodes, settings.threshold_m)
     return EnvGraph(run.env_id, run.driver, run.episodes, settings, scores, misfits, run.env_kwargs, to_ego)
 
 
-def scores_of(episodes: Sequence[Sequence[EdgeScene]], threshold_m: float) -> dict[str, CausalScores]:
-    """Returns the scores of all checkpoints and rules, by name."""
-    scenes = _numbered(episodes)
+def scores_of(
+    episodes: Sequence[Sequence[EdgeScene]], threshold_m: float, leader: str = LEADERS
+) -> dict[str, CausalScores]:
+    """Returns the scores of all checkpoints and rules, by name; `leader` names the rule of who leads."""
+    scenes = [(number, step, scene) for number, found in enumerate(episodes) for step, scene in enumerate(found)]
     if not sum(len(scene.shift_m) for *_, scene in scenes):
         return {MAJORITY: CausalScores(0, 0, 0.0, None)}
     ids = np.unique(np.concatenate([scene.receiver for *_, scene in scenes]))  # of names, numbers of 62 bits
@@ -91,46 +93,26 @@ def scores_of(episodes: Sequence[Sequence[EdgeScene]], threshold_m: float) -> di
             for number, step, scene in scenes
         ]
     )
-    found = [scene for *_, scene in scenes]
-    scores = _scores(pairs, [scene.edge_prob for scene in found], [scene.distance_m for scene in found])
-    if pairs.leads is not None:
-        scores[LEADERS] = score_rule(pairs.leads.astype(np.float64), pairs, EDGE)
-    return scores
-
-
-def scores_to_ego(episodes: Sequence[Sequence[EdgeScene]]) -> dict[str, CausalScores]:
-    """Returns the scores of edges to the ego against the vehicle ahead, by name; none where nothing is ahead."""
-    scenes = [(number, step, scene) for number, step, scene in _numbered(episodes) if scene.ahead is not None]
-    parts, distances, probs = [], [], []
-    for number, step, scene in scenes:
-        assert scene.ahead is not None and scene.distance_to_ego_m is not None
-        count = len(scene.ahead)
-        shift_m = np.zeros(count)  # nobody is moved: there is no strength
-        parts.append(CausalPairs(shift_m, scene.ahead, np.full(count, number), np.full(count, step)))
-        distances.append(scene.distance_to_ego_m)
-        probs.append(scene.prob_to_ego)
-    if not any(part.exists.any() for part in parts):
-        return {}
-    return _scores(CausalPairs.concatenate(parts), probs, distances)
-
-
-def _numbered(episodes: Sequence[Sequence[EdgeScene]]) -> list[tuple[int, int, EdgeScene]]:
-    return [(number, step, scene) for number, found in enumerate(episodes) for step, scene in enumerate(found)]
-
-
-def _scores(
-    pairs: CausalPairs, probs: Sequence[Mapping[str, np.ndarray]], distances_m: Sequence[np.ndarray]
-) -> dict[str, CausalScores]:
-    """Returns the scores of checkpoints, of the commoner answer and of the distance; the parts are those of scenes."""
 
     def joined(parts: Sequence[np.ndarray]) -> np.ndarray:
         return np.concatenate(parts).astype(np.float64)
 
     scores = {
-        name: score_rule(joined([one[name] for one in probs]), pairs, EDGE, probability=True) for name in probs[0]
+        name: score_rule(joined([scene.edge_prob[name] for *_, scene in scenes]), pairs, EDGE, probability=True)
+        for name in scenes[0][-1].edge_prob
     }
     fit, _ = halves(pairs)
     common = float(pairs.exists[fit].mean()) if fit.any() else 0.0
     scores[MAJORITY] = score_rule(np.full(len(pairs), common), pairs, EDGE)
-    scores[DISTANCE] = score_rule(-joined(distances_m), pairs, None)
+    scores[DISTANCE] = score_rule(-joined([scene.distance_m for *_, scene in scenes]), pairs, None)
+    if pairs.leads is not None:
+        scores[leader] = score_rule(pairs.leads.astype(np.float64), pairs, EDGE)
     return scores
+
+
+def scores_to_ego(episodes: Sequence[Sequence[EdgeScene]], threshold_m: float) -> dict[str, CausalScores]:
+    """Returns the scores of edges to the ego, by name; none without an ego or a known label."""
+    scenes = [[scene.to_ego for scene in found if scene.to_ego is not None] for found in episodes]
+    if not any(len(scene.shift_m) for found in scenes for scene in found):
+        return {}
+    return scores_of(scenes, threshold_m, AHEAD)

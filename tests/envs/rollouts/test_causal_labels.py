@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 
 from envs.rollouts.branches import Branches
-from envs.rollouts.causal_labels import ON_ROADS, CausalLabels, causal_labels, farthest, senders_of, with_causal_labels
+from envs.rollouts.causal_labels import (
+    ON_ROADS,
+    CausalLabels,
+    causal_labels,
+    copied,
+    farthest,
+    senders_of,
+    shift_in_place_of_ego_m,
+    with_causal_labels,
+)
 from envs.rollouts.interventions import intervene
 from envs.rollouts.world import open_world
 from envs.simulators.interventions import Intervention
@@ -16,7 +25,7 @@ SETTINGS = replace(ON_ROADS, horizon_s=5.0, threshold_m=0.5)
 
 
 def test_the_rear_one_depends_on_the_middle_one_and_the_front_one_does_not():
-    """Three in one lane, ids 1 to 3 from the rear, and the ego (0) two lanes aside."""
+    """Three in one lane, ids 1 to 3 from the rear, and the ego (0) two lanes aside, with nobody ahead."""
     world = road_world((0.0, 4.0), (25.0, 4.0), (50.0, 4.0), ego_m=(25.0, 12.0))
     world.step()
     untouched = world.full_scene()
@@ -25,13 +34,38 @@ def test_the_rear_one_depends_on_the_middle_one_and_the_front_one_does_not():
     types = causal_types(labels.shift_m, SETTINGS.threshold_m)
     assert list(labels.ids) == [0, 1, 2, 3]
     assert types.tolist() == [
-        [-1, -1, -1, -1],  # the ego's future is its policy's choice
+        [-1, 0, 0, 0],
         [0, -1, 1, 0],  # the leader's leader reaches it through the leader alone
         [0, 0, -1, 1],
         [0, 0, 0, -1],
     ]
     assert labels.shift_m[1, 2] > 2.0
     assert labels.shift_m.dtype == np.float32
+
+
+def test_a_driver_in_the_place_of_the_ego_depends_on_who_is_ahead_whatever_the_policy_does():
+    """The ego (0) drives idle behind agent 2, which follows agent 3; agent 1 drives behind it."""
+    world = road_world((0.0, 4.0), (50.0, 4.0), (75.0, 4.0), ego_m=(25.0, 4.0))
+    world.step()
+    untouched = copied(world)
+    labels = causal_labels(world, SETTINGS)
+    assert causal_types(labels.shift_m, SETTINGS.threshold_m)[0].tolist() == [-1, 0, 1, 0]
+    assert labels.shift_m[0, 2] > 2.0
+    assert_same_scenes(played(world, 5), played(untouched, 5))  # the policy drives the world on
+
+
+def test_a_driver_in_the_place_of_the_ego_yields_at_a_crossing():
+    """Policies go straight on at 9 m/s; who has the right of way makes a driver wait."""
+    world = open_world("intersection-v2", "idle")
+    world.reset(3)
+    played(world, 3)
+    row = causal_labels(world, ON_ROADS).shift_m[0]
+    assert np.isnan(row[0]) and (row[np.isfinite(row)] > 5.0).any()
+
+
+def test_without_an_agent_to_try_nothing_is_known_of_the_place_of_the_ego():
+    world = road_world((0.0, 4.0), ego_m=(25.0, 4.0))
+    assert np.isnan(shift_in_place_of_ego_m(world, [0, 1], [Intervention(0, "brake", 5)], 1.0)).all()
 
 
 def test_senders_that_are_not_tried_are_unknown():

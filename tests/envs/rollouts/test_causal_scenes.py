@@ -63,19 +63,23 @@ def test_pairs_stand_beside_their_own_probability_distance_and_leader():
     assert found.leads is not None
     assert {(r, s) for r, s, leads in zip(receivers, senders, found.leads, strict=True) if leads} == {(1, 2), (2, 3)}
     assert found.shift_m[found.leads].min() > 1.0 > found.shift_m[~found.leads].max()
-    assert found.ahead is not None and found.distance_to_ego_m is not None
-    assert np.round(100 * found.prob_to_ego["ids"]).tolist() == [1, 4, 2, 3]  # receiver 0, the ego; nearest first
-    assert found.ahead.tolist() == [False, True, False, False]  # on its lane is agent 4 alone
-    expected = [np.linalg.norm(places[agent] - places[0]) for agent in (1, 4, 2, 3)]
-    np.testing.assert_allclose(found.distance_to_ego_m, expected, rtol=1e-5)
+    to_ego = found.to_ego
+    assert to_ego is not None and to_ego.leads is not None and to_ego.to_ego is None
+    tried = np.round(100 * to_ego.edge_prob["ids"]).astype(int)  # receiver 0, the ego
+    assert set(tried) == {1, 2, 3, 4} and set(to_ego.receiver) == {0}
+    assert to_ego.leads.tolist() == (tried == 4).tolist()  # on its lane is agent 4 alone
+    np.testing.assert_array_equal(to_ego.shift_m, [labels.shift_m[0, ids.index(agent)] for agent in tried])
+    expected = [np.linalg.norm(places[agent] - places[0]) for agent in tried]
+    np.testing.assert_allclose(to_ego.distance_m, expected, rtol=1e-5)
 
 
 def test_nobody_is_ahead_of_an_ego_that_leads():
-    world = road_world((0.0, 12.0), (30.0, 4.0), ego_m=(25.0, 12.0))
+    world = road_world((0.0, 12.0), (15.0, 4.0), (30.0, 4.0), ego_m=(25.0, 12.0))
     forecaster = ByIds()
     forecaster.observe(world.perceived())
     found = labelled_scene(world, {"ids": forecaster}, ON_ROADS)
-    assert found.ahead is not None and len(found.ahead) and not found.ahead.any()
+    assert found.to_ego is not None and found.to_ego.leads is not None
+    assert len(found.to_ego.leads) and not found.to_ego.leads.any()
 
 
 def test_who_is_not_perceived_is_left_out():
@@ -109,6 +113,7 @@ def test_an_episode_has_labels_at_every_fifth_step(tmp_path: Path, monkeypatch: 
     assert steps == expected and len(found) == len(expected) > 0
     for scene in found:
         assert scene.leads is None and set(scene.receiver) <= {0, 1, 2, 3}  # landmarks are left out
+        assert scene.to_ego is None
         assert set(scene.edge_prob) == {"tag"} and ((scene.edge_prob["tag"] >= 0) & (scene.edge_prob["tag"] <= 1)).all()
         assert np.ptp(scene.edge_prob["tag"]) > 0
 

@@ -53,12 +53,12 @@ def test_edges_to_the_ego_have_a_table_of_their_own():
     result = replace(RESULT, to_ego=SCORES)
     lines = markdown([result]).splitlines()
     begin = lines.index(
-        "#### merge-v1, edges to the ego against the vehicle ahead on its lane: 40 pairs, 25 % are ahead"
+        "#### merge-v1, edges to the ego, as a driver in its place would have them: 40 pairs, 25 % are edges"
     )
     assert lines[begin + 4].startswith("| ours | 1.00 |") and "edges to the ego" not in markdown([RESULT])
     text = StringIO()
     Console(file=text, width=200).print(shown(result))
-    assert text.getvalue().count("0.67 (0.67 to 0.67)") == 4 and "against the vehicle ahead" in text.getvalue()
+    assert text.getvalue().count("0.67 (0.67 to 0.67)") == 4 and "as a driver in its place" in text.getvalue()
 
 
 def test_json_has_the_bins():

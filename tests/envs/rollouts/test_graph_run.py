@@ -10,7 +10,7 @@ from envs.rollouts import causal_scenes, graph_run
 from envs.rollouts.causal_labels import CausalLabels, CausalSettings
 from envs.rollouts.causal_scenes import EdgeScene
 from envs.rollouts.cause_run import CauseRun
-from envs.rollouts.graph_run import DISTANCE, LEADERS, MAJORITY, measure_graph, scores_of, scores_to_ego
+from envs.rollouts.graph_run import AHEAD, DISTANCE, LEADERS, MAJORITY, measure_graph, scores_of, scores_to_ego
 from envs.rollouts.world import World
 from predictor.evaluation.causal_graph import CausalScores
 from predictor.support.errors import UserError
@@ -82,32 +82,27 @@ def test_where_the_simulator_names_no_leaders_there_is_no_such_rule():
     assert LEADERS not in scores_of([[scene(0, leads=False)], [scene(1, leads=False)]], 1.0)
 
 
-def test_edges_to_the_ego_are_scored_against_the_vehicle_ahead():
-    """Of three others the second is ahead, and nobody at every other step; the nearest one is another."""
-    ahead = {True: np.array([False, True, False]), False: np.zeros(3, dtype=np.bool_)}
-    seen = [
-        replace(
-            scene(i),
-            ahead=ahead[i % 2 == 0],
-            distance_to_ego_m=np.array([5.0, 10.0, 20.0]),
-            prob_to_ego={"right": np.where(ahead[i % 2 == 0], 0.9, 0.1), "wrong": np.array([0.9, 0.1, 0.1])},
-        )
-        for i in range(12)
+def test_edges_to_the_ego_are_scored_apart():
+    """Those to the ego are inferred the wrong way round."""
+    episodes = [[replace(scene(i), to_ego=scene(i + 50)) for i in (2 * j, 2 * j + 1)] for j in range(6)]
+    swapped = [
+        [replace(one, to_ego=replace(to_ego, edge_prob={"right": to_ego.edge_prob["wrong"]}))]
+        for one, to_ego in ((found[0], found[0].to_ego) for found in episodes)
+        if to_ego is not None
     ]
-    episodes = [seen[i : i + 2] for i in range(0, 12, 2)]
-    scores = scores_to_ego(episodes)
-    assert list(scores) == ["right", "wrong", MAJORITY, DISTANCE]
-    assert {(s.pairs, s.episodes, s.share) for s in scores.values()} == {(18, 3, 1 / 6)}
-    assert [f1(scores, name) for name in ("right", "wrong", MAJORITY)] == [1.0, 0.0, 0.0]
-    auc = scores[DISTANCE].auc
-    assert auc is not None and auc.value == 0.5  # of five others two are farther, one is as far
-    assert scores["right"].strength is None
+    scores = scores_to_ego(episodes, 1.0)
+    assert list(scores) == ["right", "wrong", MAJORITY, DISTANCE, AHEAD]
+    assert {(s.pairs, s.episodes, s.share) for s in scores.values()} == {(24, 3, 0.25)}
+    assert f1(scores, "right") == f1(scores, AHEAD) == 1.0
+    assert f1(scores_to_ego(swapped, 1.0), "right") == 0.0
+    assert f1(scores_of(swapped, 1.0), "right") == 1.0
 
 
-def test_where_nothing_is_ahead_the_edges_to_the_ego_have_no_score():
-    assert scores_to_ego([[scene(0)], [scene(1)]]) == {}
-    nobody = replace(scene(0), ahead=np.zeros(2, dtype=np.bool_), distance_to_ego_m=np.ones(2), prob_to_ego={})
-    assert scores_to_ego([[nobody]]) == {}
+def test_without_a_known_label_the_edges_to_the_ego_have_no_score():
+    assert scores_to_ego([[scene(0)], [scene(1)]], 1.0) == {}
+    none = np.zeros(0)
+    nobody = EdgeScene(none, none.astype(int), none, none.astype(bool), {"right": none})
+    assert scores_to_ego([[replace(scene(0), to_ego=nobody)]], 1.0) == {}
 
 
 def run(checkpoint: str, **changes: Any) -> CauseRun:
