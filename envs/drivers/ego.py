@@ -106,7 +106,7 @@ def _meta_actions(env: gym.Env) -> dict[str, int]:
 def _keep_lane(env: gym.Env, rng: np.random.Generator) -> EgoDriver:
     """Follows the current lane with highway-env's own lane controller, with a little steering noise per episode."""
     action_type: Any = getattr(env.unwrapped, "action_type", None)
-    if not isinstance(env.action_space, gym.spaces.Box) or not hasattr(action_type, "steering_range"):
+    if not isinstance(env.action_space, gym.spaces.Box) or not getattr(action_type, "lateral", False):
         raise UserError(f"keep-lane needs continuous steering, got {env.action_space}; use random, idle or varied")
     return partial(_steer, env, action_type.steering_range[1], rng.uniform(0.0, 0.1), rng)
 

@@ -69,12 +69,15 @@ def _copied(value: Any, memo: dict[int, Any]) -> Any:
         return copy.deepcopy(value, memo)
     if id(value) in memo:
         return memo[id(value)]
-    cells = tuple(CellType() for _ in value.__closure__)
+    known = [id(cell) in memo for cell in value.__closure__]  # functions may share a variable
+    cells = tuple(memo.setdefault(id(cell), CellType()) for cell in value.__closure__)
     made = FunctionType(value.__code__, value.__globals__, value.__name__, value.__defaults__, cells)
     made.__kwdefaults__ = value.__kwdefaults__
     memo[id(value)] = made
     vars(made).update(copy.deepcopy(vars(value), memo))
-    for cell, own in zip(cells, value.__closure__, strict=True):
+    for cell, own, filled in zip(cells, value.__closure__, known, strict=True):
+        if filled:
+            continue
         try:
             content = own.cell_contents
         except ValueError:

@@ -4,7 +4,8 @@ At a step the world is branched (`envs.rollouts.branches`): for each sender, onc
 it is taken out, where that is possible. Receivers that either moves by more than the threshold may have been reached
 through others: a sender's follower brakes, and so its follower brakes. So each of them is played again, with all others
 held to what they do without the intervention. The label is the farthest direct shift within the horizon [m]; of
-receivers below the threshold already, the whole shift. Where a sender was not tried, the label is unknown.
+receivers below the threshold already, the whole shift. Where a sender was not tried, the label is unknown, and so are
+those of a receiver under an intervention, which its driver does not decide about.
 
 What the ego does is its policy's choice, which no intervention in one episode tells apart from a habit. The labels of
 what reaches the ego are therefore those of a driver of the simulator in its place (`envs.simulators.stand_in`): each
@@ -93,6 +94,7 @@ def causal_labels(world: World, settings: CausalSettings) -> CausalLabels:
         shift_m[:, column] = np.fmax(shift_m[:, column], found)
     if world.spec.has_ego:
         shift_m[0] = shift_in_place_of_ego_m(world, ids, tried, settings.threshold_m)
+    shift_m[[ids.index(agent) for agent in interventions_of(world) if agent in ids]] = np.nan
     np.fill_diagonal(shift_m, np.nan)
     return CausalLabels(ids, shift_m)
 

@@ -10,7 +10,14 @@ from envs.simulators.interventions import simulator_of
 
 
 class StandIn(IDMVehicle):
-    """IDM driver in the ego's place, with what observations and rewards ask of an ego."""
+    """IDM driver in the ego's place, with what observations and rewards ask of an ego.
+
+    Its constants are highway-env's, also in processes in which an intersection has written over those of its base.
+    """
+
+    DISTANCE_WANTED = 5.0 + IDMVehicle.LENGTH
+    COMFORT_ACC_MAX = 3.0
+    COMFORT_ACC_MIN = -5.0
 
     index_to_speed = MDPVehicle.index_to_speed
     speed_to_index = MDPVehicle.speed_to_index
@@ -19,9 +26,9 @@ class StandIn(IDMVehicle):
 def seat_driver(env: Any) -> bool:
     """Lets an IDM driver drive the only ego on from now on; returns False, without a change, where that is impossible.
 
-    It keeps the ego's route and lane, and wishes to drive at the limit of its lane (without one, at the present speed).
-    The policy's actions have no effect any more, and rules of a crossing bind it. The ego stays the same object: ids,
-    observations and interventions find it as before.
+    It begins with the ego's lane and route, changes lane as others do, and wishes to drive at the limit of its lane
+    (without one, at the present speed). The policy's actions have no effect any more, and rules of a crossing bind it.
+    The ego stays the same object: ids, observations and interventions find it as before.
 
     Args:
         env: environment, in wrappers or not; a copy, since nothing takes the driver out again.

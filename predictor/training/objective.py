@@ -105,7 +105,7 @@ def window_loss(
         steps = batch.last_observed[:, None] + torch.arange(1, horizon + 1, device=windows.device)
         truth = batch.states[windows, steps].transpose(1, 2)
         valid = batch.valid[windows, steps].transpose(1, 2)
-        weights = reaction_weights(batch, config.reaction_weight, total)
+        weights = reaction_weights(batch, config.reaction_weight, model.spec.has_ego, total)
         rollout = nll(
             output.rollout, truth, valid, scales, config.variance, config.likelihood, weights[..., None], total
         )
@@ -124,15 +124,19 @@ def window_loss(
     return loss, {k: v.detach() for k, v in terms.items()}
 
 
-def reaction_weights(batch: WindowBatch, weight: float, total: Total = of_one_process) -> Float[Tensor, "batch agents"]:
+def reaction_weights(
+    batch: WindowBatch, weight: float, has_ego: bool = False, total: Total = of_one_process
+) -> Float[Tensor, "batch agents"]:
     """Computes a factor for each agent: 1 plus `weight` times the strength of the causal edges to it, over its mean.
 
     Known are the edges from an agent whose intervention is the last thing that was observed: its receivers react. Of
-    one that was taken out, the edges are those of the step before.
+    one that was taken out, the edges are those of the step before. The edges to an ego do not count: they are those of
+    a driver in its place, not of the policy whose motion was recorded.
 
     Args:
         batch: windows; their edges are causal ones, if they have any attributes.
         weight: weight of a strength of 1; 0 gives 1 for all.
+        has_ego: whether the first agent is an ego.
         total: sums over all processes.
     """
     rows = torch.arange(len(batch.valid), device=batch.valid.device)
@@ -147,6 +151,8 @@ def reaction_weights(batch: WindowBatch, weight: float, total: Total = of_one_pr
         is_edge = (batch.edge_types[rows, step] > 0) & senders[:, None]
         found = torch.where(is_edge, batch.edge_attributes[rows, step][..., STRENGTH], 0.0)
         strength = torch.maximum(strength, found.amax(-1))
+    if has_ego:
+        strength[:, 0] = 0.0
     factors = factors + weight * strength
     return factors / total(masked_mean(factors, visible, total))
 
