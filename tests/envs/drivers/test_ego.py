@@ -201,6 +201,13 @@ def test_unknown_names_are_listed(discrete: gym.Env):
         make_ego_driver("fast", discrete, np.random.default_rng(0))
 
 
+def test_keep_lane_does_not_steer_with_the_throttle():
+    config = {"action": {"type": "ContinuousAction", "lateral": False}}
+    throttle = gym.make("highway-fast-v0", config=config)
+    with pytest.raises(UserError, match=r"keep-lane needs continuous steering, got Box\(.*; use random"):
+        make_ego_driver("keep-lane", throttle, np.random.default_rng(0))
+
+
 def test_keep_lane_needs_steering(discrete: gym.Env):
     with pytest.raises(UserError, match=r"keep-lane needs continuous steering, got Discrete\(5\); use random"):
         make_ego_driver("keep-lane", discrete, np.random.default_rng(0))

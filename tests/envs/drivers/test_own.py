@@ -92,6 +92,28 @@ def test_copies_count_for_themselves_and_share_what_cannot_be_copied():
     assert [copied(None), copied(None)] == [3, 4] and driver(None) == 3
 
 
+def counts_in_a_shared_variable(env: Any, rng: np.random.Generator) -> Any:
+    """Two functions share a count."""
+    count = 0
+
+    def bump() -> None:
+        nonlocal count
+        count += 1
+
+    def act(observation: Any) -> int:
+        bump()
+        return count % 5
+
+    return act
+
+
+def test_functions_share_their_variables_in_a_copy():
+    driver = OwnDriver(f"own:{__name__}:counts_in_a_shared_variable", None, np.random.default_rng(0))
+    assert [driver(None), driver(None)] == [1, 2]
+    copied = copy.deepcopy(driver)
+    assert [copied(None), copied(None)] == [3, 4] and driver(None) == 3
+
+
 def test_a_driver_with_a_place_in_a_sequence_is_not_copied():
     driver = OwnDriver(f"own:{__name__}:follows_a_list", None, np.random.default_rng(0))
     driver(None)

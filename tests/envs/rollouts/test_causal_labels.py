@@ -63,6 +63,17 @@ def test_a_driver_in_the_place_of_the_ego_yields_at_a_crossing():
     assert np.isnan(row[0]) and (row[np.isfinite(row)] > 5.0).any()
 
 
+def test_who_is_under_an_intervention_does_not_decide_for_itself():
+    """Agent 1 follows agent 2, and the ego (0) agent 1; both are braked."""
+    world = road_world((25.0, 4.0), (50.0, 4.0), ego_m=(0.0, 4.0))
+    world.step()
+    assert np.isfinite(causal_labels(world, SETTINGS).shift_m[[0, 1], 2]).all()
+    for agent in (0, 1):
+        intervene(world, Intervention(agent, "brake", 5))
+    shift_m = causal_labels(world, SETTINGS).shift_m
+    assert np.isnan(shift_m[[0, 1]]).all() and np.isfinite(shift_m[2]).sum() == 0
+
+
 def test_without_an_agent_to_try_nothing_is_known_of_the_place_of_the_ego():
     world = road_world((0.0, 4.0), ego_m=(25.0, 4.0))
     assert np.isnan(shift_in_place_of_ego_m(world, [0, 1], [Intervention(0, "brake", 5)], 1.0)).all()

@@ -36,6 +36,20 @@ def test_the_driver_wishes_the_limit_of_its_lane():
     assert world.full_scene().states[0, 2] == pytest.approx(limit, abs=2.0)
 
 
+def test_the_driver_is_the_same_after_an_intersection_was_played(monkeypatch: pytest.MonkeyPatch):
+    """Which writes over the constants of `IDMVehicle` for the whole process."""
+    found = []
+    for wanted in (10.0, 7.0):
+        monkeypatch.setattr(IDMVehicle, "DISTANCE_WANTED", wanted)
+        monkeypatch.setattr(IDMVehicle, "COMFORT_ACC_MAX", wanted / 2)
+        world = road_world((15.0, 4.0), ego_m=(0.0, 4.0))
+        assert seat_driver(world.env)
+        world.env.unwrapped.road.vehicles[1].COMFORT_ACC_MAX = 3.0
+        world.step()
+        found.append(world.full_scene().states[0])
+    np.testing.assert_array_equal(*found)
+
+
 @pytest.mark.parametrize("env_id", ["racetrack-v1", "two-way-v0", "roundabout-v1", "intersection-v2"])
 def test_every_road_drives_on_with_the_driver(env_id: str):
     """Of racetrack the ego has continuous actions; observation and reward of two-way ask an ego for its speeds."""

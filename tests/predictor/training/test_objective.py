@@ -297,6 +297,16 @@ def test_agents_that_react_to_one_that_is_gone_weigh_more(gone_at: int, weights:
     assert reaction_weights(windows, 3.0)[0, :2].tolist() == pytest.approx(weights)
 
 
+@pytest.mark.parametrize(("has_ego", "weights"), [(False, (7 / 4, 1 / 4)), (True, (1.0, 1.0))])
+def test_edges_to_an_ego_give_it_no_weight(has_ego: bool, weights: tuple[float, float]):
+    """Agent 0 has an edge of strength 2 from agent 1: if it is an ego, that is an edge of a driver in its place."""
+    types = torch.full((1, 3, 2, 2), -1, dtype=torch.int8)
+    attributes = torch.full((1, 3, 2, 2, len(CAUSAL_ATTRIBUTES)), math.nan)
+    types[0, 1, 0, 1], attributes[0, 1, 0, 1, STRENGTH] = 1, 2.0
+    windows = WindowBatch(torch.zeros(1, 3, 2, 4), torch.ones(1, 3, 2).bool(), torch.tensor([1]), types, attributes)
+    assert reaction_weights(windows, 3.0, has_ego)[0].tolist() == pytest.approx(weights)
+
+
 def test_the_weight_of_reactions_needs_causal_labels():
     with pytest.raises(UserError, match="reaction_weight needs the causal labels of branches; pass --causal-edges"):
         replace(SILENT, reaction_weight=1.0)

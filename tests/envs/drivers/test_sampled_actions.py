@@ -1,0 +1,17 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from envs.drivers.sampled_actions import uniform_action
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "dtype"), [(0, 1, np.int8), (-1, 1, np.int64), (0, 5, np.uint8), (250, 255, np.uint8)]
+)
+def test_whole_numbers_are_drawn_equally_often_up_to_both_bounds(low: int, high: int, dtype: type):
+    space, rng = gym.spaces.Box(low, high, (2,), dtype), np.random.default_rng(0)
+    drawn = np.stack([uniform_action(space, rng, "drivers") for _ in range(1200)])
+    assert drawn.dtype == dtype and space.contains(drawn[0])
+    values, counts = np.unique(drawn, return_counts=True)
+    assert values.tolist() == list(range(low, high + 1))
+    assert counts.min() > 0.75 * drawn.size / len(values)
